@@ -1,0 +1,1 @@
+"""One robot's mind, and the process that it runs in."""

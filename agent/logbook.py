@@ -1,0 +1,90 @@
+"""A robot's manoeuvres and anchor ranges, tick by tick: its own, or what it has been told of its peer's."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import msgspec
+
+from protocol.messages import MAX_REPORT_RANGES, MAX_REPORT_RUNS, Ranged
+from protocol.motion import Pose, Run, follow, step
+
+
+class Logbook(msgspec.Struct, frozen=True):
+    """What was executed over [0, through], never what was asked, and the ranges taken on the way."""
+
+    through: int = 0
+    runs: tuple[Run, ...] = ()
+    ranges: tuple[Ranged, ...] = ()
+
+    def drove(self, v: float, omega: float, ticks: int = 1) -> Logbook:
+        """The log after `ticks` more of one manoeuvre."""
+        runs = self.runs
+        if runs:
+            last = runs[-1]
+            if last.v == v and last.omega == omega:
+                runs, ticks_in_all = runs[:-1], last.ticks + ticks
+                return Logbook(self.through + ticks, (*runs, Run(ticks_in_all, v, omega)), self.ranges)
+        return Logbook(self.through + ticks, (*runs, Run(ticks, v, omega)), self.ranges)
+
+    def ranged(self, distance: float) -> Logbook:
+        """The log with an anchor range (m) at its last tick."""
+        return Logbook(self.through, self.runs, (*self.ranges, Ranged(self.through, distance)))
+
+    def after(self, since: int) -> Logbook:
+        """What a peer lacks that knows this log through `since`; no more than one report can carry.
+
+        Its runs begin at `since`, and the range of tick 0 goes with since = 0.
+        """
+        fresh = [begin for begin, run in _dated(self.runs) if begin + run.ticks > since]
+        ranges = [r for r in self.ranges if r.tick > since or since == 0]
+        through = fresh[MAX_REPORT_RUNS] if len(fresh) > MAX_REPORT_RUNS else self.through
+        if len(ranges) > MAX_REPORT_RANGES:
+            through = min(through, ranges[MAX_REPORT_RANGES].tick - 1)
+        return Logbook(
+            through,
+            _between(self.runs, since, through),
+            tuple(r for r in ranges if r.tick <= through),
+        )
+
+    def extended(self, since: int, told: Logbook) -> Logbook:
+        """The log with what `told` (see `after`) adds; unchanged where that would leave a gap."""
+        if since > self.through or told.through < self.through:
+            return self
+        book = self
+        for run in _between(told.runs, self.through - since, told.through - since):
+            book = book.drove(run.v, run.omega, run.ticks)
+        newest = self.ranges[-1].tick if self.ranges else -1
+        news = tuple(r for r in told.ranges if r.tick > newest)
+        return Logbook(book.through, book.runs, self.ranges + news)
+
+    def pose(self, start: Pose, tick: int, period: float) -> Pose:
+        """Where the robot was at `tick`, if it was at `start` at tick 0."""
+        return follow(start, _between(self.runs, 0, tick), period)
+
+    def track(self, start: Pose, first: int, last: int, period: float) -> list[Pose]:
+        """Where the robot was at each tick in [first, last], if it was at `start` at tick 0."""
+        pose = self.pose(start, first, period)
+        track = [pose]
+        for run in _between(self.runs, first, last):
+            for _ in range(run.ticks):
+                pose = step(pose, run.v, run.omega, period)
+                track.append(pose)
+        return track
+
+
+def _dated(runs: Iterable[Run]) -> Iterator[tuple[int, Run]]:
+    """Each run with the tick it begins at, the first at 0."""
+    begin = 0
+    for run in runs:
+        yield begin, run
+        begin += run.ticks
+
+
+def _between(runs: tuple[Run, ...], first: int, last: int) -> tuple[Run, ...]:
+    """What was driven over [first, last]."""
+    return tuple(
+        Run(min(begin + run.ticks, last) - max(begin, first), run.v, run.omega)
+        for begin, run in _dated(runs)
+        if begin < last and begin + run.ticks > first
+    )

@@ -1,0 +1,1 @@
+"""The paper's three phases: the states of each, and what ends them."""

@@ -1,0 +1,139 @@
+"""Phase 3: the last manoeuvres, and which of the placements of eq. (7) is true (Section III.C)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from agent.belief import Sighting
+from agent.geometry import Placement, placements
+from agent.phases.seeking import travelled
+from protocol.mission import RANGE_MARGIN, Mission, Role, Variant
+from protocol.motion import Controls, Pose, compose
+
+TURN_RATES = 721
+"""values of omega_2 tried in eq. (8), -omega_max and omega_max included: every half degree at T_s = 1 s"""
+
+SPEEDS = (1.0, -1.0, 0.75, -0.75, 0.5, -0.5, 0.25, -0.25, 0.1, -0.1)
+"""values of v_2 / v_max tried where the last manoeuvre must not leave the range; the letter tries the first"""
+
+ELSEWHERE = 1e-6
+"""m: a range taken nearer than this to where another was says nothing new"""
+
+
+class Standing(msgspec.Struct, frozen=True):
+    """b stands, and waits for a's second range; or, back from a manoeuvre, for word from a."""
+
+
+class Waiting(msgspec.Struct, frozen=True):
+    """a stands: it has its second range, and b makes the last manoeuvre."""
+
+
+class LastManoeuvre(msgspec.Struct, frozen=True):
+    """b drives to where the placements that are left predict different ranges."""
+
+    drive: Controls
+    origin: Pose
+
+
+class Returning(msgspec.Struct, frozen=True):
+    """b has left a's range, and drives the same arc backwards to tell it."""
+
+    drive: Controls
+    origin: Pose
+
+
+class Plan(NamedTuple):
+    """A last manoeuvre, and what it is expected to tell."""
+
+    drive: Controls
+    separation_m2: float
+    """J of eq. (8): the least difference of two predicted squared ranges"""
+
+
+def back(drive: Controls) -> Controls:
+    """The same arc, the other way."""
+    return Controls(-drive.v, -drive.omega)
+
+
+def base(sightings: Sequence[Sighting]) -> tuple[Sighting, Sighting] | None:
+    """The two ranges that eq. (7) is solved from: the first two between which only a has moved."""
+    ranged = [sighting for sighting in sightings if sighting.range is not None]
+    for first in ranged:
+        for second in ranged:
+            if (
+                first.tick < second.tick
+                and travelled(first.b, second.b) < ELSEWHERE < travelled(first.a, second.a)
+            ):
+                return first, second
+    return None
+
+
+def solve(distance: float, first: Sighting, second: Sighting) -> list[Placement]:
+    """The placements that eq. (7) leaves after two ranges; `distance` is D."""
+    assert first.range is not None and second.range is not None
+    return placements(distance, first.b, first.a, second.a, first.range, second.range)
+
+
+def redundant(sightings: Sequence[Sighting], first: Sighting, second: Sighting) -> bool:
+    """Whether there is a range more, from elsewhere, than the two that the placements were made from."""
+    return any(
+        sighting.range is not None
+        and all(
+            travelled(sighting.a, used.a) > ELSEWHERE or travelled(sighting.b, used.b) > ELSEWHERE
+            for used in (first, second)
+        )
+        for sighting in sightings
+    )
+
+
+def last_manoeuvre(
+    b: Pose, a: Pose, candidates: Sequence[Placement], mission: Mission, variant: Variant
+) -> Plan:
+    """b's manoeuvre after which the ranges that `candidates` predict differ most (eq. (8), on squares).
+
+    `b` is in <b(M2)> and `a` in <a(M1)>. By enumeration. The letter drives at v_max; `assured` takes
+    the best of the manoeuvres with the fewest candidates out of range, which silence then names. A
+    single candidate is checked by the range that changes most, towards it.
+    """
+    fractions = SPEEDS if variant == "assured" else SPEEDS[:1]
+    omega = np.linspace(-mission.max_turn_rate, mission.max_turn_rate, TURN_RATES)
+    half = 0.5 * mission.period * omega
+    unit = mission.period * np.sinc(half / math.pi)
+    speed = mission.max_speed * np.array(fractions)[:, None]
+    x = b.x + speed * unit * np.cos(b.heading + half)
+    y = b.y + speed * unit * np.sin(b.heading + half)
+
+    squared = []
+    for candidate in candidates:
+        there = compose(Pose(candidate.x, candidate.y, candidate.phi), a)
+        squared.append((there.x - x) ** 2 + (there.y - y) ** 2)
+    rim = (mission.sensing_range - RANGE_MARGIN) ** 2
+    if len(squared) == 1:
+        here = travelled(b, compose(Pose(candidates[0].x, candidates[0].y, candidates[0].phi), a))
+        told = here * here - squared[0]
+    else:
+        told = np.min(
+            [abs(one - other) for i, one in enumerate(squared) for other in squared[:i]], axis=0
+        )
+    value = told
+    if variant == "assured":
+        outside = sum((distance > rim).astype(float) for distance in squared)
+        value = np.where(outside == np.min(outside), told, -np.inf)
+    row, column = np.unravel_index(np.argmax(value), value.shape)
+    drive = Controls(float(speed[row, 0]), float(omega[column]))
+    return Plan(drive, float(abs(told[row, column])))
+
+
+def world_pose(role: Role, placement: Placement, bearing: float, own_anchor: Pose, local: Pose) -> Pose:
+    """A robot's pose in <W>, from its pose in the frame of its own anchor.
+
+    `bearing` (rad) is that of M1 seen from M2 in <W>; `own_anchor` is where the robot's anchor stands.
+    """
+    turn_b = bearing - math.atan2(placement.y, placement.x)
+    turn = turn_b if role == "b" else turn_b + placement.phi
+    return compose(Pose(own_anchor.x, own_anchor.y, turn), local)

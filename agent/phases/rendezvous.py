@@ -1,0 +1,72 @@
+"""Phase 2: out to the orbit about the own anchor, and round it until the peer is met (Section III.B)."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+
+from agent.phases.seeking import ARRIVED, straight, turn
+from protocol.mission import Mission, Orbit
+from protocol.motion import Controls, Pose, compose, wrap
+
+
+class Aligning(msgspec.Struct, frozen=True):
+    """Turns by -mu, to head straight away from the anchor."""
+
+    heading: float
+
+
+class Radial(msgspec.Struct, frozen=True):
+    """Drives along the radius until it is on the orbit: outward, or back."""
+
+
+class Tangent(msgspec.Struct, frozen=True):
+    """Turns from the radius onto the orbit: a by +90 degrees, b by -90."""
+
+    heading: float
+
+
+class Orbiting(msgspec.Struct, frozen=True):
+    """Drives round its anchor, eq. (6)."""
+
+
+Meeting = Aligning | Radial | Tangent | Orbiting
+
+
+def orientation(local: Pose) -> float:
+    """mu in rad: the heading relative to the line from the anchor through the robot."""
+    if local.x == 0.0 and local.y == 0.0:
+        return 0.0
+    return wrap(local.heading - math.atan2(local.y, local.x))
+
+
+def onward(state: Meeting, odometry: Pose, start: Pose, orbit: Orbit) -> Meeting:
+    """The state at `odometry`, whose tick 0 is `start` in the anchor's frame: what is done is passed over."""
+    while True:
+        match state:
+            case Aligning(heading) if abs(heading - odometry.heading) <= ARRIVED:
+                state = Radial()
+            case Radial() if abs(left_to_orbit(odometry, start, orbit)) <= ARRIVED:
+                state = Tangent(odometry.heading + math.copysign(math.pi / 2, orbit.omega))
+            case Tangent(heading) if abs(heading - odometry.heading) <= ARRIVED:
+                return Orbiting()
+            case _:
+                return state
+
+
+def left_to_orbit(odometry: Pose, start: Pose, orbit: Orbit) -> float:
+    """m: how much farther from the anchor the orbit is."""
+    local = compose(start, odometry)
+    return orbit.radius - math.hypot(local.x, local.y)
+
+
+def controls(state: Meeting, odometry: Pose, start: Pose, orbit: Orbit, mission: Mission) -> Controls:
+    """What `state` drives from `odometry`."""
+    match state:
+        case Aligning(heading) | Tangent(heading):
+            return turn(odometry, heading, mission)
+        case Radial():
+            return straight(left_to_orbit(odometry, start, orbit), mission)
+        case Orbiting():
+            return Controls(orbit.v, orbit.omega)

@@ -1,0 +1,108 @@
+"""How a robot takes a second range of a beacon (Section III.A.2): straight ahead, else about where it was.
+
+Phase 1 does it with the anchor, and a does it again in phase 3, with b in the anchor's place.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import msgspec
+
+from protocol.mission import Mission
+from protocol.motion import REST, TAU, Controls, Pose
+
+ARRIVED = 1e-9
+"""m and rad: nearer than this is there; the odometry knows the rest"""
+
+Beacon = Literal["anchor", "peer"]
+
+
+class Straight(msgspec.Struct, frozen=True):
+    """Drives A_0 ahead; then looks whether the beacon ranges it there."""
+
+    beacon: Beacon
+    origin: Pose
+    rho0: float
+    """m: the range at `origin`"""
+
+
+class Turning(msgspec.Struct, frozen=True):
+    """Has left the beacon's range, and turns by pi / 2 on the spot."""
+
+    beacon: Beacon
+    origin: Pose
+    rho0: float
+    heading: float
+
+
+class Circling(msgspec.Struct, frozen=True):
+    """Drives a circle of radius A_0 about `origin`, until the beacon ranges it."""
+
+    beacon: Beacon
+    origin: Pose
+    rho0: float
+
+
+Seeking = Straight | Turning | Circling
+
+
+def travelled(origin: Pose, pose: Pose) -> float:
+    """m, as the crow flies."""
+    return math.hypot(pose.x - origin.x, pose.y - origin.y)
+
+
+def moved(origin: Pose, pose: Pose) -> bool:
+    """Whether a manoeuvre begun at `origin` has been executed; in real time it may not have been."""
+    return pose != origin
+
+
+def onward(state: Seeking, pose: Pose, measured: bool, mission: Mission) -> Seeking | None:
+    """The state after a tick that led to `pose`; None once there is a second range."""
+    match state:
+        case Straight(beacon, origin, rho0):
+            if travelled(origin, pose) < mission.first_straight - ARRIVED:
+                return state
+            return None if measured else Turning(beacon, origin, rho0, pose.heading + math.pi / 2)
+        case Turning(beacon, origin, rho0, heading):
+            return state if abs(heading - pose.heading) > ARRIVED else Circling(beacon, origin, rho0)
+        case Circling():
+            return None if measured else state
+
+
+def controls(state: Seeking, pose: Pose, mission: Mission) -> Controls:
+    """What `state` drives from `pose`."""
+    match state:
+        case Straight(_, origin):
+            return straight(mission.first_straight - travelled(origin, pose), mission)
+        case Turning(heading=heading):
+            return turn(pose, heading, mission)
+        case Circling(_, _, rho0):
+            omega = min(
+                mission.max_turn_rate,
+                inside_arc(rho0, mission) / mission.period,
+                mission.max_speed / mission.first_straight,
+            )
+            return Controls(omega * mission.first_straight, omega)
+
+
+def inside_arc(rho0: float, mission: Mission) -> float:
+    """2 pi - 2 eta in rad: the arc of the circle about a point `rho0` from the beacon that is in range."""
+    radius, reach = mission.first_straight, mission.sensing_range
+    cosine = (reach * reach - rho0 * rho0 - radius * radius) / (2.0 * radius * rho0) if rho0 > 0.0 else 1.0
+    return TAU - 2.0 * math.acos(min(1.0, max(-1.0, cosine)))
+
+
+def turn(pose: Pose, heading: float, mission: Mission) -> Controls:
+    """Towards `heading` on the spot, as far as one tick allows."""
+    left = (heading - pose.heading) / mission.period
+    if left == 0.0:
+        return REST
+    return Controls(0.0, math.copysign(min(abs(left), mission.max_turn_rate), left))
+
+
+def straight(distance: float, mission: Mission) -> Controls:
+    """Ahead by `distance` m, or back where it is negative, as far as one tick allows."""
+    left = distance / mission.period
+    return Controls(math.copysign(min(abs(left), mission.max_speed), left), 0.0)

@@ -1,0 +1,429 @@
+"""The state machine of one robot: pure, so that simulation, network, replay and recovery agree to the bit.
+
+One tick has two halves, since two robots in contact tell each other what they have just sensed before
+either decides:
+
+    observe(mind, sense)  -> mind       folds in what the sensors say; `report(mind)` is then what to tell
+    decide(mind, reports) -> mind       folds in what was heard; `drive(mind)` is then what to do
+
+No I/O, no clock, no randomness. What the robot is doing is one frozen value, `mind.state`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import msgspec
+from msgspec.structs import replace
+
+from agent import radio
+from agent.belief import Branch, Sighting, branches, weigh_branches, weigh_placements
+from agent.geometry import Placement
+from agent.logbook import Logbook
+from agent.phases import anchor, encounter, rendezvous, seeking
+from agent.phases.anchor import ThirdPoint
+from agent.phases.encounter import LastManoeuvre, Returning, Standing, Waiting
+from agent.phases.rendezvous import Aligning, Orbiting, Radial, Tangent
+from agent.phases.seeking import Circling, Straight, Turning
+from protocol import messages
+from protocol.messages import Briefing, Drive, Estimate, Localised, Ranged, Report, Sense, Undecided
+from protocol.mission import Orbit
+from protocol.motion import ORIGIN, REST, Controls, Pose, compose, step
+
+
+class Asleep(msgspec.Struct, frozen=True):
+    """Has not sensed anything yet."""
+
+
+class Done(msgspec.Struct, frozen=True):
+    """Has come to its verdict; stands, and keeps telling the peer."""
+
+    phase: int
+    verdict: messages.Verdict
+
+
+Phase1 = Straight | Turning | Circling | ThirdPoint
+Phase2 = Aligning | Radial | Tangent | Orbiting
+Phase3 = Straight | Turning | Circling | Standing | Waiting | LastManoeuvre | Returning
+State = Asleep | Phase1 | Phase2 | Phase3 | Done
+
+WORDS: dict[type, str] = {
+    Asleep: "asleep",
+    Straight: "straight",
+    Turning: "turning",
+    Circling: "circling",
+    ThirdPoint: "third-point",
+    Aligning: "aligning",
+    Radial: "radial",
+    Tangent: "tangent",
+    Orbiting: "orbiting",
+    Standing: "standing",
+    Waiting: "waiting",
+    LastManoeuvre: "last-manoeuvre",
+    Returning: "returning",
+}
+MET = ("orbiting", "straight", "turning", "circling", "standing", "waiting", "last-manoeuvre", "returning")
+
+
+class Findings(msgspec.Struct, frozen=True):
+    """What phases 1 and 3 have found out, beside the state."""
+
+    branch: Branch | None = None
+    """the one that is left after phase 1"""
+    branch_by: messages.Branch | None = None
+    met: int | None = None
+    """the tick in which phase 3 began"""
+    solutions: int | None = None
+    """of eq. (7)"""
+    placements: tuple[Placement, ...] = ()
+    """those that silence has left"""
+    placements_after_silence: int | None = None
+    plan: encounter.Plan | None = None
+
+
+class Mind(msgspec.Struct, frozen=True):
+    """Everything that a robot knows."""
+
+    briefing: Briefing
+    state: State = Asleep()
+    tick: int = -1
+    odometry: Pose = ORIGIN
+    """now, in the frame of tick 0"""
+    log: Logbook = Logbook()
+    mutual: tuple[Ranged, ...] = ()
+    findings: Findings = Findings()
+    radio: radio.Radio = radio.Radio()
+
+    @property
+    def orbit(self) -> Orbit:
+        plan = self.briefing.rendezvous
+        return plan.a if self.briefing.role == "a" else plan.b
+
+    @property
+    def in_contact(self) -> bool:
+        """Whether the peer has been ranged in this tick."""
+        return bool(self.mutual) and self.mutual[-1].tick == self.tick
+
+    @property
+    def phase(self) -> int:
+        match self.state:
+            case Asleep() | ThirdPoint() | Straight("anchor") | Turning("anchor") | Circling("anchor"):
+                return 1
+            case Aligning() | Radial() | Tangent() | Orbiting():
+                return 2
+            case Done(phase, _):
+                return phase
+            case _:
+                return 3
+
+    @property
+    def doing(self) -> str:
+        """The state in a word."""
+        match self.state:
+            case Done(_, Localised()):
+                return "localised"
+            case Done(_, Undecided()):
+                return "undecided"
+            case state:
+                return WORDS[type(state)]
+
+    @property
+    def verdict(self) -> messages.Verdict | None:
+        return self.state.verdict if isinstance(self.state, Done) else None
+
+
+# --- a tick -----------------------------------------------------------------------------------------
+
+
+def observe(mind: Mind, sense: Sense) -> Mind:
+    """What the robot knows once it has sensed: where it drove, what was in range and what was silent."""
+    log, odometry = mind.log, mind.odometry
+    if sense.executed is not None:
+        v, omega = sense.executed.v, sense.executed.omega
+        log = log.drove(v, omega)
+        odometry = step(odometry, v, omega, mind.briefing.mission.period)
+    if sense.anchor_range is not None:
+        log = log.ranged(sense.anchor_range)
+    mutual = mind.mutual
+    for contact in sense.contacts:
+        if contact.peer == mind.briefing.peer and contact.range is not None:
+            mutual = (*mutual, Ranged(sense.tick, contact.range))
+    sensed = Mind(mind.briefing, mind.state, sense.tick, odometry, log, mutual, mind.findings, mind.radio)
+    return _advanced(sensed, sense.anchor_range)
+
+
+def report(mind: Mind) -> Report:
+    """What the peer has not acknowledged yet."""
+    since = mind.radio.acknowledged
+    news = mind.log.after(since)
+    return Report(
+        tick=mind.tick,
+        robot=mind.briefing.robot,
+        state=mind.doing,
+        start=mind.findings.branch.start if mind.findings.branch else None,
+        since=since,
+        through=news.through,
+        runs=news.runs,
+        ranges=news.ranges,
+        heard=mind.radio.peer.through,
+        verdict=mind.verdict,
+    )
+
+
+def decide(mind: Mind, reports: Sequence[Report] = ()) -> Mind:
+    """What the robot is set to do once it has heard its peer."""
+    if reports:
+        heard = mind.radio
+        for told in reports:
+            heard = radio.hear(heard, told)
+        mind = replace(mind, radio=heard)
+    if not mind.in_contact:
+        return mind
+    match mind.state:
+        case Orbiting() if mind.radio.state in MET and mind.radio.start is not None:
+            return _met(mind)
+        case Standing() | Waiting():
+            return _considered(mind)
+        case _:
+            return mind
+
+
+def drive(mind: Mind) -> Drive:
+    """What the robot does over the tick to come."""
+    controls = _controls(mind)
+    return Drive(
+        mind.tick,
+        mind.briefing.robot,
+        controls.v,
+        controls.omega,
+        mind.phase,
+        mind.doing,
+        mind.verdict,
+    )
+
+
+def estimate(mind: Mind) -> Estimate:
+    """What the robot holds possible."""
+    left: tuple[Branch, ...] = ()
+    if mind.findings.branch is not None:
+        left = (mind.findings.branch,)
+    elif isinstance(mind.state, ThirdPoint):
+        left = mind.state.branches
+    if isinstance(mind.verdict, Localised):
+        world: tuple[Pose, ...] = (mind.verdict.pose,)
+    else:
+        world = tuple(_world_pose(mind, placement) for placement in mind.findings.placements)
+    return Estimate(
+        tick=mind.tick,
+        robot=mind.briefing.robot,
+        local=tuple(anchor.local(left, mind.odometry)),
+        world=world,
+        localised=isinstance(mind.verdict, Localised),
+    )
+
+
+# --- what a tick changes ----------------------------------------------------------------------------
+
+
+def _advanced(mind: Mind, anchor_range: float | None) -> Mind:
+    """`mind` in the state that its own senses lead to."""
+    match mind.state:
+        case Orbiting() | Standing() | Waiting() | Done():
+            return mind
+        case Aligning() | Radial() | Tangent():
+            return _on_to_orbit(mind, mind.state)
+        case Straight(beacon) | Turning(beacon) | Circling(beacon):
+            measured = mind.in_contact if beacon == "peer" else anchor_range is not None
+            onward = seeking.onward(mind.state, mind.odometry, measured, mind.briefing.mission)
+            if onward is not None:
+                return mind if onward is mind.state else replace(mind, state=onward)
+            return replace(mind, state=Waiting()) if beacon == "peer" else _second_range(mind)
+        case ThirdPoint(_, origin):
+            return _third_range(mind, mind.state) if seeking.moved(origin, mind.odometry) else mind
+        case LastManoeuvre(driven, origin) if seeking.moved(origin, mind.odometry):
+            if mind.in_contact:
+                return replace(mind, state=Standing())
+            return replace(mind, state=Returning(encounter.back(driven), mind.odometry))
+        case Returning(_, origin) if seeking.moved(origin, mind.odometry):
+            return replace(mind, state=Standing())
+        case Asleep():
+            return _released(mind, anchor_range)
+        case _:
+            return mind
+
+
+def _released(mind: Mind, rho0: float | None) -> Mind:
+    if rho0 is None:
+        return _undecided(mind, "the anchor is out of range at the start")
+    if rho0 == 0.0:  # the heading is radial by definition, and nothing is left to find out
+        return _located(mind, Branch(0.0, ORIGIN), "on-anchor")
+    return replace(mind, state=Straight("anchor", mind.odometry, rho0))
+
+
+def _second_range(mind: Mind) -> Mind:
+    """The branches +-alpha, less what silence on the way rules out."""
+    rho0, rho = mind.log.ranges[0].range, mind.log.ranges[-1].range
+    possible = branches(rho0, mind.odometry, rho)
+    left = weigh_branches(possible, _seen(mind), mind.briefing.mission.sensing_range)
+    if isinstance(mind.state, Circling) and len(left) == 1:
+        return _located(mind, left[0], "circle")
+    return _to_third_point(mind, left, again=False)
+
+
+def _to_third_point(mind: Mind, left: tuple[Branch, ...], *, again: bool) -> Mind:
+    if not left:
+        return _undecided(mind, "no pose explains the anchor ranges")
+    mission, variant = mind.briefing.mission, mind.briefing.variant
+    controls = anchor.third_point(anchor.local(left, mind.odometry), mission, variant)
+    if controls is None:
+        return _undecided(mind, "eq. (5) leaves no way to a third range")
+    return replace(mind, state=ThirdPoint(left, mind.odometry, controls, again))
+
+
+def _third_range(mind: Mind, state: ThirdPoint) -> Mind:
+    """The branch that explains the third range, or its absence: the virtual measurement."""
+    left = weigh_branches(state.branches, _seen(mind), mind.briefing.mission.sensing_range)
+    if len(left) == 1:
+        measured = mind.log.ranges[-1].tick == mind.tick
+        return _located(mind, left[0], "three-ranges" if measured else "three-ranges-virtual")
+    if len(left) > 1 and mind.briefing.variant == "paper":
+        return _undecided(mind, "the third range does not tell +alpha from -alpha")
+    return _to_third_point(mind, left, again=True)
+
+
+def _located(mind: Mind, branch: Branch, by: messages.Branch) -> Mind:
+    """Phase 1 is done: its pose relative to the anchor is known."""
+    findings = replace(mind.findings, branch=branch, branch_by=by)
+    mu = rendezvous.orientation(compose(branch.start, mind.odometry))
+    return _on_to_orbit(replace(mind, findings=findings), Aligning(mind.odometry.heading - mu))
+
+
+def _on_to_orbit(mind: Mind, state: rendezvous.Meeting) -> Mind:
+    branch = mind.findings.branch
+    assert branch is not None
+    onward = rendezvous.onward(state, mind.odometry, branch.start, mind.orbit)
+    return mind if onward is mind.state else replace(mind, state=onward)
+
+
+def _met(mind: Mind) -> Mind:
+    """Phase 3 begins: b stops, a goes straight on (Section III.C.a)."""
+    findings = replace(mind.findings, met=mind.tick)
+    if mind.briefing.role == "b":
+        return replace(mind, state=Standing(), findings=findings)
+    straight = Straight("peer", mind.odometry, mind.mutual[-1].range)
+    return replace(mind, state=straight, findings=findings)
+
+
+def _considered(mind: Mind) -> Mind:
+    """Both logs in hand: solve eq. (7), weigh, and claim, plan the last manoeuvre, or wait."""
+    sightings = _sightings(mind)
+    base = encounter.base(sightings)
+    if base is None:
+        return mind
+    mission, findings = mind.briefing.mission, mind.findings
+    if findings.solutions is None:
+        solutions = encounter.solve(_anchor_distance(mind.briefing), *base)
+        left = weigh_placements(solutions, sightings[: base[1].tick - sightings[0].tick + 1], mission.sensing_range)
+        findings = replace(
+            findings, solutions=len(solutions), placements=left, placements_after_silence=len(left)
+        )
+    left = weigh_placements(findings.placements, sightings, mission.sensing_range)
+    checked = encounter.redundant(sightings, *base)
+    mind = replace(mind, findings=replace(findings, placements=left))
+
+    if not left:
+        return _undecided(mind, "no placement explains the mutual ranges")
+    if checked and len(left) == 1:
+        pose = _world_pose(mind, left[0])
+        return replace(mind, state=Done(3, Localised(pose)))
+    if mind.briefing.role == "a":
+        told = mind.radio.verdict
+        return _undecided(mind, told.reason) if isinstance(told, Undecided) else mind
+    if mind.briefing.variant == "paper" and findings.plan is not None:
+        missed = "the last manoeuvre left the mutual range" if not checked else "the third mutual range fits more than one placement"
+        return _undecided(mind, missed)
+    place = compose(_start(mind), mind.odometry)
+    plan = encounter.last_manoeuvre(
+        place, sightings[-1].a, left, mission, mind.briefing.variant
+    )
+    return replace(
+        mind,
+        state=LastManoeuvre(plan.drive, mind.odometry),
+        findings=replace(mind.findings, plan=plan),
+    )
+
+
+def _undecided(mind: Mind, reason: str) -> Mind:
+    return replace(mind, state=Done(mind.phase, Undecided(reason)))
+
+
+# --- what a mind implies ----------------------------------------------------------------------------
+
+
+def _controls(mind: Mind) -> Controls:
+    match mind.state:
+        case Orbiting():
+            return Controls(mind.orbit.v, mind.orbit.omega)
+        case Aligning() | Radial() | Tangent():
+            return rendezvous.controls(
+                mind.state, mind.odometry, _start(mind), mind.orbit, mind.briefing.mission
+            )
+        case Straight() | Turning() | Circling():
+            return seeking.controls(mind.state, mind.odometry, mind.briefing.mission)
+        case ThirdPoint(drive=controls) | LastManoeuvre(controls) | Returning(controls):
+            return controls
+        case _:
+            return REST
+
+
+def _start(mind: Mind) -> Pose:
+    """Where tick 0 lies in the frame of the anchor; known from phase 2 on."""
+    assert mind.findings.branch is not None
+    return mind.findings.branch.start
+
+
+def _seen(mind: Mind) -> list[tuple[Pose, float | None]]:
+    """Every tick so far: the odometry, and the anchor's range or its silence."""
+    ranges = {ranged.tick: ranged.range for ranged in mind.log.ranges}
+    track = mind.log.track(ORIGIN, 0, mind.tick, mind.briefing.mission.period)
+    return [(pose, ranges.get(tick)) for tick, pose in enumerate(track)]
+
+
+def _sightings(mind: Mind) -> list[Sighting]:
+    """Every tick of the encounter that both logs cover."""
+    met, peer = mind.findings.met, mind.radio
+    last = min(mind.tick, peer.peer.through)
+    if met is None or peer.start is None or last < met:
+        return []
+    period = mind.briefing.mission.period
+    ranges = {ranged.tick: ranged.range for ranged in mind.mutual}
+    mine = mind.log.track(_start(mind), met, last, period)
+    theirs = peer.peer.track(peer.start, met, last, period)
+    a, b = (mine, theirs) if mind.briefing.role == "a" else (theirs, mine)
+    return [
+        Sighting(tick, a[tick - met], b[tick - met], ranges.get(tick)) for tick in range(met, last + 1)
+    ]
+
+
+def _anchor_distance(briefing: Briefing) -> float:
+    """D in m."""
+    return math.hypot(
+        briefing.anchor.x - briefing.peer_anchor.x, briefing.anchor.y - briefing.peer_anchor.y
+    )
+
+
+def _world_pose(mind: Mind, placement: Placement) -> Pose:
+    briefing = mind.briefing
+    m1, m2 = (
+        (briefing.anchor, briefing.peer_anchor)
+        if briefing.role == "a"
+        else (briefing.peer_anchor, briefing.anchor)
+    )
+    return encounter.world_pose(
+        briefing.role,
+        placement,
+        math.atan2(m1.y - m2.y, m1.x - m2.x),
+        Pose(briefing.anchor.x, briefing.anchor.y, 0.0),
+        compose(_start(mind), mind.odometry),
+    )

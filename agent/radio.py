@@ -1,0 +1,55 @@
+"""What a robot has told its peer, heard from it and acknowledged: pure bookkeeping."""
+
+from __future__ import annotations
+
+import msgspec
+
+from agent.logbook import Logbook
+from protocol.messages import Report, Verdict
+from protocol.motion import Pose
+
+
+class Radio(msgspec.Struct, frozen=True):
+    """All that is known of the peer, and how much of its own log a robot need not repeat."""
+
+    peer: Logbook = Logbook()
+    start: Pose | None = None
+    """where tick 0 of the peer's odometry lies in the frame of the peer's anchor"""
+    state: str | None = None
+    """what the peer was doing when last heard"""
+    verdict: Verdict | None = None
+    """the peer's"""
+    latest: int = -1
+    """the tick of the newest report heard"""
+    acknowledged: int = 0
+    """the peer knows this robot's log through this tick"""
+    heard: int = 0
+    """reports, repeats included"""
+
+
+def contradiction(report: Report) -> str | None:
+    """What in `report` no well-formed log could say, or None."""
+    if report.through > report.tick or report.since > report.through:
+        return f"a log over [{report.since}, {report.through}] told at tick {report.tick}"
+    if sum(run.ticks for run in report.runs) != report.through - report.since:
+        return f"manoeuvres that do not fill [{report.since}, {report.through}]"
+    earliest = -1 if report.since == 0 else report.since
+    for ranged in report.ranges:
+        if not earliest < ranged.tick <= report.through:
+            return f"a range of tick {ranged.tick} outside ({report.since}, {report.through}], or out of order"
+        earliest = ranged.tick
+    return None
+
+
+def hear(radio: Radio, report: Report) -> Radio:
+    """Late, repeated and overtaken reports change nothing but the count."""
+    newer = report.tick > radio.latest
+    return Radio(
+        peer=radio.peer.extended(report.since, Logbook(report.through, report.runs, report.ranges)),
+        start=radio.start or report.start,
+        state=report.state if newer else radio.state,
+        verdict=report.verdict if newer else radio.verdict,
+        latest=max(report.tick, radio.latest),
+        acknowledged=max(report.heard, radio.acknowledged),
+        heard=radio.heard + 1,
+    )

@@ -1,0 +1,80 @@
+"""Frames in and out of a process, on disk, in order: the record of a run.
+
+A journal is a plain stream of msgpack byte strings, one a frame, so that any msgpack library reads it.
+It holds no wall-clock time. Each write is one system call: a process that is killed loses nothing it
+had journaled, and at worst leaves a last frame torn, which reading ignores.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+
+import msgpack
+
+from protocol.wire import MAX_FRAME_BYTES
+
+
+_packer = msgpack.Packer()
+
+
+class RecordExists(FileExistsError):
+    """A journal would have been overwritten."""
+
+
+class CorruptJournal(ValueError):
+    """A journal that is damaged before its end."""
+
+
+class Journal:
+    """An open journal. A new file, never an old one: what is on record stays."""
+
+    def __init__(self, path: Path, *, fsync: bool = False) -> None:
+        """Raises RecordExists if `path` is there already, OSError if it cannot be written."""
+        self.path = path
+        self._fsync = fsync
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
+        except FileExistsError:
+            raise RecordExists(f"{path}: holds a record already; choose another --out") from None
+
+    def write(self, *frames: bytes) -> None:
+        """All of `frames`, in one write, on the disk's side of the process when it returns."""
+        data = b"".join([_packer.pack(frame) for frame in frames])
+        if os.write(self._file, data) != len(data):
+            raise OSError(errno.ENOSPC, "written only in part", str(self.path))
+        if self._fsync:
+            os.fsync(self._file)
+
+    def close(self) -> None:
+        os.close(self._file)
+
+    def __enter__(self) -> Journal:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def read(path: Path) -> Iterator[bytes]:
+    """The frames of the journal at `path`, up to its end or its torn tail.
+
+    Raises OSError if it cannot be read, CorruptJournal where something stands that is no frame.
+    """
+    with path.open("rb") as file:
+        unpacker = msgpack.Unpacker(file, max_bin_len=MAX_FRAME_BYTES, raw=True)
+        try:
+            for frame in unpacker:
+                if not isinstance(frame, bytes):
+                    raise CorruptJournal(f"{path}: no frame before byte {unpacker.tell()}")
+                yield frame
+        except (ValueError, msgpack.UnpackException) as error:
+            if isinstance(error, CorruptJournal):
+                raise
+            raise CorruptJournal(f"{path}: damaged at byte {unpacker.tell()}: {error}") from None

@@ -1,0 +1,189 @@
+"""Everything that crosses the wire or enters a journal: frozen structs, encoded as tagged msgpack arrays.
+
+Units and bounds are in the types. Each message names its tick and, where one robot says it, the robot;
+so a frame explains itself wherever it is found.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from protocol.mission import Anchor, Mission, Rendezvous, Role, Variant
+from protocol.motion import Controls, Pose, Run
+from protocol.units import (
+    Angle,
+    AngularVelocity,
+    Count,
+    Range,
+    RobotId,
+    Tick,
+    Velocity,
+)
+
+Outcome = Literal["localised", "undecided", "alarm", "wrong", "failed"]
+"""How a run ended; only the first is a success."""
+
+Branch = Literal["three-ranges", "three-ranges-virtual", "circle", "on-anchor"]
+"""How phase 1 told +alpha from -alpha."""
+
+Text = Annotated[str, Meta(max_length=300)]
+Word = Annotated[str, Meta(max_length=32)]
+
+MAX_REPORT_RUNS = 100
+MAX_REPORT_RANGES = 120
+"""so many at the most that a report's frame stays within `wire.MAX_REPORT_BYTES`"""
+
+
+class Message(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag=str.lower):
+    """A frame's content."""
+
+
+class Ranged(msgspec.Struct, frozen=True, array_like=True, gc=False, forbid_unknown_fields=True):
+    """A range and the tick it was measured in."""
+
+    tick: Tick
+    range: Range
+
+
+class Contact(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """A robot within range of this one, now."""
+
+    peer: RobotId
+    range: Range | None
+    heard: tuple[Tick, ...]
+    """the ticks of those of the peer's reports that reach this robot now, in order"""
+
+
+class Localised(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="localised"):
+    """The claim to know one's pose in the world frame."""
+
+    pose: Pose
+
+
+class Undecided(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="undecided"):
+    """The robot cannot go on, and does not guess."""
+
+    reason: Text
+
+
+Verdict = Localised | Undecided
+
+
+class Briefing(Message, frozen=True):
+    """Everything that a robot needs to start."""
+
+    robot: RobotId
+    peer: RobotId
+    role: Role
+    anchor: Anchor
+    """its own"""
+    peer_anchor: Anchor
+    mission: Mission
+    variant: Variant
+    rendezvous: Rendezvous
+    answer_within: Annotated[float, Meta(ge=0.0, le=1e6)] | None
+    """s of wall time from Sense to Drive; none in lockstep, where no decision depends on a time-out"""
+
+
+class Sense(Message, frozen=True):
+    """World to one robot: what its sensors say at tick k."""
+
+    tick: Tick
+    robot: RobotId
+    executed: Controls | None
+    """over [k - 1, k]; none at tick 0"""
+    anchor_range: Range | None
+    contacts: tuple[Contact, ...] = ()
+
+
+class Report(Message, frozen=True):
+    """Robot to robot: what the peer has not acknowledged of this robot's log, up to tick k."""
+
+    tick: Tick
+    robot: RobotId
+    """who says it"""
+    state: Word
+    start: Pose | None
+    """where tick 0 of its odometry lies in the frame of its own anchor; none before phase 1 is done"""
+    since: Tick
+    through: Tick
+    """the log below covers the manoeuvres over [since, through] and the ranges in (since, through]"""
+    runs: Annotated[tuple[Run, ...], Meta(max_length=MAX_REPORT_RUNS)]
+    ranges: Annotated[tuple[Ranged, ...], Meta(max_length=MAX_REPORT_RANGES)]
+    """to its own anchor; the one of tick 0 goes with since = 0"""
+    heard: Tick
+    """the peer's log is known through this tick"""
+    verdict: Verdict | None = None
+
+
+class Drive(Message, frozen=True):
+    """Robot to world: what it does over [k, k + 1], and what it knows of itself."""
+
+    tick: Tick
+    robot: RobotId
+    v: Velocity
+    omega: AngularVelocity
+    phase: Annotated[int, Meta(ge=1, le=3)]
+    state: Word
+    verdict: Verdict | None = None
+
+
+class Estimate(Message, frozen=True):
+    """Robot to viewers: what it holds possible at tick k."""
+
+    tick: Tick
+    robot: RobotId
+    local: tuple[Pose, ...]
+    """its pose in the frame of its own anchor, one for each branch that is left"""
+    world: tuple[Pose, ...]
+    """its pose in the world frame, one for each placement that is left"""
+    localised: bool
+
+
+class Truth(Message, frozen=True):
+    """World to viewers: where everyone really is at tick k."""
+
+    tick: Tick
+    poses: dict[RobotId, Pose]
+
+
+class Missed(Message, frozen=True):
+    """Only in journals, and only in real time: what tick k did without, for it did not come in time."""
+
+    tick: Tick
+    robot: RobotId
+    """whose Drive (in the world's journal) or Report (in an agent's)"""
+
+
+class End(Message, frozen=True):
+    """World to robots: the mission is over."""
+
+    tick: Tick
+    outcome: Outcome
+    reason: Text | None
+
+
+class Farewell(Message, frozen=True):
+    """Robot to world, the answer to End: how it went, seen from inside."""
+
+    robot: RobotId
+    anchor_ranges: Count
+    mutual_ranges: Count
+    branch: Branch | None
+    alpha: Angle | None
+    """of eq. (2), signed"""
+    placements: tuple[Count, Count] | None
+    """solutions of eq. (7), before and after silence"""
+    last_turn_rate: AngularVelocity | None
+    """omega_2 of eq. (8); only b plans it"""
+    separation_m2: Annotated[float, Meta(ge=0.0, le=1e15)] | None
+    """J of eq. (8)"""
+    reports_sent: Count
+    reports_heard: Count
+    reports_refused: Count
+    """frames that were malformed, or not from whom they said"""
+    bytes_sent: Count
+    """of reports"""

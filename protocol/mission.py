@@ -1,0 +1,125 @@
+"""What every robot is told before release, and what follows from it (Sections II and III.B)."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import msgspec
+
+from protocol.motion import TAU, chord
+from protocol.units import AngularVelocity, Coordinate, Duration, Length, Range, Speed, TurnRate, Velocity
+
+Variant = Literal["assured", "paper"]
+"""`paper` plays the paper to the letter; `assured` also cures what fails in it."""
+
+Role = Literal["a", "b"]
+"""a moves first when the two meet, b stands (Section III.C)."""
+
+OPTIMAL_TURN = 2.331122370414423
+"""rad: omega_1 T_s that maximises eq. (4); the positive root of tan(u / 2) = u."""
+
+RANGE_MARGIN = 1e-6
+"""m: how far inside R a point must lie to count on its range; eq. (5) puts one exactly on R."""
+
+FIRST_STRAIGHT_LIMIT = 0.9
+"""A_0 / R at most: a longer first straight could lead to a circle that never touches the disc."""
+
+
+class Anchor(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """Where a ranging anchor stands in the world frame."""
+
+    x: Coordinate
+    y: Coordinate
+
+
+class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the robots can do and see; the same for all of them (Section II)."""
+
+    sensing_range: Length
+    """R: anchors and robots are ranged up to this distance, bounds included"""
+    period: Duration
+    """T_s"""
+    max_speed: Speed
+    """v_max"""
+    max_turn_rate: TurnRate
+    """omega_max"""
+
+    @property
+    def first_straight(self) -> float:
+        """A_0 in m: one tick at full speed, shortened where it would come near R."""
+        return min(self.max_speed * self.period, FIRST_STRAIGHT_LIMIT * self.sensing_range)
+
+
+class Orbit(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """A circle about the robot's own anchor, driven without end (Section III.B)."""
+
+    radius: Range
+    v: Velocity
+    omega: AngularVelocity
+    """its sign is the sense"""
+
+
+class Rendezvous(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """How the two robots of a pair orbit so that they meet; worked out once, then told to both."""
+
+    a: Orbit
+    b: Orbit
+    bound: Range
+    """s: T_max, the longest that both orbit before they are in range of each other"""
+
+
+def half_arc(distance: float, sensing_range: float) -> float:
+    """Omega in rad: half the angle, seen from an anchor, between the crossings of the paper's orbits."""
+    return math.acos(distance / (distance + sensing_range))
+
+
+def longest_meeting(mission: Mission, distance: float) -> float:
+    """T_max in s (Section III.B, in continuous time)."""
+    slowest = max(1.0 / mission.max_turn_rate, (distance + mission.sensing_range) / (2.0 * mission.max_speed))
+    return TAU * (math.pi / half_arc(distance, mission.sensing_range) + 1.0) * slowest
+
+
+def orbit_margin(mission: Mission, distance: float) -> float:
+    """m0 in m: how far inside (D + R) / 2 the orbits must be for sampling not to skip the encounter.
+
+    The paper's orbits meet only tangentially; the relative speed across the lens is v (1 - Omega / pi).
+    Empirical: never exceeded in any setting tried, not proved.
+    """
+    radius = 0.5 * (distance + mission.sensing_range)
+    v = min(mission.max_speed, mission.max_turn_rate * radius)
+    omega = half_arc(distance, mission.sensing_range)
+    return (v * mission.period * (1.0 - omega / math.pi)) ** 2 / (16.0 * mission.sensing_range)
+
+
+def rendezvous(mission: Mission, distance: float, variant: Variant) -> Rendezvous:
+    """The orbits of eq. (6) for anchors `distance` (D) apart; the assured ones are smaller by the margin."""
+    margin = orbit_margin(mission, distance) if variant == "assured" else 0.0
+    radius = 0.5 * (distance + mission.sensing_range) - margin
+    omega_a = min(mission.max_turn_rate, mission.max_speed / radius)
+    omega_b = -half_arc(distance, mission.sensing_range) / math.pi * omega_a
+    return Rendezvous(
+        a=Orbit(radius, omega_a * radius, omega_a),
+        b=Orbit(radius, -omega_b * radius, omega_b),
+        bound=longest_meeting(mission, distance),
+    )
+
+
+def tick_budget(mission: Mission, plan: Rendezvous) -> int:
+    """max_ticks where the scenario names none: twice T_max, and ample time for phases 1 and 3."""
+    turn = math.ceil(TAU / (mission.max_turn_rate * mission.period))
+    reach = max(plan.a.radius, plan.b.radius) + mission.sensing_range
+    radial = math.ceil(reach / (mission.max_speed * mission.period))
+    circle_rate = min(mission.max_turn_rate, mission.max_speed / mission.first_straight)
+    circle = math.ceil(TAU / (circle_rate * mission.period))
+    return 2 * math.ceil(plan.bound / mission.period) + 2 * circle + radial + 6 * turn + 50
+
+
+def third_point_turn_rate(mission: Mission) -> float:
+    """omega_1 in rad/s: the best of eq. (4) within omega_max."""
+    return min(OPTIMAL_TURN / mission.period, mission.max_turn_rate)
+
+
+def full_chord(mission: Mission, omega: float) -> float:
+    """m: the chord of one tick at v_max and `omega`."""
+    return chord(mission.max_speed, omega, mission.period)

@@ -1,0 +1,173 @@
+"""Zenoh sessions that open, become ready and close without hanging.
+
+The world is the router and robots are its clients, over TCP, so nothing else has to be installed. What
+arrives goes into one queue per process: `recv()` of Zenoh has no time-out, and a queue has. Whoever
+subscribes first declares, then shows its liveliness token: a put before the match would be lost.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from queue import SimpleQueue
+from typing import Any, NoReturn
+
+import zenoh
+
+CONNECT_TIMEOUT_S = 1.0
+"""one attempt; `open_client` makes as many as fit its patience"""
+CLOSE_TIMEOUT_S = 2.0
+"""Zenoh's own close can take ten seconds under loss; the process ends without it"""
+RETRY_MS = 50
+"""a client looks for a world that went away as often"""
+
+_ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws)/(?P<host>\[[0-9A-Fa-f:.%\w]+\]|[^\s/:\[\]]+):(?P<port>\d{1,5})")
+
+zenoh.init_log_from_env_or("off")
+
+
+_left_open: list[zenoh.Session] = []
+"""sessions that did not close in time"""
+
+
+class BadEndpoint(ValueError):
+    """An endpoint that Zenoh could not use; its text says what one looks like."""
+
+
+class CannotListen(OSError):
+    """The endpoint to listen on cannot be had; its text says why."""
+
+
+class NoWorld(ConnectionError):
+    """Nobody answers at the endpoint."""
+
+
+def check_endpoint(endpoint: str) -> str:
+    """`endpoint` itself; raises BadEndpoint if it is not of the form protocol/host:port."""
+    match = _ENDPOINT.fullmatch(endpoint)
+    if match is None or not 0 < int(match["port"]) < 65536:
+        raise BadEndpoint(f"'{endpoint}' is no endpoint; one looks like tcp/127.0.0.1:7447")
+    return endpoint
+
+
+def _config(mode: str, listen: Sequence[str], connect: Sequence[str]) -> zenoh.Config:
+    config = zenoh.Config()
+    for key, value in {
+        "mode": mode,
+        "listen/endpoints": list(listen),
+        "connect/endpoints": list(connect),
+        "connect/timeout_ms": int(CONNECT_TIMEOUT_S * 1000),
+        "connect/exit_on_failure": True,
+        "connect/retry/period_init_ms": RETRY_MS,
+        "scouting/delay": 0,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "transport/unicast/lowlatency": True,
+        "transport/unicast/qos/enabled": False,
+    }.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+@contextmanager
+def _closing(session: zenoh.Session) -> Iterator[zenoh.Session]:
+    """A session that is closed at the end, or left behind after CLOSE_TIMEOUT_S."""
+    try:
+        yield session
+    finally:
+        closer = threading.Thread(target=session.close, daemon=True)
+        closer.start()
+        closer.join(CLOSE_TIMEOUT_S)
+        if closer.is_alive():
+            _left_open.append(session)
+
+
+@contextmanager
+def open_router(listen: str) -> Iterator[zenoh.Session]:
+    """The world's session, listening on `listen`. Raises BadEndpoint or CannotListen."""
+    check_endpoint(listen)
+    try:
+        session = zenoh.open(_config("router", [listen], []))
+    except zenoh.ZError as error:
+        taken = "in use" in str(error)
+        raise CannotListen(f"{listen}: {'already in use' if taken else 'cannot listen there'}") from None
+    with _closing(session):
+        yield session
+
+
+@contextmanager
+def open_client(connect: str, keep_trying: Callable[[], bool]) -> Iterator[zenoh.Session]:
+    """A robot's session to the router at `connect`.
+
+    Tries again as long as `keep_trying()`, which is asked between attempts of CONNECT_TIMEOUT_S.
+    Raises BadEndpoint, or NoWorld when it stops trying.
+    """
+    check_endpoint(connect)
+    while True:
+        try:
+            session = zenoh.open(_config("client", [], [connect]))
+            break
+        except zenoh.ZError:
+            if not keep_trying():
+                raise NoWorld(f"nobody answers at {connect}") from None
+    with _closing(session):
+        yield session
+
+
+def subscribe(session: zenoh.Session, key: str, inbox: SimpleQueue[Any], topic: str) -> None:
+    """Put (topic, key, frame) into `inbox` for everything that is put under `key`."""
+
+    def hand_over(sample: zenoh.Sample) -> None:
+        inbox.put((topic, str(sample.key_expr), sample.payload.to_bytes()))
+
+    session.declare_subscriber(key, hand_over)
+
+
+def watch_liveliness(session: zenoh.Session, key: str, inbox: SimpleQueue[Any]) -> None:
+    """Put ("alive" or "gone", key, b"") into `inbox` for tokens under `key`, those already there included."""
+
+    def hand_over(sample: zenoh.Sample) -> None:
+        alive = sample.kind == zenoh.SampleKind.PUT
+        inbox.put(("alive" if alive else "gone", str(sample.key_expr), b""))
+
+    session.liveliness().declare_subscriber(key, hand_over, history=True)
+
+
+def alive(session: zenoh.Session, key: str, timeout: float) -> list[str]:
+    """The keys of the liveliness tokens under `key`, now; waits `timeout` seconds at the most."""
+    replies = session.liveliness().get(key, timeout=timeout)
+    return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok is not None)
+
+
+def ask(session: zenoh.Session, key: str, timeout: float) -> bytes | str | None:
+    """What the queryable at `key` answers: a frame, or its refusal in words, or None if nobody is there."""
+    for reply in session.get(key, timeout=timeout):
+        if reply.ok is not None:
+            return reply.ok.payload.to_bytes()
+        if reply.err is not None:
+            return reply.err.payload.to_string()
+    return None
+
+
+def publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
+    """A publisher for the tick's path: nothing waits to be batched, nothing is dropped."""
+    return session.declare_publisher(
+        key,
+        encoding=zenoh.Encoding("application/msgpack"),
+        congestion_control=zenoh.CongestionControl.BLOCK,
+        express=True,
+    )
+
+
+def leave(status: int) -> NoReturn:
+    """End the process. An unclosed session would hang the interpreter's exit, so it is not asked."""
+    if _left_open:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+    sys.exit(status)

@@ -1,0 +1,33 @@
+"""Quantities with their unit and bounds, as types: whoever decodes them need not check them again.
+
+Every float is bounded on both sides, since that is what refuses NaN and infinity. The bounds are far
+beyond any robot, and near enough that no sum or square of them overflows.
+"""
+
+from typing import Annotated
+
+from msgspec import Meta
+
+Length = Annotated[float, Meta(gt=0.0, le=1e6)]
+"""m, positive"""
+Coordinate = Annotated[float, Meta(ge=-1e7, le=1e7)]
+"""m"""
+Range = Annotated[float, Meta(ge=0.0, le=1e7)]
+"""m, measured"""
+Duration = Annotated[float, Meta(gt=0.0, le=1e6)]
+"""s, positive"""
+Speed = Annotated[float, Meta(gt=0.0, le=1e6)]
+"""m/s, positive"""
+TurnRate = Annotated[float, Meta(gt=0.0, le=1e6)]
+"""rad/s, positive"""
+Velocity = Annotated[float, Meta(ge=-1e6, le=1e6)]
+"""m/s"""
+AngularVelocity = Annotated[float, Meta(ge=-1e6, le=1e6)]
+"""rad/s"""
+Angle = Annotated[float, Meta(ge=-1e9, le=1e9)]
+"""rad, not wrapped"""
+Tick = Annotated[int, Meta(ge=0, le=2**31)]
+TickCount = Annotated[int, Meta(ge=1, le=2**31)]
+Count = Annotated[int, Meta(ge=0, le=2**53)]
+RobotId = Annotated[str, Meta(pattern="^[A-Za-z0-9_-]{1,32}$")]
+"""one chunk of a key expression, and part of a file's name"""

@@ -1,0 +1,52 @@
+"""Frame <-> message. A frame is one version byte, the CRC-32 of the body, and the body in msgpack."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from typing import TypeVar
+
+import msgspec
+
+VERSION = 1
+MAX_FRAME_BYTES = 1 << 20
+"""a world's truth with every robot fits; whatever is longer is refused unread"""
+MAX_REPORT_BYTES = 4096
+
+_HEAD = struct.Struct(">BI")
+_encoder = msgspec.msgpack.Encoder()
+_decoders: dict[object, msgspec.msgpack.Decoder[object]] = {}
+
+M = TypeVar("M")
+
+
+class MalformedFrame(ValueError):
+    """The one error for every frame that cannot be understood; its text says why."""
+
+
+def encode(message: msgspec.Struct) -> bytes:
+    body = _encoder.encode(message)
+    return _HEAD.pack(VERSION, zlib.crc32(body)) + body
+
+
+def decode(frame: bytes, kind: type[M], limit: int = MAX_FRAME_BYTES) -> M:
+    """The message in `frame`, which must be a `kind` (a message or a union of messages).
+
+    Raises MalformedFrame when the frame is truncated, longer than `limit` bytes, of another version,
+    damaged (CRC), not msgpack, of another kind, or has a field of the wrong type or out of bounds.
+    """
+    if not _HEAD.size < len(frame) <= limit:
+        raise MalformedFrame(f"{len(frame)} bytes, outside {_HEAD.size + 1} to {limit}")
+    version, crc = _HEAD.unpack_from(frame)
+    if version != VERSION:
+        raise MalformedFrame(f"protocol version {version}, this is version {VERSION}")
+    body = memoryview(frame)[_HEAD.size :]
+    if zlib.crc32(body) != crc:
+        raise MalformedFrame("damaged: the CRC does not match")
+    decoder = _decoders.get(kind)
+    if decoder is None:
+        decoder = _decoders[kind] = msgspec.msgpack.Decoder(kind)
+    try:
+        return decoder.decode(body)  # type: ignore[return-value]  # the decoder of `kind` returns a `kind`
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise MalformedFrame(str(error)) from None

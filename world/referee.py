@@ -1,0 +1,52 @@
+"""How a run ended, judged by the truth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import msgspec
+
+from protocol.messages import Localised, Outcome, Undecided, Verdict
+from protocol.motion import Pose, wrap
+from world.scenario import Scenario
+from world.truth import Truth
+
+TOLERANCE = 1e-6
+"""m and rad: a claim farther off than this is wrong (sensors are exact)"""
+
+
+class Judgement(msgspec.Struct, frozen=True):
+    """The outcome of a run, and why it is no better."""
+
+    outcome: Outcome
+    reason: str | None = None
+
+
+def errors(claim: Pose, truth: Pose) -> tuple[float, float]:
+    """How far off `claim` is: m, and rad."""
+    return math.hypot(claim.x - truth.x, claim.y - truth.y), abs(wrap(claim.heading - truth.heading))
+
+
+def judge(
+    scenario: Scenario, truth: Truth, verdicts: Mapping[str, Verdict | None]
+) -> Judgement | None:
+    """The judgement once every robot has its verdict, or time is up; None while the mission goes on."""
+    open_cases = [robot.id for robot in scenario.robots if verdicts.get(robot.id) is None]
+    if open_cases and truth.tick < scenario.max_ticks:
+        return None
+    for robot, pose in zip(scenario.robots, truth.poses, strict=True):
+        verdict = verdicts.get(robot.id)
+        if isinstance(verdict, Localised):
+            position, heading = errors(verdict.pose, pose)
+            if not (position <= TOLERANCE and heading <= TOLERANCE):
+                return Judgement(
+                    "wrong", f"{robot.id} claims a pose that is {position:.3g} m and {heading:.3g} rad off"
+                )
+    for robot in scenario.robots:
+        verdict = verdicts.get(robot.id)
+        if isinstance(verdict, Undecided):
+            return Judgement("undecided", f"{robot.id}: {verdict.reason}")
+    if open_cases:
+        return Judgement("undecided", f"max_ticks: {', '.join(open_cases)} not localised by then")
+    return Judgement("localised")

@@ -1,0 +1,54 @@
+"""What the world is told before it starts: the mission, and who is where. Its journal begins with it."""
+
+from __future__ import annotations
+
+import msgspec
+
+from protocol.messages import Briefing
+from protocol.mission import Anchor, Mission, Rendezvous, Role, Variant
+from protocol.motion import Pose
+from protocol.units import RobotId, Tick
+
+
+class Placed(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """One robot: whom it is to find, which anchor ranges it, and where it is released."""
+
+    id: RobotId
+    peer: RobotId
+    role: Role
+    anchor: Anchor
+    start: Pose
+    rendezvous: Rendezvous
+
+
+class Scenario(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="scenario"):
+    """A validated mission, complete: nothing in it is left to be drawn or worked out."""
+
+    name: str
+    seed: int
+    max_ticks: Tick
+    mission: Mission
+    variant: Variant
+    robots: tuple[Placed, ...]
+
+    def robot(self, robot: str) -> Placed:
+        """Raises KeyError if nobody is called that."""
+        for placed in self.robots:
+            if placed.id == robot:
+                return placed
+        raise KeyError(robot)
+
+    def briefing(self, robot: str, answer_within: float | None = None) -> Briefing:
+        """What `robot` is told; nothing of where it is. `answer_within` is set in real time only."""
+        own = self.robot(robot)
+        return Briefing(
+            robot=own.id,
+            peer=own.peer,
+            role=own.role,
+            anchor=own.anchor,
+            peer_anchor=self.robot(own.peer).anchor,
+            mission=self.mission,
+            variant=self.variant,
+            rendezvous=own.rendezvous,
+            answer_within=answer_within,
+        )

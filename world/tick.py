@@ -1,0 +1,75 @@
+"""One tick of the world, by value: Sense for everyone, then everyone's Drive, and on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import msgspec
+
+from protocol.messages import Contact, Drive, Sense, Verdict
+from protocol.motion import REST, Controls, Pose
+from world.channel import heard
+from world.referee import Judgement, judge
+from world.scenario import Scenario
+from world.sensors import anchor_ranges, mutual_ranges
+from world.truth import Truth, within_limits
+
+
+class World(msgspec.Struct, frozen=True):
+    """The true state, what was driven to get there, and who has claimed what."""
+
+    scenario: Scenario
+    truth: Truth
+    executed: tuple[Controls, ...] | None
+    """over the tick before, in the order of the scenario; none at tick 0"""
+    verdicts: dict[str, Verdict | None]
+    pairs: tuple[tuple[int, int], ...]
+    """which robots are each other's peer, by their place in the scenario"""
+
+
+def release(scenario: Scenario) -> World:
+    """The world at tick 0."""
+    place = {robot.id: i for i, robot in enumerate(scenario.robots)}
+    pairs = tuple(
+        (place[robot.id], place[robot.peer]) for robot in scenario.robots if robot.role == "a"
+    )
+    starts: tuple[Pose, ...] = tuple(robot.start for robot in scenario.robots)
+    return World(scenario, Truth(0, starts), None, {}, pairs)
+
+
+def senses(world: World) -> list[Sense]:
+    """What every robot's sensors say now, in the order of the scenario."""
+    scenario, truth, executed = world.scenario, world.truth, world.executed
+    tick, robots = truth.tick, scenario.robots
+    contacts: list[tuple[Contact, ...]] = [()] * len(robots)
+    mutual = mutual_ranges(truth.poses, world.pairs, scenario.mission.sensing_range)
+    for (one, other), rho in zip(world.pairs, mutual, strict=True):
+        if rho is not None:
+            contacts[one] = (Contact(robots[other].id, rho, heard(tick)),)
+            contacts[other] = (Contact(robots[one].id, rho, heard(tick)),)
+    ranges = anchor_ranges(truth.poses, scenario)
+    return [
+        Sense(tick, robot.id, executed[i] if executed is not None else None, ranges[i], contacts[i])
+        for i, robot in enumerate(robots)
+    ]
+
+
+def advance(world: World, drives: Mapping[str, Drive]) -> World | Judgement:
+    """The world one tick later, or how the run ended. A robot without a Drive stands still."""
+    scenario, truth = world.scenario, world.truth
+    verdicts = world.verdicts
+    executed = []
+    for robot in scenario.robots:
+        drive = drives.get(robot.id)
+        if drive is None:
+            executed.append(REST)
+            continue
+        executed.append(within_limits(drive.v, drive.omega, scenario.mission))
+        if drive.verdict is not verdicts.get(robot.id):
+            verdicts = verdicts | {robot.id: drive.verdict}
+    if verdicts or truth.tick >= scenario.max_ticks:
+        judgement = judge(scenario, truth, verdicts)
+        if judgement is not None:
+            return judgement
+    moved = truth.moved(executed, scenario.mission.period)
+    return World(scenario, moved, tuple(executed), verdicts, world.pairs)
