@@ -20,7 +20,7 @@ from msgspec.structs import replace
 from agent import radio
 from agent.belief import Branch, Sighting, branches, weigh_branches, weigh_placements
 from agent.geometry import Placement
-from agent.logbook import Logbook
+from agent.mind import MET, Asleep, Done, Mind
 from agent.phases import anchor, encounter, rendezvous, seeking
 from agent.phases.anchor import ThirdPoint
 from agent.phases.encounter import LastManoeuvre, Returning, Standing, Waiting
@@ -28,109 +28,7 @@ from agent.phases.rendezvous import Aligning, Orbiting, Radial, Tangent
 from agent.phases.seeking import Circling, Straight, Turning
 from protocol import messages
 from protocol.messages import Briefing, Drive, Estimate, Localised, Ranged, Report, Sense, Undecided
-from protocol.mission import Orbit
 from protocol.motion import ORIGIN, REST, Controls, Pose, compose, step
-
-
-class Asleep(msgspec.Struct, frozen=True):
-    """Has not sensed anything yet."""
-
-
-class Done(msgspec.Struct, frozen=True):
-    """Has come to its verdict; stands, and keeps telling the peer."""
-
-    phase: int
-    verdict: messages.Verdict
-
-
-Phase1 = Straight | Turning | Circling | ThirdPoint
-Phase2 = Aligning | Radial | Tangent | Orbiting
-Phase3 = Straight | Turning | Circling | Standing | Waiting | LastManoeuvre | Returning
-State = Asleep | Phase1 | Phase2 | Phase3 | Done
-
-WORDS: dict[type, str] = {
-    Asleep: "asleep",
-    Straight: "straight",
-    Turning: "turning",
-    Circling: "circling",
-    ThirdPoint: "third-point",
-    Aligning: "aligning",
-    Radial: "radial",
-    Tangent: "tangent",
-    Orbiting: "orbiting",
-    Standing: "standing",
-    Waiting: "waiting",
-    LastManoeuvre: "last-manoeuvre",
-    Returning: "returning",
-}
-MET = ("orbiting", "straight", "turning", "circling", "standing", "waiting", "last-manoeuvre", "returning")
-
-
-class Findings(msgspec.Struct, frozen=True):
-    """What phases 1 and 3 have found out, beside the state."""
-
-    branch: Branch | None = None
-    """the one that is left after phase 1"""
-    branch_by: messages.Branch | None = None
-    met: int | None = None
-    """the tick in which phase 3 began"""
-    solutions: int | None = None
-    """of eq. (7)"""
-    placements: tuple[Placement, ...] = ()
-    """those that silence has left"""
-    placements_after_silence: int | None = None
-    plan: encounter.Plan | None = None
-
-
-class Mind(msgspec.Struct, frozen=True):
-    """Everything that a robot knows."""
-
-    briefing: Briefing
-    state: State = Asleep()
-    tick: int = -1
-    odometry: Pose = ORIGIN
-    """now, in the frame of tick 0"""
-    log: Logbook = Logbook()
-    mutual: tuple[Ranged, ...] = ()
-    findings: Findings = Findings()
-    radio: radio.Radio = radio.Radio()
-
-    @property
-    def orbit(self) -> Orbit:
-        plan = self.briefing.rendezvous
-        return plan.a if self.briefing.role == "a" else plan.b
-
-    @property
-    def in_contact(self) -> bool:
-        """Whether the peer has been ranged in this tick."""
-        return bool(self.mutual) and self.mutual[-1].tick == self.tick
-
-    @property
-    def phase(self) -> int:
-        match self.state:
-            case Asleep() | ThirdPoint() | Straight("anchor") | Turning("anchor") | Circling("anchor"):
-                return 1
-            case Aligning() | Radial() | Tangent() | Orbiting():
-                return 2
-            case Done(phase, _):
-                return phase
-            case _:
-                return 3
-
-    @property
-    def doing(self) -> str:
-        """The state in a word."""
-        match self.state:
-            case Done(_, Localised()):
-                return "localised"
-            case Done(_, Undecided()):
-                return "undecided"
-            case state:
-                return WORDS[type(state)]
-
-    @property
-    def verdict(self) -> messages.Verdict | None:
-        return self.state.verdict if isinstance(self.state, Done) else None
 
 
 # --- a tick -----------------------------------------------------------------------------------------
@@ -325,9 +223,7 @@ def _considered(mind: Mind) -> Mind:
     if findings.solutions is None:
         solutions = encounter.solve(_anchor_distance(mind.briefing), *base)
         left = weigh_placements(solutions, sightings[: base[1].tick - sightings[0].tick + 1], mission.sensing_range)
-        findings = replace(
-            findings, solutions=len(solutions), placements=left, placements_after_silence=len(left)
-        )
+        findings = replace(findings, placements=left, solutions=(len(solutions), len(left)))
     left = weigh_placements(findings.placements, sightings, mission.sensing_range)
     checked = encounter.redundant(sightings, *base)
     mind = replace(mind, findings=replace(findings, placements=left))

@@ -19,12 +19,17 @@ from typing import Any, NoReturn
 
 import zenoh
 
+from protocol.messages import Message
+from protocol.wire import encode
+
 CONNECT_TIMEOUT_S = 1.0
 """one attempt; `open_client` makes as many as fit its patience"""
 CLOSE_TIMEOUT_S = 2.0
 """Zenoh's own close can take ten seconds under loss; the process ends without it"""
 RETRY_MS = 50
 """a client looks for a world that went away as often"""
+
+MSGPACK = zenoh.Encoding("application/msgpack")
 
 _ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws)/(?P<host>\[[0-9A-Fa-f:.%\w]+\]|[^\s/:\[\]]+):(?P<port>\d{1,5})")
 
@@ -154,11 +159,35 @@ def ask(session: zenoh.Session, key: str, timeout: float) -> bytes | str | None:
     return None
 
 
+def answer(session: zenoh.Session, key: str, reply: Callable[[str], Message | str]) -> None:
+    """Answer queries under `key` with what `reply` makes of the key asked for: a message, or a refusal."""
+
+    def hand_over(query: zenoh.Query) -> None:
+        said = reply(str(query.key_expr))
+        if isinstance(said, str):
+            query.reply_err(said)
+        else:
+            query.reply(query.key_expr, encode(said), encoding=MSGPACK)
+
+    session.declare_queryable(key, hand_over)
+
+
+def show_alive(session: zenoh.Session, key: str) -> zenoh.LivelinessToken:
+    """A token under `key`, for as long as this session lives. Declare whatever must be heard before it."""
+    return session.liveliness().declare_token(key)
+
+
+def on_matching(publisher: zenoh.Publisher, tell: Callable[[bool], None]) -> None:
+    """Tell, now and on every change, whether anyone listens to `publisher`."""
+    publisher.declare_matching_listener(lambda status: tell(status.matching))
+    tell(publisher.matching_status.matching)
+
+
 def publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
     """A publisher for the tick's path: nothing waits to be batched, nothing is dropped."""
     return session.declare_publisher(
         key,
-        encoding=zenoh.Encoding("application/msgpack"),
+        encoding=MSGPACK,
         congestion_control=zenoh.CongestionControl.BLOCK,
         express=True,
     )

@@ -1,0 +1,118 @@
+"""Everything that one robot knows, as one value; and what it is doing, as one of the states of the paper."""
+
+from __future__ import annotations
+
+import msgspec
+
+from agent.belief import Branch
+from agent.geometry import Placement
+from agent.logbook import Logbook
+from agent.phases.anchor import ThirdPoint
+from agent.phases.encounter import LastManoeuvre, Plan, Returning, Standing, Waiting
+from agent.phases.rendezvous import Aligning, Orbiting, Radial, Tangent
+from agent.phases.seeking import Circling, Straight, Turning
+from agent.radio import Radio
+from protocol import messages
+from protocol.messages import Briefing, Localised, Ranged, Undecided
+from protocol.mission import Orbit
+from protocol.motion import ORIGIN, Pose
+
+
+class Asleep(msgspec.Struct, frozen=True):
+    """Has not sensed anything yet."""
+
+
+class Done(msgspec.Struct, frozen=True):
+    """Has come to its verdict; stands, and keeps telling the peer."""
+
+    phase: int
+    verdict: messages.Verdict
+
+
+Phase1 = Straight | Turning | Circling | ThirdPoint
+Phase2 = Aligning | Radial | Tangent | Orbiting
+Phase3 = Straight | Turning | Circling | Standing | Waiting | LastManoeuvre | Returning
+State = Asleep | Phase1 | Phase2 | Phase3 | Done
+
+WORDS: dict[type, str] = {
+    Asleep: "asleep",
+    Straight: "straight",
+    Turning: "turning",
+    Circling: "circling",
+    ThirdPoint: "third-point",
+    Aligning: "aligning",
+    Radial: "radial",
+    Tangent: "tangent",
+    Orbiting: "orbiting",
+    Standing: "standing",
+    Waiting: "waiting",
+    LastManoeuvre: "last-manoeuvre",
+    Returning: "returning",
+}
+MET = ("orbiting", "straight", "turning", "circling", "standing", "waiting", "last-manoeuvre", "returning")
+
+
+class Findings(msgspec.Struct, frozen=True):
+    """What phases 1 and 3 have found out, beside the state."""
+
+    branch: Branch | None = None
+    """the one that is left after phase 1"""
+    branch_by: messages.Branch | None = None
+    met: int | None = None
+    """the tick in which phase 3 began"""
+    placements: tuple[Placement, ...] = ()
+    """those of eq. (7) that are left"""
+    solutions: tuple[int, int] | None = None
+    """how many there were at first: all of them, and what silence left"""
+    plan: Plan | None = None
+
+
+class Mind(msgspec.Struct, frozen=True):
+    """Everything that a robot knows."""
+
+    briefing: Briefing
+    state: State = Asleep()
+    tick: int = -1
+    odometry: Pose = ORIGIN
+    """now, in the frame of tick 0"""
+    log: Logbook = Logbook()
+    mutual: tuple[Ranged, ...] = ()
+    findings: Findings = Findings()
+    radio: Radio = Radio()
+
+    @property
+    def orbit(self) -> Orbit:
+        plan = self.briefing.rendezvous
+        return plan.a if self.briefing.role == "a" else plan.b
+
+    @property
+    def in_contact(self) -> bool:
+        """Whether the peer has been ranged in this tick."""
+        return bool(self.mutual) and self.mutual[-1].tick == self.tick
+
+    @property
+    def phase(self) -> int:
+        match self.state:
+            case Asleep() | ThirdPoint() | Straight("anchor") | Turning("anchor") | Circling("anchor"):
+                return 1
+            case Aligning() | Radial() | Tangent() | Orbiting():
+                return 2
+            case Done(phase, _):
+                return phase
+            case _:
+                return 3
+
+    @property
+    def doing(self) -> str:
+        """The state in a word."""
+        match self.state:
+            case Done(_, Localised()):
+                return "localised"
+            case Done(_, Undecided()):
+                return "undecided"
+            case state:
+                return WORDS[type(state)]
+
+    @property
+    def verdict(self) -> messages.Verdict | None:
+        return self.state.verdict if isinstance(self.state, Done) else None

@@ -1,0 +1,1 @@
+"""Puts processes together: scenarios, launching, records, the command line."""

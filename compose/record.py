@@ -1,0 +1,211 @@
+"""The record of a run: what its journals hold, and the views of it that a run leaves behind."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import platform
+from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError, version
+from itertools import combinations
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+
+from protocol import journal
+from protocol.messages import Drive, End, Farewell, Localised, Missed
+from protocol.motion import Pose, wrap
+from protocol.wire import MalformedFrame, decode
+from world.referee import errors
+from world.scenario import Scenario
+from world.sensors import anchor_ranges, mutual_ranges
+from world.tick import World, advance, release
+from world.truth import Truth
+
+Mode = Literal["processes", "in-process"]
+WORLD_JOURNAL = "world.journal"
+
+
+class Moment(msgspec.Struct, frozen=True):
+    """One tick: where everyone was, and what everyone then set out to do."""
+
+    truth: Truth
+    drives: dict[str, Drive]
+
+
+class Record(msgspec.Struct, frozen=True):
+    """A run, whole."""
+
+    scenario: Scenario
+    moments: tuple[Moment, ...]
+    end: End | None
+    """none if the record breaks off"""
+    farewells: dict[str, Farewell]
+
+
+def read(folder: Path) -> Record:
+    """The record of the run in `folder`: its world's journal, folded.
+
+    Raises OSError if there is none, journal.CorruptJournal if it is damaged before its end.
+    """
+    path = folder / WORLD_JOURNAL
+    frames = journal.read(path)
+    moments: list[Moment] = []
+    farewells: dict[str, Farewell] = {}
+    end: End | None = None
+    try:
+        scenario = decode(next(frames, b""), Scenario)
+        world = release(scenario)
+        drives: dict[str, Drive] = {}
+        missed = 0
+        for frame in frames:
+            match decode(frame, Drive | Missed | End | Farewell):
+                case Drive() as drive:
+                    drives[drive.robot] = drive
+                case Missed():
+                    missed += 1
+                case End() as end:
+                    continue
+                case Farewell() as farewell:
+                    farewells[farewell.robot] = farewell
+            if len(drives) + missed == len(scenario.robots):
+                moments.append(Moment(world.truth, drives))
+                onward = advance(world, drives)
+                drives, missed = {}, 0
+                if isinstance(onward, World):
+                    world = onward
+    except MalformedFrame as error:
+        raise journal.CorruptJournal(f"{path}: {error}") from None
+    return Record(scenario, tuple(moments), end, farewells)
+
+
+def ticks_csv(record: Record) -> str:
+    """One row per tick and robot; floats in their shortest exact form."""
+    out = io.StringIO()
+    rows = csv.writer(out, lineterminator="\n")
+    rows.writerow(
+        ["tick", "robot", "x", "y", "heading", "v", "omega"]
+        + ["anchor_range", "mutual_range", "phase", "state"]
+    )
+    last = record.moments[-1].truth.tick if record.moments else 0
+    ids = [robot.id for robot in record.scenario.robots]
+    for moment in record.moments:
+        anchor = anchor_ranges(moment.truth.poses, record.scenario)
+        mutual = _mutual(record.scenario, moment.truth)
+        for i, (robot, pose) in enumerate(zip(ids, moment.truth.poses, strict=True)):
+            drive = moment.drives.get(robot)
+            driven: list[object] = ["", ""] if moment.truth.tick == last else [0.0, 0.0]
+            if drive is not None and moment.truth.tick != last:
+                driven = [drive.v, drive.omega]
+            said = [drive.phase, drive.state] if drive is not None else ["", ""]
+            rows.writerow(
+                [moment.truth.tick, robot, pose.x, pose.y, wrap(pose.heading), *driven]
+                + [_or_empty(anchor[i]), _or_empty(mutual.get(robot)), *said]
+            )
+    return out.getvalue()
+
+
+def _or_empty(value: float | None) -> object:
+    return "" if value is None else value
+
+
+def _pairs(scenario: Scenario) -> Iterator[tuple[int, int]]:
+    place = {robot.id: i for i, robot in enumerate(scenario.robots)}
+    return ((place[robot.id], place[robot.peer]) for robot in scenario.robots if robot.role == "a")
+
+
+def _mutual(scenario: Scenario, truth: Truth) -> dict[str, float]:
+    """Everyone's range to its peer, if there is one."""
+    pairs = list(_pairs(scenario))
+    ranges = mutual_ranges(truth.poses, pairs, scenario.mission.sensing_range)
+    return {
+        scenario.robots[i].id: rho
+        for pair, rho in zip(pairs, ranges, strict=True)
+        if rho is not None
+        for i in pair
+    }
+
+
+def summary(record: Record, mode: Mode, wall_s: float | None) -> dict[str, Any]:
+    """What `summary.json` says; what does not apply is None."""
+    scenario, moments = record.scenario, record.moments
+    return {
+        "scenario": scenario.name,
+        "seed": scenario.seed,
+        "mode": mode,
+        "outcome": record.end.outcome if record.end is not None else "failed",
+        "reason": record.end.reason if record.end is not None else "the record breaks off",
+        "ticks": moments[-1].truth.tick if moments else 0,
+        "wall_s": wall_s,
+        "first_contact_tick": next(
+            (moment.truth.tick for moment in moments if _mutual(scenario, moment.truth)), None
+        ),
+        "t_max_s": max(robot.rendezvous.bound for robot in scenario.robots),
+        "min_separation_m": min(
+            (
+                math.hypot(one.x - other.x, one.y - other.y)
+                for moment in moments
+                for one, other in combinations(moment.truth.poses, 2)
+            ),
+            default=None,
+        ),
+        "parameters": {
+            **msgspec.to_builtins(scenario.mission),
+            "variant": scenario.variant,
+            "max_ticks": scenario.max_ticks,
+        },
+        "versions": versions(),
+        "robots": {robot.id: _robot_summary(record, i) for i, robot in enumerate(scenario.robots)},
+    }
+
+
+def _robot_summary(record: Record, place: int) -> dict[str, Any]:
+    robot = record.scenario.robots[place].id
+    farewell = record.farewells.get(robot)
+    claims = [
+        (moment.truth.tick, drive.verdict.pose)
+        for moment in record.moments
+        if (drive := moment.drives.get(robot)) is not None and isinstance(drive.verdict, Localised)
+    ]
+    truth = record.moments[-1].truth.poses[place] if record.moments else None
+    claim = claims[-1][1] if claims else None
+    position, heading = errors(claim, truth) if claim is not None and truth is not None else (None, None)
+    said = {field: getattr(farewell, field, None) for field in _SAID}
+    return {
+        "localised": bool(claims),
+        "localised_tick": claims[0][0] if claims else None,
+        "estimate": _listed(claim),
+        "truth": _listed(truth),
+        "position_error_m": position,
+        "heading_error_rad": heading,
+        **said,
+        "candidates": list(farewell.placements) if farewell and farewell.placements else None,
+    }
+
+
+_SAID = [field for field in Farewell.__struct_fields__ if field not in ("robot", "placements")]
+
+
+def _listed(pose: Pose | None) -> list[float] | None:
+    return [pose.x, pose.y, wrap(pose.heading)] if pose is not None else None
+
+
+def versions() -> dict[str, str | None]:
+    """Of everything that a run's figures may depend on."""
+    found: dict[str, str | None] = {"python": platform.python_version()}
+    for package in ("tandem-ranging", "eclipse-zenoh", "numpy", "scipy", "msgspec", "msgpack"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = None
+    return found
+
+
+def leave(record: Record, folder: Path, mode: Mode, wall_s: float | None) -> dict[str, Any]:
+    """Write `ticks.csv` and `summary.json` into `folder`; returns the summary."""
+    said = summary(record, mode, wall_s)
+    (folder / "ticks.csv").write_text(ticks_csv(record), encoding="utf-8")
+    (folder / "summary.json").write_bytes(msgspec.json.format(msgspec.json.encode(said), indent=2) + b"\n")
+    return said

@@ -1,0 +1,172 @@
+"""A TOML file -> a validated scenario, or one line that names the file and the field."""
+
+from __future__ import annotations
+
+import math
+import random
+import re
+from collections import Counter
+from importlib import resources
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+from protocol.mission import Anchor, Mission, Rendezvous, Role, Variant, rendezvous, tick_budget
+from protocol.motion import TAU, Pose
+from protocol.units import Coordinate, RobotId
+from world.scenario import Placed, Scenario
+
+NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"
+
+
+class BadScenario(ValueError):
+    """The user's scenario cannot be played; the text names the file, the field and what is wrong."""
+
+
+class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A table of the file: a field that it does not know is a typo."""
+
+
+class PlannerTable(_Table, frozen=True):
+    variant: Variant = "assured"
+
+
+class RobotTable(_Table, frozen=True):
+    id: RobotId
+    anchor: tuple[Coordinate, Coordinate]
+    start: tuple[Coordinate, Coordinate, Annotated[float, Meta(ge=-1e6, le=1e6)]] | None = None
+    """x, y in m, heading in rad; drawn from the seed inside the sensing range where it is left out"""
+    peer: RobotId | None = None
+    """needed only with more than two robots"""
+
+
+class ScenarioFile(_Table, frozen=True):
+    """What a scenario file may say."""
+
+    name: Annotated[str, Meta(pattern=NAME)]
+    mission: Mission
+    robot: Annotated[list[RobotTable], Meta(min_length=2)]
+    seed: Annotated[int, Meta(ge=0, lt=2**63)] = 0
+    max_ticks: Annotated[int, Meta(ge=1, le=10**9)] | None = None
+    planner: PlannerTable = PlannerTable()
+
+
+def shipped() -> dict[str, Path]:
+    """The scenarios that come with Tandem, by name."""
+    folder = Path(str(resources.files("compose") / "scenarios"))
+    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+
+
+def load(source: str, *, seed: int | None = None) -> Scenario:
+    """The scenario of that name, or in the file at that path; `seed` overrides its own.
+
+    Raises BadScenario.
+    """
+    path = shipped().get(source, Path(source))
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        if source not in shipped() and not path.exists():
+            raise BadScenario(
+                f"{source}: neither a file nor a scenario that ships ({', '.join(shipped())})"
+            ) from None
+        raise BadScenario(f"{source}: cannot be read: {_reason(error)}") from None
+    return parse(text, source, seed=seed)
+
+
+def _reason(error: Exception) -> str:
+    return (error.strerror or str(error)) if isinstance(error, OSError) else "it is not UTF-8 text"
+
+
+def parse(text: str, source: str, *, seed: int | None = None) -> Scenario:
+    """The scenario in `text`. Raises BadScenario, whose text begins with `source`."""
+    try:
+        file = msgspec.toml.decode(text, type=ScenarioFile)
+    except msgspec.ValidationError as error:
+        raise BadScenario(f"{source}: {_field_first(str(error))}") from None
+    except (msgspec.DecodeError, RecursionError) as error:
+        raise BadScenario(f"{source}: not TOML: {error}") from None
+    if seed is not None:
+        file = msgspec.structs.replace(file, seed=seed)
+    return _validated(file, source)
+
+
+def _field_first(error: str) -> str:
+    """msgspec's "Expected `float`, got `str` - at `$.mission.period`", with the field in front."""
+    match = re.fullmatch(r"(?P<what>.*?)(?: - at `\$\.?(?P<where>.*)`)?", error, re.DOTALL)
+    assert match is not None
+    what = match["what"].replace("`", "'")
+    what = what.replace("Object contains ", "").replace("Object missing required field", "missing field")
+    what = what[0].lower() + what[1:]
+    return f"{match['where']}: {what}" if match["where"] else what
+
+
+def _validated(file: ScenarioFile, source: str) -> Scenario:
+    peers = _peers(file.robot, source)
+    place = {robot.id: i for i, robot in enumerate(file.robot)}
+    plans: dict[str, Rendezvous] = {}
+    placed = []
+    for robot in file.robot:
+        peer = peers[robot.id]
+        first, second = sorted((robot.id, peer), key=place.__getitem__)
+        if first not in plans:
+            distance = math.dist(file.robot[place[first]].anchor, file.robot[place[second]].anchor)
+            if distance == 0.0:
+                raise BadScenario(f"{source}: robot[{place[second]}].anchor: '{first}' has the same")
+            plans[first] = rendezvous(file.mission, distance, file.planner.variant)
+        role: Role = "a" if robot.id == first else "b"
+        start = _start(robot, file.mission.sensing_range, file.seed)
+        if math.hypot(start.x - robot.anchor[0], start.y - robot.anchor[1]) > file.mission.sensing_range:
+            raise BadScenario(
+                f"{source}: robot[{place[robot.id]}].start: '{robot.id}' is "
+                f"{math.hypot(start.x - robot.anchor[0], start.y - robot.anchor[1]):.6g} m from its anchor, "
+                f"outside mission.sensing_range = {file.mission.sensing_range:g} m"
+            )
+        placed.append(Placed(robot.id, peer, role, Anchor(*robot.anchor), start, plans[first]))
+    budget = max(tick_budget(file.mission, plan) for plan in plans.values())
+    return Scenario(
+        name=file.name,
+        seed=file.seed,
+        max_ticks=min(file.max_ticks if file.max_ticks is not None else budget, 10**9),
+        mission=file.mission,
+        variant=file.planner.variant,
+        robots=tuple(placed),
+    )
+
+
+def _peers(robots: list[RobotTable], source: str) -> dict[str, str]:
+    """Everyone's peer. Two robots are each other's; more of them have to say it."""
+    for robot, count in Counter(robot.id for robot in robots).items():
+        if count > 1:
+            raise BadScenario(f"{source}: robot.id: {count} robots are called '{robot}'")
+    ids = [robot.id for robot in robots]
+    if len(robots) == 2 and all(robot.peer is None for robot in robots):
+        return {ids[0]: ids[1], ids[1]: ids[0]}
+    peers = {}
+    for i, robot in enumerate(robots):
+        if robot.peer is None:
+            raise BadScenario(f"{source}: robot[{i}].peer: '{robot.id}' needs one, with {len(ids)} robots")
+        if robot.peer not in ids:
+            raise BadScenario(f"{source}: robot[{i}].peer: there is no robot '{robot.peer}'")
+        peers[robot.id] = robot.peer
+    for i, robot in enumerate(robots):
+        if peers[robot.id] == robot.id or peers[peers[robot.id]] != robot.id:
+            raise BadScenario(
+                f"{source}: robot[{i}].peer: '{robot.id}' names '{robot.peer}', whose peer is "
+                f"'{peers[peers[robot.id]]}'; robots come in pairs"
+            )
+    return peers
+
+
+def _start(robot: RobotTable, sensing_range: float, seed: int) -> Pose:
+    """Where the robot is released: as the file says, or uniform in its anchor's range, any heading."""
+    if robot.start is not None:
+        return Pose(*robot.start)
+    draw = random.Random(f"{seed}/start/{robot.id}").random
+    radius = sensing_range * math.sqrt(draw())
+    bearing, heading = TAU * draw(), TAU * draw()
+    return Pose(
+        robot.anchor[0] + radius * math.cos(bearing), robot.anchor[1] + radius * math.sin(bearing), heading
+    )
