@@ -48,7 +48,7 @@ class ScenarioFile(_Table, frozen=True):
     name: Annotated[str, Meta(pattern=NAME)]
     mission: Mission
     robot: Annotated[list[RobotTable], Meta(min_length=2)]
-    seed: Annotated[int, Meta(ge=0, lt=2**63)] = 0
+    seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
     max_ticks: Annotated[int, Meta(ge=1, le=10**9)] | None = None
     planner: PlannerTable = PlannerTable()
 
