@@ -103,6 +103,7 @@ class AgentProcess:
         out: Path | None,
         *,
         patience: float = 30.0,
+        fsync: bool = False,
         inbox: SimpleQueue[Any] | None = None,
         say: Callable[[str], None] = lambda line: print(line, file=sys.stderr, flush=True),
     ) -> None:
@@ -128,7 +129,7 @@ class AgentProcess:
         self._report = session.publisher(link, keys.report(run, self.id, self._peer))
         self._estimate = session.publisher(link, keys.estimate(run, self.id))
         session.on_matching(self._estimate, self._set_estimate_wanted)
-        journal = Journal(out / f"agent-{self.id}.journal") if out is not None else None
+        journal = Journal(out / f"agent-{self.id}.journal", fsync=fsync) if out is not None else None
         self.robot = Robot(briefing, journal)
         session.subscribe(link, keys.sense(run, self.id), self._inbox, "sense")
         session.subscribe(link, keys.report(run, self._peer, self.id), self._inbox, "report")

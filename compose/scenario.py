@@ -18,7 +18,7 @@ from protocol.motion import TAU, Pose
 from protocol.units import Coordinate, RobotId
 from world.scenario import Placed, Scenario
 
-NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"
+NAME = r"^[A-Za-z0-9_-]{1,48}$"
 
 
 class BadScenario(ValueError):

@@ -40,7 +40,7 @@ class Journal:
         try:
             self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
         except FileExistsError:
-            raise RecordExists(f"{path}: holds a record already; choose another --out") from None
+            raise RecordExists(f"{path} is there already; choose another folder") from None
 
     def write(self, *frames: bytes) -> None:
         """All of `frames`, in one write, on the disk's side of the process when it returns."""

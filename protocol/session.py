@@ -68,7 +68,7 @@ def _config(mode: str, listen: Sequence[str], connect: Sequence[str]) -> zenoh.C
         "connect/endpoints": list(connect),
         "connect/timeout_ms": int(CONNECT_TIMEOUT_S * 1000),
         "connect/exit_on_failure": True,
-        "connect/retry/period_init_ms": RETRY_MS,
+        "connect/retry": {"period_init_ms": RETRY_MS, "period_max_ms": 1000, "period_increase_factor": 2.0},
         "scouting/delay": 0,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
@@ -96,8 +96,9 @@ def _closing(session: zenoh.Session) -> Iterator[zenoh.Session]:
 def open_router(listen: str) -> Iterator[zenoh.Session]:
     """The world's session, listening on `listen`. Raises BadEndpoint or CannotListen."""
     check_endpoint(listen)
+    config = _config("router", [listen], [])
     try:
-        session = zenoh.open(_config("router", [listen], []))
+        session = zenoh.open(config)
     except zenoh.ZError as error:
         taken = "in use" in str(error)
         raise CannotListen(f"{listen}: {'already in use' if taken else 'cannot listen there'}") from None
@@ -114,8 +115,9 @@ def open_client(connect: str, keep_trying: Callable[[], bool]) -> Iterator[zenoh
     """
     check_endpoint(connect)
     while True:
+        config = _config("client", [], [connect])
         try:
-            session = zenoh.open(_config("client", [], [connect]))
+            session = zenoh.open(config)
             break
         except zenoh.ZError:
             if not keep_trying():

@@ -1,0 +1,107 @@
+"""What a run shows on a terminal: each robot's phase, state and tick while it runs; a table at its end."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import msgpack
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from compose.record import WORLD_JOURNAL
+from protocol.messages import Drive, End, Farewell, Missed
+from protocol.wire import MalformedFrame, decode
+from world.scenario import Scenario
+
+
+class Tail:
+    """The latest of a journal that is still being written."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._read = 0
+        self._unpacker = msgpack.Unpacker(raw=True)
+        self.drives: dict[str, Drive] = {}
+
+    def update(self) -> None:
+        """Read on to the end."""
+        try:
+            with self._path.open("rb") as file:
+                file.seek(self._read)
+                news = file.read()
+        except FileNotFoundError:
+            return
+        self._read += len(news)
+        self._unpacker.feed(news)
+        for frame in self._unpacker:
+            try:
+                message = decode(frame, Drive | Missed | End | Farewell | Scenario)
+            except MalformedFrame:
+                continue
+            if isinstance(message, Drive):
+                self.drives[message.robot] = message
+
+
+@contextmanager
+def live(scenario: Scenario, folder: Path, console: Console) -> Iterator[Any]:
+    """Show the run whose record grows in `folder`; yields what to call for it to be shown anew."""
+    tail = Tail(folder / WORLD_JOURNAL)
+
+    def table() -> Table:
+        tail.update()
+        ids = [robot.id for robot in scenario.robots]
+        latest = max((drive.tick for drive in tail.drives.values()), default=0)
+        rows = Table(title=f"{scenario.name}, tick {latest} of {scenario.max_ticks} at most")
+        for heading in ("robot", "phase", "state", "v m/s", "omega rad/s"):
+            rows.add_column(heading)
+        for robot in ids:
+            drive = tail.drives.get(robot)
+            if drive is None:
+                rows.add_row(robot, "", "awaited", "", "")
+            else:
+                rows.add_row(robot, str(drive.phase), drive.state, f"{drive.v:.3f}", f"{drive.omega:.3f}")
+        return rows
+
+    with Live(get_renderable=table, console=console, auto_refresh=True, transient=True, refresh_per_second=10):
+        yield
+
+
+def result(summary: Mapping[str, Any], console: Console) -> None:
+    """The table at the end of a run."""
+    rows = Table(title=f"{summary['scenario']}: {outcome_line(summary)}", title_justify="left")
+    rows.add_column("robot")
+    for heading in ("is at", "thinks it is at", "error m", "branch", "ranges to anchor, peer", "reports sent, heard"):
+        rows.add_column(heading)
+    for name, robot in summary["robots"].items():
+        rows.add_row(
+            name,
+            _pose(robot["truth"]),
+            _pose(robot["estimate"]),
+            _number(robot["position_error_m"], ".2g"),
+            robot["branch"] or "-",
+            f"{_count(robot['anchor_ranges'])}, {_count(robot['mutual_ranges'])}",
+            f"{_count(robot['reports_sent'])}, {_count(robot['reports_heard'])}",
+        )
+    console.print(rows)
+
+
+def outcome_line(summary: Mapping[str, Any]) -> str:
+    """The outcome, in one line."""
+    reason = f" ({summary['reason']})" if summary["reason"] else ""
+    return f"{summary['outcome']} after {summary['ticks']} ticks{reason}"
+
+
+def _pose(pose: list[float] | None) -> str:
+    return f"({pose[0]:.3f}, {pose[1]:.3f}) m, {pose[2]:+.3f} rad" if pose else "does not know"
+
+
+def _number(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)
+
+
+def _count(value: int | None) -> str:
+    return "-" if value is None else str(value)
