@@ -82,6 +82,7 @@ class Mind(msgspec.Struct, frozen=True):
 
     @property
     def orbit(self) -> Orbit:
+        """This robot's part of the rendezvous."""
         plan = self.briefing.rendezvous
         return plan.a if self.briefing.role == "a" else plan.b
 
@@ -92,6 +93,7 @@ class Mind(msgspec.Struct, frozen=True):
 
     @property
     def phase(self) -> int:
+        """The paper's: 1, 2 or 3."""
         match self.state:
             case Asleep() | ThirdPoint() | Straight("anchor") | Turning("anchor") | Circling("anchor"):
                 return 1
@@ -115,4 +117,5 @@ class Mind(msgspec.Struct, frozen=True):
 
     @property
     def verdict(self) -> messages.Verdict | None:
+        """What it has come to, if it has."""
         return self.state.verdict if isinstance(self.state, Done) else None

@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import msgspec
 from msgspec.structs import replace
 
 from agent import radio
@@ -29,7 +28,6 @@ from agent.phases.seeking import Circling, Straight, Turning
 from protocol import messages
 from protocol.messages import Briefing, Drive, Estimate, Localised, Ranged, Report, Sense, Undecided
 from protocol.motion import ORIGIN, REST, Controls, Pose, compose, step
-
 
 # --- a tick -----------------------------------------------------------------------------------------
 
@@ -222,7 +220,9 @@ def _considered(mind: Mind) -> Mind:
     mission, findings = mind.briefing.mission, mind.findings
     if findings.solutions is None:
         solutions = encounter.solve(_anchor_distance(mind.briefing), *base)
-        left = weigh_placements(solutions, sightings[: base[1].tick - sightings[0].tick + 1], mission.sensing_range)
+        left = weigh_placements(
+            solutions, sightings[: base[1].tick - sightings[0].tick + 1], mission.sensing_range
+        )
         findings = replace(findings, placements=left, solutions=(len(solutions), len(left)))
     left = weigh_placements(findings.placements, sightings, mission.sensing_range)
     checked = encounter.redundant(sightings, *base)
@@ -237,12 +237,14 @@ def _considered(mind: Mind) -> Mind:
         told = mind.radio.verdict
         return _undecided(mind, told.reason) if isinstance(told, Undecided) else mind
     if mind.briefing.variant == "paper" and findings.plan is not None:
-        missed = "the last manoeuvre left the mutual range" if not checked else "the third mutual range fits more than one placement"
+        missed = (
+            "the last manoeuvre left the mutual range"
+            if not checked
+            else "the third mutual range fits more than one placement"
+        )
         return _undecided(mind, missed)
     place = compose(_start(mind), mind.odometry)
-    plan = encounter.last_manoeuvre(
-        place, sightings[-1].a, left, mission, mind.briefing.variant
-    )
+    plan = encounter.last_manoeuvre(place, sightings[-1].a, left, mission, mind.briefing.variant)
     return replace(
         mind,
         state=LastManoeuvre(plan.drive, mind.odometry),
@@ -297,16 +299,12 @@ def _sightings(mind: Mind) -> list[Sighting]:
     mine = mind.log.track(_start(mind), met, last, period)
     theirs = peer.peer.track(peer.start, met, last, period)
     a, b = (mine, theirs) if mind.briefing.role == "a" else (theirs, mine)
-    return [
-        Sighting(tick, a[tick - met], b[tick - met], ranges.get(tick)) for tick in range(met, last + 1)
-    ]
+    return [Sighting(tick, a[tick - met], b[tick - met], ranges.get(tick)) for tick in range(met, last + 1)]
 
 
 def _anchor_distance(briefing: Briefing) -> float:
     """D in m."""
-    return math.hypot(
-        briefing.anchor.x - briefing.peer_anchor.x, briefing.anchor.y - briefing.peer_anchor.y
-    )
+    return math.hypot(briefing.anchor.x - briefing.peer_anchor.x, briefing.anchor.y - briefing.peer_anchor.y)
 
 
 def _world_pose(mind: Mind, placement: Placement) -> Pose:

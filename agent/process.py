@@ -6,229 +6,195 @@ answered, so whatever is lost, late or doubled costs time and changes nothing.
 
 from __future__ import annotations
 
-import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
-from queue import Empty, SimpleQueue
-from typing import Any
 
 import zenoh
 
 from agent import radio
 from agent.robot import Robot, Told
 from protocol import keys, session
+from protocol.inbox import Arrival, Inbox
 from protocol.journal import Journal
 from protocol.messages import Briefing, End, Report, Sense
 from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode, encode
 
-LATE_REPORTS = 64
+REPORTS_KEPT = 64
 """ticks for which a report is kept that no Sense has listed yet"""
 QUERY_S = 2.0
 """how long to wait for the answer to one query"""
+ASK_AGAIN_S = 0.05
+"""how long to wait before looking for a world again"""
 FIRST_WORD_S = 5.0
 """how long an agent looks for its world before it says so"""
 
 
-class Interrupted(Exception):
-    """The process was told to stop."""
-
-
 class Unwelcome(Exception):
-    """There is a world, but this robot cannot join it; says why."""
+    """There is a world, but this robot cannot join it, or go on in it; says why."""
 
 
-class WorldLost(Exception):
-    """The world has been silent for longer than the patience; says so."""
+class NoWorld(TimeoutError):
+    """There is no world within the wait, or no longer; says so."""
 
 
-def join(
-    link: zenoh.Session,
-    run: str | None,
-    robot: str,
-    wait: float,
-    inbox: SimpleQueue[Any],
-    say: Callable[[str], None],
-) -> tuple[str, Briefing]:
+class Search:
+    """Looking for a world, for `wait` seconds at the most, and saying so after FIRST_WORD_S."""
+
+    def __init__(self, what: str, wait: float, inbox: Inbox) -> None:
+        self._what = what
+        self._wait = wait
+        self._inbox = inbox
+        self._began = time.monotonic()
+        self._told = False
+
+    def go_on(self) -> None:
+        """Wait a moment. Raises NoWorld when that has been too long, Interrupted when told to stop."""
+        waited = time.monotonic() - self._began
+        if waited >= self._wait:
+            raise NoWorld(f"no {self._what}; gave up after {self._wait:g} s")
+        if waited >= FIRST_WORD_S and not self._told:
+            self._told = True
+            self._inbox.say(f"no {self._what} yet; looking for one for {self._wait:g} s")
+        self._inbox.next(ASK_AGAIN_S)
+
+
+def join(link: zenoh.Session, run: str | None, robot: str, search: Search) -> tuple[str, Briefing]:
     """The run that `robot` belongs to, and its briefing; `run` may name it.
 
-    Raises WorldLost if there is no world within `wait` seconds, Unwelcome if there are several, if the
-    world has no such robot, or if somebody else plays it already; Interrupted when told to stop.
+    Raises Unwelcome if there are several runs, if the world has no such robot, or if somebody plays it
+    already; whatever `search` raises while there is no world.
     """
-    began = time.monotonic()
-    said = False
     while True:
         worlds = [keys.run_of(key) for key in session.alive(link, keys.world_alive(run or "*"), QUERY_S)]
         if len(worlds) > 1:
             raise Unwelcome(f"several runs are alive: {', '.join(worlds)}; choose one with --run")
-        if worlds:
-            if session.alive(link, keys.robot_alive(worlds[0], robot), QUERY_S):
-                raise Unwelcome(f"robot '{robot}' is in run '{worlds[0]}' already")
-            answer = session.ask(link, keys.briefing(worlds[0], robot), QUERY_S)
+        for world in worlds:
+            if session.alive(link, keys.robot_alive(world, robot), QUERY_S):
+                raise Unwelcome(f"robot '{robot}' is in run '{world}' already")
+            answer = session.ask(link, keys.briefing(world, robot), QUERY_S)
             if isinstance(answer, str):
                 raise Unwelcome(answer)
             if answer is not None:
                 try:
-                    return worlds[0], decode(answer, Briefing)
+                    return world, decode(answer, Briefing)
                 except MalformedFrame as error:
                     raise Unwelcome(f"the world's briefing is not understood: {error}") from None
-        waited = time.monotonic() - began
-        missing = f"no world{f' of run {run!r}' if run else ''} answers yet"
-        if waited > wait:
-            raise WorldLost(f"{missing}, gave up after {wait:g} s")
-        if waited > FIRST_WORD_S and not said:
-            said = True
-            say(f"{missing}; trying for {wait:g} s")
-        stopped(inbox, 0.05)
-
-
-def stopped(inbox: SimpleQueue[Any], timeout: float) -> None:
-    """Wait `timeout` seconds. Raises Interrupted when told to stop meanwhile."""
-    try:
-        topic, key, _ = inbox.get(timeout=timeout)
-    except Empty:
-        return
-    if topic == "stop":
-        raise Interrupted(key)
+        search.go_on()
 
 
 class AgentProcess:
-    """One robot in one run. `inbox` may be given a ("stop", why, b"") at any time."""
+    """One robot in one run."""
 
     def __init__(
         self,
         briefing: Briefing,
         link: zenoh.Session,
         run: str,
-        out: Path | None,
+        inbox: Inbox,
         *,
-        patience: float = 30.0,
+        out: Path | None = None,
         fsync: bool = False,
-        inbox: SimpleQueue[Any] | None = None,
-        say: Callable[[str], None] = lambda line: print(line, file=sys.stderr, flush=True),
+        patience: float = 30.0,
     ) -> None:
-        self.id, self._peer = briefing.robot, briefing.peer
-        self._within = briefing.answer_within
+        """The journal goes to `out`; `patience` (s) bounds the wait for the world.
+
+        Raises journal.RecordExists, OSError.
+        """
+        self._id = briefing.robot
+        self._inbox = inbox
         self._patience = patience
-        self._say = say
-        self._inbox: SimpleQueue[Any] = inbox if inbox is not None else SimpleQueue()
-        self._complained: set[tuple[str, str]] = set()
-        self._estimate_wanted = False
+        self._answer_within = briefing.answer_within
+        self._sense: Sense | None = None
+        """the latest"""
+        self._due: float | None = None
+        """in real time: when to go on without the reports that it lists"""
         self._reports: dict[int, Told] = {}
         """the peer's, by tick, as they came"""
-        self._sense: Sense | None = None
-        """the latest; what it asked for is being done"""
-        self._told: bytes | None = None
-        """the report sent for it"""
-        self._driven: bytes | None = None
-        """the Drive sent for it; none while reports are awaited"""
-        self._due: float | None = None
-        """when to go on without them"""
+        self._estimate_wanted = False
 
-        self._drive = session.publisher(link, keys.drive(run, self.id))
-        self._report = session.publisher(link, keys.report(run, self.id, self._peer))
-        self._estimate = session.publisher(link, keys.estimate(run, self.id))
-        session.on_matching(self._estimate, self._set_estimate_wanted)
-        journal = Journal(out / f"agent-{self.id}.journal", fsync=fsync) if out is not None else None
-        self.robot = Robot(briefing, journal)
-        session.subscribe(link, keys.sense(run, self.id), self._inbox, "sense")
-        session.subscribe(link, keys.report(run, self._peer, self.id), self._inbox, "report")
-        session.watch_liveliness(link, keys.world_alive(run), self._inbox)
-        self._token = session.show_alive(link, keys.robot_alive(run, self.id))
+        journal = Journal(out / f"agent-{self._id}.journal", fsync=fsync) if out is not None else None
+        self._robot = Robot(briefing, journal)
+        self._drive = session.publisher(link, keys.drive(run, self._id))
+        self._report = session.publisher(link, keys.report(run, self._id, briefing.peer))
+        self._estimate = session.publisher(link, keys.estimate(run, self._id))
+        session.on_matching(self._estimate, self._want_estimate)
+        session.subscribe(link, keys.sense(run, self._id), inbox, "sense")
+        session.subscribe(link, keys.report(run, briefing.peer, self._id), inbox, "report")
+        session.watch_liveliness(link, keys.world_alive(run), inbox)
+        self._token = session.show_alive(link, keys.robot_alive(run, self._id))
 
     def play(self) -> End:
-        """The whole run, to its End. Raises Interrupted when told to stop, WorldLost, Unwelcome."""
+        """The whole run, to its End. Raises Interrupted when told to stop; NoWorld, Unwelcome."""
+        heard_at = time.monotonic()
         while True:
-            topic, key, frame = self._next()
-            match topic:
+            until = heard_at + self._patience if self._due is None else self._due
+            arrival = self._inbox.next(until - time.monotonic())
+            if arrival.topic != "nothing":
+                heard_at = time.monotonic()
+            elif self._due is None:
+                raise NoWorld(f"nothing heard from the world for {self._patience:g} s")
+            match arrival.topic:
                 case "sense":
-                    end = self._on_sense(key, frame)
-                    if end is not None:
-                        return self._part(end)
+                    message = self._accepted(arrival)
+                    if isinstance(message, End):
+                        return self._part(message)
+                    if message is not None:
+                        self._on_sense(message, arrival.frame)
                 case "report":
-                    self._on_report(key, frame)
+                    self._on_report(arrival)
                 case "gone":
-                    self._say(f"{self.id}: the world has gone; waiting {self._patience:g} s for it")
-                case "alive" | "":
+                    self._inbox.say(f"the world has gone; waiting {self._patience:g} s for it")
+                case _:
                     pass
-            self._decide_if_all_heard()
+            self._decide_when_all_is_heard()
 
     # --- what arrives ---
 
-    def _next(self) -> tuple[str, str, bytes]:
-        timeout = self._patience
-        if self._due is not None and self._driven is None:
-            timeout = min(timeout, max(self._due - time.monotonic(), 0.0))
+    def _accepted(self, arrival: Arrival) -> Sense | End | None:
         try:
-            topic, key, frame = self._inbox.get(timeout=timeout)
-        except Empty:
-            if timeout == self._patience:
-                raise WorldLost(f"nothing heard from the world for {self._patience:g} s") from None
-            return "", "", b""
-        if topic == "stop":
-            raise Interrupted(key)
-        return topic, key, frame
-
-    def _on_sense(self, key: str, frame: bytes) -> End | None:
-        message = self._accept(key, frame, Sense | End)
-        if isinstance(message, End):
-            return message
-        if not isinstance(message, Sense):
-            return None
-        known = self._sense.tick if self._sense is not None else -1
-        if message.tick == known:
-            self._say_again()
-        elif message.tick == known + 1:
-            self._step(message)
-        elif message.tick > known:
-            raise Unwelcome(
-                f"the world is at tick {message.tick}, and the record of {self.id} ends at tick {known}"
-            )
-        return None
-
-    def _on_report(self, key: str, frame: bytes) -> None:
-        message = self._accept(key, frame, Report)
-        if isinstance(message, Report):
-            now = self._sense.tick if self._sense is not None else 0
-            if abs(message.tick - now) <= LATE_REPORTS:
-                self._reports.setdefault(message.tick, Told(message, frame))
-
-    def _accept(self, key: str, frame: bytes, kind: Any) -> Sense | End | Report | None:
-        """The message in `frame`, if it is one of `kind` and from whom the key says."""
-        try:
-            message: Sense | End | Report
-            if kind is Report:
-                message = report = decode(frame, Report, MAX_REPORT_BYTES)
-                wrong = radio.contradiction(report)
-                if report.robot != keys.robot_of(key):
-                    wrong = f"says it is from '{report.robot}'"
-                if wrong is not None:
-                    raise MalformedFrame(wrong)
-            else:
-                message = decode(frame, kind)
-                if isinstance(message, Sense) and message.robot != self.id:
-                    raise MalformedFrame(f"is meant for '{message.robot}'")
+            message: Sense | End = decode(arrival.frame, Sense | End)
         except MalformedFrame as error:
-            self.robot.refused += 1
-            if (key, str(error)) not in self._complained and len(self._complained) < 100:
-                self._complained.add((key, str(error)))
-                self._say(f"{self.id}: refused a frame on {key}: {error}")
+            self._inbox.refuse(arrival.key, error)
+            return None
+        if isinstance(message, Sense) and message.robot != self._id:
+            self._inbox.refuse(arrival.key, f"it is meant for '{message.robot}'")
             return None
         return message
 
+    def _on_sense(self, sense: Sense, frame: bytes) -> None:
+        known = self._sense.tick if self._sense is not None else -1
+        if sense.tick > known + 1:
+            raise Unwelcome(f"the world is at tick {sense.tick}, and {self._id} knows nothing after {known}")
+        if sense.tick == known + 1:
+            self._sense = sense
+            if self._answer_within is not None:
+                self._due = time.monotonic() + self._answer_within
+            told = self._robot.sense(sense, frame)
+            if told is not None:
+                self._report.put(told.frame)
+        elif sense.tick == known:
+            self._say_again()
+
+    def _on_report(self, arrival: Arrival) -> None:
+        try:
+            report = decode(arrival.frame, Report, MAX_REPORT_BYTES)
+        except MalformedFrame as error:
+            self._inbox.refuse(arrival.key, error)
+            return
+        wrong = radio.contradiction(report)
+        if report.robot != keys.robot_of(arrival.key):
+            wrong = f"it says it is from '{report.robot}'"
+        if wrong is not None:
+            self._inbox.refuse(arrival.key, wrong)
+            return
+        now = self._sense.tick if self._sense is not None else 0
+        if abs(report.tick - now) <= REPORTS_KEPT:
+            self._reports.setdefault(report.tick, Told(report, arrival.frame))
+
     # --- what is done about it ---
 
-    def _step(self, sense: Sense) -> None:
-        self._sense, self._driven, self._told = sense, None, None
-        if self._within is not None:
-            self._due = time.monotonic() + self._within
-        told = self.robot.sense(sense)
-        if told is not None:
-            self._told = told.frame
-            self._report.put(told.frame)
-
-    def _decide_if_all_heard(self) -> None:
-        if self._sense is None or self._driven is not None:
+    def _decide_when_all_is_heard(self) -> None:
+        if self._sense is None or self._robot.drive is not None:
             return
         heard: list[Told] = []
         missed: list[str] = []
@@ -241,24 +207,24 @@ class AgentProcess:
                     return
                 else:
                     missed.append(contact.peer)
-        drive = self.robot.decide(heard, missed)
-        self._driven = encode(drive)
-        self._drive.put(self._driven)
+        drive = self._robot.decide(heard, missed)
+        self._due = None
+        self._drive.put(self._robot.drive_frame)
         if self._estimate_wanted:
-            self._estimate.put(encode(self.robot.estimate()))
+            self._estimate.put(encode(self._robot.estimate()))
         if self._reports:
-            oldest = drive.tick - LATE_REPORTS
+            oldest = drive.tick - REPORTS_KEPT
             self._reports = {tick: told for tick, told in self._reports.items() if tick >= oldest}
 
     def _say_again(self) -> None:
-        if self._told is not None:
-            self._report.put(self._told)
-        if self._driven is not None:
-            self._drive.put(self._driven)
+        if self._robot.told is not None:
+            self._report.put(self._robot.told.frame)
+        if self._robot.drive is not None:
+            self._drive.put(self._robot.drive_frame)
 
     def _part(self, end: End) -> End:
-        self._drive.put(encode(self.robot.farewell(end)))
+        self._drive.put(encode(self._robot.farewell(end, self._inbox.refused)))
         return end
 
-    def _set_estimate_wanted(self, wanted: bool) -> None:
+    def _want_estimate(self, wanted: bool) -> None:
         self._estimate_wanted = wanted

@@ -36,7 +36,9 @@ def contradiction(report: Report) -> str | None:
     earliest = -1 if report.since == 0 else report.since
     for ranged in report.ranges:
         if not earliest < ranged.tick <= report.through:
-            return f"a range of tick {ranged.tick} outside ({report.since}, {report.through}], or out of order"
+            return (
+                f"a range of tick {ranged.tick} outside ({report.since}, {report.through}], or out of order"
+            )
         earliest = ranged.tick
     return None
 

@@ -28,29 +28,40 @@ class Robot:
 
     def __init__(self, briefing: Briefing, journal: Journal | None = None) -> None:
         self.mind = Mind(briefing)
+        self.told: Told | None = None
+        """the report of this tick, if there was anyone to hear it"""
+        self.drive: Drive | None = None
+        """the Drive of this tick; none before it is decided"""
         self.reports_sent = 0
         self.bytes_sent = 0
-        self.refused = 0
-        """frames that were malformed, or not from whom they said"""
+        self._frame: bytes | None = None
         self._journal = journal
         if journal is not None:
             journal.write(encode(briefing))
 
-    def sense(self, sense: Sense) -> Told | None:
-        """Fold in what was sensed; the report to send, if there is anyone to hear it."""
+    @property
+    def drive_frame(self) -> bytes:
+        """What to send of this tick's Drive, once there is one."""
+        if self._frame is None:
+            assert self.drive is not None
+            self._frame = encode(self.drive)
+        return self._frame
+
+    def sense(self, sense: Sense, frame: bytes | None = None) -> Told | None:
+        """Fold in what was sensed (it came in `frame`); the report to send, if anyone is there to hear it."""
         self.mind = planner.observe(self.mind, sense)
-        told = None
+        self.told = self.drive = self._frame = None
         if sense.contacts:
             report = planner.report(self.mind)
-            told = Told(report, encode(report))
+            self.told = Told(report, encode(report))
             self.reports_sent += 1
-            self.bytes_sent += len(told.frame)
+            self.bytes_sent += len(self.told.frame)
         if self._journal is not None:
-            frames = [encode(sense)]
-            if told is not None:
-                frames.append(told.frame)
+            frames = [frame or encode(sense)]
+            if self.told is not None:
+                frames.append(self.told.frame)
             self._journal.write(*frames)
-        return told
+        return self.told
 
     def decide(self, heard: Sequence[Told] = (), missed: Sequence[str] = ()) -> Drive:
         """Fold in what was heard; the drive for the tick. `missed` are peers whose report did not come."""
@@ -58,17 +69,17 @@ class Robot:
             silent = [encode(Missed(self.mind.tick, peer)) for peer in missed]
             self._journal.write(*[told.frame for told in heard], *silent)
         self.mind = planner.decide(self.mind, [told.report for told in heard])
-        drive = planner.drive(self.mind)
+        self.drive = planner.drive(self.mind)
         if self._journal is not None:
-            self._journal.write(encode(drive), encode(self.estimate()))
-        return drive
+            self._journal.write(self.drive_frame, encode(self.estimate()))
+        return self.drive
 
     def estimate(self) -> Estimate:
         """What the robot holds possible, for whoever watches."""
         return planner.estimate(self.mind)
 
-    def farewell(self, end: End) -> Farewell:
-        """The mission is over: how it went, seen from inside."""
+    def farewell(self, end: End, refused: int = 0) -> Farewell:
+        """The mission is over: how it went, seen from inside; `refused` frames could not be used."""
         mind, findings = self.mind, self.mind.findings
         plan = findings.plan
         farewell = Farewell(
@@ -82,7 +93,7 @@ class Robot:
             separation_m2=plan.separation_m2 if plan is not None else None,
             reports_sent=self.reports_sent,
             reports_heard=mind.radio.heard,
-            reports_refused=self.refused,
+            reports_refused=refused,
             bytes_sent=self.bytes_sent,
         )
         if self._journal is not None:

@@ -10,11 +10,12 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from protocol.inbox import Inbox, Interrupted
+
 if TYPE_CHECKING:
-    from protocol.messages import End
+    from compose.record import Mode, Record
     from world.scenario import Scenario
 
 OK, NOT_LOCALISED, USER_ERROR, FAILED = 0, 1, 2, 3
@@ -57,54 +58,59 @@ def main(arguments: list[str] | None = None) -> NoReturn:
 def run(options: argparse.Namespace) -> int:
     """Play a mission on this machine."""
     scenario = _scenario(options)
-    with _record_folder(options.out) as folder:
-        if any(folder.glob("*.journal")):
-            raise UserError(f"--out: {folder} holds a record already; choose another")
-        began = time.perf_counter()
-        if options.in_process:
-            status = _run_in_process(scenario, folder)
-        else:
-            status = _run_as_processes(options, scenario, folder)
-        if status is not None:
-            return status
-        return _conclude(folder, "in-process" if options.in_process else "processes", began, options.quiet)
+    if options.out is not None and any(options.out.glob("*.journal")):
+        raise UserError(f"--out: {options.out} holds a record already; choose another folder")
+    if options.in_process:
+        return _run_in_process(options, scenario)
+    return _run_as_processes(options, scenario)
 
 
-def _run_in_process(scenario: Scenario, folder: Path) -> int | None:
+def _run_in_process(options: argparse.Namespace, scenario: Scenario) -> int:
     from compose import inline
 
-    inline.play(scenario, folder)
-    return None
-
-
-def _run_as_processes(options: argparse.Namespace, scenario: Scenario, folder: Path) -> int | None:
-    from compose import local, stop
-
-    source = [options.scenario]
-    if options.seed is not None:
-        source += ["--seed", str(options.seed)]
     if options.rate is not None:
-        source += ["--rate", str(options.rate)]
-    try:
-        with _progress(options.quiet, scenario, folder):
-            complaints = local.play(
-                scenario, source, _run_name(options, scenario), folder, options=["--patience", str(options.patience)]
-            )
-    except local.ChildFailed as failure:
-        print(f"tandem run: failed: {failure}", file=sys.stderr)
-        return FAILED
-    except local.Interrupted as why:
-        print(f"tandem run: stopped by {why}", file=sys.stderr)
-        return stop.STATUS
-    if complaints:
-        print(complaints, file=sys.stderr)
-    return None
+        raise UserError("--rate: --in-process knows no real time")
+    if options.out is None:
+        began = time.perf_counter()
+        return _conclude(options, inline.play(scenario), None, "in-process", began)
+    with _record_folder(options.out) as folder:
+        began = time.perf_counter()
+        return _conclude(options, inline.play(scenario, folder), folder, "in-process", began)
+
+
+def _run_as_processes(options: argparse.Namespace, scenario: Scenario) -> int:
+    from compose import local, record, stop
+
+    arguments = [options.scenario]
+    for option, value in (("--seed", options.seed), ("--rate", options.rate)):
+        if value is not None:
+            arguments += [option, str(value)]
+    inbox = Inbox("tandem run")
+    with stop.stops_into(inbox), _record_folder(options.out) as folder:
+        began = time.perf_counter()
+        try:
+            with _progress(options, scenario, folder):
+                local.play(
+                    scenario,
+                    arguments,
+                    folder,
+                    inbox,
+                    run=_run_name(options, scenario),
+                    patience=options.patience,
+                )
+        except local.ChildFailed as failure:
+            inbox.say(f"failed: {failure}")
+            return FAILED
+        except Interrupted as signal_name:
+            inbox.say(f"stopped by {signal_name}")
+            return stop.STATUS
+        return _conclude(options, record.read(folder), folder, "processes", began)
 
 
 @contextmanager
-def _progress(quiet: bool, scenario: Scenario, folder: Path) -> Iterator[None]:
+def _progress(options: argparse.Namespace, scenario: Scenario, folder: Path) -> Iterator[None]:
     """What is shown while it runs, where somebody can see it."""
-    if quiet or not sys.stdout.isatty():
+    if options.quiet or not sys.stdout.isatty():
         yield
         return
     from rich.console import Console
@@ -115,17 +121,17 @@ def _progress(quiet: bool, scenario: Scenario, folder: Path) -> Iterator[None]:
         yield
 
 
-def _conclude(folder: Path, mode: Any, began: float, quiet: bool) -> int:
+def _conclude(
+    options: argparse.Namespace, played: Record, folder: Path | None, mode: Mode, began: float
+) -> int:
     """Leave the views of the record, and say how it went."""
     from compose import record
 
-    try:
-        played = record.read(folder)
-    except ValueError as error:
-        raise UserError(str(error)) from None
-    summary = record.leave(played, folder, mode, round(time.perf_counter() - began, 6))
-    if quiet:
-        print(f"{summary['outcome']} after {summary['ticks']} ticks" + _because(summary["reason"]))
+    summary = record.summary(played, mode, round(time.perf_counter() - began, 6))
+    if folder is not None and options.out is not None:
+        record.leave(played, summary, folder)
+    if options.quiet:
+        print(record.outcome_line(summary))
     else:
         from rich.console import Console
 
@@ -135,115 +141,94 @@ def _conclude(folder: Path, mode: Any, began: float, quiet: bool) -> int:
     return OK if summary["outcome"] == "localised" else NOT_LOCALISED
 
 
-def _because(reason: str | None) -> str:
-    return f" ({reason})" if reason else ""
-
-
 # --- world and agent --------------------------------------------------------------------------------
 
 
 def world(options: argparse.Namespace) -> int:
-    """Play the world's part: robots join from anywhere that reaches it."""
-    from compose import stop
+    """Play the world's part: robots join from wherever they reach it."""
+    from compose import record, stop
     from protocol import session
     from protocol.journal import Journal, RecordExists
-    from world.process import Interrupted, WorldProcess
+    from world.process import WorldProcess
 
     scenario = _scenario(options)
     name = _run_name(options, scenario)
-    inbox: SimpleQueue[Any] = SimpleQueue()
-    with _record_folder(options.out) as folder, stop.stops_into(inbox):
+    inbox = Inbox("tandem world")
+    with stop.stops_into(inbox), _record_folder(options.out) as folder:
         began = time.perf_counter()
         try:
             with (
                 session.open_router(options.listen) as link,
-                Journal(folder / "world.journal", fsync=options.fsync) as journal,
+                Journal(folder / record.WORLD_JOURNAL, fsync=options.fsync) as journal,
             ):
+                process = WorldProcess(
+                    scenario, link, name, journal, inbox, rate=options.rate, patience=options.patience
+                )
                 if not options.quiet:
                     robots = ", ".join(robot.id for robot in scenario.robots)
                     print(f"run {name} at {options.listen}: waiting for {robots}", flush=True)
-                process = WorldProcess(
-                    scenario, link, name, journal, rate=options.rate, patience=options.patience, inbox=inbox
-                )
-                with _progress(options.quiet, scenario, folder):
+                with _progress(options, scenario, folder):
                     end = process.play()
         except (session.BadEndpoint, session.CannotListen) as error:
             raise UserError(f"--listen: {error}") from None
         except RecordExists as error:
             raise UserError(f"--out: {error}") from None
-        except Interrupted as why:
-            print(f"tandem world: stopped by {why}", file=sys.stderr)
+        except Interrupted as signal_name:
+            inbox.say(f"stopped by {signal_name}")
             return stop.STATUS
-        if options.quiet and options.out is not None:  # a launcher concludes
-            return _status_of(end)
-        return _conclude(folder, "processes", began, options.quiet)
+        if options.quiet:
+            print(record.ended(end.outcome, end.tick, end.reason))
+            return OK if end.outcome == "localised" else NOT_LOCALISED
+        return _conclude(options, record.read(folder), folder, "processes", began)
 
 
 def agent(options: argparse.Namespace) -> int:
     """Play one robot's part."""
-    from agent.process import AgentProcess, Interrupted, Unwelcome, WorldLost, join
-    from compose import stop
+    from agent.process import AgentProcess, NoWorld, Search, Unwelcome, join
+    from compose import record, stop
     from protocol import session
+    from protocol.journal import RecordExists
 
-    inbox: SimpleQueue[Any] = SimpleQueue()
+    inbox = Inbox(f"tandem agent {options.id}")
     with stop.stops_into(inbox):
+        search = Search(f"world at {options.connect}", options.wait, inbox)
         try:
-            with session.open_client(options.connect, _patient(options, inbox)) as link:
-                name, briefing = join(link, options.run, options.id, options.wait, inbox, _say)
+            with session.open_client(options.connect, search.go_on) as link:
+                name, briefing = join(link, options.run, options.id, search)
                 process = AgentProcess(
-                    briefing, link, name, options.out, patience=options.patience, inbox=inbox, fsync=options.fsync
+                    briefing,
+                    link,
+                    name,
+                    inbox,
+                    out=options.out,
+                    fsync=options.fsync,
+                    patience=options.patience,
                 )
                 if not options.quiet:
-                    print(f"{options.id} is in run {name}, as {briefing.role}; its peer is {briefing.peer}", flush=True)
+                    print(f"{options.id}: in run {name}, with {briefing.peer}", flush=True)
                 end = process.play()
         except session.BadEndpoint as error:
             raise UserError(f"--connect: {error}") from None
+        except RecordExists as error:
+            raise UserError(f"--out: {error}") from None
         except Unwelcome as error:
             raise UserError(str(error)) from None
-        except (session.NoWorld, WorldLost) as error:
-            print(f"tandem agent: {options.id}: {error}", file=sys.stderr)
+        except NoWorld as error:
+            inbox.say(str(error))
             return FAILED
-        except Interrupted as why:
-            print(f"tandem agent: {options.id}: stopped by {why}", file=sys.stderr)
+        except Interrupted as signal_name:
+            inbox.say(f"stopped by {signal_name}")
             return stop.STATUS
         except OSError as error:
             raise UserError(_cannot_write(options.out, error)) from None
-    if not options.quiet:
-        print(f"{options.id}: {end.outcome} after {end.tick} ticks" + _because(end.reason))
-    return _status_of(end)
-
-
-def _patient(options: argparse.Namespace, inbox: SimpleQueue[Any]) -> Any:
-    """Whether to go on looking for a world; says once that there is none yet."""
-    from agent.process import FIRST_WORD_S, stopped
-
-    began = time.monotonic()
-    said = False
-
-    def keep_trying() -> bool:
-        nonlocal said
-        stopped(inbox, 0.0)
-        waited = time.monotonic() - began
-        if waited >= FIRST_WORD_S and not said:
-            said = True
-            _say(f"tandem agent: {options.id}: no world at {options.connect} yet; trying for {options.wait:g} s")
-        return waited < options.wait
-
-    return keep_trying
-
-
-def _say(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
-
-
-def _status_of(end: End) -> int:
+    print(f"{options.id}: {record.ended(end.outcome, end.tick, end.reason)}")
     return OK if end.outcome == "localised" else NOT_LOCALISED
 
 
 # --- scenarios and bench ----------------------------------------------------------------------------
 
 
-def scenarios(options: argparse.Namespace) -> int:
+def scenarios(_options: argparse.Namespace) -> int:
     """List the scenarios that ship."""
     from compose.scenario import shipped
 
@@ -339,7 +324,9 @@ def _parser() -> argparse.ArgumentParser:
     def of_scenario(sub: argparse.ArgumentParser) -> None:
         sub.add_argument("scenario", metavar="SCENARIO", help="a name that ships, or a TOML file")
         sub.add_argument("--seed", type=_natural, metavar="N", help="instead of the scenario's")
-        sub.add_argument("--rate", type=_positive, metavar="X", help="real time, X times as fast; else lockstep")
+        sub.add_argument(
+            "--rate", type=_positive, metavar="X", help="real time, X times as fast; else lockstep"
+        )
 
     sub = command(run)
     of_scenario(sub)
@@ -358,7 +345,9 @@ def _parser() -> argparse.ArgumentParser:
     shared(sub)
     sub.add_argument("--connect", required=True, metavar="ENDPOINT", help="such as tcp/127.0.0.1:7447")
     sub.add_argument("--run", type=_name, metavar="NAME", help="which run, if several are alive")
-    sub.add_argument("--wait", type=_positive, default=60.0, metavar="S", help="how long to look for a world (60)")
+    sub.add_argument(
+        "--wait", type=_positive, default=60.0, metavar="S", help="how long to look for a world (60)"
+    )
     sub.add_argument("--fsync", action="store_true", help="journals survive a power cut")
 
     command(scenarios)

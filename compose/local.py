@@ -9,17 +9,14 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from queue import Empty, SimpleQueue
-from typing import IO
 
-from compose.stop import stops_into
+from protocol.inbox import Inbox
 from world.scenario import Scenario
 
 STOP_S = 5.0
 """how long a process may take to end when told to; then it is killed"""
-PROGRESS_S = 0.1
 LISTENING_PORTS = range(20_000, 32_000)
 """below those that the system gives to outgoing connections, which could take one in between"""
 
@@ -29,10 +26,6 @@ ENDED = (0, 1)
 
 class ChildFailed(RuntimeError):
     """A process of the run ended before the run did; says which, and how."""
-
-
-class Interrupted(Exception):
-    """The launcher was told to stop."""
 
 
 def free_endpoint() -> str:
@@ -51,9 +44,9 @@ def free_endpoint() -> str:
 class _Child:
     """A process of the run. It is in a session of its own: Ctrl-C reaches it only through the launcher."""
 
-    def __init__(self, name: str, arguments: list[str], ended: SimpleQueue[tuple[str, str, bytes]]) -> None:
+    def __init__(self, name: str, arguments: list[str], inbox: Inbox) -> None:
         self.name = name
-        self._errors: IO[bytes] = tempfile.TemporaryFile()
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # gone with the child
         # -P: the user's directory may hold a folder called world, or agent
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "compose", *arguments],
@@ -62,19 +55,21 @@ class _Child:
             stderr=self._errors,
             start_new_session=True,
         )
-        self._ended = ended
+        self._inbox = inbox
         threading.Thread(target=self._wait, daemon=True).start()
 
     def _wait(self) -> None:
         self._process.wait()
-        self._ended.put(("ended", self.name, b""))
+        self._inbox.put("ended", self.name)
 
     @property
     def running(self) -> bool:
+        """Whether it has not ended yet."""
         return self._process.poll() is None
 
     @property
     def status(self) -> int:
+        """Its exit status, once it has ended; negative is the signal that killed it."""
         return self._process.wait()
 
     def said(self) -> str:
@@ -83,79 +78,69 @@ class _Child:
         return self._errors.read().decode(errors="replace").strip()
 
     def stop(self) -> None:
+        """Tell it to end."""
         self._process.terminate()
 
-    def kill(self) -> None:
-        self._process.kill()
+    def end(self, timeout: float) -> None:
+        """Wait `timeout` seconds for it to end; then kill it."""
+        try:
+            self._process.wait(max(timeout, 0.0))
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
 
 
 def play(
     scenario: Scenario,
-    source: list[str],
-    run: str,
+    world_arguments: Sequence[str],
     out: Path,
+    inbox: Inbox,
     *,
-    options: list[str],
-    progress: Callable[[], None] | None = None,
-) -> str:
-    """Play `scenario`, which `tandem world` finds by the arguments `source`; journals go to `out`.
-
-    `options` go to every process. Calls `progress` every PROGRESS_S. Returns what the processes
-    complained of. Raises ChildFailed or Interrupted; no process is left then, either.
-    """
-    inbox: SimpleQueue[tuple[str, str, bytes]] = SimpleQueue()
-    endpoint = free_endpoint()
-    shared = ["--run", run, "--out", str(out), "-q", *options]
-    children: dict[str, _Child] = {}
-    with stops_into(inbox):
-        try:
-            children["world"] = _Child("world", ["world", *source, "--listen", endpoint, *shared], inbox)
-            agent_options = [option for option in shared if not option.startswith("--rate")]
-            for robot in scenario.robots:
-                arguments = ["agent", robot.id, "--connect", endpoint, *agent_options]
-                children[robot.id] = _Child(f"agent {robot.id}", arguments, inbox)
-            _watch(children, inbox, progress)
-        finally:
-            _stop(children)
-    return "\n".join(said for child in children.values() if (said := child.said()))
-
-
-def _watch(
-    children: dict[str, _Child],
-    inbox: SimpleQueue[tuple[str, str, bytes]],
-    progress: Callable[[], None] | None,
+    run: str,
+    patience: float,
 ) -> None:
-    """Until all have ended."""
-    running = {child.name for child in children.values()}
-    names = {child.name: child for child in children.values()}
+    """Play `scenario`, which `tandem world` finds by `world_arguments`; journals go to `out`.
+
+    Raises ChildFailed, or Interrupted when `inbox` says so; no process is left then, either.
+    """
+    endpoint = free_endpoint()
+    shared = ["--run", run, "--out", str(out), "--patience", str(patience), "--quiet"]
+    world = ["world", *world_arguments, "--listen", endpoint, *shared]
+    children = [_Child("world", world, inbox)]
+    try:
+        for robot in scenario.robots:
+            arguments = ["agent", robot.id, "--connect", endpoint, *shared]
+            children.append(_Child(f"agent {robot.id}", arguments, inbox))
+        _watch({child.name: child for child in children}, inbox)
+    finally:
+        _stop(children)
+        for child in children:
+            if child.status in ENDED and (said := child.said()):
+                print(said, file=sys.stderr)
+
+
+def _watch(children: Mapping[str, _Child], inbox: Inbox) -> None:
+    """Until all have ended; the agents have STOP_S to follow the world."""
+    running = set(children)
     while running:
-        try:
-            topic, name, _ = inbox.get(timeout=PROGRESS_S if progress is not None else None)
-        except Empty:
-            if progress is not None:
-                progress()
-            continue
-        if topic == "stop":
-            raise Interrupted(name)
-        running.discard(name)
-        child = names[name]
+        arrival = inbox.next(None if "world" in running else STOP_S)
+        if arrival.topic == "nothing":
+            return
+        child = children[arrival.key]
+        running.discard(child.name)
         if child.status not in ENDED:
-            raise ChildFailed(f"{name} {_how(child.status)}{': ' if child.said() else ''}{child.said()}")
+            raise ChildFailed(f"{child.name} {_how(child.status)}{child.said() and ': ' + child.said()}")
 
 
 def _how(status: int) -> str:
     return f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
 
 
-def _stop(children: dict[str, _Child]) -> None:
+def _stop(children: Sequence[_Child]) -> None:
     """Leave nobody behind."""
-    for child in children.values():
+    for child in children:
         if child.running:
             child.stop()
     give_up = time.monotonic() + STOP_S
-    for child in children.values():
-        while child.running and time.monotonic() < give_up:
-            time.sleep(0.005)
-        if child.running:
-            child.kill()
-        _ = child.status
+    for child in children:
+        child.end(give_up - time.monotonic())

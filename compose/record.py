@@ -6,7 +6,7 @@ import csv
 import io
 import math
 import platform
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from itertools import combinations
 from pathlib import Path
@@ -15,7 +15,7 @@ from typing import Any, Literal
 import msgspec
 
 from protocol import journal
-from protocol.messages import Drive, End, Farewell, Localised, Missed
+from protocol.messages import Drive, End, Farewell, Localised, Missed, Outcome
 from protocol.motion import Pose, wrap
 from protocol.wire import MalformedFrame, decode
 from world.referee import errors
@@ -203,9 +203,17 @@ def versions() -> dict[str, str | None]:
     return found
 
 
-def leave(record: Record, folder: Path, mode: Mode, wall_s: float | None) -> dict[str, Any]:
-    """Write `ticks.csv` and `summary.json` into `folder`; returns the summary."""
-    said = summary(record, mode, wall_s)
+def leave(record: Record, summary: Mapping[str, Any], folder: Path) -> None:
+    """Write `ticks.csv` and `summary.json` into `folder`."""
     (folder / "ticks.csv").write_text(ticks_csv(record), encoding="utf-8")
-    (folder / "summary.json").write_bytes(msgspec.json.format(msgspec.json.encode(said), indent=2) + b"\n")
-    return said
+    (folder / "summary.json").write_bytes(msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n")
+
+
+def outcome_line(summary: Mapping[str, Any]) -> str:
+    """The outcome, in one line."""
+    return ended(summary["outcome"], summary["ticks"], summary["reason"])
+
+
+def ended(outcome: Outcome, ticks: int, reason: str | None) -> str:
+    """How a run ended, in one line."""
+    return f"{outcome} after {ticks} ticks{f' ({reason})' if reason else ''}"

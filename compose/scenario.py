@@ -30,10 +30,14 @@ class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PlannerTable(_Table, frozen=True):
+    """[planner]"""
+
     variant: Variant = "assured"
 
 
 class RobotTable(_Table, frozen=True):
+    """[[robot]]"""
+
     id: RobotId
     anchor: tuple[Coordinate, Coordinate]
     start: tuple[Coordinate, Coordinate, Annotated[float, Meta(ge=-1e6, le=1e6)]] | None = None
@@ -138,9 +142,9 @@ def _validated(file: ScenarioFile, source: str) -> Scenario:
 
 def _peers(robots: list[RobotTable], source: str) -> dict[str, str]:
     """Everyone's peer. Two robots are each other's; more of them have to say it."""
-    for robot, count in Counter(robot.id for robot in robots).items():
+    for name, count in Counter(robot.id for robot in robots).items():
         if count > 1:
-            raise BadScenario(f"{source}: robot.id: {count} robots are called '{robot}'")
+            raise BadScenario(f"{source}: robot.id: {count} robots are called '{name}'")
     ids = [robot.id for robot in robots]
     if len(robots) == 2 and all(robot.peer is None for robot in robots):
         return {ids[0]: ids[1], ids[1]: ids[0]}

@@ -3,70 +3,52 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import msgpack
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from compose.record import WORLD_JOURNAL
+from compose.record import WORLD_JOURNAL, outcome_line
+from protocol.journal import Tail
 from protocol.messages import Drive, End, Farewell, Missed
-from protocol.wire import MalformedFrame, decode
+from protocol.wire import decode
 from world.scenario import Scenario
-
-
-class Tail:
-    """The latest of a journal that is still being written."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._read = 0
-        self._unpacker = msgpack.Unpacker(raw=True)
-        self.drives: dict[str, Drive] = {}
-
-    def update(self) -> None:
-        """Read on to the end."""
-        try:
-            with self._path.open("rb") as file:
-                file.seek(self._read)
-                news = file.read()
-        except FileNotFoundError:
-            return
-        self._read += len(news)
-        self._unpacker.feed(news)
-        for frame in self._unpacker:
-            try:
-                message = decode(frame, Drive | Missed | End | Farewell | Scenario)
-            except MalformedFrame:
-                continue
-            if isinstance(message, Drive):
-                self.drives[message.robot] = message
 
 
 @contextmanager
 def live(scenario: Scenario, folder: Path, console: Console) -> Iterator[Any]:
     """Show the run whose record grows in `folder`; yields what to call for it to be shown anew."""
-    tail = Tail(folder / WORLD_JOURNAL)
+    journal = Tail(folder / WORLD_JOURNAL)
+    drives: dict[str, Drive] = {}
+
+    def update() -> None:
+        with suppress(OSError, ValueError):
+            for frame in journal.news():
+                message = decode(frame, Scenario | Drive | Missed | End | Farewell)
+                if isinstance(message, Drive):
+                    drives[message.robot] = message
 
     def table() -> Table:
-        tail.update()
+        update()
         ids = [robot.id for robot in scenario.robots]
-        latest = max((drive.tick for drive in tail.drives.values()), default=0)
+        latest = max((drive.tick for drive in drives.values()), default=0)
         rows = Table(title=f"{scenario.name}, tick {latest} of {scenario.max_ticks} at most")
         for heading in ("robot", "phase", "state", "v m/s", "omega rad/s"):
             rows.add_column(heading)
         for robot in ids:
-            drive = tail.drives.get(robot)
+            drive = drives.get(robot)
             if drive is None:
                 rows.add_row(robot, "", "awaited", "", "")
             else:
                 rows.add_row(robot, str(drive.phase), drive.state, f"{drive.v:.3f}", f"{drive.omega:.3f}")
         return rows
 
-    with Live(get_renderable=table, console=console, auto_refresh=True, transient=True, refresh_per_second=10):
+    with Live(
+        get_renderable=table, console=console, auto_refresh=True, transient=True, refresh_per_second=10
+    ):
         yield
 
 
@@ -74,7 +56,14 @@ def result(summary: Mapping[str, Any], console: Console) -> None:
     """The table at the end of a run."""
     rows = Table(title=f"{summary['scenario']}: {outcome_line(summary)}", title_justify="left")
     rows.add_column("robot")
-    for heading in ("is at", "thinks it is at", "error m", "branch", "ranges to anchor, peer", "reports sent, heard"):
+    for heading in (
+        "is at",
+        "thinks it is at",
+        "error m",
+        "branch",
+        "ranges to anchor, peer",
+        "reports sent, heard",
+    ):
         rows.add_column(heading)
     for name, robot in summary["robots"].items():
         rows.add_row(
@@ -87,12 +76,6 @@ def result(summary: Mapping[str, Any], console: Console) -> None:
             f"{_count(robot['reports_sent'])}, {_count(robot['reports_heard'])}",
         )
     console.print(rows)
-
-
-def outcome_line(summary: Mapping[str, Any]) -> str:
-    """The outcome, in one line."""
-    reason = f" ({summary['reason']})" if summary["reason"] else ""
-    return f"{summary['outcome']} after {summary['ticks']} ticks{reason}"
 
 
 def _pose(pose: list[float] | None) -> str:

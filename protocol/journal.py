@@ -17,7 +17,6 @@ import msgpack
 
 from protocol.wire import MAX_FRAME_BYTES
 
-
 _packer = msgpack.Packer()
 
 
@@ -51,6 +50,7 @@ class Journal:
             os.fsync(self._file)
 
     def close(self) -> None:
+        """Nothing is lost without it; it frees the file."""
         os.close(self._file)
 
     def __enter__(self) -> Journal:
@@ -67,14 +67,36 @@ def read(path: Path) -> Iterator[bytes]:
 
     Raises OSError if it cannot be read, CorruptJournal where something stands that is no frame.
     """
-    with path.open("rb") as file:
-        unpacker = msgpack.Unpacker(file, max_bin_len=MAX_FRAME_BYTES, raw=True)
+    tail = Tail(path)
+    return iter(tail.news())
+
+
+class Tail:
+    """A journal that may still be written, read as it grows."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._read = 0
+        self._unpacker = msgpack.Unpacker(raw=True, max_buffer_size=0)
+
+    def news(self) -> list[bytes]:
+        """The frames that have come since the last time; what is torn waits for the rest.
+
+        Raises OSError, CorruptJournal like `read`.
+        """
+        with self.path.open("rb") as file:
+            file.seek(self._read)
+            bytes_read = file.read()
+        self._read += len(bytes_read)
+        self._unpacker.feed(bytes_read)
+        frames = []
         try:
-            for frame in unpacker:
-                if not isinstance(frame, bytes):
-                    raise CorruptJournal(f"{path}: no frame before byte {unpacker.tell()}")
-                yield frame
+            for frame in self._unpacker:
+                if not isinstance(frame, bytes) or len(frame) > MAX_FRAME_BYTES:
+                    raise CorruptJournal(f"{self.path}: no frame before byte {self._unpacker.tell()}")
+                frames.append(frame)
         except (ValueError, msgpack.UnpackException) as error:
             if isinstance(error, CorruptJournal):
                 raise
-            raise CorruptJournal(f"{path}: damaged at byte {unpacker.tell()}: {error}") from None
+            raise CorruptJournal(f"{self.path}: damaged at byte {self._unpacker.tell()}: {error}") from None
+        return frames

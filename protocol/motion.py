@@ -73,7 +73,9 @@ def compose(frame: Pose, local: Pose) -> Pose:
     """`local`, given in `frame`, in the coordinates that `frame` itself is given in."""
     c, s = math.cos(frame.heading), math.sin(frame.heading)
     return Pose(
-        frame.x + c * local.x - s * local.y, frame.y + s * local.x + c * local.y, frame.heading + local.heading
+        frame.x + c * local.x - s * local.y,
+        frame.y + s * local.x + c * local.y,
+        frame.heading + local.heading,
     )
 
 

@@ -14,11 +14,11 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from queue import SimpleQueue
 from typing import Any, NoReturn
 
 import zenoh
 
+from protocol.inbox import Inbox, Topic
 from protocol.messages import Message
 from protocol.wire import encode
 
@@ -31,7 +31,9 @@ RETRY_MS = 50
 
 MSGPACK = zenoh.Encoding("application/msgpack")
 
-_ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws)/(?P<host>\[[0-9A-Fa-f:.%\w]+\]|[^\s/:\[\]]+):(?P<port>\d{1,5})")
+_ENDPOINT = re.compile(
+    r"(tcp|udp|tls|quic|ws)/(?P<host>\[[0-9A-Fa-f:.%\w]+\]|[^\s/:\[\]]+):(?P<port>\d{1,5})"
+)
 
 zenoh.init_log_from_env_or("off")
 
@@ -46,10 +48,6 @@ class BadEndpoint(ValueError):
 
 class CannotListen(OSError):
     """The endpoint to listen on cannot be had; its text says why."""
-
-
-class NoWorld(ConnectionError):
-    """Nobody answers at the endpoint."""
 
 
 def check_endpoint(endpoint: str) -> str:
@@ -107,11 +105,11 @@ def open_router(listen: str) -> Iterator[zenoh.Session]:
 
 
 @contextmanager
-def open_client(connect: str, keep_trying: Callable[[], bool]) -> Iterator[zenoh.Session]:
+def open_client(connect: str, unanswered: Callable[[], None]) -> Iterator[zenoh.Session]:
     """A robot's session to the router at `connect`.
 
-    Tries again as long as `keep_trying()`, which is asked between attempts of CONNECT_TIMEOUT_S.
-    Raises BadEndpoint, or NoWorld when it stops trying.
+    Calls `unanswered` after each attempt of CONNECT_TIMEOUT_S in vain; it may raise to give up. Raises
+    BadEndpoint.
     """
     check_endpoint(connect)
     while True:
@@ -120,27 +118,26 @@ def open_client(connect: str, keep_trying: Callable[[], bool]) -> Iterator[zenoh
             session = zenoh.open(config)
             break
         except zenoh.ZError:
-            if not keep_trying():
-                raise NoWorld(f"nobody answers at {connect}") from None
+            unanswered()
     with _closing(session):
         yield session
 
 
-def subscribe(session: zenoh.Session, key: str, inbox: SimpleQueue[Any], topic: str) -> None:
-    """Put (topic, key, frame) into `inbox` for everything that is put under `key`."""
+def subscribe(session: zenoh.Session, key: str, inbox: Inbox, topic: Topic) -> None:
+    """Put into `inbox` everything that is put under `key`."""
 
     def hand_over(sample: zenoh.Sample) -> None:
-        inbox.put((topic, str(sample.key_expr), sample.payload.to_bytes()))
+        inbox.put(topic, str(sample.key_expr), sample.payload.to_bytes())
 
     session.declare_subscriber(key, hand_over)
 
 
-def watch_liveliness(session: zenoh.Session, key: str, inbox: SimpleQueue[Any]) -> None:
-    """Put ("alive" or "gone", key, b"") into `inbox` for tokens under `key`, those already there included."""
+def watch_liveliness(session: zenoh.Session, key: str, inbox: Inbox) -> None:
+    """Put "alive" or "gone" into `inbox` for tokens under `key`, those already there included."""
 
     def hand_over(sample: zenoh.Sample) -> None:
         alive = sample.kind == zenoh.SampleKind.PUT
-        inbox.put(("alive" if alive else "gone", str(sample.key_expr), b""))
+        inbox.put("alive" if alive else "gone", str(sample.key_expr))
 
     session.liveliness().declare_subscriber(key, hand_over, history=True)
 
@@ -182,7 +179,8 @@ def show_alive(session: zenoh.Session, key: str) -> zenoh.LivelinessToken:
 def on_matching(publisher: zenoh.Publisher, tell: Callable[[bool], None]) -> None:
     """Tell, now and on every change, whether anyone listens to `publisher`."""
     publisher.declare_matching_listener(lambda status: tell(status.matching))
-    tell(publisher.matching_status.matching)
+    status: Any = publisher.matching_status  # declared as bool, which it is not
+    tell(status.matching)
 
 
 def publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from typing import TypeVar
+from typing import Any, TypeVar, overload
 
 import msgspec
 
@@ -25,11 +25,16 @@ class MalformedFrame(ValueError):
 
 
 def encode(message: msgspec.Struct) -> bytes:
+    """The frame of `message`."""
     body = _encoder.encode(message)
     return _HEAD.pack(VERSION, zlib.crc32(body)) + body
 
 
-def decode(frame: bytes, kind: type[M], limit: int = MAX_FRAME_BYTES) -> M:
+@overload
+def decode(frame: bytes, kind: type[M], limit: int = ...) -> M: ...
+@overload
+def decode(frame: bytes, kind: Any, limit: int = ...) -> Any: ...
+def decode(frame: bytes, kind: Any, limit: int = MAX_FRAME_BYTES) -> Any:
     """The message in `frame`, which must be a `kind` (a message or a union of messages).
 
     Raises MalformedFrame when the frame is truncated, longer than `limit` bytes, of another version,
@@ -47,6 +52,6 @@ def decode(frame: bytes, kind: type[M], limit: int = MAX_FRAME_BYTES) -> M:
     if decoder is None:
         decoder = _decoders[kind] = msgspec.msgpack.Decoder(kind)
     try:
-        return decoder.decode(body)  # type: ignore[return-value]  # the decoder of `kind` returns a `kind`
+        return decoder.decode(body)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise MalformedFrame(str(error)) from None

@@ -26,6 +26,7 @@ class Course:
 
     @property
     def tick(self) -> int:
+        """k"""
         return self.world.truth.tick
 
     def senses(self) -> list[Sense]:

@@ -28,9 +28,7 @@ def errors(claim: Pose, truth: Pose) -> tuple[float, float]:
     return math.hypot(claim.x - truth.x, claim.y - truth.y), abs(wrap(claim.heading - truth.heading))
 
 
-def judge(
-    scenario: Scenario, truth: Truth, verdicts: Mapping[str, Verdict | None]
-) -> Judgement | None:
+def judge(scenario: Scenario, truth: Truth, verdicts: Mapping[str, Verdict | None]) -> Judgement | None:
     """The judgement once every robot has its verdict, or time is up; None while the mission goes on."""
     open_cases = [robot.id for robot in scenario.robots if verdicts.get(robot.id) is None]
     if open_cases and truth.tick < scenario.max_ticks:

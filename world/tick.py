@@ -30,9 +30,7 @@ class World(msgspec.Struct, frozen=True):
 def release(scenario: Scenario) -> World:
     """The world at tick 0."""
     place = {robot.id: i for i, robot in enumerate(scenario.robots)}
-    pairs = tuple(
-        (place[robot.id], place[robot.peer]) for robot in scenario.robots if robot.role == "a"
-    )
+    pairs = tuple((place[robot.id], place[robot.peer]) for robot in scenario.robots if robot.role == "a")
     starts: tuple[Pose, ...] = tuple(robot.start for robot in scenario.robots)
     return World(scenario, Truth(0, starts), None, {}, pairs)
 

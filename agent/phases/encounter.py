@@ -19,7 +19,7 @@ TURN_RATES = 721
 """values of omega_2 tried in eq. (8), -omega_max and omega_max included: every half degree at T_s = 1 s"""
 
 SPEEDS = (1.0, -1.0, 0.75, -0.75, 0.5, -0.5, 0.25, -0.25, 0.1, -0.1)
-"""values of v_2 / v_max tried where the last manoeuvre must not leave the range; the letter tries the first"""
+"""values of v_2 / v_max that are tried; the letter tries the first only"""
 
 ELSEWHERE = 1e-6
 """m: a range taken nearer than this to where another was says nothing new"""
@@ -65,9 +65,8 @@ def base(sightings: Sequence[Sighting]) -> tuple[Sighting, Sighting] | None:
     ranged = [sighting for sighting in sightings if sighting.range is not None]
     for first in ranged:
         for second in ranged:
-            if (
-                first.tick < second.tick
-                and travelled(first.b, second.b) < ELSEWHERE < travelled(first.a, second.a)
+            if first.tick < second.tick and travelled(first.b, second.b) < ELSEWHERE < travelled(
+                first.a, second.a
             ):
                 return first, second
     return None
@@ -75,7 +74,8 @@ def base(sightings: Sequence[Sighting]) -> tuple[Sighting, Sighting] | None:
 
 def solve(distance: float, first: Sighting, second: Sighting) -> list[Placement]:
     """The placements that eq. (7) leaves after two ranges; `distance` is D."""
-    assert first.range is not None and second.range is not None
+    assert first.range is not None
+    assert second.range is not None
     return placements(distance, first.b, first.a, second.a, first.range, second.range)
 
 
@@ -117,9 +117,7 @@ def last_manoeuvre(
         here = travelled(b, compose(Pose(candidates[0].x, candidates[0].y, candidates[0].phi), a))
         told = here * here - squared[0]
     else:
-        told = np.min(
-            [abs(one - other) for i, one in enumerate(squared) for other in squared[:i]], axis=0
-        )
+        told = np.min([abs(one - other) for i, one in enumerate(squared) for other in squared[:i]], axis=0)
     value = told
     if variant == "assured":
         outside = sum((distance > rim).astype(float) for distance in squared)
