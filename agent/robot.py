@@ -35,6 +35,8 @@ class Robot:
         self.reports_sent = 0
         self.bytes_sent = 0
         self._frame: bytes | None = None
+        self._unwritten: bytes | None = None
+        """a Sense that nothing has followed from yet; journaled with the Drive, before that is sent"""
         self._journal = journal
         if journal is not None:
             journal.write(encode(briefing))
@@ -56,22 +58,23 @@ class Robot:
             self.told = Told(report, encode(report))
             self.reports_sent += 1
             self.bytes_sent += len(self.told.frame)
-        if self._journal is not None:
-            frames = [frame or encode(sense)]
-            if self.told is not None:
-                frames.append(self.told.frame)
-            self._journal.write(*frames)
+            if self._journal is not None:
+                self._journal.write(frame or encode(sense), self.told.frame)
+        elif self._journal is not None:
+            self._unwritten = frame or encode(sense)
         return self.told
 
     def decide(self, heard: Sequence[Told] = (), missed: Sequence[str] = ()) -> Drive:
         """Fold in what was heard; the drive for the tick. `missed` are peers whose report did not come."""
-        if self._journal is not None and (heard or missed):
-            silent = [encode(Missed(self.mind.tick, peer)) for peer in missed]
-            self._journal.write(*[told.frame for told in heard], *silent)
         self.mind = planner.decide(self.mind, [told.report for told in heard])
         self.drive = planner.drive(self.mind)
         if self._journal is not None:
-            self._journal.write(self.drive_frame, encode(self.estimate()))
+            frames = [told.frame for told in heard]
+            frames += [encode(Missed(self.mind.tick, peer)) for peer in missed]
+            if self._unwritten is not None:
+                frames.insert(0, self._unwritten)
+                self._unwritten = None
+            self._journal.write(*frames, self.drive_frame, encode(self.estimate()))
         return self.drive
 
     def estimate(self) -> Estimate:

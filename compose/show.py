@@ -7,6 +7,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from rich.box import SIMPLE
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
@@ -54,37 +55,29 @@ def live(scenario: Scenario, folder: Path, console: Console) -> Iterator[Any]:
 
 def result(summary: Mapping[str, Any], console: Console) -> None:
     """The table at the end of a run."""
-    rows = Table(title=f"{summary['scenario']}: {outcome_line(summary)}", title_justify="left")
+    rows = Table(title=f"{summary['scenario']}: {outcome_line(summary)}", title_justify="left", box=SIMPLE)
     rows.add_column("robot")
-    for heading in (
-        "is at",
-        "thinks it is at",
-        "error m",
-        "branch",
-        "ranges to anchor, peer",
-        "reports sent, heard",
-    ):
-        rows.add_column(heading)
+    for heading in ("is at\nm, m, rad", "thinks it is at\nm, m, rad", "error\nm"):
+        rows.add_column(heading, justify="right", no_wrap=True)
+    rows.add_column("phase 1\nended by")
+    rows.add_column("ranges\nanchor, peer", justify="right")
+    rows.add_column("reports\nsent, heard", justify="right")
     for name, robot in summary["robots"].items():
         rows.add_row(
             name,
             _pose(robot["truth"]),
             _pose(robot["estimate"]),
-            _number(robot["position_error_m"], ".2g"),
+            _number(robot["position_error_m"], ".1e"),
             robot["branch"] or "-",
-            f"{_count(robot['anchor_ranges'])}, {_count(robot['mutual_ranges'])}",
-            f"{_count(robot['reports_sent'])}, {_count(robot['reports_heard'])}",
+            f"{_number(robot['anchor_ranges'])}, {_number(robot['mutual_ranges'])}",
+            f"{_number(robot['reports_sent'])}, {_number(robot['reports_heard'])}",
         )
     console.print(rows)
 
 
 def _pose(pose: list[float] | None) -> str:
-    return f"({pose[0]:.3f}, {pose[1]:.3f}) m, {pose[2]:+.3f} rad" if pose else "does not know"
+    return f"{pose[0]:.3f} {pose[1]:.3f} {pose[2]:+.3f}" if pose else "-"
 
 
-def _number(value: float | None, form: str) -> str:
+def _number(value: float | None, form: str = "") -> str:
     return "-" if value is None else format(value, form)
-
-
-def _count(value: int | None) -> str:
-    return "-" if value is None else str(value)

@@ -60,6 +60,8 @@ class WorldProcess:
         self._answered = time.monotonic()
         """when a robot last appeared, or answered something new"""
         self._truth_wanted = False
+        self.playing_s = 0.0
+        """wall time since everyone had answered the first Sense"""
 
         self._sense = {robot: session.publisher(link, keys.sense(run, robot)) for robot in self._robots}
         self._truth = session.publisher(link, keys.truth(run))
@@ -72,16 +74,18 @@ class WorldProcess:
     def play(self) -> End:
         """The whole run, to its End. Raises Interrupted when told to stop."""
         due: float | None = None
+        began: float | None = None
+        end: End | None = None
         try:
-            while True:
+            while end is None:
                 drives = self._answers(self._course.senses(), due)
                 end = self._course.drive(drives)
-                if end is not None:
-                    break
+                began = time.monotonic() if began is None else began
                 if self._period is not None:
-                    due = (time.monotonic() if due is None else due) + self._period
+                    due = (began if due is None else due) + self._period
         except NoAnswer as silence:
             end = self._course.end(Judgement("failed", str(silence)))
+        self.playing_s = time.monotonic() - began if began is not None else 0.0
         self._course.farewells(self._farewells(end))
         return end
 

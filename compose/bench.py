@@ -1,0 +1,201 @@
+"""`tandem bench`: speed, each figure against the bare thing in the same run.
+
+Absolute times depend on the machine and its mood; the ratios much less. Everything is repeated in turns,
+A B A B, and the medians are compared.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from statistics import median
+
+from rich.console import Console
+from rich.progress import Progress, TimeElapsedColumn
+from rich.table import Table
+
+from compose import barrier, inline, local, record, scenario
+from protocol import session
+from protocol.inbox import Inbox
+from protocol.journal import Journal
+from protocol.wire import encode
+from world.course import Course
+from world.process import WorldProcess
+from world.scenario import Scenario
+
+MISSION = "far"
+"""thousands of ticks, so that starting is no part of what is timed"""
+MISSIONS = 200
+"""random missions a round, in-process"""
+SEED = 1000
+"""of the first of them"""
+BARE_IMPORTS = "import zenoh, numpy, scipy.optimize, msgspec"
+
+
+def main(rounds: int) -> int:
+    """Measure, print; 0."""
+    console = Console()
+    with Progress(*Progress.get_default_columns(), TimeElapsedColumn(), console=console) as progress:
+        task = progress.add_task("tandem bench", total=3 * rounds)
+
+        def done() -> None:
+            progress.advance(task)
+
+        tables = [_ticks(rounds, done), _missions(rounds, done), _start(rounds, done)]
+    for table in tables:
+        console.print(table)
+    return 0
+
+
+# --- ticks/s over Zenoh -----------------------------------------------------------------------------
+
+
+def _ticks(rounds: int, done: Callable[[], None]) -> Table:
+    """A mission as processes, against the bare barrier."""
+    played = scenario.load(MISSION)
+    sizes = _frame_sizes(played)
+    missions: list[float] = []
+    barriers: list[float] = []
+    for _ in range(rounds):
+        missions.append(_mission_rate(played))
+        barriers.append(_barrier_rate(played, sizes))
+        done()
+    table = _table("Ticks/s as processes, two robots")
+    _row(table, f"a mission ({MISSION}), with journals", missions, "ticks/s")
+    _row(table, f"the bare barrier, frames of {sizes[0]} and {sizes[1]} bytes", barriers, "ticks/s")
+    ratios = [mission / bare for mission, bare in zip(missions, barriers, strict=True)]
+    _row(table, "mission / barrier (at least 0.5)", ratios, "")
+    return table
+
+
+def _frame_sizes(played: Scenario) -> tuple[int, int]:
+    """Bytes of a typical Sense, and of a typical Drive."""
+    course = Course(played)
+    senses: list[int] = []
+    drives: list[int] = []
+    for moment in inline.play(played).moments:
+        senses += [len(encode(sense)) for sense in course.senses()]
+        drives += [len(encode(drive)) for drive in moment.drives.values()]
+        course.drive(moment.drives)
+    return int(median(senses)), int(median(drives))
+
+
+@contextmanager
+def _robots(arguments: Sequence[Sequence[str]]) -> Iterator[None]:
+    """Robots as processes, for as long as it takes."""
+    command = [sys.executable, "-P", "-m"]
+    children = [subprocess.Popen([*command, *one], stdout=subprocess.DEVNULL) for one in arguments]
+    try:
+        yield
+        for child in children:
+            child.wait(local.STOP_S)
+    finally:
+        for child in children:
+            child.kill()
+            child.wait()
+
+
+def _mission_rate(played: Scenario) -> float:
+    endpoint = local.free_endpoint()
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder)
+        common = ["--connect", endpoint, "--out", folder, "--quiet"]
+        robots = [["compose", "agent", robot.id, *common] for robot in played.robots]
+        with (
+            _robots(robots),
+            session.open_router(endpoint) as link,
+            Journal(out / record.WORLD_JOURNAL) as journal,
+        ):
+            process = WorldProcess(played, link, "bench", journal, Inbox("tandem bench"))
+            end = process.play()
+            return end.tick / process.playing_s
+
+
+def _barrier_rate(played: Scenario, sizes: tuple[int, int]) -> float:
+    endpoint = local.free_endpoint()
+    ids = [robot.id for robot in played.robots]
+    ticks = 5000
+    robots = [["compose.barrier", endpoint, one, str(sizes[1]), str(ticks)] for one in ids]
+    with session.open_router(endpoint) as link, _robots(robots):
+        return ticks / barrier.world(link, ids, sizes[0], ticks)
+
+
+# --- missions/s in one process ----------------------------------------------------------------------
+
+
+def _missions(rounds: int, done: Callable[[], None]) -> Table:
+    """Random missions in-process on one core, and how much of them is the world's."""
+    scenarios = [scenario.load("random", seed=SEED + i) for i in range(MISSIONS)]
+    whole: list[float] = []
+    world_part: list[float] = []
+    ticks = 0
+    for _ in range(rounds):
+        began = time.perf_counter()
+        records = [inline.play(one) for one in scenarios]
+        whole.append(time.perf_counter() - began)
+        began = time.perf_counter()
+        for played in records:
+            _world_alone(played)
+        world_part.append(time.perf_counter() - began)
+        ticks = sum(len(played.moments) for played in records)
+        done()
+    table = _table("In-process, one core")
+    _row(table, f"{MISSIONS} random missions (at least 300)", [MISSIONS / s for s in whole], "missions/s")
+    _row(table, f"a tick, of {ticks / MISSIONS:.1f} a mission", [1e6 * s / ticks for s in whole], "us")
+    _row(table, "of which the world", [1e6 * s / ticks for s in world_part], "us")
+    return table
+
+
+def _world_alone(played: record.Record) -> None:
+    """The same run with the robots' answers given."""
+    course = Course(played.scenario)
+    for moment in played.moments:
+        course.senses()
+        course.drive(moment.drives)
+
+
+# --- starting ---------------------------------------------------------------------------------------
+
+
+def _start(rounds: int, done: Callable[[], None]) -> Table:
+    """The whole of `tandem run paper-1 -q`, against a process that only imports what it stands on."""
+    run = [sys.executable, "-P", "-m", "compose", "run", "paper-1", "-q"]
+    bare = [sys.executable, "-c", BARE_IMPORTS]
+    runs: list[float] = []
+    imports: list[float] = []
+    for _ in range(rounds):
+        runs.append(_wall(run))
+        imports.append(_wall(bare))
+        done()
+    table = _table("Wall time of a whole command")
+    _row(table, "tandem run paper-1 -q", runs, "s")
+    _row(table, f"python -c '{BARE_IMPORTS}'", imports, "s")
+    _row(table, "run / imports (at most 4)", [a / b for a, b in zip(runs, imports, strict=True)], "")
+    return table
+
+
+def _wall(command: Sequence[str]) -> float:
+    began = time.perf_counter()
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    return time.perf_counter() - began
+
+
+# --- tables -----------------------------------------------------------------------------------------
+
+
+def _table(title: str) -> Table:
+    table = Table(title=title, title_justify="left")
+    table.add_column("", min_width=50)
+    for heading in ("median", "from", "to"):
+        table.add_column(heading, justify="right")
+    table.add_column("")
+    return table
+
+
+def _row(table: Table, what: str, values: Sequence[float], unit: str) -> None:
+    table.add_row(what, *[f"{value:.4g}" for value in (median(values), min(values), max(values))], unit)
