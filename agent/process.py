@@ -29,6 +29,10 @@ FIRST_WORD_S = 5.0
 """how long an agent looks for its world before it says so"""
 
 
+FAREWELL_S = 3.0
+"""how long an agent stays after the End for the world to hear its Farewell"""
+
+
 class Unwelcome(Exception):
     """There is a world, but this robot cannot join it, or go on in it; says why."""
 
@@ -223,7 +227,16 @@ class AgentProcess:
             self._drive.put(self._robot.drive_frame)
 
     def _part(self, end: End) -> End:
-        self._drive.put(encode(self._robot.farewell(end, self._inbox.refused)))
+        """Answer the End, as often as it is said, until the world has gone."""
+        farewell = encode(self._robot.farewell(end, self._inbox.refused))
+        self._drive.put(farewell)
+        give_up = time.monotonic() + FAREWELL_S
+        while (left := give_up - time.monotonic()) > 0.0:
+            arrival = self._inbox.next(left)
+            if arrival.topic == "gone":
+                break
+            if arrival.topic == "sense":
+                self._drive.put(farewell)
         return end
 
     def _want_estimate(self, wanted: bool) -> None:

@@ -55,23 +55,22 @@ def live(scenario: Scenario, folder: Path, console: Console) -> Iterator[Any]:
 
 def result(summary: Mapping[str, Any], console: Console) -> None:
     """The table at the end of a run."""
-    rows = Table(title=f"{summary['scenario']}: {outcome_line(summary)}", title_justify="left", box=SIMPLE)
+    title = f"{summary['scenario']}: {outcome_line(summary)}"
+    rows = Table(title=title, title_justify="left", box=SIMPLE, pad_edge=False)
     rows.add_column("robot")
-    for heading in ("is at\nm, m, rad", "thinks it is at\nm, m, rad", "error\nm"):
+    for heading in ("is at x, y, heading", "thinks it is at", "error m", "ranges", "reports"):
         rows.add_column(heading, justify="right", no_wrap=True)
-    rows.add_column("phase 1\nended by")
-    rows.add_column("ranges\nanchor, peer", justify="right")
-    rows.add_column("reports\nsent, heard", justify="right")
     for name, robot in summary["robots"].items():
         rows.add_row(
             name,
             _pose(robot["truth"]),
             _pose(robot["estimate"]),
             _number(robot["position_error_m"], ".1e"),
-            robot["branch"] or "-",
-            f"{_number(robot['anchor_ranges'])}, {_number(robot['mutual_ranges'])}",
-            f"{_number(robot['reports_sent'])}, {_number(robot['reports_heard'])}",
+            f"{_number(robot['anchor_ranges'])} + {_number(robot['mutual_ranges'])}",
+            f"{_number(robot['reports_sent'])} / {_number(robot['reports_heard'])}",
         )
+    rows.caption = "m and rad; ranges to the anchor + to the peer; reports sent / heard"
+    rows.caption_justify = "left"
     console.print(rows)
 
 
