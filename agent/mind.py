@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import msgspec
 
-from agent.belief import Branch
+from agent.belief import Branch, Sighting
 from agent.geometry import Placement
 from agent.logbook import Logbook
 from agent.phases.anchor import ThirdPoint
@@ -15,7 +17,7 @@ from agent.radio import Radio
 from protocol import messages
 from protocol.messages import Briefing, Localised, Ranged, Undecided
 from protocol.mission import Orbit
-from protocol.motion import ORIGIN, Pose
+from protocol.motion import ORIGIN, Pose, compose
 
 
 class Asleep(msgspec.Struct, frozen=True):
@@ -119,3 +121,44 @@ class Mind(msgspec.Struct, frozen=True):
     def verdict(self) -> messages.Verdict | None:
         """What it has come to, if it has."""
         return self.state.verdict if isinstance(self.state, Done) else None
+
+    @property
+    def start(self) -> Pose:
+        """Where tick 0 lies in the frame of its anchor; known from phase 2 on."""
+        assert self.findings.branch is not None
+        return self.findings.branch.start
+
+    @property
+    def local_pose(self) -> Pose:
+        """Where it is in the frame of its anchor; known from phase 2 on."""
+        return compose(self.start, self.odometry)
+
+    def world_pose(self, placement: Placement) -> Pose:
+        """Where it is in <W>, if that is how <a(M1)> lies in <b(M2)>."""
+        own, peer = self.briefing.anchor, self.briefing.peer_anchor
+        m1, m2 = (own, peer) if self.briefing.role == "a" else (peer, own)
+        turn = math.atan2(m1.y - m2.y, m1.x - m2.x) - math.atan2(placement.y, placement.x)
+        if self.briefing.role == "a":
+            turn += placement.phi
+        return compose(Pose(own.x, own.y, turn), self.local_pose)
+
+    def seen(self) -> list[tuple[Pose, float | None]]:
+        """Every tick so far: the odometry, and the anchor's range or its silence."""
+        ranges = {ranged.tick: ranged.range for ranged in self.log.ranges}
+        track = self.log.track(ORIGIN, 0, self.tick, self.briefing.mission.period)
+        return [(pose, ranges.get(tick)) for tick, pose in enumerate(track)]
+
+    def sightings(self) -> list[Sighting]:
+        """Every tick of the encounter that both robots' logs cover."""
+        first, last = self.findings.met, min(self.tick, self.radio.peer.through)
+        if first is None or self.radio.start is None or last < first:
+            return []
+        period = self.briefing.mission.period
+        own = self.log.track(self.start, first, last, period)
+        peer = self.radio.peer.track(self.radio.start, first, last, period)
+        a, b = (own, peer) if self.briefing.role == "a" else (peer, own)
+        ranges = {ranged.tick: ranged.range for ranged in self.mutual}
+        return [
+            Sighting(tick, at_a, at_b, ranges.get(tick))
+            for tick, at_a, at_b in zip(range(first, last + 1), a, b, strict=True)
+        ]

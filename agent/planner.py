@@ -11,14 +11,12 @@ No I/O, no clock, no randomness. What the robot is doing is one frozen value, `m
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 from msgspec.structs import replace
 
 from agent import radio
 from agent.belief import Branch, Sighting, branches, weigh_branches, weigh_placements
-from agent.geometry import Placement
 from agent.mind import MET, Asleep, Done, Mind
 from agent.phases import anchor, encounter, rendezvous, seeking
 from agent.phases.anchor import ThirdPoint
@@ -26,8 +24,8 @@ from agent.phases.encounter import LastManoeuvre, Returning, Standing, Waiting
 from agent.phases.rendezvous import Aligning, Orbiting, Radial, Tangent
 from agent.phases.seeking import Circling, Straight, Turning
 from protocol import messages
-from protocol.messages import Briefing, Drive, Estimate, Localised, Ranged, Report, Sense, Undecided
-from protocol.motion import ORIGIN, REST, Controls, Pose, compose, step
+from protocol.messages import Drive, Estimate, Localised, Ranged, Report, Sense, Undecided
+from protocol.motion import ORIGIN, REST, Controls, Pose, step
 
 # --- a tick -----------------------------------------------------------------------------------------
 
@@ -109,7 +107,7 @@ def estimate(mind: Mind) -> Estimate:
     if isinstance(mind.verdict, Localised):
         world: tuple[Pose, ...] = (mind.verdict.pose,)
     else:
-        world = tuple(_world_pose(mind, placement) for placement in mind.findings.placements)
+        world = tuple(mind.world_pose(placement) for placement in mind.findings.placements)
     return Estimate(
         tick=mind.tick,
         robot=mind.briefing.robot,
@@ -161,7 +159,7 @@ def _second_range(mind: Mind) -> Mind:
     """The branches +-alpha, less what silence on the way rules out."""
     rho0, rho = mind.log.ranges[0].range, mind.log.ranges[-1].range
     possible = branches(rho0, mind.odometry, rho)
-    left = weigh_branches(possible, _seen(mind), mind.briefing.mission.sensing_range)
+    left = weigh_branches(possible, mind.seen(), mind.briefing.mission.sensing_range)
     if isinstance(mind.state, Circling) and len(left) == 1:
         return _located(mind, left[0], "circle")
     return _to_third_point(mind, left, again=False)
@@ -179,7 +177,7 @@ def _to_third_point(mind: Mind, left: tuple[Branch, ...], *, again: bool) -> Min
 
 def _third_range(mind: Mind, state: ThirdPoint) -> Mind:
     """The branch that explains the third range, or its absence: the virtual measurement."""
-    left = weigh_branches(state.branches, _seen(mind), mind.briefing.mission.sensing_range)
+    left = weigh_branches(state.branches, mind.seen(), mind.briefing.mission.sensing_range)
     if len(left) == 1:
         measured = mind.log.ranges[-1].tick == mind.tick
         return _located(mind, left[0], "three-ranges" if measured else "three-ranges-virtual")
@@ -190,15 +188,13 @@ def _third_range(mind: Mind, state: ThirdPoint) -> Mind:
 
 def _located(mind: Mind, branch: Branch, by: messages.Branch) -> Mind:
     """Phase 1 is done: its pose relative to the anchor is known."""
-    findings = replace(mind.findings, branch=branch, branch_by=by)
-    mu = rendezvous.orientation(compose(branch.start, mind.odometry))
-    return _on_to_orbit(replace(mind, findings=findings), Aligning(mind.odometry.heading - mu))
+    mind = replace(mind, findings=replace(mind.findings, branch=branch, branch_by=by))
+    mu = rendezvous.orientation(mind.local_pose)
+    return _on_to_orbit(mind, Aligning(mind.odometry.heading - mu))
 
 
 def _on_to_orbit(mind: Mind, state: rendezvous.Meeting) -> Mind:
-    branch = mind.findings.branch
-    assert branch is not None
-    onward = rendezvous.onward(state, mind.odometry, branch.start, mind.orbit)
+    onward = rendezvous.onward(state, mind.odometry, mind.start, mind.orbit)
     return mind if onward is mind.state else replace(mind, state=onward)
 
 
@@ -212,44 +208,46 @@ def _met(mind: Mind) -> Mind:
 
 
 def _considered(mind: Mind) -> Mind:
-    """Both logs in hand: solve eq. (7), weigh, and claim, plan the last manoeuvre, or wait."""
-    sightings = _sightings(mind)
+    """Both logs in hand: weigh the placements; then claim, plan the last manoeuvre, or wait."""
+    sightings = mind.sightings()
     base = encounter.base(sightings)
     if base is None:
         return mind
-    mission, findings = mind.briefing.mission, mind.findings
-    if findings.solutions is None:
-        solutions = encounter.solve(_anchor_distance(mind.briefing), *base)
-        left = weigh_placements(
-            solutions, sightings[: base[1].tick - sightings[0].tick + 1], mission.sensing_range
-        )
-        findings = replace(findings, placements=left, solutions=(len(solutions), len(left)))
-    left = weigh_placements(findings.placements, sightings, mission.sensing_range)
-    checked = encounter.redundant(sightings, *base)
-    mind = replace(mind, findings=replace(findings, placements=left))
-
+    mind = _weighed(mind, sightings, base)
+    left = mind.findings.placements
+    checked = encounter.redundant(sightings, base)
     if not left:
         return _undecided(mind, "no placement explains the mutual ranges")
     if checked and len(left) == 1:
-        pose = _world_pose(mind, left[0])
-        return replace(mind, state=Done(3, Localised(pose)))
+        return replace(mind, state=Done(3, Localised(mind.world_pose(left[0]))))
     if mind.briefing.role == "a":
         told = mind.radio.verdict
-        return _undecided(mind, told.reason) if isinstance(told, Undecided) else mind
-    if mind.briefing.variant == "paper" and findings.plan is not None:
-        missed = (
-            "the last manoeuvre left the mutual range"
-            if not checked
-            else "the third mutual range fits more than one placement"
-        )
-        return _undecided(mind, missed)
-    place = compose(_start(mind), mind.odometry)
-    plan = encounter.last_manoeuvre(place, sightings[-1].a, left, mission, mind.briefing.variant)
+        if isinstance(told, Undecided):
+            return _undecided(mind, f"{mind.briefing.peer} says: {told.reason}")
+        return mind
+    if mind.briefing.variant == "paper" and mind.findings.plan is not None:
+        failure = "fits more than one placement" if checked else "could not be taken: b left a's range"
+        return _undecided(mind, f"the third mutual range {failure}")
+    plan = encounter.last_manoeuvre(
+        mind.local_pose, sightings[-1].a, left, mind.briefing.mission, mind.briefing.variant
+    )
     return replace(
         mind,
         state=LastManoeuvre(plan.drive, mind.odometry),
         findings=replace(mind.findings, plan=plan),
     )
+
+
+def _weighed(mind: Mind, sightings: Sequence[Sighting], base: tuple[Sighting, Sighting]) -> Mind:
+    """The placements of eq. (7) that every range and every silent tick of the encounter leave."""
+    reach, findings = mind.briefing.mission.sensing_range, mind.findings
+    if findings.solutions is None:
+        solutions = encounter.solve(mind.briefing.anchor_distance, base)
+        silence = [sighting for sighting in sightings if sighting.range is None]
+        left = weigh_placements(solutions, silence, reach)
+        findings = replace(findings, placements=left, solutions=(len(solutions), len(left)))
+    left = weigh_placements(findings.placements, sightings, reach)
+    return replace(mind, findings=replace(findings, placements=left))
 
 
 def _undecided(mind: Mind, reason: str) -> Mind:
@@ -265,7 +263,7 @@ def _controls(mind: Mind) -> Controls:
             return Controls(mind.orbit.v, mind.orbit.omega)
         case Aligning() | Radial() | Tangent():
             return rendezvous.controls(
-                mind.state, mind.odometry, _start(mind), mind.orbit, mind.briefing.mission
+                mind.state, mind.odometry, mind.start, mind.orbit, mind.briefing.mission
             )
         case Straight() | Turning() | Circling():
             return seeking.controls(mind.state, mind.odometry, mind.briefing.mission)
@@ -273,51 +271,3 @@ def _controls(mind: Mind) -> Controls:
             return controls
         case _:
             return REST
-
-
-def _start(mind: Mind) -> Pose:
-    """Where tick 0 lies in the frame of the anchor; known from phase 2 on."""
-    assert mind.findings.branch is not None
-    return mind.findings.branch.start
-
-
-def _seen(mind: Mind) -> list[tuple[Pose, float | None]]:
-    """Every tick so far: the odometry, and the anchor's range or its silence."""
-    ranges = {ranged.tick: ranged.range for ranged in mind.log.ranges}
-    track = mind.log.track(ORIGIN, 0, mind.tick, mind.briefing.mission.period)
-    return [(pose, ranges.get(tick)) for tick, pose in enumerate(track)]
-
-
-def _sightings(mind: Mind) -> list[Sighting]:
-    """Every tick of the encounter that both logs cover."""
-    met, peer = mind.findings.met, mind.radio
-    last = min(mind.tick, peer.peer.through)
-    if met is None or peer.start is None or last < met:
-        return []
-    period = mind.briefing.mission.period
-    ranges = {ranged.tick: ranged.range for ranged in mind.mutual}
-    mine = mind.log.track(_start(mind), met, last, period)
-    theirs = peer.peer.track(peer.start, met, last, period)
-    a, b = (mine, theirs) if mind.briefing.role == "a" else (theirs, mine)
-    return [Sighting(tick, a[tick - met], b[tick - met], ranges.get(tick)) for tick in range(met, last + 1)]
-
-
-def _anchor_distance(briefing: Briefing) -> float:
-    """D in m."""
-    return math.hypot(briefing.anchor.x - briefing.peer_anchor.x, briefing.anchor.y - briefing.peer_anchor.y)
-
-
-def _world_pose(mind: Mind, placement: Placement) -> Pose:
-    briefing = mind.briefing
-    m1, m2 = (
-        (briefing.anchor, briefing.peer_anchor)
-        if briefing.role == "a"
-        else (briefing.peer_anchor, briefing.anchor)
-    )
-    return encounter.world_pose(
-        briefing.role,
-        placement,
-        math.atan2(m1.y - m2.y, m1.x - m2.x),
-        Pose(briefing.anchor.x, briefing.anchor.y, 0.0),
-        compose(_start(mind), mind.odometry),
-    )

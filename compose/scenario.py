@@ -21,6 +21,13 @@ from world.scenario import Placed, Scenario
 NAME = r"^[A-Za-z0-9_-]{1,48}$"
 
 
+MAX_TICKS = 10**9
+NEAREST_ANCHORS = 1e-3
+"""m: that is one anchor, not two"""
+WITHIN = 1.0 - 1e-9
+"""of R: how far out a start is drawn at the most, so that rounding does not carry it outside"""
+
+
 class BadScenario(ValueError):
     """The user's scenario cannot be played; the text names the file, the field and what is wrong."""
 
@@ -53,7 +60,7 @@ class ScenarioFile(_Table, frozen=True):
     mission: Mission
     robot: Annotated[list[RobotTable], Meta(min_length=2)]
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
-    max_ticks: Annotated[int, Meta(ge=1, le=10**9)] | None = None
+    max_ticks: Annotated[int, Meta(ge=1, le=MAX_TICKS)] | None = None
     planner: PlannerTable = PlannerTable()
 
 
@@ -110,34 +117,43 @@ def _field_first(error: str) -> str:
 def _validated(file: ScenarioFile, source: str) -> Scenario:
     peers = _peers(file.robot, source)
     place = {robot.id: i for i, robot in enumerate(file.robot)}
+    placed: list[Placed] = []
     plans: dict[str, Rendezvous] = {}
-    placed = []
-    for robot in file.robot:
+    for i, robot in enumerate(file.robot):
         peer = peers[robot.id]
-        first, second = sorted((robot.id, peer), key=place.__getitem__)
-        if first not in plans:
-            distance = math.dist(file.robot[place[first]].anchor, file.robot[place[second]].anchor)
-            if distance == 0.0:
-                raise BadScenario(f"{source}: robot[{place[second]}].anchor: '{first}' has the same")
-            plans[first] = rendezvous(file.mission, distance, file.planner.variant)
-        role: Role = "a" if robot.id == first else "b"
+        role: Role = "a" if i < place[peer] else "b"
+        if role == "a":
+            plans[robot.id] = plans[peer] = _plan(file, i, place[peer], source)
         start = _start(robot, file.mission.sensing_range, file.seed)
-        if math.hypot(start.x - robot.anchor[0], start.y - robot.anchor[1]) > file.mission.sensing_range:
+        rho0 = math.dist((start.x, start.y), robot.anchor)
+        if rho0 > file.mission.sensing_range:
             raise BadScenario(
-                f"{source}: robot[{place[robot.id]}].start: '{robot.id}' is "
-                f"{math.hypot(start.x - robot.anchor[0], start.y - robot.anchor[1]):.6g} m from its anchor, "
-                f"outside mission.sensing_range = {file.mission.sensing_range:g} m"
+                f"{source}: robot[{i}].start: '{robot.id}' is {rho0:.9g} m from its anchor, "
+                f"outside mission.sensing_range = {file.mission.sensing_range:.9g} m"
             )
-        placed.append(Placed(robot.id, peer, role, Anchor(*robot.anchor), start, plans[first]))
+        placed.append(Placed(robot.id, peer, role, Anchor(*robot.anchor), start, plans[robot.id]))
     budget = max(tick_budget(file.mission, plan) for plan in plans.values())
+    if file.max_ticks is None and budget > MAX_TICKS:
+        raise BadScenario(f"{source}: mission: to meet could take {budget} ticks, more than {MAX_TICKS}")
     return Scenario(
         name=file.name,
         seed=file.seed,
-        max_ticks=min(file.max_ticks if file.max_ticks is not None else budget, 10**9),
+        max_ticks=file.max_ticks if file.max_ticks is not None else budget,
         mission=file.mission,
         variant=file.planner.variant,
         robots=tuple(placed),
     )
+
+
+def _plan(file: ScenarioFile, first: int, second: int, source: str) -> Rendezvous:
+    """How the two are to meet."""
+    distance = math.dist(file.robot[first].anchor, file.robot[second].anchor)
+    if distance < NEAREST_ANCHORS:
+        raise BadScenario(
+            f"{source}: robot[{second}].anchor: less than {NEAREST_ANCHORS:g} m from that of its peer "
+            f"'{file.robot[first].id}'"
+        )
+    return rendezvous(file.mission, distance, file.planner.variant)
 
 
 def _peers(robots: list[RobotTable], source: str) -> dict[str, str]:
@@ -169,7 +185,7 @@ def _start(robot: RobotTable, sensing_range: float, seed: int) -> Pose:
     if robot.start is not None:
         return Pose(*robot.start)
     draw = random.Random(f"{seed}/start/{robot.id}").random
-    radius = sensing_range * math.sqrt(draw())
+    radius = WITHIN * sensing_range * math.sqrt(draw())
     bearing, heading = TAU * draw(), TAU * draw()
     return Pose(
         robot.anchor[0] + radius * math.cos(bearing), robot.anchor[1] + radius * math.sin(bearing), heading

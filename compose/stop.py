@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM, as something that arrives like everything else."""
+"""Ctrl-C, SIGTERM and a closed terminal, as something that arrives like everything else."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def stops_into(inbox: Inbox) -> Iterator[None]:
     def hand_over(number: int, _frame: object) -> None:
         inbox.put("stop", signal.Signals(number).name)
 
-    signals = (signal.SIGINT, signal.SIGTERM)
+    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     before = [signal.signal(number, hand_over) for number in signals]
     try:
         yield

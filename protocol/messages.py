@@ -6,6 +6,7 @@ so a frame explains itself wherever it is found.
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 import msgspec
@@ -86,6 +87,11 @@ class Briefing(Message, frozen=True):
     rendezvous: Rendezvous
     answer_within: Annotated[float, Meta(ge=0.0, le=1e6)] | None
     """s of wall time from Sense to Drive; none in lockstep, where no decision depends on a time-out"""
+
+    @property
+    def anchor_distance(self) -> float:
+        """D in m."""
+        return math.hypot(self.anchor.x - self.peer_anchor.x, self.anchor.y - self.peer_anchor.y)
 
 
 class Sense(Message, frozen=True):

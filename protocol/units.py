@@ -1,24 +1,24 @@
 """Quantities with their unit and bounds, as types: whoever decodes them need not check them again.
 
 Every float is bounded on both sides, since that is what refuses NaN and infinity. The bounds are far
-beyond any robot, and near enough that no sum or square of them overflows.
+beyond any robot, and near enough that no sum, square or quotient of them overflows or vanishes.
 """
 
 from typing import Annotated
 
 from msgspec import Meta
 
-Length = Annotated[float, Meta(gt=0.0, le=1e6)]
+Length = Annotated[float, Meta(ge=1e-3, le=1e6)]
 """m, positive"""
 Coordinate = Annotated[float, Meta(ge=-1e7, le=1e7)]
 """m"""
 Range = Annotated[float, Meta(ge=0.0, le=1e7)]
 """m, measured"""
-Duration = Annotated[float, Meta(gt=0.0, le=1e6)]
+Duration = Annotated[float, Meta(ge=1e-6, le=1e6)]
 """s, positive"""
-Speed = Annotated[float, Meta(gt=0.0, le=1e6)]
+Speed = Annotated[float, Meta(ge=1e-6, le=1e6)]
 """m/s, positive"""
-TurnRate = Annotated[float, Meta(gt=0.0, le=1e6)]
+TurnRate = Annotated[float, Meta(ge=1e-6, le=1e6)]
 """rad/s, positive"""
 Velocity = Annotated[float, Meta(ge=-1e6, le=1e6)]
 """m/s"""

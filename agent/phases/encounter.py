@@ -12,7 +12,7 @@ import numpy as np
 from agent.belief import Sighting
 from agent.geometry import Placement, placements
 from agent.phases.seeking import travelled
-from protocol.mission import RANGE_MARGIN, Mission, Role, Variant
+from protocol.mission import RANGE_MARGIN, Mission, Variant
 from protocol.motion import Controls, Pose, compose
 
 TURN_RATES = 721
@@ -72,20 +72,21 @@ def base(sightings: Sequence[Sighting]) -> tuple[Sighting, Sighting] | None:
     return None
 
 
-def solve(distance: float, first: Sighting, second: Sighting) -> list[Placement]:
+def solve(distance: float, base: tuple[Sighting, Sighting]) -> list[Placement]:
     """The placements that eq. (7) leaves after two ranges; `distance` is D."""
+    first, second = base
     assert first.range is not None
     assert second.range is not None
     return placements(distance, first.b, first.a, second.a, first.range, second.range)
 
 
-def redundant(sightings: Sequence[Sighting], first: Sighting, second: Sighting) -> bool:
+def redundant(sightings: Sequence[Sighting], base: tuple[Sighting, Sighting]) -> bool:
     """Whether there is a range more, from elsewhere, than the two that the placements were made from."""
     return any(
         sighting.range is not None
         and all(
             travelled(sighting.a, used.a) > ELSEWHERE or travelled(sighting.b, used.b) > ELSEWHERE
-            for used in (first, second)
+            for used in base
         )
         for sighting in sightings
     )
@@ -125,13 +126,3 @@ def last_manoeuvre(
     row, column = np.unravel_index(np.argmax(value), value.shape)
     drive = Controls(float(speed[row, 0]), float(omega[column]))
     return Plan(drive, float(abs(told[row, column])))
-
-
-def world_pose(role: Role, placement: Placement, bearing: float, own_anchor: Pose, local: Pose) -> Pose:
-    """A robot's pose in <W>, from its pose in the frame of its own anchor.
-
-    `bearing` (rad) is that of M1 seen from M2 in <W>; `own_anchor` is where the robot's anchor stands.
-    """
-    turn_b = bearing - math.atan2(placement.y, placement.x)
-    turn = turn_b if role == "b" else turn_b + placement.phi
-    return compose(Pose(own_anchor.x, own_anchor.y, turn), local)
