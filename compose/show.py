@@ -20,8 +20,8 @@ from world.scenario import Scenario
 
 
 @contextmanager
-def live(scenario: Scenario, folder: Path, console: Console) -> Iterator[Any]:
-    """Show the run whose record grows in `folder`; yields what to call for it to be shown anew."""
+def live(scenario: Scenario, folder: Path) -> Iterator[None]:
+    """Show the run whose record grows in `folder`, ten times a second."""
     journal = Tail(folder / WORLD_JOURNAL)
     drives: dict[str, Drive] = {}
 
@@ -47,13 +47,11 @@ def live(scenario: Scenario, folder: Path, console: Console) -> Iterator[Any]:
                 rows.add_row(robot, str(drive.phase), drive.state, f"{drive.v:.3f}", f"{drive.omega:.3f}")
         return rows
 
-    with Live(
-        get_renderable=table, console=console, auto_refresh=True, transient=True, refresh_per_second=10
-    ):
+    with Live(get_renderable=table, auto_refresh=True, transient=True, refresh_per_second=10):
         yield
 
 
-def result(summary: Mapping[str, Any], console: Console) -> None:
+def result(summary: Mapping[str, Any]) -> None:
     """The table at the end of a run."""
     title = f"{summary['scenario']}: {outcome_line(summary)}"
     rows = Table(title=title, title_justify="left", box=SIMPLE, pad_edge=False)
@@ -71,7 +69,7 @@ def result(summary: Mapping[str, Any], console: Console) -> None:
         )
     rows.caption = "m and rad; ranges to the anchor + to the peer; reports sent / heard"
     rows.caption_justify = "left"
-    console.print(rows)
+    Console().print(rows)
 
 
 def _pose(pose: list[float] | None) -> str:

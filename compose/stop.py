@@ -8,9 +8,6 @@ from contextlib import contextmanager
 
 from protocol.inbox import Inbox
 
-STATUS = 130
-"""the exit status of a process that was told to stop"""
-
 
 @contextmanager
 def stops_into(inbox: Inbox) -> Iterator[None]:

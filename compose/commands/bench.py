@@ -6,6 +6,7 @@ A B A B, and the medians are compared.
 
 from __future__ import annotations
 
+import argparse
 import subprocess
 import sys
 import tempfile
@@ -20,6 +21,7 @@ from rich.progress import Progress, TimeElapsedColumn
 from rich.table import Table
 
 from compose import barrier, inline, local, record, scenario
+from compose.status import LOCALISED
 from protocol import session
 from protocol.inbox import Inbox
 from protocol.journal import Journal
@@ -37,8 +39,9 @@ SEED = 1000
 BARE_IMPORTS = "import zenoh, numpy, scipy.optimize, msgspec"
 
 
-def main(rounds: int) -> int:
-    """Measure, print; 0."""
+def main(options: argparse.Namespace) -> int:
+    """Measure and print."""
+    rounds = options.rounds
     console = Console()
     with Progress(*Progress.get_default_columns(), TimeElapsedColumn(), console=console) as progress:
         task = progress.add_task("tandem bench", total=3 * rounds)
@@ -49,7 +52,7 @@ def main(rounds: int) -> int:
         tables = [_ticks(rounds, done), _missions(rounds, done), _start(rounds, done)]
     for table in tables:
         console.print(table)
-    return 0
+    return LOCALISED
 
 
 # --- ticks/s over Zenoh -----------------------------------------------------------------------------

@@ -1,0 +1,1 @@
+"""The commands of `tandem`, a module each, so that none imports what another uses."""

@@ -1,0 +1,51 @@
+"""`tandem agent`: one robot of a mission whose world is somewhere else."""
+
+from __future__ import annotations
+
+import argparse
+
+from agent.process import AgentProcess, NoWorld, Search, Unwelcome, join
+from compose.keeping import cannot_write
+from compose.record import ended
+from compose.status import FAILED, LOCALISED, NOT_LOCALISED, STOPPED, UserError
+from compose.stop import stops_into
+from protocol import session
+from protocol.inbox import Inbox, Interrupted
+from protocol.journal import RecordExists
+from protocol.messages import End
+
+
+def main(options: argparse.Namespace) -> int:
+    """Play one robot's part."""
+    inbox = Inbox(f"tandem agent {options.id}")
+    with stops_into(inbox):
+        try:
+            end = _play(options, inbox)
+        except session.BadEndpoint as error:
+            raise UserError(f"--connect: {error}") from None
+        except RecordExists as error:
+            raise UserError(f"--out: {error}") from None
+        except Unwelcome as error:
+            raise UserError(str(error)) from None
+        except NoWorld as error:
+            inbox.say(str(error))
+            return FAILED
+        except Interrupted as signal_name:
+            inbox.say(f"stopped by {signal_name}")
+            return STOPPED
+        except OSError as error:
+            raise UserError(cannot_write(options.out, error)) from None
+    print(f"{options.id}: {ended(end.outcome, end.tick, end.reason)}")
+    return LOCALISED if end.outcome == "localised" else NOT_LOCALISED
+
+
+def _play(options: argparse.Namespace, inbox: Inbox) -> End:
+    search = Search(f"world at {options.connect}", options.wait, inbox)
+    with session.open_client(options.connect, search.go_on) as link:
+        run, briefing = join(link, options.run, options.id, search)
+        process = AgentProcess(
+            briefing, link, run, inbox, out=options.out, fsync=options.fsync, patience=options.patience
+        )
+        if not options.quiet:
+            print(f"{options.id}: in run {run}, with {briefing.peer}", flush=True)
+        return process.play()
