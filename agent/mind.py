@@ -59,7 +59,7 @@ class Findings(msgspec.Struct, frozen=True):
 
     branch: Branch | None = None
     """the one that is left after phase 1"""
-    branch_by: messages.Branch | None = None
+    branch_kind: messages.BranchKind | None = None
     met: int | None = None
     """the tick in which phase 3 began"""
     placements: tuple[Placement, ...] = ()

@@ -162,17 +162,17 @@ def _second_range(mind: Mind) -> Mind:
     left = weigh_branches(possible, mind.seen(), mind.briefing.mission.sensing_range)
     if isinstance(mind.state, Circling) and len(left) == 1:
         return _located(mind, left[0], "circle")
-    return _to_third_point(mind, left, again=False)
+    return _to_third_point(mind, left)
 
 
-def _to_third_point(mind: Mind, left: tuple[Branch, ...], *, again: bool) -> Mind:
+def _to_third_point(mind: Mind, left: tuple[Branch, ...]) -> Mind:
     if not left:
         return _undecided(mind, "no pose explains the anchor ranges")
     mission, variant = mind.briefing.mission, mind.briefing.variant
     controls = anchor.third_point(anchor.local(left, mind.odometry), mission, variant)
     if controls is None:
         return _undecided(mind, "eq. (5) leaves no way to a third range")
-    return replace(mind, state=ThirdPoint(left, mind.odometry, controls, again))
+    return replace(mind, state=ThirdPoint(left, mind.odometry, controls))
 
 
 def _third_range(mind: Mind, state: ThirdPoint) -> Mind:
@@ -183,12 +183,12 @@ def _third_range(mind: Mind, state: ThirdPoint) -> Mind:
         return _located(mind, left[0], "three-ranges" if measured else "three-ranges-virtual")
     if len(left) > 1 and mind.briefing.variant == "paper":
         return _undecided(mind, "the third range does not tell +alpha from -alpha")
-    return _to_third_point(mind, left, again=True)
+    return _to_third_point(mind, left)
 
 
-def _located(mind: Mind, branch: Branch, by: messages.Branch) -> Mind:
+def _located(mind: Mind, branch: Branch, kind: messages.BranchKind) -> Mind:
     """Phase 1 is done: its pose relative to the anchor is known."""
-    mind = replace(mind, findings=replace(mind.findings, branch=branch, branch_by=by))
+    mind = replace(mind, findings=replace(mind.findings, branch=branch, branch_kind=kind))
     mu = rendezvous.orientation(mind.local_pose)
     return _on_to_orbit(mind, Aligning(mind.odometry.heading - mu))
 

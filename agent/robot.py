@@ -89,7 +89,7 @@ class Robot:
             robot=mind.briefing.robot,
             anchor_ranges=len(mind.log.ranges),
             mutual_ranges=len(mind.mutual),
-            branch=findings.branch_by,
+            branch=findings.branch_kind,
             alpha=findings.branch.alpha if findings.branch is not None else None,
             placements=findings.solutions,
             last_turn_rate=plan.drive.omega if plan is not None else None,

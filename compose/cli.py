@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from compose.status import NOT_LOCALISED, USER_ERROR, UserError
+from protocol.keys import NAME
 
 
 class _Parser(argparse.ArgumentParser):
@@ -111,6 +112,6 @@ def _count(text: str) -> int:
 
 
 def _name(text: str) -> str:
-    if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", text):
+    if not NAME.fullmatch(text):
         raise argparse.ArgumentTypeError(f"'{text}' is no name: letters, digits, - and _, 64 at most")
     return text

@@ -6,7 +6,7 @@ import re
 
 ROOT = "tandem"
 NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
-"""what a run may be called"""
+"""what a run, or a robot, may be called"""
 
 
 def truth(run: str) -> str:

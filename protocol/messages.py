@@ -27,7 +27,7 @@ from protocol.units import (
 Outcome = Literal["localised", "undecided", "alarm", "wrong", "failed"]
 """How a run ended; only the first is a success."""
 
-Branch = Literal["three-ranges", "three-ranges-virtual", "circle", "on-anchor"]
+BranchKind = Literal["three-ranges", "three-ranges-virtual", "circle", "on-anchor"]
 """How phase 1 told +alpha from -alpha."""
 
 Text = Annotated[str, Meta(max_length=300)]
@@ -178,7 +178,7 @@ class Farewell(Message, frozen=True):
     robot: RobotId
     anchor_ranges: Count
     mutual_ranges: Count
-    branch: Branch | None
+    branch: BranchKind | None
     alpha: Angle | None
     """of eq. (2), signed"""
     placements: tuple[Count, Count] | None

@@ -7,7 +7,7 @@ from typing import Literal
 
 import msgspec
 
-from protocol.motion import TAU, chord
+from protocol.motion import TAU
 from protocol.units import AngularVelocity, Coordinate, Duration, Length, Range, Speed, TurnRate, Velocity
 
 Variant = Literal["assured", "paper"]
@@ -118,8 +118,3 @@ def tick_budget(mission: Mission, plan: Rendezvous) -> int:
 def third_point_turn_rate(mission: Mission) -> float:
     """omega_1 in rad/s: the best of eq. (4) within omega_max."""
     return min(OPTIMAL_TURN / mission.period, mission.max_turn_rate)
-
-
-def full_chord(mission: Mission, omega: float) -> float:
-    """m: the chord of one tick at v_max and `omega`."""
-    return chord(mission.max_speed, omega, mission.period)

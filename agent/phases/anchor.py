@@ -19,8 +19,6 @@ class ThirdPoint(msgspec.Struct, frozen=True):
     branches: tuple[Branch, ...]
     origin: Pose
     drive: Controls
-    again: bool = False
-    """whether it has done so before"""
 
 
 def third_point(places: Sequence[Pose], mission: Mission, variant: Variant) -> Controls | None:
