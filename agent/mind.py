@@ -97,10 +97,10 @@ class Mind(msgspec.Struct, frozen=True):
     def phase(self) -> int:
         """The paper's: 1, 2 or 3."""
         match self.state:
+            case Orbiting() | Aligning() | Radial() | Tangent():
+                return 2
             case Asleep() | ThirdPoint() | Straight("anchor") | Turning("anchor") | Circling("anchor"):
                 return 1
-            case Aligning() | Radial() | Tangent() | Orbiting():
-                return 2
             case Done(phase, _):
                 return phase
             case _:

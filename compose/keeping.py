@@ -8,7 +8,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from compose import record
@@ -61,6 +61,16 @@ def progress(options: argparse.Namespace, scenario: Scenario, folder: Path) -> I
 
     with show.live(scenario, folder):
         yield
+
+
+def break_off(options: argparse.Namespace, folder: Path, reason: str, began: float) -> None:
+    """Leave the views of a record that has no end, if it is to stay; as far as there is a record."""
+    if options.out is None:
+        return
+    with suppress(OSError, ValueError):
+        played = record.read(folder)
+        summary = record.summary(played, "processes", round(time.perf_counter() - began, 6))
+        record.leave(played, summary | {"reason": reason}, folder)
 
 
 def conclude(

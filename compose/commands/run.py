@@ -6,7 +6,7 @@ import argparse
 import time
 
 from compose import local
-from compose.keeping import conclude, named, progress, record_folder, validated
+from compose.keeping import break_off, conclude, named, progress, record_folder, validated
 from compose.record import read
 from compose.status import FAILED, STOPPED, UserError
 from compose.stop import stops_into
@@ -48,8 +48,10 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario) -> int:
                 local.play(scenario, arguments, folder, inbox, run=run, patience=options.patience)
         except local.ChildFailed as failure:
             inbox.say(f"failed: {failure}")
+            break_off(options, folder, str(failure), began)
             return FAILED
         except Interrupted as signal_name:
             inbox.say(f"stopped by {signal_name}")
+            break_off(options, folder, f"stopped by {signal_name}", began)
             return STOPPED
         return conclude(options, read(folder), folder, "processes", began)
