@@ -90,7 +90,7 @@ def _polished(branch: Branch, ranged: Sequence[tuple[Pose, float]]) -> Branch:
         if abs(correction) < 1e-12:
             break
     turned = heading - branch.start.heading
-    return Branch(branch.alpha + turned, Pose(rho0, 0.0, heading))
+    return Branch(wrap(branch.alpha + turned), Pose(rho0, 0.0, heading))
 
 
 class Sighting(msgspec.Struct, frozen=True):

@@ -51,7 +51,6 @@ WORDS: dict[type, str] = {
     LastManoeuvre: "last-manoeuvre",
     Returning: "returning",
 }
-MET = ("orbiting", "straight", "turning", "circling", "standing", "waiting", "last-manoeuvre", "returning")
 
 
 class Findings(msgspec.Struct, frozen=True):

@@ -17,7 +17,7 @@ from msgspec.structs import replace
 
 from agent import radio
 from agent.belief import Branch, Sighting, branches, weigh_branches, weigh_placements
-from agent.mind import MET, Asleep, Done, Mind
+from agent.mind import Asleep, Done, Mind
 from agent.phases import anchor, encounter, rendezvous, seeking
 from agent.phases.anchor import ThirdPoint
 from agent.phases.encounter import LastManoeuvre, Returning, Standing, Waiting
@@ -54,6 +54,7 @@ def report(mind: Mind) -> Report:
     return Report(
         tick=mind.tick,
         robot=mind.briefing.robot,
+        phase=mind.phase,
         state=mind.doing,
         start=mind.findings.branch.start if mind.findings.branch else None,
         since=since,
@@ -75,7 +76,7 @@ def decide(mind: Mind, reports: Sequence[Report] = ()) -> Mind:
     if not mind.in_contact:
         return mind
     match mind.state:
-        case Orbiting() if mind.radio.state in MET and mind.radio.start is not None:
+        case Orbiting() if mind.radio.phase == 3 or mind.radio.state == mind.doing:
             return _met(mind)
         case Standing() | Waiting():
             return _considered(mind)

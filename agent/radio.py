@@ -15,8 +15,9 @@ class Radio(msgspec.Struct, frozen=True):
     peer: Logbook = Logbook()
     start: Pose | None = None
     """where tick 0 of the peer's odometry lies in the frame of the peer's anchor"""
-    state: str | None = None
-    """what the peer was doing when last heard"""
+    phase: int = 1
+    state: str = ""
+    """where in the mission the peer was when last heard, and what it did"""
     verdict: Verdict | None = None
     """the peer's"""
     latest: int = -1
@@ -29,6 +30,8 @@ class Radio(msgspec.Struct, frozen=True):
 
 def contradiction(report: Report) -> str | None:
     """What in `report` no well-formed log could say, or None."""
+    if report.heard > report.tick:
+        return f"tick {report.heard} acknowledged at tick {report.tick}"
     if report.through > report.tick or report.since > report.through:
         return f"a log over [{report.since}, {report.through}] told at tick {report.tick}"
     if sum(run.ticks for run in report.runs) != report.through - report.since:
@@ -49,6 +52,7 @@ def hear(radio: Radio, report: Report) -> Radio:
     return Radio(
         peer=radio.peer.extended(report.since, Logbook(report.through, report.runs, report.ranges)),
         start=radio.start or report.start,
+        phase=report.phase if newer else radio.phase,
         state=report.state if newer else radio.state,
         verdict=report.verdict if newer else radio.verdict,
         latest=max(report.tick, radio.latest),

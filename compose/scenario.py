@@ -18,7 +18,7 @@ from protocol.motion import TAU, Pose
 from protocol.units import Coordinate, RobotId
 from world.scenario import Placed, Scenario
 
-NAME = r"^[A-Za-z0-9_-]{1,48}$"
+NAME = r"^[A-Za-z0-9_-]{1,48}\Z"
 
 
 MAX_TICKS = 10**9

@@ -18,6 +18,8 @@ import msgpack
 from protocol.wire import MAX_FRAME_BYTES
 
 _packer = msgpack.Packer()
+_LONGEST = b"\xc6" + MAX_FRAME_BYTES.to_bytes(4, "big")
+"""how the longest frame begins"""
 
 
 class RecordExists(FileExistsError):
@@ -77,7 +79,6 @@ class Tail:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._read = 0
-        self._unpacker = msgpack.Unpacker(raw=True, max_buffer_size=0)
 
     def news(self) -> list[bytes]:
         """The frames that have come since the last time; what is torn waits for the rest.
@@ -86,17 +87,21 @@ class Tail:
         """
         with self.path.open("rb") as file:
             file.seek(self._read)
-            bytes_read = file.read()
-        self._read += len(bytes_read)
-        self._unpacker.feed(bytes_read)
-        frames = []
+            data = file.read()
+        unpacker = msgpack.Unpacker(max_buffer_size=0)
+        unpacker.feed(data)
+        frames: list[bytes] = []
+        whole = 0
         try:
-            for frame in self._unpacker:
+            for frame in unpacker:
                 if not isinstance(frame, bytes) or len(frame) > MAX_FRAME_BYTES:
-                    raise CorruptJournal(f"{self.path}: no frame before byte {self._unpacker.tell()}")
+                    raise ValueError("no frame")  # noqa: TRY004  # it is the file that is wrong
                 frames.append(frame)
+                whole = unpacker.tell()
+            torn = data[whole : whole + len(_LONGEST)]
+            if torn.startswith(_LONGEST[:1]) and torn > _LONGEST:
+                raise ValueError("a frame of impossible length")
         except (ValueError, msgpack.UnpackException) as error:
-            if isinstance(error, CorruptJournal):
-                raise
-            raise CorruptJournal(f"{self.path}: damaged at byte {self._unpacker.tell()}: {error}") from None
+            raise CorruptJournal(f"{self.path}: damaged at byte {self._read + whole}: {error}") from None
+        self._read += whole
         return frames

@@ -31,10 +31,11 @@ BranchKind = Literal["three-ranges", "three-ranges-virtual", "circle", "on-ancho
 """How phase 1 told +alpha from -alpha."""
 
 Text = Annotated[str, Meta(max_length=300)]
+Phase = Annotated[int, Meta(ge=1, le=3)]
 Word = Annotated[str, Meta(max_length=32)]
 
-MAX_REPORT_RUNS = 100
-MAX_REPORT_RANGES = 120
+MAX_REPORT_RUNS = 70
+MAX_REPORT_RANGES = 70
 """so many at the most that a report's frame stays within `wire.MAX_REPORT_BYTES`"""
 
 
@@ -111,6 +112,7 @@ class Report(Message, frozen=True):
     tick: Tick
     robot: RobotId
     """who says it"""
+    phase: Phase
     state: Word
     start: Pose | None
     """where tick 0 of its odometry lies in the frame of its own anchor; none before phase 1 is done"""
@@ -132,7 +134,7 @@ class Drive(Message, frozen=True):
     robot: RobotId
     v: Velocity
     omega: AngularVelocity
-    phase: Annotated[int, Meta(ge=1, le=3)]
+    phase: Phase
     state: Word
     verdict: Verdict | None = None
 

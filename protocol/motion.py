@@ -48,13 +48,14 @@ REST = Controls(0.0, 0.0)
 
 def chord(v: float, omega: float, period: float) -> float:
     """A_k of eq. (1a): the straight distance in m, signed like `v`, between the ends of one manoeuvre."""
-    return v * period if omega == 0.0 else 2.0 * v / omega * math.sin(0.5 * period * omega)
+    half = 0.5 * period * omega
+    return v * period if half == 0.0 else v * period * (math.sin(half) / half)
 
 
 def step(pose: Pose, v: float, omega: float, period: float) -> Pose:
     """The pose after driving (v, omega) for `period` seconds (eq. (1a), exact for any period)."""
     half = 0.5 * period * omega
-    length = v * period if omega == 0.0 else 2.0 * v / omega * math.sin(half)
+    length = chord(v, omega, period)
     course = pose.heading + half
     return Pose(
         pose.x + length * math.cos(course), pose.y + length * math.sin(course), pose.heading + period * omega

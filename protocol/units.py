@@ -29,5 +29,5 @@ Angle = Annotated[float, Meta(ge=-1e9, le=1e9)]
 Tick = Annotated[int, Meta(ge=0, le=2**31)]
 TickCount = Annotated[int, Meta(ge=1, le=2**31)]
 Count = Annotated[int, Meta(ge=0, le=2**53)]
-RobotId = Annotated[str, Meta(pattern="^[A-Za-z0-9_-]{1,32}$")]
+RobotId = Annotated[str, Meta(pattern="^[A-Za-z0-9_-]{1,32}\\Z")]
 """one chunk of a key expression, and part of a file's name"""

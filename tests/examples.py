@@ -1,0 +1,52 @@
+"""One of each message, with nothing left out that it may hold."""
+
+from __future__ import annotations
+
+from compose.scenario import load
+from protocol.messages import (
+    Contact,
+    Drive,
+    End,
+    Estimate,
+    Farewell,
+    Localised,
+    Message,
+    Missed,
+    Ranged,
+    Report,
+    Sense,
+    Truth,
+    Undecided,
+)
+from protocol.motion import Controls, Pose, Run
+
+POSE = Pose(1.5, -2.5, 0.75)
+
+EXAMPLES: tuple[Message, ...] = (
+    load("paper-1").briefing("a", answer_within=0.25),
+    Sense(7, "a", Controls(1.0, -0.5), 2.5, (Contact("b", 1.25, (5, 7)), Contact("c", None, ()))),
+    Sense(0, "a", None, None),
+    Report(
+        tick=9,
+        robot="a",
+        phase=2,
+        state="orbiting",
+        start=POSE,
+        since=2,
+        through=9,
+        runs=(Run(4, 1.0, 0.0), Run(3, 0.5, -0.25)),
+        ranges=(Ranged(3, 1.0), Ranged(9, 2.0)),
+        heard=8,
+        verdict=Undecided("no pose explains the anchor ranges"),
+    ),
+    Report(0, "a", 1, "asleep", None, 0, 0, (), (), 0),
+    Drive(3, "b", 0.5, 0.25, 3, "localised", Localised(POSE)),
+    Drive(4, "b", 0.0, 0.0, 1, "straight"),
+    Estimate(5, "a", (POSE,), (POSE, Pose(0.5, 0.5, 0.5)), localised=True),
+    Truth(6, {"a": POSE, "b": Pose(0.5, 0.5, 0.5)}),
+    Missed(8, "b"),
+    End(48, "wrong", "a claims a pose that is 1 m off"),
+    End(48, "localised", None),
+    Farewell("b", 5, 3, "circle", -2.5, (4, 2), 0.5, 1.5, 3, 4, 1, 600),
+    Farewell("b", 0, 0, None, None, None, None, None, 0, 0, 0, 0),
+)

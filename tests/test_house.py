@@ -1,0 +1,252 @@
+"""The house stands: arrows point down, the heart is pure, and nobody carries what they do not use."""
+
+from __future__ import annotations
+
+import ast
+import copy
+import subprocess
+import sys
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from agent import planner
+from agent.mind import Mind
+from compose.scenario import load
+from protocol.wire import encode
+from tests.steps import steps
+from world.tick import advance, release, senses
+
+HOUSE = Path(__file__).parents[1]
+BELOW = {
+    "protocol": {"protocol"},
+    "agent": {"agent", "protocol"},
+    "world": {"world", "protocol"},
+    "compose": {"compose", "agent", "world", "protocol"},
+}
+"""what each room may import of the house"""
+
+SHELL = {"protocol.session", "protocol.journal", "protocol.inbox"}
+"""the rooms' windows: files, networks, clocks"""
+
+PURE = {
+    "agent.planner",
+    "agent.mind",
+    "agent.belief",
+    "agent.geometry",
+    "agent.logbook",
+    "agent.radio",
+    *(
+        ".".join(path.relative_to(HOUSE).with_suffix("").parts)
+        for path in sorted((HOUSE / "agent" / "phases").glob("*.py"))
+    ),
+    "world.tick",
+    "world.truth",
+    "world.sensors",
+    "world.channel",
+    "world.referee",
+    "world.scenario",
+    "protocol.messages",
+    "protocol.mission",
+    "protocol.motion",
+    "protocol.units",
+}
+ALLOWED = {"__future__", "math", "itertools", "collections.abc", "typing", "msgspec", "numpy", "re"}
+IMPURE = {
+    "open", "print", "input", "eval", "exec", "compile", "globals", "setattr", "delattr", "breakpoint",
+    "__import__", "importlib", "os", "sys", "time", "datetime", "random", "secrets", "uuid", "threading",
+}  # fmt: skip
+
+
+def modules(room: str) -> list[str]:
+    return [
+        ".".join(path.relative_to(HOUSE).with_suffix("").parts).removesuffix(".__init__")
+        for path in sorted((HOUSE / room).rglob("*.py"))
+    ]
+
+
+@cache
+def tree(module: str) -> ast.Module:
+    path = HOUSE.joinpath(*module.split("."))
+    file = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+    return ast.parse(file.read_text(encoding="utf-8"))
+
+
+def imports(source: ast.Module) -> Iterator[str]:
+    """Every module that is imported, wherever in `source` that is done."""
+    for node in ast.walk(source):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "the house has no relative imports"
+            assert node.module is not None
+            for alias in node.names:
+                whole = f"{node.module}.{alias.name}"
+                yield whole if _is_module(whole) else node.module
+
+
+def _is_module(name: str) -> bool:
+    path = HOUSE.joinpath(*name.split("."))
+    return path.is_dir() or path.with_suffix(".py").exists()
+
+
+def room(module: str) -> str:
+    return module.partition(".")[0]
+
+
+# --- arrows point down --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("module", [module for room in BELOW for module in modules(room)])
+def test_a_room_imports_only_what_is_below_it(module: str) -> None:
+    of_the_house = {imported for imported in imports(tree(module)) if room(imported) in {*BELOW, "tests"}}
+    assert {imported for imported in of_the_house if room(imported) not in BELOW[room(module)]} == set()
+
+
+@pytest.mark.parametrize(
+    "module", [module for room in ("protocol", "agent", "world") for module in modules(room)]
+)
+def test_no_module_hides_an_import(module: str) -> None:
+    hidden = {"__import__", "import_module", "exec", "eval"}
+    assert not {node.id for node in ast.walk(tree(module)) if isinstance(node, ast.Name)} & hidden
+    assert not {node.attr for node in ast.walk(tree(module)) if isinstance(node, ast.Attribute)} & hidden
+
+
+def test_every_module_of_the_house_is_looked_at() -> None:
+    assert {"agent.phases.anchor", "compose.cli", "protocol.wire", "world.process"} <= {
+        module for room in BELOW for module in modules(room)
+    }
+
+
+def test_no_import_escapes_wherever_it_stands() -> None:
+    source = """
+import agent.planner as p
+from world import tick, referee as judge
+from world.tick import World
+if TYPE_CHECKING:
+    from compose.record import Record
+def f():
+    class C:
+        def g(self):
+            from agent import geometry
+            import compose.cli, math
+"""
+    assert sorted(imports(ast.parse(source))) == [
+        "agent.geometry",
+        "agent.planner",
+        "compose.cli",
+        "compose.record",
+        "math",
+        "world.referee",
+        "world.tick",
+        "world.tick",
+    ]
+
+
+# --- the heart is pure --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("module", sorted(PURE))
+def test_a_pure_module_imports_only_what_is_pure(module: str) -> None:
+    assert {name for name in imports(tree(module)) if not _is_pure(name)} == set()
+
+
+def _is_pure(imported: str) -> bool:
+    if room(imported) in BELOW:
+        return imported in PURE or (room(imported) == "protocol" and imported not in SHELL)
+    return imported in ALLOWED or room(imported) == "msgspec"
+
+
+@pytest.mark.parametrize("module", sorted(PURE))
+def test_a_pure_module_names_nothing_that_acts_or_changes_by_itself(module: str) -> None:
+    found = set()
+    for node in ast.walk(tree(module)):
+        match node:
+            case ast.Name(id=name) | ast.Attribute(attr=name) if name in IMPURE:
+                found.add(name)
+            case ast.Global() | ast.Nonlocal():
+                found.add("global")
+    assert found == set()
+
+
+@pytest.mark.parametrize("module", sorted(PURE))
+def test_a_pure_module_keeps_no_variable(module: str) -> None:
+    """Whatever stands at its top is a definition or a constant of a type that cannot change."""
+    for node in tree(module).body:
+        value = node.value if isinstance(node, ast.Assign | ast.AnnAssign) else None
+        if isinstance(value, ast.List | ast.Set | ast.ListComp | ast.SetComp | ast.DictComp):
+            pytest.fail(f"{module}, line {node.lineno}: something that can change")
+        if isinstance(value, ast.Dict):
+            target = node.targets[0] if isinstance(node, ast.Assign) else getattr(node, "target", None)
+            assert isinstance(target, ast.Name)
+            assert target.id.isupper(), f"{module}, line {node.lineno}: a table is a constant"
+
+
+def frozen(value: object) -> bytes:
+    """Every bit of a value, as the wire would carry it; states that are of another type look different."""
+    return repr(value).encode()
+
+
+@pytest.mark.parametrize("name", ["paper-1", "paper-2", "random"])
+def test_the_same_values_give_the_same_step_and_are_left_as_they_were(name: str) -> None:
+    for world, sensed, before, observed, reports, drives in steps(name):
+        for sense in sensed:
+            mind, heard = before[sense.robot], reports[sense.robot]
+            was = frozen((mind, sense))
+            once, again = planner.observe(mind, sense), planner.observe(copy.deepcopy(mind), sense)
+            assert once == again == observed[sense.robot]
+            assert frozen(once) == frozen(again)
+            assert frozen((mind, sense)) == was
+
+            was = frozen((once, heard))
+            decided, anew = planner.decide(once, heard), planner.decide(copy.deepcopy(once), list(heard))
+            assert decided == anew
+            assert frozen(decided) == frozen(anew)
+            assert (
+                encode(planner.drive(decided)) == encode(planner.drive(anew)) == encode(drives[sense.robot])
+            )
+            assert encode(planner.report(decided)) == encode(planner.report(anew))
+            assert encode(planner.estimate(decided)) == encode(planner.estimate(anew))
+            assert frozen((once, heard)) == was
+
+        was = frozen((world, drives))
+        assert senses(world) == sensed
+        assert frozen(advance(world, drives)) == frozen(advance(copy.deepcopy(world), drives))
+        assert frozen((world, drives)) == was
+
+
+def test_a_mind_and_a_world_cannot_be_changed() -> None:
+    scenario = load("paper-1")
+    mind, world = Mind(scenario.briefing("a")), release(scenario)
+    for value in (mind, mind.log, mind.radio, mind.findings, mind.briefing, world, world.truth, scenario):
+        assert isinstance(value, msgspec.Struct)
+        field = value.__struct_fields__[0]
+        with pytest.raises(AttributeError, match="immutable"):
+            setattr(value, field, None)
+
+
+# --- nobody carries what they do not use --------------------------------------------------------------
+
+
+def loaded_by(module: str) -> set[str]:
+    """The top-level packages that a process has loaded once it has imported `module`."""
+    code = f"import sys, {module}; print(*{{name.partition('.')[0] for name in sys.modules}})"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return set(found.stdout.split())
+
+
+@pytest.mark.parametrize(
+    ("module", "absent"),
+    [
+        ("compose.cli", {"zenoh", "numpy", "scipy", "rich"}),
+        ("agent.process", {"world", "compose", "scipy", "rich"}),
+        ("world.process", {"numpy", "scipy", "rich", "agent", "compose"}),
+        ("agent.planner", {"zenoh", "scipy", "rich", "world", "compose"}),
+        ("compose.inline", {"zenoh", "rich"}),
+    ],
+)
+def test_a_process_does_not_import_what_it_does_not_use(module: str, absent: set[str]) -> None:
+    assert loaded_by(module) & absent == set()

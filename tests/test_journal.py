@@ -1,0 +1,154 @@
+"""What was journaled is read back: all of it, up to where a write was torn."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import msgpack
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from compose.inline import play
+from compose.scenario import load
+from protocol import journal
+from protocol.journal import CorruptJournal, Journal, RecordExists, Tail
+from protocol.messages import Drive, End, Farewell
+from protocol.wire import MAX_FRAME_BYTES, decode, encode
+from tests.examples import EXAMPLES
+from world.scenario import Scenario
+
+FRAMES = [encode(message) for message in EXAMPLES]
+
+
+def written(path: Path, frames: list[bytes]) -> bytes:
+    """What a journal of `frames` is on disk."""
+    with Journal(path) as book:
+        for frame in frames:
+            book.write(frame)
+    return path.read_bytes()
+
+
+def test_frames_come_back_in_order(tmp_path: Path) -> None:
+    written(tmp_path / "deep" / "down" / "a.journal", FRAMES)
+    assert list(journal.read(tmp_path / "deep" / "down" / "a.journal")) == FRAMES
+
+
+def test_one_write_of_many_is_the_same_as_many_of_one(tmp_path: Path) -> None:
+    with Journal(tmp_path / "at-once", fsync=True) as book:
+        book.write(*FRAMES)
+    assert (tmp_path / "at-once").read_bytes() == written(tmp_path / "one-by-one", FRAMES)
+
+
+def test_any_msgpack_library_reads_a_journal(tmp_path: Path) -> None:
+    play(load("paper-1"), tmp_path)
+    with (tmp_path / "world.journal").open("rb") as file:
+        frames = list(msgpack.Unpacker(file))
+    kinds = Scenario | Drive | End | Farewell
+    messages = [decode(frame, kinds) for frame in frames]
+    assert messages[0] == load("paper-1")
+    assert [type(message) for message in messages[-3:]] == [End, Farewell, Farewell]
+    assert len(messages) == 1 + 2 * 49 + 3
+    assert msgpack.unpackb(frames[1][5:])[:3] == ["drive", 0, "a"]
+
+
+def test_a_journal_cut_anywhere_reads_back_every_whole_frame(tmp_path: Path) -> None:
+    data = written(tmp_path / "whole", FRAMES)
+    ends = [len(b"".join(msgpack.packb(frame) for frame in FRAMES[:i])) for i in range(len(FRAMES) + 1)]
+    assert ends[-1] == len(data)
+    cut = tmp_path / "cut"
+    for length in range(len(data) + 1):
+        cut.write_bytes(data[:length])
+        assert list(journal.read(cut)) == FRAMES[: sum(end <= length for end in ends) - 1]
+
+
+@settings(max_examples=50)
+@given(st.lists(st.integers(0, 2000), max_size=12))
+def test_a_journal_read_as_it_grows_gives_each_frame_once(
+    tmp_path_factory: pytest.TempPathFactory, cuts: list[int]
+) -> None:
+    folder = tmp_path_factory.mktemp("grows")
+    data = written(folder / "whole", FRAMES)
+    growing = folder / "growing"
+    growing.touch()
+    tail, read = Tail(growing), []
+    for length in [*sorted(min(cut, len(data)) for cut in cuts), len(data)]:
+        growing.write_bytes(data[:length])
+        read += tail.news()
+    assert read == FRAMES
+    assert tail.news() == []
+
+
+GARBAGE = {
+    "reserved": b"\xc1",
+    "a number": b"\x07",
+    "nil": b"\xc0",
+    "a map": b"\x81\x01\x02",
+    "an array": b"\x92\x01\x02",
+    "a text": b"\xa5hello",
+    "an extension": b"\xd4\x05\x00",
+    "zeros": b"\x00" * 64,
+    "an oversized frame": msgpack.packb(b"x" * (MAX_FRAME_BYTES + 1)),
+    "the head of a frame larger than any": b"\xc6\x7f\xff\xff\xff",
+}
+
+
+@pytest.mark.parametrize("garbage", GARBAGE)
+@pytest.mark.parametrize("place", [0, 1, 5])
+def test_garbage_in_the_middle_is_found_and_the_file_is_named(
+    garbage: str, place: int, tmp_path: Path
+) -> None:
+    first = written(tmp_path / "first", FRAMES[:place])
+    rest = written(tmp_path / "rest", FRAMES[place:])
+    damaged = tmp_path / "damaged.journal"
+    damaged.write_bytes(first + GARBAGE[garbage] + rest)
+    with pytest.raises(CorruptJournal, match=r"damaged\.journal"):
+        list(journal.read(damaged))
+
+
+def test_an_existing_journal_is_not_overwritten(tmp_path: Path) -> None:
+    path = tmp_path / "a.journal"
+    data = written(path, FRAMES)
+    with pytest.raises(RecordExists, match=r"a\.journal is there already"):
+        Journal(path)
+    assert path.read_bytes() == data
+
+
+def test_a_journal_that_is_not_there_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        list(journal.read(tmp_path / "none"))
+
+
+WRITER = """
+import sys
+from pathlib import Path
+from protocol.journal import Journal
+
+book = Journal(Path(sys.argv[1]))
+number = 0
+while True:
+    book.write(b"%d" % number, b"x" * 500)
+    print(number, flush=True)
+    number += 1
+"""
+
+
+def test_a_killed_process_has_lost_nothing_of_what_it_journaled(tmp_path: Path) -> None:
+    path = tmp_path / "killed.journal"
+    with subprocess.Popen(
+        [sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        for _ in range(200):
+            process.stdout.readline()
+        process.kill()
+        told = 200 + len(process.stdout.read().splitlines())
+    assert process.returncode == -9
+    frames = list(journal.read(path))
+    numbers = [int(frame) for frame in frames[::2]]
+    assert numbers == list(range(len(numbers)))
+    assert len(numbers) >= told - 1  # the last line may be torn
+    assert frames[1::2] == [b"x" * 500] * (len(frames) // 2)
+    assert len(frames) // 2 >= 200

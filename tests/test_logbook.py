@@ -1,0 +1,272 @@
+"""What two robots tell each other of their logs arrives whole, whatever the channel does on the way."""
+
+from __future__ import annotations
+
+from collections import deque
+from itertools import cycle
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from agent import planner
+from agent.logbook import Logbook
+from agent.mind import Done, Mind
+from agent.radio import Radio, contradiction, hear
+from compose.scenario import load
+from protocol.messages import MAX_REPORT_RANGES, MAX_REPORT_RUNS, Localised, Ranged, Report, Undecided
+from protocol.motion import ORIGIN, Pose, Run, step
+from protocol.wire import MAX_REPORT_BYTES, decode, encode
+
+Tick = tuple[float, float, float | None]
+"""v and omega over one tick, and the anchor range at its end, if there is one"""
+
+MIND = Mind(load("paper-1").briefing("a"))
+
+ticks = st.builds(
+    lambda few, times: few * times,
+    st.lists(
+        st.tuples(
+            st.sampled_from([0.0, 1.0, 0.5]), st.sampled_from([0.0, 0.25]), st.none() | st.floats(0.0, 3.0)
+        ),
+        min_size=1,
+        max_size=30,
+    ),
+    st.sampled_from([1, 1, 2, 20]),
+)
+
+
+def prefixes(driven: list[Tick]) -> list[Logbook]:
+    """The log of a robot that was in range at its start, after each of its ticks."""
+    book = Logbook().ranged(1.5)
+    grown = [book]
+    for v, omega, distance in driven:
+        book = book.drove(v, omega)
+        if distance is not None:
+            book = book.ranged(distance)
+        grown.append(book)
+    return grown
+
+
+def told(book: Logbook, radio: Radio) -> Report:
+    """What the planner tells, having this log and this radio."""
+    return planner.report(replace(MIND, log=book, radio=radio, tick=book.through))
+
+
+@st.composite
+def deliveries(draw: st.DrawFn) -> tuple[list[Logbook], list[tuple[int, int]]]:
+    """A growing log, and (tick of the report, what it takes for acknowledged), in the order of arrival."""
+    books = prefixes(draw(ticks))
+    last = len(books) - 1
+    tellings = draw(st.lists(st.tuples(st.integers(0, last), st.integers(0, last)), max_size=20))
+    tellings = [(max(pair), min(pair)) for pair in tellings]
+    again = draw(st.lists(st.sampled_from(tellings), max_size=5)) if tellings else []
+    return books, draw(st.permutations(tellings + again))
+
+
+@settings(max_examples=200)
+@given(deliveries())
+@example((prefixes([(1.0, 0.0, 1.5)] * 300), [(300, 0), (300, 0)]))
+def test_reports_in_any_order_repeated_and_lost_give_back_the_log(
+    case: tuple[list[Logbook], list[tuple[int, int]]],
+) -> None:
+    books, arrivals = case
+    radio = Radio()
+    for tick, since in arrivals:
+        report = told(books[tick], Radio(acknowledged=since))
+        assert contradiction(report) is None
+        before = radio.peer.through
+        radio = hear(radio, report)
+        assert radio.peer == books[radio.peer.through] or radio.peer == Logbook()
+        assert radio.peer.through >= before
+        if since <= before:
+            assert radio.peer.through >= report.through
+    assert radio.heard == len(arrivals)
+    whole = books[-1]
+    for _ in range(2 + whole.through // MAX_REPORT_RUNS + len(whole.ranges) // MAX_REPORT_RANGES):
+        radio = hear(radio, told(whole, Radio(acknowledged=radio.peer.through)))
+    assert radio.peer == whole
+
+
+class Side:
+    """A robot on a channel that loses, delays and doubles what it is told."""
+
+    def __init__(self, driven: list[Tick]) -> None:
+        self.books = prefixes(driven)
+        self.radio = Radio()
+        self.held: deque[Report] = deque()
+
+    def hear(self, report: Report, fate: str) -> None:
+        match fate:
+            case "lost":
+                return
+            case "late":
+                self.held.appendleft(report)
+                return
+            case "twice":
+                self.radio = hear(self.radio, report)
+        self.radio = hear(self.radio, report)
+        if self.held and fate == "late ones too":
+            self.radio = hear(self.radio, self.held.pop())
+
+
+@given(
+    ticks, ticks, st.lists(st.sampled_from(["heard", "lost", "late", "late ones too", "twice"]), min_size=1)
+)
+def test_what_is_acknowledged_is_known_and_what_is_lost_is_told_again(
+    a_drove: list[Tick], b_drove: list[Tick], fates: list[str]
+) -> None:
+    length = min(len(a_drove), len(b_drove))
+    a, b = Side(a_drove[:length]), Side(b_drove[:length])
+    fate = cycle(fates)
+    for tick in range(length + 1):
+        from_a, from_b = told(a.books[tick], a.radio), told(b.books[tick], b.radio)
+        a.hear(from_b, next(fate))
+        b.hear(from_a, next(fate))
+        assert a.radio.acknowledged <= b.radio.peer.through
+        assert b.radio.acknowledged <= a.radio.peer.through
+    for _ in range(5 + 2 * length // min(MAX_REPORT_RUNS, MAX_REPORT_RANGES)):
+        from_a, from_b = told(a.books[-1], a.radio), told(b.books[-1], b.radio)
+        a.hear(from_b, "heard")
+        b.hear(from_a, "heard")
+    assert (a.radio.peer, b.radio.peer) == (b.books[-1], a.books[-1])
+    last = told(a.books[-1], a.radio)
+    assert (last.since, last.runs, [r for r in last.ranges if r.tick > 0]) == (length, (), [])
+
+
+def test_an_overtaken_report_does_not_bring_back_an_old_state() -> None:
+    old, new = (replace(told(Logbook(), Radio()), tick=tick) for tick in (3, 7))
+    new = replace(new, state="standing", verdict=Undecided("lost"))
+    radio = hear(hear(Radio(), new), old)
+    assert (radio.state, radio.verdict, radio.latest, radio.heard) == ("standing", Undecided("lost"), 7, 2)
+
+
+# --- the size of a report -----------------------------------------------------------------------------
+
+
+@given(ticks)
+@example([(1.0, 0.0, 1.5)] * 300)
+@example([(1.0, 0.0, None), (0.5, 0.0, None)] * 150)
+def test_a_report_fits_its_frame_and_tells_as_much_as_fits(driven: list[Tick]) -> None:
+    book = prefixes(driven)[-1]
+    report = told(book, Radio())
+    frame = encode(report)
+    assert len(frame) <= MAX_REPORT_BYTES
+    assert decode(frame, Report, MAX_REPORT_BYTES) == report
+    assert report.through > 0
+    if len(book.runs) <= MAX_REPORT_RUNS and len(book.ranges) <= MAX_REPORT_RANGES:
+        assert report.through == book.through
+
+
+def longest_log(begin: int, ticks_a_run: int) -> Logbook:
+    """More than a report can carry: no two manoeuvres in a row alike; as many ranges as both limits allow."""
+    more = MAX_REPORT_RANGES - MAX_REPORT_RUNS
+    book = Logbook().drove(0.0, 0.0, begin) if begin else Logbook()
+    for i in range(2 * MAX_REPORT_RUNS):
+        book = book.drove(0.1 + i, 0.2, ticks_a_run)
+        if i >= -more:
+            book = book.ranged(0.3)
+        if i < more:
+            book = book.drove(0.1 + i, 0.2).ranged(0.3)
+    return book
+
+
+VERDICTS = {
+    "none": None,
+    "localised": Localised(Pose(1.0, 2.0, 3.0)),
+    "undecided": Undecided("eq. (5) leaves no way to a third range"),
+    "the peer's": Undecided("\U0001f916" * 300),  # a repeats b's reason, whatever b says
+}
+
+
+@pytest.mark.parametrize("ticks_a_run", [1, 200, 70_000])
+@pytest.mark.parametrize("verdict", VERDICTS)
+@pytest.mark.parametrize("begin", [0, 70_000])
+def test_the_longest_report_that_there_is_fits_its_frame(begin: int, verdict: str, ticks_a_run: int) -> None:
+    book = longest_log(begin, ticks_a_run)
+    said = VERDICTS[verdict]
+    mind = replace(
+        MIND,
+        briefing=replace(MIND.briefing, robot="r" * 32),
+        state=Done(3, said) if said is not None else MIND.state,
+        log=book,
+        tick=book.through,
+        radio=Radio(acknowledged=begin),
+    )
+    report = planner.report(mind)
+    assert report.runs
+    size = len(encode(report))
+    assert size <= MAX_REPORT_BYTES
+
+
+# --- what a log says ----------------------------------------------------------------------------------
+
+
+@given(ticks, st.data())
+def test_a_log_knows_where_the_robot_was_at_every_tick(driven: list[Tick], data: st.DataObject) -> None:
+    book = prefixes(driven)[-1]
+    track = [ORIGIN]
+    for v, omega, _ in driven:
+        track.append(step(track[-1], v, omega, 0.5))
+    first = data.draw(st.integers(0, len(driven)))
+    last = data.draw(st.integers(first, len(driven)))
+    found = book.track(ORIGIN, first, last, 0.5)
+    assert len(found) == last - first + 1
+    for pose, true in zip(
+        [*found, book.pose(ORIGIN, last, 0.5)], [*track[first : last + 1], track[last]], strict=True
+    ):
+        assert (pose.x, pose.y, pose.heading) == pytest.approx((true.x, true.y, true.heading), abs=1e-9)
+
+
+def test_equal_manoeuvres_are_one_entry() -> None:
+    book = Logbook().drove(1.0, 0.0).drove(1.0, 0.0).drove(1.0, 0.5).drove(1.0, 0.0, 3)
+    assert book == Logbook(6, (Run(2, 1.0, 0.0), Run(1, 1.0, 0.5), Run(3, 1.0, 0.0)))
+
+
+# --- contradictions -----------------------------------------------------------------------------------
+
+SOUND = Report(
+    tick=9,
+    robot="a",
+    phase=3,
+    state="standing",
+    start=None,
+    since=2,
+    through=8,
+    runs=(Run(4, 1.0, 0.0), Run(2, 0.5, 0.1)),
+    ranges=(Ranged(3, 1.0), Ranged(8, 2.0)),
+    heard=4,
+)
+
+
+def test_a_sound_report_contradicts_nothing() -> None:
+    assert contradiction(SOUND) is None
+    assert contradiction(replace(SOUND, tick=8)) is None
+    assert contradiction(replace(SOUND, since=8, runs=(), ranges=())) is None
+    from_the_start = replace(
+        SOUND, since=0, runs=(Run(8, 1.0, 0.0),), ranges=(Ranged(0, 1.0), Ranged(8, 2.0))
+    )
+    assert contradiction(from_the_start) is None
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"tick": 7}, "log over [2, 8] told at tick 7"),
+        ({"since": 9, "runs": (), "ranges": ()}, "log over [9, 8]"),
+        ({"runs": ()}, "do not fill [2, 8]"),
+        ({"runs": (Run(7, 1.0, 0.0),)}, "do not fill [2, 8]"),
+        ({"runs": (Run(2**31, 1.0, 0.0),)}, "do not fill [2, 8]"),
+        ({"since": 3}, "do not fill [3, 8]"),
+        ({"ranges": (Ranged(2, 1.0),)}, "range of tick 2 outside"),
+        ({"ranges": (Ranged(9, 1.0),)}, "range of tick 9 outside"),
+        ({"ranges": (Ranged(0, 1.0),)}, "range of tick 0 outside"),
+        ({"ranges": (Ranged(8, 1.0), Ranged(3, 1.0))}, "range of tick 3 outside"),
+        ({"ranges": (Ranged(3, 1.0), Ranged(3, 2.0))}, "range of tick 3 outside"),
+    ],
+)
+def test_a_report_that_no_log_could_say_is_named(change: dict[str, object], named: str) -> None:
+    found = contradiction(replace(SOUND, **change))
+    assert found is not None
+    assert named in found

@@ -1,0 +1,392 @@
+"""What follows from the mission's parameters: the plan, the turn rates, the bounds; and who keeps to them."""
+
+from __future__ import annotations
+
+import math
+from itertools import combinations
+
+import pytest
+from hypothesis import assume, example, given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from agent import planner
+from agent.geometry import Placement
+from agent.phases.anchor import third_point
+from agent.phases.encounter import SPEEDS, TURN_RATES, last_manoeuvre
+from compose.inline import play
+from compose.record import Moment, Record
+from compose.scenario import load, parse
+from protocol.messages import Localised
+from protocol.mission import (
+    OPTIMAL_TURN,
+    Mission,
+    Variant,
+    half_arc,
+    longest_meeting,
+    orbit_margin,
+    rendezvous,
+    third_point_turn_rate,
+    tick_budget,
+)
+from protocol.motion import Pose, compose, step
+from tests.steps import steps
+from world.sensors import anchor_ranges, mutual_ranges
+
+SECTION_IV = Mission(3.0, 1.0, 1.0, math.pi)
+D = 10.0
+VARIANTS: tuple[Variant, ...] = ("paper", "assured")
+
+missions = st.builds(
+    Mission, st.floats(1.0, 8.0), st.floats(0.1, 2.0), st.floats(0.3, 2.0), st.floats(0.3, math.pi)
+)
+angles = st.floats(-math.pi, math.pi)
+
+
+# --- the rendezvous -----------------------------------------------------------------------------------
+
+
+@given(missions, st.floats(5.0, 40.0))
+def test_the_papers_orbits_are_eq_6(mission: Mission, distance: float) -> None:
+    plan = rendezvous(mission, distance, "paper")
+    radius = (distance + mission.sensing_range) / 2
+    share = math.acos(distance / (distance + mission.sensing_range)) / math.pi
+    assert plan.a.radius == plan.b.radius == pytest.approx(radius)
+    assert plan.a.omega == pytest.approx(min(mission.max_turn_rate, mission.max_speed / radius))
+    assert plan.b.omega == pytest.approx(-share * plan.a.omega)
+    assert plan.a.v == pytest.approx(plan.a.omega * radius)
+    assert plan.b.v == pytest.approx(-plan.b.omega * radius)
+    assert plan.bound == pytest.approx((2 * math.pi + 2 * math.pi * share) / abs(plan.b.omega))
+    assert plan.a.v <= mission.max_speed * (1 + 1e-12)
+
+
+def test_the_assured_orbits_are_smaller_by_the_margin_and_driven_at_full_speed() -> None:
+    margin = (1.0 * (1.0 - 0.6931599 / math.pi)) ** 2 / (16 * 3.0)
+    plan = rendezvous(SECTION_IV, D, "assured")
+    assert orbit_margin(SECTION_IV, D) == pytest.approx(margin, rel=1e-6)
+    assert plan.a.radius == plan.b.radius == pytest.approx(6.5 - margin, rel=1e-9)
+    assert plan.a.omega == pytest.approx(1.0 / (6.5 - margin), rel=1e-9)
+    assert plan.a.v == pytest.approx(1.0)
+    assert plan.b.omega == pytest.approx(-half_arc(D, 3.0) / math.pi * plan.a.omega)
+    assert plan.bound == longest_meeting(SECTION_IV, D)
+
+
+@settings(max_examples=60)
+@given(
+    st.sampled_from(
+        [(10.0, 3.0, 1.0), (30.0, 1.5, 1.0), (7.0, 3.0, 1.0), (15.0, 3.0, 0.5), (10.0, 3.0, 2.0)]
+    ),
+    angles,
+    angles,
+)
+def test_on_the_assured_orbits_the_two_meet_within_the_bound(
+    setting: tuple[float, float, float], bearing_a: float, bearing_b: float
+) -> None:
+    """From any two points of the orbits, at the sampling instants (D, R and v_max as in the notes)."""
+    distance, reach, speed = setting
+    mission = Mission(reach, 1.0, speed, math.pi)
+    plan = rendezvous(mission, distance, "assured")
+    radius = plan.a.radius
+
+    def are_in_range(tick: int) -> bool:
+        a, b = bearing_a + plan.a.omega * tick, bearing_b + plan.b.omega * tick
+        dx = distance + radius * (math.cos(b) - math.cos(a))
+        return math.hypot(dx, radius * (math.sin(b) - math.sin(a))) <= reach
+
+    assert any(are_in_range(tick) for tick in range(math.floor(plan.bound) + 1))
+
+
+@given(missions, st.floats(5.0, 40.0), st.sampled_from(VARIANTS))
+def test_the_tick_budget_leaves_room_beyond_the_bound(
+    mission: Mission, distance: float, variant: Variant
+) -> None:
+    plan = rendezvous(mission, distance, variant)
+    assert tick_budget(mission, plan) > 2 * plan.bound / mission.period
+
+
+# --- eq. (4) and eq. (5) ------------------------------------------------------------------------------
+
+
+def gain(turn: float) -> float:
+    """The cost of eq. (4) over v_1 T_s, at omega_1 T_s = turn."""
+    return math.sin(turn / 2) ** 2 / turn
+
+
+def test_the_optimum_of_eq_4_is_the_root_that_the_notes_give() -> None:
+    assert pytest.approx(2.3311, abs=5e-5) == OPTIMAL_TURN
+    assert math.tan(OPTIMAL_TURN / 2) == pytest.approx(OPTIMAL_TURN, abs=1e-12)
+    assert math.cos(OPTIMAL_TURN) + OPTIMAL_TURN * math.sin(OPTIMAL_TURN) - 1 == pytest.approx(0.0, abs=1e-12)
+
+
+@given(st.floats(1e-3, 2 * math.pi))
+def test_no_other_turn_rate_tells_the_branches_better_apart(turn: float) -> None:
+    assert gain(turn) <= gain(OPTIMAL_TURN) * (1 + 1e-12)
+
+
+@given(missions)
+def test_the_turn_rate_of_the_third_point_is_the_optimum_within_omega_max(mission: Mission) -> None:
+    assert third_point_turn_rate(mission) == min(OPTIMAL_TURN / mission.period, mission.max_turn_rate)
+
+
+@st.composite
+def second_points(draw: st.DrawFn) -> tuple[Mission, list[Pose]]:
+    """A mission, and where +alpha and -alpha put a robot that has its second range, in the anchor's frame."""
+    mission = draw(missions)
+    alpha = draw(st.floats(0.0, math.pi))
+    rho0 = draw(st.floats(0.0, 1.0)) * mission.sensing_range
+    places = [step(Pose(rho0, 0.0, side * alpha), mission.first_straight, 0.0, 1.0) for side in (1.0, -1.0)]
+    assume(math.hypot(places[0].x, places[0].y) <= mission.sensing_range)
+    return mission, places
+
+
+def after(place: Pose, v: float, omega: float, mission: Mission) -> float:
+    end = step(place, v, omega, mission.period)
+    return math.hypot(end.x, end.y)
+
+
+@settings(max_examples=300)
+@given(second_points(), st.sampled_from(VARIANTS))
+@example((SECTION_IV, [Pose(0.7, 2.8, 1.25), Pose(0.7, -2.8, -1.25)]), "paper")
+def test_eq_5_keeps_the_nearer_branch_in_range(case: tuple[Mission, list[Pose]], variant: Variant) -> None:
+    mission, places = case
+    controls = third_point(places, mission, variant)
+    if controls is None:
+        assert variant == "paper"
+        return
+    assert 0.0 < abs(controls.v) <= mission.max_speed
+    assert abs(controls.omega) <= mission.max_turn_rate
+    assert variant == "assured" or controls.v > 0.0
+    nearer = min(after(place, controls.v, controls.omega, mission) for place in places)
+    assert nearer <= mission.sensing_range - 0.9e-6
+
+
+@given(st.floats(1.0, 8.0), st.floats(0.1, 3.0), st.floats(0.1, 2.0), st.floats(0.3, math.pi))
+def test_where_there_is_room_the_third_point_is_the_best_of_eq_4(
+    rho0: float, alpha: float, period: float, turn_rate: float
+) -> None:
+    mission = Mission(20.0, period, 2.0, turn_rate)
+    places = [step(Pose(rho0, 0.0, side * alpha), 2.0, 0.0, period) for side in (1.0, -1.0)]
+    controls = third_point(places, mission, "paper")
+    assert controls is not None
+    assert controls.v == mission.max_speed
+    assert controls.omega == third_point_turn_rate(mission)
+    plus, minus = (after(place, controls.v, controls.omega, mission) ** 2 for place in places)
+    for fraction in range(1, 101):
+        omega = mission.max_turn_rate * fraction / 100
+        one, other = (after(place, mission.max_speed, omega, mission) ** 2 for place in places)
+        assert abs(one - other) <= abs(plus - minus) * (1 + 1e-9)
+
+
+def test_a_branch_on_the_circle_of_range_is_put_inside_it_by_the_margin() -> None:
+    """Eq. (5) to the letter puts it exactly on R, and rounding would say whether it is measured."""
+    place = step(Pose(1.8337195113037719, 0.0, 0.31233737057044775), 1.0, 0.0, 1.0)
+    mirrored = Pose(place.x, -place.y, -place.heading)
+    controls = third_point([place, mirrored], SECTION_IV, "paper")
+    assert controls is not None
+    assert controls.v < 1.0
+    nearer = min(after(one, controls.v, controls.omega, SECTION_IV) for one in (place, mirrored))
+    assert nearer == pytest.approx(3.0 - 1e-6, abs=1e-9)
+
+
+def test_branches_that_mirror_across_the_heading_are_told_apart_straight_ahead() -> None:
+    """So they may lie after a circle: one in front of the anchor, one behind, and no turn helps."""
+    places = [Pose(0.5, 1.0, math.pi / 2), Pose(0.5, -1.0, math.pi / 2)]
+    controls = third_point(places, SECTION_IV, "paper")
+    assert controls is not None
+    assert (controls.v, controls.omega) == (1.0, 0.0)
+
+
+# --- ranges -------------------------------------------------------------------------------------------
+
+
+def test_a_range_is_taken_up_to_r_and_at_r() -> None:
+    scenario = load("paper-1")
+    beyond = math.nextafter(3.0, 4.0)
+    poses = [Pose(3.0, 0.0, 0.0), Pose(10.0, -beyond, 0.0)]
+    assert anchor_ranges(poses, scenario) == [3.0, None]
+    assert mutual_ranges([Pose(0.0, 0.0, 0.0), Pose(0.0, 3.0, 0.0)], [(0, 1)], 3.0) == [3.0]
+    assert mutual_ranges([Pose(0.0, 0.0, 0.0), Pose(0.0, beyond, 0.0)], [(0, 1)], 3.0) == [None]
+
+
+# --- missions whose parameters bite -------------------------------------------------------------------
+
+
+def mission_of(
+    start: tuple[float, float, float], *, reach: float = 3.0, speed: float = 1.0, turn_rate: float = math.pi
+) -> Record:
+    text = f"""
+        name = "mission"
+        [mission]
+        sensing_range = {reach}
+        period = 1.0
+        max_speed = {speed}
+        max_turn_rate = {turn_rate!r}
+        [[robot]]
+        id = "a"
+        anchor = [0.0, 0.0]
+        start = {list(start)}
+        [[robot]]
+        id = "b"
+        anchor = [10.0, 0.0]
+        start = [10.4, 0.3, 3.6]
+        """
+    return play(parse(text, "mission"))
+
+
+def turns(record: Record, state: str) -> list[float]:
+    """The turns that a makes on the spot, before it meets b."""
+    drives = [moment.drives["a"] for moment in record.moments if moment.drives["a"].phase < 3]
+    assert all(drive.v == 0.0 for drive in drives if drive.state == state)
+    return [drive.omega for drive in drives if drive.state == state]
+
+
+def test_a_small_omega_max_makes_every_turn_take_several_ticks() -> None:
+    record = mission_of((2.4, -1.2, 4.8), turn_rate=0.5)
+    outward = turns(record, "turning")
+    assert outward == pytest.approx([0.5, 0.5, 0.5, math.pi / 2 - 1.5])
+    onto_orbit = turns(record, "tangent")
+    assert onto_orbit == pytest.approx([0.5, 0.5, 0.5, math.pi / 2 - 1.5])
+    aligning = turns(record, "aligning")
+    assert len(aligning) > 1
+    assert aligning[:-1] == pytest.approx([math.copysign(0.5, aligning[0])] * (len(aligning) - 1))
+    assert abs(sum(aligning)) <= math.pi
+    assert record.end is not None
+    assert record.end.outcome == "localised"
+
+
+def test_no_robot_ever_asks_for_more_than_its_actuators_give() -> None:
+    for record in (mission_of((2.4, -1.2, 4.8), turn_rate=0.5), mission_of((0.5, 0.2, 2.0), reach=1.0)):
+        mission = record.scenario.mission
+        for moment in record.moments:
+            for drive in moment.drives.values():
+                assert abs(drive.v) <= mission.max_speed * (1 + 1e-12)
+                assert abs(drive.omega) <= mission.max_turn_rate
+
+
+@pytest.mark.parametrize(
+    ("reach", "speed", "straight"), [(1.0, 1.0, 0.9), (1.0, 0.95, 0.9), (1.0, 0.89, 0.89), (3.0, 1.0, 1.0)]
+)
+def test_the_first_straight_is_shortened_where_it_would_come_near_the_range(
+    reach: float, speed: float, straight: float
+) -> None:
+    record = mission_of((0.5, 0.2, 2.0), reach=reach, speed=speed)
+    first = record.moments[0].drives["a"]
+    assert first.state == "straight"
+    assert (first.v, first.omega) == pytest.approx((straight, 0.0))
+    assert record.scenario.mission.first_straight == pytest.approx(straight)
+    assert record.end is not None
+    assert record.end.outcome == "localised"
+
+
+def test_a_robot_released_on_its_anchor_knows_its_branch_at_once() -> None:
+    record = mission_of((0.0, 0.0, 2.0))
+    assert record.farewells["a"].branch == "on-anchor"
+    assert record.moments[0].drives["a"].phase == 2
+    assert record.end is not None
+    assert record.end.outcome == "localised"
+
+
+def test_nobody_claims_before_a_third_mutual_range() -> None:
+    for seed in range(40):
+        record = play(load("random", seed=seed))
+        assert record.end is not None
+        assert record.end.outcome == "localised"
+        ranged = [moment.truth.tick for moment in record.moments if math.dist(*_places(moment)) <= 3.0]
+        for robot in "ab":
+            claims = [m.truth.tick for m in record.moments if isinstance(m.drives[robot].verdict, Localised)]
+            assert sum(tick <= claims[0] for tick in ranged) >= 3
+
+
+def _places(moment: Moment) -> list[tuple[float, float]]:
+    return [(pose.x, pose.y) for pose in moment.truth.poses]
+
+
+def test_a_single_candidate_is_checked_before_it_is_claimed() -> None:
+    """Two mutual ranges and D leave no redundancy: with one placement left, b still makes a manoeuvre."""
+    second = next(step for step in steps("paper-1") if step.drives["b"].state == "last-manoeuvre")
+    mind, heard = second.observed["b"], second.heard["b"]
+    possible = planner.decide(mind, heard).findings.placements
+    assert len(possible) == 4
+    for placement in possible:
+        findings = replace(mind.findings, placements=(placement,), solutions=(4, 1))
+        decided = planner.decide(replace(mind, findings=findings), heard)
+        assert decided.verdict is None
+        assert planner.drive(decided).v == 1.0
+
+
+# --- eq. (8) ------------------------------------------------------------------------------------------
+
+
+@st.composite
+def last_points(draw: st.DrawFn) -> tuple[Pose, Pose, list[Placement]]:
+    """b in <b(M2)>, a in <a(M1)>, and placements that put a within b's range."""
+    b = Pose(6.5 * math.cos(1.0), 6.5 * math.sin(1.0), draw(angles))
+    a = Pose(6.5, 0.0, 0.0)
+    found = []
+    for _ in range(draw(st.integers(2, 4))):
+        phi, bearing, rho = draw(angles), draw(angles), draw(st.floats(0.2, 2.9))
+        there = compose(Pose(0.0, 0.0, phi), a)
+        found.append(
+            Placement(phi, b.x + rho * math.cos(bearing) - there.x, b.y + rho * math.sin(bearing) - there.y)
+        )
+    return b, a, found
+
+
+def predicted(b: Pose, a: Pose, found: list[Placement], v: float, omega: float) -> list[float]:
+    """m: d_i of eq. (8)."""
+    end = step(b, v, omega, SECTION_IV.period)
+    places = [compose(Pose(p.x, p.y, p.phi), a) for p in found]
+    return [math.hypot(place.x - end.x, place.y - end.y) for place in places]
+
+
+def least(distances: list[float]) -> float:
+    """J of eq. (8), on squares."""
+    return min(abs(one**2 - other**2) for one, other in combinations(distances, 2))
+
+
+def grid() -> list[float]:
+    return [SECTION_IV.max_turn_rate * (2 * i / (TURN_RATES - 1) - 1) for i in range(TURN_RATES)]
+
+
+@settings(max_examples=25)
+@given(last_points())
+def test_the_letters_last_manoeuvre_maximises_eq_8_at_full_speed(
+    case: tuple[Pose, Pose, list[Placement]],
+) -> None:
+    b, a, found = case
+    plan = last_manoeuvre(b, a, found, SECTION_IV, "paper")
+    best = max(least(predicted(b, a, found, 1.0, omega)) for omega in grid())
+    assert plan.drive.v == 1.0
+    assert plan.separation_m2 == pytest.approx(best, abs=1e-9)
+    attained = least(predicted(b, a, found, plan.drive.v, plan.drive.omega))
+    assert attained == pytest.approx(best, abs=1e-9)
+
+
+@settings(max_examples=8)
+@given(last_points())
+def test_the_assured_last_manoeuvre_keeps_as_many_candidates_in_range_as_it_can(
+    case: tuple[Pose, Pose, list[Placement]],
+) -> None:
+    """And of those that keep as many, it is the one that eq. (8) likes best."""
+    b, a, found = case
+    rim = SECTION_IV.sensing_range - 1e-6
+    plan = last_manoeuvre(b, a, found, SECTION_IV, "assured")
+
+    def value(v: float, omega: float) -> tuple[int, float]:
+        distances = predicted(b, a, found, v, omega)
+        return -sum(distance > rim for distance in distances), least(distances)
+
+    fewest, best = max(value(speed, omega) for speed in SPEEDS for omega in grid())
+    outside, attained = value(plan.drive.v, plan.drive.omega)
+    assert outside == fewest
+    assert attained == pytest.approx(best, abs=1e-9)
+    assert plan.separation_m2 == pytest.approx(best, abs=1e-9)
+
+
+def test_a_single_candidate_is_checked_from_where_its_range_changes_most() -> None:
+    b, a = Pose(0.0, 0.0, 0.0), Pose(6.5, 0.0, 0.0)
+    ahead = Placement(0.0, -4.5, 0.0)
+    plan = last_manoeuvre(b, a, [ahead], SECTION_IV, "assured")
+    assert plan.drive.v == 1.0
+    assert plan.drive.omega == pytest.approx(0.0, abs=1e-9)
+    assert predicted(b, a, [ahead], 1.0, 0.0) == [pytest.approx(1.0)]

@@ -1,0 +1,321 @@
+"""Section IV and the reference values: what the paper says happens, happens, at every tick."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from agent.geometry import Placement, placements
+from compose.inline import play
+from compose.record import Record, summary, ticks_csv
+from compose.scenario import load, parse
+from protocol import journal
+from protocol.messages import Briefing, Drive, End, Estimate, Farewell, Report, Sense
+from protocol.mission import Mission, half_arc, longest_meeting, rendezvous
+from protocol.motion import Pose, wrap
+from protocol.wire import decode
+from tests.reference import REFERENCE, Equation7, Phase1, Simulation, Triple
+
+NAMES = ("paper-1", "paper-2")
+SIMULATIONS = dict(zip(NAMES, REFERENCE.sims, strict=True))
+EXACT = 1e-9
+
+
+@cache
+def played(name: str) -> Record:
+    return play(load(name))
+
+
+def first_tick(record: Record, robot: str, state: str) -> int:
+    return next(moment.truth.tick for moment in record.moments if moment.drives[robot].state == state)
+
+
+def drive(record: Record, robot: str, tick: int) -> Drive:
+    return record.moments[tick].drives[robot]
+
+
+def optional(cell: str) -> float | None:
+    return float(cell) if cell else None
+
+
+# --- Section IV, tick by tick -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_pose_control_and_range_of_section_iv_is_the_references(name: str) -> None:
+    reference = SIMULATIONS[name]
+    rows = list(csv.DictReader(io.StringIO(ticks_csv(played(name)))))
+    assert [(int(row["tick"]), row["robot"]) for row in rows] == [
+        (tick, robot) for tick in range(reference.k_last + 1) for robot in "ab"
+    ]
+    for row in rows:
+        tick = int(row["tick"])
+        poses, controls, ranges = (
+            (reference.poses_a, reference.u_a, reference.range_a)
+            if row["robot"] == "a"
+            else (reference.poses_b, reference.u_b, reference.range_b)
+        )
+        x, y, heading = poses[tick]
+        assert [float(row["x"]), float(row["y"])] == pytest.approx([x, y], abs=EXACT)
+        assert wrap(float(row["heading"]) - heading) == pytest.approx(0.0, abs=EXACT)
+        assert -math.pi < float(row["heading"]) <= math.pi
+        expected = controls[tick] if tick < reference.k_last else (None, None)
+        driven = (optional(row["v"]), optional(row["omega"]))
+        assert driven == pytest.approx(expected, abs=EXACT)
+        assert optional(row["anchor_range"]) == pytest.approx(ranges[tick], abs=EXACT)
+        assert optional(row["mutual_range"]) == pytest.approx(reference.mutual[tick], abs=EXACT)
+
+
+@pytest.mark.parametrize("robot", ["a", "b"])
+@pytest.mark.parametrize("name", NAMES)
+def test_a_robot_senses_the_references_ranges_and_what_it_drove(
+    name: str, robot: str, tmp_path: Path
+) -> None:
+    reference = SIMULATIONS[name]
+    play(load(name), tmp_path)
+    kinds = Briefing | Sense | Report | Drive | Estimate | End | Farewell
+    frames = [decode(frame, kinds) for frame in journal.read(tmp_path / f"agent-{robot}.journal")]
+    senses = [frame for frame in frames if isinstance(frame, Sense)]
+    controls = reference.u_a if robot == "a" else reference.u_b
+    ranges = reference.range_a if robot == "a" else reference.range_b
+
+    assert [sense.tick for sense in senses] == list(range(reference.k_last + 1))
+    assert senses[0].executed is None
+    for sense, driven in zip(senses[1:], controls, strict=True):
+        assert sense.executed is not None
+        assert (sense.executed.v, sense.executed.omega) == pytest.approx(driven, abs=EXACT)
+    for sense in senses:
+        assert sense.anchor_range == pytest.approx(ranges[sense.tick], abs=EXACT)
+        mutual = reference.mutual[sense.tick]
+        heard = [contact.range for contact in sense.contacts]
+        assert heard == ([pytest.approx(mutual, abs=EXACT)] if mutual is not None else [])
+
+
+# --- the table of Section IV --------------------------------------------------------------------------
+
+
+class Row(NamedTuple):
+    """What the notes on the paper say of one robot's phases 1 and 2."""
+
+    scenario: str
+    robot: str
+    branch: str
+    alpha: float
+    located: int
+    """the tick in which phase 1 is done"""
+    anchor_ranges: int
+    """by then"""
+    mu: float
+    orbits: int
+
+
+ROWS = (
+    Row("paper-1", "a", "circle", +1.980462, 5, 2, -3.113663, 12),
+    Row("paper-1", "b", "three-ranges", -2.384686, 2, 3, +0.952119, 9),
+    Row("paper-2", "a", "three-ranges-virtual", -1.389410, 2, 2, +1.287471, 8),
+    Row("paper-2", "b", "three-ranges", +1.287611, 2, 3, +1.892149, 10),
+)
+
+
+@pytest.mark.parametrize("row", ROWS, ids=[f"{row.scenario}-{row.robot}" for row in ROWS])
+def test_phases_1_and_2_go_as_the_table_says(row: Row) -> None:
+    record = played(row.scenario)
+    farewell = record.farewells[row.robot]
+    reference = SIMULATIONS[row.scenario]
+    ranges = reference.range_a if row.robot == "a" else reference.range_b
+    assert farewell.branch == row.branch
+    assert farewell.alpha == pytest.approx(row.alpha, abs=5.1e-7)
+    assert first_tick(record, row.robot, "aligning") == row.located
+    assert sum(rho is not None for rho in ranges[: row.located + 1]) == row.anchor_ranges
+    aligning = drive(record, row.robot, row.located)
+    assert (aligning.v, -aligning.omega) == pytest.approx((0.0, row.mu), abs=5.1e-7)
+    assert first_tick(record, row.robot, "orbiting") == row.orbits
+
+
+def test_in_simulation_1_a_leaves_its_anchors_range_and_circles_for_three_ticks() -> None:
+    record = played("paper-1")
+    assert [drive(record, "a", tick).state for tick in range(6)] == [
+        "straight",
+        "turning",
+        "circling",
+        "circling",
+        "circling",
+        "aligning",
+    ]
+
+
+def test_in_simulation_2_a_drives_its_third_manoeuvre_at_the_optimum_and_full_speed() -> None:
+    third = drive(played("paper-2"), "a", 1)
+    assert (third.state, third.v) == ("third-point", 1.0)
+    assert third.omega == pytest.approx(2.331122, abs=5.1e-7)
+
+
+@pytest.mark.parametrize(
+    ("name", "first", "first_range", "second", "second_range", "way"),
+    [
+        ("paper-1", 46, 2.949342, 47, 2.106468, ["straight"]),
+        ("paper-2", 106, 2.998668, 109, 2.176967, ["straight", "turning", "circling"]),
+    ],
+)
+def test_a_takes_its_second_mutual_range_while_b_stands(
+    name: str, first: int, first_range: float, second: int, second_range: float, way: list[str]
+) -> None:
+    record = played(name)
+    rows = list(csv.DictReader(io.StringIO(ticks_csv(record))))
+    mutual = {int(row["tick"]): float(row["mutual_range"]) for row in rows if row["mutual_range"]}
+    assert list(mutual) == [first, second, record.moments[-1].truth.tick]
+    assert mutual[first] == pytest.approx(first_range, abs=5.1e-7)
+    assert mutual[second] == pytest.approx(second_range, abs=5.1e-7)
+    assert [drive(record, "a", tick).state for tick in range(first, second)] == way
+    assert {drive(record, "b", tick).state for tick in range(first, second)} == {"standing"}
+    assert drive(record, "a", second).state == "waiting"
+    assert drive(record, "b", second).state == "last-manoeuvre"
+    assert summary(record, "in-process", None)["first_contact_tick"] == first
+
+
+@pytest.mark.parametrize(
+    ("name", "solutions", "omega", "separation", "last"),
+    [
+        ("paper-1", (4, 4), +0.9076, 1.80395, 48),
+        ("paper-2", (4, 2), +0.1484, 0.95768, 110),
+    ],
+)
+def test_b_chooses_the_last_manoeuvre_that_the_table_says(
+    name: str, solutions: tuple[int, int], omega: float, separation: float, last: int
+) -> None:
+    record = played(name)
+    reference = SIMULATIONS[name]
+    b = record.farewells["b"]
+    assert b.placements == solutions
+    assert record.farewells["a"].placements == solutions
+    assert b.last_turn_rate == pytest.approx(omega, abs=5.1e-5)
+    assert b.last_turn_rate == pytest.approx(reference.w2, abs=EXACT)
+    assert b.separation_m2 == pytest.approx(separation, abs=5.1e-6)
+    assert b.separation_m2 == pytest.approx(reference.J, abs=EXACT)
+    assert record.moments[-1].truth.tick == last == reference.k_last
+    assert drive(record, "b", last - 1).v == 1.0
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_both_robots_end_knowing_their_pose(name: str) -> None:
+    record = played(name)
+    told = summary(record, "in-process", None)
+    assert told["outcome"] == "localised"
+    for robot in told["robots"].values():
+        assert robot["localised"]
+        assert robot["localised_tick"] == told["ticks"]
+        assert robot["position_error_m"] < EXACT
+        assert robot["heading_error_rad"] < EXACT
+
+
+def test_the_constants_of_section_iv_are_the_notes() -> None:
+    mission = Mission(3.0, 1.0, 1.0, math.pi)
+    plan = rendezvous(mission, 10.0, "paper")
+    assert half_arc(10.0, 3.0) == pytest.approx(0.6931599, abs=5.1e-8)
+    assert plan.a.omega == pytest.approx(0.15384615, abs=5.1e-9)
+    assert plan.b.omega == pytest.approx(-0.0339445617, abs=5.1e-11)
+    assert plan.b.v == pytest.approx(0.2206396513, abs=5.1e-11)
+    assert plan.bound == longest_meeting(mission, 10.0) == pytest.approx(225.942087, abs=5.1e-7)
+
+
+# --- phase 1 ------------------------------------------------------------------------------------------
+
+BRANCHES = {
+    "straight-3meas": "three-ranges",
+    "straight-3meas-virtual": "three-ranges-virtual",
+    "circle-2meas": "circle",
+}
+
+
+def alone(start: Triple) -> Record:
+    """The mission of a robot released there, its anchor at the origin; its peer starts as in simulation 1."""
+    text = f"""
+        name = "phase-1"
+        mission = {{sensing_range = 3.0, period = 1.0, max_speed = 1.0, max_turn_rate = {math.pi!r}}}
+        planner = {{variant = "paper"}}
+        [[robot]]
+        id = "a"
+        anchor = [0.0, 0.0]
+        start = {list(start)}
+        [[robot]]
+        id = "b"
+        anchor = [10.0, 0.0]
+        start = [11.3, -0.4, 3.6]
+        """
+    return play(parse(text, "phase-1"))
+
+
+@pytest.mark.parametrize("case", REFERENCE.phase1, ids=lambda case: f"{case.start[0]:+.3f}")
+def test_phase_1_finds_the_references_branch_and_orientation(case: Phase1) -> None:
+    record = alone(case.start)
+    farewell = record.farewells["a"]
+    for tick, controls in enumerate(case.u):
+        driven = drive(record, "a", tick)
+        assert (driven.v, driven.omega) == pytest.approx(controls, abs=EXACT)
+    measured = [math.hypot(*_place(record, tick)) for tick in range(case.k_end + 1)]
+    assert [rho if rho <= 3.0 else None for rho in measured] == pytest.approx(case.ranges, abs=EXACT)
+    assert measured[0] == pytest.approx(case.rho0, abs=EXACT)
+    assert measured[-1] == pytest.approx(case.r_end, abs=EXACT)
+    assert farewell.branch == BRANCHES[case.branch]
+    assert farewell.alpha == pytest.approx(case.alpha_signed, abs=EXACT)
+    assert first_tick(record, "a", "aligning") == case.k_end
+    aligning = drive(record, "a", case.k_end)
+    assert (aligning.v, -aligning.omega) == pytest.approx((0.0, case.mu), abs=EXACT)
+    radial = [moment.drives["a"].v for moment in record.moments if moment.drives["a"].state == "radial"]
+    assert sum(radial) == pytest.approx(6.5 - case.r_end, abs=EXACT)
+
+
+def _place(record: Record, tick: int) -> tuple[float, float]:
+    pose = record.moments[tick].truth.poses[0]
+    return pose.x, pose.y
+
+
+def test_every_way_through_phase_1_is_among_the_cases() -> None:
+    assert {case.branch for case in REFERENCE.phase1} == set(BRANCHES)
+    assert len(REFERENCE.phase1) == 14
+
+
+# --- eq. (7) ------------------------------------------------------------------------------------------
+
+
+def by_turn(found: list[Placement]) -> list[float]:
+    return [part for placement in sorted(found) for part in placement]
+
+
+@pytest.mark.parametrize("case", REFERENCE.eq7, ids=lambda case: f"{case.D:.3f}")
+def test_eq_7_has_all_the_references_placements_and_no_more(case: Equation7) -> None:
+    found = placements(
+        case.D, Pose(*case.p1b, 0.0), Pose(*case.p1a, 0.0), Pose(*case.p2a, 0.0), case.rho1, case.rho2
+    )
+    expected = [Placement(solution.phi, *solution.T) for solution in case.solutions]
+    assert len(found) == len(expected)
+    assert by_turn(found) == pytest.approx(by_turn(expected), abs=EXACT)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_eq_7_has_the_references_four_placements_at_each_encounter(name: str) -> None:
+    """Both frames as the paper has them: centred in the own anchor, the x-axis through p_0."""
+    reference = SIMULATIONS[name]
+    a1, a2 = (_from_anchor(reference, "a", tick) for tick in (reference.k_meet, reference.k_second))
+    b = _from_anchor(reference, "b", reference.k_meet)
+    rho1, rho2 = reference.mutual[reference.k_meet], reference.mutual[reference.k_second]
+    assert rho1 is not None
+    assert rho2 is not None
+    found = placements(10.0, b, a1, a2, rho1, rho2)
+    expected = [Placement(phi, *shift) for phi, shift in reference.candidates]
+    assert len(found) == len(expected) == 4
+    assert by_turn(found) == pytest.approx(by_turn(expected), abs=EXACT)
+
+
+def _from_anchor(reference: Simulation, robot: str, tick: int) -> Pose:
+    poses, anchor_x = (reference.poses_a, 0.0) if robot == "a" else (reference.poses_b, 10.0)
+    bearing = math.atan2(poses[0][1], poses[0][0] - anchor_x)
+    x, y, heading = poses[tick]
+    c, s = math.cos(bearing), math.sin(bearing)
+    return Pose(c * (x - anchor_x) + s * y, -s * (x - anchor_x) + c * y, heading - bearing)

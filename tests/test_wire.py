@@ -1,0 +1,297 @@
+"""A frame is understood whole, or refused with the one error there is."""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Iterator
+from functools import reduce
+from operator import or_
+from typing import Any
+
+import msgpack
+import msgspec
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from compose.scenario import load
+from protocol.messages import MAX_REPORT_RANGES, MAX_REPORT_RUNS, Drive, End, Farewell, Message, Report, Sense
+from protocol.mission import Mission
+from protocol.wire import MAX_FRAME_BYTES, VERSION, MalformedFrame, decode, encode
+from tests.examples import EXAMPLES
+from world.scenario import Scenario
+
+ANY: Any = reduce(or_, sorted(Message.__subclasses__(), key=lambda kind: kind.__name__))
+HEAD = 5
+"""bytes before the body: the version and the CRC-32"""
+
+by_message = pytest.mark.parametrize(
+    "message", EXAMPLES, ids=[f"{i}-{type(message).__name__}" for i, message in enumerate(EXAMPLES)]
+)
+
+
+def framed(body: bytes, version: int = VERSION) -> bytes:
+    """`body` as if it were a message's."""
+    return struct.pack(">BI", version, zlib.crc32(body)) + body
+
+
+def packed(value: object) -> bytes:
+    body: bytes = msgpack.packb(value)
+    return body
+
+
+def plain(message: Message) -> Any:
+    """The message as any msgpack library reads it."""
+    return msgpack.unpackb(encode(message)[HEAD:])
+
+
+def refuses(frame: bytes, kind: Any = ANY) -> None:
+    with pytest.raises(MalformedFrame):
+        decode(frame, kind)
+
+
+# --- what we send ------------------------------------------------------------------------------------
+
+
+def test_there_is_an_example_of_every_message() -> None:
+    assert {type(message) for message in EXAMPLES} == set(Message.__subclasses__())
+
+
+@by_message
+def test_a_message_comes_back_as_it_was_sent(message: Message) -> None:
+    assert decode(encode(message), type(message)) == message
+    assert decode(encode(message), ANY) == message
+
+
+@pytest.mark.parametrize("name", ["paper-1", "paper-2", "random"])
+def test_a_scenario_comes_back_as_it_was_journaled(name: str) -> None:
+    scenario = load(name)
+    assert decode(encode(scenario), Scenario) == scenario
+
+
+@by_message
+def test_any_msgpack_library_reads_what_we_send(message: Message) -> None:
+    frame = encode(message)
+    assert frame[0] == VERSION
+    assert frame[1:HEAD] == zlib.crc32(frame[HEAD:]).to_bytes(4, "big")
+    assert plain(message) == msgspec.json.decode(msgspec.json.encode(message))
+    assert plain(message)[0] == type(message).__name__.lower()
+    assert decode(framed(packed(plain(message))), ANY) == message
+
+
+# --- what is refused ---------------------------------------------------------------------------------
+
+
+@by_message
+def test_a_truncated_frame_is_refused(message: Message) -> None:
+    frame = encode(message)
+    for length in range(len(frame)):
+        refuses(frame[:length])
+        if length > HEAD:  # the CRC fits, and the message breaks off
+            refuses(framed(frame[HEAD:length]))
+
+
+@by_message
+def test_a_frame_with_any_bit_flipped_is_refused(message: Message) -> None:
+    frame = encode(message)
+    for i in range(len(frame)):
+        for bit in range(8):
+            refuses(frame[:i] + bytes([frame[i] ^ 1 << bit]) + frame[i + 1 :])
+
+
+@by_message
+def test_a_frame_with_something_behind_it_is_refused(message: Message) -> None:
+    frame = encode(message)
+    refuses(frame + b"\x00")
+    refuses(framed(frame[HEAD:] + b"\xc0"))
+    refuses(framed(frame[HEAD:] * 2))
+
+
+@pytest.mark.parametrize("version", [0, VERSION + 1, 255])
+def test_another_version_is_refused_and_named(version: int) -> None:
+    body = encode(EXAMPLES[0])[HEAD:]
+    with pytest.raises(MalformedFrame, match=f"version {version}, this is version {VERSION}"):
+        decode(framed(body, version), ANY)
+
+
+def test_an_oversized_frame_is_refused_even_if_it_is_sound() -> None:
+    frame = encode(EXAMPLES[1])
+    assert decode(frame, ANY, len(frame)) == EXAMPLES[1]
+    with pytest.raises(MalformedFrame, match=f"{len(frame)} bytes"):
+        decode(frame, ANY, len(frame) - 1)
+    refuses(framed(packed(["drive", 3, "b" * MAX_FRAME_BYTES, 0.5, 0.25, 3, "localised", None]), VERSION))
+
+
+@pytest.mark.parametrize("tag", ["teleport", "Sense", "", 3, None, ["sense"]])
+def test_an_unknown_tag_is_refused(tag: object) -> None:
+    refuses(framed(packed([tag, *plain(EXAMPLES[1])[1:]])))
+
+
+@by_message
+def test_a_message_of_another_kind_is_refused(message: Message) -> None:
+    for kind in (Sense | End, Drive | Farewell, Report):
+        if not isinstance(message, kind):
+            refuses(encode(message), kind)
+
+
+Path = tuple[object, ...]
+
+
+def parts(value: Any, path: Path = ()) -> Iterator[tuple[Path, Any]]:
+    """Every value in a msgpack tree with the way to it, the tag at the top aside."""
+    yield path, value
+    if isinstance(value, list):
+        for i, item in enumerate(value):
+            if path or i:
+                yield from parts(item, (*path, i))
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            yield from parts(item, (*path, key))
+
+
+def changed(value: Any, path: Path, new: object) -> Any:
+    """A copy of the tree with `new` at `path`."""
+    if not path:
+        return new
+    step, *rest = path
+    if isinstance(value, dict):
+        return value | {step: changed(value[step], tuple(rest), new)}
+    return [changed(item, tuple(rest), new) if i == step else item for i, item in enumerate(value)]
+
+
+def is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+@by_message
+def test_what_is_no_finite_number_within_bounds_is_refused(message: Message) -> None:
+    tree = plain(message)
+    for path, value in parts(tree):
+        if is_number(value):
+            for bad in (math.nan, math.inf, -math.inf, 1e300, -1e300, -(2**63), 2**64 - 1):
+                refuses(framed(packed(changed(tree, path, bad))))
+        if is_number(value) and isinstance(value, int):
+            refuses(framed(packed(changed(tree, path, -1))))
+            refuses(framed(packed(changed(tree, path, 0.5))))
+
+
+@by_message
+def test_a_value_of_the_wrong_type_is_refused(message: Message) -> None:
+    tree = plain(message)
+    for path, value in parts(tree):
+        wrong: list[object] = [b"\x00", {1: 1}, [[[]]], msgpack.ExtType(5, b"")]
+        if not isinstance(value, bool):
+            wrong.append(True)
+        if is_number(value) or isinstance(value, list | dict):
+            wrong.append("1.0")
+        if isinstance(value, str):
+            wrong.append(1.0)
+        for bad in wrong:
+            refuses(framed(packed(changed(tree, path, bad))))
+
+
+def _understood(frame: bytes) -> object:
+    """The message, or None where it is refused; nothing else is ever raised."""
+    try:
+        return decode(frame, ANY)
+    except MalformedFrame:
+        return None
+
+
+@by_message
+def test_an_extra_field_is_refused_wherever_it_stands(message: Message) -> None:
+    tree = plain(message)
+    for path, value in parts(tree):
+        if isinstance(value, list):
+            refuses(framed(packed(changed(tree, path, [*value, "extra"]))))
+        if isinstance(value, dict):
+            refuses(framed(packed(changed(tree, path, value | {"no field": 1.0}))))
+
+
+@pytest.mark.parametrize("robot", ["", "a/b", "a b", "*", "a" * 33, "a\n", "ä", "a\x00", "$"])
+def test_a_robot_that_is_no_single_chunk_of_a_key_is_refused(robot: str) -> None:
+    refuses(framed(packed(["missed", 8, robot])))
+
+
+def test_too_many_entries_and_too_long_words_are_refused() -> None:
+    sound = plain(EXAMPLES[3])
+    runs, ranges, state = 8, 9, 4
+    assert sound[runs] == [[4, 1.0, 0.0], [3, 0.5, -0.25]]
+    refuses(framed(packed(changed(sound, (runs,), [[1, 1.0, 0.0]] * (MAX_REPORT_RUNS + 1)))))
+    refuses(framed(packed(changed(sound, (ranges,), [[1, 1.0]] * (MAX_REPORT_RANGES + 1)))))
+    refuses(framed(packed(changed(sound, (state,), "x" * 33))))
+    refuses(framed(packed(["end", 48, "failed", "x" * 301])))
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"\xc1",
+        b"\x91" * 100_000,
+        b"\x81\x01" * 100_000,
+        b"\x93\xa6missed\x08\xa1\xff",
+        b"\xdd\xff\xff\xff\xff",
+        b"\xdf\xff\xff\xff\xff",
+        b"\xc6\xff\xff\xff\xff",
+        b"\x93\xa6missed\xcf\xff\xff\xff\xff\xff\xff\xff\xff\xa1a",
+    ],
+    ids=["reserved", "deep", "deep map", "not UTF-8", "huge array", "huge map", "huge bytes", "huge tick"],
+)
+def test_a_hostile_body_is_refused(body: bytes) -> None:
+    refuses(framed(body))
+    refuses(framed(body), Sense | End)
+    refuses(framed(body), Scenario)
+
+
+@settings(max_examples=500)
+@given(st.binary(max_size=300))
+@example(b"")
+def test_random_bytes_are_refused(frame: bytes) -> None:
+    refuses(frame)
+    refuses(bytes([VERSION]) + frame)
+
+
+msgpack_values = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**63), 2**64 - 1)
+    | st.floats()
+    | st.text(max_size=8)
+    | st.binary(max_size=8)
+    | st.sampled_from([kind.__name__.lower() for kind in Message.__subclasses__()]),
+    lambda inner: (
+        st.lists(inner, max_size=12)
+        | st.dictionaries(st.text(max_size=8) | st.integers(0, 9), inner, max_size=4)
+    ),
+    max_leaves=20,
+)
+
+
+@settings(max_examples=500)
+@given(st.binary(max_size=60) | msgpack_values.map(packed))
+def test_any_body_is_a_message_or_refused(body: bytes) -> None:
+    assert isinstance(_understood(framed(body)), Message | None)
+
+
+@settings(max_examples=500)
+@given(st.sampled_from(EXAMPLES), st.data(), msgpack_values)
+def test_a_message_with_anything_anywhere_is_a_message_or_refused(
+    message: Message, data: st.DataObject, value: object
+) -> None:
+    tree = plain(message)
+    path, _ = data.draw(st.sampled_from(list(parts(tree))))
+    understood = _understood(framed(packed(changed(tree, path, value))))
+    assert isinstance(understood, Message | None)
+    if understood is not None:
+        assert decode(encode(understood), ANY) == understood
+
+
+def test_a_mission_without_one_of_its_parameters_is_refused() -> None:
+    tree = plain(EXAMPLES[0])
+    (path,) = [path for path, value in parts(tree) if isinstance(value, dict)]
+    parameters = Mission.__struct_fields__
+    for gone in parameters:
+        kept = {name: 1.0 for name in parameters if name != gone}
+        refuses(framed(packed(changed(tree, path, kept))))
