@@ -1,3 +1,11 @@
-from compose.cli import main
+"""The program `tandem`."""
 
-main()
+import signal
+
+for _number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    signal.signal(_number, signal.SIG_DFL)  # until a command says otherwise: end at once, silently
+
+from compose.cli import main  # noqa: E402  # nothing slow before that
+
+if __name__ == "__main__":
+    main()

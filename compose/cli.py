@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import re
-import signal
 import sys
 from importlib import import_module
 from pathlib import Path
 from typing import NoReturn
 
 from compose.status import NOT_LOCALISED, USER_ERROR, UserError
+from protocol.inbox import one_line
 from protocol.keys import NAME
 
 
@@ -18,18 +18,16 @@ class _Parser(argparse.ArgumentParser):
     """Says what is wrong in one line."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(USER_ERROR, f"{self.prog}: {message}\n")
+        self.exit(USER_ERROR, one_line(f"{self.prog}: {message}") + "\n")
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
-    """The entry point."""
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_DFL)  # before a command says otherwise: end at once, silently
+    """Parse, and do as told; ends the process."""
     options = _parser().parse_args(arguments)
     try:
         status = import_module(f"compose.commands.{options.command}").main(options)
     except UserError as error:
-        print(f"tandem {options.command}: {error}", file=sys.stderr)
+        print(one_line(f"tandem {options.command}: {error}"), file=sys.stderr)
         status = USER_ERROR
     except BrokenPipeError:
         status = NOT_LOCALISED
@@ -64,6 +62,7 @@ def _parser() -> argparse.ArgumentParser:
     agent.add_argument(
         "--wait", type=_positive, default=60.0, metavar="S", help="how long to look for a world (60)"
     )
+    world.add_argument("--launched", action="store_true", help=argparse.SUPPRESS)  # who did so concludes
     for sub in (world, agent):
         sub.add_argument("--fsync", action="store_true", help="the journal survives a power cut")
 

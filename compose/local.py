@@ -105,7 +105,7 @@ def play(
     """
     endpoint = free_endpoint()
     shared = ["--run", run, "--out", str(out), "--patience", str(patience), "--quiet"]
-    world = ["world", *world_arguments, "--listen", endpoint, *shared]
+    world = ["world", *world_arguments, "--listen", endpoint, "--launched", *shared]
     children = [_Child("world", world, inbox)]
     try:
         for robot in scenario.robots:

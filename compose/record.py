@@ -17,7 +17,7 @@ import msgspec
 from protocol import journal
 from protocol.messages import Drive, End, Farewell, Localised, Missed, Outcome
 from protocol.motion import Pose, wrap
-from protocol.wire import MalformedFrame, decode
+from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 from world.referee import errors
 from world.scenario import Scenario
 from world.sensors import anchor_ranges, mutual_ranges
@@ -56,7 +56,7 @@ def read(folder: Path) -> Record:
     farewells: dict[str, Farewell] = {}
     end: End | None = None
     try:
-        scenario = decode(next(frames, b""), Scenario)
+        scenario = decode(next(frames, b""), Scenario, MAX_FRAME_BYTES)
         world = release(scenario)
         drives: dict[str, Drive] = {}
         missed = 0

@@ -15,13 +15,17 @@ from msgspec import Meta
 
 from protocol.mission import Anchor, Mission, Rendezvous, Role, Variant, rendezvous, tick_budget
 from protocol.motion import TAU, Pose
-from protocol.units import Coordinate, RobotId
+from protocol.units import RobotId
 from world.scenario import Placed, Scenario
 
 NAME = r"^[A-Za-z0-9_-]{1,48}\Z"
 
 
 MAX_TICKS = 10**9
+MAX_ROBOTS = 200
+"""so many that the truth about all of them fits a frame"""
+Place = Annotated[float, Meta(ge=-1e6, le=1e6)]
+"""m: nobody gets so far from there that `units.Coordinate` would not hold it"""
 NEAREST_ANCHORS = 1e-3
 """m: that is one anchor, not two"""
 WITHIN = 1.0 - 1e-9
@@ -46,8 +50,8 @@ class RobotTable(_Table, frozen=True):
     """[[robot]]"""
 
     id: RobotId
-    anchor: tuple[Coordinate, Coordinate]
-    start: tuple[Coordinate, Coordinate, Annotated[float, Meta(ge=-1e6, le=1e6)]] | None = None
+    anchor: tuple[Place, Place]
+    start: tuple[Place, Place, Annotated[float, Meta(ge=-1e6, le=1e6)]] | None = None
     """x, y in m, heading in rad; drawn from the seed inside the sensing range where it is left out"""
     peer: RobotId | None = None
     """needed only with more than two robots"""
@@ -58,7 +62,7 @@ class ScenarioFile(_Table, frozen=True):
 
     name: Annotated[str, Meta(pattern=NAME)]
     mission: Mission
-    robot: Annotated[list[RobotTable], Meta(min_length=2)]
+    robot: Annotated[list[RobotTable], Meta(min_length=2, max_length=MAX_ROBOTS)]
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
     max_ticks: Annotated[int, Meta(ge=1, le=MAX_TICKS)] | None = None
     planner: PlannerTable = PlannerTable()
@@ -78,17 +82,14 @@ def load(source: str, *, seed: int | None = None) -> Scenario:
     path = shipped().get(source, Path(source))
     try:
         text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError, ValueError) as error:
-        if source not in shipped() and not path.exists():
-            raise BadScenario(
-                f"{source}: neither a file nor a scenario that ships ({', '.join(shipped())})"
-            ) from None
-        raise BadScenario(f"{source}: cannot be read: {_reason(error)}") from None
+    except FileNotFoundError:
+        names = ", ".join(shipped())
+        raise BadScenario(f"{source}: neither a file nor a scenario that ships ({names})") from None
+    except OSError as error:
+        raise BadScenario(f"{source}: cannot be read: {error.strerror or error}") from None
+    except ValueError:
+        raise BadScenario(f"{source}: cannot be read: it is not UTF-8 text") from None
     return parse(text, source, seed=seed)
-
-
-def _reason(error: Exception) -> str:
-    return (error.strerror or str(error)) if isinstance(error, OSError) else "it is not UTF-8 text"
 
 
 def parse(text: str, source: str, *, seed: int | None = None) -> Scenario:

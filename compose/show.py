@@ -15,7 +15,7 @@ from rich.table import Table
 from compose.record import WORLD_JOURNAL, outcome_line
 from protocol.journal import Tail
 from protocol.messages import Drive, End, Farewell, Missed
-from protocol.wire import decode
+from protocol.wire import MAX_FRAME_BYTES, decode
 from world.scenario import Scenario
 
 
@@ -28,7 +28,7 @@ def live(scenario: Scenario, folder: Path) -> Iterator[None]:
     def update() -> None:
         with suppress(OSError, ValueError):
             for frame in journal.news():
-                message = decode(frame, Scenario | Drive | Missed | End | Farewell)
+                message = decode(frame, Scenario | Drive | Missed | End | Farewell, MAX_FRAME_BYTES)
                 if isinstance(message, Drive):
                     drives[message.robot] = message
 

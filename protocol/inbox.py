@@ -61,4 +61,9 @@ class Inbox:
 
     def say(self, line: str) -> None:
         """Tell whoever watches the process."""
-        print(f"{self._owner}: {line}", file=sys.stderr, flush=True)
+        print(one_line(f"{self._owner}: {line}"), file=sys.stderr, flush=True)
+
+
+def one_line(text: str) -> str:
+    """`text` with whatever would break or garble a line escaped."""
+    return "".join([char if char.isprintable() else repr(char)[1:-1] for char in text])

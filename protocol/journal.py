@@ -95,7 +95,7 @@ class Tail:
         try:
             for frame in unpacker:
                 if not isinstance(frame, bytes) or len(frame) > MAX_FRAME_BYTES:
-                    raise ValueError("no frame")  # noqa: TRY004  # it is the file that is wrong
+                    raise ValueError("no frame")  # it is the file that is wrong
                 frames.append(frame)
                 whole = unpacker.tell()
             torn = data[whole : whole + len(_LONGEST)]

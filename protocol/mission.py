@@ -8,7 +8,17 @@ from typing import Literal
 import msgspec
 
 from protocol.motion import TAU
-from protocol.units import AngularVelocity, Coordinate, Duration, Length, Range, Speed, TurnRate, Velocity
+from protocol.units import (
+    AngularVelocity,
+    Coordinate,
+    Duration,
+    Length,
+    Range,
+    Speed,
+    Time,
+    TurnRate,
+    Velocity,
+)
 
 Variant = Literal["assured", "paper"]
 """`paper` plays the paper to the letter; `assured` also cures what fails in it."""
@@ -65,7 +75,7 @@ class Rendezvous(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fi
 
     a: Orbit
     b: Orbit
-    bound: Range
+    bound: Time
     """s: T_max, the longest that both orbit before they are in range of each other"""
 
 

@@ -14,6 +14,8 @@ Coordinate = Annotated[float, Meta(ge=-1e7, le=1e7)]
 """m"""
 Range = Annotated[float, Meta(ge=0.0, le=1e7)]
 """m, measured"""
+Time = Annotated[float, Meta(ge=0.0, le=1e15)]
+"""s"""
 Duration = Annotated[float, Meta(ge=1e-6, le=1e6)]
 """s, positive"""
 Speed = Annotated[float, Meta(ge=1e-6, le=1e6)]

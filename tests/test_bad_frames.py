@@ -1,0 +1,232 @@
+"""A stranger puts nonsense on every key: it is refused, told once and counted, and the mission goes on."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import struct
+import zlib
+from collections.abc import Mapping
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+
+import msgspec
+import pytest
+import zenoh
+
+from protocol import keys, session
+from protocol.journal import read
+from protocol.messages import Drive, Report, Sense
+from protocol.motion import ORIGIN
+from protocol.wire import encode
+from tests.commands import LONG, LONG_JOURNAL_BYTES, LONG_TICKS, Command, several_pairs, tandem, until, world
+
+RUN = "mine"
+TIMES = 3
+"""each frame is put so often, and must be told of once"""
+VOLLEYS = 12
+
+GENUINE = {
+    "sense": (Sense(0, "a", None, 1.0), 1 << 20),
+    "drive": (Drive(0, "a", 0.5, 0.5, 1, "straight"), 1 << 20),
+    "report": (Report(0, "b", 1, "straight", ORIGIN, 0, 0, (), (), 0), 4096),
+}
+"""by topic: what robot a gets, says, and is told by its peer, b; and the longest frame in bytes"""
+
+TRUSTED = {
+    "sense": keys.sense(RUN, "a"),
+    "drive": keys.drive(RUN, "a"),
+    "report": keys.report(RUN, "b", "a"),
+}
+"""the keys that somebody acts on"""
+WATCHED = [keys.truth(RUN), keys.estimate(RUN, "a"), keys.briefing(RUN, "a")]
+"""those that nobody of the mission listens to"""
+GHOST, OTHER = keys.drive(RUN, "ghost"), keys.drive(RUN, "b")
+"""a Drive comes by them that says it is from somebody else, or from nobody"""
+
+
+def framed(content: object, version: int = 1) -> bytes:
+    """A frame whose CRC is as it should be, whatever is in it."""
+    body = content if isinstance(content, bytes) else msgspec.msgpack.encode(content)
+    return struct.pack(">BI", version, zlib.crc32(body)) + body
+
+
+def flipped(frame: bytes, bit: int) -> bytes:
+    spoilt = bytearray(frame)
+    spoilt[bit // 8] ^= 1 << bit % 8
+    return bytes(spoilt)
+
+
+def bad_frames(topic: str) -> dict[bytes, str]:
+    """Every kind of nonsense for a key that carries `topic`, and the pattern of what is said of it."""
+    message, limit = GENUINE[topic]
+    frame = encode(message)
+    said = msgspec.msgpack.decode(frame[5:])
+    assert framed(said) == frame
+
+    def with_field(place: int, value: object) -> bytes:
+        return framed([*said[:place], value, *said[place + 1 :]])
+
+    def with_number(value: float) -> bytes:
+        field = {"sense": "anchor_range", "drive": "v", "report": "start"}[topic]
+        place = 1 + message.__struct_fields__.index(field)  # the tag comes first
+        return with_field(place, [value, 0.0, 0.0] if topic == "report" else value)
+
+    frames = {
+        b"": "0 bytes, outside",
+        frame[:4]: "4 bytes, outside",
+        bytes(limit + 1): f"{limit + 1} bytes, outside",
+        frame[:-1]: "damaged: the CRC does not match",
+        flipped(frame, 9): "damaged: the CRC does not match",
+        flipped(frame, 8 * len(frame) - 20): "damaged: the CRC does not match",
+        framed(said, 0): "protocol version 0, this is version 1",
+        framed(said, 2): "protocol version 2, this is version 1",
+        with_number(math.nan): "Expected `float` >= .* - at ",
+        with_number(math.inf): "Expected `float` <= .* - at ",
+        with_number(-1e300): "Expected `float` >= .* - at ",
+        with_field(1, "zero"): re.escape("Expected `int`, got `str` - at `$[1]`"),
+        with_field(1, -1): re.escape("Expected `int` >= 0 - at `$[1]`"),
+        with_field(0, "teleport"): "Invalid value 'teleport'",
+        with_field(2, "stranger"): "'stranger'",
+        with_field(2, "no/robot"): "Expected `str` matching regex",
+        framed(said[:2]): "Expected `array` of at least length",
+        framed([*said, *[None] * 9]): "Expected `array` of at most length",
+        framed({"tick": 0}): "Expected `array`, got `object`",
+        framed(b"\xc1"): "malformed",
+        framed(b"\x91" * 4000): "Expected",
+    }
+    if topic == "sense":  # it costs the robot its link, and never arrives: see below
+        del frames[bytes(limit + 1)]
+    return frames
+
+
+def stranger_at(endpoint: str) -> zenoh.Session:
+    """A session with nothing of our configuration: ours cannot even send what is oversized."""
+    config = zenoh.Config()
+    config.insert_json5("mode", json.dumps("client"))
+    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    return zenoh.open(config)
+
+
+def publishers(link: zenoh.Session) -> dict[str, zenoh.Publisher]:
+    """One for each key, once everybody listens: a put before that would be lost."""
+    found = {key: session.publisher(link, key) for key in (*TRUSTED.values(), *WATCHED, GHOST, OTHER)}
+    heard: set[str] = set()
+    for key in (*TRUSTED.values(), GHOST, OTHER):
+        session.on_matching(found[key], partial(mark, heard, key))
+    until(lambda: len(heard) == len(TRUSTED) + 2, "everyone listens")
+    return found
+
+
+def mark(heard: set[str], key: str, matching: bool) -> None:
+    if matching:
+        heard.add(key)
+
+
+def volley(stranger: Mapping[str, zenoh.Publisher], nonsense: Mapping[str, Mapping[bytes, str]]) -> None:
+    for key, frames in nonsense.items():
+        for frame in frames:
+            stranger[key].put(frame)
+
+
+def complaints(command: Command, key: str) -> list[str]:
+    """What it has said of frames on `key`."""
+    said = re.findall(rf"refused a frame on {re.escape(key)}: (.*)", command.err)
+    return [str(why) for why in said]
+
+
+def refused_on(key: str, command: Command, frames: Mapping[bytes, str]) -> None:
+    """It has complained of every kind, and of each only once."""
+    told = complaints(command, key)
+    for frame, pattern in frames.items():
+        assert any(re.search(pattern, why) for why in told), (frame[:40], told)
+    assert len(told) == len(set(told))
+
+
+def test_nonsense_before_the_first_tick_is_refused_told_once_and_counted(tmp_path: Path) -> None:
+    """Robot d is not there yet, so the tick stands still while everyone else listens."""
+    scenario, out, alone = tmp_path / "pairs.toml", tmp_path / "out", tmp_path / "alone"
+    scenario.write_text(several_pairs(2))
+    nonsense = {key: bad_frames(topic) for topic, key in TRUSTED.items()}
+    with world(scenario, "--run", RUN, "--out", out) as (clock, endpoint), ExitStack() as others:
+        agents = [
+            others.enter_context(Command("agent", robot, "--connect", endpoint, "--out", out))
+            for robot in ("a", "b", "c")
+        ]
+        for robot, agent in zip("abc", agents, strict=True):
+            agent.until_answered(robot, out)
+        link = others.enter_context(stranger_at(endpoint))
+        stranger = publishers(link)
+        for _ in range(TIMES):
+            volley(stranger, nonsense)
+            volley(stranger, dict.fromkeys(WATCHED, bad_frames("sense")))
+            stranger[GHOST].put(encode(Drive(0, "ghost", 1.0, 0.0, 1, "haunting")))
+            stranger[OTHER].put(encode(Drive(0, "a", 1.0, 0.0, 1, "posing")))
+        clock.until_says(f"refused a frame on {OTHER}")
+        assert isinstance(session.ask(link, keys.briefing(RUN, "*"), 5.0), str)
+        agents.append(others.enter_context(Command("agent", "d", "--connect", endpoint, "--out", out)))
+        assert clock.ended().status == 0
+        assert [agent.ended().status for agent in agents] == [0] * 4
+
+        refused_on(TRUSTED["drive"], clock, nonsense[TRUSTED["drive"]])
+        for topic in ("sense", "report"):
+            refused_on(TRUSTED[topic], agents[0], nonsense[TRUSTED[topic]])
+        assert complaints(clock, GHOST) == ["it says it is from 'ghost'"]
+        assert complaints(clock, OTHER) == ["it says it is from 'a'"]
+        assert not any("Traceback" in command.err for command in (clock, *agents))
+
+    assert tandem("run", scenario, "--in-process", "-q", "--out", alone).status == 0
+    assert (out / "ticks.csv").read_bytes() == (alone / "ticks.csv").read_bytes()
+    counted = {
+        name: robot["reports_refused"]
+        for name, robot in json.loads((out / "summary.json").read_text())["robots"].items()
+    }
+    frames = sum(len(nonsense[TRUSTED[topic]]) for topic in ("sense", "report"))
+    assert counted == {"a": TIMES * frames, "b": 0, "c": 0, "d": 0}
+
+
+def test_a_mission_under_fire_goes_on_as_if_nothing_happened(tmp_path: Path) -> None:
+    scenario, out, alone = tmp_path / "long.toml", tmp_path / "out", tmp_path / "alone"
+    scenario.write_text(LONG)
+    nonsense = {key: bad_frames(topic) for topic, key in TRUSTED.items()}
+    for key in WATCHED:
+        nonsense[key] = bad_frames("sense")
+    fired = 0
+    with world(scenario, "--run", RUN, "--out", out) as (clock, endpoint), ExitStack() as others:
+        agents = [
+            others.enter_context(Command("agent", robot, "--connect", endpoint, "--out", out))
+            for robot in ("a", "b")
+        ]
+        stranger = publishers(others.enter_context(stranger_at(endpoint)))
+        while fired < VOLLEYS and clock.running:
+            clock.until_written(out / "world.journal", max(200, fired * LONG_JOURNAL_BYTES // VOLLEYS))
+            volley(stranger, nonsense)
+            fired += 1
+            if fired == VOLLEYS // 2:
+                stranger[TRUSTED["sense"]].put(bytes((1 << 20) + 1))
+        assert fired == VOLLEYS
+        assert clock.ended().status == 0
+        assert [agent.ended().status for agent in agents] == [0, 0]
+        for command in (clock, *agents):
+            lines = [line for line in command.err.splitlines() if "the world has gone" not in line]
+            assert len(lines) == len(set(lines))
+            assert all("refused a frame on " in line for line in lines), lines
+
+    assert tandem("run", scenario, "--in-process", "-q", "--out", alone).status == 0
+    assert (out / "ticks.csv").read_bytes() == (alone / "ticks.csv").read_bytes()
+    summary = json.loads((out / "summary.json").read_text())
+    assert (summary["outcome"], summary["ticks"]) == ("localised", LONG_TICKS)
+    assert summary["robots"]["a"]["reports_refused"] > 0
+    for robot in ("a", "b"):  # all but the Farewell, which counts what was refused
+        path = f"agent-{robot}.journal"
+        assert list(read(out / path))[:-1] == list(read(alone / path))[:-1]
+
+
+@pytest.mark.parametrize("topic", GENUINE)
+def test_the_frame_that_the_nonsense_is_made_of_is_itself_understood(topic: str) -> None:
+    """Else all of it would be refused for one and the same reason."""
+    message, _ = GENUINE[topic]
+    assert msgspec.msgpack.decode(encode(message)[5:], type=type(message)) == message

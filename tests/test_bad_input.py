@@ -1,0 +1,273 @@
+"""Bad input is one line that names the file and the field, exit status 2; never a traceback or a trace."""
+
+from __future__ import annotations
+
+import re
+import socket
+from pathlib import Path
+
+import pytest
+
+from tests.commands import PAPER_1, Ended, several_pairs, tandem, world
+
+LISTEN = ("--listen", "tcp/127.0.0.1:7447")
+CONNECT = ("--connect", "tcp/127.0.0.1:7447")
+GOOD = PAPER_1.replace("seed = 1", "seed = 1\nmax_ticks = 500")
+FOUR = several_pairs(2)
+
+
+def refused(ended: Ended, *words: str) -> None:
+    assert ended.status == 2, ended
+    assert ended.out == ""
+    assert re.fullmatch(r"tandem[^\n]*: [^\n]+\n", ended.err), ended.err
+    for word in words:
+        assert word in ended.err, ended.err
+
+
+def refused_scenario(text: str | bytes, folder: Path, field: str) -> None:
+    """Its file is named, and the field; nothing is left beside it."""
+    file = folder / "mine.toml"
+    file.write_bytes(text.encode() if isinstance(text, str) else text)
+    refused(tandem("run", "mine.toml", "--out", "out", cwd=folder), f"mine.toml: {field}")
+    assert list(folder.iterdir()) == [file]
+
+
+def changed(text: str, was: str, new: str) -> str:
+    assert was in text
+    return text.replace(was, new, 1)
+
+
+# --- a scenario's file ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (b"", "missing field 'name'"),
+        (b"name = ", "not TOML"),
+        (b"[mission", "not TOML"),
+        (b"name = 'x'\nname = 'y'", "not TOML"),
+        (b"\x00\x01\x02", "not TOML"),
+        (b"a = " + b"[" * 100_000, "not TOML"),
+        (b'name = "\xff\xfe"', "cannot be read: it is not UTF-8"),
+    ],
+    ids=["empty", "cut off", "open table", "said twice", "binary", "nested deeply", "not UTF-8"],
+)
+def test_a_file_that_is_not_toml_is_refused(text: bytes, says: str, tmp_path: Path) -> None:
+    refused_scenario(text, tmp_path, says)
+
+
+@pytest.mark.parametrize(
+    ("was", "typo", "field"),
+    [
+        ("seed = 1", "sede = 1", "unknown field 'sede'"),
+        ("[planner]", "[planer]", "unknown field 'planer'"),
+        ("period =", "peroid =", "mission: unknown field 'peroid'"),
+        ("variant =", "varaint =", "planner: unknown field 'varaint'"),
+        ("start = [11", "statr = [11", "robot[1]: unknown field 'statr'"),
+        ("seed = 1", '"two\\nlines" = 1', "unknown field 'two"),
+    ],
+)
+def test_an_unknown_field_is_named(was: str, typo: str, field: str, tmp_path: Path) -> None:
+    refused_scenario(changed(GOOD, was, typo), tmp_path, field)
+
+
+@pytest.mark.parametrize(
+    ("line", "field"),
+    [
+        ('name = "paper-1"\n', "missing field 'name'"),
+        ("period = 1.0\n", "mission: missing field 'period'"),
+        ("sensing_range = 3.0\n", "mission: missing field 'sensing_range'"),
+        ("max_speed = 1.0\n", "mission: missing field 'max_speed'"),
+        ("max_turn_rate = 3.141592653589793\n", "mission: missing field 'max_turn_rate'"),
+        ('id = "b"\n', "robot[1]: missing field 'id'"),
+        ("anchor = [0.0, 0.0]\n", "robot[0]: missing field 'anchor'"),
+    ],
+)
+def test_a_missing_field_is_named(line: str, field: str, tmp_path: Path) -> None:
+    refused_scenario(changed(GOOD, line, ""), tmp_path, field)
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-1.0", "0", "1e300", "5e-324", '"1"'])
+@pytest.mark.parametrize("line", re.findall(r"^(?:sensing|period|max_speed|max_turn).*", GOOD, re.MULTILINE))
+def test_what_must_be_a_positive_quantity_is(line: str, value: str, tmp_path: Path) -> None:
+    field = line.partition(" = ")[0]
+    refused_scenario(changed(GOOD, line, f"{field} = {value}"), tmp_path, f"mission.{field}: ")
+
+
+@pytest.mark.parametrize(
+    ("was", "new", "field"),
+    [
+        *(("seed = 1", f"seed = {v}", "seed: ") for v in ("-1", "1.5", '"1"', "true", "nan", str(2**63))),
+        *(("= 500", f"= {v}", "max_ticks: ") for v in ("0", "-1", "1.5", '"1"', "inf", str(10**30))),
+        *((GOOD.split('"')[1], v, "name: ") for v in ("", "a b", "a/b", "*", "é", "x" * 65, "x\\n")),
+        *(('id = "a"', f'id = "{v}"', "robot[0].id: ") for v in ("", "a b", "a/b", "*", "x" * 33, "a\\n")),
+        *(('id = "a"', f"id = {v}", "robot[0].id: ") for v in ("1", "[]")),
+        *(('"paper"', v, "planner.variant: ") for v in ('"Paper"', '""', "1", '"two\\nlines"')),
+        ("[0.0, 0.0]", "[0.0]", "robot[0].anchor: "),
+        ("[0.0, 0.0]", "[0.0, nan]", "robot[0].anchor[1]: "),
+        ("[0.0, 0.0]", "[1e300, 0.0]", "robot[0].anchor[0]: "),
+        ("[0.0, 0.0]", '"origin"', "robot[0].anchor: "),
+        ("[2.4, -1.2, 4.8]", "[2.4, -1.2]", "robot[0].start: "),
+        ("[2.4, -1.2, 4.8]", "[2.4, -1.2, nan]", "robot[0].start[2]: "),
+        ("[2.4, -1.2, 4.8]", "[-inf, -1.2, 4.8]", "robot[0].start[0]: "),
+        ("[2.4, -1.2, 4.8]", '["x", -1.2, 4.8]', "robot[0].start[0]: "),
+        ("[2.4, -1.2, 4.8]", "2.4", "robot[0].start: "),
+    ],
+)
+def test_a_value_out_of_bounds_is_named(was: str, new: str, field: str, tmp_path: Path) -> None:
+    refused_scenario(changed(GOOD, was, new), tmp_path, field)
+
+
+@pytest.mark.parametrize(
+    ("text", "field"),
+    [
+        (changed(GOOD, "[2.4, -1.2, 4.8]", "[2.4, -2.2, 4.8]"), "robot[0].start: "),
+        (changed(GOOD, "[11.3, -0.4, 3.6]", "[1.3, -0.4, 3.6]"), "robot[1].start: "),
+        (changed(GOOD, 'id = "b"', 'id = "a"'), "robot.id: "),
+        (changed(GOOD, "[10.0, 0.0]", "[0.0, 0.0]"), "robot[1].anchor: "),
+        (GOOD[: GOOD.rindex("[[robot]]")], "robot: "),
+        (changed(GOOD, 'id = "b"', 'id = "b"\npeer = "a"'), "robot[0].peer: "),
+        (changed(FOUR, 'peer = "a"\n', ""), "robot[1].peer: "),
+        (FOUR[: FOUR.rindex("[[robot]]")], "robot[2].peer: there is no robot 'd'"),
+        (changed(FOUR, 'peer = "a"', 'peer = "z"'), "robot[1].peer: there is no robot 'z'"),
+        (changed(FOUR, 'peer = "a"', 'peer = "c"'), "robot[0].peer: 'a' names 'b'"),
+        (changed(FOUR, 'peer = "a"', 'peer = "b"'), "robot[0].peer: 'a' names 'b'"),
+    ],
+    ids=[
+        *("a starts out of range", "b starts out of range", "one id twice", "one anchor twice"),
+        *("one robot", "only one of two names its peer", "no peer of four", "three robots"),
+        *("an unknown peer", "not each other's", "its own peer"),
+    ],
+)
+def test_robots_that_do_not_make_a_mission_are_refused(text: str, field: str, tmp_path: Path) -> None:
+    refused_scenario(text, tmp_path, field)
+
+
+@pytest.mark.parametrize("command", [("run",), ("world", *LISTEN)], ids=["run", "world"])
+@pytest.mark.parametrize(
+    ("source", "says"),
+    [
+        ("paper-3", "paper-3: neither a file nor a scenario that ships"),
+        ("missing.toml", "missing.toml: neither a file"),
+        ("folder", "folder: cannot be read: Is a directory"),
+        ("two\nlines", "neither a file"),
+        ("x" * 5000, "x: "),
+        ("\udcff", "neither a file"),
+    ],
+    ids=["name", "file", "folder", "two lines", "long", "not text"],
+)
+def test_an_unknown_scenario_is_refused(
+    command: tuple[str, ...], source: str, says: str, tmp_path: Path
+) -> None:
+    (tmp_path / "folder").mkdir()
+    refused(tandem(*command, source, "--out", "out", cwd=tmp_path), says)
+    assert [path.name for path in tmp_path.iterdir()] == ["folder"]
+
+
+# --- the command line -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ([], "COMMAND"),
+        (["fly"], "'fly'"),
+        (["run"], "SCENARIO"),
+        (["world", "paper-1"], "--listen"),
+        (["world", *LISTEN], "SCENARIO"),
+        (["agent", "a"], "--connect"),
+        (["agent", *CONNECT], "ID"),
+        (["run", "paper-1", "--fast"], "--fast"),
+        (["run", "paper-1", "paper-2"], "paper-2"),
+        (["run", "paper-1", "--out"], "--out"),
+        (["run", "paper-1", "--in-process", "--rate", "2"], "--rate"),
+        *((["run", "paper-1", "--rate", v], "--rate: ") for v in ("0", "-1", "nan", "inf", "fast", "1e400")),
+        *((["run", "paper-1", "--patience", v], "--patience: ") for v in ("0", "-1", "nan", "inf", "x")),
+        *((["run", "paper-1", "--seed", v], "--seed: ") for v in ("-1", "1.5", "x", "nan", "²", str(2**63))),
+        *((["agent", "a", *CONNECT, "--wait", v], "--wait: ") for v in ("0", "-1", "nan", "inf", "soon")),
+        *((["agent", v, *CONNECT], "ID: ") for v in ("", "a/b", "*", "a\n", "x" * 65)),
+        *((["agent", "a", *CONNECT, "--run", v], "--run: ") for v in ("", "a/b", "**", "a b")),
+        *((["world", "paper-1", *LISTEN, "--run", v], "--run: ") for v in ("", "a/b", "@x", "x" * 65)),
+    ],
+)
+def test_a_mistyped_command_line_is_one_line(arguments: list[str], says: str, tmp_path: Path) -> None:
+    refused(tandem(*arguments, cwd=tmp_path), says)
+    assert list(tmp_path.iterdir()) == []
+
+
+ENDPOINTS = [
+    *("", "7447", "127.0.0.1:7447", "tcp/127.0.0.1", "tcp/127.0.0.1:", "tcp/127.0.0.1:0"),
+    *("tcp/127.0.0.1:65536", "tcp/127.0.0.1:-1", "tcp/127.0.0.1:port", "tcp/:7447", "tpc/127.0.0.1:7447"),
+    *("tcp:127.0.0.1:7447", "tcp//127.0.0.1:7447", "tcp/127.0.0.1:7447 ", "http://127.0.0.1:7447", "\n"),
+    "tcp/127.0.0.1:7447\n",
+]
+
+
+@pytest.mark.parametrize("endpoint", ENDPOINTS)
+@pytest.mark.parametrize(
+    "command", [("world", "paper-1", "--listen"), ("agent", "a", "--connect")], ids=["listen", "connect"]
+)
+def test_an_endpoint_that_does_not_parse_is_refused(
+    command: tuple[str, ...], endpoint: str, tmp_path: Path
+) -> None:
+    refused(tandem(*command, endpoint, "--out", "out", cwd=tmp_path), f"{command[-1]}: ", "is no endpoint")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("host", ["192.0.2.1", "nowhere.invalid"])
+def test_an_address_of_another_machine_cannot_be_listened_on(host: str, tmp_path: Path) -> None:
+    endpoint = f"tcp/{host}:7447"
+    refused(tandem("world", "paper-1", "--listen", endpoint, cwd=tmp_path), f"--listen: {endpoint}: ")
+
+
+def test_a_port_in_use_is_one_line(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        ended = tandem("world", "paper-1", "--listen", endpoint, "--out", "out", cwd=tmp_path)
+    refused(ended, f"--listen: {endpoint}: already in use")
+    assert list(tmp_path.glob("out/*")) == []
+
+
+# --- where the record goes --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("out", ["file", "file/out", "/proc/out", "/proc/self/fdinfo"])
+@pytest.mark.parametrize(
+    "command",
+    [("run", "paper-1"), ("run", "paper-1", "--in-process"), ("world", "paper-1", *LISTEN)],
+    ids=["run", "in-process", "world"],
+)
+def test_a_folder_that_cannot_be_written_is_refused(
+    command: tuple[str, ...], out: str, tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_text("mine")
+    refused(tandem(*command, "--out", out, cwd=tmp_path), f"--out: {out} cannot be written: ")
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_an_agents_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    with world("paper-1") as (_, endpoint):
+        ended = tandem("agent", "a", "--connect", endpoint, "--out", "file/out", cwd=tmp_path)
+    refused(ended, "--out: file/out cannot be written: ")
+
+
+@pytest.mark.parametrize(
+    "command",
+    [("run", "paper-2"), ("run", "paper-2", "--in-process"), ("world", "paper-2", *LISTEN)],
+    ids=["run", "in-process", "world"],
+)
+def test_a_record_is_never_overwritten(command: tuple[str, ...], tmp_path: Path) -> None:
+    (tmp_path / "world.journal").write_text("precious")
+    refused(tandem(*command, "--out", tmp_path), f"--out: {tmp_path}", "already", "another folder")
+    assert [path.name for path in tmp_path.iterdir()] == ["world.journal"]
+    assert (tmp_path / "world.journal").read_text() == "precious"
+
+
+def test_an_agents_record_is_never_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "agent-a.journal").write_text("precious")
+    with world("paper-1") as (_, endpoint):
+        ended = tandem("agent", "a", "--connect", endpoint, "--out", tmp_path)
+    refused(ended, f"--out: {tmp_path}", "already", "another folder")
+    assert (tmp_path / "agent-a.journal").read_text() == "precious"

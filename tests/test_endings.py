@@ -1,0 +1,239 @@
+"""Nothing hangs: told to stop, or robbed of a process, a run ends, says why and leaves nobody behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+from random import Random
+from signal import SIGINT, SIGKILL, SIGSTOP, SIGTERM
+
+import pytest
+
+from compose.local import free_endpoint
+from tests.commands import (
+    ENDLESS,
+    LONG,
+    LONG_JOURNAL_BYTES,
+    LONG_TICKS,
+    Command,
+    process_of,
+    processes_of,
+    size,
+    tandem,
+    until,
+    world,
+)
+
+AT_ONCE_S = 4.0
+"""less than the 5 s after which a process that was told to stop is killed"""
+SOON_S = 15.0
+"""for what has a patience of 2 s"""
+
+draw = Random(7).random
+Moment = Callable[[Command, Path], bool]
+
+
+def journaled(bytes_written: int) -> Moment:
+    return lambda _run, out: size(out / "world.journal") >= bytes_written
+
+
+def processes(number: int) -> Moment:
+    return lambda _run, out: len(processes_of(out)) >= number
+
+
+def ready(run: Command, _out: Path) -> bool:
+    return run.catches(SIGTERM)
+
+
+def concluded(_run: Command, out: Path) -> bool:
+    return (out / "summary.json").exists()
+
+
+MOMENTS: dict[str, Moment] = {
+    "ready": ready,
+    **{f"{number} processes": processes(number) for number in (2, 3, 4)},
+    **{f"{size} bytes": journaled(size) for size in sorted(int(200_000 * draw()) for _ in range(14))},
+}
+LAST_MOMENTS: dict[str, Moment] = {
+    "99.9 %": journaled(int(0.999 * LONG_JOURNAL_BYTES)),
+    "concluded": concluded,
+}
+
+
+@pytest.fixture
+def endless(tmp_path: Path) -> Path:
+    """A scenario that does not end by itself."""
+    path = tmp_path / "endless.toml"
+    path.write_text(ENDLESS)
+    return path
+
+
+@pytest.fixture
+def long(tmp_path: Path) -> Path:
+    """A scenario that takes its time."""
+    path = tmp_path / "long.toml"
+    path.write_text(LONG)
+    return path
+
+
+# --- told to stop -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("number", [SIGINT, SIGTERM], ids=["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("moment", MOMENTS)
+def test_a_run_that_is_told_to_stop_says_so_and_leaves_no_process(
+    moment: str, number: signal.Signals, endless: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    with Command("run", endless, "--out", out, "-q") as run:
+        run.until(lambda: MOMENTS[moment](run, out), moment)
+        run.tell(number)
+        ended = run.ended(AT_ONCE_S)
+    assert ended == (130, "", f"tandem run: stopped by {number.name}\n")
+    assert not processes_of(out)
+
+
+@pytest.mark.parametrize("number", [SIGINT, SIGTERM], ids=["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("moment", LAST_MOMENTS)
+def test_a_run_that_is_told_to_stop_as_it_ends_says_either(
+    moment: str, number: signal.Signals, long: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    with Command("run", long, "--out", out, "-q") as run:
+        until(lambda: LAST_MOMENTS[moment](run, out) or not run.running, moment)
+        run.tell(number)
+        ended = run.ended(AT_ONCE_S)
+    assert not processes_of(out)
+    if ended.status == 130:
+        assert ended[1:] == ("", f"tandem run: stopped by {number.name}\n")
+    else:  # the signal may come after its last word
+        assert ended.status in (0, -number)
+        assert ended[1:] == (f"localised after {LONG_TICKS} ticks\n", "")
+
+
+@pytest.mark.parametrize("delay", [round(0.15 * draw(), 3) for _ in range(6)])
+def test_a_run_that_is_told_to_stop_while_it_starts_leaves_no_process(
+    delay: float, endless: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    with Command("run", endless, "--out", out, "-q") as run:
+        began = time.monotonic()
+        run.until(lambda: time.monotonic() >= began + delay, f"{delay} s have passed")
+        run.tell(SIGTERM)
+        ended = run.ended(AT_ONCE_S)
+    assert not processes_of(out)
+    assert ended in ((-SIGTERM, "", ""), (130, "", "tandem run: stopped by SIGTERM\n"))
+
+
+def test_a_second_ctrl_c_changes_nothing(endless: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with Command("run", endless, "--out", out, "-q") as run:
+        run.until_written(out / "world.journal", 10_000)
+        until(lambda: not run.tell(SIGINT), "it ends, told again and again")
+        ended = run.ended(AT_ONCE_S)
+    assert not processes_of(out)
+    assert ended.status in (130, -SIGINT)
+    assert "Traceback" not in ended.err
+
+
+@pytest.mark.parametrize("number", [SIGINT, SIGTERM], ids=["SIGINT", "SIGTERM"])
+def test_a_world_and_an_agent_that_are_told_to_stop_say_so(number: signal.Signals) -> None:
+    with world("paper-1") as (clock, endpoint):
+        with Command("agent", "a", "--connect", endpoint) as agent:
+            agent.until_says("a: in run")
+            agent.tell(number)
+            assert agent.ended(AT_ONCE_S)[::2] == (130, f"tandem agent a: stopped by {number.name}\n")
+        clock.tell(number)
+        assert clock.ended(AT_ONCE_S)[::2] == (130, f"tandem world: stopped by {number.name}\n")
+
+
+def test_an_agent_that_looks_for_a_world_can_be_told_to_stop() -> None:
+    with Command("agent", "a", "--connect", free_endpoint()) as agent:
+        agent.until(lambda: agent.catches(SIGTERM), "it is ready")
+        agent.tell(SIGINT)
+        assert agent.ended(AT_ONCE_S) == (130, "", "tandem agent a: stopped by SIGINT\n")
+
+
+# --- robbed of a process ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("child", ["world", "agent a", "agent b"])
+def test_a_process_that_dies_ends_the_run_at_once_and_is_named(
+    child: str, endless: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    with Command("run", endless, "--out", out, "-q") as run:
+        run.until_written(out / "world.journal", 10_000)
+        os.kill(process_of(out, *child.split()), SIGKILL)
+        ended = run.ended(AT_ONCE_S)
+    assert ended == (3, "", f"tandem run: failed: {child} was killed by signal 9\n")
+    assert not processes_of(out)
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["outcome"] == "failed"
+    assert f"{child} was killed by signal 9" in summary["reason"]
+    assert summary["ticks"] > 0
+
+
+def test_a_robot_that_falls_silent_fails_the_run_within_the_patience(endless: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with Command("run", endless, "--out", out, "--patience", "2", "-q") as run:
+        run.until_written(out / "world.journal", 10_000)
+        os.kill(process_of(out, "agent", "b"), SIGSTOP)
+        ended = run.ended(30.0)
+    assert ended.status != 0
+    assert "no answer from b at tick " in ended.out + ended.err
+    assert "for 2 s" in ended.out + ended.err
+    assert not processes_of(out)
+
+
+def test_an_agent_whose_world_dies_ends_within_its_patience(tmp_path: Path) -> None:
+    with world("paper-1", "--run", "mine") as (clock, endpoint):
+        patience = ("--patience", "2", "--out", tmp_path)
+        with Command("agent", "a", "--connect", endpoint, *patience) as agent:
+            agent.until_answered("a", tmp_path)
+            clock.tell(SIGKILL)
+            ended = agent.ended(SOON_S)
+    assert ended.status == 3
+    assert ended.err.splitlines() == [
+        "tandem agent a: the world has gone; waiting 2 s for it",
+        "tandem agent a: nothing heard from the world for 2 s",
+    ]
+
+
+@pytest.mark.parametrize("comes", ["nobody", "a"])
+def test_a_world_whose_robot_never_comes_fails_and_says_who_was_missing(comes: str, tmp_path: Path) -> None:
+    missing = {"nobody": "a (not there), b (not there)", "a": "b (not there)"}[comes]
+    reason = f"no answer from {missing} at tick 0 for 2 s"
+    with world("paper-1", "--patience", "2", "--out", tmp_path) as (clock, endpoint):
+        if comes == "a":
+            agent = tandem("agent", "a", "--connect", endpoint)
+            assert agent.status == 1
+            assert f"a: failed after 0 ticks ({reason})" in agent.out
+        ended = clock.ended(SOON_S)
+    assert ended.status == 1
+    assert reason in " ".join(ended.out.split())
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert (summary["outcome"], summary["reason"], summary["ticks"]) == ("failed", reason, 0)
+
+
+# --- a port in use ----------------------------------------------------------------------------------
+
+
+def test_a_world_whose_port_another_world_has_is_one_clear_line() -> None:
+    with world("paper-1") as (_, endpoint):
+        assert tandem("world", "paper-1", "--listen", endpoint) == (
+            *(2, ""),
+            f"tandem world: --listen: {endpoint}: already in use\n",
+        )
+
+
+def test_an_agent_at_a_port_that_does_not_speak_zenoh_gives_up() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        endpoint = f"tcp/127.0.0.1:{mute.getsockname()[1]}"
+        ended = tandem("agent", "a", "--connect", endpoint, "--wait", "2")
+    assert ended == (3, "", f"tandem agent a: no world at {endpoint}; gave up after 2 s\n")

@@ -1,0 +1,318 @@
+"""`tandem run`: the whole mission as processes over Zenoh, and what it leaves behind."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+import pty
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.commands import PAPER_1, Command, journals, processes_of, tandem
+
+PAPER_TICKS = {"paper-1": 48, "paper-2": 110}
+COLUMNS = ["tick", "robot", "x", "y", "heading", "v", "omega", "anchor_range", "mutual_range"]
+FLOATS = ["x", "y", "heading", "v", "omega", "anchor_range", "mutual_range"]
+RECORD = ["agent-a.journal", "agent-b.journal", "summary.json", "ticks.csv", "world.journal"]
+
+
+def summary(folder: Path) -> dict[str, Any]:
+    told: dict[str, Any] = json.loads((folder / "summary.json").read_text())
+    return told
+
+
+def ticks(folder: Path) -> list[dict[str, str]]:
+    with (folder / "ticks.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def distance(one: dict[str, str], other: dict[str, str]) -> float:
+    return math.hypot(float(one["x"]) - float(other["x"]), float(one["y"]) - float(other["y"]))
+
+
+@pytest.fixture(scope="module", params=["paper-1", "paper-2"])
+def played(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+    """A paper's mission, played as processes, and where its record is."""
+    out = tmp_path_factory.mktemp(request.param) / "out"
+    ended = tandem("run", request.param, "--out", out)
+    assert ended.status == 0, ended
+    assert ended.err == ""
+    assert not processes_of(out)
+    return request.param, out
+
+
+# --- what it leaves ---------------------------------------------------------------------------------
+
+
+def test_the_papers_missions_localise_at_their_tick_and_leave_the_whole_record(
+    played: tuple[str, Path],
+) -> None:
+    name, out = played
+    told = summary(out)
+    assert sorted(path.name for path in out.iterdir()) == RECORD
+    assert (told["outcome"], told["ticks"], told["reason"]) == ("localised", PAPER_TICKS[name], None)
+    for robot in told["robots"].values():
+        assert robot["position_error_m"] < 1e-9
+        assert robot["heading_error_rad"] < 1e-9
+
+
+def test_summary_says_everything_that_is_promised_of_a_run(played: tuple[str, Path]) -> None:
+    name, out = played
+    told = summary(out)
+    assert list(told) == [
+        *("scenario", "seed", "mode", "outcome", "reason", "ticks", "wall_s", "first_contact_tick"),
+        *("t_max_s", "min_separation_m", "parameters", "versions", "robots"),
+    ]
+    assert (told["scenario"], told["seed"], told["mode"]) == (name, 1, "processes")
+    assert 0.0 < told["wall_s"] < 60.0
+    assert told["first_contact_tick"] == {"paper-1": 46, "paper-2": 106}[name]
+    assert told["t_max_s"] == pytest.approx(225.942087, abs=1e-6)
+    assert told["parameters"] == {
+        "sensing_range": 3.0,
+        "period": 1.0,
+        "max_speed": 1.0,
+        "max_turn_rate": math.pi,
+        "variant": "paper",
+        "max_ticks": told["parameters"]["max_ticks"],
+    }
+    assert told["parameters"]["max_ticks"] > 2 * 226
+    assert {"python", "tandem-ranging", "eclipse-zenoh", "numpy"} <= told["versions"].keys()
+    assert all(isinstance(version, str) for version in told["versions"].values())
+    rows = ticks(out)
+    nearest = min(distance(a, b) for a, b in zip(rows[::2], rows[1::2], strict=True))
+    assert told["min_separation_m"] == pytest.approx(nearest, abs=1e-12)
+
+
+PAPERS_ROBOTS: dict[tuple[str, str], dict[str, Any]] = {
+    ("paper-1", "a"): {"branch": "circle", "alpha": 1.980462, "candidates": [4, 4], "anchor_ranges": 3},
+    ("paper-1", "b"): {
+        "branch": "three-ranges",
+        "alpha": -2.384686,
+        "candidates": [4, 4],
+        "last_turn_rate": 0.9076,
+        "separation_m2": 1.80395,
+    },
+    ("paper-2", "a"): {"branch": "three-ranges-virtual", "alpha": -1.389410, "candidates": [4, 2]},
+    ("paper-2", "b"): {
+        "branch": "three-ranges",
+        "alpha": 1.287611,
+        "candidates": [4, 2],
+        "last_turn_rate": 0.1484,
+        "separation_m2": 0.95768,
+    },
+}
+
+
+@pytest.mark.parametrize("robot", ["a", "b"])
+def test_summary_says_everything_that_is_promised_of_a_robot(played: tuple[str, Path], robot: str) -> None:
+    name, out = played
+    told = summary(out)["robots"][robot]
+    assert sorted(told) == sorted(
+        [
+            *("localised", "localised_tick", "estimate", "truth", "position_error_m", "heading_error_rad"),
+            *("anchor_ranges", "mutual_ranges", "branch", "alpha", "candidates", "last_turn_rate"),
+            *("separation_m2", "reports_sent", "reports_heard", "reports_refused", "bytes_sent"),
+        ]
+    )
+    expected = {"last_turn_rate": None, "separation_m2": None} | PAPERS_ROBOTS[name, robot]
+    for field, value in expected.items():
+        assert told[field] == (pytest.approx(value, abs=1e-4) if isinstance(value, float) else value), field
+    assert told["localised"] is True
+    assert told["localised_tick"] == PAPER_TICKS[name]
+    assert told["mutual_ranges"] == 3
+    assert told["reports_refused"] == 0
+    assert told["reports_sent"] == told["reports_heard"] >= 3
+    assert 0 < told["bytes_sent"] <= 4096 * told["reports_sent"]
+    last = [row for row in ticks(out) if row["robot"] == robot][-1]
+    assert told["truth"] == [float(last[field]) for field in ("x", "y", "heading")]
+    assert told["estimate"] == pytest.approx(told["truth"], abs=1e-9)
+    error = math.dist(told["estimate"][:2], told["truth"][:2])
+    assert told["position_error_m"] == pytest.approx(error, abs=1e-15)
+    own = [row for row in ticks(out) if row["robot"] == robot and row["anchor_range"]]
+    assert told["anchor_ranges"] == len(own)
+
+
+def test_ticks_has_a_row_per_tick_and_robot_from_tick_0_on(played: tuple[str, Path]) -> None:
+    name, out = played
+    assert (out / "ticks.csv").read_text().splitlines()[0].split(",") == [*COLUMNS, "phase", "state"]
+    rows = [(int(row["tick"]), row["robot"]) for row in ticks(out)]
+    assert rows == [(tick, robot) for tick in range(PAPER_TICKS[name] + 1) for robot in ("a", "b")]
+
+
+def test_ticks_gives_floats_in_their_shortest_exact_form(played: tuple[str, Path]) -> None:
+    cells = [row[column] for row in ticks(played[1]) for column in FLOATS if row[column]]
+    assert cells == [repr(float(cell)) for cell in cells]
+
+
+def test_ticks_gives_headings_in_the_half_open_turn(played: tuple[str, Path]) -> None:
+    headings = [float(row["heading"]) for row in ticks(played[1])]
+    assert all(-math.pi < heading <= math.pi for heading in headings)
+
+
+def test_ticks_gives_the_controls_of_the_tick_to_come_and_none_in_the_last_row(
+    played: tuple[str, Path],
+) -> None:
+    for robot in ("a", "b"):
+        rows = [row for row in ticks(played[1]) if row["robot"] == robot]
+        assert (rows[-1]["v"], rows[-1]["omega"]) == ("", "")
+        for now, after in pairwise(rows):
+            v, omega, heading = (float(now[field]) for field in ("v", "omega", "heading"))
+            turned = math.remainder(float(after["heading"]) - heading - omega, 2 * math.pi)
+            assert turned == pytest.approx(0.0, abs=1e-9)
+            chord = v if omega == 0.0 else abs(2.0 * v / omega * math.sin(omega / 2.0))
+            assert distance(now, after) == pytest.approx(abs(chord), abs=1e-9)
+
+
+def test_ticks_gives_the_ranges_that_are_within_reach_and_no_others(played: tuple[str, Path]) -> None:
+    rows = ticks(played[1])
+    anchors = {"a": {"x": "0", "y": "0"}, "b": {"x": "10", "y": "0"}}
+    peers = [row for a, b in zip(rows[::2], rows[1::2], strict=True) for row in (b, a)]
+    for row, peer in zip(rows, peers, strict=True):
+        for column, other in (("anchor_range", anchors[row["robot"]]), ("mutual_range", peer)):
+            rho = distance(row, other)
+            assert bool(row[column]) == (rho <= 3.0)
+            assert not row[column] or float(row[column]) == pytest.approx(rho, abs=1e-12)
+
+
+def test_ticks_names_the_phases_in_order(played: tuple[str, Path]) -> None:
+    for robot in ("a", "b"):
+        rows = [row for row in ticks(played[1]) if row["robot"] == robot]
+        phases = [int(row["phase"]) for row in rows]
+        assert phases == sorted(phases)
+        assert set(phases) == {1, 2, 3}
+        assert rows[0]["state"] == "straight"
+        assert rows[-1]["state"] == "localised"
+
+
+# --- in one process -------------------------------------------------------------------------------------
+
+
+def same_in_process(out: Path, again: Path, *arguments: str) -> None:
+    ended = tandem("run", *arguments, "--out", again, "--in-process", "-q")
+    assert ended.status == 0, ended
+    assert journals(again) == journals(out)
+    assert (again / "ticks.csv").read_bytes() == (out / "ticks.csv").read_bytes()
+    one, other = summary(out), summary(again)
+    assert (one.pop("mode"), other.pop("mode")) == ("processes", "in-process")
+    assert one.pop("wall_s") > 0.0
+    assert other.pop("wall_s") > 0.0
+    assert one == other
+
+
+def test_in_process_leaves_the_same_bytes(played: tuple[str, Path], tmp_path: Path) -> None:
+    name, out = played
+    assert sorted(journals(out)) == [file for file in RECORD if file.endswith("journal")]
+    same_in_process(out, tmp_path / "again", name)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_in_process_leaves_the_same_bytes_from_random_starts(seed: int, tmp_path: Path) -> None:
+    out, arguments = tmp_path / "out", ("random", "--seed", str(seed))
+    ended = tandem("run", *arguments, "--out", out, "-q")
+    assert ended.status == 0, ended
+    assert summary(out)["seed"] == seed
+    same_in_process(out, tmp_path / "again", *arguments)
+
+
+def test_the_seed_draws_the_starts(tmp_path: Path) -> None:
+    for seed in ("1", "2"):
+        tandem("run", "random", "--seed", seed, "--in-process", "-q", "--out", tmp_path / seed)
+    one, other = (ticks(tmp_path / seed)[0] for seed in ("1", "2"))
+    assert (one["x"], one["y"], one["heading"]) != (other["x"], other["y"], other["heading"])
+
+
+# --- what it says -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", [[], ["--in-process"]], ids=["processes", "in-process"])
+def test_quiet_prints_only_the_outcome(mode: list[str]) -> None:
+    assert tandem("run", "paper-1", "-q", *mode) == (0, "localised after 48 ticks\n", "")
+
+
+def test_without_out_nothing_is_left(tmp_path: Path) -> None:
+    assert tandem("run", "paper-1", "-q", cwd=tmp_path).status == 0
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_table_at_the_end_says_how_each_robot_fared() -> None:
+    ended = tandem("run", "paper-1", "--in-process")
+    assert "localised after 48 ticks" in ended.out
+    rows = {words[0]: words[1:] for line in ended.out.splitlines() if (words := line.strip(" │┃").split())}
+    for robot, x, y, heading in (("a", "3.654", "-5.468", "+0.436"), ("b", "3.737", "-3.077", "+3.060")):
+        for figure in (x, y, heading):  # where it is, and where it thinks it is
+            assert sum(figure in word for word in rows[robot]) == 2, ended.out
+
+
+def test_a_terminal_shows_each_robots_phase_and_state_while_it_runs() -> None:
+    ours, theirs = pty.openpty()
+    with Command("run", "random", "--seed", "3", "--rate", "20", terminal=theirs) as command:
+        os.close(theirs)
+        shown = ""
+        while True:
+            try:
+                shown += os.read(ours, 65536).decode(errors="replace")
+            except OSError:  # the terminal's other end is closed: the command has ended
+                break
+        os.close(ours)
+        assert command.ended().status == 0
+    for words in ("phase", "state", "orbiting", "tick ", "localised after"):
+        assert words in shown, shown
+
+
+@pytest.mark.parametrize("mode", [[], ["--in-process"]], ids=["processes", "in-process"])
+def test_a_mission_that_runs_out_of_ticks_is_undecided_and_says_so(mode: list[str], tmp_path: Path) -> None:
+    short = tmp_path / "short.toml"
+    short.write_text(PAPER_1.replace("seed = 1", "seed = 1\nmax_ticks = 5"))
+    ended = tandem("run", short, "--out", tmp_path / "out", "-q", *mode)
+    told = summary(tmp_path / "out")
+    assert ended.status == 1
+    assert ended.out.startswith("undecided after 5 ticks")
+    assert told["outcome"] == "undecided"
+    assert "max_ticks" in told["reason"]
+    assert told["ticks"] == 5
+    for robot in told["robots"].values():
+        assert robot["localised"] is False
+        for field in ("localised_tick", "estimate", "position_error_m", "heading_error_rad", "candidates"):
+            assert robot[field] is None, field
+        assert len(robot["truth"]) == 3
+    assert told["first_contact_tick"] is None
+
+
+def test_rate_plays_in_real_time(tmp_path: Path) -> None:
+    ended = tandem("run", "random", "--seed", "3", "--rate", "20", "-q", "--out", tmp_path / "out")
+    assert ended.status == 0, ended
+    told = summary(tmp_path / "out")
+    assert told["outcome"] == "localised"
+    assert told["wall_s"] >= (told["ticks"] - 1) / 20
+
+
+def test_scenarios_lists_what_ships() -> None:
+    ended = tandem("scenarios")
+    lines = dict(line.split(maxsplit=1) for line in ended.out.splitlines())
+    assert ended.status == 0
+    assert {"paper-1", "paper-2", "random"} <= lines.keys()
+    assert "48" in lines["paper-1"]
+
+
+# --- company ----------------------------------------------------------------------------------------
+
+
+def test_runs_side_by_side_do_not_disturb_each_other(played: tuple[str, Path], tmp_path: Path) -> None:
+    name, alone = played
+    runs = [Command("run", name, "--out", tmp_path / str(i), "-q") for i in range(3)]
+    for i, run in enumerate(runs):
+        with run:
+            assert run.ended() == (0, f"localised after {PAPER_TICKS[name]} ticks\n", "")
+        assert journals(tmp_path / str(i)) == journals(alone)
+
+
+def test_folders_that_are_called_like_our_packages_do_not_disturb_a_run(tmp_path: Path) -> None:
+    for package in ("world", "agent", "protocol", "compose", "zenoh", "numpy"):
+        (tmp_path / package).mkdir()
+        (tmp_path / package / "__init__.py").write_text("raise SystemExit('the wrong one')")
+    assert tandem("run", "paper-1", "-q", cwd=tmp_path) == (0, "localised after 48 ticks\n", "")

@@ -1,0 +1,157 @@
+"""`tandem world` and `tandem agent`, each started on its own: any order, any number of pairs, no mix-ups."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from itertools import permutations
+from pathlib import Path
+
+import pytest
+
+from compose.local import free_endpoint
+from protocol import keys, session
+from tests.commands import Command, journals, processes_of, several_pairs, tandem, world
+
+
+def unanswered() -> None:
+    raise AssertionError("nobody listens there")
+
+
+@pytest.fixture(scope="module")
+def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The record of the paper's first mission."""
+    out = tmp_path_factory.mktemp("paper-1") / "out"
+    assert tandem("run", "paper-1", "--in-process", "-q", "--out", out).status == 0
+    return out
+
+
+# --- any order ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", list(permutations(["world", "a", "b"])), ids="-".join)
+def test_any_order_of_starting_gives_the_same_record(
+    order: tuple[str, ...], paper_1: Path, tmp_path: Path
+) -> None:
+    endpoint, out = free_endpoint(), tmp_path / "out"
+    with ExitStack() as shells:
+        started: dict[str, Command] = {}
+        for name in order:
+            if name == "world":
+                for agent in started.values():  # which it says after 5 s
+                    agent.until_says(f"no world at {endpoint} yet")
+                part = ("world", "paper-1", "--listen", endpoint)
+            else:
+                part = ("agent", name, "--connect", endpoint)
+            started[name] = shells.enter_context(Command(*part, "--out", out))
+            if name == "world":
+                started[name].until_says("waiting for a, b")
+            if "world" in started and len(started) == 2:
+                for robot in started.keys() - {"world"}:
+                    started[robot].until_answered(robot, out)
+        ended = {name: command.ended() for name, command in started.items()}
+    assert {name: end.status for name, end in ended.items()} == {"world": 0, "a": 0, "b": 0}, ended
+    for name in ("a", "b"):
+        assert f"{name}: localised after 48 ticks" in ended[name].out
+    assert "localised after 48 ticks" in ended["world"].out
+    assert journals(out) == journals(paper_1)
+    assert (out / "ticks.csv").read_bytes() == (paper_1 / "ticks.csv").read_bytes()
+    assert not processes_of(endpoint)
+
+
+def test_each_shell_may_keep_its_record_in_a_folder_of_its_own(paper_1: Path, tmp_path: Path) -> None:
+    with world("paper-1", "--out", tmp_path / "world") as (clock, endpoint), ExitStack() as shells:
+        for robot in ("a", "b"):
+            agent = Command("agent", robot, "--connect", endpoint, "--out", tmp_path / robot)
+            shells.enter_context(agent)
+        assert clock.ended().status == 0
+    found = {name: data for part in ("world", "a", "b") for name, data in journals(tmp_path / part).items()}
+    assert found == journals(paper_1)
+
+
+@pytest.mark.parametrize("pairs", [2, 3])
+def test_several_pairs_localise_side_by_side_in_one_world(pairs: int, tmp_path: Path) -> None:
+    scenario, out = tmp_path / "pairs.toml", tmp_path / "out"
+    scenario.write_text(several_pairs(pairs))
+    robots = "abcdef"[: 2 * pairs]
+    with world(scenario, "--out", out) as (clock, endpoint), ExitStack() as shells:
+        agents = [
+            shells.enter_context(Command("agent", robot, "--connect", endpoint, "--out", out))
+            for robot in reversed(robots)
+        ]
+        assert clock.ended().status == 0
+        assert [agent.ended().status for agent in agents] == [0] * len(agents)
+    again = tmp_path / "again"
+    assert tandem("run", scenario, "--in-process", "-q", "--out", again).status == 0
+    assert sorted(journals(out)) == sorted([*(f"agent-{robot}.journal" for robot in robots), "world.journal"])
+    assert journals(out) == journals(again)
+
+
+# --- no world -----------------------------------------------------------------------------------------
+
+
+def test_an_agent_without_a_world_says_so_and_gives_up(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    ended = tandem("agent", "a", "--connect", endpoint, "--wait", "6", "--out", tmp_path / "out")
+    assert ended.status == 3
+    assert ended.err.splitlines() == [
+        f"tandem agent a: no world at {endpoint} yet; looking for one for 6 s",
+        f"tandem agent a: no world at {endpoint}; gave up after 6 s",
+    ]
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_agent_finds_no_world_where_its_run_is_not_alive() -> None:
+    with world("paper-1", "--run", "mine") as (_, endpoint):
+        ended = tandem("agent", "a", "--connect", endpoint, "--run", "yours", "--wait", "1")
+    assert ended.status == 3
+    assert "gave up after 1 s" in ended.err
+
+
+# --- who may join -------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def waiting(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The endpoint of a world, run "mine", that has a and waits for b."""
+    out = tmp_path_factory.mktemp("waiting") / "out"
+    with (
+        world("paper-1", "--run", "mine", "--patience", "100") as (_, endpoint),
+        Command("agent", "a", "--connect", endpoint, "--out", out) as agent,
+    ):
+        agent.until_answered("a", out)
+        yield endpoint
+
+
+def test_an_unknown_robot_is_refused_with_those_that_there_are(waiting: str) -> None:
+    ended = tandem("agent", "z", "--connect", waiting)
+    assert ended == (2, "", "tandem agent: this world has no robot 'z'; it has a, b\n")
+
+
+def test_a_second_agent_of_the_same_robot_is_refused(waiting: str) -> None:
+    ended = tandem("agent", "a", "--connect", waiting)
+    assert ended == (2, "", "tandem agent: robot 'a' is in run 'mine' already\n")
+
+
+def test_an_agent_that_is_refused_leaves_the_mission_alone(paper_1: Path, tmp_path: Path) -> None:
+    with world("paper-1", "--out", tmp_path) as (clock, endpoint):
+        with Command("agent", "a", "--connect", endpoint, "--out", tmp_path) as a:
+            a.until_answered("a", tmp_path)
+            for refused in ("a", "z"):
+                assert tandem("agent", refused, "--connect", endpoint).status == 2
+            assert tandem("agent", "b", "--connect", endpoint, "--out", tmp_path).status == 0
+        assert clock.ended().status == 0
+    assert journals(tmp_path) == journals(paper_1)
+
+
+def test_an_agent_that_meets_several_runs_must_be_told_which() -> None:
+    with (
+        world("paper-1", "--run", "mine") as (_, endpoint),
+        session.open_client(endpoint, unanswered) as link,
+    ):
+        _token = session.show_alive(link, keys.world_alive("yours"))  # all that tells a world from afar
+        ended = tandem("agent", "a", "--connect", endpoint)
+        says = "tandem agent: several runs are alive: mine, yours; choose one with --run\n"
+        assert ended == (2, "", says)
+        with Command("agent", "a", "--connect", endpoint, "--run", "mine") as agent:
+            agent.until_says("a: in run mine, with b")
