@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 
 import msgspec
 
-from agent.geometry import SAME, Placement, included_angle, same_placement
+from agent.geometry import Placement, included_angle, same_placement
 from protocol.motion import Pose, compose, wrap
 
 FLOOR = 1e-9
@@ -22,7 +22,13 @@ MUTUAL_FLOOR = 1e-7
 """m: the same for a mutual range, whose prediction inherits the rounding of both robots' phase 1"""
 
 POLISHING_STEPS = 12
-"""Gauss-Newton steps at the most; a simple root takes one, a double root as many as it lost bits"""
+"""Gauss-Newton steps at the most; they end when the fit gets no better, mostly after one"""
+
+SAME_ANCHOR = 1e-8
+"""m: branches that put the anchor so near each other are one"""
+
+SINGULAR = 1e-14
+"""how nearly parallel two columns may be before they count as one (the sine of their angle, squared)"""
 
 
 class Branch(msgspec.Struct, frozen=True):
@@ -32,6 +38,12 @@ class Branch(msgspec.Struct, frozen=True):
     """rad, of eq. (2), signed"""
     start: Pose
     """where tick 0 of the odometry lies in the frame of the anchor: (rho_0, 0, heading)"""
+
+    @property
+    def anchor(self) -> tuple[float, float]:
+        """Where the anchor lies in the frame of the odometry, in m."""
+        c, s = math.cos(self.start.heading), math.sin(self.start.heading)
+        return -self.start.x * c, self.start.x * s
 
     def distance(self, odometry: Pose) -> float:
         """From the anchor, in m."""
@@ -56,7 +68,10 @@ def branches(rho0: float, measured_at: Pose, rho: float) -> tuple[Branch, ...]:
 def weigh_branches(
     candidates: Iterable[Branch], seen: Iterable[tuple[Pose, float | None]], sensing_range: float
 ) -> tuple[Branch, ...]:
-    """Those of `candidates` that explain every odometry pose in `seen` with its range, or its silence."""
+    """Those of `candidates` that explain every odometry pose in `seen` with its range, or its silence.
+
+    Two that put the anchor in the same place are one: so near the anchor, or so nearly radial, they are.
+    """
     seen = tuple(seen)
     ranged = [(pose, rho) for pose, rho in seen if rho is not None]
     silent = [pose for pose, rho in seen if rho is None]
@@ -66,31 +81,39 @@ def weigh_branches(
         if (
             all(abs(branch.distance(pose) - rho) <= FLOOR for pose, rho in ranged)
             and all(branch.distance(pose) > sensing_range - FLOOR for pose in silent)
-            and not any(abs(wrap(branch.alpha - other.alpha)) < SAME for other in left)
+            and not any(math.dist(branch.anchor, other.anchor) < SAME_ANCHOR for other in left)
         ):
             left.append(branch)
     return tuple(left)
 
 
 def _polished(branch: Branch, ranged: Sequence[tuple[Pose, float]]) -> Branch:
-    """The same branch with the heading that fits all ranges best, in squares (Gauss-Newton)."""
+    """The same branch with the heading that fits all ranges best, in squares (Gauss-Newton).
+
+    Two ranges are met exactly by construction, and near a radial heading they say nothing more.
+    """
+    if len(ranged) < 3:
+        return branch
     rho0, heading = branch.start.x, branch.start.heading
+    best = math.inf
+    fitted = heading
     for _ in range(POLISHING_STEPS):
         c, s = math.cos(heading), math.sin(heading)
-        gradient = curvature = 0.0
+        cost = gradient = curvature = 0.0
         for pose, rho in ranged:
             x, y = rho0 + c * pose.x - s * pose.y, s * pose.x + c * pose.y
-            slope = -2.0 * rho0 * (s * pose.x + c * pose.y)
-            gradient += slope * (x * x + y * y - rho * rho)
+            error = x * x + y * y - rho * rho
+            slope = -2.0 * rho0 * y
+            cost += error * error
+            gradient += slope * error
             curvature += slope * slope
-        if curvature == 0.0:
+        if cost >= best or curvature == 0.0:
             break
-        correction = gradient / curvature
-        heading -= correction
-        if abs(correction) < 1e-12:
-            break
-    turned = heading - branch.start.heading
-    return Branch(wrap(branch.alpha + turned), Pose(rho0, 0.0, heading))
+        best, fitted = cost, heading
+        heading -= gradient / curvature
+    if best is math.inf:
+        return branch
+    return Branch(wrap(branch.alpha + fitted - branch.start.heading), Pose(rho0, 0.0, fitted))
 
 
 class Sighting(msgspec.Struct, frozen=True):
@@ -104,11 +127,8 @@ class Sighting(msgspec.Struct, frozen=True):
 
 def separation(placement: Placement, a: Pose, b: Pose) -> float:
     """m: between a at `a` in <a(M1)> and b at `b` in <b(M2)>, if this is how they lie."""
-    c, s = math.cos(placement.phi), math.sin(placement.phi)
-    return math.hypot(
-        placement.x + c * a.x - s * a.y - b.x,
-        placement.y + s * a.x + c * a.y - b.y,
-    )
+    there = placement.place(a)
+    return math.hypot(there.x - b.x, there.y - b.y)
 
 
 def weigh_placements(
@@ -137,33 +157,34 @@ def _polished_placement(placement: Placement, sightings: Sequence[Sighting]) -> 
     The unknowns are phi and the bearing psi of M1 in <b(M2)>. Two ranges determine them exactly; more
     of them tell apart what eq. (7) alone gives as a double root.
     """
-    distance = math.hypot(placement.x, placement.y)
-    phi, psi = placement.phi, math.atan2(placement.y, placement.x)
     ranged = [(s.a, s.b, s.range) for s in sightings if s.range is not None]
     if len(ranged) < 3:
         return placement
+    distance = math.hypot(placement.x, placement.y)
+    phi, psi = placement.phi, math.atan2(placement.y, placement.x)
+    best, fitted = math.inf, placement
     for _ in range(POLISHING_STEPS):
         c, s = math.cos(phi), math.sin(phi)
         tx, ty = distance * math.cos(psi), distance * math.sin(psi)
-        pp = pq = qq = gp = gq = 0.0
+        cost = pp = pq = qq = gp = gq = 0.0
         for a, b, rho in ranged:
             ax, ay = c * a.x - s * a.y, s * a.x + c * a.y
             x, y = tx + ax - b.x, ty + ay - b.y
             error = x * x + y * y - rho * rho
             by_phi = 2.0 * (y * ax - x * ay)
             by_psi = 2.0 * (y * tx - x * ty)
+            cost += error * error
             pp += by_phi * by_phi
             pq += by_phi * by_psi
             qq += by_psi * by_psi
             gp += by_phi * error
             gq += by_psi * error
+        if cost >= best:
+            break
+        best, fitted = cost, Placement(wrap(phi), tx, ty)
         determinant = pp * qq - pq * pq
-        if determinant <= 1e-14 * pp * qq:
+        if determinant <= SINGULAR * pp * qq:
             break
-        turn = (qq * gp - pq * gq) / determinant
-        swing = (pp * gq - pq * gp) / determinant
-        phi -= turn
-        psi -= swing
-        if abs(turn) + abs(swing) < 1e-13:
-            break
-    return Placement(wrap(phi), distance * math.cos(psi), distance * math.sin(psi))
+        phi -= (qq * gp - pq * gq) / determinant
+        psi -= (pp * gq - pq * gp) / determinant
+    return fitted

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from protocol.motion import Pose, wrap
+from protocol.motion import Pose, compose, wrap
 
 SLACK = 1e-6
 """m: by so much may rounding break a triangle's inequality; what that lets in, residuals weigh later"""
@@ -38,6 +38,10 @@ class Placement(NamedTuple):
     phi: float
     x: float
     y: float
+
+    def place(self, pose: Pose) -> Pose:
+        """`pose`, of <a(M1)>, in <b(M2)>."""
+        return compose(Pose(self.x, self.y, self.phi), pose)
 
 
 def placements(
@@ -92,7 +96,7 @@ def same_placement(one: Placement, other: Placement, tolerance: float) -> bool:
 
 
 def circle_intersections(x: float, y: float, radius: float, distance: float) -> list[tuple[float, float]]:
-    """Where the circle of `radius` about (x, y) meets the circle of radius `distance` about the origin.
+    """Where (m) the circle of `radius` about (x, y) meets that of radius `distance` about the origin.
 
     A tangent point is given once. Empty where they do not meet, or are the same circle, or the first is
     a point.

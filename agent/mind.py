@@ -63,7 +63,7 @@ class Findings(msgspec.Struct, frozen=True):
     """the tick in which phase 3 began"""
     placements: tuple[Placement, ...] = ()
     """those of eq. (7) that are left"""
-    solutions: tuple[int, int] | None = None
+    candidates: tuple[int, int] | None = None
     """how many there were at first: all of them, and what silence left"""
     plan: Plan | None = None
 

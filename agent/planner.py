@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from agent import radio
-from agent.belief import Branch, Sighting, branches, weigh_branches, weigh_placements
+from agent.belief import FLOOR, Branch, Sighting, branches, weigh_branches, weigh_placements
 from agent.mind import Asleep, Done, Mind
 from agent.phases import anchor, encounter, rendezvous, seeking
 from agent.phases.anchor import ThirdPoint
@@ -24,7 +24,7 @@ from agent.phases.encounter import LastManoeuvre, Returning, Standing, Waiting
 from agent.phases.rendezvous import Aligning, Orbiting, Radial, Tangent
 from agent.phases.seeking import Circling, Straight, Turning
 from protocol import messages
-from protocol.messages import Drive, Estimate, Localised, Ranged, Report, Sense, Undecided
+from protocol.messages import MAX_REASON, Drive, Estimate, Localised, Ranged, Report, Sense, Undecided
 from protocol.motion import ORIGIN, REST, Controls, Pose, step
 
 # --- a tick -----------------------------------------------------------------------------------------
@@ -73,6 +73,8 @@ def decide(mind: Mind, reports: Sequence[Report] = ()) -> Mind:
         for told in reports:
             heard = radio.hear(heard, told)
         mind = replace(mind, radio=heard)
+        if isinstance(heard.verdict, Undecided) and mind.verdict is None:
+            return _undecided(mind, f"{mind.briefing.peer} says: {heard.verdict.reason}")
     if not mind.in_contact:
         return mind
     match mind.state:
@@ -151,7 +153,7 @@ def _advanced(mind: Mind, anchor_range: float | None) -> Mind:
 def _released(mind: Mind, rho0: float | None) -> Mind:
     if rho0 is None:
         return _undecided(mind, "the anchor is out of range at the start")
-    if rho0 == 0.0:  # the heading is radial by definition, and nothing is left to find out
+    if rho0 <= FLOOR:  # the heading is radial by definition, and nothing is left to find out
         return _located(mind, Branch(0.0, ORIGIN), "on-anchor")
     return replace(mind, state=Straight("anchor", mind.odometry, rho0))
 
@@ -222,9 +224,6 @@ def _considered(mind: Mind) -> Mind:
     if checked and len(left) == 1:
         return replace(mind, state=Done(3, Localised(mind.world_pose(left[0]))))
     if mind.briefing.role == "a":
-        told = mind.radio.verdict
-        if isinstance(told, Undecided):
-            return _undecided(mind, f"{mind.briefing.peer} says: {told.reason}")
         return mind
     if mind.briefing.variant == "paper" and mind.findings.plan is not None:
         failure = "fits more than one placement" if checked else "could not be taken: b left a's range"
@@ -242,17 +241,17 @@ def _considered(mind: Mind) -> Mind:
 def _weighed(mind: Mind, sightings: Sequence[Sighting], base: tuple[Sighting, Sighting]) -> Mind:
     """The placements of eq. (7) that every range and every silent tick of the encounter leave."""
     reach, findings = mind.briefing.mission.sensing_range, mind.findings
-    if findings.solutions is None:
+    if findings.candidates is None:
         solutions = encounter.solve(mind.briefing.anchor_distance, base)
         silence = [sighting for sighting in sightings if sighting.range is None]
         left = weigh_placements(solutions, silence, reach)
-        findings = replace(findings, placements=left, solutions=(len(solutions), len(left)))
+        findings = replace(findings, placements=left, candidates=(len(solutions), len(left)))
     left = weigh_placements(findings.placements, sightings, reach)
     return replace(mind, findings=replace(findings, placements=left))
 
 
 def _undecided(mind: Mind, reason: str) -> Mind:
-    return replace(mind, state=Done(mind.phase, Undecided(reason)))
+    return replace(mind, state=Done(mind.phase, Undecided(reason[:MAX_REASON])))
 
 
 # --- what a mind implies ----------------------------------------------------------------------------

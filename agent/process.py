@@ -19,6 +19,8 @@ from protocol.journal import Journal
 from protocol.messages import Briefing, End, Report, Sense
 from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode, encode
 
+REPORT_SHARE = 0.5
+"""of a tick in real time: how long to wait for the peer's report"""
 REPORTS_KEPT = 64
 """ticks for which a report is kept that no Sense has listed yet"""
 QUERY_S = 2.0
@@ -34,11 +36,11 @@ FAREWELL_S = 3.0
 
 
 class Unwelcome(Exception):
-    """There is a world, but this robot cannot join it, or go on in it; says why."""
+    """There is a world, but this robot cannot join it; says why."""
 
 
 class NoWorld(TimeoutError):
-    """There is no world within the wait, or no longer; says so."""
+    """There is no world within the wait, or none to go on with; says so."""
 
 
 class Search:
@@ -107,13 +109,17 @@ class AgentProcess:
         self._id = briefing.robot
         self._inbox = inbox
         self._patience = patience
-        self._answer_within = briefing.answer_within
+        self._tick_s = briefing.tick_s
         self._sense: Sense | None = None
         """the latest"""
         self._due: float | None = None
         """in real time: when to go on without the reports that it lists"""
         self._reports: dict[int, Told] = {}
         """the peer's, by tick, as they came"""
+        self._listed: set[int] = set()
+        """those of them that a Sense has listed"""
+        self._unheard = 0
+        """those that went without"""
         self._estimate_wanted = False
 
         journal = Journal(out / f"agent-{self._id}.journal", fsync=fsync) if out is not None else None
@@ -128,29 +134,28 @@ class AgentProcess:
         self._token = session.show_alive(link, keys.robot_alive(run, self._id))
 
     def play(self) -> End:
-        """The whole run, to its End. Raises Interrupted when told to stop; NoWorld, Unwelcome."""
-        heard_at = time.monotonic()
+        """The whole run, to its End. Raises NoWorld, or Interrupted when told to stop."""
+        patience = self._patience + (self._tick_s or 0.0)
+        give_up = time.monotonic() + patience
         while True:
-            until = heard_at + self._patience if self._due is None else self._due
-            arrival = self._inbox.next(until - time.monotonic())
-            if arrival.topic != "nothing":
-                heard_at = time.monotonic()
-            elif self._due is None:
-                raise NoWorld(f"nothing heard from the world for {self._patience:g} s")
+            arrival = self._inbox.next((self._due or give_up) - time.monotonic())
             match arrival.topic:
                 case "sense":
                     message = self._accepted(arrival)
                     if isinstance(message, End):
                         return self._part(message)
                     if message is not None:
+                        give_up = time.monotonic() + patience
                         self._on_sense(message, arrival.frame)
                 case "report":
                     self._on_report(arrival)
                 case "gone":
-                    self._inbox.say(f"the world has gone; waiting {self._patience:g} s for it")
+                    self._inbox.say(f"the world has gone; waiting {patience:g} s for it")
                 case _:
                     pass
             self._decide_when_all_is_heard()
+            if time.monotonic() > give_up:
+                raise NoWorld(f"nothing heard from the world for {patience:g} s")
 
     # --- what arrives ---
 
@@ -158,21 +163,21 @@ class AgentProcess:
         try:
             message: Sense | End = decode(arrival.frame, Sense | End)
         except MalformedFrame as error:
-            self._inbox.refuse(arrival.key, error)
+            self._inbox.refuse(arrival, error)
             return None
         if isinstance(message, Sense) and message.robot != self._id:
-            self._inbox.refuse(arrival.key, f"it is meant for '{message.robot}'")
+            self._inbox.refuse(arrival, f"it is meant for '{message.robot}'")
             return None
         return message
 
     def _on_sense(self, sense: Sense, frame: bytes) -> None:
         known = self._sense.tick if self._sense is not None else -1
         if sense.tick > known + 1:
-            raise Unwelcome(f"the world is at tick {sense.tick}, and {self._id} knows nothing after {known}")
+            raise NoWorld(f"the world is at tick {sense.tick}, and {self._id} knows nothing after {known}")
         if sense.tick == known + 1:
             self._sense = sense
-            if self._answer_within is not None:
-                self._due = time.monotonic() + self._answer_within
+            if self._tick_s is not None:
+                self._due = time.monotonic() + REPORT_SHARE * self._tick_s
             told = self._robot.sense(sense, frame)
             if told is not None:
                 self._report.put(told.frame)
@@ -183,17 +188,19 @@ class AgentProcess:
         try:
             report = decode(arrival.frame, Report, MAX_REPORT_BYTES)
         except MalformedFrame as error:
-            self._inbox.refuse(arrival.key, error)
+            self._inbox.refuse(arrival, error)
             return
         wrong = radio.contradiction(report)
         if report.robot != keys.robot_of(arrival.key):
             wrong = f"it says it is from '{report.robot}'"
         if wrong is not None:
-            self._inbox.refuse(arrival.key, wrong)
+            self._inbox.refuse(arrival, wrong)
             return
         now = self._sense.tick if self._sense is not None else 0
         if abs(report.tick - now) <= REPORTS_KEPT:
             self._reports.setdefault(report.tick, Told(report, arrival.frame))
+        else:
+            self._unheard += 1
 
     # --- what is done about it ---
 
@@ -216,9 +223,15 @@ class AgentProcess:
         self._drive.put(self._robot.drive_frame)
         if self._estimate_wanted:
             self._estimate.put(encode(self._robot.estimate()))
-        if self._reports:
-            oldest = drive.tick - REPORTS_KEPT
-            self._reports = {tick: told for tick, told in self._reports.items() if tick >= oldest}
+        self._listed.update(told.report.tick for told in heard)
+        self._forget_reports(before=drive.tick - REPORTS_KEPT)
+
+    def _forget_reports(self, before: int) -> None:
+        """Those of ticks `before`, counting what nobody has asked for."""
+        for tick in [tick for tick in self._reports if tick < before]:
+            del self._reports[tick]
+            self._unheard += tick not in self._listed
+            self._listed.discard(tick)
 
     def _say_again(self) -> None:
         if self._robot.told is not None:
@@ -228,7 +241,15 @@ class AgentProcess:
 
     def _part(self, end: End) -> End:
         """Answer the End, as often as it is said, until the world has gone."""
-        farewell = encode(self._robot.farewell(end, self._inbox.refused))
+        self._forget_reports(before=end.tick + REPORTS_KEPT + 1)
+        farewell = encode(
+            self._robot.farewell(
+                end,
+                reports_refused=self._inbox.refused["report"],
+                reports_unheard=self._unheard,
+                frames_refused=self._inbox.refused.total(),
+            )
+        )
         self._drive.put(farewell)
         give_up = time.monotonic() + FAREWELL_S
         while (left := give_up - time.monotonic()) > 0.0:

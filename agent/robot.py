@@ -81,8 +81,10 @@ class Robot:
         """What the robot holds possible, for whoever watches."""
         return planner.estimate(self.mind)
 
-    def farewell(self, end: End, refused: int = 0) -> Farewell:
-        """The mission is over: how it went, seen from inside; `refused` frames could not be used."""
+    def farewell(
+        self, end: End, *, reports_refused: int = 0, reports_unheard: int = 0, frames_refused: int = 0
+    ) -> Farewell:
+        """The mission is over: how it went, seen from inside, and what the wire brought that was no use."""
         mind, findings = self.mind, self.mind.findings
         plan = findings.plan
         farewell = Farewell(
@@ -91,12 +93,14 @@ class Robot:
             mutual_ranges=len(mind.mutual),
             branch=findings.branch_kind,
             alpha=findings.branch.alpha if findings.branch is not None else None,
-            placements=findings.solutions,
+            candidates=findings.candidates,
             last_turn_rate=plan.drive.omega if plan is not None else None,
             separation_m2=plan.separation_m2 if plan is not None else None,
             reports_sent=self.reports_sent,
             reports_heard=mind.radio.heard,
-            reports_refused=refused,
+            reports_refused=reports_refused,
+            reports_unheard=reports_unheard,
+            frames_refused=frames_refused,
             bytes_sent=self.bytes_sent,
         )
         if self._journal is not None:

@@ -6,6 +6,7 @@ puts a frame to each robot and waits for a frame of each. Nothing is encoded, ch
 
 from __future__ import annotations
 
+import signal
 import sys
 import time
 from collections.abc import Sequence
@@ -14,6 +15,7 @@ from queue import SimpleQueue
 import zenoh
 
 from protocol import keys, session
+from protocol.inbox import Inbox
 
 PATIENCE_S = 30.0
 RUN = "barrier"
@@ -25,12 +27,17 @@ def drop(frames: SimpleQueue[bytes], sample: zenoh.Sample) -> None:
 
 
 def world(link: zenoh.Session, robots: Sequence[str], size: int, ticks: int) -> float:
-    """Seconds that `ticks` rounds take, once everybody is there; frames of `size` bytes."""
+    """Seconds that `ticks` rounds take, once everybody is there; frames of `size` bytes.
+
+    Raises queue.Empty after PATIENCE_S without an answer.
+    """
     frames: SimpleQueue[bytes] = SimpleQueue()
+    there = Inbox("barrier")
     link.declare_subscriber(keys.drive(RUN, "*"), lambda sample: drop(frames, sample))
     publishers = [session.publisher(link, keys.sense(RUN, robot)) for robot in robots]
-    for _ in robots:  # each puts one frame when it is ready
-        frames.get(timeout=PATIENCE_S)
+    session.watch_liveliness(link, keys.robot_alive(RUN, "*"), there)
+    for _ in robots:
+        there.next(PATIENCE_S)
     frame = bytes(size)
     began = time.perf_counter()
     for _ in range(ticks):
@@ -44,19 +51,23 @@ def world(link: zenoh.Session, robots: Sequence[str], size: int, ticks: int) -> 
 def robot(endpoint: str, name: str, size: int, ticks: int) -> None:
     """Answer `ticks` frames with one of `size` bytes each."""
     frames: SimpleQueue[bytes] = SimpleQueue()
+    give_up = time.monotonic() + PATIENCE_S
 
     def unanswered() -> None:
-        return
+        if time.monotonic() > give_up:
+            sys.exit(1)
 
     with session.open_client(endpoint, unanswered) as link:
         link.declare_subscriber(keys.sense(RUN, name), lambda sample: drop(frames, sample))
         publisher = session.publisher(link, keys.drive(RUN, name))
+        token = session.show_alive(link, keys.robot_alive(RUN, name))
         frame = bytes(size)
-        publisher.put(frame)
         for _ in range(ticks):
             frames.get(timeout=PATIENCE_S)
             publisher.put(frame)
+        token.undeclare()
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     robot(sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4]))

@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 import re
 import sys
+import traceback
 from importlib import import_module
 from pathlib import Path
 from typing import NoReturn
 
-from compose.status import NOT_LOCALISED, USER_ERROR, UserError
+from compose.status import BUG, NOT_LOCALISED, USER_ERROR, UserError
 from protocol.inbox import one_line
-from protocol.keys import NAME
+from protocol.units import NAME
 
 
 class _Parser(argparse.ArgumentParser):
@@ -31,6 +32,9 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         status = USER_ERROR
     except BrokenPipeError:
         status = NOT_LOCALISED
+    except Exception:  # noqa: BLE001  # whatever it is, it must not look like a mission's outcome
+        traceback.print_exc()
+        status = BUG
     session = sys.modules.get("protocol.session")
     (session.leave if session is not None else sys.exit)(status)
     raise AssertionError
@@ -62,8 +66,8 @@ def _parser() -> argparse.ArgumentParser:
     agent.add_argument(
         "--wait", type=_positive, default=60.0, metavar="S", help="how long to look for a world (60)"
     )
-    world.add_argument("--launched", action="store_true", help=argparse.SUPPRESS)  # who did so concludes
     for sub in (world, agent):
+        sub.add_argument("--launched", action="store_true", help=argparse.SUPPRESS)  # by `tandem run`
         sub.add_argument("--fsync", action="store_true", help="the journal survives a power cut")
 
     command("scenarios", "List the scenarios that ship.")
@@ -111,6 +115,6 @@ def _count(text: str) -> int:
 
 
 def _name(text: str) -> str:
-    if not NAME.fullmatch(text):
-        raise argparse.ArgumentTypeError(f"'{text}' is no name: letters, digits, - and _, 64 at most")
+    if not re.search(NAME, text):
+        raise argparse.ArgumentTypeError(f"'{text}' is no name: letters, digits, - and _ only")
     return text

@@ -10,18 +10,18 @@ import tempfile
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
+from compose.status import ENDED
 from protocol.inbox import Inbox
+from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from world.scenario import Scenario
 
 STOP_S = 5.0
 """how long a process may take to end when told to; then it is killed"""
 LISTENING_PORTS = range(20_000, 32_000)
 """below those that the system gives to outgoing connections, which could take one in between"""
-
-ENDED = (0, 1)
-"""exit statuses of a process whose mission came to an End"""
 
 
 class ChildFailed(RuntimeError):
@@ -50,12 +50,14 @@ class _Child:
         # -P: the user's directory may hold a folder called world, or agent
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "compose", *arguments],
-            stdin=subprocess.DEVNULL,
+            stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=self._errors,
             start_new_session=True,
         )
         self._inbox = inbox
+        assert self._process.stdin is not None
+        self._input = self._process.stdin  # open as long as the launcher lives: the child ends with it
         threading.Thread(target=self._wait, daemon=True).start()
 
     def _wait(self) -> None:
@@ -77,6 +79,12 @@ class _Child:
         self._errors.seek(0)
         return self._errors.read().decode(errors="replace").strip()
 
+    def hand(self, frame: bytes) -> None:
+        """Give it `frame` to start from."""
+        with suppress(BrokenPipeError):
+            self._input.write(len(frame).to_bytes(4, "big") + frame)
+            self._input.flush()
+
     def stop(self) -> None:
         """Tell it to end."""
         self._process.terminate()
@@ -88,25 +96,28 @@ class _Child:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+        with suppress(BrokenPipeError):
+            self._input.close()
+
+
+def handed() -> Scenario:
+    """In a child: the scenario that its launcher has handed it."""
+    size = int.from_bytes(sys.stdin.buffer.read(4), "big")
+    return decode(sys.stdin.buffer.read(size), Scenario, MAX_FRAME_BYTES)
 
 
 def play(
-    scenario: Scenario,
-    world_arguments: Sequence[str],
-    out: Path,
-    inbox: Inbox,
-    *,
-    run: str,
-    patience: float,
+    scenario: Scenario, out: Path, inbox: Inbox, *, run: str, rate: float | None, patience: float
 ) -> None:
-    """Play `scenario`, which `tandem world` finds by `world_arguments`; journals go to `out`.
+    """Play `scenario`; journals go to `out`.
 
     Raises ChildFailed, or Interrupted when `inbox` says so; no process is left then, either.
     """
     endpoint = free_endpoint()
-    shared = ["--run", run, "--out", str(out), "--patience", str(patience), "--quiet"]
-    world = ["world", *world_arguments, "--listen", endpoint, "--launched", *shared]
-    children = [_Child("world", world, inbox)]
+    shared = ["--launched", "--run", run, "--out", str(out), "--patience", str(patience)]
+    real_time = ["--rate", str(rate)] if rate is not None else []
+    children = [_Child("world", ["world", scenario.name, "--listen", endpoint, *shared, *real_time], inbox)]
+    children[0].hand(encode(scenario))
     try:
         for robot in scenario.robots:
             arguments = ["agent", robot.id, "--connect", endpoint, *shared]
@@ -115,7 +126,7 @@ def play(
     finally:
         _stop(children)
         for child in children:
-            if child.status in ENDED and (said := child.said()):
+            if child.status == ENDED and (said := child.said()):
                 print(said, file=sys.stderr)
 
 
@@ -128,7 +139,7 @@ def _watch(children: Mapping[str, _Child], inbox: Inbox) -> None:
             return
         child = children[arrival.key]
         running.discard(child.name)
-        if child.status not in ENDED:
+        if child.status != ENDED:
             raise ChildFailed(f"{child.name} {_how(child.status)}{child.said() and ': ' + child.said()}")
 
 

@@ -6,7 +6,9 @@ import csv
 import io
 import math
 import platform
+import tempfile
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from itertools import combinations
 from pathlib import Path
@@ -14,6 +16,7 @@ from typing import Any, Literal
 
 import msgspec
 
+from compose.status import UserError
 from protocol import journal
 from protocol.messages import Drive, End, Farewell, Localised, Missed, Outcome
 from protocol.motion import Pose, wrap
@@ -22,10 +25,31 @@ from world.referee import errors
 from world.scenario import Scenario
 from world.sensors import anchor_ranges, mutual_ranges
 from world.tick import World, advance, release
-from world.truth import Truth
+from world.truth import Truth, within_limits
 
 Mode = Literal["processes", "in-process"]
 WORLD_JOURNAL = "world.journal"
+
+
+@contextmanager
+def folder_for(out: Path | None) -> Iterator[Path]:
+    """Where a record goes: `out`, or a folder that is gone afterwards. Raises UserError."""
+    if out is None:
+        with tempfile.TemporaryDirectory(prefix="tandem-") as folder:
+            yield Path(folder)
+        return
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out):
+            pass
+    except OSError as error:
+        raise UserError(cannot_write(out, error)) from None
+    yield out
+
+
+def cannot_write(out: Path | None, error: OSError) -> str:
+    """What to tell the user of `error`."""
+    return f"--out: {out} cannot be written: {error.strerror or error}"
 
 
 class Moment(msgspec.Struct, frozen=True):
@@ -98,7 +122,8 @@ def ticks_csv(record: Record) -> str:
             drive = moment.drives.get(robot)
             driven: list[object] = ["", ""] if moment.truth.tick == last else [0.0, 0.0]
             if drive is not None and moment.truth.tick != last:
-                driven = [drive.v, drive.omega]
+                executed = within_limits(drive.v, drive.omega, record.scenario.mission)
+                driven = [executed.v, executed.omega]
             said = [drive.phase, drive.state] if drive is not None else ["", ""]
             rows.writerow(
                 [moment.truth.tick, robot, pose.x, pose.y, wrap(pose.heading), *driven]
@@ -111,14 +136,9 @@ def _or_empty(value: float | None) -> object:
     return "" if value is None else value
 
 
-def _pairs(scenario: Scenario) -> Iterator[tuple[int, int]]:
-    place = {robot.id: i for i, robot in enumerate(scenario.robots)}
-    return ((place[robot.id], place[robot.peer]) for robot in scenario.robots if robot.role == "a")
-
-
 def _mutual(scenario: Scenario, truth: Truth) -> dict[str, float]:
     """Everyone's range to its peer, if there is one."""
-    pairs = list(_pairs(scenario))
+    pairs = scenario.pairs()
     ranges = mutual_ranges(truth.poses, pairs, scenario.mission.sensing_range)
     return {
         scenario.robots[i].id: rho
@@ -170,9 +190,8 @@ def _robot_summary(record: Record, place: int) -> dict[str, Any]:
         if (drive := moment.drives.get(robot)) is not None and isinstance(drive.verdict, Localised)
     ]
     truth = record.moments[-1].truth.poses[place] if record.moments else None
-    claim = claims[-1][1] if claims else None
+    claim = claims[0][1] if claims else None
     position, heading = errors(claim, truth) if claim is not None and truth is not None else (None, None)
-    said = {field: getattr(farewell, field, None) for field in _SAID}
     return {
         "localised": bool(claims),
         "localised_tick": claims[0][0] if claims else None,
@@ -180,12 +199,11 @@ def _robot_summary(record: Record, place: int) -> dict[str, Any]:
         "truth": _listed(truth),
         "position_error_m": position,
         "heading_error_rad": heading,
-        **said,
-        "candidates": list(farewell.placements) if farewell and farewell.placements else None,
+        **{field: getattr(farewell, field, None) for field in _SAID},
     }
 
 
-_SAID = [field for field in Farewell.__struct_fields__ if field not in ("robot", "placements")]
+_SAID = [field for field in Farewell.__struct_fields__ if field != "robot"]
 
 
 def _listed(pose: Pose | None) -> list[float] | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import random
 import re
+import secrets
 from collections import Counter
 from importlib import resources
 from pathlib import Path
@@ -13,13 +14,13 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
+from compose.status import UserError
+from protocol.messages import Briefing
 from protocol.mission import Anchor, Mission, Rendezvous, Role, Variant, rendezvous, tick_budget
 from protocol.motion import TAU, Pose
-from protocol.units import RobotId
+from protocol.units import NAME, RobotId
+from protocol.wire import MalformedFrame, decode, encode
 from world.scenario import Placed, Scenario
-
-NAME = r"^[A-Za-z0-9_-]{1,48}\Z"
-
 
 MAX_TICKS = 10**9
 MAX_ROBOTS = 200
@@ -28,11 +29,13 @@ Place = Annotated[float, Meta(ge=-1e6, le=1e6)]
 """m: nobody gets so far from there that `units.Coordinate` would not hold it"""
 NEAREST_ANCHORS = 1e-3
 """m: that is one anchor, not two"""
+TICK_S = (5e-4, 3600.0)
+"""s of wall time that a tick in real time may last"""
 WITHIN = 1.0 - 1e-9
 """of R: how far out a start is drawn at the most, so that rounding does not carry it outside"""
 
 
-class BadScenario(ValueError):
+class BadScenario(UserError):
     """The user's scenario cannot be played; the text names the file, the field and what is wrong."""
 
 
@@ -60,7 +63,7 @@ class RobotTable(_Table, frozen=True):
 class ScenarioFile(_Table, frozen=True):
     """What a scenario file may say."""
 
-    name: Annotated[str, Meta(pattern=NAME)]
+    name: Annotated[str, Meta(pattern=NAME, max_length=48)]
     mission: Mission
     robot: Annotated[list[RobotTable], Meta(min_length=2, max_length=MAX_ROBOTS)]
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
@@ -72,6 +75,22 @@ def shipped() -> dict[str, Path]:
     """The scenarios that come with Tandem, by name."""
     folder = Path(str(resources.files("compose") / "scenarios"))
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+
+
+def run_name(scenario: Scenario) -> str:
+    """A name for a run of it that no other run has."""
+    return f"{scenario.name}-{secrets.token_hex(3)}"
+
+
+def check_rate(scenario: Scenario, rate: float | None) -> None:
+    """Raises UserError where `rate` makes a tick last no sensible time."""
+    shortest, longest = TICK_S
+    if rate is not None and not shortest <= scenario.mission.period / rate <= longest:
+        period = scenario.mission.period
+        raise UserError(
+            f"--rate: {rate:g} makes a tick of {period:g} s last {period / rate:g} s, "
+            f"outside {shortest:g} to {longest:g} s"
+        )
 
 
 def load(source: str, *, seed: int | None = None) -> Scenario:
@@ -98,7 +117,7 @@ def parse(text: str, source: str, *, seed: int | None = None) -> Scenario:
         file = msgspec.toml.decode(text, type=ScenarioFile)
     except msgspec.ValidationError as error:
         raise BadScenario(f"{source}: {_field_first(str(error))}") from None
-    except (msgspec.DecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # of msgspec, or of the TOML library beneath it
         raise BadScenario(f"{source}: not TOML: {error}") from None
     if seed is not None:
         file = msgspec.structs.replace(file, seed=seed)
@@ -136,7 +155,7 @@ def _validated(file: ScenarioFile, source: str) -> Scenario:
     budget = max(tick_budget(file.mission, plan) for plan in plans.values())
     if file.max_ticks is None and budget > MAX_TICKS:
         raise BadScenario(f"{source}: mission: to meet could take {budget} ticks, more than {MAX_TICKS}")
-    return Scenario(
+    scenario = Scenario(
         name=file.name,
         seed=file.seed,
         max_ticks=file.max_ticks if file.max_ticks is not None else budget,
@@ -144,6 +163,12 @@ def _validated(file: ScenarioFile, source: str) -> Scenario:
         variant=file.planner.variant,
         robots=tuple(placed),
     )
+    try:
+        for one in scenario.robots:
+            decode(encode(scenario.briefing(one.id)), Briefing)
+    except MalformedFrame as error:
+        raise BadScenario(f"{source}: mission: no robot could be told of it: {error}") from None
+    return scenario
 
 
 def _plan(file: ScenarioFile, first: int, second: int, source: str) -> Rendezvous:

@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from protocol.inbox import Inbox
+
+
+def stop_with_launcher(inbox: Inbox) -> None:
+    """Put "stop" into `inbox` when standard input, which a launcher holds open, comes to its end."""
+
+    def wait() -> None:
+        while os.read(0, 4096):
+            pass
+        inbox.put("stop", "the end of its launcher")
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from queue import Empty, SimpleQueue
 from typing import Literal, NamedTuple
 
@@ -31,7 +32,7 @@ class Inbox:
     """A queue that callbacks and signal handlers fill, and one thread empties, with a bound on each wait."""
 
     def __init__(self, owner: str) -> None:
-        self.refused = 0
+        self.refused = Counter[Topic]()
         """frames that were malformed, or not from whom they said"""
         self._owner = owner
         self._queue: SimpleQueue[Arrival] = SimpleQueue()
@@ -51,13 +52,13 @@ class Inbox:
             raise Interrupted(arrival.key)
         return arrival
 
-    def refuse(self, key: str, why: object) -> None:
-        """Count a frame that came by `key` and cannot be used; tell of each kind once."""
-        self.refused += 1
-        complaint = (key, str(why))
+    def refuse(self, arrival: Arrival, why: object) -> None:
+        """Count a frame that cannot be used; tell of each kind once."""
+        self.refused[arrival.topic] += 1
+        complaint = (arrival.key, str(why))
         if complaint not in self._complaints and len(self._complaints) < COMPLAINTS:
             self._complaints.add(complaint)
-            self.say(f"refused a frame on {key}: {why}")
+            self.say(f"refused a frame on {arrival.key}: {why}")
 
     def say(self, line: str) -> None:
         """Tell whoever watches the process."""

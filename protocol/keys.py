@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import re
-
 ROOT = "tandem"
-NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
-"""what a run, or a robot, may be called"""
 
 
 def truth(run: str) -> str:
@@ -15,7 +11,7 @@ def truth(run: str) -> str:
 
 
 def briefing(run: str, robot: str) -> str:
-    """Queryable at the world: what that robot needs to start; "*" for all of them."""
+    """Queryable at the world: what that robot needs to start; the world answers for "*"."""
     return f"{ROOT}/{run}/world/briefing/{robot}"
 
 

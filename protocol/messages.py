@@ -30,7 +30,9 @@ Outcome = Literal["localised", "undecided", "alarm", "wrong", "failed"]
 BranchKind = Literal["three-ranges", "three-ranges-virtual", "circle", "on-anchor"]
 """How phase 1 told +alpha from -alpha."""
 
-Text = Annotated[str, Meta(max_length=300)]
+MAX_REASON = 300
+"""characters"""
+Text = Annotated[str, Meta(max_length=MAX_REASON)]
 Phase = Annotated[int, Meta(ge=1, le=3)]
 Word = Annotated[str, Meta(max_length=32)]
 
@@ -86,8 +88,8 @@ class Briefing(Message, frozen=True):
     mission: Mission
     variant: Variant
     rendezvous: Rendezvous
-    answer_within: Annotated[float, Meta(ge=0.0, le=1e6)] | None
-    """s of wall time from Sense to Drive; none in lockstep, where no decision depends on a time-out"""
+    tick_s: Annotated[float, Meta(gt=0.0, le=1e6)] | None
+    """s of wall time that a tick lasts; none in lockstep, where no decision depends on a time-out"""
 
     @property
     def anchor_distance(self) -> float:
@@ -183,15 +185,19 @@ class Farewell(Message, frozen=True):
     branch: BranchKind | None
     alpha: Angle | None
     """of eq. (2), signed"""
-    placements: tuple[Count, Count] | None
+    candidates: tuple[Count, Count] | None
     """solutions of eq. (7), before and after silence"""
     last_turn_rate: AngularVelocity | None
     """omega_2 of eq. (8); only b plans it"""
     separation_m2: Annotated[float, Meta(ge=0.0, le=1e15)] | None
-    """J of eq. (8)"""
+    """J of eq. (8); none where one candidate was left, and nothing to be told apart"""
     reports_sent: Count
     reports_heard: Count
     reports_refused: Count
-    """frames that were malformed, or not from whom they said"""
+    """malformed, or not from whom they said"""
+    reports_unheard: Count
+    """that arrived, though no Sense listed them"""
+    frames_refused: Count
+    """of all kinds"""
     bytes_sent: Count
     """of reports"""

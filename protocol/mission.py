@@ -90,23 +90,31 @@ def longest_meeting(mission: Mission, distance: float) -> float:
     return TAU * (math.pi / half_arc(distance, mission.sensing_range) + 1.0) * slowest
 
 
-def orbit_margin(mission: Mission, distance: float) -> float:
+def orbit_margin(mission: Mission, distance: float, speed: float) -> float:
     """m0 in m: how far inside (D + R) / 2 the orbits must be for sampling not to skip the encounter.
 
-    The paper's orbits meet only tangentially; the relative speed across the lens is v (1 - Omega / pi).
-    Empirical: never exceeded in any setting tried, not proved.
+    The paper's orbits meet only tangentially; at `speed` (m/s) the robots pass each other with
+    v (1 - Omega / pi). Empirical: T_max was never exceeded in any setting tried; not proved.
     """
-    radius = 0.5 * (distance + mission.sensing_range)
-    v = min(mission.max_speed, mission.max_turn_rate * radius)
-    omega = half_arc(distance, mission.sensing_range)
-    return (v * mission.period * (1.0 - omega / math.pi)) ** 2 / (16.0 * mission.sensing_range)
+    v = min(speed, mission.max_turn_rate * 0.5 * (distance + mission.sensing_range))
+    return (v * mission.period * _closing(mission, distance)) ** 2 / (16.0 * mission.sensing_range)
+
+
+def _closing(mission: Mission, distance: float) -> float:
+    """1 - Omega / pi: the relative speed of the two orbits, over that of a."""
+    return 1.0 - half_arc(distance, mission.sensing_range) / math.pi
 
 
 def rendezvous(mission: Mission, distance: float, variant: Variant) -> Rendezvous:
-    """The orbits of eq. (6) for anchors `distance` (D) apart; the assured ones are smaller by the margin."""
-    margin = orbit_margin(mission, distance) if variant == "assured" else 0.0
-    radius = 0.5 * (distance + mission.sensing_range) - margin
-    omega_a = min(mission.max_turn_rate, mission.max_speed / radius)
+    """The orbits of eq. (6) for anchors `distance` m (D) apart.
+
+    The assured ones are smaller by the margin, and no faster than lets it be a quarter of R.
+    """
+    radius, speed = 0.5 * (distance + mission.sensing_range), mission.max_speed
+    if variant == "assured":
+        speed = min(speed, 2.0 * mission.sensing_range / (mission.period * _closing(mission, distance)))
+        radius -= orbit_margin(mission, distance, speed)
+    omega_a = min(mission.max_turn_rate, speed / radius)
     omega_b = -half_arc(distance, mission.sensing_range) / math.pi * omega_a
     return Rendezvous(
         a=Orbit(radius, omega_a * radius, omega_a),

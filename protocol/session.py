@@ -31,9 +31,7 @@ RETRY_MS = 50
 
 MSGPACK = zenoh.Encoding("application/msgpack")
 
-_ENDPOINT = re.compile(
-    r"(tcp|udp|tls|quic|ws)/(?P<host>\[[0-9A-Fa-f:.%\w]+\]|[^\s/:\[\]]+):(?P<port>\d{1,5})"
-)
+_ENDPOINT = re.compile(r"(tcp|tls|quic|ws)/(?P<host>\[[0-9A-Fa-f:.%\w]+\]|[^\s/:\[\]]+):(?P<port>\d{1,5})")
 
 zenoh.init_log_from_env_or("off")
 

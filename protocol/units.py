@@ -31,5 +31,6 @@ Angle = Annotated[float, Meta(ge=-1e9, le=1e9)]
 Tick = Annotated[int, Meta(ge=0, le=2**31)]
 TickCount = Annotated[int, Meta(ge=1, le=2**31)]
 Count = Annotated[int, Meta(ge=0, le=2**53)]
-RobotId = Annotated[str, Meta(pattern="^[A-Za-z0-9_-]{1,32}\\Z")]
-"""one chunk of a key expression, and part of a file's name"""
+NAME = r"\A[A-Za-z0-9][A-Za-z0-9_-]{0,63}\Z"
+"""of a robot, a run, a scenario: one chunk of a key expression, part of a file's name, never an option"""
+RobotId = Annotated[str, Meta(pattern=NAME, max_length=32)]

@@ -23,7 +23,7 @@ from protocol.motion import Controls, Pose, Run
 POSE = Pose(1.5, -2.5, 0.75)
 
 EXAMPLES: tuple[Message, ...] = (
-    load("paper-1").briefing("a", answer_within=0.25),
+    load("paper-1").briefing("a", tick_s=0.25),
     Sense(7, "a", Controls(1.0, -0.5), 2.5, (Contact("b", 1.25, (5, 7)), Contact("c", None, ()))),
     Sense(0, "a", None, None),
     Report(
@@ -47,6 +47,6 @@ EXAMPLES: tuple[Message, ...] = (
     Missed(8, "b"),
     End(48, "wrong", "a claims a pose that is 1 m off"),
     End(48, "localised", None),
-    Farewell("b", 5, 3, "circle", -2.5, (4, 2), 0.5, 1.5, 3, 4, 1, 600),
-    Farewell("b", 0, 0, None, None, None, None, None, 0, 0, 0, 0),
+    Farewell("b", 5, 3, "circle", -2.5, (4, 2), 0.5, 1.5, 3, 4, 1, 2, 3, 600),
+    Farewell("b", 0, 0, None, None, None, None, None, 0, 0, 0, 0, 0, 0),
 )

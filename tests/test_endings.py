@@ -212,10 +212,10 @@ def test_a_world_whose_robot_never_comes_fails_and_says_who_was_missing(comes: s
     with world("paper-1", "--patience", "2", "--out", tmp_path) as (clock, endpoint):
         if comes == "a":
             agent = tandem("agent", "a", "--connect", endpoint)
-            assert agent.status == 1
+            assert agent.status == 3
             assert f"a: failed after 0 ticks ({reason})" in agent.out
         ended = clock.ended(SOON_S)
-    assert ended.status == 1
+    assert ended.status == 3
     assert reason in " ".join(ended.out.split())
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert (summary["outcome"], summary["reason"], summary["ticks"]) == ("failed", reason, 0)

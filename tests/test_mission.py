@@ -63,7 +63,7 @@ def test_the_papers_orbits_are_eq_6(mission: Mission, distance: float) -> None:
 def test_the_assured_orbits_are_smaller_by_the_margin_and_driven_at_full_speed() -> None:
     margin = (1.0 * (1.0 - 0.6931599 / math.pi)) ** 2 / (16 * 3.0)
     plan = rendezvous(SECTION_IV, D, "assured")
-    assert orbit_margin(SECTION_IV, D) == pytest.approx(margin, rel=1e-6)
+    assert orbit_margin(SECTION_IV, D, 1.0) == pytest.approx(margin, rel=1e-6)
     assert plan.a.radius == plan.b.radius == pytest.approx(6.5 - margin, rel=1e-9)
     assert plan.a.omega == pytest.approx(1.0 / (6.5 - margin), rel=1e-9)
     assert plan.a.v == pytest.approx(1.0)
@@ -308,7 +308,7 @@ def test_a_single_candidate_is_checked_before_it_is_claimed() -> None:
     possible = planner.decide(mind, heard).findings.placements
     assert len(possible) == 4
     for placement in possible:
-        findings = replace(mind.findings, placements=(placement,), solutions=(4, 1))
+        findings = replace(mind.findings, placements=(placement,), candidates=(4, 1))
         decided = planner.decide(replace(mind, findings=findings), heard)
         assert decided.verdict is None
         assert planner.drive(decided).v == 1.0

@@ -192,8 +192,8 @@ def test_b_chooses_the_last_manoeuvre_that_the_table_says(
     record = played(name)
     reference = SIMULATIONS[name]
     b = record.farewells["b"]
-    assert b.placements == solutions
-    assert record.farewells["a"].placements == solutions
+    assert b.candidates == solutions
+    assert record.farewells["a"].candidates == solutions
     assert b.last_turn_rate == pytest.approx(omega, abs=5.1e-5)
     assert b.last_turn_rate == pytest.approx(reference.w2, abs=EXACT)
     assert b.separation_m2 == pytest.approx(separation, abs=5.1e-6)

@@ -112,13 +112,11 @@ PAPERS_ROBOTS: dict[tuple[str, str], dict[str, Any]] = {
 def test_summary_says_everything_that_is_promised_of_a_robot(played: tuple[str, Path], robot: str) -> None:
     name, out = played
     told = summary(out)["robots"][robot]
-    assert sorted(told) == sorted(
-        [
-            *("localised", "localised_tick", "estimate", "truth", "position_error_m", "heading_error_rad"),
-            *("anchor_ranges", "mutual_ranges", "branch", "alpha", "candidates", "last_turn_rate"),
-            *("separation_m2", "reports_sent", "reports_heard", "reports_refused", "bytes_sent"),
-        ]
-    )
+    assert set(told) >= {
+        *("localised", "localised_tick", "estimate", "truth", "position_error_m", "heading_error_rad"),
+        *("anchor_ranges", "mutual_ranges", "branch", "alpha", "candidates", "last_turn_rate"),
+        *("separation_m2", "reports_sent", "reports_heard", "reports_refused", "bytes_sent"),
+    }
     expected = {"last_turn_rate": None, "separation_m2": None} | PAPERS_ROBOTS[name, robot]
     for field, value in expected.items():
         assert told[field] == (pytest.approx(value, abs=1e-4) if isinstance(value, float) else value), field

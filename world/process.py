@@ -15,7 +15,7 @@ from typing import Any
 import zenoh
 
 from protocol import keys, session
-from protocol.inbox import Arrival, Inbox
+from protocol.inbox import NOTHING, Arrival, Inbox
 from protocol.journal import Journal
 from protocol.messages import Drive, End, Farewell, Message, Sense, Truth
 from protocol.wire import MalformedFrame, decode, encode
@@ -27,8 +27,6 @@ REPEAT_S = 0.25
 """how often what is unanswered is said again"""
 FAREWELL_S = 2.0
 """how long the world waits for the robots' last word"""
-REPORT_SHARE = 0.5
-"""of a real-time tick: how long an agent may wait for its peer's report"""
 
 
 class NoAnswer(TimeoutError):
@@ -53,6 +51,7 @@ class WorldProcess:
         self._scenario = scenario
         self._course = Course(scenario, journal)
         self._period = scenario.mission.period / rate if rate is not None else None
+        self._tick_s = self._period or 0.0
         self._patience = patience
         self._inbox = inbox
         self._robots = [robot.id for robot in scenario.robots]
@@ -82,11 +81,13 @@ class WorldProcess:
                 end = self._course.drive(drives)
                 began = time.monotonic() if began is None else began
                 if self._period is not None:
-                    due = (began if due is None else due) + self._period
+                    due = max((due or began) + self._period, time.monotonic())
         except NoAnswer as silence:
             end = self._course.end(Judgement("failed", str(silence)))
         self.playing_s = time.monotonic() - began if began is not None else 0.0
         self._course.farewells(self._farewells(end))
+        if refused := self._inbox.refused.total():
+            self._inbox.say(f"refused {refused} frames in all")
         return end
 
     # --- a tick ---
@@ -100,7 +101,7 @@ class WorldProcess:
         drives: dict[str, Drive] = {}
         now = time.monotonic()
         repeat = now + REPEAT_S
-        while now < due if due is not None else len(drives) < len(self._robots):
+        while due is not None or len(drives) < len(self._robots):
             arrival = self._next((repeat if due is None else due) - now)
             now = time.monotonic()
             if arrival.topic == "drive":
@@ -108,11 +109,13 @@ class WorldProcess:
                 if isinstance(drive, Drive) and drive.tick == tick and drive.robot not in drives:
                     drives[drive.robot] = drive
                     self._answered = now
-            elif arrival.topic == "alive" or (now >= repeat and due is None):
+            if arrival.topic == "alive" or (due is None and now >= repeat):
                 repeat = now + REPEAT_S
                 self._put(frames)
-            if now - self._answered > self._patience:
+            if len(drives) < len(self._robots) and now - self._answered > self._patience + self._tick_s:
                 raise NoAnswer(self._who_is_missing(drives))
+            if due is not None and now >= due and (arrival is NOTHING or now >= due + self._tick_s):
+                break
         return drives
 
     def _put(self, frames: Mapping[str, bytes]) -> None:
@@ -133,10 +136,10 @@ class WorldProcess:
         try:
             message: Drive | Farewell = decode(arrival.frame, kind)
         except MalformedFrame as error:
-            self._inbox.refuse(arrival.key, error)
+            self._inbox.refuse(arrival, error)
             return None
         if message.robot not in self._robots or message.robot != keys.robot_of(arrival.key):
-            self._inbox.refuse(arrival.key, f"it says it is from '{message.robot}'")
+            self._inbox.refuse(arrival, f"it says it is from '{message.robot}'")
             return None
         return message
 
@@ -160,8 +163,7 @@ class WorldProcess:
         robot = key.rsplit("/", 1)[1]
         if robot not in self._robots:
             return f"this world has no robot '{robot}'; it has {', '.join(self._robots)}"
-        within = self._period * REPORT_SHARE if self._period is not None else None
-        return self._scenario.briefing(robot, within)
+        return self._scenario.briefing(robot, self._period)
 
     def _farewells(self, end: End) -> list[Farewell]:
         """Tell everyone that it is over, until everyone has answered or left."""

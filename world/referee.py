@@ -28,9 +28,16 @@ def errors(claim: Pose, truth: Pose) -> tuple[float, float]:
     return math.hypot(claim.x - truth.x, claim.y - truth.y), abs(wrap(claim.heading - truth.heading))
 
 
-def judge(scenario: Scenario, truth: Truth, verdicts: Mapping[str, Verdict | None]) -> Judgement | None:
-    """The judgement once every robot has its verdict, or time is up; None while the mission goes on."""
-    open_cases = [robot.id for robot in scenario.robots if verdicts.get(robot.id) is None]
+def judge(scenario: Scenario, truth: Truth, verdicts: Mapping[str, Verdict]) -> Judgement | None:
+    """The judgement once nothing more can come, or time is up; None while the mission goes on.
+
+    A robot whose peer has given up cannot localise any more.
+    """
+    open_cases = [
+        robot.id
+        for robot in scenario.robots
+        if robot.id not in verdicts and not isinstance(verdicts.get(robot.peer), Undecided)
+    ]
     if open_cases and truth.tick < scenario.max_ticks:
         return None
     for robot, pose in zip(scenario.robots, truth.poses, strict=True):

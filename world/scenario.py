@@ -31,6 +31,11 @@ class Scenario(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fiel
     variant: Variant
     robots: tuple[Placed, ...]
 
+    def pairs(self) -> tuple[tuple[int, int], ...]:
+        """Which robots are each other's peer, by their place; a first."""
+        place = {robot.id: i for i, robot in enumerate(self.robots)}
+        return tuple((place[one.id], place[one.peer]) for one in self.robots if one.role == "a")
+
     def robot(self, robot: str) -> Placed:
         """Raises KeyError if nobody is called that."""
         for placed in self.robots:
@@ -38,8 +43,8 @@ class Scenario(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fiel
                 return placed
         raise KeyError(robot)
 
-    def briefing(self, robot: str, answer_within: float | None = None) -> Briefing:
-        """What `robot` is told; nothing of where it is. `answer_within` is set in real time only."""
+    def briefing(self, robot: str, tick_s: float | None = None) -> Briefing:
+        """What `robot` is told; nothing of where it is. `tick_s` is set in real time only."""
         own = self.robot(robot)
         return Briefing(
             robot=own.id,
@@ -50,5 +55,5 @@ class Scenario(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fiel
             mission=self.mission,
             variant=self.variant,
             rendezvous=own.rendezvous,
-            answer_within=answer_within,
+            tick_s=tick_s,
         )

@@ -22,17 +22,16 @@ class World(msgspec.Struct, frozen=True):
     truth: Truth
     executed: tuple[Controls, ...] | None
     """over the tick before, in the order of the scenario; none at tick 0"""
-    verdicts: dict[str, Verdict | None]
+    verdicts: dict[str, Verdict]
+    """everyone's first; nobody takes back what it has claimed"""
     pairs: tuple[tuple[int, int], ...]
     """which robots are each other's peer, by their place in the scenario"""
 
 
 def release(scenario: Scenario) -> World:
     """The world at tick 0."""
-    place = {robot.id: i for i, robot in enumerate(scenario.robots)}
-    pairs = tuple((place[robot.id], place[robot.peer]) for robot in scenario.robots if robot.role == "a")
     starts: tuple[Pose, ...] = tuple(robot.start for robot in scenario.robots)
-    return World(scenario, Truth(0, starts), None, {}, pairs)
+    return World(scenario, Truth(0, starts), None, {}, scenario.pairs())
 
 
 def senses(world: World) -> list[Sense]:
@@ -63,7 +62,7 @@ def advance(world: World, drives: Mapping[str, Drive]) -> World | Judgement:
             executed.append(REST)
             continue
         executed.append(within_limits(drive.v, drive.omega, scenario.mission))
-        if drive.verdict is not verdicts.get(robot.id):
+        if drive.verdict is not None and robot.id not in verdicts:
             verdicts = verdicts | {robot.id: drive.verdict}
     if verdicts or truth.tick >= scenario.max_ticks:
         judgement = judge(scenario, truth, verdicts)

@@ -9,8 +9,12 @@ from itertools import combinations
 import msgspec
 
 from agent.belief import Branch
+from agent.phases.seeking import ARRIVED
 from protocol.mission import RANGE_MARGIN, Mission, Variant, third_point_turn_rate
 from protocol.motion import Controls, Pose, chord, compose
+
+PREFERENCE = 1e-9
+"""a later choice must be better than an earlier one by more than rounding"""
 
 
 class ThirdPoint(msgspec.Struct, frozen=True):
@@ -22,7 +26,7 @@ class ThirdPoint(msgspec.Struct, frozen=True):
 
 
 def third_point(places: Sequence[Pose], mission: Mission, variant: Variant) -> Controls | None:
-    """The manoeuvre whose end tells best where among `places`, in the anchor's frame, the robot is.
+    """The manoeuvre whose end tells best which of `places` (poses in the anchor's frame) the robot is at.
 
     Eq. (4) has its best turn rate where the branches mirror each other along the heading, and is best
     straight ahead where they mirror across it (after a circle); both are tried, with the longest chord
@@ -32,7 +36,9 @@ def third_point(places: Sequence[Pose], mission: Mission, variant: Variant) -> C
     best: Controls | None = None
     best_value = 0.0
     turn_rate = third_point_turn_rate(mission)
-    turn_rates = (turn_rate, 0.0) if variant == "paper" else (turn_rate, -turn_rate, 0.0)
+    turn_rates = [turn_rate] if variant == "paper" else [turn_rate, -turn_rate]
+    if len(places) > 1:  # one branch was found on a radius: there, straight ahead checks nothing
+        turn_rates.append(0.0)
     for omega in turn_rates:
         unit = chord(1.0, omega, mission.period)
         longest = mission.max_speed * unit
@@ -41,14 +47,14 @@ def third_point(places: Sequence[Pose], mission: Mission, variant: Variant) -> C
             outward = [_outward(place, half, forward) for place in places]
             reach = max(_reach(along, across, mission) for along, across in outward)
             length = min(longest, reach)
-            value = _told(length, [along for along, _ in outward])
-            if length > 0.0 and (best is None or value > best_value * (1.0 + 1e-9)):
+            value = _separation(length, [along for along, _ in outward])
+            if length > ARRIVED and (best is None or value > best_value * (1.0 + PREFERENCE)):
                 best, best_value = Controls(forward * min(length / unit, mission.max_speed), omega), value
     return best
 
 
 def _outward(place: Pose, half_turn: float, forward: float) -> tuple[float, float]:
-    """m: the parts of the position along and across the chord to come."""
+    """m: the parts of the position, seen from the anchor, along and across the chord to come."""
     course = place.heading + half_turn
     c, s = forward * math.cos(course), forward * math.sin(course)
     return place.x * c + place.y * s, place.y * c - place.x * s
@@ -61,7 +67,7 @@ def _reach(along: float, across: float, mission: Mission) -> float:
     return math.sqrt(inside) - along if inside >= 0.0 else -math.inf
 
 
-def _told(length: float, along: Sequence[float]) -> float:
+def _separation(length: float, along: Sequence[float]) -> float:
     """m^2: the least difference of the squared ranges that the branches predict, |d_+^2 - d_-^2|.
 
     One branch has nothing to be told from; there the longest way is worth most, to check it.

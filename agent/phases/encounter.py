@@ -13,7 +13,7 @@ from agent.belief import Sighting
 from agent.geometry import Placement, placements
 from agent.phases.seeking import travelled
 from protocol.mission import RANGE_MARGIN, Mission, Variant
-from protocol.motion import Controls, Pose, compose
+from protocol.motion import Controls, Pose
 
 TURN_RATES = 721
 """values of omega_2 tried in eq. (8), -omega_max and omega_max included: every half degree at T_s = 1 s"""
@@ -51,8 +51,8 @@ class Plan(NamedTuple):
     """A last manoeuvre, and what it is expected to tell."""
 
     drive: Controls
-    separation_m2: float
-    """J of eq. (8): the least difference of two predicted squared ranges"""
+    separation_m2: float | None
+    """J of eq. (8): the least difference of two predicted squared ranges; none for one candidate"""
 
 
 def back(drive: Controls) -> Controls:
@@ -99,7 +99,7 @@ def last_manoeuvre(
 
     `b` is in <b(M2)> and `a` in <a(M1)>. By enumeration. The letter drives at v_max; `assured` takes
     the best of the manoeuvres with the fewest candidates out of range, which silence then names. A
-    single candidate is checked by the range that changes most, towards it.
+    single candidate is checked by the range that changes most, towards it: silence would check nothing.
     """
     fractions = SPEEDS if variant == "assured" else SPEEDS[:1]
     omega = np.linspace(-mission.max_turn_rate, mission.max_turn_rate, TURN_RATES)
@@ -111,18 +111,18 @@ def last_manoeuvre(
 
     squared = []
     for candidate in candidates:
-        there = compose(Pose(candidate.x, candidate.y, candidate.phi), a)
+        there = candidate.place(a)
         squared.append((there.x - x) ** 2 + (there.y - y) ** 2)
     rim = (mission.sensing_range - RANGE_MARGIN) ** 2
     if len(squared) == 1:
-        here = travelled(b, compose(Pose(candidates[0].x, candidates[0].y, candidates[0].phi), a))
-        told = here * here - squared[0]
+        here = travelled(b, candidates[0].place(a))
+        gap = here * here - squared[0]
     else:
-        told = np.min([abs(one - other) for i, one in enumerate(squared) for other in squared[:i]], axis=0)
-    value = told
+        gap = np.min([abs(one - other) for i, one in enumerate(squared) for other in squared[:i]], axis=0)
+    value = gap
     if variant == "assured":
         outside = sum((distance > rim).astype(float) for distance in squared)
-        value = np.where(outside == np.min(outside), told, -np.inf)
+        value = np.where(outside == np.min(outside), gap, -np.inf)
     row, column = np.unravel_index(np.argmax(value), value.shape)
     drive = Controls(float(speed[row, 0]), float(omega[column]))
-    return Plan(drive, float(abs(told[row, column])))
+    return Plan(drive, float(gap[row, column]) if len(candidates) > 1 else None)

@@ -15,6 +15,7 @@ class Aligning(msgspec.Struct, frozen=True):
     """Turns by -mu, to head straight away from the anchor."""
 
     heading: float
+    """rad, of the odometry, to turn to"""
 
 
 class Radial(msgspec.Struct, frozen=True):
@@ -25,6 +26,7 @@ class Tangent(msgspec.Struct, frozen=True):
     """Turns from the radius onto the orbit: a by +90 degrees, b by -90."""
 
     heading: float
+    """rad, of the odometry, to turn to"""
 
 
 class Orbiting(msgspec.Struct, frozen=True):

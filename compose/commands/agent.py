@@ -5,10 +5,9 @@ from __future__ import annotations
 import argparse
 
 from agent.process import AgentProcess, NoWorld, Search, Unwelcome, join
-from compose.keeping import cannot_write
-from compose.record import ended
-from compose.status import FAILED, LOCALISED, NOT_LOCALISED, STOPPED, UserError
-from compose.stop import stops_into
+from compose.record import cannot_write, ended
+from compose.status import ENDED, FAILED, STOPPED, UserError, status_of
+from compose.stop import stop_with_launcher, stops_into
 from protocol import session
 from protocol.inbox import Inbox, Interrupted
 from protocol.journal import RecordExists
@@ -18,6 +17,8 @@ from protocol.messages import End
 def main(options: argparse.Namespace) -> int:
     """Play one robot's part."""
     inbox = Inbox(f"tandem agent {options.id}")
+    if options.launched:
+        stop_with_launcher(inbox)
     with stops_into(inbox):
         try:
             end = _play(options, inbox)
@@ -35,8 +36,10 @@ def main(options: argparse.Namespace) -> int:
             return STOPPED
         except OSError as error:
             raise UserError(cannot_write(options.out, error)) from None
+    if options.launched:
+        return ENDED
     print(f"{options.id}: {ended(end.outcome, end.tick, end.reason)}")
-    return LOCALISED if end.outcome == "localised" else NOT_LOCALISED
+    return status_of(end.outcome)
 
 
 def _play(options: argparse.Namespace, inbox: Inbox) -> End:
@@ -46,6 +49,6 @@ def _play(options: argparse.Namespace, inbox: Inbox) -> End:
         process = AgentProcess(
             briefing, link, run, inbox, out=options.out, fsync=options.fsync, patience=options.patience
         )
-        if not options.quiet:
+        if not (options.quiet or options.launched):
             print(f"{options.id}: in run {run}, with {briefing.peer}", flush=True)
         return process.play()

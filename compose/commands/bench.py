@@ -32,6 +32,8 @@ from world.scenario import Scenario
 
 MISSION = "far"
 """thousands of ticks, so that starting is no part of what is timed"""
+BARRIER_TICKS = 5000
+"""about as many as the mission's"""
 MISSIONS = 200
 """random missions a round, in-process"""
 SEED = 1000
@@ -122,10 +124,9 @@ def _mission_rate(played: Scenario) -> float:
 def _barrier_rate(played: Scenario, sizes: tuple[int, int]) -> float:
     endpoint = local.free_endpoint()
     ids = [robot.id for robot in played.robots]
-    ticks = 5000
-    robots = [["compose.barrier", endpoint, one, str(sizes[1]), str(ticks)] for one in ids]
+    robots = [["compose.barrier", endpoint, one, str(sizes[1]), str(BARRIER_TICKS)] for one in ids]
     with session.open_router(endpoint) as link, _robots(robots):
-        return ticks / barrier.world(link, ids, sizes[0], ticks)
+        return BARRIER_TICKS / barrier.world(link, ids, sizes[0], BARRIER_TICKS)
 
 
 # --- missions/s in one process ----------------------------------------------------------------------

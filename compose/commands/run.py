@@ -6,17 +6,18 @@ import argparse
 import time
 
 from compose import local
-from compose.keeping import break_off, conclude, named, progress, record_folder, validated
-from compose.record import read
+from compose.record import folder_for, read
+from compose.scenario import check_rate, load, run_name
 from compose.status import FAILED, STOPPED, UserError
 from compose.stop import stops_into
+from compose.telling import break_off, conclude, progress
 from protocol.inbox import Inbox, Interrupted
 from world.scenario import Scenario
 
 
 def main(options: argparse.Namespace) -> int:
     """Play the mission, as processes or in this one."""
-    scenario = validated(options)
+    scenario = load(options.scenario, seed=options.seed)
     if options.out is not None and any(options.out.glob("*.journal")):
         raise UserError(f"--out: {options.out} holds a record already; choose another folder")
     return _in_process(options, scenario) if options.in_process else _as_processes(options, scenario)
@@ -30,22 +31,25 @@ def _in_process(options: argparse.Namespace, scenario: Scenario) -> int:
     began = time.perf_counter()
     if options.out is None:
         return conclude(options, inline.play(scenario), None, "in-process", began)
-    with record_folder(options.out) as folder:
+    with folder_for(options.out) as folder:
         return conclude(options, inline.play(scenario, folder), folder, "in-process", began)
 
 
 def _as_processes(options: argparse.Namespace, scenario: Scenario) -> int:
-    arguments = [options.scenario]
-    for option, value in (("--seed", options.seed), ("--rate", options.rate)):
-        if value is not None:
-            arguments += [option, str(value)]
+    check_rate(scenario, options.rate)
     inbox = Inbox("tandem run")
-    with stops_into(inbox), record_folder(options.out) as folder:
+    with stops_into(inbox), folder_for(options.out) as folder:
         began = time.perf_counter()
-        run = named(options, scenario)
         try:
             with progress(options, scenario, folder):
-                local.play(scenario, arguments, folder, inbox, run=run, patience=options.patience)
+                local.play(
+                    scenario,
+                    folder,
+                    inbox,
+                    run=run_name(scenario),
+                    rate=options.rate,
+                    patience=options.patience,
+                )
         except local.ChildFailed as failure:
             inbox.say(f"failed: {failure}")
             break_off(options, folder, str(failure), began)

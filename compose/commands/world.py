@@ -8,10 +8,12 @@ from pathlib import Path
 
 import zenoh
 
-from compose.keeping import conclude, named, progress, record_folder, validated
-from compose.record import WORLD_JOURNAL, read
-from compose.status import LOCALISED, NOT_LOCALISED, STOPPED, UserError
-from compose.stop import stops_into
+from compose.local import handed
+from compose.record import WORLD_JOURNAL, cannot_write, folder_for, read
+from compose.scenario import check_rate, load, run_name
+from compose.status import ENDED, STOPPED, UserError
+from compose.stop import stop_with_launcher, stops_into
+from compose.telling import break_off, conclude, progress
 from protocol import session
 from protocol.inbox import Inbox, Interrupted
 from protocol.journal import Journal, RecordExists
@@ -21,40 +23,43 @@ from world.scenario import Scenario
 
 def main(options: argparse.Namespace) -> int:
     """Play the world's part."""
-    scenario = validated(options)
-    run = named(options, scenario)
+    scenario = handed() if options.launched else load(options.scenario, seed=options.seed)
+    check_rate(scenario, options.rate)
     inbox = Inbox("tandem world")
+    if options.launched:
+        stop_with_launcher(inbox)
     with stops_into(inbox):
         try:
-            with session.open_router(options.listen) as link, record_folder(options.out) as folder:
-                return _play(options, scenario, run, link, folder, inbox)
+            with session.open_router(options.listen) as link, folder_for(options.out) as folder:
+                return _play(options, scenario, link, folder, inbox)
         except (session.BadEndpoint, session.CannotListen) as error:
             raise UserError(f"--listen: {error}") from None
         except RecordExists as error:
             raise UserError(f"--out: {error}") from None
-        except Interrupted as signal_name:
-            inbox.say(f"stopped by {signal_name}")
-            return STOPPED
+        except OSError as error:
+            raise UserError(cannot_write(options.out, error)) from None
 
 
 def _play(
-    options: argparse.Namespace,
-    scenario: Scenario,
-    run: str,
-    link: zenoh.Session,
-    folder: Path,
-    inbox: Inbox,
+    options: argparse.Namespace, scenario: Scenario, link: zenoh.Session, folder: Path, inbox: Inbox
 ) -> int:
     began = time.perf_counter()
+    run = options.run or run_name(scenario)
     with Journal(folder / WORLD_JOURNAL, fsync=options.fsync) as journal:
         process = WorldProcess(
             scenario, link, run, journal, inbox, rate=options.rate, patience=options.patience
         )
-        if not options.quiet:
+        if not (options.quiet or options.launched):
             robots = ", ".join(robot.id for robot in scenario.robots)
             print(f"run {run} at {options.listen}: waiting for {robots}", flush=True)
-        with progress(options, scenario, folder):
-            end = process.play()
-    if options.launched:
-        return LOCALISED if end.outcome == "localised" else NOT_LOCALISED
+        try:
+            with progress(options, scenario, folder):
+                process.play()
+        except Interrupted as signal_name:
+            inbox.say(f"stopped by {signal_name}")
+            if not options.launched:
+                break_off(options, folder, f"stopped by {signal_name}", began)
+            return STOPPED
+    if options.launched:  # who did so concludes
+        return ENDED
     return conclude(options, read(folder), folder, "processes", began)

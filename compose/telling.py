@@ -1,0 +1,59 @@
+"""What is told of a run: while it runs, at its end, or where it breaks off."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from compose import record
+from compose.status import UserError, status_of
+from world.scenario import Scenario
+
+
+@contextmanager
+def progress(options: argparse.Namespace, scenario: Scenario, folder: Path) -> Iterator[None]:
+    """Show the run while it runs, where somebody can see it."""
+    if options.quiet or not sys.stdout.isatty():
+        yield
+        return
+    from compose import show  # noqa: PLC0415  # where nothing is shown, nothing is loaded to show it
+
+    with show.live(scenario, folder):
+        yield
+
+
+def conclude(
+    options: argparse.Namespace,
+    played: record.Record,
+    folder: Path | None,
+    mode: record.Mode,
+    began: float,
+) -> int:
+    """Leave the views of the record in `folder`, if it is to stay, and say how it went; the status."""
+    summary = record.summary(played, mode, round(time.perf_counter() - began, 6))
+    if folder is not None and options.out is not None:
+        try:
+            record.leave(played, summary, folder)
+        except OSError as error:
+            raise UserError(record.cannot_write(folder, error)) from None
+    if options.quiet:
+        print(record.outcome_line(summary))
+    else:
+        from compose import show  # noqa: PLC0415  # as above
+
+        show.result(summary)
+    return status_of(summary["outcome"])
+
+
+def break_off(options: argparse.Namespace, folder: Path, reason: str, began: float) -> None:
+    """Leave the views of a record that has no end, if it is to stay; as far as there is a record."""
+    if options.out is None:
+        return
+    with suppress(OSError, ValueError):
+        played = record.read(folder)
+        summary = record.summary(played, "processes", round(time.perf_counter() - began, 6))
+        record.leave(played, summary | {"reason": reason}, folder)
