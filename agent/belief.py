@@ -24,8 +24,8 @@ MUTUAL_FLOOR = 1e-7
 POLISHING_STEPS = 12
 """Gauss-Newton steps at the most; they end when the fit gets no better, mostly after one"""
 
-SAME_ANCHOR = 1e-8
-"""m: branches that put the anchor so near each other are one"""
+SAME_ANCHOR = FLOOR
+"""m: branches that put the anchor so near each other predict the same ranges, to the floor"""
 
 SINGULAR = 1e-14
 """how nearly parallel two columns may be before they count as one (the sine of their angle, squared)"""

@@ -22,14 +22,18 @@ def included_angle(near: float, far: float, moved: float) -> float | None:
     """alpha of eq. (2): the turn, at a point `near` m from a beacon, away from the outward radial direction.
 
     Going `moved` m in that direction leads to a point `far` m from the beacon. In [0, pi]; None where
-    no triangle has these sides. At the beacon itself every direction is radial: 0.
+    no triangle has these sides. At the beacon itself every direction is radial: 0. By Kahan's formula
+    for an angle from three sides, which loses no digits where eq. (2) does: near 0 and pi.
     """
     if near == 0.0:
         return 0.0
     if not abs(far - near) - SLACK <= moved <= far + near + SLACK:
         return None
-    cosine = (far * far - near * near - moved * moved) / (2.0 * near * moved)
-    return math.acos(min(1.0, max(-1.0, cosine)))
+    long, short = max(near, moved), min(near, moved)
+    excess = far - (long - short) if far <= short else short - (long - far)
+    opposite = max(0.0, ((long - short) + far) * excess)
+    adjacent = max(0.0, (long + (short + far)) * ((long - far) + short))
+    return math.pi - 2.0 * math.atan2(math.sqrt(opposite), math.sqrt(adjacent))
 
 
 class Placement(NamedTuple):

@@ -221,8 +221,10 @@ class AgentProcess:
         drive = self._robot.decide(heard, missed)
         self._due = None
         self._drive.put(self._robot.drive_frame)
-        if self._estimate_wanted:
-            self._estimate.put(encode(self._robot.estimate()))
+        if self._robot.journaled or self._estimate_wanted:
+            estimate = self._robot.estimate()
+            if self._estimate_wanted:
+                self._estimate.put(estimate)
         self._listed.update(told.report.tick for told in heard)
         self._forget_reports(before=drive.tick - REPORTS_KEPT)
 

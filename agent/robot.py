@@ -12,7 +12,7 @@ import msgspec
 from agent import planner
 from agent.mind import Mind
 from protocol.journal import Journal
-from protocol.messages import Briefing, Drive, End, Estimate, Farewell, Missed, Report, Sense
+from protocol.messages import Briefing, Drive, End, Farewell, Missed, Report, Sense
 from protocol.wire import encode
 
 
@@ -40,6 +40,11 @@ class Robot:
         self._journal = journal
         if journal is not None:
             journal.write(encode(briefing))
+
+    @property
+    def journaled(self) -> bool:
+        """Whether there is a record to keep."""
+        return self._journal is not None
 
     @property
     def drive_frame(self) -> bytes:
@@ -74,12 +79,18 @@ class Robot:
             if self._unwritten is not None:
                 frames.insert(0, self._unwritten)
                 self._unwritten = None
-            self._journal.write(*frames, self.drive_frame, encode(self.estimate()))
+            self._journal.write(*frames, self.drive_frame)
         return self.drive
 
-    def estimate(self) -> Estimate:
-        """What the robot holds possible, for whoever watches."""
-        return planner.estimate(self.mind)
+    def estimate(self) -> bytes:
+        """The frame of what the robot holds possible, for whoever watches; once a tick, after the Drive.
+
+        Nobody waits for it, so it is made and journaled when the Drive is on its way.
+        """
+        frame = encode(planner.estimate(self.mind))
+        if self._journal is not None:
+            self._journal.write(frame)
+        return frame
 
     def farewell(
         self, end: End, *, reports_refused: int = 0, reports_unheard: int = 0, frames_refused: int = 0

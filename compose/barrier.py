@@ -60,12 +60,11 @@ def robot(endpoint: str, name: str, size: int, ticks: int) -> None:
     with session.open_client(endpoint, unanswered) as link:
         link.declare_subscriber(keys.sense(RUN, name), lambda sample: drop(frames, sample))
         publisher = session.publisher(link, keys.drive(RUN, name))
-        token = session.show_alive(link, keys.robot_alive(RUN, name))
+        _token = session.show_alive(link, keys.robot_alive(RUN, name))
         frame = bytes(size)
         for _ in range(ticks):
             frames.get(timeout=PATIENCE_S)
             publisher.put(frame)
-        token.undeclare()
 
 
 if __name__ == "__main__":

@@ -37,6 +37,8 @@ def play(scenario: Scenario, out: Path | None = None) -> Record:
         for sense in senses:
             heard = [told[contact.peer] for contact in sense.contacts for _ in contact.heard]
             drives[sense.robot] = robots[sense.robot].decide(heard)
+            if out is not None:
+                robots[sense.robot].estimate()
         moments.append(Moment(course.world.truth, drives))
         end = course.drive(drives)
     farewells: dict[str, Farewell] = {robot: robots[robot].farewell(end) for robot in ids}

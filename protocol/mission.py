@@ -84,10 +84,9 @@ def half_arc(distance: float, sensing_range: float) -> float:
     return math.acos(distance / (distance + sensing_range))
 
 
-def longest_meeting(mission: Mission, distance: float) -> float:
-    """T_max in s (Section III.B, in continuous time)."""
-    slowest = max(1.0 / mission.max_turn_rate, (distance + mission.sensing_range) / (2.0 * mission.max_speed))
-    return TAU * (math.pi / half_arc(distance, mission.sensing_range) + 1.0) * slowest
+def longest_meeting(mission: Mission, distance: float, omega_b: float) -> float:
+    """T_max in s (Section III.B, in continuous time): b's way round, and twice over the arc 2 Omega."""
+    return (TAU + 2.0 * half_arc(distance, mission.sensing_range)) / abs(omega_b)
 
 
 def orbit_margin(mission: Mission, distance: float, speed: float) -> float:
@@ -119,7 +118,7 @@ def rendezvous(mission: Mission, distance: float, variant: Variant) -> Rendezvou
     return Rendezvous(
         a=Orbit(radius, omega_a * radius, omega_a),
         b=Orbit(radius, -omega_b * radius, omega_b),
-        bound=longest_meeting(mission, distance),
+        bound=longest_meeting(mission, distance, omega_b),
     )
 
 

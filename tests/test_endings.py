@@ -237,3 +237,11 @@ def test_an_agent_at_a_port_that_does_not_speak_zenoh_gives_up() -> None:
         endpoint = f"tcp/127.0.0.1:{mute.getsockname()[1]}"
         ended = tandem("agent", "a", "--connect", endpoint, "--wait", "2")
     assert ended == (3, "", f"tandem agent a: no world at {endpoint}; gave up after 2 s\n")
+
+
+def test_processes_end_when_their_launcher_is_killed(endless: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with Command("run", endless, "--out", out, "-q") as run:
+        run.until_written(out / "world.journal", 10_000)
+        os.kill(run.pid, SIGKILL)
+        until(lambda: not processes_of(out), "all have ended")

@@ -68,7 +68,7 @@ def test_the_assured_orbits_are_smaller_by_the_margin_and_driven_at_full_speed()
     assert plan.a.omega == pytest.approx(1.0 / (6.5 - margin), rel=1e-9)
     assert plan.a.v == pytest.approx(1.0)
     assert plan.b.omega == pytest.approx(-half_arc(D, 3.0) / math.pi * plan.a.omega)
-    assert plan.bound == longest_meeting(SECTION_IV, D)
+    assert plan.bound == longest_meeting(SECTION_IV, D, plan.b.omega)
 
 
 @settings(max_examples=60)

@@ -221,7 +221,7 @@ def test_the_constants_of_section_iv_are_the_notes() -> None:
     assert plan.a.omega == pytest.approx(0.15384615, abs=5.1e-9)
     assert plan.b.omega == pytest.approx(-0.0339445617, abs=5.1e-11)
     assert plan.b.v == pytest.approx(0.2206396513, abs=5.1e-11)
-    assert plan.bound == longest_meeting(mission, 10.0) == pytest.approx(225.942087, abs=5.1e-7)
+    assert plan.bound == longest_meeting(mission, 10.0, plan.b.omega) == pytest.approx(225.942087, abs=5.1e-7)
 
 
 # --- phase 1 ------------------------------------------------------------------------------------------

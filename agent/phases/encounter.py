@@ -19,7 +19,7 @@ TURN_RATES = 721
 """values of omega_2 tried in eq. (8), -omega_max and omega_max included: every half degree at T_s = 1 s"""
 
 SPEEDS = (1.0, -1.0, 0.75, -0.75, 0.5, -0.5, 0.25, -0.25, 0.1, -0.1)
-"""values of v_2 / v_max that are tried; the letter tries the first only"""
+"""values of v_2 tried, over v_max or, where that would leave the range in one tick, over A_0 / T_s"""
 
 ELSEWHERE = 1e-6
 """m: a range taken nearer than this to where another was says nothing new"""
@@ -101,11 +101,13 @@ def last_manoeuvre(
     the best of the manoeuvres with the fewest candidates out of range, which silence then names. A
     single candidate is checked by the range that changes most, towards it: silence would check nothing.
     """
-    fractions = SPEEDS if variant == "assured" else SPEEDS[:1]
     omega = np.linspace(-mission.max_turn_rate, mission.max_turn_rate, TURN_RATES)
     half = 0.5 * mission.period * omega
     unit = mission.period * np.sinc(half / math.pi)
-    speed = mission.max_speed * np.array(fractions)[:, None]
+    if variant == "paper":
+        speed = np.array([[mission.max_speed]])
+    else:
+        speed = mission.first_straight / mission.period * np.array(SPEEDS)[:, None]
     x = b.x + speed * unit * np.cos(b.heading + half)
     y = b.y + speed * unit * np.sin(b.heading + half)
 

@@ -1,0 +1,81 @@
+"""Starts and settings next to where formulas break down, which random starts never hit."""
+
+from __future__ import annotations
+
+import math
+from itertools import product
+
+import pytest
+from msgspec.structs import replace
+
+from compose import inline
+from compose.scenario import load, parse
+from protocol.messages import Localised
+from tests.commands import SECTION_IV
+from world.referee import errors
+from world.scenario import Scenario
+
+R = 3.0
+RADII = (0.0, 1e-15, 1e-12, 1e-10, 1e-9, 3e-9, 1e-6, 1e-3, 0.5, 2.4, R - 1e-12, R)
+OFFSETS = (0.0, *(sign * 10.0**-n for n in (15, 12, 9, 8, 6, 3) for sign in (1, -1)))
+HEADINGS = {"outward": 0.0, "inward": math.pi, "tangent left": math.pi / 2, "tangent right": -math.pi / 2}
+
+
+def assert_localised(scenario: Scenario) -> None:
+    record = inline.play(scenario)
+    assert record.end is not None
+    assert record.end.outcome == "localised", record.end
+    last = record.moments[-1]
+    for robot, truth in zip(scenario.robots, last.truth.poses, strict=True):
+        verdict = last.drives[robot.id].verdict
+        assert isinstance(verdict, Localised)
+        assert max(errors(verdict.pose, truth)) < 1e-6
+
+
+def with_start(rho0: float, heading: float) -> Scenario:
+    """Robot a starts on the x-axis, `rho0` m from its anchor; b anywhere."""
+    scenario = load("random", seed=11)
+    a, b = scenario.robots
+    return replace(scenario, robots=(replace(a, start=replace(a.start, x=rho0, y=0.0, heading=heading)), b))
+
+
+@pytest.mark.parametrize("direction", HEADINGS)
+@pytest.mark.parametrize("rho0", RADII)
+def test_starts_at_the_edge_of_what_can_be_told_localise(rho0: float, direction: str) -> None:
+    for offset in OFFSETS:
+        assert_localised(with_start(rho0, HEADINGS[direction] + offset))
+
+
+@pytest.mark.parametrize("angle", ["3.14159265", "3.141592653589793", "0.0", "-3.1415926"])
+def test_a_start_straight_towards_the_anchor_as_a_user_types_it_localises(angle: str) -> None:
+    text = f'name = "typed"\n{SECTION_IV}'
+    for x in ("0.3", "1.0", "1.7", "2.4", "3.0"):
+        robots = (
+            f'[[robot]]\nid = "a"\nanchor = [0.0, 0.0]\nstart = [{x}, 0.0, {angle}]\n'
+            '[[robot]]\nid = "b"\nanchor = [10.0, 0.0]\nstart = [10.0, 1.0, 1.0]\n'
+        )
+        assert_localised(parse(text + robots, "typed"))
+
+
+@pytest.mark.parametrize(
+    ("sensing_range", "distance", "period", "speed", "turn_rate"),
+    [
+        *((3.0, 10.0, 1.0, speed, 3.14) for speed in (0.3, 2.0, 2.9, 5.0, 20.0, 100.0)),
+        (3.0, 10.0, 1.0, 100.0, 1000.0),
+        (3.0, 10.0, 0.05, 1.0, 0.2),
+        (3.0, 7.0, 0.5, 1.0, 0.5),
+        (1.0, 10.0, 1.0, 1.0, 3.14),
+        (5.0, 10.0, 1.0, 1.0, 3.14),
+    ],
+)
+def test_settings_far_from_the_papers_localise(
+    sensing_range: float, distance: float, period: float, speed: float, turn_rate: float
+) -> None:
+    for seed, offset in product(range(5), (0.0, 1e4)):
+        text = (
+            f'name = "setting"\nseed = {seed}\n[mission]\nsensing_range = {sensing_range}\n'
+            f"period = {period}\nmax_speed = {speed}\nmax_turn_rate = {turn_rate}\n"
+            f'[[robot]]\nid = "a"\nanchor = [{offset}, {offset}]\n'
+            f'[[robot]]\nid = "b"\nanchor = [{offset}, {offset - distance}]\n'
+        )
+        assert_localised(parse(text, "setting"))

@@ -1,0 +1,67 @@
+"""`--rate`: the world does not wait, and whoever is late stands still."""
+
+from __future__ import annotations
+
+import csv
+import os
+from pathlib import Path
+from signal import SIGCONT, SIGINT, SIGSTOP
+
+import pytest
+
+from protocol import journal
+from protocol.messages import Drive, End, Farewell, Missed
+from protocol.wire import MAX_FRAME_BYTES, decode
+from tests.commands import ENDLESS, PAPER_1, Command, process_of, tandem
+from world.scenario import Scenario
+
+
+def missed(path: Path, robot: str) -> int:
+    """In how many ticks the world went without `robot`'s Drive."""
+    kinds = Scenario | Drive | Missed | End | Farewell
+    messages = [decode(frame, kinds, MAX_FRAME_BYTES) for frame in journal.read(path)]
+    return sum(isinstance(message, Missed) and message.robot == robot for message in messages)
+
+
+def test_a_rate_that_cannot_be_kept_can_still_be_stopped(tmp_path: Path) -> None:
+    scenario = tmp_path / "endless.toml"
+    scenario.write_text(ENDLESS)
+    with Command("run", scenario, "--rate", "2000", "--out", tmp_path / "out", "-q") as run:
+        run.until_written(tmp_path / "out" / "world.journal", 10_000)
+        os.kill(run.pid, SIGINT)
+        ended = run.ended()
+    assert ended.status == 130
+    assert "Traceback" not in ended.err
+
+
+def test_a_tick_may_last_longer_than_the_patience(tmp_path: Path) -> None:
+    scenario = tmp_path / "slow.toml"
+    scenario.write_text("max_ticks = 2\n" + PAPER_1)
+    ended = tandem("run", scenario, "--rate", "0.5", "--patience", "1", "-q")
+    assert (ended.status, ended.out) == (
+        1,
+        "undecided after 2 ticks (max_ticks: a, b not localised by then)\n",
+    )
+
+
+@pytest.mark.parametrize(("rate", "lasts"), [("1e-8", "1e+08"), ("1e8", "1e-08")])
+def test_a_rate_beyond_all_sense_is_refused(rate: str, lasts: str) -> None:
+    ended = tandem("run", "paper-1", "--rate", rate)
+    assert ended.status == 2
+    assert ended.err.startswith(f"tandem run: --rate: {float(rate):g} makes a tick of 1 s last {lasts} s")
+    assert ended.err.count("\n") == 1
+
+
+def test_a_robot_whose_agent_is_stopped_stands_still_and_the_mission_goes_on(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with Command("run", "paper-2", "--rate", "20", "--out", out, "-q") as run:
+        run.until_written(out / "world.journal", 3000)
+        stopped = process_of(out, "agent", "a")
+        os.kill(stopped, SIGSTOP)
+        run.until(lambda: missed(out / "world.journal", "a") >= 10, "ten of a's Drives are missed")
+        os.kill(stopped, SIGCONT)
+        assert run.ended().status == 0
+    with (out / "ticks.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["robot"] == "a" and row["state"] == ""]
+    assert len(rows) >= 10
+    assert {(row["v"], row["omega"]) for row in rows} == {("0.0", "0.0")}

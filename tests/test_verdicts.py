@@ -1,0 +1,48 @@
+"""A verdict is given once, and a robot that gives up does not keep its peer waiting."""
+
+from __future__ import annotations
+
+from msgspec.structs import replace
+
+from agent import planner
+from protocol.messages import Localised, Undecided
+from protocol.motion import ORIGIN
+from tests.steps import steps
+from world.referee import Judgement, judge
+from world.tick import World, advance
+
+GAVE_UP = Undecided("no pose explains the anchor ranges")
+
+
+def test_the_mission_ends_when_one_of_a_pair_has_given_up() -> None:
+    world = next(steps("paper-1")).world
+    judgement = judge(world.scenario, world.truth, {"a": GAVE_UP})
+    assert judgement == Judgement("undecided", f"a: {GAVE_UP.reason}")
+    assert judge(world.scenario, world.truth, {}) is None
+
+
+def test_a_robot_whose_peer_has_given_up_gives_up_too() -> None:
+    met = next(step for step in steps("paper-1") if step.heard["a"])
+    told = [replace(report, verdict=GAVE_UP) for report in met.heard["a"]]
+    verdict = planner.decide(met.observed["a"], told).verdict
+    assert verdict == Undecided(f"b says: {GAVE_UP.reason}")
+
+
+def test_a_reason_handed_on_stays_within_what_a_message_can_hold() -> None:
+    met = next(step for step in steps("paper-1") if step.heard["a"])
+    told = [replace(report, verdict=Undecided("x" * 300)) for report in met.heard["a"]]
+    verdict = planner.decide(met.observed["a"], told).verdict
+    assert isinstance(verdict, Undecided)
+    assert len(verdict.reason) == 300
+
+
+def test_a_wrong_claim_cannot_be_taken_back() -> None:
+    step = next(steps("paper-1"))
+    claim = replace(step.drives["a"], verdict=Localised(replace(ORIGIN, x=5.0)))
+    world = advance(step.world, step.drives | {"a": claim})
+    assert isinstance(world, World)
+    world = advance(world, step.drives)
+    assert isinstance(world, World)
+    judgement = judge(world.scenario, world.truth, world.verdicts | {"b": GAVE_UP})
+    assert judgement is not None
+    assert judgement.outcome == "wrong"
