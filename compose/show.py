@@ -55,7 +55,7 @@ def result(summary: Mapping[str, Any]) -> None:
     """The table at the end of a run."""
     title = f"{summary['scenario']}: {outcome_line(summary)}"
     rows = Table(title=title, title_justify="left", box=SIMPLE, pad_edge=False)
-    rows.add_column("robot")
+    rows.add_column("robot", no_wrap=True)
     for heading in ("is at x, y, heading", "thinks it is at", "error m", "ranges", "reports"):
         rows.add_column(heading, justify="right", no_wrap=True)
     for name, robot in summary["robots"].items():
@@ -73,7 +73,7 @@ def result(summary: Mapping[str, Any]) -> None:
 
 
 def _pose(pose: list[float] | None) -> str:
-    return f"{pose[0]:.3f} {pose[1]:.3f} {pose[2]:+.3f}" if pose else "-"
+    return f"{pose[0]:.2f} {pose[1]:.2f} {pose[2]:+.2f}" if pose else "-"
 
 
 def _number(value: float | None, form: str = "") -> str:
