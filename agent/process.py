@@ -25,6 +25,8 @@ REPORTS_KEPT = 64
 """ticks for which a report is kept that no Sense has listed yet"""
 QUERY_S = 2.0
 """how long to wait for the answer to one query"""
+SESSION_S = 3.0
+"""how long to look for a world through one session"""
 ASK_AGAIN_S = 0.05
 """how long to wait before looking for a world again"""
 FIRST_WORD_S = 5.0
@@ -64,13 +66,14 @@ class Search:
         self._inbox.next(ASK_AGAIN_S)
 
 
-def join(link: zenoh.Session, run: str | None, robot: str, search: Search) -> tuple[str, Briefing]:
-    """The run that `robot` belongs to, and its briefing; `run` may name it.
+def join(link: zenoh.Session, run: str | None, robot: str, search: Search) -> tuple[str, Briefing] | None:
+    """The run that `robot` belongs to, and its briefing; `run` may name it. None after SESSION_S without.
 
     Raises Unwelcome if there are several runs, if the world has no such robot, or if somebody plays it
     already; whatever `search` raises while there is no world.
     """
-    while True:
+    until = time.monotonic() + SESSION_S
+    while time.monotonic() < until:
         worlds = [keys.run_of(key) for key in session.alive(link, keys.world_alive(run or "*"), QUERY_S)]
         if len(worlds) > 1:
             raise Unwelcome(f"several runs are alive: {', '.join(worlds)}; choose one with --run")
@@ -86,6 +89,7 @@ def join(link: zenoh.Session, run: str | None, robot: str, search: Search) -> tu
                 except MalformedFrame as error:
                     raise Unwelcome(f"the world's briefing is not understood: {error}") from None
         search.go_on()
+    return None
 
 
 class AgentProcess:
@@ -173,7 +177,7 @@ class AgentProcess:
     def _on_sense(self, sense: Sense, frame: bytes) -> None:
         known = self._sense.tick if self._sense is not None else -1
         if sense.tick > known + 1:
-            raise NoWorld(f"the world is at tick {sense.tick}, and {self._id} knows nothing after {known}")
+            raise NoWorld(f"too late: the world is at tick {sense.tick}, {self._id} knows it up to {known}")
         if sense.tick == known + 1:
             self._sense = sense
             if self._tick_s is not None:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import os
 import re
 import sys
 import traceback
 from importlib import import_module
 from pathlib import Path
-from typing import NoReturn
+from typing import NoReturn, TextIO
 
-from compose.status import BUG, NOT_LOCALISED, USER_ERROR, UserError
+from compose.status import BROKEN_PIPE, BUG, FAILED, USER_ERROR, UserError
 from protocol.inbox import one_line
 from protocol.units import NAME
 
@@ -24,20 +25,33 @@ class _Parser(argparse.ArgumentParser):
 
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Parse, and do as told; ends the process."""
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115  # closed by whoever started this
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
     options = _parser().parse_args(arguments)
     try:
         status = import_module(f"compose.commands.{options.command}").main(options)
     except UserError as error:
         print(one_line(f"tandem {options.command}: {error}"), file=sys.stderr)
         status = USER_ERROR
+        sys.stdout.flush()
     except BrokenPipeError:
-        status = NOT_LOCALISED
+        _leave_stream(sys.stdout)
+        status = BROKEN_PIPE
+    except OSError as error:
+        _leave_stream(sys.stdout)
+        print(one_line(f"tandem {options.command}: cannot go on: {error}"), file=sys.stderr)
+        status = FAILED
     except Exception:  # noqa: BLE001  # whatever it is, it must not look like a mission's outcome
         traceback.print_exc()
         status = BUG
     session = sys.modules.get("protocol.session")
     (session.leave if session is not None else sys.exit)(status)
     raise AssertionError
+
+
+def _leave_stream(stream: TextIO) -> None:
+    """Nobody takes what is left in `stream`: let the interpreter not try at its end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -86,9 +100,15 @@ def _add_scenario(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_playing(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", type=Path, metavar="DIR", help="where the record goes")
+    parser.add_argument("--out", type=_folder, metavar="DIR", help="where the record goes")
     parser.add_argument("--patience", type=_positive, default=30.0, metavar="S", help="longest silence (30)")
     parser.add_argument("-q", "--quiet", action="store_true", help="print only the outcome")
+
+
+def _folder(text: str) -> Path:
+    if not text:
+        raise argparse.ArgumentTypeError("'' is no folder")
+    return Path(text).expanduser()
 
 
 def _positive(text: str) -> float:

@@ -18,7 +18,9 @@ from protocol.inbox import Inbox
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from world.scenario import Scenario
 
-STOP_S = 5.0
+FOLLOW_S = 2.0
+"""how long the agents may outlast the world"""
+STOP_S = 3.0
 """how long a process may take to end when told to; then it is killed"""
 LISTENING_PORTS = range(20_000, 32_000)
 """below those that the system gives to outgoing connections, which could take one in between"""
@@ -131,10 +133,10 @@ def play(
 
 
 def _watch(children: Mapping[str, _Child], inbox: Inbox) -> None:
-    """Until all have ended; the agents have STOP_S to follow the world."""
+    """Until all have ended; the agents have FOLLOW_S to follow the world."""
     running = set(children)
     while running:
-        arrival = inbox.next(None if "world" in running else STOP_S)
+        arrival = inbox.next(None if "world" in running else FOLLOW_S)
         if arrival.topic == "nothing":
             return
         child = children[arrival.key]

@@ -131,6 +131,8 @@ def _field_first(error: str) -> str:
     what = match["what"].replace("`", "'")
     what = what.replace("Object contains ", "").replace("Object missing required field", "missing field")
     what = what[0].lower() + what[1:]
+    if "matching regex" in what:
+        what = "no name: letters, digits, - and _, a letter or digit first"
     return f"{match['where']}: {what}" if match["where"] else what
 
 
@@ -193,7 +195,9 @@ def _peers(robots: list[RobotTable], source: str) -> dict[str, str]:
     peers = {}
     for i, robot in enumerate(robots):
         if robot.peer is None:
-            raise BadScenario(f"{source}: robot[{i}].peer: '{robot.id}' needs one, with {len(ids)} robots")
+            raise BadScenario(
+                f"{source}: robot[{i}].peer: '{robot.id}' needs one: of {len(ids)} robots, two are a pair"
+            )
         if robot.peer not in ids:
             raise BadScenario(f"{source}: robot[{i}].peer: there is no robot '{robot.peer}'")
         peers[robot.id] = robot.peer

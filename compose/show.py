@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import io
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from rich.box import SIMPLE
+from rich.box import SIMPLE_HEAD
+from rich.cells import cell_len
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
@@ -17,6 +20,10 @@ from protocol.journal import Tail
 from protocol.messages import Drive, End, Farewell, Missed
 from protocol.wire import MAX_FRAME_BYTES, decode
 from world.scenario import Scenario
+
+COLUMNS = ("is at x, y, heading", "thinks it is at", "error m", "ranges", "reports")
+UNLIMITED = 1000
+"""columns, of what is not a terminal"""
 
 
 @contextmanager
@@ -52,24 +59,37 @@ def live(scenario: Scenario, folder: Path) -> Iterator[None]:
 
 
 def result(summary: Mapping[str, Any]) -> None:
-    """The table at the end of a run."""
+    """The table at the end of a run: a line each robot, or a few where the terminal is narrow."""
+    robots = {name: _cells(robot) for name, robot in summary["robots"].items()}
+    rows = Table("robot", box=SIMPLE_HEAD, pad_edge=False)
+    for heading in COLUMNS:
+        rows.add_column(heading, justify="right")
+    for name, cells in robots.items():
+        rows.add_row(name, *cells)
+    page = Console(width=UNLIMITED, file=io.StringIO())
+    with page.capture() as capture:
+        page.print(rows)
+    lines = [line.rstrip() for line in capture.get().splitlines() if line.strip()]
+    if sys.stdout.isatty() and max(map(cell_len, lines)) > Console().width:
+        lines = [
+            line
+            for name, cells in robots.items()
+            for line in (name, *(f"  {head}: {cell}" for head, cell in zip(COLUMNS, cells, strict=True)))
+        ]
     title = f"{summary['scenario']}: {outcome_line(summary)}"
-    rows = Table(title=title, title_justify="left", box=SIMPLE, pad_edge=False)
-    rows.add_column("robot", no_wrap=True)
-    for heading in ("is at x, y, heading", "thinks it is at", "error m", "ranges", "reports"):
-        rows.add_column(heading, justify="right", no_wrap=True)
-    for name, robot in summary["robots"].items():
-        rows.add_row(
-            name,
-            _pose(robot["truth"]),
-            _pose(robot["estimate"]),
-            _number(robot["position_error_m"], ".1e"),
-            f"{_number(robot['anchor_ranges'])} + {_number(robot['mutual_ranges'])}",
-            f"{_number(robot['reports_sent'])} / {_number(robot['reports_heard'])}",
-        )
-    rows.caption = "m and rad; ranges to the anchor + to the peer; reports sent / heard"
-    rows.caption_justify = "left"
-    Console().print(rows)
+    print(
+        title, "", *lines, "", "m and rad; ranges to the anchor + to the peer; reports sent / heard", sep="\n"
+    )
+
+
+def _cells(robot: Mapping[str, Any]) -> list[str]:
+    return [
+        _pose(robot["truth"]),
+        _pose(robot["estimate"]),
+        _number(robot["position_error_m"], ".1e"),
+        f"{_number(robot['anchor_ranges'])} + {_number(robot['mutual_ranges'])}",
+        f"{_number(robot['reports_sent'])} / {_number(robot['reports_heard'])}",
+    ]
 
 
 def _pose(pose: list[float] | None) -> str:

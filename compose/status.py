@@ -12,6 +12,8 @@ FAILED = 3
 """the run itself was lost"""
 BUG = 70
 """an error of ours, with its traceback"""
+BROKEN_PIPE = 141
+"""whoever read the output has gone"""
 STOPPED = 130
 """by Ctrl-C, or a signal to the same effect"""
 

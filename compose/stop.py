@@ -1,12 +1,10 @@
-"""Ctrl-C, SIGTERM and a closed terminal, as something that arrives like everything else."""
+"""Ctrl-C, SIGTERM, a closed terminal and the end of a launcher, as something that arrives like the rest."""
 
 from __future__ import annotations
 
 import os
 import signal
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 from protocol.inbox import Inbox
 
@@ -22,20 +20,15 @@ def stop_with_launcher(inbox: Inbox) -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
-@contextmanager
-def stops_into(inbox: Inbox) -> Iterator[None]:
-    """Put "stop" into `inbox` when the process is told to stop.
+def stop_by_signal(inbox: Inbox) -> None:
+    """From now on, put "stop" into `inbox` when the process is told to stop.
 
-    Before and afterwards such a signal ends the process at once and silently.
+    Until now such a signal has ended the process at once and silently. There is no way back: what has
+    come to its end is said and written before the process ends, whatever arrives meanwhile.
     """
 
     def hand_over(number: int, _frame: object) -> None:
         inbox.put("stop", signal.Signals(number).name)
 
-    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = [signal.signal(number, hand_over) for number in signals]
-    try:
-        yield
-    finally:
-        for number, handler in zip(signals, before, strict=True):
-            signal.signal(number, handler)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, hand_over)

@@ -241,9 +241,16 @@ def test_the_table_at_the_end_says_how_each_robot_fared() -> None:
     ended = tandem("run", "paper-1", "--in-process")
     assert "localised after 48 ticks" in ended.out
     rows = {words[0]: words[1:] for line in ended.out.splitlines() if (words := line.strip(" │┃").split())}
-    for robot, x, y, heading in (("a", "3.654", "-5.468", "+0.436"), ("b", "3.737", "-3.077", "+3.060")):
+    for robot, x, y, heading in (("a", "3.65", "-5.47", "+0.44"), ("b", "3.74", "-3.08", "+3.06")):
         for figure in (x, y, heading):  # where it is, and where it thinks it is
             assert sum(figure in word for word in rows[robot]) == 2, ended.out
+
+
+def test_output_that_nobody_takes_is_one_line_and_no_traceback() -> None:
+    with Path("/dev/full").open("wb") as full, Command("run", "paper-1", "-q", terminal=full.fileno()) as run:
+        ended = run.ended()
+    assert ended.status == 3
+    assert ended.err == "tandem run: cannot go on: [Errno 28] No space left on device\n"
 
 
 def test_a_terminal_shows_each_robots_phase_and_state_while_it_runs() -> None:

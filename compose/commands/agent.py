@@ -7,7 +7,7 @@ import argparse
 from agent.process import AgentProcess, NoWorld, Search, Unwelcome, join
 from compose.record import cannot_write, ended
 from compose.status import ENDED, FAILED, STOPPED, UserError, status_of
-from compose.stop import stop_with_launcher, stops_into
+from compose.stop import stop_by_signal, stop_with_launcher
 from protocol import session
 from protocol.inbox import Inbox, Interrupted
 from protocol.journal import RecordExists
@@ -19,23 +19,23 @@ def main(options: argparse.Namespace) -> int:
     inbox = Inbox(f"tandem agent {options.id}")
     if options.launched:
         stop_with_launcher(inbox)
-    with stops_into(inbox):
-        try:
-            end = _play(options, inbox)
-        except session.BadEndpoint as error:
-            raise UserError(f"--connect: {error}") from None
-        except RecordExists as error:
-            raise UserError(f"--out: {error}") from None
-        except Unwelcome as error:
-            raise UserError(str(error)) from None
-        except NoWorld as error:
-            inbox.say(str(error))
-            return FAILED
-        except Interrupted as signal_name:
-            inbox.say(f"stopped by {signal_name}")
-            return STOPPED
-        except OSError as error:
-            raise UserError(cannot_write(options.out, error)) from None
+    stop_by_signal(inbox)
+    try:
+        end = _play(options, inbox)
+    except session.BadEndpoint as error:
+        raise UserError(f"--connect: {error}") from None
+    except RecordExists as error:
+        raise UserError(f"--out: {error}") from None
+    except Unwelcome as error:
+        raise UserError(str(error)) from None
+    except NoWorld as error:
+        inbox.say(str(error))
+        return FAILED
+    except Interrupted as signal_name:
+        inbox.say(f"stopped by {signal_name}")
+        return STOPPED
+    except OSError as error:
+        raise UserError(cannot_write(options.out, error)) from None
     if options.launched:
         return ENDED
     print(f"{options.id}: {ended(end.outcome, end.tick, end.reason)}")
@@ -43,12 +43,17 @@ def main(options: argparse.Namespace) -> int:
 
 
 def _play(options: argparse.Namespace, inbox: Inbox) -> End:
-    search = Search(f"world at {options.connect}", options.wait, inbox)
-    with session.open_client(options.connect, search.go_on) as link:
-        run, briefing = join(link, options.run, options.id, search)
-        process = AgentProcess(
-            briefing, link, run, inbox, out=options.out, fsync=options.fsync, patience=options.patience
-        )
-        if not (options.quiet or options.launched):
-            print(f"{options.id}: in run {run}, with {briefing.peer}", flush=True)
-        return process.play()
+    which = f"world of run '{options.run}'" if options.run else "world"
+    search = Search(f"{which} at {options.connect}", options.wait, inbox)
+    while True:
+        with session.open_client(options.connect, search.go_on) as link:
+            joined = join(link, options.run, options.id, search)
+            if joined is None:  # a session that has lost its link finds nothing; a new one may
+                continue
+            run, briefing = joined
+            process = AgentProcess(
+                briefing, link, run, inbox, out=options.out, fsync=options.fsync, patience=options.patience
+            )
+            if not (options.quiet or options.launched):
+                print(f"{options.id}: in run {run}, with {briefing.peer}", flush=True)
+            return process.play()

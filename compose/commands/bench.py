@@ -194,10 +194,10 @@ def _wall(command: Sequence[str]) -> float:
 
 def _table(title: str) -> Table:
     table = Table(title=title, title_justify="left")
-    table.add_column("", min_width=50)
-    for heading in ("median", "from", "to"):
-        table.add_column(heading, justify="right")
     table.add_column("")
+    for heading in ("median", "from", "to"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("", no_wrap=True)
     return table
 
 

@@ -9,7 +9,7 @@ from compose import local
 from compose.record import folder_for, read
 from compose.scenario import check_rate, load, run_name
 from compose.status import FAILED, STOPPED, UserError
-from compose.stop import stops_into
+from compose.stop import stop_by_signal
 from compose.telling import break_off, conclude, progress
 from protocol.inbox import Inbox, Interrupted
 from world.scenario import Scenario
@@ -38,7 +38,8 @@ def _in_process(options: argparse.Namespace, scenario: Scenario) -> int:
 def _as_processes(options: argparse.Namespace, scenario: Scenario) -> int:
     check_rate(scenario, options.rate)
     inbox = Inbox("tandem run")
-    with stops_into(inbox), folder_for(options.out) as folder:
+    stop_by_signal(inbox)
+    with folder_for(options.out) as folder:
         began = time.perf_counter()
         try:
             with progress(options, scenario, folder):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from compose.scenario import shipped
-from compose.status import LOCALISED
+from compose.status import ENDED
 
 
 def main(_options: argparse.Namespace) -> int:
@@ -13,4 +13,4 @@ def main(_options: argparse.Namespace) -> int:
     for name, path in shipped().items():
         first = path.read_text(encoding="utf-8").splitlines()[0]
         print(f"{name:10} {first.removeprefix('# ')}")
-    return LOCALISED
+    return ENDED

@@ -12,7 +12,7 @@ from compose.local import handed
 from compose.record import WORLD_JOURNAL, cannot_write, folder_for, read
 from compose.scenario import check_rate, load, run_name
 from compose.status import ENDED, STOPPED, UserError
-from compose.stop import stop_with_launcher, stops_into
+from compose.stop import stop_by_signal, stop_with_launcher
 from compose.telling import break_off, conclude, progress
 from protocol import session
 from protocol.inbox import Inbox, Interrupted
@@ -28,16 +28,16 @@ def main(options: argparse.Namespace) -> int:
     inbox = Inbox("tandem world")
     if options.launched:
         stop_with_launcher(inbox)
-    with stops_into(inbox):
-        try:
-            with session.open_router(options.listen) as link, folder_for(options.out) as folder:
-                return _play(options, scenario, link, folder, inbox)
-        except (session.BadEndpoint, session.CannotListen) as error:
-            raise UserError(f"--listen: {error}") from None
-        except RecordExists as error:
-            raise UserError(f"--out: {error}") from None
-        except OSError as error:
-            raise UserError(cannot_write(options.out, error)) from None
+    stop_by_signal(inbox)
+    try:
+        with session.open_router(options.listen) as link, folder_for(options.out) as folder:
+            return _play(options, scenario, link, folder, inbox)
+    except (session.BadEndpoint, session.CannotListen) as error:
+        raise UserError(f"--listen: {error}") from None
+    except RecordExists as error:
+        raise UserError(f"--out: {error}") from None
+    except OSError as error:
+        raise UserError(cannot_write(options.out, error)) from None
 
 
 def _play(
