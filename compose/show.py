@@ -22,6 +22,7 @@ from protocol.wire import MAX_FRAME_BYTES, decode
 from world.scenario import Scenario
 
 COLUMNS = ("is at x, y, heading", "thinks it is at", "error m", "ranges", "reports")
+LEGEND = "m and rad; ranges to the anchor + to the peer; reports sent / heard"
 UNLIMITED = 1000
 """columns, of what is not a terminal"""
 
@@ -77,9 +78,7 @@ def result(summary: Mapping[str, Any]) -> None:
             for line in (name, *(f"  {head}: {cell}" for head, cell in zip(COLUMNS, cells, strict=True)))
         ]
     title = f"{summary['scenario']}: {outcome_line(summary)}"
-    print(
-        title, "", *lines, "", "m and rad; ranges to the anchor + to the peer; reports sent / heard", sep="\n"
-    )
+    print(title, "", *lines, "", LEGEND, sep="\n")
 
 
 def _cells(robot: Mapping[str, Any]) -> list[str]:
