@@ -30,10 +30,10 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     options = _parser().parse_args(arguments)
     try:
         status = import_module(f"compose.commands.{options.command}").main(options)
+        sys.stdout.flush()
     except UserError as error:
         print(one_line(f"tandem {options.command}: {error}"), file=sys.stderr)
         status = USER_ERROR
-        sys.stdout.flush()
     except BrokenPipeError:
         _leave_stream(sys.stdout)
         status = BROKEN_PIPE

@@ -115,11 +115,15 @@ class Command:
     def until(self, condition: Callable[[], object], what: str) -> None:
         """Wait for `condition`, which the command must bring about before it ends."""
 
-        def come() -> object:
-            return condition() or not self.running
+        met = False
+
+        def come() -> bool:
+            nonlocal met
+            met = bool(condition())
+            return met or not self.running
 
         until(come, f"{what}\n{self.err}")
-        assert condition(), f"ended before {what}: {self.out}{self.err}"
+        assert met or condition(), f"ended before {what}: {self.out}{self.err}"
 
     def until_says(self, words: str) -> None:
         """Wait until it has said `words`, on either stream."""
