@@ -9,6 +9,7 @@ import platform
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from itertools import combinations
 from pathlib import Path
@@ -210,6 +211,7 @@ def _listed(pose: Pose | None) -> list[float] | None:
     return [pose.x, pose.y, wrap(pose.heading)] if pose is not None else None
 
 
+@cache
 def versions() -> dict[str, str | None]:
     """Of everything that a run's figures may depend on."""
     found: dict[str, str | None] = {"python": platform.python_version()}
