@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import signal
 import socket
 import subprocess
 import sys
@@ -88,8 +89,9 @@ class _Child:
             self._input.flush()
 
     def stop(self) -> None:
-        """Tell it to end."""
+        """Tell it to end, even if it has been suspended."""
         self._process.terminate()
+        self._process.send_signal(signal.SIGCONT)
 
     def end(self, timeout: float) -> None:
         """Wait `timeout` seconds for it to end; then kill it."""
