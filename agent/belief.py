@@ -95,8 +95,7 @@ def _polished(branch: Branch, ranged: Sequence[tuple[Pose, float]]) -> Branch:
     if len(ranged) < 3:
         return branch
     rho0, heading = branch.start.x, branch.start.heading
-    best = math.inf
-    fitted = heading
+    best, fitted = math.inf, heading
     for _ in range(POLISHING_STEPS):
         c, s = math.cos(heading), math.sin(heading)
         cost = gradient = curvature = 0.0
@@ -111,8 +110,6 @@ def _polished(branch: Branch, ranged: Sequence[tuple[Pose, float]]) -> Branch:
             break
         best, fitted = cost, heading
         heading -= gradient / curvature
-    if best is math.inf:
-        return branch
     return Branch(wrap(branch.alpha + fitted - branch.start.heading), Pose(rho0, 0.0, fitted))
 
 

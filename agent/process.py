@@ -108,7 +108,7 @@ class AgentProcess:
     ) -> None:
         """The journal goes to `out`; `patience` (s) bounds the wait for the world.
 
-        Raises journal.RecordExists, OSError.
+        Raises journal.CannotRecord.
         """
         self._id = briefing.robot
         self._inbox = inbox

@@ -15,7 +15,7 @@ from world.scenario import Scenario
 def play(scenario: Scenario, out: Path | None = None) -> Record:
     """The run of `scenario`. Journals go to `out`, byte for byte those of the run as processes.
 
-    Raises journal.RecordExists if `out` holds a record, OSError if it cannot be written.
+    Raises journal.CannotRecord if `out` holds a record, or cannot be written.
     """
     ids = [robot.id for robot in scenario.robots]
     journals: dict[str, Journal] = {}

@@ -39,16 +39,21 @@ def folder_for(out: Path | None) -> Iterator[Path]:
         with tempfile.TemporaryDirectory(prefix="tandem-") as folder:
             yield Path(folder)
         return
+    make(out)
+    yield out
+
+
+def make(out: Path) -> None:
+    """See to it that `out` is a folder that can be written. Raises UserError."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=out):
             pass
     except OSError as error:
         raise UserError(cannot_write(out, error)) from None
-    yield out
 
 
-def cannot_write(out: Path | None, error: OSError) -> str:
+def cannot_write(out: Path, error: OSError) -> str:
     """What to tell the user of `error`."""
     return f"--out: {out} cannot be written: {error.strerror or error}"
 

@@ -22,7 +22,11 @@ _LONGEST = b"\xc6" + MAX_FRAME_BYTES.to_bytes(4, "big")
 """how the longest frame begins"""
 
 
-class RecordExists(FileExistsError):
+class CannotRecord(OSError):
+    """A journal cannot be opened or written; the text says which, and why."""
+
+
+class RecordExists(CannotRecord):
     """A journal would have been overwritten."""
 
 
@@ -34,22 +38,33 @@ class Journal:
     """An open journal. A new file, never an old one: what is on record stays."""
 
     def __init__(self, path: Path, *, fsync: bool = False) -> None:
-        """Raises RecordExists if `path` is there already, OSError if it cannot be written."""
+        """Raises RecordExists if `path` is there already, CannotRecord if it cannot be written."""
         self.path = path
         self._fsync = fsync
-        path.parent.mkdir(parents=True, exist_ok=True)
         try:
+            path.parent.mkdir(parents=True, exist_ok=True)
             self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
-        except FileExistsError:
-            raise RecordExists(f"{path} is there already; choose another folder") from None
+        except OSError as error:
+            if path.exists():
+                raise RecordExists(f"{path} is there already; choose another folder") from None
+            raise self._cannot(error) from None
 
     def write(self, *frames: bytes) -> None:
-        """All of `frames`, in one write, on the disk's side of the process when it returns."""
+        """All of `frames`, in one write, on the disk's side of the process when it returns.
+
+        Raises CannotRecord when the disk takes no more.
+        """
         data = b"".join([_packer.pack(frame) for frame in frames])
-        if os.write(self._file, data) != len(data):
-            raise OSError(errno.ENOSPC, "written only in part", str(self.path))
-        if self._fsync:
-            os.fsync(self._file)
+        try:
+            if os.write(self._file, data) != len(data):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            if self._fsync:
+                os.fsync(self._file)
+        except OSError as error:
+            raise self._cannot(error) from None
+
+    def _cannot(self, error: OSError) -> CannotRecord:
+        return CannotRecord(f"{self.path} cannot be written: {error.strerror or error}")
 
     def close(self) -> None:
         """Nothing is lost without it; it frees the file."""

@@ -11,7 +11,7 @@ def truth(run: str) -> str:
 
 
 def briefing(run: str, robot: str) -> str:
-    """Queryable at the world: what that robot needs to start; the world answers for "*"."""
+    """Queryable at the world: what that robot needs to start. The world answers under "*"."""
     return f"{ROOT}/{run}/world/briefing/{robot}"
 
 

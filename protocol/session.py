@@ -48,12 +48,11 @@ class CannotListen(OSError):
     """The endpoint to listen on cannot be had; its text says why."""
 
 
-def check_endpoint(endpoint: str) -> str:
-    """`endpoint` itself; raises BadEndpoint if it is not of the form protocol/host:port."""
+def check_endpoint(endpoint: str) -> None:
+    """Raises BadEndpoint if `endpoint` is not of the form protocol/host:port."""
     match = _ENDPOINT.fullmatch(endpoint)
     if match is None or not 0 < int(match["port"]) < 65536:
         raise BadEndpoint(f"'{endpoint}' is no endpoint; one looks like tcp/127.0.0.1:7447")
-    return endpoint
 
 
 def _config(mode: str, listen: Sequence[str], connect: Sequence[str]) -> zenoh.Config:

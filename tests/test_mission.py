@@ -16,7 +16,7 @@ from agent.phases.anchor import third_point
 from agent.phases.encounter import SPEEDS, TURN_RATES, last_manoeuvre
 from compose.inline import play
 from compose.record import Moment, Record
-from compose.scenario import load, parse
+from compose.scenario import load
 from protocol.messages import Localised
 from protocol.mission import (
     OPTIMAL_TURN,
@@ -30,6 +30,7 @@ from protocol.mission import (
     tick_budget,
 )
 from protocol.motion import Pose, compose, step
+from tests.missions import mission_of
 from tests.steps import steps
 from world.sensors import anchor_ranges, mutual_ranges
 
@@ -209,28 +210,6 @@ def test_a_range_is_taken_up_to_r_and_at_r() -> None:
 
 
 # --- missions whose parameters bite -------------------------------------------------------------------
-
-
-def mission_of(
-    start: tuple[float, float, float], *, reach: float = 3.0, speed: float = 1.0, turn_rate: float = math.pi
-) -> Record:
-    text = f"""
-        name = "mission"
-        [mission]
-        sensing_range = {reach}
-        period = 1.0
-        max_speed = {speed}
-        max_turn_rate = {turn_rate!r}
-        [[robot]]
-        id = "a"
-        anchor = [0.0, 0.0]
-        start = {list(start)}
-        [[robot]]
-        id = "b"
-        anchor = [10.0, 0.0]
-        start = [10.4, 0.3, 3.6]
-        """
-    return play(parse(text, "mission"))
 
 
 def turns(record: Record, state: str) -> list[float]:

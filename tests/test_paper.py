@@ -14,13 +14,14 @@ import pytest
 from agent.geometry import Placement, placements
 from compose.inline import play
 from compose.record import Record, summary, ticks_csv
-from compose.scenario import load, parse
+from compose.scenario import load
 from protocol import journal
 from protocol.messages import Briefing, Drive, End, Estimate, Farewell, Report, Sense
 from protocol.mission import Mission, half_arc, longest_meeting, rendezvous
 from protocol.motion import Pose, wrap
 from protocol.wire import decode
-from tests.reference import REFERENCE, Equation7, Phase1, Simulation, Triple
+from tests.missions import mission_of
+from tests.reference import REFERENCE, Equation7, Phase1, Simulation
 
 NAMES = ("paper-1", "paper-2")
 SIMULATIONS = dict(zip(NAMES, REFERENCE.sims, strict=True))
@@ -233,27 +234,9 @@ BRANCHES = {
 }
 
 
-def alone(start: Triple) -> Record:
-    """The mission of a robot released there, its anchor at the origin; its peer starts as in simulation 1."""
-    text = f"""
-        name = "phase-1"
-        mission = {{sensing_range = 3.0, period = 1.0, max_speed = 1.0, max_turn_rate = {math.pi!r}}}
-        planner = {{variant = "paper"}}
-        [[robot]]
-        id = "a"
-        anchor = [0.0, 0.0]
-        start = {list(start)}
-        [[robot]]
-        id = "b"
-        anchor = [10.0, 0.0]
-        start = [11.3, -0.4, 3.6]
-        """
-    return play(parse(text, "phase-1"))
-
-
 @pytest.mark.parametrize("case", REFERENCE.phase1, ids=lambda case: f"{case.start[0]:+.3f}")
 def test_phase_1_finds_the_references_branch_and_orientation(case: Phase1) -> None:
-    record = alone(case.start)
+    record = mission_of(case.start, variant="paper")
     farewell = record.farewells["a"]
     for tick, controls in enumerate(case.u):
         driven = drive(record, "a", tick)

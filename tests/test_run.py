@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from compose.local import free_endpoint
 from tests.commands import PAPER_1, Command, journals, processes_of, tandem
 
 PAPER_TICKS = {"paper-1": 48, "paper-2": 110}
@@ -251,6 +252,17 @@ def test_output_that_nobody_takes_is_one_line_and_no_traceback() -> None:
         ended = run.ended()
     assert ended.status == 3
     assert ended.err == "tandem run: cannot go on: [Errno 28] No space left on device\n"
+
+
+def test_a_world_whose_output_nobody_takes_does_not_blame_its_record(tmp_path: Path) -> None:
+    options = ("--listen", free_endpoint(), "--out", tmp_path / "out")
+    with (
+        Path("/dev/full").open("wb") as full,
+        Command("world", "paper-1", *options, terminal=full.fileno()) as run,
+    ):
+        ended = run.ended()
+    assert ended.status == 3
+    assert ended.err == "tandem world: cannot go on: [Errno 28] No space left on device\n"
 
 
 def test_a_terminal_shows_each_robots_phase_and_state_while_it_runs() -> None:

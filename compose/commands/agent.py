@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 
 from agent.process import AgentProcess, NoWorld, Search, Unwelcome, join
-from compose.record import cannot_write, ended
+from compose.record import ended, make
 from compose.status import ENDED, FAILED, STOPPED, UserError, status_of
 from compose.stop import stop_by_signal, stop_with_launcher
 from protocol import session
 from protocol.inbox import Inbox, Interrupted
-from protocol.journal import RecordExists
+from protocol.journal import CannotRecord
 from protocol.messages import End
 
 
@@ -24,7 +24,7 @@ def main(options: argparse.Namespace) -> int:
         end = _play(options, inbox)
     except session.BadEndpoint as error:
         raise UserError(f"--connect: {error}") from None
-    except RecordExists as error:
+    except CannotRecord as error:
         raise UserError(f"--out: {error}") from None
     except Unwelcome as error:
         raise UserError(str(error)) from None
@@ -34,8 +34,6 @@ def main(options: argparse.Namespace) -> int:
     except Interrupted as signal_name:
         inbox.say(f"stopped by {signal_name}")
         return STOPPED
-    except OSError as error:
-        raise UserError(cannot_write(options.out, error)) from None
     if options.launched:
         return ENDED
     print(f"{options.id}: {ended(end.outcome, end.tick, end.reason)}")
@@ -51,6 +49,8 @@ def _play(options: argparse.Namespace, inbox: Inbox) -> End:
             if joined is None:  # a session that has lost its link finds nothing; a new one may
                 continue
             run, briefing = joined
+            if options.out is not None:
+                make(options.out)
             process = AgentProcess(
                 briefing, link, run, inbox, out=options.out, fsync=options.fsync, patience=options.patience
             )

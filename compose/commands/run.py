@@ -12,6 +12,7 @@ from compose.status import FAILED, STOPPED, UserError
 from compose.stop import stop_by_signal
 from compose.telling import break_off, conclude, progress
 from protocol.inbox import Inbox, Interrupted
+from protocol.journal import CannotRecord
 from world.scenario import Scenario
 
 
@@ -32,7 +33,11 @@ def _in_process(options: argparse.Namespace, scenario: Scenario) -> int:
     if options.out is None:
         return conclude(options, inline.play(scenario), None, "in-process", began)
     with folder_for(options.out) as folder:
-        return conclude(options, inline.play(scenario, folder), folder, "in-process", began)
+        try:
+            played = inline.play(scenario, folder)
+        except CannotRecord as error:
+            raise UserError(f"--out: {error}") from None
+        return conclude(options, played, folder, "in-process", began)
 
 
 def _as_processes(options: argparse.Namespace, scenario: Scenario) -> int:

@@ -9,14 +9,14 @@ from pathlib import Path
 import zenoh
 
 from compose.local import handed
-from compose.record import WORLD_JOURNAL, cannot_write, folder_for, read
+from compose.record import WORLD_JOURNAL, folder_for, read
 from compose.scenario import check_rate, load, run_name
 from compose.status import ENDED, STOPPED, UserError
 from compose.stop import stop_by_signal, stop_with_launcher
 from compose.telling import break_off, conclude, progress
 from protocol import session
 from protocol.inbox import Inbox, Interrupted
-from protocol.journal import Journal, RecordExists
+from protocol.journal import CannotRecord, Journal
 from world.process import WorldProcess
 from world.scenario import Scenario
 
@@ -34,10 +34,8 @@ def main(options: argparse.Namespace) -> int:
             return _play(options, scenario, link, folder, inbox)
     except (session.BadEndpoint, session.CannotListen) as error:
         raise UserError(f"--listen: {error}") from None
-    except RecordExists as error:
+    except CannotRecord as error:
         raise UserError(f"--out: {error}") from None
-    except OSError as error:
-        raise UserError(cannot_write(options.out, error)) from None
 
 
 def _play(

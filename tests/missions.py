@@ -1,0 +1,38 @@
+"""A mission whose robot a is released where a test wants it, its anchor at the origin."""
+
+from __future__ import annotations
+
+import math
+
+from compose.inline import play
+from compose.record import Record
+from compose.scenario import parse
+
+
+def mission_of(
+    start: tuple[float, float, float],
+    *,
+    variant: str = "assured",
+    reach: float = 3.0,
+    speed: float = 1.0,
+    turn_rate: float = math.pi,
+) -> Record:
+    """Played in this process; the peer starts half a metre from its own anchor."""
+    text = f"""
+        name = "mission"
+        planner = {{variant = "{variant}"}}
+        [mission]
+        sensing_range = {reach}
+        period = 1.0
+        max_speed = {speed}
+        max_turn_rate = {turn_rate!r}
+        [[robot]]
+        id = "a"
+        anchor = [0.0, 0.0]
+        start = {list(start)}
+        [[robot]]
+        id = "b"
+        anchor = [10.0, 0.0]
+        start = [10.4, 0.3, 3.6]
+        """
+    return play(parse(text, "mission"))
