@@ -129,18 +129,18 @@ def separation(placement: Placement, a: Pose, b: Pose) -> float:
 
 
 def weigh_placements(
-    candidates: Iterable[Placement], sightings: Sequence[Sighting], sensing_range: float
+    candidates: Iterable[Placement], sightings: Sequence[Sighting], sensing_range: float, tolerance: float
 ) -> tuple[Placement, ...]:
-    """Those of `candidates` that explain every sighting, be it a range or silence."""
+    """Those of `candidates` that explain every sighting, be it a range or silence, to `tolerance` m."""
     left: list[Placement] = []
     for candidate in candidates:
         placement = _polished_placement(candidate, sightings)
         for sighting in sightings:
             predicted = separation(placement, sighting.a, sighting.b)
             if sighting.range is None:
-                if predicted <= sensing_range - MUTUAL_FLOOR:
+                if predicted <= sensing_range - tolerance:
                     break
-            elif abs(predicted - sighting.range) > MUTUAL_FLOOR:
+            elif abs(predicted - sighting.range) > tolerance:
                 break
         else:
             if not any(same_placement(placement, other, MUTUAL_FLOOR) for other in left):

@@ -31,31 +31,24 @@ class Logbook(msgspec.Struct, frozen=True):
         """The log with an anchor range (m) at its last tick."""
         return Logbook(self.through, self.runs, (*self.ranges, Ranged(self.through, distance)))
 
-    def after(self, since: int) -> Logbook:
-        """What a peer lacks that knows this log through `since`; no more than one report can carry.
+    def after(self, since: int, ranges_since: int) -> Logbook:
+        """What a peer lacks that knows the manoeuvres through tick `since`, and the first `ranges_since` ranges.
 
-        Its runs begin at `since`, and the range of tick 0 goes with since = 0.
+        No more than one report can carry. Its runs begin at `since`.
         """
         fresh = [begin for begin, run in _dated(self.runs) if begin + run.ticks > since]
-        ranges = [r for r in self.ranges if r.tick > since or since == 0]
         through = fresh[MAX_REPORT_RUNS] if len(fresh) > MAX_REPORT_RUNS else self.through
-        if len(ranges) > MAX_REPORT_RANGES:
-            through = min(through, ranges[MAX_REPORT_RANGES].tick - 1)
-        return Logbook(
-            through,
-            _between(self.runs, since, through),
-            tuple(r for r in ranges if r.tick <= through),
-        )
+        ranges = self.ranges[ranges_since : ranges_since + MAX_REPORT_RANGES]
+        return Logbook(through, _between(self.runs, since, through), ranges)
 
-    def extended(self, since: int, told: Logbook) -> Logbook:
-        """The log with what `told` (see `after`) adds; unchanged where that would leave a gap."""
-        if since > self.through or told.through < self.through:
-            return self
+    def extended(self, since: int, ranges_since: int, told: Logbook) -> Logbook:
+        """The log with what `told` (see `after`) adds; of what would leave a gap, nothing."""
         book = self
-        for run in _between(told.runs, self.through - since, told.through - since):
-            book = book.drove(run.v, run.omega, run.ticks)
-        newest = self.ranges[-1].tick if self.ranges else -1
-        news = tuple(r for r in told.ranges if r.tick > newest)
+        if since <= self.through:
+            for run in _between(told.runs, self.through - since, told.through - since):
+                book = book.drove(run.v, run.omega, run.ticks)
+        known = len(self.ranges)
+        news = told.ranges[known - ranges_since :] if ranges_since <= known else ()
         return Logbook(book.through, book.runs, self.ranges + news)
 
     def pose(self, start: Pose, tick: int, period: float) -> Pose:

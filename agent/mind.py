@@ -11,13 +11,13 @@ from agent.geometry import Placement
 from agent.logbook import Logbook
 from agent.phases.anchor import ThirdPoint
 from agent.phases.encounter import LastManoeuvre, Plan, Returning, Standing, Waiting
-from agent.phases.rendezvous import Aligning, Orbiting, Radial, Tangent
+from agent.phases.rendezvous import Aligning, Orbiting, Radial, Tangent, off_anchor
 from agent.phases.seeking import Circling, Straight, Turning
 from agent.radio import Radio
 from protocol import messages
 from protocol.messages import Briefing, Localised, Ranged, Undecided
-from protocol.mission import Orbit
 from protocol.motion import ORIGIN, Pose, compose
+from protocol.rendezvous import Orbit
 
 
 class Asleep(msgspec.Struct, frozen=True):
@@ -93,6 +93,21 @@ class Mind(msgspec.Struct, frozen=True):
         return bool(self.mutual) and self.mutual[-1].tick == self.tick
 
     @property
+    def hears_peer(self) -> bool:
+        """Whether the peer's report of this tick has been heard."""
+        return self.radio.latest == self.tick
+
+    @property
+    def off_anchor(self) -> bool:
+        """Whether b, be it this robot or the peer, is where it can be met; phase 1 is done by both."""
+        assert self.radio.start is not None
+        if self.briefing.role == "b":
+            local = self.local_pose
+        else:
+            local = self.radio.peer.pose(self.radio.start, self.tick, self.briefing.mission.period)
+        return off_anchor(local, self.briefing.rendezvous.b)
+
+    @property
     def phase(self) -> int:
         """The paper's: 1, 2 or 3."""
         match self.state:
@@ -147,10 +162,10 @@ class Mind(msgspec.Struct, frozen=True):
         track = self.log.track(ORIGIN, 0, self.tick, self.briefing.mission.period)
         return [(pose, ranges.get(tick)) for tick, pose in enumerate(track)]
 
-    def sightings(self) -> list[Sighting]:
-        """Every tick of the encounter that both robots' logs cover."""
-        first, last = self.findings.met, min(self.tick, self.radio.peer.through)
-        if first is None or self.radio.start is None or last < first:
+    def sightings(self, first: int) -> list[Sighting]:
+        """Every tick from `first` on that both robots' logs cover: where both were, and the range between."""
+        last = min(self.tick, self.radio.peer.through)
+        if self.radio.start is None or last < first:
             return []
         period = self.briefing.mission.period
         own = self.log.track(self.start, first, last, period)

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from agent import radio
-from agent.belief import FLOOR, Branch, Sighting, branches, weigh_branches, weigh_placements
+from agent.belief import FLOOR, MUTUAL_FLOOR, Branch, Sighting, branches, weigh_branches, weigh_placements
 from agent.mind import Asleep, Done, Mind
 from agent.phases import anchor, encounter, rendezvous, seeking
 from agent.phases.anchor import ThirdPoint
@@ -37,7 +37,7 @@ def observe(mind: Mind, sense: Sense) -> Mind:
         v, omega = sense.executed.v, sense.executed.omega
         log = log.drove(v, omega)
         odometry = step(odometry, v, omega, mind.briefing.mission.period)
-    if sense.anchor_range is not None:
+    if sense.anchor_range is not None and not _again(mind, sense):
         log = log.ranged(sense.anchor_range)
     mutual = mind.mutual
     for contact in sense.contacts:
@@ -49,8 +49,8 @@ def observe(mind: Mind, sense: Sense) -> Mind:
 
 def report(mind: Mind) -> Report:
     """What the peer has not acknowledged yet."""
-    since = mind.radio.acknowledged
-    news = mind.log.after(since)
+    since, ranges_since = mind.radio.acknowledged, mind.radio.ranges_acknowledged
+    news = mind.log.after(since, ranges_since)
     return Report(
         tick=mind.tick,
         robot=mind.briefing.robot,
@@ -60,8 +60,10 @@ def report(mind: Mind) -> Report:
         since=since,
         through=news.through,
         runs=news.runs,
+        ranges_since=ranges_since,
         ranges=news.ranges,
         heard=mind.radio.peer.through,
+        ranges_heard=len(mind.radio.peer.ranges),
         verdict=mind.verdict,
     )
 
@@ -78,7 +80,7 @@ def decide(mind: Mind, reports: Sequence[Report] = ()) -> Mind:
     if not mind.in_contact:
         return mind
     match mind.state:
-        case Orbiting() if mind.radio.phase == 3 or mind.radio.state == mind.doing:
+        case Aligning() | Radial() | Tangent() | Orbiting() if _meets(mind):
             return _met(mind)
         case Standing() | Waiting():
             return _considered(mind)
@@ -150,6 +152,15 @@ def _advanced(mind: Mind, anchor_range: float | None) -> Mind:
             return mind
 
 
+def _again(mind: Mind, sense: Sense) -> bool:
+    """Whether the anchor's range is the last one over again, from where the robot has stood since phase 1."""
+    return (
+        mind.findings.branch is not None
+        and sense.executed == REST
+        and sense.anchor_range == mind.log.ranges[-1].range
+    )
+
+
 def _released(mind: Mind, rho0: float | None) -> Mind:
     if rho0 is None:
         return _undecided(mind, "the anchor is out of range at the start")
@@ -201,6 +212,28 @@ def _on_to_orbit(mind: Mind, state: rendezvous.Meeting) -> Mind:
     return mind if onward is mind.state else replace(mind, state=onward)
 
 
+def _meets(mind: Mind) -> bool:
+    """Whether phase 3 begins, once in contact: by the letter when both orbit, else as soon as it can."""
+    if mind.briefing.variant == "paper":
+        return isinstance(mind.state, Orbiting) and (
+            mind.radio.phase == 3 or mind.radio.state == mind.doing
+        )
+    return mind.radio.phase == 3 or (mind.hears_peer and mind.radio.start is not None and mind.off_anchor)
+
+
+def _lingers(mind: Mind) -> bool:
+    """Whether the robot stands still so as not to lose a peer that is not ready for phase 3.
+
+    It is still in phase 1; or it is b, and too near its anchor.
+    """
+    return (
+        mind.briefing.variant == "assured"
+        and mind.in_contact
+        and mind.hears_peer
+        and (mind.radio.start is None or mind.briefing.role == "a")
+    )
+
+
 def _met(mind: Mind) -> Mind:
     """Phase 3 begins: b stops, a goes straight on (Section III.C.a)."""
     findings = replace(mind.findings, met=mind.tick)
@@ -211,9 +244,14 @@ def _met(mind: Mind) -> Mind:
 
 
 def _considered(mind: Mind) -> Mind:
-    """Both logs in hand: weigh the placements; then claim, plan the last manoeuvre, or wait."""
-    sightings = mind.sightings()
-    base = encounter.base(sightings)
+    """Both logs in hand: weigh the placements; then claim, plan the last manoeuvre, or wait.
+
+    The letter looks at the encounter alone; `assured` also at what was ranged, and what was silent, before.
+    """
+    variant, met = mind.briefing.variant, mind.findings.met
+    assert met is not None
+    sightings = mind.sightings(met if variant == "paper" else 0)
+    base = encounter.base([sighting for sighting in sightings if sighting.tick >= met])
     if base is None:
         return mind
     mind = _weighed(mind, sightings, base)
@@ -222,15 +260,15 @@ def _considered(mind: Mind) -> Mind:
     if not left:
         return _undecided(mind, "no placement explains the mutual ranges")
     if checked and len(left) == 1:
+        if not weigh_placements(left, sightings, mind.briefing.mission.sensing_range, MUTUAL_FLOOR):
+            return _undecided(mind, "no placement explains the mutual ranges")
         return replace(mind, state=Done(3, Localised(mind.world_pose(left[0]))))
     if mind.briefing.role == "a":
         return mind
-    if mind.briefing.variant == "paper" and mind.findings.plan is not None:
+    if variant == "paper" and mind.findings.plan is not None:
         failure = "fits more than one placement" if checked else "could not be taken: b left a's range"
         return _undecided(mind, f"the third mutual range {failure}")
-    plan = encounter.last_manoeuvre(
-        mind.local_pose, sightings[-1].a, left, mind.briefing.mission, mind.briefing.variant
-    )
+    plan = encounter.last_manoeuvre(mind.local_pose, sightings[-1].a, left, mind.briefing.mission, variant)
     return replace(
         mind,
         state=LastManoeuvre(plan.drive, mind.odometry),
@@ -239,14 +277,18 @@ def _considered(mind: Mind) -> Mind:
 
 
 def _weighed(mind: Mind, sightings: Sequence[Sighting], base: tuple[Sighting, Sighting]) -> Mind:
-    """The placements of eq. (7) that every range and every silent tick of the encounter leave."""
+    """The placements of eq. (7) that every range and every silent tick in `sightings` leave.
+
+    The letter takes the one that fits; `assured` keeps what misses by so little that it might.
+    """
     reach, findings = mind.briefing.mission.sensing_range, mind.findings
+    tolerance = MUTUAL_FLOOR if mind.briefing.variant == "paper" else encounter.SMALLEST_GAP
     if findings.candidates is None:
         solutions = encounter.solve(mind.briefing.anchor_distance, base)
         silence = [sighting for sighting in sightings if sighting.range is None]
-        left = weigh_placements(solutions, silence, reach)
+        left = weigh_placements(solutions, silence, reach, tolerance)
         findings = replace(findings, placements=left, candidates=(len(solutions), len(left)))
-    left = weigh_placements(findings.placements, sightings, reach)
+    left = weigh_placements(findings.placements, sightings, reach, tolerance)
     return replace(mind, findings=replace(findings, placements=left))
 
 
@@ -259,6 +301,8 @@ def _undecided(mind: Mind, reason: str) -> Mind:
 
 def _controls(mind: Mind) -> Controls:
     match mind.state:
+        case Aligning() | Radial() | Tangent() | Orbiting() if _lingers(mind):
+            return REST
         case Orbiting():
             return Controls(mind.orbit.v, mind.orbit.omega)
         case Aligning() | Radial() | Tangent():

@@ -23,7 +23,9 @@ class Radio(msgspec.Struct, frozen=True):
     latest: int = -1
     """the tick of the newest report heard"""
     acknowledged: int = 0
-    """the peer knows this robot's log through this tick"""
+    """the peer knows this robot's manoeuvres through this tick"""
+    ranges_acknowledged: int = 0
+    """and so many of its ranges"""
     heard: int = 0
     """reports, repeats included"""
 
@@ -36,12 +38,10 @@ def contradiction(report: Report) -> str | None:
         return f"a log over [{report.since}, {report.through}] told at tick {report.tick}"
     if sum(run.ticks for run in report.runs) != report.through - report.since:
         return f"manoeuvres that do not fill [{report.since}, {report.through}]"
-    earliest = -1 if report.since == 0 else report.since
+    earliest = report.ranges_since - 1  # one a tick at the most
     for ranged in report.ranges:
-        if not earliest < ranged.tick <= report.through:
-            return (
-                f"a range of tick {ranged.tick} outside ({report.since}, {report.through}], or out of order"
-            )
+        if not earliest < ranged.tick <= report.tick:
+            return f"a range of tick {ranged.tick} outside ({earliest}, {report.tick}]"
         earliest = ranged.tick
     return None
 
@@ -50,12 +50,15 @@ def hear(radio: Radio, report: Report) -> Radio:
     """Late, repeated and overtaken reports change nothing but the count."""
     newer = report.tick > radio.latest
     return Radio(
-        peer=radio.peer.extended(report.since, Logbook(report.through, report.runs, report.ranges)),
+        peer=radio.peer.extended(
+            report.since, report.ranges_since, Logbook(report.through, report.runs, report.ranges)
+        ),
         start=radio.start or report.start,
         phase=report.phase if newer else radio.phase,
         state=report.state if newer else radio.state,
         verdict=report.verdict if newer else radio.verdict,
         latest=max(report.tick, radio.latest),
         acknowledged=max(report.heard, radio.acknowledged),
+        ranges_acknowledged=max(report.ranges_heard, radio.ranges_acknowledged),
         heard=radio.heard + 1,
     )

@@ -16,8 +16,9 @@ from msgspec import Meta
 
 from compose.status import UserError
 from protocol.messages import Briefing
-from protocol.mission import Anchor, Mission, Rendezvous, Role, Variant, rendezvous, tick_budget
+from protocol.mission import Anchor, Mission, Role, Variant
 from protocol.motion import TAU, Pose
+from protocol.rendezvous import Rendezvous, rendezvous, tick_budget
 from protocol.units import NAME, RobotId
 from protocol.wire import MalformedFrame, decode, encode
 from world.scenario import Placed, Scenario

@@ -12,8 +12,9 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from protocol.mission import Anchor, Mission, Rendezvous, Role, Variant
+from protocol.mission import Anchor, Mission, Role, Variant
 from protocol.motion import Controls, Pose, Run
+from protocol.rendezvous import Rendezvous
 from protocol.units import (
     Angle,
     AngularVelocity,
@@ -109,7 +110,11 @@ class Sense(Message, frozen=True):
 
 
 class Report(Message, frozen=True):
-    """Robot to robot: what the peer has not acknowledged of this robot's log, up to tick k."""
+    """Robot to robot: what the peer has not acknowledged of this robot's log, up to tick k.
+
+    Manoeuvres and ranges are acknowledged each for themselves: what many ranges there may be to tell must
+    not hold up where the robot is.
+    """
 
     tick: Tick
     robot: RobotId
@@ -120,12 +125,16 @@ class Report(Message, frozen=True):
     """where tick 0 of its odometry lies in the frame of its own anchor; none before phase 1 is done"""
     since: Tick
     through: Tick
-    """the log below covers the manoeuvres over [since, through] and the ranges in (since, through]"""
+    """the log below covers the manoeuvres over [since, through]"""
     runs: Annotated[tuple[Run, ...], Meta(max_length=MAX_REPORT_RUNS)]
+    ranges_since: Count
+    """the log below has the ranges after the first so many"""
     ranges: Annotated[tuple[Ranged, ...], Meta(max_length=MAX_REPORT_RANGES)]
-    """to its own anchor; the one of tick 0 goes with since = 0"""
+    """to its own anchor"""
     heard: Tick
-    """the peer's log is known through this tick"""
+    """the peer's manoeuvres are known through this tick"""
+    ranges_heard: Count
+    """and so many of the peer's ranges"""
     verdict: Verdict | None = None
 
 

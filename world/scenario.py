@@ -5,8 +5,9 @@ from __future__ import annotations
 import msgspec
 
 from protocol.messages import Briefing
-from protocol.mission import Anchor, Mission, Rendezvous, Role, Variant
+from protocol.mission import Anchor, Mission, Role, Variant
 from protocol.motion import Pose
+from protocol.rendezvous import Rendezvous
 from protocol.units import RobotId, Tick
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from agent.belief import Sighting
 from agent.geometry import Placement, placements
 from agent.phases.seeking import travelled
-from protocol.mission import RANGE_MARGIN, Mission, Variant
+from protocol.mission import Mission, Variant
 from protocol.motion import Controls, Pose
 
 TURN_RATES = 721
@@ -23,6 +23,13 @@ SPEEDS = (1.0, -1.0, 0.75, -0.75, 0.5, -0.5, 0.25, -0.25, 0.1, -0.1)
 
 ELSEWHERE = 1e-6
 """m: a range taken nearer than this to where another was says nothing new"""
+
+
+SMALLEST_GAP = 1e-6
+"""m: placements whose predictions differ by less are not told apart by a range, and another is taken.
+
+Ten times `belief.MUTUAL_FLOOR`, the most by which rounding may put a true prediction off.
+"""
 
 
 class Standing(msgspec.Struct, frozen=True):
@@ -115,7 +122,7 @@ def last_manoeuvre(
     for candidate in candidates:
         there = candidate.place(a)
         squared.append((there.x - x) ** 2 + (there.y - y) ** 2)
-    rim = (mission.sensing_range - RANGE_MARGIN) ** 2
+    rim = (mission.sensing_range - SMALLEST_GAP) ** 2
     if len(squared) == 1:
         here = travelled(b, candidates[0].place(a))
         gap = here * here - squared[0]

@@ -1,4 +1,4 @@
-"""Phase 2: out to the orbit about the own anchor, and round it until the peer is met (Section III.B)."""
+"""Phase 2: to the orbit about the own anchor, and round it until the peer is met (Section III.B)."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ import math
 import msgspec
 
 from agent.phases.seeking import ARRIVED, straight, turn
-from protocol.mission import Mission, Orbit
+from protocol.mission import Mission
 from protocol.motion import Controls, Pose, compose, wrap
+from protocol.rendezvous import Orbit
 
 
 class Aligning(msgspec.Struct, frozen=True):
@@ -30,7 +31,7 @@ class Tangent(msgspec.Struct, frozen=True):
 
 
 class Orbiting(msgspec.Struct, frozen=True):
-    """Drives round its anchor, eq. (6)."""
+    """Drives round its anchor, eq. (6); or waits there, where that is its part of the plan."""
 
 
 Meeting = Aligning | Radial | Tangent | Orbiting
@@ -50,6 +51,8 @@ def onward(state: Meeting, odometry: Pose, start: Pose, orbit: Orbit) -> Meeting
             case Aligning(heading) if abs(heading - odometry.heading) <= ARRIVED:
                 state = Radial()
             case Radial() if abs(left_to_orbit(odometry, start, orbit)) <= ARRIVED:
+                if orbit.v == 0.0:
+                    return Orbiting()
                 state = Tangent(odometry.heading + math.copysign(math.pi / 2, orbit.omega))
             case Tangent(heading) if abs(heading - odometry.heading) <= ARRIVED:
                 return Orbiting()
@@ -61,6 +64,15 @@ def left_to_orbit(odometry: Pose, start: Pose, orbit: Orbit) -> float:
     """m: how much farther from the anchor the orbit is."""
     local = compose(start, odometry)
     return orbit.radius - math.hypot(local.x, local.y)
+
+
+def off_anchor(local: Pose, orbit: Orbit) -> bool:
+    """Whether b, at `local` in its anchor's frame, is far enough from its anchor to be met there.
+
+    On its anchor, its ranges to a would not tell its heading: eq. (7) has a line of solutions. Half way
+    to where it waits is far enough.
+    """
+    return math.hypot(local.x, local.y) >= 0.5 * orbit.radius
 
 
 def controls(state: Meeting, odometry: Pose, start: Pose, orbit: Orbit, mission: Mission) -> Controls:
