@@ -129,7 +129,10 @@ def separation(placement: Placement, a: Pose, b: Pose) -> float:
 
 
 def weigh_placements(
-    candidates: Iterable[Placement], sightings: Sequence[Sighting], sensing_range: float, tolerance: float
+    candidates: Iterable[Placement],
+    sightings: Sequence[Sighting],
+    sensing_range: float,
+    tolerance: float = MUTUAL_FLOOR,
 ) -> tuple[Placement, ...]:
     """Those of `candidates` that explain every sighting, be it a range or silence, to `tolerance` m."""
     left: list[Placement] = []
@@ -146,6 +149,34 @@ def weigh_placements(
             if not any(same_placement(placement, other, MUTUAL_FLOOR) for other in left):
                 left.append(placement)
     return tuple(left)
+
+
+def dilution(placement: Placement, sightings: Sequence[Sighting]) -> float:
+    """How far an error in the ranges would turn either robot about its anchor, in rad per m of error.
+
+    The dilution of precision, of least squares over all ranges in `sightings`; infinite where they leave
+    a turn open, next to a double root of eq. (7).
+    """
+    tx, ty = placement.x, placement.y
+    pp = pq = qq = 0.0
+    for sighting in sightings:
+        if sighting.range is None:
+            continue
+        there = placement.place(sighting.a)
+        x, y = there.x - sighting.b.x, there.y - sighting.b.y
+        apart = math.hypot(x, y)
+        if apart == 0.0:
+            continue
+        by_phi = (y * (there.x - tx) - x * (there.y - ty)) / apart
+        by_psi = (y * tx - x * ty) / apart
+        pp += by_phi * by_phi
+        pq += by_phi * by_psi
+        qq += by_psi * by_psi
+    determinant = pp * qq - pq * pq
+    if determinant <= SINGULAR * pp * qq:
+        return math.inf
+    # in <W>, b is turned by -psi and a by phi - psi
+    return math.sqrt(max(pp, pp + qq + 2.0 * pq) / determinant)
 
 
 def _polished_placement(placement: Placement, sightings: Sequence[Sighting]) -> Placement:

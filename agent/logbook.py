@@ -32,9 +32,9 @@ class Logbook(msgspec.Struct, frozen=True):
         return Logbook(self.through, self.runs, (*self.ranges, Ranged(self.through, distance)))
 
     def after(self, since: int, ranges_since: int) -> Logbook:
-        """What a peer lacks that knows the manoeuvres through tick `since`, and the first `ranges_since` ranges.
+        """What a peer lacks that knows the manoeuvres through `since`, and the first `ranges_since` ranges.
 
-        No more than one report can carry. Its runs begin at `since`.
+        No more than one report can carry. Its runs begin at tick `since`.
         """
         fresh = [begin for begin, run in _dated(self.runs) if begin + run.ticks > since]
         through = fresh[MAX_REPORT_RUNS] if len(fresh) > MAX_REPORT_RUNS else self.through

@@ -12,7 +12,7 @@ from agent.logbook import Logbook
 from agent.phases.anchor import ThirdPoint
 from agent.phases.encounter import LastManoeuvre, Plan, Returning, Standing, Waiting
 from agent.phases.rendezvous import Aligning, Orbiting, Radial, Tangent, off_anchor
-from agent.phases.seeking import Circling, Straight, Turning
+from agent.phases.seeking import Backing, Circling, Straight, Turning
 from agent.radio import Radio
 from protocol import messages
 from protocol.messages import Briefing, Localised, Ranged, Undecided
@@ -31,14 +31,15 @@ class Done(msgspec.Struct, frozen=True):
     verdict: messages.Verdict
 
 
-Phase1 = Straight | Turning | Circling | ThirdPoint
+Phase1 = Straight | Backing | Turning | Circling | ThirdPoint
 Phase2 = Aligning | Radial | Tangent | Orbiting
-Phase3 = Straight | Turning | Circling | Standing | Waiting | LastManoeuvre | Returning
+Phase3 = Straight | Backing | Turning | Circling | Standing | Waiting | LastManoeuvre | Returning
 State = Asleep | Phase1 | Phase2 | Phase3 | Done
 
 WORDS: dict[type, str] = {
     Asleep: "asleep",
     Straight: "straight",
+    Backing: "backing",
     Turning: "turning",
     Circling: "circling",
     ThirdPoint: "third-point",
@@ -113,7 +114,9 @@ class Mind(msgspec.Struct, frozen=True):
         match self.state:
             case Orbiting() | Aligning() | Radial() | Tangent():
                 return 2
-            case Asleep() | ThirdPoint() | Straight("anchor") | Turning("anchor") | Circling("anchor"):
+            case Asleep() | ThirdPoint():
+                return 1
+            case Straight("anchor") | Backing("anchor") | Turning("anchor") | Circling("anchor"):
                 return 1
             case Done(phase, _):
                 return phase

@@ -22,7 +22,7 @@ from agent.phases import anchor, encounter, rendezvous, seeking
 from agent.phases.anchor import ThirdPoint
 from agent.phases.encounter import LastManoeuvre, Returning, Standing, Waiting
 from agent.phases.rendezvous import Aligning, Orbiting, Radial, Tangent
-from agent.phases.seeking import Circling, Straight, Turning
+from agent.phases.seeking import Backing, Circling, Straight, Turning
 from protocol import messages
 from protocol.messages import MAX_REASON, Drive, Estimate, Localised, Ranged, Report, Sense, Undecided
 from protocol.motion import ORIGIN, REST, Controls, Pose, step
@@ -132,9 +132,10 @@ def _advanced(mind: Mind, anchor_range: float | None) -> Mind:
             return mind
         case Aligning() | Radial() | Tangent():
             return _on_to_orbit(mind, mind.state)
-        case Straight(beacon) | Turning(beacon) | Circling(beacon):
+        case Straight(beacon) | Backing(beacon) | Turning(beacon) | Circling(beacon):
             measured = mind.in_contact if beacon == "peer" else anchor_range is not None
-            onward = seeking.onward(mind.state, mind.odometry, measured, mind.briefing.mission)
+            mission, variant = mind.briefing.mission, mind.briefing.variant
+            onward = seeking.onward(mind.state, mind.odometry, measured, mission, variant)
             if onward is not None:
                 return mind if onward is mind.state else replace(mind, state=onward)
             return replace(mind, state=Waiting()) if beacon == "peer" else _second_range(mind)
@@ -215,9 +216,7 @@ def _on_to_orbit(mind: Mind, state: rendezvous.Meeting) -> Mind:
 def _meets(mind: Mind) -> bool:
     """Whether phase 3 begins, once in contact: by the letter when both orbit, else as soon as it can."""
     if mind.briefing.variant == "paper":
-        return isinstance(mind.state, Orbiting) and (
-            mind.radio.phase == 3 or mind.radio.state == mind.doing
-        )
+        return isinstance(mind.state, Orbiting) and (mind.radio.phase == 3 or mind.radio.state == mind.doing)
     return mind.radio.phase == 3 or (mind.hears_peer and mind.radio.start is not None and mind.off_anchor)
 
 
@@ -248,6 +247,7 @@ def _considered(mind: Mind) -> Mind:
 
     The letter looks at the encounter alone; `assured` also at what was ranged, and what was silent, before.
     """
+    mission, distance = mind.briefing.mission, mind.briefing.anchor_distance
     variant, met = mind.briefing.variant, mind.findings.met
     assert met is not None
     sightings = mind.sightings(met if variant == "paper" else 0)
@@ -259,16 +259,16 @@ def _considered(mind: Mind) -> Mind:
     checked = encounter.redundant(sightings, base)
     if not left:
         return _undecided(mind, "no placement explains the mutual ranges")
-    if checked and len(left) == 1:
-        if not weigh_placements(left, sightings, mind.briefing.mission.sensing_range, MUTUAL_FLOOR):
+    if checked and len(left) == 1 and encounter.pinned_down(left[0], sightings, mission, distance):
+        if not weigh_placements(left, sightings, mission.sensing_range):
             return _undecided(mind, "no placement explains the mutual ranges")
         return replace(mind, state=Done(3, Localised(mind.world_pose(left[0]))))
     if mind.briefing.role == "a":
         return mind
     if variant == "paper" and mind.findings.plan is not None:
-        failure = "fits more than one placement" if checked else "could not be taken: b left a's range"
+        failure = "does not settle where they are" if checked else "could not be taken: b left a's range"
         return _undecided(mind, f"the third mutual range {failure}")
-    plan = encounter.last_manoeuvre(mind.local_pose, sightings[-1].a, left, mind.briefing.mission, variant)
+    plan = encounter.last_manoeuvre(mind.local_pose, sightings[-1].a, left, mission, variant)
     return replace(
         mind,
         state=LastManoeuvre(plan.drive, mind.odometry),
@@ -309,7 +309,7 @@ def _controls(mind: Mind) -> Controls:
             return rendezvous.controls(
                 mind.state, mind.odometry, mind.start, mind.orbit, mind.briefing.mission
             )
-        case Straight() | Turning() | Circling():
+        case Straight() | Backing() | Turning() | Circling():
             return seeking.controls(mind.state, mind.odometry, mind.briefing.mission)
         case ThirdPoint(drive=controls) | LastManoeuvre(controls) | Returning(controls):
             return controls

@@ -122,7 +122,7 @@ def ticks_csv(record: Record) -> str:
     last = record.moments[-1].truth.tick if record.moments else 0
     ids = [robot.id for robot in record.scenario.robots]
     for moment in record.moments:
-        anchor = anchor_ranges(moment.truth.poses, record.scenario)
+        anchor = anchor_ranges(moment.truth, record.scenario)
         mutual = _mutual(record.scenario, moment.truth)
         for i, (robot, pose) in enumerate(zip(ids, moment.truth.poses, strict=True)):
             drive = moment.drives.get(robot)
@@ -145,7 +145,7 @@ def _or_empty(value: float | None) -> object:
 def _mutual(scenario: Scenario, truth: Truth) -> dict[str, float]:
     """Everyone's range to its peer, if there is one."""
     pairs = scenario.pairs()
-    ranges = mutual_ranges(truth.poses, pairs, scenario.mission.sensing_range)
+    ranges = mutual_ranges(truth, pairs, scenario.mission.sensing_range)
     return {
         scenario.robots[i].id: rho
         for pair, rho in zip(pairs, ranges, strict=True)

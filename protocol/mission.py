@@ -24,6 +24,14 @@ FIRST_STRAIGHT_LIMIT = 0.9
 """A_0 / R at most: a longer first straight could lead to a circle that never touches the disc."""
 
 
+SHORTEST_STEP = 1e-4
+"""m: with manoeuvres A_0 that are shorter, too many ranges differ by no more than rounding"""
+
+COARSEST = 2e6
+"""(D + R)^2 / A_0, times R / D where that is more than 1, in m: what rounding does to a range, times what
+that does to a pose. Up to here every start tried is localised; far beyond, some never are."""
+
+
 class Anchor(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
     """Where a ranging anchor stands in the world frame."""
 
@@ -47,6 +55,23 @@ class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def first_straight(self) -> float:
         """A_0 in m: one tick at full speed, shortened where it would come near R."""
         return min(self.max_speed * self.period, FIRST_STRAIGHT_LIMIT * self.sensing_range)
+
+
+def obstacle(mission: Mission, distance: float) -> str | None:
+    """Why robots with anchors `distance` m (D) apart could not be sure of their poses; None if they can."""
+    step, reach = mission.first_straight, mission.sensing_range
+    if step < SHORTEST_STEP:
+        return (
+            f"a tick moves a robot by {step:.3g} m at most; from less than {SHORTEST_STEP:g} m, ranges tell "
+            "nothing for sure: raise max_speed or period"
+        )
+    if max(1.0, reach / distance) * (distance + reach) ** 2 / step > COARSEST:
+        return (
+            f"with {distance:.6g} m between the anchors and ranges up to {reach:.6g} m, manoeuvres of "
+            f"{step:.3g} m are too short for a pose to be sure to a micrometre in double precision: "
+            "raise max_speed or period"
+        )
+    return None
 
 
 def third_point_turn_rate(mission: Mission) -> float:

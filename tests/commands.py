@@ -47,6 +47,8 @@ LONG = f"""
 name = "long"
 seed = 1
 {SECTION_IV}
+[planner]
+variant = "paper"
 [[robot]]
 id = "a"
 anchor = [0.0, 0.0]
@@ -54,9 +56,11 @@ anchor = [0.0, 0.0]
 id = "b"
 anchor = [60.0, 0.0]
 """
-"""1888 ticks: time enough to interfere with it"""
-LONG_TICKS = 1888
-ENDLESS = LONG.replace("60.0", "3000.0").replace('"long"', '"endless"')
+"""1874 ticks: time enough to interfere with it"""
+LONG_TICKS = 1874
+ENDLESS = (
+    LONG.replace("60.0", "400.0").replace("max_speed = 1.0", "max_speed = 0.1").replace('"long"', '"endless"')
+)
 """so long that it does not end while a test runs"""
 LONG_JOURNAL_BYTES = 180_000
 

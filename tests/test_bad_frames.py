@@ -31,7 +31,7 @@ VOLLEYS = 12
 GENUINE = {
     "sense": (Sense(0, "a", None, 1.0), 1 << 20),
     "drive": (Drive(0, "a", 0.5, 0.5, 1, "straight"), 1 << 20),
-    "report": (Report(0, "b", 1, "straight", ORIGIN, 0, 0, (), (), 0), 4096),
+    "report": (Report(0, "b", 1, "straight", ORIGIN, 0, 0, (), 0, (), 0, 0), 4096),
 }
 """by topic: what robot a gets, says, and is told by its peer, b; and the longest frame in bytes"""
 

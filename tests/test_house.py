@@ -52,9 +52,20 @@ PURE = {
     "protocol.messages",
     "protocol.mission",
     "protocol.motion",
+    "protocol.rendezvous",
     "protocol.units",
 }
-ALLOWED = {"__future__", "math", "itertools", "collections.abc", "typing", "msgspec", "numpy", "re"}
+ALLOWED = {
+    "__future__",
+    "functools",
+    "math",
+    "itertools",
+    "collections.abc",
+    "typing",
+    "msgspec",
+    "numpy",
+    "re",
+}
 IMPURE = {
     "open", "print", "input", "eval", "exec", "compile", "globals", "setattr", "delattr", "breakpoint",
     "__import__", "importlib", "os", "sys", "time", "datetime", "random", "secrets", "uuid", "threading",

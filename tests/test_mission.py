@@ -18,21 +18,13 @@ from compose.inline import play
 from compose.record import Moment, Record
 from compose.scenario import load
 from protocol.messages import Localised
-from protocol.mission import (
-    OPTIMAL_TURN,
-    Mission,
-    Variant,
-    half_arc,
-    longest_meeting,
-    orbit_margin,
-    rendezvous,
-    third_point_turn_rate,
-    tick_budget,
-)
+from protocol.mission import OPTIMAL_TURN, Mission, Variant, third_point_turn_rate
 from protocol.motion import Pose, compose, step
+from protocol.rendezvous import rendezvous, tick_budget
 from tests.missions import mission_of
 from tests.steps import steps
 from world.sensors import anchor_ranges, mutual_ranges
+from world.truth import Truth
 
 SECTION_IV = Mission(3.0, 1.0, 1.0, math.pi)
 D = 10.0
@@ -59,42 +51,6 @@ def test_the_papers_orbits_are_eq_6(mission: Mission, distance: float) -> None:
     assert plan.b.v == pytest.approx(-plan.b.omega * radius)
     assert plan.bound == pytest.approx((2 * math.pi + 2 * math.pi * share) / abs(plan.b.omega))
     assert plan.a.v <= mission.max_speed * (1 + 1e-12)
-
-
-def test_the_assured_orbits_are_smaller_by_the_margin_and_driven_at_full_speed() -> None:
-    margin = (1.0 * (1.0 - 0.6931599 / math.pi)) ** 2 / (16 * 3.0)
-    plan = rendezvous(SECTION_IV, D, "assured")
-    assert orbit_margin(SECTION_IV, D, 1.0) == pytest.approx(margin, rel=1e-6)
-    assert plan.a.radius == plan.b.radius == pytest.approx(6.5 - margin, rel=1e-9)
-    assert plan.a.omega == pytest.approx(1.0 / (6.5 - margin), rel=1e-9)
-    assert plan.a.v == pytest.approx(1.0)
-    assert plan.b.omega == pytest.approx(-half_arc(D, 3.0) / math.pi * plan.a.omega)
-    assert plan.bound == longest_meeting(SECTION_IV, D, plan.b.omega)
-
-
-@settings(max_examples=60)
-@given(
-    st.sampled_from(
-        [(10.0, 3.0, 1.0), (30.0, 1.5, 1.0), (7.0, 3.0, 1.0), (15.0, 3.0, 0.5), (10.0, 3.0, 2.0)]
-    ),
-    angles,
-    angles,
-)
-def test_on_the_assured_orbits_the_two_meet_within_the_bound(
-    setting: tuple[float, float, float], bearing_a: float, bearing_b: float
-) -> None:
-    """From any two points of the orbits, at the sampling instants (D, R and v_max as in the notes)."""
-    distance, reach, speed = setting
-    mission = Mission(reach, 1.0, speed, math.pi)
-    plan = rendezvous(mission, distance, "assured")
-    radius = plan.a.radius
-
-    def are_in_range(tick: int) -> bool:
-        a, b = bearing_a + plan.a.omega * tick, bearing_b + plan.b.omega * tick
-        dx = distance + radius * (math.cos(b) - math.cos(a))
-        return math.hypot(dx, radius * (math.sin(b) - math.sin(a))) <= reach
-
-    assert any(are_in_range(tick) for tick in range(math.floor(plan.bound) + 1))
 
 
 @given(missions, st.floats(5.0, 40.0), st.sampled_from(VARIANTS))
@@ -203,10 +159,13 @@ def test_branches_that_mirror_across_the_heading_are_told_apart_straight_ahead()
 def test_a_range_is_taken_up_to_r_and_at_r() -> None:
     scenario = load("paper-1")
     beyond = math.nextafter(3.0, 4.0)
-    poses = [Pose(3.0, 0.0, 0.0), Pose(10.0, -beyond, 0.0)]
-    assert anchor_ranges(poses, scenario) == [3.0, None]
-    assert mutual_ranges([Pose(0.0, 0.0, 0.0), Pose(0.0, 3.0, 0.0)], [(0, 1)], 3.0) == [3.0]
-    assert mutual_ranges([Pose(0.0, 0.0, 0.0), Pose(0.0, beyond, 0.0)], [(0, 1)], 3.0) == [None]
+
+    def at(a: Pose, b: Pose) -> Truth:
+        return Truth(0, (a, b), (scenario.robots[0].anchor,) * 2)
+
+    assert anchor_ranges(at(Pose(3.0, 0.0, 0.0), Pose(10.0, -beyond, 0.0)), scenario) == [3.0, None]
+    assert mutual_ranges(at(Pose(0.0, 0.0, 0.0), Pose(0.0, 3.0, 0.0)), [(0, 1)], 3.0) == [3.0]
+    assert mutual_ranges(at(Pose(0.0, 0.0, 0.0), Pose(0.0, beyond, 0.0)), [(0, 1)], 3.0) == [None]
 
 
 # --- missions whose parameters bite -------------------------------------------------------------------
@@ -220,7 +179,7 @@ def turns(record: Record, state: str) -> list[float]:
 
 
 def test_a_small_omega_max_makes_every_turn_take_several_ticks() -> None:
-    record = mission_of((2.4, -1.2, 4.8), turn_rate=0.5)
+    record = mission_of((2.4, -1.2, 4.8), turn_rate=0.5, variant="paper")
     outward = turns(record, "turning")
     assert outward == pytest.approx([0.5, 0.5, 0.5, math.pi / 2 - 1.5])
     onto_orbit = turns(record, "tangent")

@@ -17,8 +17,9 @@ from compose.record import Record, summary, ticks_csv
 from compose.scenario import load
 from protocol import journal
 from protocol.messages import Briefing, Drive, End, Estimate, Farewell, Report, Sense
-from protocol.mission import Mission, half_arc, longest_meeting, rendezvous
+from protocol.mission import Mission
 from protocol.motion import Pose, wrap
+from protocol.rendezvous import half_arc, longest_meeting, rendezvous
 from protocol.wire import decode
 from tests.missions import mission_of
 from tests.reference import REFERENCE, Equation7, Phase1, Simulation

@@ -30,8 +30,13 @@ class World(msgspec.Struct, frozen=True):
 
 def release(scenario: Scenario) -> World:
     """The world at tick 0."""
-    starts: tuple[Pose, ...] = tuple(robot.start for robot in scenario.robots)
-    return World(scenario, Truth(0, starts), None, {}, scenario.pairs())
+    pairs = scenario.pairs()
+    origins = {place: scenario.robots[pair[0]].anchor for pair in pairs for place in pair}
+    local = tuple(
+        Pose(robot.start.x - origins[i].x, robot.start.y - origins[i].y, robot.start.heading)
+        for i, robot in enumerate(scenario.robots)
+    )
+    return World(scenario, Truth(0, local, tuple(origins[i] for i in range(len(local)))), None, {}, pairs)
 
 
 def senses(world: World) -> list[Sense]:
@@ -39,12 +44,12 @@ def senses(world: World) -> list[Sense]:
     scenario, truth, executed = world.scenario, world.truth, world.executed
     tick, robots = truth.tick, scenario.robots
     contacts: list[tuple[Contact, ...]] = [()] * len(robots)
-    mutual = mutual_ranges(truth.poses, world.pairs, scenario.mission.sensing_range)
+    mutual = mutual_ranges(truth, world.pairs, scenario.mission.sensing_range)
     for (one, other), rho in zip(world.pairs, mutual, strict=True):
         if rho is not None:
             contacts[one] = (Contact(robots[other].id, rho, heard(tick)),)
             contacts[other] = (Contact(robots[one].id, rho, heard(tick)),)
-    ranges = anchor_ranges(truth.poses, scenario)
+    ranges = anchor_ranges(truth, scenario)
     return [
         Sense(tick, robot.id, executed[i] if executed is not None else None, ranges[i], contacts[i])
         for i, robot in enumerate(robots)

@@ -6,21 +6,36 @@ from collections.abc import Sequence
 
 import msgspec
 
-from protocol.mission import Mission
+from protocol.mission import Anchor, Mission
 from protocol.motion import Controls, Pose, step
 
 
 class Truth(msgspec.Struct, frozen=True):
-    """The true state at one tick."""
+    """The true state at one tick.
+
+    It is kept relative to the anchor of each pair's a, so that where in the plane the anchors stand
+    costs no digits.
+    """
 
     tick: int
-    poses: tuple[Pose, ...]
+    local: tuple[Pose, ...]
+    """relative to `origins`; the axes are the world's"""
+    origins: tuple[Anchor, ...]
+
+    @property
+    def poses(self) -> tuple[Pose, ...]:
+        """In the world frame."""
+        return tuple(
+            Pose(origin.x + pose.x, origin.y + pose.y, pose.heading)
+            for origin, pose in zip(self.origins, self.local, strict=True)
+        )
 
     def moved(self, controls: Sequence[Controls], period: float) -> Truth:
         """Where everyone is one tick later, having driven `controls`."""
         return Truth(
             self.tick + 1,
-            tuple([step(pose, c.v, c.omega, period) for pose, c in zip(self.poses, controls, strict=True)]),
+            tuple([step(pose, c.v, c.omega, period) for pose, c in zip(self.local, controls, strict=True)]),
+            self.origins,
         )
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from agent.belief import Sighting
+from agent.belief import Sighting, dilution
 from agent.geometry import Placement, placements
 from agent.phases.seeking import travelled
 from protocol.mission import Mission, Variant
@@ -30,6 +30,13 @@ SMALLEST_GAP = 1e-6
 
 Ten times `belief.MUTUAL_FLOOR`, the most by which rounding may put a true prediction off.
 """
+
+
+ROUNDING = 64 * 2.0**-52
+"""of D + R: how far rounding may put a range off its prediction"""
+
+SURE = 1e-7
+"""rad, and m at the distance D + R: how exact a pose must be to be claimed; a tenth of what is tolerated"""
 
 
 class Standing(msgspec.Struct, frozen=True):
@@ -97,6 +104,14 @@ def redundant(sightings: Sequence[Sighting], base: tuple[Sighting, Sighting]) ->
         )
         for sighting in sightings
     )
+
+
+def pinned_down(
+    placement: Placement, sightings: Sequence[Sighting], mission: Mission, distance: float
+) -> bool:
+    """Whether the ranges in `sightings` fix `placement` as exactly as a claim has to be."""
+    size = distance + mission.sensing_range
+    return dilution(placement, sightings) * ROUNDING * size * max(1.0, size) <= SURE
 
 
 def last_manoeuvre(

@@ -1,5 +1,7 @@
 """How a robot takes a second range of a beacon (Section III.A.2): straight ahead, else about where it was.
 
+In between, `assured` looks straight behind: sooner than round a circle, and mostly in range.
+
 Phase 1 does it with the anchor, and a does it again in phase 3, with b in the anchor's place.
 """
 
@@ -10,7 +12,7 @@ from typing import Literal
 
 import msgspec
 
-from protocol.mission import Mission
+from protocol.mission import Mission, Variant
 from protocol.motion import REST, TAU, Controls, Pose
 
 ARRIVED = 1e-9
@@ -28,8 +30,16 @@ class Straight(msgspec.Struct, frozen=True):
     """m: the range at `origin`"""
 
 
+class Backing(msgspec.Struct, frozen=True):
+    """Has left the beacon's range ahead, and drives back to A_0 behind `origin`."""
+
+    beacon: Beacon
+    origin: Pose
+    rho0: float
+
+
 class Turning(msgspec.Struct, frozen=True):
-    """Has left the beacon's range, and turns by pi / 2 on the spot."""
+    """Has left the beacon's range, and turns by pi / 2 on the spot, to have `origin` on its left."""
 
     beacon: Beacon
     origin: Pose
@@ -45,7 +55,7 @@ class Circling(msgspec.Struct, frozen=True):
     rho0: float
 
 
-Seeking = Straight | Turning | Circling
+Seeking = Straight | Backing | Turning | Circling
 
 
 def travelled(origin: Pose, pose: Pose) -> float:
@@ -58,13 +68,26 @@ def moved(origin: Pose, pose: Pose) -> bool:
     return pose != origin
 
 
-def onward(state: Seeking, pose: Pose, measured: bool, mission: Mission) -> Seeking | None:
+def ahead(origin: Pose, pose: Pose) -> float:
+    """m from `origin` to `pose`, along the heading there; negative behind it."""
+    return (pose.x - origin.x) * math.cos(origin.heading) + (pose.y - origin.y) * math.sin(origin.heading)
+
+
+def onward(state: Seeking, pose: Pose, measured: bool, mission: Mission, variant: Variant) -> Seeking | None:
     """The state after a tick that led to `pose`; None once there is a second range."""
     match state:
         case Straight(beacon, origin, rho0):
             if travelled(origin, pose) < mission.first_straight - ARRIVED:
                 return state
-            return None if measured else Turning(beacon, origin, rho0, pose.heading + math.pi / 2)
+            if measured:
+                return None
+            if variant == "assured":
+                return Backing(beacon, origin, rho0)
+            return Turning(beacon, origin, rho0, pose.heading + math.pi / 2)
+        case Backing(beacon, origin, rho0):
+            if ahead(origin, pose) > ARRIVED - mission.first_straight:
+                return state
+            return None if measured else Turning(beacon, origin, rho0, pose.heading - math.pi / 2)
         case Turning(beacon, origin, rho0, heading):
             return state if abs(heading - pose.heading) > ARRIVED else Circling(beacon, origin, rho0)
         case Circling():
@@ -76,6 +99,8 @@ def controls(state: Seeking, pose: Pose, mission: Mission) -> Controls:
     match state:
         case Straight(_, origin):
             return straight(mission.first_straight - travelled(origin, pose), mission)
+        case Backing(_, origin):
+            return straight(-mission.first_straight - ahead(origin, pose), mission)
         case Turning(heading=heading):
             return turn(pose, heading, mission)
         case Circling(_, _, rho0):
