@@ -1,0 +1,151 @@
+"""How soon the two meet, at whatever phases they begin to orbit; and what their orbits keep to."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, example, given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from protocol.mission import RANGE_MARGIN, Mission
+from protocol.motion import TAU
+from protocol.rendezvous import WAITING_PLACE, Orbit, half_passage, rendezvous
+
+Setting = tuple[float, float, float, float, float]
+"""D, R, T_s, v_max, omega_max"""
+
+SECTION_IV: Setting = (10.0, 3.0, 1.0, 1.0, math.pi)
+SETTINGS: tuple[Setting, ...] = (
+    SECTION_IV,
+    *((distance, 3.0, 1.0, 1.0, math.pi) for distance in (7.0, 8.0, 15.0, 30.0)),
+    *((10.0, reach, 1.0, 1.0, math.pi) for reach in (1.5, 5.0)),
+    *((10.0, 3.0, 1.0, speed, math.pi) for speed in (0.3, 0.5, 2.0, 5.0)),
+    (10.0, 3.0, 1.0, 1.0, 0.5),
+    *((10.0, 3.0, period, 1.0, math.pi) for period in (0.1, 0.5)),
+    *((10.0, 1.0, period, 1.0, turn_rate) for period in (0.05, 1.0) for turn_rate in (0.2, math.pi)),
+)
+ALWAYS_IN_RANGE: tuple[Setting, ...] = tuple(
+    (10.0, 15.0, period, 1.0, turn_rate) for period in (0.05, 1.0) for turn_rate in (0.2, math.pi)
+)
+
+FINE = (8192, 128)
+"""phases of a and of b: a's are the finer since a moves; b's hold those nearest to M1 and farthest from it"""
+COARSE = (120, 120)
+ROUNDING = 1e-9
+"""s, m and rad"""
+
+Array = NDArray[np.float64]
+
+distances = st.floats(1.0, 40.0)
+ratios = st.floats(0.1, 1.5)
+"""R / D"""
+periods = st.floats(0.05, 1.0)
+speeds = st.floats(0.3, 5.0)
+turn_rates = st.floats(0.2, math.pi)
+
+
+def mission_of(setting: Setting) -> Mission:
+    return Mission(*setting[1:])
+
+
+def pairs(phases: tuple[int, int]) -> tuple[Array, Array]:
+    """Every pair of starting phases of a and b."""
+    alpha, beta = np.meshgrid(*(np.arange(n) * (TAU / n) for n in phases))
+    return alpha.ravel(), beta.ravel()
+
+
+def apart(distance: float, a: Orbit, alpha: Array, b: Orbit, beta: Array) -> Array:
+    """m: between robots at the phases alpha and beta of their orbits; M1 is at (0, 0) and M2 at (D, 0)."""
+    x = distance + b.radius * np.cos(beta) - a.radius * np.cos(alpha)
+    y = b.radius * np.sin(beta) - a.radius * np.sin(alpha)
+    return np.hypot(x, y)
+
+
+def meeting(setting: Setting, a: Orbit, b: Orbit, phases: tuple[int, int]) -> Array:
+    """The ticks until both are first in range, from every pair of phases: sampled, as the robots do.
+
+    Ticks before which they cannot close the gap between them need no look. Fails where one pair passes by.
+    """
+    distance, reach, period, _, _ = setting
+    alpha, beta = pairs(phases)
+    most = 2.0 * rendezvous(mission_of(setting), distance, "paper").bound / period
+    ticks, left = np.zeros_like(alpha), np.arange(alpha.size)
+    while left.size:
+        time = ticks[left] * period
+        gap = apart(distance, a, alpha[left] + a.omega * time, b, beta[left] + b.omega * time) - reach
+        left, gap = left[gap > 0.0], gap[gap > 0.0]
+        ticks[left] += np.maximum(1.0, np.floor(gap / ((a.v + b.v) * period)))
+        assert np.all(ticks[left] <= most)
+    return ticks
+
+
+# --- how long it takes --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_they_meet_within_the_bound_from_all_phases_and_no_sooner_from_some(setting: Setting) -> None:
+    distance, _, period, _, _ = setting
+    plan = rendezvous(mission_of(setting), distance, "assured")
+    longest = np.max(meeting(setting, plan.a, plan.b, FINE)) * period
+    assert longest <= plan.bound + ROUNDING
+    assert longest >= plan.bound - period - ROUNDING
+
+
+@given(distances, ratios, periods, speeds, turn_rates)
+def test_the_bound_holds_in_every_setting(
+    distance: float, ratio: float, period: float, speed: float, turn_rate: float
+) -> None:
+    setting = (distance, ratio * distance, period, speed, turn_rate)
+    plan = rendezvous(mission_of(setting), distance, "assured")
+    assume(plan.bound > 0.0)
+    assert np.max(meeting(setting, plan.a, plan.b, (240, 24))) * period <= plan.bound + ROUNDING
+
+
+def papers(setting: Setting) -> tuple[Orbit, Orbit]:
+    """Eq. (6), inside (D + R) / 2 by the margin that sampled orbits need so as to meet at all."""
+    distance, reach, period, speed, turn_rate = setting
+    share = math.acos(distance / (distance + reach)) / math.pi
+    radius = 0.5 * (distance + reach) - (speed * period * (1.0 - share)) ** 2 / (16.0 * reach)
+    omega = min(turn_rate, speed / radius)
+    return Orbit(radius, radius * omega, omega), Orbit(radius, radius * share * omega, -share * omega)
+
+
+def compared(setting: Setting) -> tuple[float, float]:
+    """How long it takes, over how long on the paper's orbits: in the mean, and at worst."""
+    plan = rendezvous(mission_of(setting), setting[0], "assured")
+    ours = meeting(setting, plan.a, plan.b, COARSE)
+    theirs = meeting(setting, *papers(setting), COARSE)
+    return float(np.mean(ours) / np.mean(theirs)), float(np.max(ours) / np.max(theirs))
+
+
+def test_at_section_ivs_parameters_they_meet_in_well_under_the_time_that_the_papers_orbits_take() -> None:
+    mean, worst = compared(SECTION_IV)
+    assert mean <= 0.6
+    assert worst <= 0.6
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_they_meet_sooner_than_on_the_papers_orbits(setting: Setting) -> None:
+    mean, _ = compared(setting)
+    assert mean <= 0.75
+
+
+# --- where they are always in range -------------------------------------------------------------------
+
+
+@given(distances, st.floats(1.0, 1.5), periods, speeds, turn_rates)
+@example(*ALWAYS_IN_RANGE[0])
+@example(*ALWAYS_IN_RANGE[-1])
+def test_where_they_are_in_range_wherever_they_wait_both_wait(
+    distance: float, ratio: float, period: float, speed: float, turn_rate: float
+) -> None:
+    reach = ratio * distance if ratio <= 1.5 else ratio
+    waiting = WAITING_PLACE * reach
+    assume(distance + waiting < reach - 2.0 * RANGE_MARGIN)
+    plan = rendezvous(Mission(reach, period, speed, turn_rate), distance, "assured")
+    assert plan.bound == plan.a.v == plan.a.omega == plan.b.v == plan.b.omega == 0.0
+    assert plan.a.radius > 0.0
+    assert np.max(apart(distance, plan.a, *_with(plan.b, (48, 48)))) <= reach
