@@ -122,12 +122,6 @@ class Sighting(msgspec.Struct, frozen=True):
     range: float | None
 
 
-def separation(placement: Placement, a: Pose, b: Pose) -> float:
-    """m: between a at `a` in <a(M1)> and b at `b` in <b(M2)>, if this is how they lie."""
-    there = placement.place(a)
-    return math.hypot(there.x - b.x, there.y - b.y)
-
-
 def weigh_placements(
     candidates: Iterable[Placement],
     sightings: Sequence[Sighting],
@@ -138,17 +132,26 @@ def weigh_placements(
     left: list[Placement] = []
     for candidate in candidates:
         placement = _polished_placement(candidate, sightings)
-        for sighting in sightings:
-            predicted = separation(placement, sighting.a, sighting.b)
-            if sighting.range is None:
-                if predicted <= sensing_range - tolerance:
-                    break
-            elif abs(predicted - sighting.range) > tolerance:
-                break
-        else:
-            if not any(same_placement(placement, other, MUTUAL_FLOOR) for other in left):
-                left.append(placement)
+        if _explains(placement, sightings, sensing_range, tolerance) and not any(
+            same_placement(placement, other, MUTUAL_FLOOR) for other in left
+        ):
+            left.append(placement)
     return tuple(left)
+
+
+def _explains(
+    placement: Placement, sightings: Sequence[Sighting], sensing_range: float, tolerance: float
+) -> bool:
+    c, s = math.cos(placement.phi), math.sin(placement.phi)
+    for sighting in sightings:
+        a, b = sighting.a, sighting.b
+        apart = math.hypot(placement.x + c * a.x - s * a.y - b.x, placement.y + s * a.x + c * a.y - b.y)
+        if sighting.range is None:
+            if apart <= sensing_range - tolerance:
+                return False
+        elif abs(apart - sighting.range) > tolerance:
+            return False
+    return True
 
 
 def dilution(placement: Placement, sightings: Sequence[Sighting]) -> float:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
-from agent.belief import Sighting, branches, separation, weigh_branches, weigh_placements
+from agent.belief import Sighting, branches, weigh_branches, weigh_placements
 from agent.geometry import Placement, circle_intersections, included_angle, placements
 from protocol.motion import TAU, Pose, Run, chord, compose, follow, step, wrap
 
@@ -31,6 +31,11 @@ poses = st.builds(Pose, coordinates, coordinates, headings)
 
 def apart(one: Pose, other: Pose) -> float:
     return math.hypot(one.x - other.x, one.y - other.y)
+
+
+def separation(placement: Placement, a: Pose, b: Pose) -> float:
+    """m: between a at `a` in <a(M1)> and b at `b` in <b(M2)>, if this is how they lie."""
+    return apart(placement.place(a), b)
 
 
 def turned(one: float, other: float) -> float:
