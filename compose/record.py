@@ -165,9 +165,7 @@ def summary(record: Record, mode: Mode, wall_s: float | None) -> dict[str, Any]:
         "reason": record.end.reason if record.end is not None else "the record breaks off",
         "ticks": moments[-1].truth.tick if moments else 0,
         "wall_s": wall_s,
-        "first_contact_tick": next(
-            (moment.truth.tick for moment in moments if _mutual(scenario, moment.truth)), None
-        ),
+        "first_contact_tick": first_contact(record),
         "t_max_s": max(robot.rendezvous.bound for robot in scenario.robots),
         "min_separation_m": min(
             (
@@ -187,20 +185,35 @@ def summary(record: Record, mode: Mode, wall_s: float | None) -> dict[str, Any]:
     }
 
 
+def first_contact(record: Record) -> int | None:
+    """The first tick at which two peers were in range of each other."""
+    pairs, reach = record.scenario.pairs(), record.scenario.mission.sensing_range
+    for moment in record.moments:
+        for rho in mutual_ranges(moment.truth.poses, pairs, reach):
+            if rho is not None:
+                return moment.truth.tick
+    return None
+
+
+def first_claim(record: Record, robot: str) -> tuple[int, Pose] | None:
+    """When `robot` first claimed to know its pose, and the pose."""
+    for moment in record.moments:
+        drive = moment.drives.get(robot)
+        if drive is not None and isinstance(drive.verdict, Localised):
+            return moment.truth.tick, drive.verdict.pose
+    return None
+
+
 def _robot_summary(record: Record, place: int) -> dict[str, Any]:
     robot = record.scenario.robots[place].id
     farewell = record.farewells.get(robot)
-    claims = [
-        (moment.truth.tick, drive.verdict.pose)
-        for moment in record.moments
-        if (drive := moment.drives.get(robot)) is not None and isinstance(drive.verdict, Localised)
-    ]
+    claimed = first_claim(record, robot)
     truth = record.moments[-1].truth.poses[place] if record.moments else None
-    claim = claims[0][1] if claims else None
+    claim = claimed[1] if claimed is not None else None
     position, heading = errors(claim, truth) if claim is not None and truth is not None else (None, None)
     return {
-        "localised": bool(claims),
-        "localised_tick": claims[0][0] if claims else None,
+        "localised": claimed is not None,
+        "localised_tick": claimed[0] if claimed is not None else None,
         "estimate": _listed(claim),
         "truth": _listed(truth),
         "position_error_m": position,

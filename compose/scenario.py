@@ -7,9 +7,10 @@ import random
 import re
 import secrets
 from collections import Counter
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta
@@ -38,6 +39,10 @@ WITHIN = 1.0 - 1e-9
 
 class BadScenario(UserError):
     """The user's scenario cannot be played; the text names the file, the field and what is wrong."""
+
+
+class Unworkable(BadScenario):
+    """The scenario is sound, but no mission could be played in its setting; the text says why."""
 
 
 class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -72,10 +77,32 @@ class ScenarioFile(_Table, frozen=True):
     planner: PlannerTable = PlannerTable()
 
 
-def shipped() -> dict[str, Path]:
-    """The scenarios that come with Tandem, by name."""
-    folder = Path(str(resources.files("compose") / "scenarios"))
-    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+class Setting(msgspec.Struct, frozen=True):
+    """A scenario file found good, and the scenario that it makes; another draw from it is cheap."""
+
+    file: ScenarioFile
+    scenario: Scenario
+    """with the seed of the file"""
+
+    def seeded(self, seed: int) -> Scenario:
+        """The same, with what the file leaves open drawn from `seed`."""
+        reach = self.file.mission.sensing_range
+        return msgspec.structs.replace(
+            self.scenario,
+            seed=seed,
+            robots=tuple(
+                [
+                    msgspec.structs.replace(placed, start=_start(robot, reach, seed))
+                    for placed, robot in zip(self.scenario.robots, self.file.robot, strict=True)
+                ]
+            ),
+        )
+
+
+def shipped(folder: str = "scenarios") -> dict[str, Path]:
+    """The scenarios that come with Tandem, by name; or what else of `folder`."""
+    path = Path(str(resources.files("compose") / folder))
+    return {file.stem: file for file in sorted(path.glob("*.toml"))}
 
 
 def run_name(scenario: Scenario) -> str:
@@ -101,31 +128,51 @@ def load(source: str, *, seed: int | None = None) -> Scenario:
     """
     path = shipped().get(source, Path(source))
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
     except FileNotFoundError:
         names = ", ".join(shipped())
         raise BadScenario(f"{source}: neither a file nor a scenario that ships ({names})") from None
-    except OSError as error:
-        raise BadScenario(f"{source}: cannot be read: {error.strerror or error}") from None
-    except ValueError:
-        raise BadScenario(f"{source}: cannot be read: it is not UTF-8 text") from None
+    except ValueError as error:
+        raise BadScenario(f"{source}: {error}") from None
     return parse(text, source, seed=seed)
+
+
+def read_text(path: Path) -> str:
+    """What the file says. Raises FileNotFoundError, and ValueError, whose text says why it cannot be read."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise ValueError(f"cannot be read: {error.strerror or error}") from None
+    except ValueError:
+        raise ValueError("cannot be read: it is not UTF-8 text") from None
 
 
 def parse(text: str, source: str, *, seed: int | None = None) -> Scenario:
     """The scenario in `text`. Raises BadScenario, whose text begins with `source`."""
+    setting = validate(table_in(text, source), source)
+    return setting.scenario if seed is None else setting.seeded(seed)
+
+
+def table_in(text: str, source: str) -> dict[str, Any]:
+    """The TOML in `text`, whatever it says. Raises BadScenario."""
     try:
-        file = msgspec.toml.decode(text, type=ScenarioFile)
-    except msgspec.ValidationError as error:
-        raise BadScenario(f"{source}: {_field_first(str(error))}") from None
+        return msgspec.toml.decode(text, type=dict[str, Any])
     except (ValueError, RecursionError) as error:  # of msgspec, or of the TOML library beneath it
         raise BadScenario(f"{source}: not TOML: {error}") from None
-    if seed is not None:
-        file = msgspec.structs.replace(file, seed=seed)
-    return _validated(file, source)
 
 
-def _field_first(error: str) -> str:
+def validate(table: Mapping[str, Any], source: str) -> Setting:
+    """The setting that the table of a scenario file describes. Raises BadScenario and Unworkable."""
+    try:
+        file = msgspec.convert(table, ScenarioFile)
+    except msgspec.ValidationError as error:
+        raise BadScenario(f"{source}: {field_first(str(error))}") from None
+    return Setting(file, _validated(file, source))
+
+
+def field_first(error: str) -> str:
     """msgspec's "Expected `float`, got `str` - at `$.mission.period`", with the field in front."""
     match = re.fullmatch(r"(?P<what>.*?)(?: - at `\$\.?(?P<where>.*)`)?", error, re.DOTALL)
     assert match is not None
@@ -157,7 +204,7 @@ def _validated(file: ScenarioFile, source: str) -> Scenario:
         placed.append(Placed(robot.id, peer, role, Anchor(*robot.anchor), start, plans[robot.id]))
     budget = max(tick_budget(file.mission, plan) for plan in plans.values())
     if file.max_ticks is None and budget > MAX_TICKS:
-        raise BadScenario(f"{source}: mission: to meet could take {budget} ticks, more than {MAX_TICKS}")
+        raise Unworkable(f"{source}: mission: to meet could take {budget} ticks, more than {MAX_TICKS}")
     scenario = Scenario(
         name=file.name,
         seed=file.seed,
@@ -170,7 +217,7 @@ def _validated(file: ScenarioFile, source: str) -> Scenario:
         for one in scenario.robots:
             decode(encode(scenario.briefing(one.id)), Briefing)
     except MalformedFrame as error:
-        raise BadScenario(f"{source}: mission: no robot could be told of it: {error}") from None
+        raise Unworkable(f"{source}: mission: no robot could be told of it: {error}") from None
     return scenario
 
 

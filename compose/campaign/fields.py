@@ -1,0 +1,136 @@
+"""A dotted path into a scenario file: `mission.period`, `robot.a.start`, `robot[1].anchor[0]`."""
+
+from __future__ import annotations
+
+import copy
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import msgspec
+from msgspec import inspect
+
+from compose.scenario import ScenarioFile
+
+Steps = tuple[str | int, ...]
+"""keys of tables and places in lists, from the top of the file"""
+_STEP = re.compile(r"(?P<dot>\.?)(?:(?P<key>[A-Za-z0-9_-]+)|\[(?P<place>[0-9]{1,4})\])")
+DRAWN = "seed"
+"""the one field that is every trial's own"""
+
+
+class NoSuchField(ValueError):
+    """A path leads nowhere; the text says where it ends."""
+
+
+def steps(path: str, base: Mapping[str, Any]) -> Steps:
+    """The way to the field `path` of the scenario `base`, which may leave it out. Raises NoSuchField."""
+    kind: inspect.Type = inspect.type_info(ScenarioFile)
+    value: Any = base
+    walked: list[str | int] = []
+    for step in _split(path):
+        so_far = _written(walked)
+        match _bare(kind):
+            case inspect.StructType(fields=fields):
+                kinds = {field.encode_name: field.type for field in fields}
+                if step not in kinds:
+                    raise NoSuchField(f"{so_far or 'a scenario'} has no field '{step}'")
+                kind = kinds[str(step)]
+                value = value.get(step) if isinstance(value, Mapping) else None
+            case inspect.DictType(value_type=kind):
+                value = value.get(step) if isinstance(value, Mapping) else None
+            case inspect.ListType() | inspect.TupleType() | inspect.VarTupleType() as many:
+                listed = value if isinstance(value, Sequence) else ()
+                place = _place(step, listed, so_far)
+                kind = many.item_types[place] if isinstance(many, inspect.TupleType) else many.item_type
+                value = listed[place]
+                walked.append(place)
+                continue
+            case _:
+                raise NoSuchField(f"{so_far} is a single value")
+        walked.append(step)
+    if walked == [DRAWN]:
+        raise NoSuchField("every trial has a seed of its own")
+    return tuple(walked)
+
+
+def with_value(table: Mapping[str, Any], way: Steps, value: Any) -> dict[str, Any]:
+    """A copy of `table` in which the field at `way` is `value`."""
+    changed = copy.deepcopy(dict(table))
+    inner: Any = changed
+    for step in way[:-1]:
+        inner = inner.setdefault(step, {}) if isinstance(inner, dict) else inner[step]
+    inner[way[-1]] = copy.deepcopy(value)
+    return changed
+
+
+def _split(path: str) -> list[str | int]:
+    found: list[str | int] = []
+    at = 0
+    while at < len(path):
+        match = _STEP.match(path, at)
+        if match is None or bool(match["dot"]) != (at > 0 and match["key"] is not None):
+            raise NoSuchField("no path: such as mission.period, robot.a.start or robot[1].anchor[0]")
+        found.append(match["key"] or int(match["place"]))
+        at = match.end()
+    if not found:
+        raise NoSuchField("is empty")
+    return found
+
+
+def _written(walked: Sequence[str | int]) -> str:
+    return "".join([f"[{step}]" if isinstance(step, int) else f".{step}" for step in walked]).lstrip(".")
+
+
+def _bare(kind: inspect.Type) -> inspect.Type:
+    """What a field holds that may be left out."""
+    if isinstance(kind, inspect.Metadata):
+        return _bare(kind.type)
+    if isinstance(kind, inspect.UnionType):
+        left = [one for one in kind.types if not isinstance(one, inspect.NoneType)]
+        return _bare(left[0]) if len(left) == 1 else kind
+    return kind
+
+
+def _place(step: str | int, listed: Sequence[Any], so_far: str) -> int:
+    """Where in a list: as the path says, or of the table with that id."""
+    if isinstance(step, int):
+        if step >= len(listed):
+            raise NoSuchField(f"the base scenario has no {so_far}[{step}]")
+        return step
+    ids = [one.get("id") if isinstance(one, Mapping) else None for one in listed]
+    if step not in ids:
+        raise NoSuchField(f"the base scenario has no {so_far} with the id '{step}'")
+    return ids.index(step)
+
+
+def jsonable(value: Any) -> bool:
+    """Whether the value is made of what both TOML and JSON know; NaN is not."""
+    match value:
+        case bool() | int() | str():
+            return True
+        case float():
+            return value == value and abs(value) != float("inf")  # noqa: PLR0124  # NaN is not itself
+        case list():
+            return all(jsonable(one) for one in value)
+        case dict():
+            return all(jsonable(one) for one in value.values())
+        case _:
+            return False
+
+
+def canonical(value: Any) -> str:
+    """The value as JSON text that is the same however it was written: 1 and 1.0 are one number."""
+    return msgspec.json.encode(_whole(value), order="deterministic").decode()
+
+
+def _whole(value: Any) -> Any:
+    match value:
+        case float() if value.is_integer():
+            return int(value)
+        case list():
+            return [_whole(one) for one in value]
+        case dict():
+            return {key: _whole(one) for key, one in value.items()}
+        case _:
+            return value

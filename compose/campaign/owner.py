@@ -1,0 +1,212 @@
+"""Who owns the processes in which trials run: one for each thread that plays chunks, kept between chunks.
+
+A trial that hangs or dies takes its process along, and nothing else: its row says how, and a fresh process
+goes on with the rest. So whoever hands out chunks sees only chunks that are done.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from contextlib import suppress
+
+import msgspec
+
+from compose.campaign.trial import lost
+from compose.campaign.worker import LENGTH_BYTES, MAX_ERROR, READY, Chunk, framed
+from protocol.inbox import one_line
+
+START_S = 60.0
+"""how long a process may take to import what it needs"""
+READ_BYTES = 1 << 16
+
+
+class Died(Exception):
+    """A process has ended; the text says how."""
+
+
+class Hung(Exception):
+    """A process has not answered in time."""
+
+
+class Child:
+    """A process in which trials run, in a session of its own: Ctrl-C reaches only who owns it."""
+
+    def __init__(self) -> None:
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # gone with the child
+        self._folder = tempfile.TemporaryDirectory(prefix="tandem-trials-", ignore_cleanup_errors=True)
+        # -P: the user's directory may hold a folder called world, or agent
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", "-m", "compose.campaign.worker", self._folder.name],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            start_new_session=True,
+            bufsize=0,
+        )
+        assert self._process.stdout is not None
+        self._output = self._process.stdout.fileno()
+        self._poll = select.poll()
+        self._poll.register(self._output, select.POLLIN)
+        self._read = b""
+
+    def ask(self, chunk: Chunk) -> None:
+        """Have it play the trials of `chunk`."""
+        assert self._process.stdin is not None
+        frame = memoryview(framed(msgspec.msgpack.encode(chunk)))
+        with suppress(BrokenPipeError):  # the answer tells
+            while frame:
+                frame = frame[self._process.stdin.write(frame) :]
+
+    def answer(self, timeout: float) -> bytes:
+        """The next frame. Raises Hung after `timeout` seconds without one, and Died."""
+        give_up = time.monotonic() + timeout
+        while (body := self._frame()) is None:
+            if not self._poll.poll(max(0.0, 1e3 * (give_up - time.monotonic()))):
+                raise Hung
+            news = os.read(self._output, READ_BYTES)
+            if not news:
+                raise Died(self._how())
+            self._read += news
+        return body
+
+    def _frame(self) -> bytes | None:
+        """The first of what has been read, if it is whole."""
+        end = LENGTH_BYTES + int.from_bytes(self._read[:LENGTH_BYTES], "big")
+        if len(self._read) < max(end, LENGTH_BYTES):
+            return None
+        body, self._read = self._read[LENGTH_BYTES:end], self._read[end:]
+        return body
+
+    def _how(self) -> str:
+        try:
+            status = self._process.wait(1.0)
+        except subprocess.TimeoutExpired:  # it has closed its standard output, and goes on
+            self.kill()
+            return "it closed its standard output"
+        size = os.fstat(self._errors.fileno()).st_size
+        said = os.pread(self._errors.fileno(), MAX_ERROR, max(0, size - MAX_ERROR)).decode(errors="replace")
+        last = one_line(said.strip().splitlines()[-1]) if said.strip() else ""
+        how = f"killed by {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
+        return f"{how}: {last}" if last else how
+
+    def kill(self) -> None:
+        """End it now. What its trials started ends with it."""
+        with suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+
+    def close(self) -> None:
+        """End it, and leave nothing of it behind."""
+        if self._process.poll() is None:
+            self.kill()
+        with self._process, suppress(BrokenPipeError):
+            self._process.wait()
+        self._errors.close()
+        self._folder.cleanup()
+
+
+class _Children:
+    """The processes that this one owns, by campaign and thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._working: dict[tuple[str, int], Child] = {}
+        self._resting: dict[tuple[str, int], Child] = {}
+        self._over: set[str] = set()
+
+    def take(self, campaign: str) -> tuple[Child, bool] | None:
+        """This thread's, and whether it has served before; None where the campaign is over.
+
+        Raises Died or Hung where a new one does not get ready.
+        """
+        key = campaign, threading.get_ident()
+        with self._lock:
+            if campaign in self._over:
+                return None
+            kept = self._resting.pop(key, None)
+            child = self._working[key] = kept or Child()
+        if kept is None:
+            try:
+                ready = child.answer(START_S)
+                assert ready == READY
+            except (Died, Hung):
+                self.drop(campaign)
+                raise
+        return child, kept is not None
+
+    def keep(self, campaign: str) -> None:
+        """This thread has no more use for its process, for now."""
+        key = campaign, threading.get_ident()
+        with self._lock:
+            child = self._working.pop(key)
+            if campaign not in self._over:
+                self._resting[key] = child
+                return
+        child.close()
+
+    def drop(self, campaign: str) -> bool:
+        """This thread's process is of no more use; whether the campaign goes on."""
+        with self._lock:
+            child = self._working.pop((campaign, threading.get_ident()))
+            goes_on = campaign not in self._over
+        child.close()
+        return goes_on
+
+    def dismiss(self, campaign: str) -> None:
+        """The campaign is over: no process of it stays, and none will start."""
+        with self._lock:
+            self._over.add(campaign)
+            for key, child in self._working.items():
+                if key[0] == campaign:
+                    child.kill()  # its thread sees it die, and closes it
+            idle = [self._resting.pop(key) for key in list(self._resting) if key[0] == campaign]
+        for child in idle:
+            child.close()
+
+
+_children = _Children()
+
+
+def dismiss(campaign: str) -> None:
+    """End every process of the campaign that this process owns, now and for good."""
+    _children.dismiss(campaign)
+
+
+def run(campaign: str, encoded: bytes) -> list[bytes]:
+    """The rows, encoded, of an encoded chunk of the campaign; not all of them where the campaign is over.
+
+    Raises Died or Hung where no process comes up that could play trials.
+    """
+    chunk = msgspec.msgpack.decode(encoded, type=Chunk)
+    rows: list[bytes] = []
+    while len(rows) < len(chunk.trials) and (taken := _children.take(campaign)) is not None:
+        child, kept = taken
+        asked = len(rows)
+        began = time.perf_counter()
+        try:
+            child.ask(chunk.after(asked))
+            for _ in chunk.trials[asked:]:
+                rows.append(child.answer(chunk.timeout))
+                began = time.perf_counter()
+        except Hung:
+            error = f"hung: no answer within {chunk.timeout:g} s"
+        except Died as death:
+            if kept and len(rows) == asked:  # perhaps it had ended by itself before: only a fresh one tells
+                _children.drop(campaign)
+                continue
+            error = f"died: {death}"
+        else:
+            _children.keep(campaign)
+            break
+        if not _children.drop(campaign):
+            break
+        i = len(rows)
+        took_s = time.perf_counter() - began
+        rows.append(msgspec.msgpack.encode(lost(chunk.cell, chunk.trials[i], chunk.seeds[i], error, took_s)))
+    return rows

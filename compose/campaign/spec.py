@@ -1,0 +1,207 @@
+"""A campaign's TOML file -> a validated campaign, or one line that names the file and the field."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import combinations
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta
+
+from compose import scenario
+from compose.campaign.fields import NoSuchField, Steps, canonical, jsonable, steps
+from compose.scenario import BadScenario, field_first, read_text, table_in
+from compose.status import UserError
+from protocol.units import NAME
+
+MAX_TRIALS = 10**7
+"""per cell"""
+MAX_CELLS = 10_000
+TRIAL_TIMEOUT_S = 60.0
+Label = Annotated[str, Meta(min_length=1, max_length=60)]
+
+
+class BadSpec(UserError):
+    """The user's campaign cannot be run; the text names the file, the field and what is wrong."""
+
+
+class AxisTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """[[axis]]: one `field` and its values; or `name` and `fields`, which vary together."""
+
+    values: Annotated[list[Any], Meta(min_length=1)]
+    field: str | None = None
+    fields: Annotated[list[str], Meta(min_length=1)] | None = None
+    name: Annotated[str, Meta(pattern=NAME, max_length=48)] | None = None
+    labels: list[Label] | None = None
+    """what to call each value in tables and figures"""
+    paired: bool = False
+    """left out of the trials' seeds: all its values face the same draws"""
+
+
+class SpecFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a campaign's file may say."""
+
+    name: Annotated[str, Meta(pattern=NAME, max_length=48)]
+    scenario: str
+    """a name that ships, or a file, relative to this one"""
+    trials: Annotated[int, Meta(ge=1, le=MAX_TRIALS)]
+    """per cell"""
+    seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
+    trial_timeout: Annotated[float, Meta(gt=0.0, le=1e6)] = TRIAL_TIMEOUT_S
+    """s of wall time, after which a trial counts as hung"""
+    axis: list[AxisTable] = []
+
+
+class Axis(msgspec.Struct, frozen=True):
+    """Fields of the scenario that vary together, and their values."""
+
+    name: str
+    """the field, if it is only one"""
+    fields: tuple[str, ...]
+    ways: tuple[Steps, ...]
+    """to each of the fields"""
+    values: tuple[tuple[Any, ...], ...]
+    """of each of the fields, a tuple for each value of the axis"""
+    labels: tuple[str, ...] | None
+    paired: bool
+
+    def label(self, place: int) -> str:
+        """What to call a value of it."""
+        if self.labels is not None:
+            return self.labels[place]
+        said = [value if isinstance(value, str) else canonical(value) for value in self.values[place]]
+        if len(said) == 1:
+            return said[0]
+        return ", ".join(f"{field}={value}" for field, value in zip(self.fields, said, strict=True))
+
+
+class Campaign(msgspec.Struct, frozen=True):
+    """A campaign, complete: what each trial is follows from it."""
+
+    source: str
+    """the spec, as the user calls it"""
+    name: str
+    base: dict[str, Any]
+    """the table of the scenario's file"""
+    axes: tuple[Axis, ...]
+    trials: int
+    """per cell"""
+    seed: int
+    trial_timeout: float
+    """s"""
+
+
+def shipped() -> dict[str, Path]:
+    """The campaigns that come with Tandem, by name."""
+    return scenario.shipped("sweeps")
+
+
+def load(source: str, *, trials: int | None = None, seed: int | None = None) -> Campaign:
+    """The campaign of that name, or in the file at that path; `trials` and `seed` override its own.
+
+    Raises BadSpec, and BadScenario if it is the base scenario that cannot be read.
+    """
+    path = shipped().get(source, Path(source))
+    try:
+        table = table_in(read_text(path), source)
+        spec = msgspec.convert(table, SpecFile)
+    except FileNotFoundError:
+        names = ", ".join(shipped())
+        raise BadSpec(f"{source}: neither a file nor a campaign that ships ({names})") from None
+    except msgspec.ValidationError as error:
+        raise BadSpec(f"{source}: {field_first(str(error))}") from None
+    except ValueError as error:
+        raise BadSpec(f"{source}: {error}") from None
+    base = _base(spec, path, source)
+    axes = tuple(_axis(axis, f"{source}: axis[{i}]", base) for i, axis in enumerate(spec.axis))
+    _check_together(axes, source)
+    return Campaign(
+        source=source,
+        name=spec.name,
+        base=base,
+        axes=axes,
+        trials=trials if trials is not None else spec.trials,
+        seed=seed if seed is not None else spec.seed,
+        trial_timeout=spec.trial_timeout,
+    )
+
+
+def _base(spec: SpecFile, path: Path, source: str) -> dict[str, Any]:
+    """The table of the scenario that `spec` varies."""
+    file = scenario.shipped().get(spec.scenario, path.parent / spec.scenario)
+    try:
+        return table_in(read_text(file), spec.scenario)
+    except FileNotFoundError:
+        names = ", ".join(scenario.shipped())
+        raise BadSpec(
+            f"{source}: scenario: '{spec.scenario}' is neither a file beside it nor a scenario that ships "
+            f"({names})"
+        ) from None
+    except (ValueError, BadScenario) as error:
+        raise BadSpec(f"{source}: scenario: {error}") from None
+
+
+def _axis(table: AxisTable, where: str, base: dict[str, Any]) -> Axis:
+    if (table.field is None) == (table.fields is None):
+        raise BadSpec(f"{where}: names one 'field', or a 'name' and the 'fields' that vary together")
+    if table.fields is not None and table.name is None:
+        raise BadSpec(f"{where}.name: missing: what to call {', '.join(table.fields)} together")
+    fields = table.fields if table.fields is not None else [str(table.field)]
+    ways = []
+    for i, field in enumerate(fields):
+        named = f"{where}.fields[{i}]" if table.fields is not None else f"{where}.field"
+        try:
+            ways.append(steps(field, base))
+        except NoSuchField as error:
+            raise BadSpec(f"{named}: '{field}': {error}") from None
+    values = [_value(value, f"{where}.values[{i}]", table.fields) for i, value in enumerate(table.values)]
+    seen: dict[str, int] = {}
+    for i, value in enumerate(table.values):
+        if (first := seen.setdefault(canonical(value), i)) != i:
+            raise BadSpec(f"{where}.values[{i}]: the same as values[{first}]")
+    if table.labels is not None and len(table.labels) != len(values):
+        raise BadSpec(f"{where}.labels: {len(table.labels)} of them, for {len(values)} values")
+    if table.labels is not None and len(set(table.labels)) != len(values):
+        raise BadSpec(f"{where}.labels: two are the same")
+    return Axis(
+        name=table.name if table.name is not None else fields[0],
+        fields=tuple(fields),
+        ways=tuple(ways),
+        values=tuple(values),
+        labels=tuple(table.labels) if table.labels is not None else None,
+        paired=table.paired,
+    )
+
+
+def _value(value: Any, where: str, fields: Sequence[str] | None) -> tuple[Any, ...]:
+    if not jsonable(value):
+        raise BadSpec(f"{where}: not a number, a text, true or false, or a list or table of these")
+    if fields is None:
+        return (value,)
+    if not isinstance(value, list) or len(value) != len(fields):
+        raise BadSpec(f"{where}: not a list of {len(fields)} values, one for each of the fields")
+    return tuple(value)
+
+
+def _check_together(axes: Sequence[Axis], source: str) -> None:
+    """Raises BadSpec where two axes get into each other's way."""
+    names: set[str] = set()
+    for i, axis in enumerate(axes):
+        if axis.name in names:
+            raise BadSpec(f"{source}: axis[{i}]: another axis is called '{axis.name}'")
+        names.add(axis.name)
+    placed = [
+        (f"axis[{i}]", field, way)
+        for i, axis in enumerate(axes)
+        for field, way in zip(axis.fields, axis.ways, strict=True)
+    ]
+    for (one, field, way), (other, another, further) in combinations(placed, 2):
+        shorter = min(len(way), len(further))
+        if way[:shorter] == further[:shorter]:
+            raise BadSpec(f"{source}: {other}: '{another}' is set by {one} ('{field}') already")
+    count = math.prod(len(axis.values) for axis in axes)
+    if count > MAX_CELLS:
+        raise BadSpec(f"{source}: axis: {count} cells, more than {MAX_CELLS}")

@@ -1,0 +1,172 @@
+"""One trial, played, and the row that it leaves."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import time
+from pathlib import Path
+from typing import TypeVar
+
+import msgspec
+
+from compose import inline
+from compose.record import Record, first_claim, first_contact, read
+from compose.scenario import run_name
+from protocol.inbox import Inbox
+from protocol.messages import Outcome
+from world.referee import errors
+from world.scenario import Scenario
+
+N = TypeVar("N", int, float)
+PATIENCE_S = 30.0
+"""how long the processes of a trial wait for each other"""
+
+
+class Trial(msgspec.Struct, frozen=True):
+    """What is to be played."""
+
+    cell: int
+    number: int
+    """within the cell"""
+    scenario: Scenario
+    processes: bool
+    """over Zenoh, instead of in this process"""
+
+
+class RobotRow(msgspec.Struct, frozen=True, array_like=True):
+    """What a row says of one robot; what does not apply is None."""
+
+    branch: str | None = None
+    alpha: float | None = None
+    """rad"""
+    candidates: int | None = None
+    candidates_left: int | None = None
+    position_error_m: float | None = None
+    heading_error_rad: float | None = None
+
+
+class Row(msgspec.Struct, frozen=True, array_like=True):
+    """A trial that was played, or was lost; what does not apply is None."""
+
+    cell: int
+    trial: int
+    seed: int
+    """of the scenario"""
+    outcome: Outcome
+    reason: str | None = None
+    """why the outcome is no better"""
+    error: str | None = None
+    """why there is none"""
+    ticks: int | None = None
+    first_contact_tick: int | None = None
+    """two peers in range of each other"""
+    orbiting_tick: int | None = None
+    """both of a pair orbit; of several pairs the last; none if they meet before"""
+    meeting_tick: int | None = None
+    """phase 3 begins; of several pairs the last"""
+    t_max_s: float | None = None
+    t_max_ticks: int | None = None
+    candidates: int | None = None
+    """the most of any robot, before silence"""
+    candidates_left: int | None = None
+    """and after"""
+    position_error_m: float | None = None
+    """of the robot that is farthest off"""
+    heading_error_rad: float | None = None
+    reports_sent: int | None = None
+    """by all"""
+    reports_heard: int | None = None
+    bytes_sent: int | None = None
+    """of reports, by all"""
+    wall_s: float | None = None
+    robots: dict[str, RobotRow] = {}
+
+
+def lost(cell: int, trial: int, seed: int, error: str, wall_s: float | None) -> Row:
+    """The row of a trial that was not played to an end."""
+    return Row(cell, trial, seed, "failed", error=error, wall_s=None if wall_s is None else round(wall_s, 6))
+
+
+def play(trial: Trial) -> Row:
+    """Play it. What it raises becomes a row with that error."""
+    began = time.perf_counter()
+    record = _as_processes(trial.scenario) if trial.processes else inline.play(trial.scenario)
+    return row(trial, record, time.perf_counter() - began)
+
+
+def _as_processes(scenario: Scenario) -> Record:
+    from compose import local  # noqa: PLC0415  # in-process trials do without
+
+    with tempfile.TemporaryDirectory(prefix="tandem-") as folder:
+        out = Path(folder)
+        inbox = Inbox("tandem sweep")
+        local.play(scenario, out, inbox, run=run_name(scenario), rate=None, patience=PATIENCE_S)
+        return read(out)
+
+
+def row(trial: Trial, record: Record, wall_s: float) -> Row:
+    """What is kept of a record."""
+    scenario, end = record.scenario, record.end
+    if end is None:
+        return lost(trial.cell, trial.number, scenario.seed, "the record breaks off", wall_s)
+    robots = {robot.id: _robot_row(record, i) for i, robot in enumerate(scenario.robots)}
+    t_max_s = max(robot.rendezvous.bound for robot in scenario.robots)
+    met = [_meeting(record, scenario.robots[a].id, scenario.robots[b].id) for a, b in scenario.pairs()]
+    said = record.farewells.values()
+    return Row(
+        cell=trial.cell,
+        trial=trial.number,
+        seed=scenario.seed,
+        outcome=end.outcome,
+        reason=end.reason,
+        ticks=end.tick,
+        first_contact_tick=first_contact(record),
+        orbiting_tick=_last([orbiting for orbiting, _ in met]),
+        meeting_tick=_last([meeting for _, meeting in met]),
+        t_max_s=t_max_s,
+        t_max_ticks=math.ceil(t_max_s / scenario.mission.period),
+        candidates=_most([robot.candidates for robot in robots.values()]),
+        candidates_left=_most([robot.candidates_left for robot in robots.values()]),
+        position_error_m=_most([robot.position_error_m for robot in robots.values()]),
+        heading_error_rad=_most([robot.heading_error_rad for robot in robots.values()]),
+        reports_sent=sum([farewell.reports_sent for farewell in said]),
+        reports_heard=sum([farewell.reports_heard for farewell in said]),
+        bytes_sent=sum([farewell.bytes_sent for farewell in said]),
+        wall_s=round(wall_s, 6),
+        robots=robots,
+    )
+
+
+def _robot_row(record: Record, place: int) -> RobotRow:
+    robot = record.scenario.robots[place].id
+    farewell, claimed = record.farewells.get(robot), first_claim(record, robot)
+    position = heading = None
+    if claimed is not None:
+        position, heading = errors(claimed[1], record.moments[-1].truth.poses[place])
+    if farewell is None:
+        return RobotRow(position_error_m=position, heading_error_rad=heading)
+    before, left = farewell.candidates if farewell.candidates is not None else (None, None)
+    return RobotRow(farewell.branch, farewell.alpha, before, left, position, heading)
+
+
+def _meeting(record: Record, a: str, b: str) -> tuple[int | None, int | None]:
+    """The tick from which both of a pair orbit, and that at which their phase 3 begins."""
+    orbiting = None
+    for moment in record.moments:
+        drives = [drive for drive in (moment.drives.get(a), moment.drives.get(b)) if drive is not None]
+        if any(drive.phase == 3 for drive in drives):
+            return orbiting, moment.truth.tick
+        if orbiting is None and len(drives) == 2 and all(drive.state == "orbiting" for drive in drives):
+            orbiting = moment.truth.tick
+    return orbiting, None
+
+
+def _last(ticks: list[int | None]) -> int | None:
+    """The last of several, once all are there."""
+    known = [tick for tick in ticks if tick is not None]
+    return max(known) if len(known) == len(ticks) else None
+
+
+def _most(values: list[N | None]) -> N | None:
+    return max([value for value in values if value is not None], default=None)
