@@ -85,7 +85,9 @@ def _parser() -> argparse.ArgumentParser:
         sub.add_argument("--launched", action="store_true", help=argparse.SUPPRESS)  # by `tandem run`
         sub.add_argument("--fsync", action="store_true", help="the journal survives a power cut")
 
-    command("scenarios", "List the scenarios that ship.")
+    _add_sweep(command("sweep", "Play a campaign: many trials of a scenario, over axes of its fields."))
+
+    command("scenarios", "List the scenarios and the campaigns that ship.")
 
     bench = command("bench", "Measure speed, against the bare thing in the same run.")
     bench.add_argument("--rounds", type=_count, default=5, metavar="N", help="repetitions (5)")
@@ -104,6 +106,22 @@ def _add_playing(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=_folder, metavar="DIR", help="where the record goes")
     parser.add_argument("--patience", type=_positive, default=30.0, metavar="S", help="longest silence (30)")
     parser.add_argument("-q", "--quiet", action="store_true", help="print only the outcome")
+
+
+def _add_sweep(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("spec", metavar="SPEC", help="a name that ships, or a TOML file")
+    parser.add_argument(
+        "--out", type=_folder, metavar="DIR", help="where the results go, and go on (sweep-NAME)"
+    )
+    parser.add_argument("--trials", type=_trials, metavar="N", help="per cell, instead of the spec's")
+    parser.add_argument("--seed", type=_natural, metavar="S", help="instead of the spec's")
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument(
+        "--workers", type=_count, metavar="N", help="on this machine (as many as it has cores)"
+    )
+    where.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask scheduler that runs already")
+    parser.add_argument("--processes", action="store_true", help="trials as processes, over Zenoh")
+    parser.add_argument("-q", "--quiet", action="store_true", help="print only the counts")
 
 
 def _folder(text: str) -> Path:
@@ -132,6 +150,13 @@ def _count(text: str) -> int:
     value = _natural(text)
     if not 0 < value <= 1000:
         raise argparse.ArgumentTypeError(f"{value} is not from 1 to 1000")
+    return value
+
+
+def _trials(text: str) -> int:
+    value = _natural(text)
+    if not 0 < value <= 10**7:
+        raise argparse.ArgumentTypeError(f"{value} is not from 1 to 10000000")
     return value
 
 

@@ -145,11 +145,7 @@ def _base(spec: SpecFile, path: Path, source: str) -> dict[str, Any]:
 
 
 def _axis(table: AxisTable, where: str, base: dict[str, Any]) -> Axis:
-    if (table.field is None) == (table.fields is None):
-        raise BadSpec(f"{where}: names one 'field', or a 'name' and the 'fields' that vary together")
-    if table.fields is not None and table.name is None:
-        raise BadSpec(f"{where}.name: missing: what to call {', '.join(table.fields)} together")
-    fields = table.fields if table.fields is not None else [str(table.field)]
+    fields = _fields(table, where)
     ways = []
     for i, field in enumerate(fields):
         named = f"{where}.fields[{i}]" if table.fields is not None else f"{where}.field"
@@ -157,15 +153,14 @@ def _axis(table: AxisTable, where: str, base: dict[str, Any]) -> Axis:
             ways.append(steps(field, base))
         except NoSuchField as error:
             raise BadSpec(f"{named}: '{field}': {error}") from None
-    values = [_value(value, f"{where}.values[{i}]", table.fields) for i, value in enumerate(table.values)]
     seen: dict[str, int] = {}
+    values = []
     for i, value in enumerate(table.values):
+        values.append(_value(value, f"{where}.values[{i}]", table.fields))
         if (first := seen.setdefault(canonical(value), i)) != i:
             raise BadSpec(f"{where}.values[{i}]: the same as values[{first}]")
-    if table.labels is not None and len(table.labels) != len(values):
-        raise BadSpec(f"{where}.labels: {len(table.labels)} of them, for {len(values)} values")
-    if table.labels is not None and len(set(table.labels)) != len(values):
-        raise BadSpec(f"{where}.labels: two are the same")
+    if table.labels is not None and not len(table.labels) == len(set(table.labels)) == len(values):
+        raise BadSpec(f"{where}.labels: not {len(values)} different ones, one for each of the values")
     return Axis(
         name=table.name if table.name is not None else fields[0],
         fields=tuple(fields),
@@ -174,6 +169,20 @@ def _axis(table: AxisTable, where: str, base: dict[str, Any]) -> Axis:
         labels=tuple(table.labels) if table.labels is not None else None,
         paired=table.paired,
     )
+
+
+def _fields(table: AxisTable, where: str) -> list[str]:
+    """What the axis varies. Raises BadSpec where that, or what to call it, is not said."""
+    if (table.field is None) == (table.fields is None):
+        raise BadSpec(f"{where}: names one 'field', or a 'name' and the 'fields' that vary together")
+    fields = table.fields if table.fields is not None else [str(table.field)]
+    if table.name is None and table.fields is not None:
+        raise BadSpec(f"{where}.name: missing: what to call {', '.join(fields)} together")
+    if table.name is None and table.labels is not None:
+        raise BadSpec(f"{where}.name: missing: the labels are a column of their own")
+    if table.name in fields:
+        raise BadSpec(f"{where}.name: '{table.name}' is one of its fields")
+    return fields
 
 
 def _value(value: Any, where: str, fields: Sequence[str] | None) -> tuple[Any, ...]:

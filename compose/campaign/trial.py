@@ -65,6 +65,8 @@ class Row(msgspec.Struct, frozen=True, array_like=True):
     """both of a pair orbit; of several pairs the last; none if they meet before"""
     meeting_tick: int | None = None
     """phase 3 begins; of several pairs the last"""
+    period_s: float | None = None
+    """T_s: what a tick lasts"""
     t_max_s: float | None = None
     t_max_ticks: int | None = None
     candidates: int | None = None
@@ -124,6 +126,7 @@ def row(trial: Trial, record: Record, wall_s: float) -> Row:
         first_contact_tick=first_contact(record),
         orbiting_tick=_last([orbiting for orbiting, _ in met]),
         meeting_tick=_last([meeting for _, meeting in met]),
+        period_s=scenario.mission.period,
         t_max_s=t_max_s,
         t_max_ticks=math.ceil(t_max_s / scenario.mission.period),
         candidates=_most([robot.candidates for robot in robots.values()]),

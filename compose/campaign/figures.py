@@ -1,0 +1,239 @@
+"""Pictures of a campaign: success and ticks against each axis, and when robots met, against T_max."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import pyarrow as pa
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from compose.campaign.run import Results
+from compose.campaign.spec import Axis
+from compose.campaign.summary import Counted, column, counted, orbited_over_t_max
+
+STYLES = (
+    ("#0b3c6f", "-", "o"),
+    ("#d9541e", "--", "s"),
+    ("#3f8f5a", "-.", "^"),
+    ("#8a8a8a", ":", "D"),
+    ("#8e5ea2", (0, (5, 1)), "v"),
+    ("#c9a227", (0, (3, 1, 1, 1)), "P"),
+)
+"""colour, line, marker: of different lightness, and told apart without colour too"""
+LOGARITHMIC = 20.0
+"""an axis whose largest value is so many times its smallest"""
+DPI = 160
+
+
+def draw(results: Results, folder: Path) -> None:
+    """Draw them anew, each as SVG and PNG, into `folder`."""
+    mpl.rcParams.update({"svg.hashsalt": "tandem", "font.size": 9})
+    folder.mkdir(exist_ok=True)
+    for place, axis in enumerate(results.campaign.axes):
+        if len(axis.values) > 1:
+            name = re.sub(r"[^A-Za-z0-9_-]+", "-", axis.name).strip("-")
+            _save(_success(results, place), folder / f"success-{name}")
+            _save(_ticks(results, place), folder / f"ticks-{name}")
+    _save(_meeting(results), folder / "meeting")
+
+
+def _save(figure: Figure, path: Path) -> None:
+    figure.savefig(path.with_suffix(".svg"), metadata={"Date": None})
+    figure.savefig(path.with_suffix(".png"), dpi=DPI)
+
+
+def _success(results: Results, place: int) -> Figure:
+    """The rate of localised trials, with Wilson's interval."""
+    figure, axes, at = _against(results.campaign.axes[place])
+    lines = list(_lines(results, place))
+    for i, (label, tables) in enumerate(lines):
+        colour, style, marker = STYLES[i]
+        points = [
+            (x, figures) for x, table in zip(at, tables, strict=True) if (figures := counted(table)).trials
+        ]
+        where = np.array([x for x, _ in points]) + _aside(results.campaign.axes[place], i, len(lines))
+        rates, low, high = _rates([figures for _, figures in points])
+        axes.errorbar(
+            where,
+            rates,
+            yerr=[rates - low, high - rates],
+            color=colour,
+            ls=_joined(results.campaign.axes[place], style),
+            marker=marker,
+            ms=4,
+            lw=1.2,
+            capsize=2.5,
+            label=label,
+        )
+    axes.set_ylabel("localised, of all trials (95 % interval)")
+    axes.set_ylim(top=min(1.02, axes.get_ylim()[1]))
+    _legend(axes, lines)
+    return figure
+
+
+def _rates(figures: Sequence[Counted]) -> tuple[Any, Any, Any]:
+    rows = [(one.rate or 0.0, one.rate_low or 0.0, one.rate_high or 0.0) for one in figures]
+    rates, low, high = np.array(rows).reshape(-1, 3).T
+    return rates, np.minimum(low, rates), np.maximum(high, rates)
+
+
+def _ticks(results: Results, place: int) -> Figure:
+    """Median, 95 % and maximum of the ticks that trials took which localised."""
+    axis = results.campaign.axes[place]
+    figure, axes, at = _against(axis)
+    lines = list(_lines(results, place))
+    for i, (label, tables) in enumerate(lines):
+        colour, style, marker = STYLES[i]
+        points = [
+            (x, figures)
+            for x, table in zip(at, tables, strict=True)
+            if (figures := counted(table)).ticks_p50 is not None
+        ]
+        where = np.array([x for x, _ in points]) + _aside(axis, i, len(lines))
+        middle, most, top = (
+            np.array([getattr(figures, name) for _, figures in points], float)
+            for name in ("ticks_p50", "ticks_p95", "ticks_max")
+        )
+        axes.plot(where, middle, color=colour, ls=_joined(axis, style), marker=marker, ms=4, label=label)
+        axes.vlines(where, middle, most, color=colour, lw=1.2)
+        axes.plot(where, most, color=colour, ls="", marker="_", ms=7)
+        axes.plot(where, top, color=colour, ls="", marker=marker, ms=4, mfc="white")
+    axes.plot([], [], color="0.3", ls="", marker="|", ms=8, label="up to 95 %")
+    axes.plot([], [], color="0.3", ls="", marker="o", ms=4, mfc="white", label="maximum")
+    axes.set_ylabel("ticks until localised (median)")
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter("{x:.0f}")
+    axes.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def _meeting(results: Results) -> Figure:
+    """How many have met by when: in seconds since release; and of T_max since both orbit."""
+    figure = Figure(figsize=(7.2, 3.4), layout="constrained")
+    since_release, in_orbit = figure.subplots(1, 2, sharey=True)
+    groups = _groups(results)
+    for (label, table), (colour, style, _) in zip(groups, STYLES, strict=False):
+        seconds = column(table, "meeting_tick") * column(table, "period_s")
+        for axes, values in ((since_release, seconds), (in_orbit, orbited_over_t_max(table))):
+            met = np.sort(values[~np.isnan(values)])
+            share = np.arange(len(met) + 1) / max(1, len(table))
+            axes.step(
+                np.concatenate([[0.0], met]), share, where="post", color=colour, ls=style, lw=1.3, label=label
+            )
+    in_orbit.axvline(1.0, color="0.2", lw=1.0)
+    in_orbit.annotate("$T_{max}$", (1.0, 0.02), xytext=(-3, 0), textcoords="offset points", ha="right")
+    in_orbit.set_xlabel("from both in orbit to meeting, over $T_{max}$")
+    since_release.set_xlabel("from release to meeting [s]")
+    since_release.set_ylabel("share of all trials")
+    since_release.set_ylim(0.0, 1.02)
+    if len(groups) > 1:
+        figure.legend(
+            *since_release.get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False
+        )
+    return figure
+
+
+def _groups(results: Results) -> list[tuple[str, pa.Table]]:
+    """Each cell on its own while there are few; else by the values of one axis."""
+    axes = results.campaign.axes
+    played = [cell for cell in results.cells if results.figures[cell.index].trials]
+    if len(played) <= len(STYLES):
+        return [
+            (
+                ", ".join([axis.label(i) for axis, i in zip(axes, cell.place, strict=True)]),
+                _of(results, {cell.index}),
+            )
+            for cell in played
+        ]
+    place = _told_apart(results, None)
+    if place is None:
+        return [("all", results.table)]
+    return [
+        (label, table)
+        for i, label in enumerate(map(axes[place].label, range(len(axes[place].values))))
+        if len(table := _of(results, {cell.index for cell in results.cells if cell.place[place] == i}))
+    ]
+
+
+def _lines(results: Results, place: int) -> Iterator[tuple[str, list[pa.Table]]]:
+    """The trials at each value of an axis: a line each value of the axis told apart, the others pooled."""
+    axes = results.campaign.axes
+    apart = _told_apart(results, place)
+    for i in range(len(axes[apart].values)) if apart is not None else (None,):
+        label = axes[apart].label(i) if apart is not None and i is not None else ""
+        yield (
+            label,
+            [
+                _of(
+                    results,
+                    {
+                        cell.index
+                        for cell in results.cells
+                        if cell.place[place] == x and (apart is None or cell.place[apart] == i)
+                    },
+                )
+                for x in range(len(axes[place].values))
+            ],
+        )
+
+
+def _told_apart(results: Results, place: int | None) -> int | None:
+    """Another axis with few values: a paired one, if there is one."""
+    axes = results.campaign.axes
+    others = [i for i, axis in enumerate(axes) if i != place and 1 < len(axis.values) <= len(STYLES)]
+    return min(others, key=lambda i: (not axes[i].paired, i), default=None)
+
+
+def _of(results: Results, cells: set[int]) -> pa.Table:
+    return results.table.filter(pa.array(np.isin(results.table["cell"].to_numpy(), list(cells))))
+
+
+def _against(axis: Axis) -> tuple[Figure, Axes, list[float]]:
+    """A picture with the values of an axis along it, and where they lie."""
+    numbers = _numbers(axis)
+    figure = Figure(figsize=(7.2, 3.6), layout="constrained")
+    axes = figure.subplots()
+    axes.set_xlabel(axis.name)
+    axes.grid(axis="y", lw=0.4, color="0.85")
+    if numbers is not None:
+        if min(numbers) > 0.0 and max(numbers) >= LOGARITHMIC * min(numbers):
+            axes.set_xscale("log")
+        return figure, axes, numbers
+    labels = [axis.label(i) for i in range(len(axis.values))]
+    crowded = sum(map(len, labels)) > 60
+    axes.set_xticks(
+        range(len(labels)), labels, rotation=40 if crowded else 0, ha="right" if crowded else "center"
+    )
+    axes.set_xlim(-0.5, len(labels) - 0.5)
+    return figure, axes, [float(i) for i in range(len(labels))]
+
+
+def _numbers(axis: Axis) -> list[float] | None:
+    """The values of the axis, if they are numbers."""
+    if len(axis.fields) > 1 or axis.labels is not None:
+        return None
+    values = [value for (value,) in axis.values]
+    if any(isinstance(value, bool) or not isinstance(value, int | float) for value in values):
+        return None
+    return [float(value) for value in values]
+
+
+def _joined(axis: Axis, style: Any) -> Any:
+    """Between numbers there is something; between names there is not."""
+    return style if _numbers(axis) is not None else ""
+
+
+def _aside(axis: Axis, i: int, lines: int) -> float:
+    """How far beside a name the point of one of several lines stands."""
+    return 0.0 if _numbers(axis) is not None else 0.12 * (i - 0.5 * (lines - 1))
+
+
+def _legend(axes: Axes, lines: Sequence[tuple[str, object]]) -> None:
+    if len(lines) > 1:
+        axes.legend(frameon=False, fontsize=8)

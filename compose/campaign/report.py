@@ -1,0 +1,144 @@
+"""What a campaign shows on a terminal: how far it is, and in the end a table with a row a cell."""
+
+from __future__ import annotations
+
+import io
+import shlex
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich import progress as bars
+from rich.box import SIMPLE_HEAD
+from rich.cells import cell_len
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from compose.campaign.cells import Cell
+from compose.campaign.folder import CELLS
+from compose.campaign.run import Progress, Results
+from compose.campaign.summary import Counted, noted
+from compose.show import UNLIMITED
+
+RATE_OVER_S = 10.0
+"""what the rate is averaged over"""
+OUTCOMES = ("localised", "undecided", "alarm", "wrong", "failed")
+LEGEND = "rate: 95 % interval (Wilson); ticks: of trials that localised; error: m, of the worse robot"
+WIDEST = (*OUTCOMES, "rate", "rate_low", "rate_high", "p50", "p95", "max", "error p50", "error max")
+CHOICES = (
+    ("trials", *WIDEST),
+    ("trials", *WIDEST[:-2]),
+    ("trials", "rate", "rate_low", "rate_high", "p50", "p95", "max"),
+    ("trials", "rate", "p50", "max"),
+    ("trials", "rate"),
+)
+"""of the columns; the first that fits"""
+
+
+class _Rate(bars.ProgressColumn):
+    """Trials a second."""
+
+    def render(self, task: bars.Task) -> Text:
+        """As rich asks for it."""
+        return Text(f"{task.speed:.3g}/s" if task.speed else "")
+
+
+@contextmanager
+def progress(name: str, say: Callable[[str], None], visible: bool) -> Iterator[Progress]:
+    """A bar with the rate and the time left, where somebody can see it."""
+    bar = bars.Progress(
+        bars.TextColumn("{task.description}"),
+        bars.BarColumn(),
+        bars.MofNCompleteColumn(),
+        _Rate(),
+        bars.TimeRemainingColumn(),
+        disable=not visible,
+        transient=True,
+        speed_estimate_period=RATE_OVER_S,
+    )
+    with bar:
+        task = bar.add_task(name, total=None)
+
+        def begin(done: int, total: int) -> None:
+            bar.reset(task, total=total, completed=done)
+
+        yield Progress(say, begin, lambda more: bar.advance(task, more))
+
+
+def show(results: Results, out: Path, *, quiet: bool) -> None:
+    """The table, and how to see one of its trials; or only the counts."""
+    total = {name: sum([getattr(one, name) for one in results.figures.values()]) for name in OUTCOMES}
+    counts = ", ".join([f"{count} {name}" for name, count in total.items() if count])
+    print(f"{results.campaign.name}: {counts} of {len(results.table)} trials in {_cells(len(results.cells))}")
+    if quiet:
+        return
+    print("", *_lines(results), "", LEGEND, sep="\n")
+    for index, figures in results.figures.items():
+        if figures.refused is not None:
+            print(f"cell {index} cannot be played: {figures.refused}")
+    note = noted(results.table)
+    if note is not None:
+        why = f" ({note.why})" if note.why else ""
+        how = f"{note.outcome} after {note.ticks} ticks" if note.ticks is not None else note.outcome
+        file = shlex.quote(str(out / CELLS / f"{note.cell:03d}.toml"))
+        print(f"to look at first: trial {note.trial} of cell {note.cell}, {how}{why}; any trial again:")
+        print(f"  tandem run {file} --seed {note.seed} --out record")
+    print(f"results: {out}")
+
+
+def _lines(results: Results) -> list[str]:
+    """The table, as wide as there is room."""
+    room = Console().width if sys.stdout.isatty() else UNLIMITED
+    lines: list[str] = []
+    for columns in CHOICES:
+        lines = _table(results, columns)
+        if max(map(cell_len, lines)) <= room:
+            break
+    return lines
+
+
+def _table(results: Results, columns: Sequence[str]) -> list[str]:
+    axes = results.campaign.axes
+    table = Table("cell", box=SIMPLE_HEAD, pad_edge=False)
+    for axis in axes:
+        table.add_column(axis.name.rpartition(".")[2])
+    for heading in columns:
+        table.add_column(heading, justify="right")
+    for cell in results.cells:
+        figures = results.figures[cell.index]
+        said = _figures(figures)
+        table.add_row(*_axes(results, cell), *[said[column] for column in columns])
+    page = Console(width=UNLIMITED, file=io.StringIO())
+    with page.capture() as capture:
+        page.print(table)
+    return [line.rstrip() for line in capture.get().splitlines() if line.strip()]
+
+
+def _axes(results: Results, cell: Cell) -> list[str]:
+    places = zip(results.campaign.axes, cell.place, strict=True)
+    return [str(cell.index), *[axis.label(place) for axis, place in places]]
+
+
+def _figures(figures: Counted) -> dict[str, str]:
+    return {
+        "trials": str(figures.trials),
+        **{name: str(getattr(figures, name)) for name in OUTCOMES},
+        "rate": _number(figures.rate, ".4f"),
+        "rate_low": _number(figures.rate_low, ".4f"),
+        "rate_high": _number(figures.rate_high, ".4f"),
+        "p50": _number(figures.ticks_p50, ".0f"),
+        "p95": _number(figures.ticks_p95, ".0f"),
+        "max": _number(figures.ticks_max, ".0f"),
+        "error p50": _number(figures.error_p50_m, ".1e"),
+        "error max": _number(figures.error_max_m, ".1e"),
+    }
+
+
+def _number(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)
+
+
+def _cells(count: int) -> str:
+    return "one cell" if count == 1 else f"{count} cells"

@@ -1,0 +1,141 @@
+"""A campaign, from its spec to its results: what is left of it is played, and what there is gathered."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import msgspec
+import pyarrow as pa
+
+from compose.campaign import engine
+from compose.campaign.cells import Cell, Refused, setting_of
+from compose.campaign.folder import Folder, opened
+from compose.campaign.spec import BadSpec, Campaign
+from compose.campaign.summary import Counted, counted, header, summary_csv
+from compose.campaign.trial import Row
+from compose.campaign.worker import PLAY
+from protocol.inbox import Inbox, Interrupted
+
+SUMMARY = "summary.csv"
+
+
+class Means(msgspec.Struct, frozen=True):
+    """Where and how trials are played; nothing in their rows depends on it but the wall time."""
+
+    workers: int = os.cpu_count() or 1
+    """threads, each with a process for trials, where there is no scheduler"""
+    scheduler: str | None = None
+    """the address of Dask's"""
+    processes: bool = False
+    """trials as processes over Zenoh"""
+    play: str = PLAY
+
+
+class Progress(msgspec.Struct, frozen=True):
+    """Who is told how the campaign goes on."""
+
+    say: Callable[[str], None]
+    begin: Callable[[int, int], None]
+    """so many trials are done, of so many"""
+    done: Callable[[int], None]
+    """so many more are"""
+
+
+class Results(msgspec.Struct, frozen=True):
+    """What there is of a campaign."""
+
+    campaign: Campaign
+    cells: tuple[Cell, ...]
+    table: pa.Table
+    figures: dict[int, Counted]
+    """of each cell"""
+    stopped: str | None
+    """why there is no more yet"""
+    interrupted: bool
+    """because somebody said so"""
+    trials: int
+    """in all cells that are not refused"""
+
+
+def sweep(campaign: Campaign, out: Path, means: Means, inbox: Inbox, progress: Progress) -> Results:
+    """Play what has no row in `out` yet, and gather what there is then, however it ended.
+
+    Raises UserError: of the spec, a cell that is not a scenario, `out` or the scheduler.
+    """
+    with opened(out, campaign) as folder:
+        for names in (folder.schema.names, header(campaign)):
+            for name, count in Counter(names).items():
+                if count > 1:
+                    raise BadSpec(f"{campaign.source}: axis: {count} columns would be called '{name}'")
+        work = _left(folder, progress)
+        stopped, interrupted = None, False
+        if work:
+            try:
+                _play(folder, work, means, inbox, progress)
+            except Interrupted as signal_name:
+                stopped, interrupted = f"stopped by {signal_name}", True
+            except engine.EngineFailed as error:
+                stopped = str(error)
+        return _gathered(folder, stopped, interrupted)
+
+
+def _left(folder: Folder, progress: Progress) -> list[engine.Work]:
+    """What has to be played; only the settings of those cells are worked out."""
+    campaign, refused = folder.campaign, dict(folder.refused)
+    done = folder.done()
+    work = []
+    count = 0
+    for cell in folder.cells.values():
+        if cell.index in refused:
+            continue
+        count += campaign.trials
+        left = [trial for trial in range(campaign.trials) if trial not in done[cell.index]]
+        if not left:
+            continue
+        setting = setting_of(campaign, cell)
+        if isinstance(setting, Refused):
+            refused[cell.index] = setting.reason
+            count -= campaign.trials
+        else:
+            work.append(engine.Work(cell.index, cell.key, setting, left))
+    if len(refused) == len(folder.cells):
+        first, reason = next(iter(refused.items()))
+        raise BadSpec(f"{campaign.source}: no cell can be played; cell {first}: {reason}")
+    folder.ask(refused)
+    for part in folder.ignored:
+        progress.say(f"{part} cannot be read: its trials are played again")
+    progress.begin(count - sum([len(one.trials) for one in work]), count)
+    return work
+
+
+def _play(folder: Folder, work: list[engine.Work], means: Means, inbox: Inbox, progress: Progress) -> None:
+    orders = engine.Orders(folder.campaign.seed, means.processes, folder.campaign.trial_timeout, means.play)
+
+    def keep(rows: list[Row]) -> None:
+        folder.add(rows)
+        progress.done(len(rows))
+
+    with engine.connect(means.workers, means.scheduler) as client:
+        engine.play(client, work, orders, inbox, keep)
+
+
+def _gathered(folder: Folder, stopped: str | None, interrupted: bool) -> Results:
+    table = folder.gather()
+    cells = tuple(folder.cells.values())
+    figures = _figures(table, cells, folder.refused)
+    text = summary_csv(folder.campaign, cells, figures)
+    (folder.path / SUMMARY).write_text(text, encoding="utf-8")
+    trials = folder.campaign.trials * (len(cells) - len(folder.refused))
+    return Results(folder.campaign, cells, table, figures, stopped, interrupted, trials)
+
+
+def _figures(table: pa.Table, cells: tuple[Cell, ...], refused: Mapping[int, str]) -> dict[int, Counted]:
+    ends = table["cell"].to_numpy().searchsorted([cell.index for cell in cells], side="right")
+    begins = [0, *ends[:-1]]
+    return {
+        cell.index: counted(table.slice(begin, end - begin), refused.get(cell.index))
+        for cell, begin, end in zip(cells, begins, ends, strict=True)
+    }

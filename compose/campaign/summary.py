@@ -1,0 +1,174 @@
+"""A row a cell: how many of its trials ended how, how long they took, and how exact they were."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+from statistics import NormalDist
+from typing import Any, get_args
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from compose.campaign.cells import Cell
+from compose.campaign.fields import canonical
+from compose.campaign.spec import Campaign
+from protocol.messages import Outcome
+
+Floats = NDArray[np.float64]
+CONFIDENCE = 0.95
+"""of an interval"""
+WORSE = ("wrong", "alarm", "failed", "undecided")
+"""outcomes that call for a look, the worst first"""
+
+
+class Counted(msgspec.Struct, frozen=True):
+    """A row of `summary.csv`, after its axes; what does not apply is None."""
+
+    trials: int
+    localised: int
+    undecided: int
+    alarm: int
+    wrong: int
+    failed: int
+    """lost to an error, or to a process that was"""
+    rate: float | None
+    """localised, of all trials"""
+    rate_low: float | None
+    rate_high: float | None
+    """Wilson's interval"""
+    ticks_p50: float | None
+    """until all was known; of trials that localised"""
+    ticks_p95: float | None
+    ticks_max: float | None
+    meeting_tick_p50: float | None
+    """when phase 3 began; of trials in which it did"""
+    meeting_tick_max: float | None
+    t_max_s: float | None
+    t_max_ratio_max: float | None
+    """the longest that both orbited until phase 3 began, over T_max"""
+    error_p50_m: float | None
+    """of the worse robot of each trial in which one claimed"""
+    error_max_m: float | None
+    error_max_rad: float | None
+    reports_p50: float | None
+    """sent, by all"""
+    refused: str | None
+    """why no mission can be played in this setting"""
+
+
+class Noted(msgspec.Struct, frozen=True):
+    """A trial that deserves a look: the worst outcome; where all localised, the longest."""
+
+    cell: int
+    trial: int
+    seed: int
+    outcome: Outcome
+    ticks: int | None
+    why: str | None
+
+
+def counted(table: pa.Table, refused: str | None = None) -> Counted:
+    """The figures of these trials."""
+    outcomes = table["outcome"].to_pylist()
+    counts = {outcome: outcomes.count(outcome) for outcome in get_args(Outcome)}
+    k, n = counts["localised"], len(outcomes)
+    low, high = wilson(k, n)
+    ticks = column(table, "ticks")[np.array([outcome == "localised" for outcome in outcomes], bool)]
+    meeting, error = _known(column(table, "meeting_tick")), _known(column(table, "position_error_m"))
+    return Counted(
+        trials=n,
+        **counts,
+        rate=k / n if n else None,
+        rate_low=low,
+        rate_high=high,
+        ticks_p50=_percentile(ticks, 50),
+        ticks_p95=_percentile(ticks, 95),
+        ticks_max=_percentile(ticks, 100),
+        meeting_tick_p50=_percentile(meeting, 50),
+        meeting_tick_max=_percentile(meeting, 100),
+        t_max_s=_percentile(_known(column(table, "t_max_s")), 100),
+        t_max_ratio_max=_percentile(_known(orbited_over_t_max(table)), 100),
+        error_p50_m=_percentile(error, 50),
+        error_max_m=_percentile(error, 100),
+        error_max_rad=_percentile(_known(column(table, "heading_error_rad")), 100),
+        reports_p50=_percentile(_known(column(table, "reports_sent")), 50),
+        refused=refused,
+    )
+
+
+def wilson(k: int, n: int) -> tuple[float | None, float | None]:
+    """Between which rates the true one lies, given k of n."""
+    if not n:
+        return None, None
+    z = NormalDist().inv_cdf(0.5 + 0.5 * CONFIDENCE)
+    centre = (k + 0.5 * z * z) / (n + z * z)
+    half = z / (n + z * z) * math.sqrt(k * (n - k) / n + 0.25 * z * z)
+    return max(0.0, centre - half), min(1.0, centre + half)
+
+
+def column(table: pa.Table, name: str) -> Floats:
+    """A column of numbers; NaN where there is none."""
+    return np.asarray(table[name].cast(pa.float64()).to_numpy(), float)
+
+
+def orbited_over_t_max(table: pa.Table) -> Floats:
+    """How long both orbited until phase 3 began, over T_max: 0 if they met before, NaN if never."""
+    meeting, orbiting = column(table, "meeting_tick"), column(table, "orbiting_tick")
+    orbited = meeting - np.where(np.isnan(orbiting), meeting, orbiting)
+    return orbited * column(table, "period_s") / column(table, "t_max_s")
+
+
+def summary_csv(campaign: Campaign, cells: Sequence[Cell], figures: Mapping[int, Counted]) -> str:
+    """A row a cell."""
+    out = io.StringIO()
+    rows = csv.writer(out, lineterminator="\n")
+    rows.writerow(header(campaign))
+    for cell in cells:
+        axes: list[Any] = []
+        for axis, place in zip(campaign.axes, cell.place, strict=True):
+            axes += [axis.label(place)] if axis.labels is not None else []
+            axes += [value if isinstance(value, str) else canonical(value) for value in axis.values[place]]
+        rows.writerow([cell.index, *axes, *msgspec.structs.astuple(figures[cell.index])])
+    return out.getvalue()
+
+
+def header(campaign: Campaign) -> list[str]:
+    """Of `summary.csv`."""
+    axes = [
+        name
+        for axis in campaign.axes
+        for name in ([axis.name] if axis.labels is not None else []) + list(axis.fields)
+    ]
+    return ["cell", *axes, *Counted.__struct_fields__]
+
+
+def noted(table: pa.Table) -> Noted | None:
+    """The trial to look at first, if there is any."""
+    if not len(table):
+        return None
+    outcomes = table["outcome"].to_pylist()
+    worst = next((outcome for outcome in WORSE if outcome in outcomes), None)
+    place = outcomes.index(worst) if worst is not None else int(np.nanargmax(column(table, "ticks")))
+    found = table.slice(place, 1).to_pylist()[0]
+    return Noted(
+        cell=found["cell"],
+        trial=found["trial"],
+        seed=found["seed"],
+        outcome=found["outcome"],
+        ticks=found["ticks"],
+        why=found["error"] or found["reason"],
+    )
+
+
+def _known(values: Floats) -> Floats:
+    return values[~np.isnan(values)]
+
+
+def _percentile(values: Floats, percent: float) -> float | None:
+    """Between the two nearest, in proportion; None of none."""
+    return float(np.percentile(values, percent)) if len(values) else None

@@ -1,0 +1,56 @@
+"""`tandem sweep`: a campaign, on this machine or wherever a Dask scheduler has workers."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from compose.campaign import spec
+from compose.status import FAILED, LOCALISED, NOT_LOCALISED, STOPPED, UserError
+from compose.stop import stop_by_signal
+from protocol.inbox import Inbox
+
+if TYPE_CHECKING:
+    from compose.campaign.run import Results
+
+LAB = ("distributed", "matplotlib", "pyarrow", "tomli_w")
+
+
+def main(options: argparse.Namespace) -> int:
+    """Play the campaign, or what is left of it."""
+    campaign = spec.load(options.spec, trials=options.trials, seed=options.seed)
+    missing = [module for module in LAB if find_spec(module) is None]
+    if missing:
+        raise UserError(f"needs {', '.join(missing)}: install `tandem-ranging[lab]`")
+    inbox = Inbox("tandem sweep")
+    stop_by_signal(inbox)
+    from compose.campaign import figures, report, run  # noqa: PLC0415  # slow, and there may be no extra
+
+    out = options.out if options.out is not None else Path(f"sweep-{campaign.name}")
+    means = run.Means(scheduler=options.scheduler, processes=options.processes)
+    if options.workers is not None:
+        means = run.Means(workers=options.workers, processes=options.processes)
+    visible = sys.stdout.isatty() and not options.quiet
+    with report.progress(campaign.name, inbox.say, visible) as progress:
+        results = run.sweep(campaign, out, means, inbox, progress)
+    if results.stopped is not None:
+        inbox.say(
+            f"{results.stopped}: {len(results.table)} of {results.trials} trials are done; "
+            "the same command goes on from there"
+        )
+        return STOPPED if results.interrupted else FAILED
+    figures.draw(results, out / "figures")
+    report.show(results, out, quiet=options.quiet)
+    return _status(results)
+
+
+def _status(results: Results) -> int:
+    """As of a mission: localised only where all are; failed where any is."""
+    counts = [figures.failed for figures in results.figures.values()]
+    if any(counts):
+        return FAILED
+    localised = sum([figures.localised for figures in results.figures.values()])
+    return LOCALISED if localised == len(results.table) else NOT_LOCALISED
