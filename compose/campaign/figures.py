@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
 
 from compose.campaign.run import Results
 from compose.campaign.spec import Axis
@@ -28,6 +29,10 @@ STYLES = (
 """colour, line, marker: of different lightness, and told apart without colour too"""
 LOGARITHMIC = 20.0
 """an axis whose largest value is so many times its smallest"""
+FITTING = 60
+"""characters that stand side by side below an axis"""
+APART = 0.45
+"""of the room that a name has, for what stands beside each other there"""
 DPI = 160
 
 
@@ -73,7 +78,7 @@ def _success(results: Results, place: int) -> Figure:
         )
     axes.set_ylabel("localised, of all trials (95 % interval)")
     axes.set_ylim(top=min(1.02, axes.get_ylim()[1]))
-    _legend(axes, lines)
+    _legend(figure, axes)
     return figure
 
 
@@ -100,7 +105,9 @@ def _ticks(results: Results, place: int) -> Figure:
             np.array([getattr(figures, name) for _, figures in points], float)
             for name in ("ticks_p50", "ticks_p95", "ticks_max")
         )
-        axes.plot(where, middle, color=colour, ls=_joined(axis, style), marker=marker, ms=4, label=label)
+        axes.plot(
+            where, middle, color=colour, ls=_joined(axis, style), marker=marker, ms=4, label=label or "median"
+        )
         axes.vlines(where, middle, most, color=colour, lw=1.2)
         axes.plot(where, most, color=colour, ls="", marker="_", ms=7)
         axes.plot(where, top, color=colour, ls="", marker=marker, ms=4, mfc="white")
@@ -109,7 +116,9 @@ def _ticks(results: Results, place: int) -> Figure:
     axes.set_ylabel("ticks until localised (median)")
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter("{x:.0f}")
-    axes.legend(frameon=False, fontsize=8)
+    axes.yaxis.set_minor_formatter(LogFormatter(labelOnlyBase=False, minor_thresholds=(1.0, 0.4)))
+    axes.grid(axis="y", which="minor", lw=0.25, color="0.9")
+    _legend(figure, axes)
     return figure
 
 
@@ -118,14 +127,17 @@ def _meeting(results: Results) -> Figure:
     figure = Figure(figsize=(7.2, 3.4), layout="constrained")
     since_release, in_orbit = figure.subplots(1, 2, sharey=True)
     groups = _groups(results)
-    for (label, table), (colour, style, _) in zip(groups, STYLES, strict=False):
-        seconds = column(table, "meeting_tick") * column(table, "period_s")
-        for axes, values in ((since_release, seconds), (in_orbit, orbited_over_t_max(table))):
-            met = np.sort(values[~np.isnan(values)])
+    times = [
+        (column(table, "meeting_tick") * column(table, "period_s"), orbited_over_t_max(table))
+        for _, table in groups
+    ]
+    for k, axes in enumerate((since_release, in_orbit)):
+        known = [values[k][~np.isnan(values[k])] for values in times]
+        end = max([1.0, *[met.max() for met in known if len(met)]])
+        for (label, table), met, (colour, style, _) in zip(groups, known, STYLES, strict=False):
             share = np.arange(len(met) + 1) / max(1, len(table))
-            axes.step(
-                np.concatenate([[0.0], met]), share, where="post", color=colour, ls=style, lw=1.3, label=label
-            )
+            x, y = np.concatenate([[0.0], np.sort(met), [end]]), np.append(share, share[-1])
+            axes.step(x, y, where="post", color=colour, ls=style, lw=1.3, label=label)
     in_orbit.axvline(1.0, color="0.2", lw=1.0)
     in_orbit.annotate("$T_{max}$", (1.0, 0.02), xytext=(-3, 0), textcoords="offset points", ha="right")
     in_orbit.set_xlabel("from both in orbit to meeting, over $T_{max}$")
@@ -133,9 +145,7 @@ def _meeting(results: Results) -> Figure:
     since_release.set_ylabel("share of all trials")
     since_release.set_ylim(0.0, 1.02)
     if len(groups) > 1:
-        figure.legend(
-            *since_release.get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False
-        )
+        _legend(figure, since_release)
     return figure
 
 
@@ -197,7 +207,9 @@ def _of(results: Results, cells: set[int]) -> pa.Table:
 def _against(axis: Axis) -> tuple[Figure, Axes, list[float]]:
     """A picture with the values of an axis along it, and where they lie."""
     numbers = _numbers(axis)
-    figure = Figure(figsize=(7.2, 3.6), layout="constrained")
+    labels = [axis.label(i) for i in range(len(axis.values))]
+    crowded = numbers is None and sum(map(len, labels)) > FITTING
+    figure = Figure(figsize=(7.2, 5.0 if crowded else 3.6), layout="constrained")
     axes = figure.subplots()
     axes.set_xlabel(axis.name)
     axes.grid(axis="y", lw=0.4, color="0.85")
@@ -205,8 +217,6 @@ def _against(axis: Axis) -> tuple[Figure, Axes, list[float]]:
         if min(numbers) > 0.0 and max(numbers) >= LOGARITHMIC * min(numbers):
             axes.set_xscale("log")
         return figure, axes, numbers
-    labels = [axis.label(i) for i in range(len(axis.values))]
-    crowded = sum(map(len, labels)) > 60
     axes.set_xticks(
         range(len(labels)), labels, rotation=40 if crowded else 0, ha="right" if crowded else "center"
     )
@@ -231,9 +241,12 @@ def _joined(axis: Axis, style: Any) -> Any:
 
 def _aside(axis: Axis, i: int, lines: int) -> float:
     """How far beside a name the point of one of several lines stands."""
-    return 0.0 if _numbers(axis) is not None else 0.12 * (i - 0.5 * (lines - 1))
+    return 0.0 if _numbers(axis) is not None else APART / lines * (i - 0.5 * (lines - 1))
 
 
-def _legend(axes: Axes, lines: Sequence[tuple[str, object]]) -> None:
-    if len(lines) > 1:
-        axes.legend(frameon=False, fontsize=8)
+def _legend(figure: Figure, axes: Axes) -> None:
+    """Above, where it hides nothing; none where there is nothing to tell apart."""
+    handles, labels = axes.get_legend_handles_labels()
+    if any(labels):
+        columns = min(4, len(labels)) if max(map(len, labels)) < 24 else 1
+        figure.legend(handles, labels, loc="outside upper center", ncols=columns, frameon=False)

@@ -65,14 +65,14 @@ class Folder:
     def ask(self, refused: Mapping[int, str]) -> None:
         """Put down what is about to be played, and each cell's scenario."""
         self.refused = dict(refused)
+        asked = msgspec.json.encode(Asked(self.campaign, self.refused))
+        _write(self.path / CAMPAIGN, msgspec.json.format(asked, indent=2) + b"\n")
         (self.path / CELLS).mkdir(exist_ok=True)
         self._parts.mkdir(exist_ok=True)
         for cell in self.cells.values():
             comment = f"# Cell {cell.index} of {self.campaign.name}: {label(self.campaign, cell)}."
             text = f"{comment}\n{tomli_w.dumps(cell.table)}"
             _write(self.path / CELLS / cell.file_name, text.encode())
-        asked = msgspec.json.encode(Asked(self.campaign, self.refused), order="deterministic")
-        _write(self.path / CAMPAIGN, msgspec.json.format(asked, indent=2) + b"\n")
 
     def add(self, rows: Sequence[Row]) -> None:
         """Keep the rows of a chunk."""
