@@ -1,12 +1,8 @@
-"""Where chunks are played: on a cluster in this process, or wherever a scheduler of Dask's has workers.
-
-What a chunk holds, and who plays which, follows from how long trials take; what a trial is does not.
-"""
+"""Where chunks are played: on a cluster in this process, or wherever a scheduler of Dask's has workers."""
 
 from __future__ import annotations
 
 import logging
-import math
 import secrets
 import tempfile
 import time
@@ -17,66 +13,24 @@ from typing import Any
 import dask
 import msgspec
 from distributed import Client, Future, LocalCluster
+from distributed.comm import parse_address
+from distributed.comm.registry import get_backend
 
 from compose.campaign import owner
-from compose.campaign.cells import trial_seed
 from compose.campaign.trial import Row, lost
+from compose.campaign.work import EngineFailed, Orders, Work, chunks_of
 from compose.campaign.worker import MAX_ERROR, Chunk
-from compose.scenario import Setting
 from compose.status import UserError
 from protocol.inbox import Inbox, one_line
 
-CHUNK_S = 1.0
-"""what a chunk should last: long beside handing it out, short beside losing it"""
-MAX_CHUNK = 1000
-"""trials"""
-FIRST_CHUNK = 8
-"""trials, while nobody knows how long one takes; as processes one, which takes most of a second"""
 AHEAD = 2
 """chunks for each thread that plays them: one that it plays, one that waits"""
-CONNECT_S = 10.0
+CONNECT_S = 5.0
 LOOK_S = 1.0
 """how often to look how many threads there are"""
 RETRIES = 2
 """of a chunk on whose worker no process for trials came up"""
 LOOPBACK = "127.0.0.1:0"
-
-
-class EngineFailed(Exception):
-    """The campaign cannot go on; the text says why."""
-
-
-class Work(msgspec.Struct):
-    """What is left to do in a cell."""
-
-    cell: int
-    key: str
-    """of its seeds"""
-    setting: Setting
-    trials: range | list[int]
-    given: int = 0
-    """how many have been handed out"""
-    played: int = 0
-    played_s: float = 0.0
-    """s of wall time that those took"""
-
-    def size(self, threads: int, first: int) -> int:
-        """How many trials to hand out at once, so that near the end all threads have some."""
-        share = math.ceil((len(self.trials) - self.given) / (2 * threads))
-        if not self.played:
-            return min(first, share)
-        fitting = CHUNK_S * self.played / max(self.played_s, 1e-9)
-        return max(1, min(round(fitting), share, MAX_CHUNK))
-
-
-class Orders(msgspec.Struct, frozen=True):
-    """What holds for every trial of a campaign."""
-
-    seed: int
-    processes: bool
-    timeout: float
-    """s"""
-    play: str
 
 
 @contextmanager
@@ -86,6 +40,7 @@ def connect(workers: int, scheduler: str | None) -> Iterator[Client]:
     logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)  # what is to be said, we say
     if scheduler is not None:
         try:
+            get_backend(parse_address(scheduler)[0])
             client = Client(scheduler, timeout=CONNECT_S, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:
             why = one_line(str(error).splitlines()[0] if str(error) else type(error).__name__)
@@ -95,6 +50,7 @@ def connect(workers: int, scheduler: str | None) -> Iterator[Client]:
         return
     with (
         tempfile.TemporaryDirectory(prefix="tandem-dask-") as folder,
+        dask.config.set({"temporary-directory": folder}),
         LocalCluster(
             n_workers=1,
             threads_per_worker=workers,
@@ -102,7 +58,6 @@ def connect(workers: int, scheduler: str | None) -> Iterator[Client]:
             dashboard_address=LOOPBACK,
             worker_dashboard_address=LOOPBACK,
             memory_limit=0,
-            local_directory=folder,
             silence_logs=logging.CRITICAL + 1,
         ) as cluster,
         Client(cluster, set_as_default=False) as client,
@@ -122,7 +77,7 @@ def play(
     flying: dict[str, tuple[Future[Any], Chunk, Work]] = {}
     try:
         threads, looked = _threads(client), time.monotonic()
-        chunks = _chunks(work, orders, lambda: max(threads, 1))
+        chunks = chunks_of(work, orders, lambda: max(threads, 1))
         while True:
             while len(flying) < AHEAD * max(threads, 1) and (following := next(chunks, None)) is not None:
                 chunk, source = following
@@ -146,21 +101,6 @@ def play(
                 threads, looked = _threads(client), time.monotonic()
     finally:
         _leave(client, campaign, [future for future, _, _ in flying.values()])
-
-
-def _chunks(work: Sequence[Work], orders: Orders, threads: Callable[[], int]) -> Iterator[tuple[Chunk, Work]]:
-    for source in work:
-        while source.given < len(source.trials):
-            size = source.size(threads(), 1 if orders.processes else FIRST_CHUNK)
-            trials = tuple(source.trials[source.given : source.given + size])
-            source.given += size
-            seeds = tuple([trial_seed(orders.seed, source.key, trial) for trial in trials])
-            yield (
-                Chunk(
-                    source.cell, trials, seeds, source.setting, orders.processes, orders.timeout, orders.play
-                ),
-                source,
-            )
 
 
 def _rows(future: Future[Any], chunk: Chunk) -> list[Row]:

@@ -156,7 +156,7 @@ def _groups(results: Results) -> list[tuple[str, pa.Table]]:
     if len(played) <= len(STYLES):
         return [
             (
-                ", ".join([axis.label(i) for axis, i in zip(axes, cell.place, strict=True)]),
+                ", ".join([_named(axis, i) for axis, i in zip(axes, cell.place, strict=True)]),
                 _of(results, {cell.index}),
             )
             for cell in played
@@ -166,7 +166,7 @@ def _groups(results: Results) -> list[tuple[str, pa.Table]]:
         return [("all", results.table)]
     return [
         (label, table)
-        for i, label in enumerate(map(axes[place].label, range(len(axes[place].values))))
+        for i, label in enumerate([_named(axes[place], i) for i in range(len(axes[place].values))])
         if len(table := _of(results, {cell.index for cell in results.cells if cell.place[place] == i}))
     ]
 
@@ -176,7 +176,7 @@ def _lines(results: Results, place: int) -> Iterator[tuple[str, list[pa.Table]]]
     axes = results.campaign.axes
     apart = _told_apart(results, place)
     for i in range(len(axes[apart].values)) if apart is not None else (None,):
-        label = axes[apart].label(i) if apart is not None and i is not None else ""
+        label = _named(axes[apart], i) if apart is not None and i is not None else ""
         yield (
             label,
             [
@@ -198,6 +198,11 @@ def _told_apart(results: Results, place: int | None) -> int | None:
     axes = results.campaign.axes
     others = [i for i, axis in enumerate(axes) if i != place and 1 < len(axis.values) <= len(STYLES)]
     return min(others, key=lambda i: (not axes[i].paired, i), default=None)
+
+
+def _named(axis: Axis, i: int) -> str:
+    """A value of the axis, where it stands alone."""
+    return axis.label(i) if _numbers(axis) is None else f"{axis.name.rpartition('.')[2]} = {axis.label(i)}"
 
 
 def _of(results: Results, cells: set[int]) -> pa.Table:

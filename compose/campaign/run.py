@@ -10,12 +10,12 @@ from pathlib import Path
 import msgspec
 import pyarrow as pa
 
-from compose.campaign import engine
 from compose.campaign.cells import Cell, Refused, setting_of
 from compose.campaign.folder import Folder, opened
 from compose.campaign.spec import BadSpec, Campaign
 from compose.campaign.summary import Counted, counted, header, summary_csv
 from compose.campaign.trial import Row
+from compose.campaign.work import EngineFailed, Orders, Work
 from compose.campaign.worker import PLAY
 from protocol.inbox import Inbox, Interrupted
 
@@ -77,12 +77,12 @@ def sweep(campaign: Campaign, out: Path, means: Means, inbox: Inbox, progress: P
                 _play(folder, work, means, inbox, progress)
             except Interrupted as signal_name:
                 stopped, interrupted = f"stopped by {signal_name}", True
-            except engine.EngineFailed as error:
+            except EngineFailed as error:
                 stopped = str(error)
         return _gathered(folder, stopped, interrupted)
 
 
-def _left(folder: Folder, progress: Progress) -> list[engine.Work]:
+def _left(folder: Folder, progress: Progress) -> list[Work]:
     """What has to be played; only the settings of those cells are worked out."""
     campaign, refused = folder.campaign, dict(folder.refused)
     done = folder.done()
@@ -100,7 +100,7 @@ def _left(folder: Folder, progress: Progress) -> list[engine.Work]:
             refused[cell.index] = setting.reason
             count -= campaign.trials
         else:
-            work.append(engine.Work(cell.index, cell.key, setting, left))
+            work.append(Work(cell.index, cell.key, setting, left))
     if len(refused) == len(folder.cells):
         first, reason = next(iter(refused.items()))
         raise BadSpec(f"{campaign.source}: no cell can be played; cell {first}: {reason}")
@@ -111,12 +111,14 @@ def _left(folder: Folder, progress: Progress) -> list[engine.Work]:
     return work
 
 
-def _play(folder: Folder, work: list[engine.Work], means: Means, inbox: Inbox, progress: Progress) -> None:
-    orders = engine.Orders(folder.campaign.seed, means.processes, folder.campaign.trial_timeout, means.play)
+def _play(folder: Folder, work: list[Work], means: Means, inbox: Inbox, progress: Progress) -> None:
+    orders = Orders(folder.campaign.seed, means.processes, folder.campaign.trial_timeout, means.play)
 
     def keep(rows: list[Row]) -> None:
         folder.add(rows)
         progress.done(len(rows))
+
+    from compose.campaign import engine  # noqa: PLC0415  # Dask takes a second
 
     with engine.connect(means.workers, means.scheduler) as client:
         engine.play(client, work, orders, inbox, keep)

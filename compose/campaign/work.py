@@ -1,0 +1,77 @@
+"""What is left to do in a campaign, and how it is cut into chunks.
+
+What a chunk holds, and who plays which, follows from how long trials take; what a trial is does not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+
+import msgspec
+
+from compose.campaign.cells import trial_seed
+from compose.campaign.worker import Chunk
+from compose.scenario import Setting
+
+CHUNK_S = 1.0
+"""what a chunk should last: long beside handing it out, short beside losing it"""
+MAX_CHUNK = 1000
+"""trials"""
+FIRST_CHUNK = 8
+"""trials, while nobody knows how long one takes; as processes one, which takes most of a second"""
+
+
+class EngineFailed(Exception):
+    """The campaign cannot go on; the text says why."""
+
+
+class Work(msgspec.Struct):
+    """What is left to do in a cell."""
+
+    cell: int
+    key: str
+    """of its seeds"""
+    setting: Setting
+    trials: range | list[int]
+    given: int = 0
+    """how many have been handed out"""
+    played: int = 0
+    played_s: float = 0.0
+    """s of wall time that those took"""
+
+    def size(self, threads: int, first: int) -> int:
+        """How many trials to hand out at once, so that near the end all threads have some."""
+        share = math.ceil((len(self.trials) - self.given) / (2 * threads))
+        if not self.played:
+            return min(first, share)
+        fitting = CHUNK_S * self.played / max(self.played_s, 1e-9)
+        return max(1, min(round(fitting), share, MAX_CHUNK))
+
+
+class Orders(msgspec.Struct, frozen=True):
+    """What holds for every trial of a campaign."""
+
+    seed: int
+    processes: bool
+    timeout: float
+    """s"""
+    play: str
+
+
+def chunks_of(
+    work: Sequence[Work], orders: Orders, threads: Callable[[], int]
+) -> Iterator[tuple[Chunk, Work]]:
+    """All of it, each chunk as large as fits when it is asked for."""
+    for source in work:
+        while source.given < len(source.trials):
+            size = source.size(threads(), 1 if orders.processes else FIRST_CHUNK)
+            trials = tuple(source.trials[source.given : source.given + size])
+            source.given += size
+            seeds = tuple([trial_seed(orders.seed, source.key, trial) for trial in trials])
+            yield (
+                Chunk(
+                    source.cell, trials, seeds, source.setting, orders.processes, orders.timeout, orders.play
+                ),
+                source,
+            )

@@ -1,0 +1,45 @@
+"""Trials that go wrong, and a campaign of them: `python -m tests.misbehaving FUNCTION SPEC OUT`."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from pathlib import Path
+
+from compose.campaign import run, spec, trial
+from compose.stop import stop_by_signal
+from protocol.inbox import Inbox
+
+
+def astray(one: trial.Trial) -> trial.Row:
+    """The second trial raises, the fourth ends its process, the sixth never ends; others are as they are."""
+    match one.number:
+        case 1:
+            raise ValueError("two\nlines")
+        case 3:
+            os._exit(3)
+        case 5:
+            threading.Event().wait()
+    return trial.play(one)
+
+
+def endless(one: trial.Trial) -> trial.Row:
+    """From the fourth trial on, none ends."""
+    if one.number >= 3:
+        threading.Event().wait()
+    return trial.play(one)
+
+
+def main(function: str, source: str, out: str) -> None:
+    """Play the campaign so on two workers, as `tandem sweep` does."""
+    inbox = Inbox("misbehaving")
+    stop_by_signal(inbox)
+    means = run.Means(workers=2, play=f"tests.misbehaving:{function}")
+    silent = run.Progress(say=print, begin=lambda *_: None, done=lambda _: None)
+    results = run.sweep(spec.load(source), Path(out), means, inbox, silent)
+    print(f"{len(results.table)} rows, {results.stopped}")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

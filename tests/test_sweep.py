@@ -1,0 +1,502 @@
+"""A campaign's rows depend on what was asked, and not on who plays them or what goes wrong meanwhile."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from signal import SIGINT, SIGKILL, SIGTERM, Signals
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+from scipy.stats import binomtest  # type: ignore[import-untyped]
+
+from compose.campaign import spec
+from compose.campaign.cells import Refused, cells, setting_of, trial_seed
+from compose.campaign.owner import Child
+from compose.campaign.summary import wilson
+from compose.campaign.worker import READY
+from tests.commands import PAPER_1, Command, Ended, tandem, until
+
+HOUSE = Path(__file__).parents[1]
+RANDOM = PAPER_1.replace("start", "# start")
+"""its starts are drawn"""
+BOTH = """
+name = "both"
+scenario = "base.toml"
+trials = 12
+seed = 5
+[[axis]]
+field = "robot.b.anchor[0]"
+values = [10.0, 8]
+[[axis]]
+field = "planner.variant"
+values = ["paper", "assured"]
+paired = true
+"""
+LENGTHY = BOTH.replace("[10.0, 8]", "[60.0]").replace("trials = 12", "trials = 40")
+"""some seconds of it"""
+ASTRAY = 'name = "astray"\nscenario = "base.toml"\ntrials = 8\ntrial_timeout = 1.5\n'
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Every temporary folder is in tmp_path, so the processes of a test are known by their arguments."""
+    folder = tmp_path / "tmp"
+    folder.mkdir()
+    monkeypatch.setenv("TMPDIR", str(folder))
+    yield
+    until(lambda: not trial_processes(tmp_path), "no process for trials is left")
+    assert list(folder.iterdir()) == []
+
+
+def trial_processes(tmp_path: Path) -> list[int]:
+    return [
+        pid
+        for pid in map(int, filter(str.isdigit, os.listdir("/proc")))
+        if (words := said_by(pid))
+        and "compose.campaign.worker" in words
+        and words[-2].startswith(f"{tmp_path}/")
+    ]
+
+
+def said_by(pid: int) -> list[str]:
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes().decode().split("\0")
+    except OSError:  # ended meanwhile
+        return []
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """With base.toml, both.toml, lengthy.toml and astray.toml."""
+    (tmp_path / "base.toml").write_text(RANDOM)
+    for name, text in (("both", BOTH), ("lengthy", LENGTHY), ("astray", ASTRAY)):
+        (tmp_path / f"{name}.toml").write_text(text)
+    return tmp_path
+
+
+def rows(out: Path) -> list[dict[str, Any]]:
+    """All of them, but for their wall times."""
+    return [
+        {name: value for name, value in row.items() if name != "wall_s"}
+        for row in pq.read_table(out / "trials.parquet").to_pylist()
+    ]
+
+
+def summary_rows(out: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader((out / "summary.csv").read_text().splitlines()))
+
+
+def sweep(folder: Path, spec: str, out: str, *arguments: str) -> Ended:
+    return tandem("sweep", spec, "--out", out, *arguments, cwd=folder)
+
+
+def parts(out: Path) -> int:
+    return len(list(out.glob("parts/*.parquet")))
+
+
+# --- who plays it is all the same ---------------------------------------------------------------------
+
+
+def test_rows_are_the_same_on_one_worker_and_on_two(folder: Path) -> None:
+    assert sweep(folder, "both.toml", "one", "--workers", "1").status == 1
+    assert sweep(folder, "both.toml", "two", "--workers", "2").status == 1
+    found = rows(folder / "one")
+    assert [(row["cell"], row["trial"]) for row in found] == [(i, k) for i in range(4) for k in range(12)]
+    assert found == rows(folder / "two")
+    for file in ("summary.csv", "campaign.json", "cells/003.toml"):
+        assert (folder / "one" / file).read_bytes() == (folder / "two" / file).read_bytes()
+    assert len({row["seed"] for row in found}) == 24
+    assert [row["seed"] for row in found[:12]] == [row["seed"] for row in found[12:24]], "paired"
+
+
+def test_rows_are_the_same_as_processes_over_zenoh(folder: Path) -> None:
+    assert sweep(folder, "both.toml", "inline", "--trials", "1").status in (0, 1)
+    assert sweep(folder, "both.toml", "zenoh", "--trials", "1", "--processes").status in (0, 1)
+    assert rows(folder / "zenoh") == rows(folder / "inline")
+
+
+def dask(stack: ExitStack, module: str, *arguments: str | Path, cwd: Path) -> subprocess.Popen[bytes]:
+    """A part of a cluster that somebody started by hand."""
+    process = subprocess.Popen(
+        [sys.executable, "-P", "-W", "ignore", "-m", f"distributed.cli.{module}", *map(str, arguments)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        cwd=cwd,
+    )
+    stack.callback(process.wait)
+    stack.callback(process.kill)
+    return process
+
+
+def test_rows_are_the_same_by_a_scheduler_and_workers_started_by_hand_even_if_one_is_lost(
+    folder: Path,
+) -> None:
+    assert sweep(folder, "lengthy.toml", "here").status == 1
+    with ExitStack() as stack:
+        file = folder / "scheduler.json"
+        arguments = ("--host", "127.0.0.1", "--no-dashboard")
+        dask(stack, "dask_scheduler", "--port", "0", "--scheduler-file", file, *arguments, cwd=folder)
+        until(lambda: file.exists() and file.read_text().endswith("}"), "the scheduler listens")
+        address = json.loads(file.read_text())["address"]
+        workers = [
+            dask(stack, "dask_worker", address, "--nthreads", "1", "--no-nanny", *arguments, cwd=folder)
+            for _ in range(2)
+        ]
+        with Command(
+            "sweep", "lengthy.toml", "--out", "there", "--scheduler", address, cwd=folder
+        ) as command:
+            command.until(lambda: parts(folder / "there") >= 2, "two chunks are done")
+            workers[0].kill()
+            assert command.ended().status == 1
+        until(lambda: not trial_processes(folder), "the workers keep no process of a campaign that is over")
+        for worker in workers[1:]:
+            worker.terminate()
+            worker.wait(20.0)
+    assert rows(folder / "there") == rows(folder / "here")
+
+
+def test_a_scheduler_that_is_not_there_is_one_line(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT", "1s")
+    for address in ("tcp://127.0.0.1:9", "nonsense://x"):
+        ended = sweep(folder, "both.toml", "out", "--scheduler", address)
+        assert ended.status == 2
+        assert re.fullmatch(rf"tandem sweep: --scheduler: {address} cannot be reached: [^\n]+\n", ended.err)
+
+
+def test_a_seed_follows_from_the_campaign_the_cell_and_the_trial(folder: Path) -> None:
+    def seeds(text: str) -> dict[tuple[str, ...], int]:
+        (folder / "x.toml").write_text(text)
+        campaign = spec.load(str(folder / "x.toml"))
+        return {tuple(map(str, cell.fields.values())): trial_seed(5, cell.key, 0) for cell in cells(campaign)}
+
+    before = seeds(BOTH)
+    assert trial_seed(5, '{"robot.b.anchor[0]":10}', 0) == before["10.0", "paper"] == 1
+    more = seeds(BOTH.replace("[10.0, 8]", "[1.5, 8, 10]"))
+    assert more["10", "assured"] == before["10.0", "assured"], "cells beside it, and how numbers are written"
+    assert more["8", "paper"] == before["8", "paper"] != before["10.0", "paper"]
+    unpaired = seeds(BOTH.replace("paired = true", ""))
+    assert len(set(unpaired.values())) == 4
+    assert len(set(before.values())) == 2
+    assert trial_seed(6, "{}", 0) != trial_seed(5, "{}", 0) != trial_seed(5, "{}", 1)
+    assert all(0 <= trial_seed(5, "{}", k) < 2**63 for k in range(100))
+
+
+# --- what goes wrong ----------------------------------------------------------------------------------
+
+
+def misbehaving(function: str, source: str, folder: Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "tests.misbehaving", function, str(folder / source), str(folder / "out")],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=HOUSE,
+        env=os.environ | {"PYTHONPATH": str(HOUSE)},
+        start_new_session=True,
+    )
+
+
+def test_trials_that_raise_die_or_hang_are_rows_and_the_others_go_on(folder: Path) -> None:
+    assert sweep(folder, "astray.toml", "well").status == 1
+    with misbehaving("astray", "astray.toml", folder) as process:
+        assert process.communicate(timeout=60.0) == ("8 rows, None\n", "")
+    found, expected = rows(folder / "out"), rows(folder / "well")
+    errors = {row["trial"]: row["error"] for row in found if row["error"] is not None}
+    assert errors == {
+        1: "ValueError: two\\nlines",
+        3: "died: exit status 3",
+        5: "hung: no answer within 1.5 s",
+    }
+    assert {row["outcome"] for row in found if row["error"] is not None} == {"failed"}
+    assert [row["seed"] for row in found] == [row["seed"] for row in expected]
+    assert [row for row in found if row["error"] is None] == [
+        row for row in expected if row["trial"] not in errors
+    ]
+    summary = summary_rows(folder / "out")[0]
+    assert (summary["trials"], summary["failed"]) == ("8", "3")
+    again = sweep(folder, "astray.toml", "out")
+    assert again.status == 3
+    assert "trial 1 of cell 0, failed (ValueError: two\\nlines)" in again.out
+
+
+def test_a_campaign_that_is_killed_twice_goes_on_where_it_was(folder: Path) -> None:
+    out = folder / "killed"
+    for already in (0, 1):
+        with Command("sweep", "lengthy.toml", "--out", "killed", cwd=folder) as command:
+            was = parts(out)
+            assert was >= already
+            command.until(lambda: parts(out) > was, "a chunk is done")  # noqa: B023  # within the round
+            command.tell(SIGKILL)
+            assert command.ended().status == -SIGKILL
+        until(lambda: not trial_processes(folder), "the trials' processes end with their owner")
+        assert not (out / "trials.parquet").exists()
+    for folder_left in (folder / "tmp").glob("tandem-dask-*"):  # nobody was left to remove it
+        for path in sorted(folder_left.rglob("*"), reverse=True):
+            path.rmdir() if path.is_dir() else path.unlink()
+        folder_left.rmdir()
+    done = parts(out)
+    (out / "parts" / "00000-99999999.parquet").write_bytes(b"torn")
+    ended = sweep(folder, "lengthy.toml", "killed")
+    assert ended.status == 1
+    assert ended.err.count("cannot be read: its trials are played again\n") == 1
+    assert done > 1
+    assert parts(out) == 0
+    assert sweep(folder, "lengthy.toml", "straight").status == 1
+    assert rows(out) == rows(folder / "straight")
+
+
+@pytest.mark.parametrize("number", [SIGINT, SIGTERM])
+def test_ctrl_c_leaves_what_is_done_and_no_process(number: Signals, folder: Path) -> None:
+    with misbehaving("endless", "both.toml", folder) as process:
+        until(lambda: parts(folder / "out") == 0 and len(trial_processes(folder)) == 2, "trials are played")
+        os.killpg(process.pid, number)
+        said = process.communicate(timeout=30.0)
+    assert said == (f"0 rows, stopped by {number.name}\n", "")
+
+
+def test_a_stopped_campaign_says_so_in_one_line_and_goes_on(folder: Path) -> None:
+    with Command("sweep", "lengthy.toml", "--out", "out", "--workers", "1", cwd=folder) as command:
+        command.until(lambda: parts(folder / "out"), "a chunk is done")
+        command.tell(SIGINT)
+        ended = command.ended()
+    assert ended.status == 130
+    assert ended.out == ""
+    said = re.fullmatch(r"tandem sweep: stopped by SIGINT: (\d+) of 80 trials are done; [^\n]+\n", ended.err)
+    assert said is not None, ended.err
+    found = rows(folder / "out")
+    assert 0 < int(said[1]) == len(found) < 80
+    assert trial_processes(folder) == []
+    assert sweep(folder, "lengthy.toml", "out").status == 1
+    finished = rows(folder / "out")
+    assert len(finished) == 80
+    assert all(row in finished for row in found)
+
+
+def test_a_process_for_trials_ends_with_its_owner_and_keeps_its_answers_to_itself() -> None:
+    child = Child()
+    try:
+        assert child.answer(60.0) == READY
+    finally:
+        child.close()
+
+
+# --- a campaign's folder ------------------------------------------------------------------------------
+
+
+def test_more_trials_extend_a_campaign_and_fewer_leave_it(folder: Path) -> None:
+    assert sweep(folder, "both.toml", "grown", "--trials", "3").status in (0, 1)
+    assert sweep(folder, "both.toml", "grown").status == 1
+    assert sweep(folder, "both.toml", "grown", "--trials", "3").status == 1
+    assert sweep(folder, "both.toml", "whole").status == 1
+    assert rows(folder / "grown") == rows(folder / "whole")
+
+
+def test_a_folder_of_another_campaign_is_refused(folder: Path) -> None:
+    assert sweep(folder, "both.toml", "out", "--trials", "1").status in (0, 1)
+    before = rows(folder / "out")
+    for was, new, says in (
+        ("seed = 5", "seed = 6", "seed is 5 there and 6 here"),
+        ("[10.0, 8]", "[10.0, 9]", "axis[0].values[1][0] is 8 there and 9 here"),
+        ("base.toml", "other.toml", "scenario.mission.period is 1 there and 0.5 here"),
+    ):
+        (folder / "other.toml").write_text(RANDOM.replace("period = 1.0", "period = 0.5"))
+        (folder / "both.toml").write_text(BOTH.replace(was, new))
+        ended = sweep(folder, "both.toml", "out")
+        assert ended == (
+            2,
+            "",
+            f"tandem sweep: --out: out holds another campaign: {says}; choose another folder\n",
+        )
+    assert rows(folder / "out") == before
+
+
+def test_a_folder_in_use_is_refused(folder: Path) -> None:
+    with misbehaving("endless", "both.toml", folder) as process:
+        until(lambda: trial_processes(folder), "trials are played")
+        assert sweep(folder, "both.toml", "out") == (
+            2,
+            "",
+            "tandem sweep: --out: out is in use by another sweep\n",
+        )
+        os.killpg(process.pid, SIGTERM)
+        process.communicate(timeout=30.0)
+
+
+def test_results_are_left_in_a_folder_named_for_the_campaign(folder: Path) -> None:
+    ended = tandem("sweep", "both.toml", "--trials", "2", cwd=folder)
+    out = folder / "sweep-both"
+    figures = {path.name: path.stat().st_size for path in (out / "figures").iterdir()}
+    assert set(figures) == {
+        f"{name}.{kind}"
+        for kind in ("svg", "png")
+        for name in (
+            *("success-robot-b-anchor-0", "success-planner-variant", "meeting"),
+            *("ticks-robot-b-anchor-0", "ticks-planner-variant"),
+        )
+    }
+    assert min(figures.values()) > 5_000
+    assert {path.name for path in out.iterdir()} == {
+        *("campaign.json", "cells", "figures", "summary.csv", "trials.parquet")
+    }
+    summary = summary_rows(out)
+    assert [row["trials"] for row in summary] == ["2"] * 4
+    assert list(summary[0])[:9] == [
+        *("cell", "robot.b.anchor[0]", "planner.variant"),
+        *("trials", "localised", "undecided", "alarm", "wrong", "failed"),
+    ]
+    assert ended.out.splitlines()[-1] == "results: sweep-both"
+
+
+def test_the_command_that_the_table_prints_plays_the_trial_again(folder: Path) -> None:
+    ended = sweep(folder, "both.toml", "out")
+    command = shlex.split(next(line for line in ended.out.splitlines() if line.startswith("  tandem run ")))
+    assert command[0] == "tandem"
+    tandem(*command[1:], cwd=folder)
+    summary = json.loads((folder / "record" / "summary.json").read_text())
+    cell = int(Path(command[2]).stem)
+    row = next(row for row in rows(folder / "out") if (row["cell"], row["seed"]) == (cell, summary["seed"]))
+    for name in ("outcome", "reason", "ticks", "first_contact_tick", "t_max_s"):
+        assert row[name] == summary[name]
+    for robot in ("a", "b"):
+        said = summary["robots"][robot]
+        for name in ("branch", "alpha", "position_error_m", "heading_error_rad"):
+            assert row[f"{robot}_{name}"] == said[name]
+    assert row["bytes_sent"] == sum(robot["bytes_sent"] for robot in summary["robots"].values())
+
+
+def test_a_setting_in_which_nobody_can_meet_is_a_refused_cell(folder: Path) -> None:
+    text = BOTH.replace(
+        '"robot.b.anchor[0]"\nvalues = [10.0, 8]', '"mission.max_speed"\nvalues = [1.0, 1e-6]'
+    )
+    (folder / "slow.toml").write_text(text.replace("trials = 12", "trials = 2"))
+    ended = sweep(folder, "slow.toml", "out")
+    assert ended.status in (0, 1)
+    assert "cell 2 cannot be played: mission: to meet could take " in ended.out
+    summary = summary_rows(folder / "out")
+    assert [row["trials"] for row in summary] == ["2", "2", "0", "0"]
+    assert [bool(row["refused"]) for row in summary] == [False, False, True, True]
+    (folder / "slow.toml").write_text(text.replace("[1.0, 1e-6]", "[1e-6]"))
+    none = sweep(folder, "slow.toml", "none")
+    assert none.status == 2
+    assert none.err.startswith(
+        "tandem sweep: slow.toml: no cell can be played; cell 0: mission: to meet could"
+    )
+    assert not (folder / "none").exists()
+
+
+@pytest.mark.parametrize(("k", "n"), [(0, 1), (1, 1), (3, 10), (9990, 10_000), (0, 500), (500, 500)])
+def test_a_rate_s_interval_is_wilson_s(k: int, n: int) -> None:
+    interval = binomtest(k, n).proportion_ci(method="wilson")
+    assert wilson(k, n) == pytest.approx((interval.low, interval.high), abs=1e-12)
+
+
+@pytest.mark.parametrize("name", sorted(spec.shipped()))
+def test_a_campaign_that_ships_can_be_played(name: str) -> None:
+    campaign = spec.load(name)
+    for cell in cells(campaign):
+        setting = setting_of(campaign, cell)
+        assert isinstance(setting, Refused) or setting.scenario.name == "random"
+    assert f"{name:10} " in tandem("scenarios").out
+
+
+# --- a mistake in the spec ----------------------------------------------------------------------------
+
+AXIS = 'field = "robot.b.anchor[0]"\nvalues = [10.0, 8]'
+JOINT = 'name = "both"\nfields = ["mission.period", "mission.max_speed"]\nvalues = [[1.0, 1.0], [0.5, 1.0]]'
+
+
+def axis(text: str) -> Callable[[str], str]:
+    return lambda spec: spec.replace(AXIS, text)
+
+
+@pytest.mark.parametrize(
+    ("was", "new", "says"),
+    [
+        ('name = "both"', "name = 1", "name: expected"),
+        ('name = "both"', 'name = "a b"', "name: no name"),
+        ("trials = 12", "", "missing field 'trials'"),
+        ("trials = 12", "trials = 0", "trials: "),
+        ("trials = 12", 'trials = "12"', "trials: "),
+        ("trials = 12", "trails = 12", "unknown field 'trails'"),
+        ("seed = 5", "seed = -1", "seed: "),
+        ("seed = 5", "trial_timeout = 0", "trial_timeout: "),
+        ("base.toml", "absent.toml", "scenario: 'absent.toml' is neither"),
+        ("base.toml", "both.toml/x", "scenario: "),
+        ("name", "name = ", "not TOML"),
+        ("paired = true", "paird = true", "axis[1]: unknown field 'paird'"),
+        (
+            "robot.b.anchor[0]",
+            "robot.b.anker",
+            "axis[0].field: 'robot.b.anker': robot[1] has no field 'anker'",
+        ),
+        (
+            "robot.b.anchor[0]",
+            "robot.c.anchor",
+            "axis[0].field: 'robot.c.anchor': the base scenario has no robot",
+        ),
+        (
+            "robot.b.anchor[0]",
+            "robot[2].anchor",
+            "axis[0].field: 'robot[2].anchor': the base scenario has no",
+        ),
+        ("robot.b.anchor[0]", "robot..anchor", "axis[0].field: 'robot..anchor': no path"),
+        (
+            "robot.b.anchor[0]",
+            "mission.period.x",
+            "axis[0].field: 'mission.period.x': mission.period is a single",
+        ),
+        ("robot.b.anchor[0]", "seed", "axis[0].field: 'seed': every trial has a seed of its own"),
+        ("robot.b.anchor[0]", "planner", "axis[1]: 'planner.variant' is set by axis[0] ('planner') already"),
+        ("robot.b.anchor[0]", "planner.variant", "axis[1]: another axis is called 'planner.variant'"),
+        ("[10.0, 8]", "[]", "axis[0].values: "),
+        ("[10.0, 8]", "[8, 8.0]", "axis[0].values[1]: the same as values[0]"),
+        ("[10.0, 8]", "[8, 1979-05-27]", "axis[0].values[1]: not a number"),
+        ("[10.0, 8]", "[8, nan]", "axis[0].values[1]: not a number"),
+        (
+            "[10.0, 8]",
+            '[8, "x"]',
+            "cell 2 (robot.b.anchor[0] = x; planner.variant = paper): robot[1].anchor[0]: ",
+        ),
+        ("[10.0, 8]", "[8, 0]", "cell 2 (robot.b.anchor[0] = 0; planner.variant = paper): robot[1].anchor: "),
+        ('field = "robot.b.anchor[0]"', "", "axis[0]: names one 'field', or a 'name'"),
+        (AXIS, AXIS + '\nlabels = ["x", "y"]', "axis[0].name: missing"),
+        (AXIS, AXIS + '\nname = "D"\nlabels = ["x", "x"]', "axis[0].labels: not 2 different ones"),
+        (AXIS, AXIS + '\nname = "rate"\nlabels = ["x", "y"]', "axis: 2 columns would be called 'rate'"),
+        (AXIS, JOINT.replace('name = "both"', ""), "axis[0].name: missing"),
+        (AXIS, JOINT.replace("[0.5, 1.0]", "[0.5]"), "axis[0].values[1]: not a list of 2 values"),
+        (
+            AXIS,
+            JOINT.replace("mission.period", "mission.perod"),
+            "axis[0].fields[0]: 'mission.perod': mission has no",
+        ),
+    ],
+)
+def test_a_mistake_in_a_spec_is_one_line_that_names_the_field(
+    was: str, new: str, says: str, folder: Path
+) -> None:
+    assert was in BOTH
+    (folder / "bad.toml").write_text(BOTH.replace(was, new, 1))
+    ended = sweep(folder, "bad.toml", "out")
+    assert ended.status == 2
+    assert ended.out == ""
+    assert re.fullmatch(r"tandem sweep: bad\.toml: [^\n]+\n", ended.err), ended.err
+    assert f"bad.toml: {says}" in ended.err
+    assert not (folder / "out").exists()
+
+
+def test_a_spec_that_is_not_there_is_named() -> None:
+    ended = tandem("sweep", "nowhere")
+    assert ended.status == 2
+    assert ended.err.startswith(
+        "tandem sweep: nowhere: neither a file nor a campaign that ships (any-start, "
+    )
