@@ -257,6 +257,8 @@ def loaded_by(module: str) -> set[str]:
         ("world.process", {"numpy", "scipy", "rich", "agent", "compose"}),
         ("agent.planner", {"zenoh", "scipy", "rich", "world", "compose"}),
         ("compose.inline", {"zenoh", "rich"}),
+        ("compose.campaign.worker", {"zenoh", "rich", "distributed", "dask", "pyarrow", "matplotlib"}),
+        ("compose.commands.sweep", {"zenoh", "rich", "distributed", "dask", "pyarrow", "matplotlib"}),
     ],
 )
 def test_a_process_does_not_import_what_it_does_not_use(module: str, absent: set[str]) -> None:

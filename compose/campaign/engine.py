@@ -13,7 +13,7 @@ from typing import Any
 import dask
 import msgspec
 from distributed import Client, Future, LocalCluster
-from distributed.comm import parse_address
+from distributed.comm.addressing import parse_address
 from distributed.comm.registry import get_backend
 
 from compose.campaign import owner
