@@ -13,7 +13,7 @@ from compose.status import ENDED
 def main(_options: argparse.Namespace) -> int:
     """List the scenarios and the campaigns that ship, with the first line of each."""
     _list(shipped())
-    print("\ncampaigns, for `tandem sweep`:")
+    print("campaigns, for `tandem sweep`:")
     _list(shipped("sweeps"))
     return ENDED
 
