@@ -189,7 +189,7 @@ def first_contact(record: Record) -> int | None:
     """The first tick at which two peers were in range of each other."""
     pairs, reach = record.scenario.pairs(), record.scenario.mission.sensing_range
     for moment in record.moments:
-        for rho in mutual_ranges(moment.truth.poses, pairs, reach):
+        for rho in mutual_ranges(moment.truth, pairs, reach):
             if rho is not None:
                 return moment.truth.tick
     return None

@@ -17,7 +17,7 @@ from msgspec import Meta
 
 from compose.status import UserError
 from protocol.messages import Briefing
-from protocol.mission import Anchor, Mission, Role, Variant
+from protocol.mission import Anchor, Mission, Role, Variant, obstacle
 from protocol.motion import TAU, Pose
 from protocol.rendezvous import Rendezvous, rendezvous, tick_budget
 from protocol.units import NAME, RobotId
@@ -225,10 +225,13 @@ def _plan(file: ScenarioFile, first: int, second: int, source: str) -> Rendezvou
     """How the two are to meet."""
     distance = math.dist(file.robot[first].anchor, file.robot[second].anchor)
     if distance < NEAREST_ANCHORS:
-        raise BadScenario(
+        raise Unworkable(
             f"{source}: robot[{second}].anchor: less than {NEAREST_ANCHORS:g} m from that of its peer "
             f"'{file.robot[first].id}'"
         )
+    why = obstacle(file.mission, distance)
+    if why is not None:
+        raise Unworkable(f"{source}: mission: {why}")
     return rendezvous(file.mission, distance, file.planner.variant)
 
 

@@ -35,16 +35,15 @@ FINE = (8192, 128)
 """phases of a and of b: a's are the finer since a moves; b's hold those nearest to M1 and farthest from it"""
 COARSE = (120, 120)
 ROUNDING = 1e-9
-"""s, m and rad"""
+"""s, m and rad: more than sums of this size lose"""
 
 Array = NDArray[np.float64]
 
-distances = st.floats(1.0, 40.0)
-ratios = st.floats(0.1, 1.5)
-"""R / D"""
-periods = st.floats(0.05, 1.0)
-speeds = st.floats(0.3, 5.0)
-turn_rates = st.floats(0.2, math.pi)
+
+def drawn(least: float, most: float) -> st.SearchStrategy[Setting]:
+    """Settings of all kinds, with R / D from `least` to `most`."""
+    ranges = st.floats(least, most), st.floats(0.05, 1.0), st.floats(0.3, 5.0), st.floats(0.2, math.pi)
+    return st.tuples(st.floats(1.0, 40.0), *ranges).map(lambda of: (of[0], of[0] * of[1], *of[2:]))
 
 
 def mission_of(setting: Setting) -> Mission:
@@ -94,14 +93,11 @@ def test_they_meet_within_the_bound_from_all_phases_and_no_sooner_from_some(sett
     assert longest >= plan.bound - period - ROUNDING
 
 
-@given(distances, ratios, periods, speeds, turn_rates)
-def test_the_bound_holds_in_every_setting(
-    distance: float, ratio: float, period: float, speed: float, turn_rate: float
-) -> None:
-    setting = (distance, ratio * distance, period, speed, turn_rate)
-    plan = rendezvous(mission_of(setting), distance, "assured")
+@given(drawn(0.1, 1.5))
+def test_the_bound_holds_in_every_setting(setting: Setting) -> None:
+    plan = rendezvous(mission_of(setting), setting[0], "assured")
     assume(plan.bound > 0.0)
-    assert np.max(meeting(setting, plan.a, plan.b, (240, 24))) * period <= plan.bound + ROUNDING
+    assert np.max(meeting(setting, plan.a, plan.b, (240, 24))) * setting[2] <= plan.bound + ROUNDING
 
 
 def papers(setting: Setting) -> tuple[Orbit, Orbit]:
@@ -136,16 +132,53 @@ def test_they_meet_sooner_than_on_the_papers_orbits(setting: Setting) -> None:
 # --- where they are always in range -------------------------------------------------------------------
 
 
-@given(distances, st.floats(1.0, 1.5), periods, speeds, turn_rates)
-@example(*ALWAYS_IN_RANGE[0])
-@example(*ALWAYS_IN_RANGE[-1])
-def test_where_they_are_in_range_wherever_they_wait_both_wait(
-    distance: float, ratio: float, period: float, speed: float, turn_rate: float
-) -> None:
-    reach = ratio * distance if ratio <= 1.5 else ratio
-    waiting = WAITING_PLACE * reach
-    assume(distance + waiting < reach - 2.0 * RANGE_MARGIN)
-    plan = rendezvous(Mission(reach, period, speed, turn_rate), distance, "assured")
+@given(drawn(1.1, 1.5))
+@example(ALWAYS_IN_RANGE[0])
+@example(ALWAYS_IN_RANGE[1])
+@example(ALWAYS_IN_RANGE[2])
+@example(ALWAYS_IN_RANGE[3])
+def test_where_they_are_in_range_wherever_they_wait_both_wait(setting: Setting) -> None:
+    distance, reach, *_ = setting
+    assume(distance + WAITING_PLACE * reach < reach - 2.0 * RANGE_MARGIN)
+    plan = rendezvous(mission_of(setting), distance, "assured")
     assert plan.bound == plan.a.v == plan.a.omega == plan.b.v == plan.b.omega == 0.0
     assert plan.a.radius > 0.0
-    assert np.max(apart(distance, plan.a, *_with(plan.b, (48, 48)))) <= reach
+    assert np.max(apart(distance, plan.a, pairs(COARSE)[0], plan.b, pairs(COARSE)[1])) <= reach
+
+
+# --- what the orbits keep to --------------------------------------------------------------------------
+
+
+@given(drawn(0.1, 1.5))
+def test_b_waits_near_its_anchor_and_a_orbits_within_what_it_can_drive(setting: Setting) -> None:
+    distance, reach, _, speed, turn_rate = setting
+    plan = rendezvous(mission_of(setting), distance, "assured")
+    assert plan.b == Orbit(reach / 8.0, 0.0, 0.0)
+    assert 0.0 <= plan.a.v <= speed * (1.0 + 1e-12)
+    assert 0.0 <= plan.a.omega <= turn_rate
+    assert plan.a.v == pytest.approx(plan.a.omega * plan.a.radius)
+
+
+lengths = st.floats(0.1, 40.0)
+
+
+@given(lengths, lengths, lengths)
+def test_half_a_passage_ends_where_the_range_does(distance: float, radius: float, reach: float) -> None:
+    half = half_passage(distance, radius, reach)
+    if reach <= abs(distance - radius):
+        assert half == pytest.approx(0.0, abs=1e-6)
+    elif reach >= distance + radius:
+        assert half == pytest.approx(math.pi, abs=1e-6)
+    else:
+        end = math.hypot(distance - radius * math.cos(half), radius * math.sin(half))
+        assert end == pytest.approx(reach, abs=ROUNDING)
+
+
+@given(lengths, st.floats(0.01, 0.99), lengths, lengths)
+def test_a_passage_is_shortest_where_b_waits_nearest_to_as_anchor_or_farthest(
+    distance: float, share: float, radius: float, reach: float
+) -> None:
+    waiting = share * distance
+    places = np.linspace(distance - waiting, distance + waiting, 101)
+    halves = [half_passage(float(place), radius, reach) for place in places]
+    assert min(halves) >= min(halves[0], halves[-1]) - ROUNDING
