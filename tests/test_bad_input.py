@@ -120,6 +120,26 @@ def test_a_value_out_of_bounds_is_named(was: str, new: str, field: str, tmp_path
 
 
 @pytest.mark.parametrize(
+    ("was", "new", "why"),
+    [
+        ("max_speed = 1.0", "max_speed = 9e-5", "a tick moves a robot by 9e-05 m at most"),
+        ("period = 1.0", "period = 5e-5", "a tick moves a robot by 5e-05 m at most"),
+        ("anchor = [10.0", "anchor = [1500.0", "1500 m between the anchors"),
+        ("sensing_range = 3.0", "sensing_range = 2000.0", "ranges up to 2000 m"),
+        ("anchor = [10.0", "anchor = [1e6", "manoeuvres of 1 m are too short for a pose to be sure"),
+    ],
+)
+@pytest.mark.parametrize("variant", ["paper", "assured"])
+def test_a_setting_in_which_no_pose_could_be_sure_is_refused(
+    was: str, new: str, why: str, variant: str, tmp_path: Path
+) -> None:
+    text = changed(changed(GOOD, was, new), "start = [11.3, -0.4, 3.6]", "")
+    text = changed(text, '"paper"', f'"{variant}"')
+    refused_scenario(text, tmp_path, "mission: ")
+    refused(tandem("run", "mine.toml", cwd=tmp_path), why)
+
+
+@pytest.mark.parametrize(
     ("text", "field"),
     [
         (changed(GOOD, "[2.4, -1.2, 4.8]", "[2.4, -2.2, 4.8]"), "robot[0].start: "),
