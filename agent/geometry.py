@@ -103,10 +103,10 @@ def circle_intersections(x: float, y: float, radius: float, distance: float) -> 
     """Where (m) the circle of `radius` about (x, y) meets that of radius `distance` about the origin.
 
     A tangent point is given once. Empty where they do not meet, or are the same circle, or the first is
-    a point.
+    a point, to rounding.
     """
     apart = math.hypot(x, y)
-    if apart == 0.0 or radius == 0.0:
+    if min(apart, radius) < SAME:
         return []
     away = included_angle(apart, radius, distance)
     if away is None:
