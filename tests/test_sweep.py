@@ -7,6 +7,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -22,9 +23,7 @@ from scipy.stats import binomtest  # type: ignore[import-untyped]
 
 from compose.campaign import run, spec
 from compose.campaign.cells import Refused, cells, setting_of, trial_seed
-from compose.campaign.owner import Child
 from compose.campaign.summary import wilson
-from compose.campaign.worker import READY
 from compose.status import UserError
 from protocol.inbox import Inbox
 from tests.commands import PAPER_1, Command, Ended, tandem, until
@@ -105,12 +104,24 @@ def sweep(folder: Path, spec: str, out: str, *arguments: str) -> Ended:
 
 
 def played(
-    folder: Path, source: str, out: str, *, trials: int | None = None, workers: int = 2
+    folder: Path,
+    source: str,
+    out: str,
+    *,
+    trials: int | None = None,
+    workers: int = 2,
+    done: Callable[[int], None] = lambda _: None,
 ) -> run.Results:
     """The campaign, as the command plays it, but for figures and what is said."""
-    silent = run.Progress(say=print, begin=lambda *_: None, done=lambda _: None)
+    silent = run.Progress(say=print, begin=lambda *_: None, done=done)
     campaign = spec.load(str(folder / source), trials=trials)
     return run.sweep(campaign, folder / out, run.Means(workers=workers), Inbox("test"), silent)
+
+
+def sweep_up(folder: Path) -> None:
+    """Remove what a command that was killed could not."""
+    for left in (folder / "tmp").glob("tandem-dask-*"):
+        shutil.rmtree(left)
 
 
 def parts(out: Path) -> int:
@@ -253,10 +264,7 @@ def test_a_campaign_that_is_killed_twice_goes_on_where_it_was(folder: Path) -> N
             assert command.ended().status == -SIGKILL
         until(lambda: not trial_processes(folder), "the trials' processes end with their owner")
         assert not (out / "trials.parquet").exists()
-    for folder_left in (folder / "tmp").glob("tandem-dask-*"):  # nobody was left to remove it
-        for path in sorted(folder_left.rglob("*"), reverse=True):
-            path.rmdir() if path.is_dir() else path.unlink()
-        folder_left.rmdir()
+    sweep_up(folder)
     done = parts(out)
     (out / "parts" / "00000-99999999.parquet").write_bytes(b"torn")
     ended = sweep(folder, "lengthy.toml", "killed")
@@ -270,7 +278,7 @@ def test_a_campaign_that_is_killed_twice_goes_on_where_it_was(folder: Path) -> N
 
 def test_a_campaign_whose_trials_hang_can_be_stopped(folder: Path) -> None:
     with misbehaving("endless", "both.toml", folder) as process:
-        until(lambda: len(trial_processes(folder)) == 2, "trials are played")
+        until(lambda: len(list(folder.glob("tmp/*/playing"))) == 2, "trials are played")
         os.killpg(process.pid, SIGTERM)
         said = process.communicate(timeout=30.0)
     assert said == ("0 rows, stopped by SIGTERM\n", "")
@@ -294,12 +302,13 @@ def test_a_stopped_campaign_says_so_in_one_line_and_goes_on(folder: Path) -> Non
     assert all(row in finished for row in found)
 
 
-def test_a_process_for_trials_ends_with_its_owner_and_keeps_its_answers_to_itself() -> None:
-    child = Child()
-    try:
-        assert child.answer(60.0) == READY
-    finally:
-        child.close()
+def test_a_trial_that_hangs_does_not_outlive_whoever_ran_it(folder: Path) -> None:
+    with misbehaving("endless", "both.toml", folder) as process:
+        until(lambda: len(list(folder.glob("tmp/*/playing"))) == 2, "trials are played")
+        process.kill()
+        process.communicate(timeout=30.0)
+    until(lambda: not trial_processes(folder), "the trials' processes end with their owner")
+    sweep_up(folder)
 
 
 # --- a campaign's folder ------------------------------------------------------------------------------
@@ -307,7 +316,9 @@ def test_a_process_for_trials_ends_with_its_owner_and_keeps_its_answers_to_itsel
 
 def test_more_trials_extend_a_campaign_and_fewer_leave_it(folder: Path) -> None:
     played(folder, "both.toml", "grown", trials=3)
-    played(folder, "both.toml", "grown")
+    more: list[int] = []
+    played(folder, "both.toml", "grown", done=more.append)
+    assert sum(more) == 48 - 12, "what is there is not played again"
     assert len(played(folder, "both.toml", "grown", trials=3).table) == 48
     played(folder, "both.toml", "whole")
     assert rows(folder / "grown") == rows(folder / "whole")
@@ -331,7 +342,7 @@ def test_a_folder_of_another_campaign_is_refused(folder: Path) -> None:
 
 def test_a_folder_in_use_is_refused(folder: Path) -> None:
     with misbehaving("endless", "both.toml", folder) as process:
-        until(lambda: trial_processes(folder), "trials are played")
+        until(lambda: list(folder.glob("tmp/*/playing")), "trials are played")
         with pytest.raises(UserError, match="out is in use by another sweep"):
             played(folder, "both.toml", "out")
         os.killpg(process.pid, SIGTERM)
@@ -415,10 +426,6 @@ def test_a_campaign_that_ships_can_be_played(name: str) -> None:
 
 AXIS = 'field = "robot.b.anchor[0]"\nvalues = [10.0, 8]'
 JOINT = 'name = "both"\nfields = ["mission.period", "mission.max_speed"]\nvalues = [[1.0, 1.0], [0.5, 1.0]]'
-
-
-def axis(text: str) -> Callable[[str], str]:
-    return lambda spec: spec.replace(AXIS, text)
 
 
 @pytest.mark.parametrize(
