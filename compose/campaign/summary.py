@@ -108,7 +108,7 @@ def wilson(k: int, n: int) -> tuple[float | None, float | None]:
     z = NormalDist().inv_cdf(0.5 + 0.5 * CONFIDENCE)
     centre = (k + 0.5 * z * z) / (n + z * z)
     half = z / (n + z * z) * math.sqrt(k * (n - k) / n + 0.25 * z * z)
-    return max(0.0, centre - half), min(1.0, centre + half)
+    return 0.0 if k == 0 else centre - half, 1.0 if k == n else centre + half
 
 
 def column(table: pa.Table, name: str) -> Floats:
