@@ -123,33 +123,28 @@ class Sighting(msgspec.Struct, frozen=True):
 
 
 def weigh_placements(
-    candidates: Iterable[Placement],
-    sightings: Sequence[Sighting],
-    sensing_range: float,
-    tolerance: float = MUTUAL_FLOOR,
+    candidates: Iterable[Placement], sightings: Sequence[Sighting], sensing_range: float
 ) -> tuple[Placement, ...]:
-    """Those of `candidates` that explain every sighting, be it a range or silence, to `tolerance` m."""
+    """Those of `candidates` that explain every sighting, be it a range or silence."""
     left: list[Placement] = []
     for candidate in candidates:
         placement = _polished_placement(candidate, sightings)
-        if _explains(placement, sightings, sensing_range, tolerance) and not any(
+        if _explains(placement, sightings, sensing_range) and not any(
             same_placement(placement, other, MUTUAL_FLOOR) for other in left
         ):
             left.append(placement)
     return tuple(left)
 
 
-def _explains(
-    placement: Placement, sightings: Sequence[Sighting], sensing_range: float, tolerance: float
-) -> bool:
+def _explains(placement: Placement, sightings: Sequence[Sighting], sensing_range: float) -> bool:
     c, s = math.cos(placement.phi), math.sin(placement.phi)
     for sighting in sightings:
         a, b = sighting.a, sighting.b
         apart = math.hypot(placement.x + c * a.x - s * a.y - b.x, placement.y + s * a.x + c * a.y - b.y)
         if sighting.range is None:
-            if apart <= sensing_range - tolerance:
+            if apart <= sensing_range - MUTUAL_FLOOR:
                 return False
-        elif abs(apart - sighting.range) > tolerance:
+        elif abs(apart - sighting.range) > MUTUAL_FLOOR:
             return False
     return True
 

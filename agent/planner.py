@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from agent import radio
-from agent.belief import FLOOR, MUTUAL_FLOOR, Branch, Sighting, branches, weigh_branches, weigh_placements
+from agent.belief import FLOOR, Branch, Sighting, branches, weigh_branches, weigh_placements
 from agent.mind import Asleep, Done, Mind
 from agent.phases import anchor, encounter, rendezvous, seeking
 from agent.phases.anchor import ThirdPoint
@@ -141,12 +141,8 @@ def _advanced(mind: Mind, anchor_range: float | None) -> Mind:
             return replace(mind, state=Waiting()) if beacon == "peer" else _second_range(mind)
         case ThirdPoint(_, origin):
             return _third_range(mind, mind.state) if seeking.moved(origin, mind.odometry) else mind
-        case LastManoeuvre(driven, origin) if seeking.moved(origin, mind.odometry):
-            if mind.in_contact:
-                return replace(mind, state=Standing())
-            return replace(mind, state=Returning(encounter.back(driven), mind.odometry))
-        case Returning(_, origin) if seeking.moved(origin, mind.odometry):
-            return replace(mind, state=Standing())
+        case LastManoeuvre(_, origin) | Returning(_, origin) if seeking.moved(origin, mind.odometry):
+            return replace(mind, state=encounter.advanced(mind.state, mind.odometry, mind.in_contact))
         case Asleep():
             return _released(mind, anchor_range)
         case _:
@@ -260,35 +256,31 @@ def _considered(mind: Mind) -> Mind:
     if not left:
         return _undecided(mind, "no placement explains the mutual ranges")
     if checked and len(left) == 1 and encounter.pinned_down(left[0], sightings, mission, distance):
-        if not weigh_placements(left, sightings, mission.sensing_range):
-            return _undecided(mind, "no placement explains the mutual ranges")
         return replace(mind, state=Done(3, Localised(mind.world_pose(left[0]))))
     if mind.briefing.role == "a":
         return mind
     if variant == "paper" and mind.findings.plan is not None:
         failure = "does not settle where they are" if checked else "could not be taken: b left a's range"
         return _undecided(mind, f"the third mutual range {failure}")
-    plan = encounter.last_manoeuvre(mind.local_pose, sightings[-1].a, left, mission, variant)
+    plan = encounter.last_manoeuvre(
+        mind.local_pose, sightings[-1].a, left, mission, variant, mind.findings.plan
+    )
     return replace(
         mind,
-        state=LastManoeuvre(plan.drive, mind.odometry),
+        state=LastManoeuvre(plan.drive, mind.odometry, plan.ticks),
         findings=replace(mind.findings, plan=plan),
     )
 
 
 def _weighed(mind: Mind, sightings: Sequence[Sighting], base: tuple[Sighting, Sighting]) -> Mind:
-    """The placements of eq. (7) that every range and every silent tick in `sightings` leave.
-
-    The letter takes the one that fits; `assured` keeps what misses by so little that it might.
-    """
+    """The placements of eq. (7) that every range and every silent tick in `sightings` leave."""
     reach, findings = mind.briefing.mission.sensing_range, mind.findings
-    tolerance = MUTUAL_FLOOR if mind.briefing.variant == "paper" else encounter.SMALLEST_GAP
     if findings.candidates is None:
         solutions = encounter.solve(mind.briefing.anchor_distance, base)
         silence = [sighting for sighting in sightings if sighting.range is None]
-        left = weigh_placements(solutions, silence, reach, tolerance)
+        left = weigh_placements(solutions, silence, reach)
         findings = replace(findings, placements=left, candidates=(len(solutions), len(left)))
-    left = weigh_placements(findings.placements, sightings, reach, tolerance)
+    left = weigh_placements(findings.placements, sightings, reach)
     return replace(mind, findings=replace(findings, placements=left))
 
 

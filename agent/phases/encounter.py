@@ -12,7 +12,7 @@ import numpy as np
 from agent.belief import Sighting, dilution
 from agent.geometry import Placement, placements
 from agent.phases.seeking import travelled
-from protocol.mission import Mission, Variant
+from protocol.mission import RANGE_MARGIN, Mission, Variant
 from protocol.motion import Controls, Pose
 
 TURN_RATES = 721
@@ -26,11 +26,13 @@ ELSEWHERE = 1e-6
 
 
 SMALLEST_GAP = 1e-6
-"""m: placements whose predictions differ by less are not told apart by a range, and another is taken.
+"""m: a manoeuvre after which two predicted ranges differ by less tells nothing, and a longer one is taken.
 
 Ten times `belief.MUTUAL_FLOOR`, the most by which rounding may put a true prediction off.
 """
 
+LONGEST = 64
+"""ticks of a last manoeuvre"""
 
 ROUNDING = 64 * 2.0**-52
 """of D + R: how far rounding may put a range off its prediction"""
@@ -52,26 +54,31 @@ class LastManoeuvre(msgspec.Struct, frozen=True):
 
     drive: Controls
     origin: Pose
+    """where this tick began"""
+    left: int = 1
+    """ticks, this one included"""
+    driven: int = 0
+    """ticks before this one"""
 
 
 class Returning(msgspec.Struct, frozen=True):
-    """b has left a's range, and drives the same arc backwards to tell it."""
+    """b has left a's range, and drives the same arc backwards until it can tell it."""
 
     drive: Controls
     origin: Pose
+    left: int = 1
+
+
+State = Standing | Waiting | LastManoeuvre | Returning
 
 
 class Plan(NamedTuple):
     """A last manoeuvre, and what it is expected to tell."""
 
     drive: Controls
+    ticks: int
     separation_m2: float | None
     """J of eq. (8): the least difference of two predicted squared ranges; none for one candidate"""
-
-
-def back(drive: Controls) -> Controls:
-    """The same arc, the other way."""
-    return Controls(-drive.v, -drive.omega)
 
 
 def base(sightings: Sequence[Sighting]) -> tuple[Sighting, Sighting] | None:
@@ -114,18 +121,54 @@ def pinned_down(
     return dilution(placement, sightings) * ROUNDING * size * max(1.0, size) <= SURE
 
 
+def advanced(state: LastManoeuvre | Returning, pose: Pose, in_contact: bool) -> State:
+    """The state after a tick that led to `pose`."""
+    match state:
+        case LastManoeuvre(drive, _, left, driven):
+            if not in_contact:
+                return Returning(Controls(-drive.v, -drive.omega), pose, driven + 1)
+            return LastManoeuvre(drive, pose, left - 1, driven + 1) if left > 1 else Standing()
+        case Returning(drive, _, left):
+            return Returning(drive, pose, left - 1) if left > 1 and not in_contact else Standing()
+
+
 def last_manoeuvre(
-    b: Pose, a: Pose, candidates: Sequence[Placement], mission: Mission, variant: Variant
+    b: Pose,
+    a: Pose,
+    candidates: Sequence[Placement],
+    mission: Mission,
+    variant: Variant,
+    before: Plan | None = None,
 ) -> Plan:
     """b's manoeuvre after which the ranges that `candidates` predict differ most (eq. (8), on squares).
 
-    `b` is in <b(M2)> and `a` in <a(M1)>. By enumeration. The letter drives at v_max; `assured` takes
-    the best of the manoeuvres with the fewest candidates out of range, which silence then names. A
-    single candidate is checked by the range that changes most, towards it: silence would check nothing.
+    `b` is in <b(M2)> and `a` in <a(M1)>. One tick; in `assured` more where that would tell too little, and
+    more than `before`, the last one, which has not told enough.
     """
-    omega = np.linspace(-mission.max_turn_rate, mission.max_turn_rate, TURN_RATES)
-    half = 0.5 * mission.period * omega
-    unit = mission.period * np.sinc(half / math.pi)
+    if variant == "paper":
+        return _best(b, a, candidates, mission, variant, 1)
+    ticks = 1 if before is None else min(2 * before.ticks, LONGEST)
+    while True:
+        plan = _best(b, a, candidates, mission, variant, ticks)
+        enough = 2.0 * mission.sensing_range * SMALLEST_GAP
+        if ticks == LONGEST or plan.separation_m2 is None or plan.separation_m2 >= enough:
+            return plan
+        ticks *= 2
+
+
+def _best(
+    b: Pose, a: Pose, candidates: Sequence[Placement], mission: Mission, variant: Variant, ticks: int
+) -> Plan:
+    """By enumeration, of the manoeuvres of so many ticks.
+
+    The letter drives at v_max; `assured` takes the best of those with the fewest candidates out of range,
+    which silence then names. A single candidate is checked by the range that changes most, towards it:
+    silence would check nothing.
+    """
+    period = ticks * mission.period
+    omega = np.linspace(-mission.max_turn_rate, mission.max_turn_rate, TURN_RATES) / ticks
+    half = 0.5 * period * omega
+    unit = period * np.sinc(half / math.pi)
     if variant == "paper":
         speed = np.array([[mission.max_speed]])
     else:
@@ -137,7 +180,7 @@ def last_manoeuvre(
     for candidate in candidates:
         there = candidate.place(a)
         squared.append((there.x - x) ** 2 + (there.y - y) ** 2)
-    rim = (mission.sensing_range - SMALLEST_GAP) ** 2
+    rim = (mission.sensing_range - RANGE_MARGIN) ** 2
     if len(squared) == 1:
         here = travelled(b, candidates[0].place(a))
         gap = here * here - squared[0]
@@ -149,4 +192,4 @@ def last_manoeuvre(
         value = np.where(outside == np.min(outside), gap, -np.inf)
     row, column = np.unravel_index(np.argmax(value), value.shape)
     drive = Controls(float(speed[row, 0]), float(omega[column]))
-    return Plan(drive, float(gap[row, column]) if len(candidates) > 1 else None)
+    return Plan(drive, ticks, float(gap[row, column]) if len(candidates) > 1 else None)

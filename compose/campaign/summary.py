@@ -120,7 +120,9 @@ def orbited_over_t_max(table: pa.Table) -> Floats:
     """How long both orbited until phase 3 began, over T_max: 0 if they met before, NaN if never."""
     meeting, orbiting = column(table, "meeting_tick"), column(table, "orbiting_tick")
     orbited = meeting - np.where(np.isnan(orbiting), meeting, orbiting)
-    return orbited * column(table, "period_s") / column(table, "t_max_s")
+    t_max = column(table, "t_max_s")
+    at_once = np.where(orbited > 0.0, math.inf, orbited)  # where T_max is 0
+    return np.divide(orbited * column(table, "period_s"), t_max, out=at_once, where=t_max > 0.0)
 
 
 def summary_csv(campaign: Campaign, cells: Sequence[Cell], figures: Mapping[int, Counted]) -> str:
