@@ -82,7 +82,7 @@ def decide(mind: Mind, reports: Sequence[Report] = ()) -> Mind:
     match mind.state:
         case Aligning() | Radial() | Tangent() | Orbiting() if _meets(mind):
             return _met(mind)
-        case Standing() | Waiting():
+        case Standing() | Waiting() | LastManoeuvre():
             return _considered(mind)
         case _:
             return mind
@@ -239,7 +239,7 @@ def _met(mind: Mind) -> Mind:
 
 
 def _considered(mind: Mind) -> Mind:
-    """Both logs in hand: weigh the placements; then claim, plan the last manoeuvre, or wait.
+    """Both logs in hand: weigh the placements; then claim, plan the last manoeuvre, or go on.
 
     The letter looks at the encounter alone; `assured` also at what was ranged, and what was silent, before.
     """
@@ -257,7 +257,7 @@ def _considered(mind: Mind) -> Mind:
         return _undecided(mind, "no placement explains the mutual ranges")
     if checked and len(left) == 1 and encounter.pinned_down(left[0], sightings, mission, distance):
         return replace(mind, state=Done(3, Localised(mind.world_pose(left[0]))))
-    if mind.briefing.role == "a":
+    if not isinstance(mind.state, Standing):
         return mind
     if variant == "paper" and mind.findings.plan is not None:
         failure = "does not settle where they are" if checked else "could not be taken: b left a's range"
