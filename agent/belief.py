@@ -155,6 +155,19 @@ def dilution(placement: Placement, sightings: Sequence[Sighting]) -> float:
     The dilution of precision, of least squares over all ranges in `sightings`; infinite where they leave
     a turn open, next to a double root of eq. (7).
     """
+    pp, pq, qq = information(placement, sightings)
+    determinant = pp * qq - pq * pq
+    if determinant <= SINGULAR * pp * qq:
+        return math.inf
+    # in <W>, b is turned by -psi and a by phi - psi
+    return math.sqrt(max(pp, pp + qq + 2.0 * pq) / determinant)
+
+
+def information(placement: Placement, sightings: Sequence[Sighting]) -> tuple[float, float, float]:
+    """What the ranges in `sightings` tell of phi and of psi, the bearing of M1 in <b(M2)>.
+
+    The Fisher information for ranges of 1 m standard deviation, in 1 / rad^2: of phi, mixed, of psi.
+    """
     tx, ty = placement.x, placement.y
     pp = pq = qq = 0.0
     for sighting in sightings:
@@ -170,11 +183,7 @@ def dilution(placement: Placement, sightings: Sequence[Sighting]) -> float:
         pp += by_phi * by_phi
         pq += by_phi * by_psi
         qq += by_psi * by_psi
-    determinant = pp * qq - pq * pq
-    if determinant <= SINGULAR * pp * qq:
-        return math.inf
-    # in <W>, b is turned by -psi and a by phi - psi
-    return math.sqrt(max(pp, pp + qq + 2.0 * pq) / determinant)
+    return pp, pq, qq
 
 
 def _polished_placement(placement: Placement, sightings: Sequence[Sighting]) -> Placement:

@@ -27,6 +27,9 @@ from protocol import messages
 from protocol.messages import MAX_REASON, Drive, Estimate, Localised, Ranged, Report, Sense, Undecided
 from protocol.motion import ORIGIN, REST, Controls, Pose, step
 
+PEER_RESTS = ("standing", "waiting")
+"""what it says then: two that move at once may do so in mirror image, and learn nothing"""
+
 # --- a tick -----------------------------------------------------------------------------------------
 
 
@@ -142,7 +145,8 @@ def _advanced(mind: Mind, anchor_range: float | None) -> Mind:
         case ThirdPoint(_, origin):
             return _third_range(mind, mind.state) if seeking.moved(origin, mind.odometry) else mind
         case LastManoeuvre(_, origin) | Returning(_, origin) if seeking.moved(origin, mind.odometry):
-            return replace(mind, state=encounter.advanced(mind.state, mind.odometry, mind.in_contact))
+            rest = Standing() if mind.briefing.role == "b" else Waiting()
+            return replace(mind, state=encounter.advanced(mind.state, mind.odometry, mind.in_contact, rest))
         case Asleep():
             return _released(mind, anchor_range)
         case _:
@@ -257,14 +261,19 @@ def _considered(mind: Mind) -> Mind:
         return _undecided(mind, "no placement explains the mutual ranges")
     if checked and len(left) == 1 and encounter.pinned_down(left[0], sightings, mission, distance):
         return replace(mind, state=Done(3, Localised(mind.world_pose(left[0]))))
-    if not isinstance(mind.state, Standing):
+    mover, before = mind.briefing.role, mind.findings.plan
+    if isinstance(mind.state, LastManoeuvre) or mover != (encounter.turn(sightings) if checked else "b"):
         return mind
-    if variant == "paper" and mind.findings.plan is not None:
+    if variant == "assured" and mind.radio.state not in PEER_RESTS:
+        return mind
+    if variant == "paper" and before is not None:
         failure = "does not settle where they are" if checked else "could not be taken: b left a's range"
         return _undecided(mind, f"the third mutual range {failure}")
-    plan = encounter.last_manoeuvre(
-        mind.local_pose, sightings[-1].a, left, mission, variant, mind.findings.plan
-    )
+    a, b = sightings[-1].a, sightings[-1].b
+    if checked and len(left) == 1:
+        plan = encounter.survey(mover, a, b, left[0], sightings, mission, before)
+    else:
+        plan = encounter.last_manoeuvre(mover, a, b, left, mission, variant, before)
     return replace(
         mind,
         state=LastManoeuvre(plan.drive, mind.odometry, plan.ticks),

@@ -8,12 +8,16 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
-from agent.belief import Sighting, dilution
+from agent.belief import Sighting, dilution, information
 from agent.geometry import Placement, placements
 from agent.phases.seeking import travelled
-from protocol.mission import RANGE_MARGIN, Mission, Variant
+from protocol.mission import RANGE_MARGIN, Mission, Role, Variant
 from protocol.motion import Controls, Pose
+
+Array = NDArray[np.float64]
+Point = float | Array
 
 TURN_RATES = 721
 """values of omega_2 tried in eq. (8), -omega_max and omega_max included: every half degree at T_s = 1 s"""
@@ -34,6 +38,9 @@ Ten times `belief.MUTUAL_FLOOR`, the most by which rounding may put a true predi
 LONGEST = 64
 """ticks of a last manoeuvre"""
 
+FAINT = 1e-6
+"""1 / rad^2: added to the information there is, so that the first of two missing ranges counts"""
+
 ROUNDING = 64 * 2.0**-52
 """of D + R: how far rounding may put a range off its prediction"""
 
@@ -46,11 +53,11 @@ class Standing(msgspec.Struct, frozen=True):
 
 
 class Waiting(msgspec.Struct, frozen=True):
-    """a stands: it has its second range, and b makes the last manoeuvre."""
+    """a stands: it has its second range, and b makes the last manoeuvre; a too, where that is not enough."""
 
 
 class LastManoeuvre(msgspec.Struct, frozen=True):
-    """b drives to where the placements that are left predict different ranges."""
+    """Drives to where the placements that are left predict different ranges."""
 
     drive: Controls
     origin: Pose
@@ -62,14 +69,15 @@ class LastManoeuvre(msgspec.Struct, frozen=True):
 
 
 class Returning(msgspec.Struct, frozen=True):
-    """b has left a's range, and drives the same arc backwards until it can tell it."""
+    """Has left the peer's range, and drives the same arc backwards until it can tell it."""
 
     drive: Controls
     origin: Pose
     left: int = 1
 
 
-State = Standing | Waiting | LastManoeuvre | Returning
+Resting = Standing | Waiting
+State = Resting | LastManoeuvre | Returning
 
 
 class Plan(NamedTuple):
@@ -113,6 +121,16 @@ def redundant(sightings: Sequence[Sighting], base: tuple[Sighting, Sighting]) ->
     )
 
 
+def turn(sightings: Sequence[Sighting]) -> Role:
+    """Whose move it is: the other's than whose was the last. b moves first."""
+    for before, now in zip(sightings[-2::-1], sightings[::-1]):
+        if travelled(before.b, now.b) > 0.0:
+            return "a"
+        if travelled(before.a, now.a) > 0.0:
+            return "b"
+    return "b"
+
+
 def pinned_down(
     placement: Placement, sightings: Sequence[Sighting], mission: Mission, distance: float
 ) -> bool:
@@ -121,43 +139,91 @@ def pinned_down(
     return dilution(placement, sightings) * ROUNDING * size * max(1.0, size) <= SURE
 
 
-def advanced(state: LastManoeuvre | Returning, pose: Pose, in_contact: bool) -> State:
-    """The state after a tick that led to `pose`."""
+def advanced(state: LastManoeuvre | Returning, pose: Pose, in_contact: bool, rest: Resting) -> State:
+    """The state after a tick that led to `pose`; in the end it is `rest`."""
     match state:
         case LastManoeuvre(drive, _, left, driven):
             if not in_contact:
                 return Returning(Controls(-drive.v, -drive.omega), pose, driven + 1)
-            return LastManoeuvre(drive, pose, left - 1, driven + 1) if left > 1 else Standing()
+            return LastManoeuvre(drive, pose, left - 1, driven + 1) if left > 1 else rest
         case Returning(drive, _, left):
-            return Returning(drive, pose, left - 1) if left > 1 and not in_contact else Standing()
+            return Returning(drive, pose, left - 1) if left > 1 and not in_contact else rest
+
+
+# --- the last manoeuvre -------------------------------------------------------------------------------
 
 
 def last_manoeuvre(
-    b: Pose,
+    mover: Role,
     a: Pose,
+    b: Pose,
     candidates: Sequence[Placement],
     mission: Mission,
     variant: Variant,
     before: Plan | None = None,
 ) -> Plan:
-    """b's manoeuvre after which the ranges that `candidates` predict differ most (eq. (8), on squares).
+    """The manoeuvre after which the ranges that `candidates` predict differ most (eq. (8), on squares).
 
-    `b` is in <b(M2)> and `a` in <a(M1)>. One tick; in `assured` more where that would tell too little, and
-    more than `before`, the last one, which has not told enough.
+    Of `mover`, in the paper always b; `a` is in <a(M1)> and `b` in <b(M2)>. One tick; in `assured` more
+    where that would tell too little, and more than `before`, its last one, which has not told enough.
     """
     if variant == "paper":
-        return _best(b, a, candidates, mission, variant, 1)
-    ticks = 1 if before is None else min(2 * before.ticks, LONGEST)
+        return _most_telling(mover, a, b, candidates, mission, variant, 1)
+    ticks = longer(before)
+    enough = 2.0 * mission.sensing_range * SMALLEST_GAP
     while True:
-        plan = _best(b, a, candidates, mission, variant, ticks)
-        enough = 2.0 * mission.sensing_range * SMALLEST_GAP
+        plan = _most_telling(mover, a, b, candidates, mission, variant, ticks)
         if ticks == LONGEST or plan.separation_m2 is None or plan.separation_m2 >= enough:
             return plan
         ticks *= 2
 
 
-def _best(
-    b: Pose, a: Pose, candidates: Sequence[Placement], mission: Mission, variant: Variant, ticks: int
+def survey(
+    mover: Role,
+    a: Pose,
+    b: Pose,
+    placement: Placement,
+    sightings: Sequence[Sighting],
+    mission: Mission,
+    before: Plan | None,
+) -> Plan:
+    """The manoeuvre of `mover` after which one more range would pin down `placement` best.
+
+    For a placement that alone fits, and that the ranges in `sightings` do not determine: both robots and
+    their anchors on one line. By the determinant of the information, which both robots have to raise.
+    """
+    ticks = longer(before)
+    speed, omega = _manoeuvres(mission, "assured", ticks)
+    own = a if mover == "a" else b
+    outside = np.zeros((len(speed), len(omega)), bool)
+    for tick in range(1, ticks + 1):
+        x, y = _driven(own, speed, omega, tick * mission.period)
+        (ax, ay), (bx, by) = _placed(mover, a, b, placement, x, y)
+        dx, dy = ax - bx, ay - by
+        outside |= np.hypot(dx, dy) > mission.sensing_range - RANGE_MARGIN
+    apart = np.maximum(np.hypot(dx, dy), ELSEWHERE)
+    by_phi = (dy * (ax - placement.x) - dx * (ay - placement.y)) / apart
+    by_psi = (dy * placement.x - dx * placement.y) / apart
+    pp, pq, qq = information(placement, sightings)
+    value = (pp + by_phi**2 + FAINT) * (qq + by_psi**2 + FAINT) - (pq + by_phi * by_psi) ** 2
+    value = np.where(outside, -np.inf, value)
+    row, column = np.unravel_index(np.argmax(value), value.shape)
+    return Plan(Controls(float(speed[row, 0]), float(omega[column])), ticks, None)
+
+
+def longer(before: Plan | None) -> int:
+    """ticks of the manoeuvre after one that has not told enough."""
+    return 1 if before is None else min(2 * before.ticks, LONGEST)
+
+
+def _most_telling(
+    mover: Role,
+    a: Pose,
+    b: Pose,
+    candidates: Sequence[Placement],
+    mission: Mission,
+    variant: Variant,
+    ticks: int,
 ) -> Plan:
     """By enumeration, of the manoeuvres of so many ticks.
 
@@ -165,31 +231,54 @@ def _best(
     which silence then names. A single candidate is checked by the range that changes most, towards it:
     silence would check nothing.
     """
-    period = ticks * mission.period
-    omega = np.linspace(-mission.max_turn_rate, mission.max_turn_rate, TURN_RATES) / ticks
-    half = 0.5 * period * omega
-    unit = period * np.sinc(half / math.pi)
-    if variant == "paper":
-        speed = np.array([[mission.max_speed]])
-    else:
-        speed = mission.first_straight / mission.period * np.array(SPEEDS)[:, None]
-    x = b.x + speed * unit * np.cos(b.heading + half)
-    y = b.y + speed * unit * np.sin(b.heading + half)
-
-    squared = []
-    for candidate in candidates:
-        there = candidate.place(a)
-        squared.append((there.x - x) ** 2 + (there.y - y) ** 2)
+    speed, omega = _manoeuvres(mission, variant, ticks)
+    own = a if mover == "a" else b
     rim = (mission.sensing_range - RANGE_MARGIN) ** 2
+    squared: list[Array] = []
+    outside = np.zeros((len(speed), len(omega)))
+    for candidate in candidates:
+        lost = np.zeros((len(speed), len(omega)), bool)
+        for tick in range(1, ticks + 1):
+            x, y = _driven(own, speed, omega, tick * mission.period)
+            (ax, ay), (bx, by) = _placed(mover, a, b, candidate, x, y)
+            distance = np.square(ax - bx) + np.square(ay - by)
+            lost |= distance > rim
+        squared.append(distance)
+        outside += lost
     if len(squared) == 1:
-        here = travelled(b, candidates[0].place(a))
-        gap = here * here - squared[0]
+        gap = travelled(b, candidates[0].place(a)) ** 2 - squared[0]
     else:
         gap = np.min([abs(one - other) for i, one in enumerate(squared) for other in squared[:i]], axis=0)
     value = gap
     if variant == "assured":
-        outside = sum((distance > rim).astype(float) for distance in squared)
         value = np.where(outside == np.min(outside), gap, -np.inf)
     row, column = np.unravel_index(np.argmax(value), value.shape)
     drive = Controls(float(speed[row, 0]), float(omega[column]))
     return Plan(drive, ticks, float(gap[row, column]) if len(candidates) > 1 else None)
+
+
+def _manoeuvres(mission: Mission, variant: Variant, ticks: int) -> tuple[Array, Array]:
+    """v (a column) and omega (a row) of the manoeuvres of so many ticks that are compared."""
+    omega = np.linspace(-mission.max_turn_rate, mission.max_turn_rate, TURN_RATES) / ticks
+    if variant == "paper":
+        return np.array([[mission.max_speed]]), omega
+    return mission.first_straight / mission.period * np.array(SPEEDS)[:, None], omega
+
+
+def _driven(pose: Pose, speed: Array, omega: Array, seconds: float) -> tuple[Array, Array]:
+    """m: where they lead from `pose` (eq. (1a))."""
+    half = 0.5 * seconds * omega
+    chord = speed * (seconds * np.sinc(half / math.pi))
+    course = pose.heading + half
+    return pose.x + chord * np.cos(course), pose.y + chord * np.sin(course)
+
+
+def _placed(
+    mover: Role, a: Pose, b: Pose, placement: Placement, x: Array, y: Array
+) -> tuple[tuple[Point, Point], tuple[Point, Point]]:
+    """Where a and b are in <b(M2)>: `mover` at (x, y) in the frame of its anchor, the other where it is."""
+    if mover == "b":
+        there = placement.place(a)
+        return (there.x, there.y), (x, y)
+    c, s = math.cos(placement.phi), math.sin(placement.phi)
+    return (placement.x + c * x - s * y, placement.y + s * x + c * y), (b.x, b.y)
