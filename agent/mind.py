@@ -160,7 +160,10 @@ class Mind(msgspec.Struct, frozen=True):
         return compose(Pose(own.x, own.y, turn), self.local_pose)
 
     def seen(self) -> list[tuple[Pose, float | None]]:
-        """Every tick so far: the odometry, and the anchor's range or its silence."""
+        """Every tick of phase 1: the odometry, and the anchor's range or its silence.
+
+        Not beyond: from phase 2 on the log leaves out the ranges that say nothing new.
+        """
         ranges = {ranged.tick: ranged.range for ranged in self.log.ranges}
         track = self.log.track(ORIGIN, 0, self.tick, self.briefing.mission.period)
         return [(pose, ranges.get(tick)) for tick, pose in enumerate(track)]

@@ -85,7 +85,7 @@ def decide(mind: Mind, reports: Sequence[Report] = ()) -> Mind:
     match mind.state:
         case Aligning() | Radial() | Tangent() | Orbiting() if _meets(mind):
             return _met(mind)
-        case Standing() | Waiting() | LastManoeuvre():
+        case Standing() | Waiting():
             return _considered(mind)
         case _:
             return mind
@@ -221,14 +221,13 @@ def _meets(mind: Mind) -> bool:
 
 
 def _lingers(mind: Mind) -> bool:
-    """Whether the robot stands still so as not to lose a peer that is not ready for phase 3.
+    """Whether the robot stands still so as not to lose a peer with which phase 3 cannot begin yet.
 
-    It is still in phase 1; or it is b, and too near its anchor.
+    The peer is in phase 1, or has not been heard; or it is b, and too near its anchor.
     """
     return (
         mind.briefing.variant == "assured"
         and mind.in_contact
-        and mind.hears_peer
         and (mind.radio.start is None or mind.briefing.role == "a")
     )
 
@@ -251,9 +250,10 @@ def _considered(mind: Mind) -> Mind:
     variant, met = mind.briefing.variant, mind.findings.met
     assert met is not None
     sightings = mind.sightings(met if variant == "paper" else 0)
-    base = encounter.base([sighting for sighting in sightings if sighting.tick >= met])
-    if base is None:
-        return mind
+    base = encounter.base(sightings)
+    if base is None:  # yet; or, where a report was missed, b was still driving as a went straight
+        again = isinstance(mind.state, Waiting) and mind.hears_peer and mind.radio.state == "standing"
+        return _met(mind) if again and variant == "assured" else mind
     mind = _weighed(mind, sightings, base)
     left = mind.findings.placements
     checked = encounter.redundant(sightings, base)
@@ -261,22 +261,22 @@ def _considered(mind: Mind) -> Mind:
         return _undecided(mind, "no placement explains the mutual ranges")
     if checked and len(left) == 1 and encounter.pinned_down(left[0], sightings, mission, distance):
         return replace(mind, state=Done(3, Localised(mind.world_pose(left[0]))))
-    mover, before = mind.briefing.role, mind.findings.plan
-    if isinstance(mind.state, LastManoeuvre) or mover != (encounter.turn(sightings) if checked else "b"):
+    mover = mind.briefing.role
+    if mover != (encounter.turn(sightings) if checked else "b"):
         return mind
     if variant == "assured" and mind.radio.state not in PEER_RESTS:
         return mind
-    if variant == "paper" and before is not None:
+    if variant == "paper" and mind.findings.plan is not None:
         failure = "does not settle where they are" if checked else "could not be taken: b left a's range"
         return _undecided(mind, f"the third mutual range {failure}")
     a, b = sightings[-1].a, sightings[-1].b
     if checked and len(left) == 1:
-        plan = encounter.survey(mover, a, b, left[0], sightings, mission, before)
+        plan = encounter.survey(mover, a, b, left[0], sightings, mission)
     else:
-        plan = encounter.last_manoeuvre(mover, a, b, left, mission, variant, before)
+        plan = encounter.last_manoeuvre(mover, a, b, left, mission, variant)
     return replace(
         mind,
-        state=LastManoeuvre(plan.drive, mind.odometry, plan.ticks),
+        state=LastManoeuvre(plan.drive, mind.odometry),
         findings=replace(mind.findings, plan=plan),
     )
 
@@ -287,8 +287,8 @@ def _weighed(mind: Mind, sightings: Sequence[Sighting], base: tuple[Sighting, Si
     if findings.candidates is None:
         solutions = encounter.solve(mind.briefing.anchor_distance, base)
         silence = [sighting for sighting in sightings if sighting.range is None]
-        left = weigh_placements(solutions, silence, reach)
-        findings = replace(findings, placements=left, candidates=(len(solutions), len(left)))
+        unheard = weigh_placements(solutions, silence, reach)
+        findings = replace(findings, placements=tuple(solutions), candidates=(len(solutions), len(unheard)))
     left = weigh_placements(findings.placements, sightings, reach)
     return replace(mind, findings=replace(findings, placements=left))
 

@@ -34,6 +34,8 @@ def contradiction(report: Report) -> str | None:
     """What in `report` no well-formed log could say, or None."""
     if report.heard > report.tick:
         return f"tick {report.heard} acknowledged at tick {report.tick}"
+    if report.ranges_heard > report.tick + 1:
+        return f"{report.ranges_heard} ranges acknowledged at tick {report.tick}, one a tick at the most"
     if report.through > report.tick or report.since > report.through:
         return f"a log over [{report.since}, {report.through}] told at tick {report.tick}"
     if sum(run.ticks for run in report.runs) != report.through - report.since:

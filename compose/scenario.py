@@ -225,7 +225,7 @@ def _plan(file: ScenarioFile, first: int, second: int, source: str) -> Rendezvou
     """How the two are to meet."""
     distance = math.dist(file.robot[first].anchor, file.robot[second].anchor)
     if distance < NEAREST_ANCHORS:
-        raise Unworkable(
+        raise BadScenario(
             f"{source}: robot[{second}].anchor: less than {NEAREST_ANCHORS:g} m from that of its peer "
             f"'{file.robot[first].id}'"
         )

@@ -1,8 +1,8 @@
 """How the two robots of a pair meet: where each orbits, and how long that takes at most (Section III.B).
 
 The paper has both orbit, in opposite senses. In `assured`, b waits beside its anchor and a goes round on
-the circle that passes b's range whichever way b lies: of all pairs of circles and constant speeds tried,
-these meet soonest, in the mean and at worst (`docs/rendezvous.py`), and the bound has a proof.
+the circle that passes b's range whichever way b lies: of all the pairs of circles and constant speeds that
+`docs/rendezvous.py` tries, none meets sooner in the mean.
 """
 
 from __future__ import annotations
@@ -17,13 +17,14 @@ from protocol.motion import TAU
 from protocol.units import AngularVelocity, Range, Time, Velocity
 
 WAITING_PLACE = 0.125
-"""of R: how far from its anchor b waits. Not on it: there its ranges would not tell its heading"""
+"""of R: how far from its anchor b waits. Not on it: there its ranges would not tell its heading; and not
+farther than that takes, since each metre lengthens a's way round by two pi"""
 
 PASSAGE = 1.5
 """ticks at least that a is in b's range at each pass: one, to be measured, and room to go straight on"""
 
 RADII = 400
-"""of a's orbit that are compared"""
+"""of a's orbit that are compared: twice as many change no meeting by a tick"""
 
 
 class Orbit(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
@@ -93,6 +94,9 @@ def searching(mission: Mission, distance: float) -> Rendezvous:
 
     Of the radii that do, the one on which a is there soonest: on its way out, and half round in the mean.
     Where R is so far beyond D that both are in range of each other wherever they wait, a waits too.
+
+    The bound: wherever b waits, at least `2 half` of a's circle is in its range. From outside, a has at most
+    `TAU - 2 half` to drive until it is in; and as omega T_s is less than `2 half`, no tick jumps the passage.
     """
     reach, period = mission.sensing_range - RANGE_MARGIN, mission.period
     waiting = Orbit(WAITING_PLACE * mission.sensing_range, 0.0, 0.0)

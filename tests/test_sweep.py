@@ -397,12 +397,12 @@ def test_a_setting_in_which_nobody_can_meet_is_a_refused_cell(folder: Path) -> N
     (folder / "slow.toml").write_text(start + "[[1.0, 1.0], [1e-6, 1e-3]]")
     ended = sweep(folder, "slow.toml", "out")
     assert ended.status in (0, 1)
-    assert "cell 1 cannot be played: mission: to meet could take " in ended.out
+    assert "cell 1 cannot be played: mission: a tick moves a robot by " in ended.out
     summary = summary_rows(folder / "out")
     assert [row["trials"] for row in summary] == ["2", "0"]
     assert [bool(row["refused"]) for row in summary] == [False, True]
     (folder / "slow.toml").write_text(start + "[[1e-6, 1e-3]]")
-    with pytest.raises(UserError, match="no cell can be played; cell 0: mission: to meet could take"):
+    with pytest.raises(UserError, match="no cell can be played; cell 0: mission: a tick moves a robot by"):
         played(folder, "slow.toml", "none")
     assert not (folder / "none").exists()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import msgspec
@@ -20,23 +21,14 @@ Array = NDArray[np.float64]
 Point = float | Array
 
 TURN_RATES = 721
-"""values of omega_2 tried in eq. (8), -omega_max and omega_max included: every half degree at T_s = 1 s"""
+"""values of omega_2 tried in eq. (8), from -omega_max to omega_max: every half degree in Section IV"""
 
 SPEEDS = (1.0, -1.0, 0.75, -0.75, 0.5, -0.5, 0.25, -0.25, 0.1, -0.1)
-"""values of v_2 tried, over v_max or, where that would leave the range in one tick, over A_0 / T_s"""
+"""values of v_2 tried, over A_0 / T_s: v_max, or less where that would come near R in one tick"""
 
 ELSEWHERE = 1e-6
 """m: a range taken nearer than this to where another was says nothing new"""
 
-
-SMALLEST_GAP = 1e-6
-"""m: a manoeuvre after which two predicted ranges differ by less tells nothing, and a longer one is taken.
-
-Ten times `belief.MUTUAL_FLOOR`, the most by which rounding may put a true prediction off.
-"""
-
-LONGEST = 64
-"""ticks of a last manoeuvre"""
 
 FAINT = 1e-6
 """1 / rad^2: added to the information there is, so that the first of two missing ranges counts"""
@@ -61,19 +53,13 @@ class LastManoeuvre(msgspec.Struct, frozen=True):
 
     drive: Controls
     origin: Pose
-    """where this tick began"""
-    left: int = 1
-    """ticks, this one included"""
-    driven: int = 0
-    """ticks before this one"""
 
 
 class Returning(msgspec.Struct, frozen=True):
-    """Has left the peer's range, and drives the same arc backwards until it can tell it."""
+    """Has left the peer's range, and drives the same arc backwards to tell it."""
 
     drive: Controls
     origin: Pose
-    left: int = 1
 
 
 Resting = Standing | Waiting
@@ -84,7 +70,6 @@ class Plan(NamedTuple):
     """A last manoeuvre, and what it is expected to tell."""
 
     drive: Controls
-    ticks: int
     separation_m2: float | None
     """J of eq. (8): the least difference of two predicted squared ranges; none for one candidate"""
 
@@ -123,7 +108,7 @@ def redundant(sightings: Sequence[Sighting], base: tuple[Sighting, Sighting]) ->
 
 def turn(sightings: Sequence[Sighting]) -> Role:
     """Whose move it is: the other's than whose was the last. b moves first."""
-    for before, now in zip(sightings[-2::-1], sightings[::-1]):
+    for before, now in pairwise(reversed(sightings)):
         if travelled(before.b, now.b) > 0.0:
             return "a"
         if travelled(before.a, now.a) > 0.0:
@@ -142,135 +127,76 @@ def pinned_down(
 def advanced(state: LastManoeuvre | Returning, pose: Pose, in_contact: bool, rest: Resting) -> State:
     """The state after a tick that led to `pose`; in the end it is `rest`."""
     match state:
-        case LastManoeuvre(drive, _, left, driven):
-            if not in_contact:
-                return Returning(Controls(-drive.v, -drive.omega), pose, driven + 1)
-            return LastManoeuvre(drive, pose, left - 1, driven + 1) if left > 1 else rest
-        case Returning(drive, _, left):
-            return Returning(drive, pose, left - 1) if left > 1 and not in_contact else rest
+        case LastManoeuvre(drive) if not in_contact:
+            return Returning(Controls(-drive.v, -drive.omega), pose)
+        case _:
+            return rest
 
 
 # --- the last manoeuvre -------------------------------------------------------------------------------
 
 
 def last_manoeuvre(
-    mover: Role,
-    a: Pose,
-    b: Pose,
-    candidates: Sequence[Placement],
-    mission: Mission,
-    variant: Variant,
-    before: Plan | None = None,
+    mover: Role, a: Pose, b: Pose, candidates: Sequence[Placement], mission: Mission, variant: Variant
 ) -> Plan:
     """The manoeuvre after which the ranges that `candidates` predict differ most (eq. (8), on squares).
 
-    Of `mover`, in the paper always b; `a` is in <a(M1)> and `b` in <b(M2)>. One tick; in `assured` more
-    where that would tell too little, and more than `before`, its last one, which has not told enough.
-    """
-    if variant == "paper":
-        return _most_telling(mover, a, b, candidates, mission, variant, 1)
-    ticks = longer(before)
-    enough = 2.0 * mission.sensing_range * SMALLEST_GAP
-    while True:
-        plan = _most_telling(mover, a, b, candidates, mission, variant, ticks)
-        if ticks == LONGEST or plan.separation_m2 is None or plan.separation_m2 >= enough:
-            return plan
-        ticks *= 2
-
-
-def survey(
-    mover: Role,
-    a: Pose,
-    b: Pose,
-    placement: Placement,
-    sightings: Sequence[Sighting],
-    mission: Mission,
-    before: Plan | None,
-) -> Plan:
-    """The manoeuvre of `mover` after which one more range would pin down `placement` best.
-
-    For a placement that alone fits, and that the ranges in `sightings` do not determine: both robots and
-    their anchors on one line. By the determinant of the information, which both robots have to raise.
-    """
-    ticks = longer(before)
-    speed, omega = _manoeuvres(mission, "assured", ticks)
-    own = a if mover == "a" else b
-    outside = np.zeros((len(speed), len(omega)), bool)
-    for tick in range(1, ticks + 1):
-        x, y = _driven(own, speed, omega, tick * mission.period)
-        (ax, ay), (bx, by) = _placed(mover, a, b, placement, x, y)
-        dx, dy = ax - bx, ay - by
-        outside |= np.hypot(dx, dy) > mission.sensing_range - RANGE_MARGIN
-    apart = np.maximum(np.hypot(dx, dy), ELSEWHERE)
-    by_phi = (dy * (ax - placement.x) - dx * (ay - placement.y)) / apart
-    by_psi = (dy * placement.x - dx * placement.y) / apart
-    pp, pq, qq = information(placement, sightings)
-    value = (pp + by_phi**2 + FAINT) * (qq + by_psi**2 + FAINT) - (pq + by_phi * by_psi) ** 2
-    value = np.where(outside, -np.inf, value)
-    row, column = np.unravel_index(np.argmax(value), value.shape)
-    return Plan(Controls(float(speed[row, 0]), float(omega[column])), ticks, None)
-
-
-def longer(before: Plan | None) -> int:
-    """ticks of the manoeuvre after one that has not told enough."""
-    return 1 if before is None else min(2 * before.ticks, LONGEST)
-
-
-def _most_telling(
-    mover: Role,
-    a: Pose,
-    b: Pose,
-    candidates: Sequence[Placement],
-    mission: Mission,
-    variant: Variant,
-    ticks: int,
-) -> Plan:
-    """By enumeration, of the manoeuvres of so many ticks.
-
-    The letter drives at v_max; `assured` takes the best of those with the fewest candidates out of range,
+    Of `mover`, in the paper always b; `a` is in <a(M1)> and `b` in <b(M2)>. By enumeration. The letter
+    drives at v_max; `assured` takes the best of the manoeuvres with the fewest candidates out of range,
     which silence then names. A single candidate is checked by the range that changes most, towards it:
     silence would check nothing.
     """
-    speed, omega = _manoeuvres(mission, variant, ticks)
-    own = a if mover == "a" else b
-    rim = (mission.sensing_range - RANGE_MARGIN) ** 2
+    speed, omega, x, y = _ends(a if mover == "a" else b, mission, variant)
     squared: list[Array] = []
-    outside = np.zeros((len(speed), len(omega)))
     for candidate in candidates:
-        lost = np.zeros((len(speed), len(omega)), bool)
-        for tick in range(1, ticks + 1):
-            x, y = _driven(own, speed, omega, tick * mission.period)
-            (ax, ay), (bx, by) = _placed(mover, a, b, candidate, x, y)
-            distance = np.square(ax - bx) + np.square(ay - by)
-            lost |= distance > rim
-        squared.append(distance)
-        outside += lost
+        (ax, ay), (bx, by) = _placed(mover, a, b, candidate, x, y)
+        squared.append(np.square(ax - bx) + np.square(ay - by))
     if len(squared) == 1:
         gap = travelled(b, candidates[0].place(a)) ** 2 - squared[0]
     else:
         gap = np.min([abs(one - other) for i, one in enumerate(squared) for other in squared[:i]], axis=0)
     value = gap
     if variant == "assured":
+        rim = (mission.sensing_range - RANGE_MARGIN) ** 2
+        outside = np.sum([distance > rim for distance in squared], axis=0)
         value = np.where(outside == np.min(outside), gap, -np.inf)
     row, column = np.unravel_index(np.argmax(value), value.shape)
     drive = Controls(float(speed[row, 0]), float(omega[column]))
-    return Plan(drive, ticks, float(gap[row, column]) if len(candidates) > 1 else None)
+    return Plan(drive, float(gap[row, column]) if len(candidates) > 1 else None)
 
 
-def _manoeuvres(mission: Mission, variant: Variant, ticks: int) -> tuple[Array, Array]:
-    """v (a column) and omega (a row) of the manoeuvres of so many ticks that are compared."""
-    omega = np.linspace(-mission.max_turn_rate, mission.max_turn_rate, TURN_RATES) / ticks
+def survey(
+    mover: Role, a: Pose, b: Pose, placement: Placement, sightings: Sequence[Sighting], mission: Mission
+) -> Plan:
+    """The manoeuvre of `mover` after which one more range would pin down `placement` best.
+
+    For a placement that alone fits, and that the ranges in `sightings` do not determine: both robots and
+    their anchors on one line. By the determinant of the information, which takes both robots to raise.
+    """
+    speed, omega, x, y = _ends(a if mover == "a" else b, mission, "assured")
+    (ax, ay), (bx, by) = _placed(mover, a, b, placement, x, y)
+    dx, dy = ax - bx, ay - by
+    apart = np.maximum(np.hypot(dx, dy), ELSEWHERE)
+    by_phi = (dy * (ax - placement.x) - dx * (ay - placement.y)) / apart
+    by_psi = (dy * placement.x - dx * placement.y) / apart
+    pp, pq, qq = information(placement, sightings)
+    value = (pp + by_phi**2 + FAINT) * (qq + by_psi**2 + FAINT) - (pq + by_phi * by_psi) ** 2
+    value = np.where(apart <= mission.sensing_range - RANGE_MARGIN, value, -np.inf)
+    row, column = np.unravel_index(np.argmax(value), value.shape)
+    return Plan(Controls(float(speed[row, 0]), float(omega[column])), None)
+
+
+def _ends(pose: Pose, mission: Mission, variant: Variant) -> tuple[Array, Array, Array, Array]:
+    """v (a column) and omega (a row) of the manoeuvres that are compared, and x and y of where each ends."""
+    omega = np.linspace(-mission.max_turn_rate, mission.max_turn_rate, TURN_RATES)
+    half = 0.5 * mission.period * omega
+    unit = mission.period * np.sinc(half / math.pi)
     if variant == "paper":
-        return np.array([[mission.max_speed]]), omega
-    return mission.first_straight / mission.period * np.array(SPEEDS)[:, None], omega
-
-
-def _driven(pose: Pose, speed: Array, omega: Array, seconds: float) -> tuple[Array, Array]:
-    """m: where they lead from `pose` (eq. (1a))."""
-    half = 0.5 * seconds * omega
-    chord = speed * (seconds * np.sinc(half / math.pi))
+        speed = np.array([[mission.max_speed]])
+    else:
+        speed = mission.first_straight / mission.period * np.array(SPEEDS)[:, None]
     course = pose.heading + half
-    return pose.x + chord * np.cos(course), pose.y + chord * np.sin(course)
+    return speed, omega, pose.x + speed * unit * np.cos(course), pose.y + speed * unit * np.sin(course)
 
 
 def _placed(

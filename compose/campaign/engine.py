@@ -5,14 +5,16 @@ from __future__ import annotations
 import logging
 import secrets
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import Any
+from queue import Empty, SimpleQueue
+from typing import Any, TypeVar
 
 import dask
 import msgspec
-from distributed import Client, Future, LocalCluster
+from distributed import Client, Future, KilledWorker, LocalCluster
 from distributed.comm.addressing import parse_address
 from distributed.comm.registry import get_backend
 
@@ -22,6 +24,8 @@ from compose.campaign.work import EngineFailed, Orders, Work, chunks_of
 from compose.campaign.worker import MAX_ERROR, Chunk
 from compose.status import UserError
 from protocol.inbox import Inbox, one_line
+
+T = TypeVar("T")
 
 AHEAD = 2
 """chunks for each thread that plays them: one that it plays, one that waits"""
@@ -77,6 +81,8 @@ def play(
     flying: dict[str, tuple[Future[Any], Chunk, Work]] = {}
     try:
         threads, looked = _threads(client), time.monotonic()
+        if not threads:
+            inbox.say("the scheduler has no workers yet")
         chunks = chunks_of(work, orders, lambda: max(threads, 1))
         while True:
             while len(flying) < AHEAD * max(threads, 1) and (following := next(chunks, None)) is not None:
@@ -111,6 +117,8 @@ def _rows(future: Future[Any], chunk: Chunk) -> list[Row]:
         raise EngineFailed("the scheduler is lost")
     error = future.exception()
     said = one_line(f"lost: {type(error).__name__}: {error}")[:MAX_ERROR]
+    if not isinstance(error, KilledWorker | owner.Died | owner.Hung):  # not of these trials, but of any
+        raise EngineFailed(f"a worker cannot play trials: {said}")
     return [
         lost(chunk.cell, trial, seed, said, None)
         for trial, seed in zip(chunk.trials, chunk.seeds, strict=True)
@@ -118,13 +126,33 @@ def _rows(future: Future[Any], chunk: Chunk) -> list[Row]:
 
 
 def _threads(client: Client) -> int:
-    """How many play chunks now."""
-    return sum(client.nthreads().values())
+    """How many play chunks now. Raises EngineFailed where the scheduler does not say."""
+    known = _within(CONNECT_S, client.nthreads)
+    if known is None:
+        raise EngineFailed(f"the scheduler has not answered for {CONNECT_S:g} s")
+    return sum(known.values())
+
+
+def _within(seconds: float, ask: Callable[[], T]) -> T | None:
+    """What it answers, if that comes in time: a host that is frozen would be waited for without end."""
+    answers: SimpleQueue[T] = SimpleQueue()
+
+    def wait() -> None:
+        with suppress(Exception):  # no answer, either
+            answers.put(ask())
+
+    threading.Thread(target=wait, daemon=True).start()
+    with suppress(Empty):
+        return answers.get(timeout=seconds)
+    return None
 
 
 def _leave(client: Client, campaign: str, flying: Sequence[Future[Any]]) -> None:
     """Nobody waits for `flying` any more, and no process of the campaign stays."""
-    with suppress(Exception):  # of a scheduler that is lost; its workers' processes end by themselves
+
+    def dismiss() -> None:
         client.cancel(flying, force=True)
         client.run(owner.dismiss, campaign)
+
+    _within(CONNECT_S, dismiss)  # where the scheduler is lost, its workers' processes end by themselves
     owner.dismiss(campaign)

@@ -19,6 +19,8 @@ from world.referee import errors
 from world.scenario import Scenario
 
 N = TypeVar("N", int, float)
+ROUNDING = 1e-6
+"""ticks by which a quotient may miss a whole number"""
 PATIENCE_S = 30.0
 """how long the processes of a trial wait for each other"""
 
@@ -128,7 +130,7 @@ def row(trial: Trial, record: Record, wall_s: float) -> Row:
         meeting_tick=_last([meeting for _, meeting in met]),
         period_s=scenario.mission.period,
         t_max_s=t_max_s,
-        t_max_ticks=math.ceil(t_max_s / scenario.mission.period),
+        t_max_ticks=math.ceil(t_max_s / scenario.mission.period - ROUNDING),
         candidates=_most([robot.candidates for robot in robots.values()]),
         candidates_left=_most([robot.candidates_left for robot in robots.values()]),
         position_error_m=_most([robot.position_error_m for robot in robots.values()]),
