@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import msgspec
+from msgspec.structs import replace
 
 from agent.belief import Branch, Sighting
 from agent.geometry import Placement
@@ -15,7 +16,7 @@ from agent.phases.rendezvous import Aligning, Orbiting, Radial, Tangent, off_anc
 from agent.phases.seeking import Backing, Circling, Straight, Turning
 from agent.radio import Radio
 from protocol import messages
-from protocol.messages import Briefing, Localised, Ranged, Undecided
+from protocol.messages import MAX_REASON, Briefing, Localised, Ranged, Undecided
 from protocol.motion import ORIGIN, Pose, compose
 from protocol.rendezvous import Orbit
 
@@ -138,6 +139,10 @@ class Mind(msgspec.Struct, frozen=True):
     def verdict(self) -> messages.Verdict | None:
         """What it has come to, if it has."""
         return self.state.verdict if isinstance(self.state, Done) else None
+
+    def undecided(self, reason: str) -> Mind:
+        """It cannot go on, and does not guess."""
+        return replace(self, state=Done(self.phase, Undecided(reason[:MAX_REASON])))
 
     @property
     def start(self) -> Pose:

@@ -15,8 +15,8 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from agent import radio
-from agent.belief import FLOOR, Branch, Sighting, branches, weigh_branches, weigh_placements
+from agent import meeting, radio
+from agent.belief import FLOOR, Branch, branches, weigh_branches
 from agent.mind import Asleep, Done, Mind
 from agent.phases import anchor, encounter, rendezvous, seeking
 from agent.phases.anchor import ThirdPoint
@@ -24,11 +24,8 @@ from agent.phases.encounter import LastManoeuvre, Returning, Standing, Waiting
 from agent.phases.rendezvous import Aligning, Orbiting, Radial, Tangent
 from agent.phases.seeking import Backing, Circling, Straight, Turning
 from protocol import messages
-from protocol.messages import MAX_REASON, Drive, Estimate, Localised, Ranged, Report, Sense, Undecided
+from protocol.messages import Drive, Estimate, Localised, Ranged, Report, Sense, Undecided
 from protocol.motion import ORIGIN, REST, Controls, Pose, step
-
-PEER_RESTS = ("standing", "waiting")
-"""what it says then: two that move at once may do so in mirror image, and learn nothing"""
 
 # --- a tick -----------------------------------------------------------------------------------------
 
@@ -79,14 +76,14 @@ def decide(mind: Mind, reports: Sequence[Report] = ()) -> Mind:
             heard = radio.hear(heard, told)
         mind = replace(mind, radio=heard)
         if isinstance(heard.verdict, Undecided) and mind.verdict is None:
-            return _undecided(mind, f"{mind.briefing.peer} says: {heard.verdict.reason}")
+            return mind.undecided(f"{mind.briefing.peer} says: {heard.verdict.reason}")
     if not mind.in_contact:
         return mind
     match mind.state:
-        case Aligning() | Radial() | Tangent() | Orbiting() if _meets(mind):
-            return _met(mind)
+        case Aligning() | Radial() | Tangent() | Orbiting() if meeting.meets(mind):
+            return meeting.met(mind)
         case Standing() | Waiting():
-            return _considered(mind)
+            return meeting.considered(mind)
         case _:
             return mind
 
@@ -164,7 +161,7 @@ def _again(mind: Mind, sense: Sense) -> bool:
 
 def _released(mind: Mind, rho0: float | None) -> Mind:
     if rho0 is None:
-        return _undecided(mind, "the anchor is out of range at the start")
+        return mind.undecided("the anchor is out of range at the start")
     if rho0 <= FLOOR:  # the heading is radial by definition, and nothing is left to find out
         return _located(mind, Branch(0.0, ORIGIN), "on-anchor")
     return replace(mind, state=Straight("anchor", mind.odometry, rho0))
@@ -182,11 +179,11 @@ def _second_range(mind: Mind) -> Mind:
 
 def _to_third_point(mind: Mind, left: tuple[Branch, ...]) -> Mind:
     if not left:
-        return _undecided(mind, "no pose explains the anchor ranges")
+        return mind.undecided("no pose explains the anchor ranges")
     mission, variant = mind.briefing.mission, mind.briefing.variant
     controls = anchor.third_point(anchor.local(left, mind.odometry), mission, variant)
     if controls is None:
-        return _undecided(mind, "eq. (5) leaves no way to a third range")
+        return mind.undecided("eq. (5) leaves no way to a third range")
     return replace(mind, state=ThirdPoint(left, mind.odometry, controls))
 
 
@@ -197,7 +194,7 @@ def _third_range(mind: Mind, state: ThirdPoint) -> Mind:
         measured = mind.log.ranges[-1].tick == mind.tick
         return _located(mind, left[0], "three-ranges" if measured else "three-ranges-virtual")
     if len(left) > 1 and mind.briefing.variant == "paper":
-        return _undecided(mind, "the third range does not tell +alpha from -alpha")
+        return mind.undecided("the third range does not tell +alpha from -alpha")
     return _to_third_point(mind, left)
 
 
@@ -213,96 +210,12 @@ def _on_to_orbit(mind: Mind, state: rendezvous.Meeting) -> Mind:
     return mind if onward is mind.state else replace(mind, state=onward)
 
 
-def _meets(mind: Mind) -> bool:
-    """Whether phase 3 begins, once in contact: by the letter when both orbit, else as soon as it can."""
-    if mind.briefing.variant == "paper":
-        return isinstance(mind.state, Orbiting) and (mind.radio.phase == 3 or mind.radio.state == mind.doing)
-    return mind.radio.phase == 3 or (mind.hears_peer and mind.radio.start is not None and mind.off_anchor)
-
-
-def _lingers(mind: Mind) -> bool:
-    """Whether the robot stands still so as not to lose a peer with which phase 3 cannot begin yet.
-
-    The peer is in phase 1, or has not been heard; or it is b, and too near its anchor.
-    """
-    return (
-        mind.briefing.variant == "assured"
-        and mind.in_contact
-        and (mind.radio.start is None or mind.briefing.role == "a")
-    )
-
-
-def _met(mind: Mind) -> Mind:
-    """Phase 3 begins: b stops, a goes straight on (Section III.C.a)."""
-    findings = replace(mind.findings, met=mind.tick)
-    if mind.briefing.role == "b":
-        return replace(mind, state=Standing(), findings=findings)
-    straight = Straight("peer", mind.odometry, mind.mutual[-1].range)
-    return replace(mind, state=straight, findings=findings)
-
-
-def _considered(mind: Mind) -> Mind:
-    """Both logs in hand: weigh the placements; then claim, plan the last manoeuvre, or go on.
-
-    The letter looks at the encounter alone; `assured` also at what was ranged, and what was silent, before.
-    """
-    mission, distance = mind.briefing.mission, mind.briefing.anchor_distance
-    variant, met = mind.briefing.variant, mind.findings.met
-    assert met is not None
-    sightings = mind.sightings(met if variant == "paper" else 0)
-    base = encounter.base(sightings)
-    if base is None:  # yet; or, where a report was missed, b was still driving as a went straight
-        again = isinstance(mind.state, Waiting) and mind.hears_peer and mind.radio.state == "standing"
-        return _met(mind) if again and variant == "assured" else mind
-    mind = _weighed(mind, sightings, base)
-    left = mind.findings.placements
-    checked = encounter.redundant(sightings, base)
-    if not left:
-        return _undecided(mind, "no placement explains the mutual ranges")
-    if checked and len(left) == 1 and encounter.pinned_down(left[0], sightings, mission, distance):
-        return replace(mind, state=Done(3, Localised(mind.world_pose(left[0]))))
-    mover = mind.briefing.role
-    if mover != (encounter.turn(sightings) if checked else "b"):
-        return mind
-    if variant == "assured" and mind.radio.state not in PEER_RESTS:
-        return mind
-    if variant == "paper" and mind.findings.plan is not None:
-        failure = "does not settle where they are" if checked else "could not be taken: b left a's range"
-        return _undecided(mind, f"the third mutual range {failure}")
-    a, b = sightings[-1].a, sightings[-1].b
-    if checked and len(left) == 1:
-        plan = encounter.survey(mover, a, b, left[0], sightings, mission)
-    else:
-        plan = encounter.last_manoeuvre(mover, a, b, left, mission, variant)
-    return replace(
-        mind,
-        state=LastManoeuvre(plan.drive, mind.odometry),
-        findings=replace(mind.findings, plan=plan),
-    )
-
-
-def _weighed(mind: Mind, sightings: Sequence[Sighting], base: tuple[Sighting, Sighting]) -> Mind:
-    """The placements of eq. (7) that every range and every silent tick in `sightings` leave."""
-    reach, findings = mind.briefing.mission.sensing_range, mind.findings
-    if findings.candidates is None:
-        solutions = encounter.solve(mind.briefing.anchor_distance, base)
-        silence = [sighting for sighting in sightings if sighting.range is None]
-        unheard = weigh_placements(solutions, silence, reach)
-        findings = replace(findings, placements=tuple(solutions), candidates=(len(solutions), len(unheard)))
-    left = weigh_placements(findings.placements, sightings, reach)
-    return replace(mind, findings=replace(findings, placements=left))
-
-
-def _undecided(mind: Mind, reason: str) -> Mind:
-    return replace(mind, state=Done(mind.phase, Undecided(reason[:MAX_REASON])))
-
-
 # --- what a mind implies ----------------------------------------------------------------------------
 
 
 def _controls(mind: Mind) -> Controls:
     match mind.state:
-        case Aligning() | Radial() | Tangent() | Orbiting() if _lingers(mind):
+        case Aligning() | Radial() | Tangent() | Orbiting() if meeting.lingers(mind):
             return REST
         case Orbiting():
             return Controls(mind.orbit.v, mind.orbit.omega)

@@ -35,6 +35,7 @@ SHELL = {"protocol.session", "protocol.journal", "protocol.inbox"}
 PURE = {
     "agent.planner",
     "agent.mind",
+    "agent.meeting",
     "agent.belief",
     "agent.geometry",
     "agent.logbook",
@@ -64,6 +65,7 @@ ALLOWED = {
     "typing",
     "msgspec",
     "numpy",
+    "numpy.typing",
     "re",
 }
 IMPURE = {

@@ -1,0 +1,98 @@
+"""From the first range of each other to a verdict: phase 3 as the planner goes through it (Section III.C)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from msgspec.structs import replace
+
+from agent.belief import Sighting, weigh_placements
+from agent.mind import Done, Mind
+from agent.phases import encounter
+from agent.phases.encounter import LastManoeuvre, Standing, Waiting
+from agent.phases.rendezvous import Orbiting
+from agent.phases.seeking import Straight
+from protocol.messages import Localised
+
+PEER_RESTS = ("standing", "waiting")
+"""what it says then: two that move at once may do so in mirror image, and learn nothing"""
+
+
+def meets(mind: Mind) -> bool:
+    """Whether phase 3 begins, once in contact: by the letter when both orbit, else as soon as it can."""
+    if mind.briefing.variant == "paper":
+        return isinstance(mind.state, Orbiting) and (mind.radio.phase == 3 or mind.radio.state == mind.doing)
+    return mind.radio.phase == 3 or (mind.hears_peer and mind.radio.start is not None and mind.off_anchor)
+
+
+def lingers(mind: Mind) -> bool:
+    """Whether the robot stands still so as not to lose a peer with which phase 3 cannot begin yet.
+
+    The peer is in phase 1, or has not been heard; or it is b, and too near its anchor.
+    """
+    return (
+        mind.briefing.variant == "assured"
+        and mind.in_contact
+        and (mind.radio.start is None or mind.briefing.role == "a")
+    )
+
+
+def met(mind: Mind) -> Mind:
+    """Phase 3 begins: b stops, a goes straight on (Section III.C.a)."""
+    findings = replace(mind.findings, met=mind.tick)
+    if mind.briefing.role == "b":
+        return replace(mind, state=Standing(), findings=findings)
+    straight = Straight("peer", mind.odometry, mind.mutual[-1].range)
+    return replace(mind, state=straight, findings=findings)
+
+
+def considered(mind: Mind) -> Mind:
+    """Both logs in hand: weigh the placements; then claim, plan the last manoeuvre, or go on.
+
+    The letter looks at the encounter alone; `assured` also at what was ranged, and what was silent, before.
+    """
+    mission, distance = mind.briefing.mission, mind.briefing.anchor_distance
+    variant, began = mind.briefing.variant, mind.findings.met
+    assert began is not None
+    sightings = mind.sightings(began if variant == "paper" else 0)
+    base = encounter.base(sightings)
+    if base is None:  # yet; or, where a report was missed, b was still driving as a went straight
+        again = isinstance(mind.state, Waiting) and mind.hears_peer and mind.radio.state == "standing"
+        return met(mind) if again and variant == "assured" else mind
+    mind = _weighed(mind, sightings, base)
+    left = mind.findings.placements
+    checked = encounter.redundant(sightings, base)
+    if not left:
+        return mind.undecided("no placement explains the mutual ranges")
+    if checked and len(left) == 1 and encounter.pinned_down(left[0], sightings, mission, distance):
+        return replace(mind, state=Done(3, Localised(mind.world_pose(left[0]))))
+    mover = mind.briefing.role
+    if mover != (encounter.turn(sightings) if checked else "b"):
+        return mind
+    if variant == "assured" and mind.radio.state not in PEER_RESTS:
+        return mind
+    if variant == "paper" and mind.findings.plan is not None:
+        failure = "does not settle where they are" if checked else "could not be taken: b left a's range"
+        return mind.undecided(f"the third mutual range {failure}")
+    a, b = sightings[-1].a, sightings[-1].b
+    if checked and len(left) == 1:
+        plan = encounter.survey(mover, a, b, left[0], sightings, mission)
+    else:
+        plan = encounter.last_manoeuvre(mover, a, b, left, mission, variant)
+    return replace(
+        mind,
+        state=LastManoeuvre(plan.drive, mind.odometry),
+        findings=replace(mind.findings, plan=plan),
+    )
+
+
+def _weighed(mind: Mind, sightings: Sequence[Sighting], base: tuple[Sighting, Sighting]) -> Mind:
+    """The placements of eq. (7) that every range and every silent tick in `sightings` leave."""
+    reach, findings = mind.briefing.mission.sensing_range, mind.findings
+    if findings.candidates is None:
+        solutions = encounter.solve(mind.briefing.anchor_distance, base)
+        silence = [sighting for sighting in sightings if sighting.range is None]
+        unheard = weigh_placements(solutions, silence, reach)
+        findings = replace(findings, placements=tuple(solutions), candidates=(len(solutions), len(unheard)))
+    left = weigh_placements(findings.placements, sightings, reach)
+    return replace(mind, findings=replace(findings, placements=left))
