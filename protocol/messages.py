@@ -197,7 +197,7 @@ class Farewell(Message, frozen=True):
     candidates: tuple[Count, Count] | None
     """solutions of eq. (7), before and after silence"""
     last_turn_rate: AngularVelocity | None
-    """omega_2 of eq. (8); only b plans it"""
+    """omega_2 of eq. (8), of the latest; a plans one only where b's has not settled it"""
     separation_m2: Annotated[float, Meta(ge=0.0, le=1e15)] | None
     """J of eq. (8); none where one candidate was left, and nothing to be told apart"""
     reports_sent: Count

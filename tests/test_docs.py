@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import pytest
 
-from docs import random_starts
+from docs import rendezvous
 
 
-def test_the_figures_of_random_starts_are_printed_for_both_variants(
-    capsys: pytest.CaptureFixture[str],
+def test_the_figures_of_the_rendezvous_are_printed_a_line_a_setting(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    random_starts.main(20)
-    lines = [line for line in capsys.readouterr().out.splitlines() if line.strip()]
-    assert [line.partition(":")[0] for line in lines[-2:]] == ["assured", "paper"]
-    assert "20 localised of 20; worst error " in lines[-2]
+    monkeypatch.setattr(rendezvous, "SETTINGS", [rendezvous.SECTION_IV])
+    rendezvous.main(90, 25)
+    heading, line = capsys.readouterr().out.splitlines()
+    assert heading.split()[0] == "D,"
+    setting, _, figures = line.partition("3.14 ")
+    assert setting.split() == ["10,", "3,", "1,", "1,"]
+    bound, mean, worst, papers, papers_worst, *_ = (float(word) for word in figures.replace("/", " ").split())
+    assert worst <= bound
+    assert mean <= 0.6 * papers
+    assert worst <= 0.6 * papers_worst
