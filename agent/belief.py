@@ -18,6 +18,10 @@ from protocol.motion import Pose, compose, wrap
 FLOOR = 1e-9
 """m: how far an exact anchor range may be from its prediction (rounding; a thousand times what is seen)"""
 
+ON_ANCHOR = 5e-9
+"""m: nearer to its anchor than this, a robot is on it. The branches put the anchor 2 rho_0 apart at the most,
+and one that turns slowly would not come to where ranges tell so little in any useful time."""
+
 MUTUAL_FLOOR = 1e-7
 """m: the same for a mutual range, whose prediction inherits the rounding of both robots' phase 1"""
 

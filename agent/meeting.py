@@ -10,7 +10,7 @@ from agent.belief import Sighting, weigh_placements
 from agent.mind import Done, Mind
 from agent.phases import encounter
 from agent.phases.encounter import LastManoeuvre, Standing, Waiting
-from agent.phases.rendezvous import Orbiting
+from agent.phases.rendezvous import Orbiting, off_anchor
 from agent.phases.seeking import Straight
 from protocol.messages import Localised
 
@@ -55,7 +55,7 @@ def considered(mind: Mind) -> Mind:
     variant, began = mind.briefing.variant, mind.findings.met
     assert began is not None
     sightings = mind.sightings(began if variant == "paper" else 0)
-    base = encounter.base(sightings)
+    base = encounter.base([at for at in sightings if off_anchor(at.b, mind.briefing.rendezvous.b)])
     if base is None:  # yet; or, where a report was missed, b was still driving as a went straight
         again = isinstance(mind.state, Waiting) and mind.hears_peer and mind.radio.state == "standing"
         return met(mind) if again and variant == "assured" else mind
@@ -64,7 +64,8 @@ def considered(mind: Mind) -> Mind:
     checked = encounter.redundant(sightings, base)
     if not left:
         return mind.undecided("no placement explains the mutual ranges")
-    if checked and len(left) == 1 and encounter.pinned_down(left[0], sightings, mission, distance):
+    starts = [start for start in (mind.start, mind.radio.start) if start is not None]
+    if checked and len(left) == 1 and encounter.pinned_down(left[0], sightings, starts, mission, distance):
         return replace(mind, state=Done(3, Localised(mind.world_pose(left[0]))))
     mover = mind.briefing.role
     if mover != (encounter.turn(sightings) if checked else "b"):

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from agent import meeting, radio
-from agent.belief import FLOOR, Branch, branches, weigh_branches
+from agent.belief import ON_ANCHOR, Branch, branches, weigh_branches
 from agent.mind import Asleep, Done, Mind
 from agent.phases import anchor, encounter, rendezvous, seeking
 from agent.phases.anchor import ThirdPoint
@@ -162,7 +162,7 @@ def _again(mind: Mind, sense: Sense) -> bool:
 def _released(mind: Mind, rho0: float | None) -> Mind:
     if rho0 is None:
         return mind.undecided("the anchor is out of range at the start")
-    if rho0 <= FLOOR:  # the heading is radial by definition, and nothing is left to find out
+    if rho0 <= ON_ANCHOR:  # the heading is radial by definition, and nothing is left to find out
         return _located(mind, Branch(0.0, ORIGIN), "on-anchor")
     return replace(mind, state=Straight("anchor", mind.odometry, rho0))
 

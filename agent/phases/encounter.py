@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.belief import Sighting, dilution, information
+from agent.belief import ON_ANCHOR, Sighting, dilution, information
 from agent.geometry import Placement, placements
 from agent.phases.seeking import travelled
 from protocol.mission import RANGE_MARGIN, Mission, Role, Variant
@@ -36,8 +36,8 @@ FAINT = 1e-6
 ROUNDING = 64 * 2.0**-52
 """of D + R: how far rounding may put a range off its prediction"""
 
-SURE = 1e-7
-"""rad, and m at the distance D + R: how exact a pose must be to be claimed; a tenth of what is tolerated"""
+SURE = 5e-7
+"""rad, and m at the distance D + R: how exact a pose must be to be claimed; half of what is tolerated"""
 
 
 class Standing(msgspec.Struct, frozen=True):
@@ -117,11 +117,20 @@ def turn(sightings: Sequence[Sighting]) -> Role:
 
 
 def pinned_down(
-    placement: Placement, sightings: Sequence[Sighting], mission: Mission, distance: float
+    placement: Placement,
+    sightings: Sequence[Sighting],
+    starts: Sequence[Pose],
+    mission: Mission,
+    distance: float,
 ) -> bool:
-    """Whether the ranges in `sightings` fix `placement` as exactly as a claim has to be."""
+    """Whether the ranges in `sightings` fix `placement` as exactly as a claim has to be.
+
+    `starts` are the robots', in the frames of their anchors: a robot that began on its anchor may have been
+    that little beside it.
+    """
     size = distance + mission.sensing_range
-    return dilution(placement, sightings) * ROUNDING * size * max(1.0, size) <= SURE
+    off = max([ROUNDING * size, *[ON_ANCHOR for start in starts if start.x == 0.0]])
+    return dilution(placement, sightings) * off * max(1.0, size) <= SURE
 
 
 def advanced(state: LastManoeuvre | Returning, pose: Pose, in_contact: bool, rest: Resting) -> State:

@@ -1,0 +1,678 @@
+"""What `assured` does beyond the letter: seen in whole missions, from ordinary and from awkward starts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from functools import cache
+from itertools import product
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from agent import planner
+from agent.belief import Sighting, dilution, weigh_placements
+from agent.geometry import Placement, same_placement
+from agent.mind import Mind
+from agent.phases.encounter import SPEEDS, TURN_RATES, LastManoeuvre, base, pinned_down, solve
+from compose.inline import play
+from compose.record import Moment, Record
+from compose.scenario import parse
+from protocol.messages import Localised
+from protocol.mission import Mission, obstacle
+from protocol.motion import ORIGIN, Pose, compose, step
+from tests.steps import Step, steps
+from world.referee import errors
+
+
+class Setting(NamedTuple):
+    distance: float = 10.0
+    reach: float = 3.0
+    period: float = 1.0
+    speed: float = 1.0
+    turn_rate: float = math.pi
+
+    @property
+    def mission(self) -> Mission:
+        return Mission(*self[1:])
+
+
+SECTION_IV = Setting()
+CLOSE = Setting(7.0, 5.0)
+"""where many meet on the way to their orbits"""
+WIDE = Setting(10.0, 15.0)
+"""where they are in range of each other wherever they wait"""
+SLOW = Setting(10.0, 1.0, 1.0, 0.9, 0.2)
+"""where b's last manoeuvre cannot keep every placement in range"""
+SHORTENED = Setting(3.0, 1.0)
+"""where the first straight is less than one tick at full speed"""
+
+
+def text_of(
+    setting: Setting,
+    a: Pose | None = None,
+    b: Pose | None = None,
+    *,
+    seed: int = 0,
+    variant: str = "assured",
+    frame: Pose = ORIGIN,
+    max_ticks: int | None = None,
+) -> str:
+    """A scenario file. The anchors are at (0, 0) and (D, 0), the starts where they are given: in `frame`."""
+
+    def robot(name: str, anchor: Pose, start: Pose | None) -> str:
+        there = compose(frame, anchor)
+        text = f'[[robot]]\nid = "{name}"\nanchor = [{there.x!r}, {there.y!r}]\n'
+        if start is None:
+            return text
+        there = compose(frame, start)
+        return text + f"start = [{there.x!r}, {there.y!r}, {there.heading!r}]\n"
+
+    return (
+        f'name = "assured"\nseed = {seed}\nplanner = {{variant = "{variant}"}}\n'
+        + (f"max_ticks = {max_ticks}\n" if max_ticks is not None else "")
+        + f"[mission]\nsensing_range = {setting.reach!r}\nperiod = {setting.period!r}\n"
+        + f"max_speed = {setting.speed!r}\nmax_turn_rate = {setting.turn_rate!r}\n"
+        + robot("a", ORIGIN, a)
+        + robot("b", Pose(setting.distance, 0.0, 0.0), b)
+    )
+
+
+@cache
+def drawn(setting: Setting, seed: int, variant: str = "assured") -> Record:
+    """The mission with starts drawn from `seed`."""
+    return play(parse(text_of(setting, seed=seed, variant=variant), "assured"))
+
+
+def released(setting: Setting, a: Pose | None, b: Pose | None, frame: Pose = ORIGIN) -> Record:
+    """The mission with these starts; one that is left out is drawn."""
+    return play(parse(text_of(setting, a, b, seed=11, frame=frame), "assured"))
+
+
+def steps_of(folder: Path, setting: Setting, seed: int) -> Iterator[Step]:
+    """The ticks of the mission with starts drawn from `seed`, with all that the robots know."""
+    path = folder / "assured.toml"
+    path.write_text(text_of(setting, seed=seed))
+    return steps(str(path))
+
+
+def assert_localised(record: Record) -> None:
+    starts = [robot.start for robot in record.scenario.robots]
+    assert record.end is not None
+    assert record.end.outcome == "localised", (record.end, starts)
+    last = record.moments[-1]
+    for robot, truth in zip(record.scenario.robots, last.truth.poses, strict=True):
+        verdict = last.drives[robot.id].verdict
+        assert isinstance(verdict, Localised)
+        assert max(errors(verdict.pose, truth)) < 1e-6, starts
+
+
+def in_contact(record: Record, moment: Moment) -> bool:
+    a, b = moment.truth.local
+    return math.hypot(a.x - b.x, a.y - b.y) <= record.scenario.mission.sensing_range
+
+
+def met(record: Record) -> int:
+    """The tick in which phase 3 begins."""
+    return next(m.truth.tick for m in record.moments if any(d.phase == 3 for d in m.drives.values()))
+
+
+def claimed(record: Record) -> int:
+    """The tick of the first claim."""
+    return next(m.truth.tick for m in record.moments if any(d.verdict for d in m.drives.values()))
+
+
+def states(record: Record, robot: str) -> list[tuple[int, str]]:
+    """Phase and state of `robot`, one after the other."""
+    found: list[tuple[int, str]] = []
+    for moment in record.moments:
+        drive = moment.drives[robot]
+        if not found or found[-1] != (drive.phase, drive.state):
+            found.append((drive.phase, drive.state))
+    return found
+
+
+# --- phase 3 begins as soon as it can -----------------------------------------------------------------
+
+
+def off_anchor(record: Record, moment: Moment) -> bool:
+    """Whether b is at least half way to where it waits, R / 8 from its anchor."""
+    anchor, place = record.scenario.robots[1].anchor, moment.truth.local[1]
+    return math.hypot(place.x - anchor.x, place.y - anchor.y) >= record.scenario.mission.sensing_range / 16.0
+
+
+@pytest.mark.parametrize(
+    ("setting", "on_the_way"), [(SECTION_IV, 3), (CLOSE, 15), (CLOSE._replace(turn_rate=0.2), 15), (WIDE, 60)]
+)
+def test_phase_3_begins_in_the_first_tick_of_contact_in_which_both_know_their_anchors(
+    setting: Setting, on_the_way: int
+) -> None:
+    """Whether they are in orbit or not: at least `on_the_way` of 60 are not."""
+    before_orbit = 0
+    for seed in range(60):
+        record = drawn(setting, seed)
+        first = next(
+            moment
+            for moment in record.moments
+            if in_contact(record, moment)
+            and all(drive.phase > 1 for drive in moment.drives.values())
+            and off_anchor(record, moment)
+        )
+        assert met(record) == first.truth.tick, seed
+        assert [drive.phase for drive in first.drives.values()] == [3, 3], seed
+        last = record.moments[first.truth.tick - 1]
+        before_orbit += any(drive.state != "orbiting" for drive in last.drives.values())
+    assert before_orbit >= on_the_way
+
+
+@pytest.mark.parametrize("setting", [CLOSE, CLOSE._replace(turn_rate=0.2), WIDE])
+def test_who_is_done_with_phase_1_stands_still_while_a_peer_in_range_is_not(setting: Setting) -> None:
+    waited = 0
+    for seed in range(100):
+        record = drawn(setting, seed)
+        for moment in record.moments:
+            for one, other in (("a", "b"), ("b", "a")):
+                drive = moment.drives[one]
+                if in_contact(record, moment) and drive.phase == 2 and moment.drives[other].phase == 1:
+                    assert (drive.v, drive.omega) == (0.0, 0.0), seed
+                    waited += 1
+    assert waited >= 8
+
+
+def test_a_stands_still_while_b_in_range_drives_off_its_anchor() -> None:
+    """On its anchor, b's ranges would not tell how it is turned."""
+    record = released(CLOSE._replace(speed=0.1), Pose(4.0, 0.5, 1.0), Pose(7.0, 0.0, 2.0))
+    waited = [
+        moment.drives["a"]
+        for moment in record.moments
+        if [moment.drives[robot].phase for robot in "ab"] == [2, 2] and not off_anchor(record, moment)
+    ]
+    assert len(waited) >= 3
+    assert {(drive.v, drive.omega) for drive in waited} == {(0.0, 0.0)}
+    assert off_anchor(record, record.moments[met(record)])
+    assert not off_anchor(record, record.moments[met(record) - 1])
+    assert_localised(record)
+
+
+@pytest.mark.parametrize("setting", [SECTION_IV, CLOSE, SECTION_IV._replace(distance=30.0), SLOW])
+def test_once_both_orbit_phase_3_begins_within_the_bound(setting: Setting) -> None:
+    for seed in range(60):
+        record = drawn(setting, seed)
+        orbits = sum(
+            all(drive.state == "orbiting" for drive in moment.drives.values()) for moment in record.moments
+        )
+        bound = record.scenario.robots[0].rendezvous.bound
+        assert orbits * setting.period <= bound + 1e-9, seed
+
+
+@pytest.mark.parametrize(("reach", "a_ranges"), [(3.0, 1), (6.0, 400)])
+def test_however_long_b_has_waited_the_first_report_tells_the_whole_way(
+    reach: float, a_ranges: int, tmp_path: Path
+) -> None:
+    """Also where a report cannot hold all the ranges that there are to tell: a's, less than 6 m from M1."""
+    for seed in (0, 2):
+        waited = 0
+        for moment in steps_of(tmp_path, Setting(reach=reach, period=0.05), seed):
+            waited += moment.drives["b"].state == "orbiting"
+            if any(moment.heard.values()):
+                break
+        assert waited > 300
+        assert len(moment.before["a"].log.ranges) >= a_ranges
+        assert len(moment.before["b"].log.ranges) < 100
+        for told in moment.heard.values():
+            assert [(report.since, report.through) for report in told] == [(0, moment.world.truth.tick)]
+        assert {drive.phase for drive in moment.drives.values()} == {3}
+
+
+# --- what was sensed before phase 3 counts ------------------------------------------------------------
+
+
+def encounter(record: Record) -> list[Moment]:
+    """The ticks from the beginning of phase 3 until b sets out on its last manoeuvre, or the claim."""
+    moments = record.moments[met(record) :]
+    end = next(
+        i
+        for i, moment in enumerate(moments)
+        if moment.drives["b"].state == "last-manoeuvre" or any(d.verdict for d in moment.drives.values())
+    )
+    return list(moments[: end + 1])
+
+
+def test_silence_before_phase_3_rules_placements_out() -> None:
+    """Of missions in which there was none since."""
+    fewer = 0
+    for seed in range(150):
+        record = drawn(CLOSE, seed)
+        if all(in_contact(record, moment) for moment in encounter(record)):
+            candidates = record.farewells["b"].candidates
+            assert candidates is not None
+            assert candidates == record.farewells["a"].candidates
+            fewer += candidates[1] < candidates[0]
+    assert fewer >= 15
+
+
+def test_ranges_before_phase_3_make_a_last_manoeuvre_needless() -> None:
+    """Who has them claims after the two ranges that eq. (7) is made from."""
+    spared = 0
+    for seed in range(150):
+        record = drawn(CLOSE, seed)
+        ranged = [moment.truth.tick for moment in record.moments if in_contact(record, moment)]
+        since = [tick for tick in ranged if met(record) <= tick <= claimed(record)]
+        if len(since) < 3:
+            assert len(since) == 2
+            assert len([tick for tick in ranged if tick <= claimed(record)]) >= 3
+            assert all(moment.drives["b"].state != "last-manoeuvre" for moment in record.moments)
+            spared += 1
+    assert spared >= 15
+
+
+def test_without_what_was_sensed_before_phase_3_more_placements_would_be_left(tmp_path: Path) -> None:
+    more = 0
+    for seed in range(60):
+        claim = next(step for step in steps_of(tmp_path, CLOSE, seed) if step.drives["b"].verdict)
+        mind = planner.decide(claim.observed["b"], claim.heard["b"])
+        assert mind.findings.met is not None
+        late = mind.sightings(mind.findings.met)
+        pair = base(late)
+        assert pair is not None
+        left = weigh_placements(solve(CLOSE.distance, pair), late, CLOSE.reach)
+        (known,) = mind.findings.placements
+        assert any(same_placement(known, one, 1e-6) for one in left), seed
+        more += len(left) > 1
+    assert more >= 6
+
+
+# --- nobody claims without a check --------------------------------------------------------------------
+
+
+def places(moment: Moment) -> tuple[float, ...]:
+    """m: of a and of b."""
+    a, b = moment.truth.local
+    return a.x, a.y, b.x, b.y
+
+
+@pytest.mark.parametrize("setting", [SECTION_IV, CLOSE, WIDE, SLOW])
+def test_nobody_claims_before_ranges_from_three_different_places(setting: Setting) -> None:
+    single = 0
+    for seed in range(100):
+        record = drawn(setting, seed)
+        assert_localised(record)
+        different: list[tuple[float, ...]] = []
+        for moment in record.moments[: claimed(record) + 1]:
+            here = places(moment)
+            if in_contact(record, moment) and all(math.dist(here, there) > 1e-6 for there in different):
+                different.append(here)
+        assert len(different) >= 3, seed
+        single += record.farewells["b"].candidates in {(2, 1), (4, 1), (1, 1)}
+    assert single >= 5 or setting != CLOSE
+
+
+# --- a second range: straight ahead, straight behind, round a circle ----------------------------------
+
+
+def sought(record: Record, robot: str, phase: int) -> list[str]:
+    """What `robot` did in `phase` to get a second range."""
+    words = ("straight", "backing", "turning", "circling")
+    return [word for of, word in states(record, robot) if of == phase and word in words]
+
+
+@pytest.mark.parametrize("setting", [SECTION_IV, SLOW, WIDE, SHORTENED])
+def test_who_leaves_the_range_straight_ahead_looks_behind_before_it_circles(setting: Setting) -> None:
+    ways = set()
+    for seed in range(100):
+        record = drawn(setting, seed)
+        for robot, phase in (("a", 1), ("b", 1), ("a", 3)):
+            ways.add((phase, *sought(record, robot, phase)))
+        for moment in record.moments:
+            for drive in moment.drives.values():
+                assert drive.state != "backing" or (drive.v < 0.0 and drive.omega == 0.0)
+    whole = ("straight", "backing", "turning", "circling")
+    assert ways - {(1,)} <= {(phase, *whole[:length]) for phase in (1, 3) for length in (1, 2, 4)}
+    assert (1, *whole[:2]) in ways
+    assert (3, *whole[:2]) in ways
+    assert (1, *whole) in ways or setting not in (SECTION_IV, SLOW)
+
+
+def test_the_letter_never_looks_behind() -> None:
+    for seed in range(100):
+        record = drawn(SECTION_IV, seed, "paper")
+        assert all(drive.state != "backing" for moment in record.moments for drive in moment.drives.values())
+
+
+def known(record: Record, robot: str) -> int:
+    """The tick at which phase 1 ends."""
+    return next(moment.truth.tick for moment in record.moments if moment.drives[robot].phase > 1)
+
+
+@pytest.mark.parametrize("reach", [1.0, 3.0, 5.0])
+def test_to_look_behind_is_never_slower_than_to_circle_for_who_turns_slowly_and_finds_the_anchor_there(
+    reach: float,
+) -> None:
+    setting = Setting(reach=reach, turn_rate=0.2)
+    behind = 0
+    for seed in range(60):
+        ours, letters = drawn(setting, seed), drawn(setting, seed, "paper")
+        for robot in "ab":
+            if sought(ours, robot, 1) == ["straight", "backing"] and letters.farewells[robot].branch:
+                assert known(ours, robot) < known(letters, robot), seed
+                behind += 1
+    assert behind >= 10
+
+
+# --- the last manoeuvre -------------------------------------------------------------------------------
+
+
+def left_out(mind: Mind, v: float, omega: float, candidates: tuple[Placement, ...]) -> list[Placement]:
+    """Those by which a is out of range of b, who is at `mind`, once b has driven (v, omega)."""
+    mission = mind.briefing.mission
+    end = step(mind.local_pose, v, omega, mission.period)
+    a = mind.sightings(mind.tick)[-1].a
+    rim = mission.sensing_range - 1e-6
+    return [one for one in candidates if math.hypot(one.place(a).x - end.x, one.place(a).y - end.y) > rim]
+
+
+def grid(mission: Mission) -> Iterator[tuple[float, float]]:
+    """Some of the manoeuvres among which b chooses."""
+    unit = mission.first_straight / mission.period
+    rates = [mission.max_turn_rate * (2 * i / (TURN_RATES - 1) - 1) for i in range(0, TURN_RATES, 24)]
+    return ((unit * speed, rate) for speed, rate in product(SPEEDS, rates))
+
+
+def test_the_last_manoeuvre_leaves_no_more_placements_out_of_range_than_it_must(tmp_path: Path) -> None:
+    counts = set()
+    for seed in (*range(20), 64, 78, 83, 86):
+        for moment in steps_of(tmp_path, SLOW, seed):
+            mind = planner.decide(moment.observed["b"], moment.heard["b"])
+            if isinstance(mind.state, LastManoeuvre) and not isinstance(
+                moment.before["b"].state, LastManoeuvre
+            ):
+                candidates = mind.findings.placements
+                drive = moment.drives["b"]
+                out = len(left_out(mind, drive.v, drive.omega, candidates))
+                assert out <= min(len(left_out(mind, *one, candidates)) for one in grid(SLOW.mission)), seed
+                assert out <= 1
+                counts.add(out)
+    assert counts == {0, 1}
+
+
+@pytest.mark.parametrize("seed", [64, 78, 83, 86])
+def test_silence_names_the_placement_left_out_and_b_drives_back_to_tell(seed: int, tmp_path: Path) -> None:
+    moments = list(steps_of(tmp_path, SLOW, seed))
+    doing = [moment.drives["b"].state for moment in moments]
+    out = doing.index("returning")
+    setting_out, silent, back = moments[out - 1], moments[out], moments[out + 1]
+    drive, returning = setting_out.drives["b"], silent.drives["b"]
+    assert drive.state == "last-manoeuvre"
+    assert not silent.heard["b"]
+    assert (returning.v, returning.omega) == (-drive.v, -drive.omega)
+    assert math.dist(places_of(back)[1], places_of(setting_out)[1]) < 1e-9
+    assert back.heard["b"]
+    mind = planner.decide(setting_out.observed["b"], setting_out.heard["b"])
+    for robot in "ab":
+        named = planner.decide(back.observed[robot], back.heard[robot]).findings.placements
+        (only,) = left_out(mind, drive.v, drive.omega, mind.findings.placements)
+        assert len(named) == 1
+        assert same_placement(named[0], only, 1e-6)
+
+
+def places_of(moment: Step) -> list[tuple[float, float]]:
+    return [(pose.x, pose.y) for pose in moment.world.truth.local]
+
+
+@pytest.mark.parametrize("setting", [SECTION_IV, CLOSE, SHORTENED, Setting(speed=5.0)])
+def test_b_sets_out_only_once_a_stands(setting: Setting) -> None:
+    for seed in range(100):
+        for moment in drawn(setting, seed).moments:
+            if moment.drives["b"].state == "last-manoeuvre":
+                assert (moment.drives["a"].v, moment.drives["a"].omega) == (0.0, 0.0), seed
+
+
+# --- how exact a placement is -------------------------------------------------------------------------
+
+angles = st.floats(-math.pi, math.pi)
+coordinates = st.floats(-20.0, 20.0)
+poses = st.builds(Pose, coordinates, coordinates, angles)
+
+
+def sighted(placement: Placement, a: Pose, b: Pose) -> Sighting:
+    there = placement.place(a)
+    return Sighting(0, a, b, math.hypot(there.x - b.x, there.y - b.y))
+
+
+def ranges_of(distance: float, phi: float, psi: float, sightings: list[Sighting]) -> list[float]:
+    """m: as predicted where M1 lies in the direction psi of M2, and <a(M1)> is turned by phi."""
+    placement = Placement(phi, distance * math.cos(psi), distance * math.sin(psi))
+    found = [sighted(placement, one.a, one.b).range for one in sightings if one.range is not None]
+    return [rho for rho in found if rho is not None]
+
+
+@given(st.floats(1.0, 40.0), angles, angles, st.lists(st.tuples(poses, poses), min_size=2, max_size=5))
+def test_dilution_is_how_far_least_squares_would_turn_a_robot_for_a_metre_of_error(
+    distance: float, phi: float, psi: float, pairs: list[tuple[Pose, Pose]]
+) -> None:
+    placement = Placement(phi, distance * math.cos(psi), distance * math.sin(psi))
+    sightings = [sighted(placement, a, b) for a, b in pairs]
+    assume(all((one.range or 0.0) > 0.1 for one in sightings))
+    h = 1e-5
+    by_phi, by_psi = (
+        np.subtract(
+            ranges_of(distance, phi + h * turn, psi + h * (1 - turn), sightings),
+            ranges_of(distance, phi - h * turn, psi - h * (1 - turn), sightings),
+        )
+        / (2 * h)
+        for turn in (1, 0)
+    )
+    slopes = np.column_stack([by_phi, by_psi])
+    assume(np.linalg.cond(slopes) < 1e3)
+    fit = np.linalg.pinv(slopes)
+    turned_a, turned_b = np.linalg.norm(fit[0] - fit[1]), np.linalg.norm(fit[1])
+    silent = Sighting(0, Pose(1.0, 2.0, 3.0), ORIGIN, None)
+    assert dilution(placement, [*sightings, silent]) == pytest.approx(max(turned_a, turned_b), rel=1e-3)
+
+
+GENERAL = Placement(0.7, -9.0, 4.0)
+OPEN = {
+    "b between the anchors": (
+        Placement(0.3, 10.0, 0.0),
+        [((4.0, 3.0), (8.0, 0.0)), ((5.0, 2.0), (8.0, 0.0))],
+    ),
+    "a went straight away from b": (
+        Placement(0.0, -9.0, 4.0),
+        [((11.0, -4.0), (0.0, 0.0)), ((10.0, -4.0), (0.0, 0.0))],
+    ),
+    "all in a line": (
+        Placement(0.0, -10.0, 0.0),
+        [((7.0, 0.0), (-0.3, 0.0)), ((8.0, 0.0), (-0.3, 0.0)), ((8.0, 0.0), (-1.0, 0.0))],
+    ),
+    "one range": (GENERAL, [((5.0, 1.0), (0.3, 0.1))]),
+}
+"""Double roots of eq. (7), and less: a placement, and where a and b were when they were ranged"""
+
+
+def seen_at(placement: Placement, *places: tuple[tuple[float, float], tuple[float, float]]) -> list[Sighting]:
+    return [sighted(placement, Pose(*a, 0.0), Pose(*b, 0.0)) for a, b in places]
+
+
+def certain(placement: Placement, sightings: list[Sighting]) -> bool:
+    return pinned_down(placement, sightings, [], SECTION_IV.mission, SECTION_IV.distance)
+
+
+@pytest.mark.parametrize("case", OPEN)
+def test_ranges_that_leave_a_turn_open_pin_nothing_down(case: str) -> None:
+    placement, places = OPEN[case]
+    sightings = seen_at(placement, *places)
+    assert dilution(placement, sightings) == math.inf
+    assert not certain(placement, sightings)
+
+
+def test_ranges_from_where_nothing_is_special_pin_a_placement_down() -> None:
+    assert certain(GENERAL, seen_at(GENERAL, ((8.0, 3.0), (0.3, 0.2)), ((7.5, 4.0), (0.3, 0.2))))
+
+
+def test_one_more_range_from_elsewhere_pins_a_double_root_down() -> None:
+    placement, places = OPEN["b between the anchors"]
+    assert certain(placement, seen_at(placement, *places, ((5.0, 2.0), (8.0, 1.0))))
+
+
+# --- wherever in the plane ----------------------------------------------------------------------------
+
+FRAMES = [
+    Pose(9e5, -9e5, 0.0),
+    Pose(-9e5, -9e5, 2.0),
+    Pose(9e5, 9e5, -2.5),
+    Pose(0.0, 0.0, math.pi / 2),
+    Pose(-1e4, 9e5, math.pi),
+    Pose(0.5, 0.25, 1.0),
+]
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_a_mission_is_the_same_wherever_in_the_plane_it_is(frame: Pose) -> None:
+    for setting, seed in product((SECTION_IV, CLOSE), range(8)):
+        here = drawn(setting, seed)
+        a, b = (robot.start for robot in here.scenario.robots)
+        there = released(setting, a, b, frame)
+        assert_localised(there)
+        assert len(there.moments) == len(here.moments), seed
+        for robot in "ab":
+            assert states(there, robot) == states(here, robot), seed
+
+
+# --- starts that are anything but random --------------------------------------------------------------
+
+
+def drawn_pose(setting: Setting, seed: int) -> Pose:
+    """Where a is drawn."""
+    return drawn(setting, seed).scenario.robots[0].start
+
+
+def mirrored(setting: Setting, a: Pose) -> Pose:
+    """What b's start is to be for the two to be each other's image."""
+    return Pose(setting.distance - a.x, a.y, math.pi - a.heading)
+
+
+def shifted(setting: Setting, a: Pose) -> Pose:
+    """What b's start is to be for both to stand alike to their anchors."""
+    return Pose(setting.distance + a.x, a.y, a.heading)
+
+
+@pytest.mark.parametrize("setting", [SECTION_IV, CLOSE, Setting(4.0), SLOW])
+@pytest.mark.parametrize("of_a", [mirrored, shifted])
+def test_two_that_start_alike_localise(setting: Setting, of_a: Callable[[Setting, Pose], Pose]) -> None:
+    for seed in range(25):
+        a = drawn_pose(setting, seed)
+        assert_localised(released(setting, a, of_a(setting, a)))
+
+
+@pytest.mark.parametrize("setting", [Setting(4.0), Setting(2.0), Setting(5.0, 5.0), CLOSE])
+@pytest.mark.parametrize("apart", [0.0, 1e-9, 1e-3, 0.5])
+def test_two_that_start_together_localise(setting: Setting, apart: float) -> None:
+    """On each other, or nearly; with headings that are the same, opposite or neither."""
+    middle = setting.distance / 2
+    for turn, (x, y), heading in product(
+        (0.0, math.pi, 1.0), ((0.0, 0.0), (0.1, 0.3), (-0.2, -0.6)), (0.0, 0.4, 2.0, 3.5, 5.0)
+    ):
+        a = Pose(middle + x, y, heading)
+        assert_localised(released(setting, a, Pose(a.x + apart, a.y, heading + turn)))
+
+
+OFFSETS = (0.0, *(sign * 10.0**-n for n in (12, 9, 6, 3) for sign in (1, -1)))
+RADIAL_AND_TANGENT = (0.0, math.pi, math.pi / 2, -math.pi / 2)
+HARD = [SECTION_IV, Setting(2.0), SECTION_IV._replace(distance=30.0), WIDE, Setting(period=0.05), SLOW]
+INSIDE = (0.0, 1e-12, 1e-9, 1e-6, 1e-3)
+"""m: rho_0"""
+AT_THE_RIM = (-1e-12, 0.0)
+"""m: rho_0 - R"""
+
+
+def hard(setting: Setting) -> Iterator[tuple[float, float]]:
+    """rho_0 and heading of starts next to where formulas break down."""
+    radii = (*INSIDE, *(setting.reach + rim for rim in AT_THE_RIM))
+    offsets = OFFSETS if setting.period == 1.0 else OFFSETS[::4]
+    return ((rho0, heading + offset) for rho0, heading, offset in product(radii, RADIAL_AND_TANGENT, offsets))
+
+
+@pytest.mark.parametrize("setting", HARD)
+def test_b_localises_from_starts_at_the_edge_of_what_can_be_told(setting: Setting) -> None:
+    for rho0, heading in hard(setting):
+        assert_localised(released(setting, None, Pose(setting.distance + rho0, 0.0, heading)))
+
+
+@pytest.mark.parametrize("setting", HARD)
+def test_both_localise_from_mirrored_starts_at_the_edge_of_what_can_be_told(setting: Setting) -> None:
+    for rho0, heading in hard(setting):
+        a = Pose(rho0, 0.0, heading)
+        if not in_line(a):
+            assert_localised(released(setting, a, mirrored(setting, a)))
+
+
+def in_line(a: Pose) -> bool:
+    """Whether a start, that b mirrors, leads neither out of the line through the anchors; see below."""
+    return a.x <= 1e-9 and abs(math.sin(a.heading)) < 0.1
+
+
+@pytest.mark.parametrize("heading_a", [0.0, math.pi])
+@pytest.mark.parametrize("heading_b", [0.0, math.pi])
+def test_two_on_their_anchors_who_head_along_the_line_between_these_localise(
+    heading_a: float, heading_b: float
+) -> None:
+    """Nothing that they do then leads out of that line, on which ranges do not tell how anybody is turned."""
+    assert_localised(released(SECTION_IV, Pose(0.0, 0.0, heading_a), Pose(10.0, 0.0, heading_b)))
+
+
+@pytest.mark.parametrize("rho0", [1.1e-9, 2e-9, 5e-9, 1e-8, 1e-7])
+def test_who_turns_slowly_gets_through_phase_1_from_next_to_its_anchor(rho0: float) -> None:
+    setting = Setting(reach=1.0, period=0.05, turn_rate=0.2)
+    for heading in (*RADIAL_AND_TANGENT, 1.0, 4.0):
+        text = text_of(setting, Pose(rho0, 0.0, heading), None, max_ticks=200)
+        assert play(parse(text, "assured")).moments[-1].drives["a"].phase > 1, heading
+
+
+# --- what is too small and too large ------------------------------------------------------------------
+
+
+@given(st.floats(0.1, 1.5), st.floats(0.05, 1.0), st.floats(0.2, math.pi))
+def test_nothing_is_in_the_way_of_ordinary_missions(ratio: float, period: float, turn_rate: float) -> None:
+    assert obstacle(Mission(10.0 * ratio, period, 1.0, turn_rate), 10.0) is None
+
+
+@pytest.mark.parametrize(
+    ("mission", "distance", "step"),
+    [
+        (Mission(3.0, 1e-3, 0.05, 1.0), 10.0, "5e-05 m"),
+        (Mission(3.0, 1e-5, 1.0, 1.0), 10.0, "1e-05 m"),
+        (Mission(3.0, 1.0, 9.9e-5, 1.0), 10.0, "9.9e-05 m"),
+    ],
+)
+def test_ticks_that_move_a_robot_too_little_are_in_the_way(
+    mission: Mission, distance: float, step: str
+) -> None:
+    why = obstacle(mission, distance)
+    assert why is not None
+    assert f"a tick moves a robot by {step} at most" in why
+    assert why.endswith("raise max_speed or period")
+    assert obstacle(replace(mission, max_speed=mission.max_speed * 1e3), distance) is None
+
+
+@pytest.mark.parametrize(
+    ("mission", "distance", "named"),
+    [
+        (Mission(3.0, 0.05, 1.0, 1.0), 1000.0, ("1000 m", "3 m", "0.05 m")),
+        (Mission(3.0, 1.0, 1.0, 1.0), 2e3, ("2000 m", "3 m", "1 m")),
+        (Mission(300.0, 1.0, 0.3, 1.0), 10.0, ("10 m", "300 m", "0.3 m")),
+    ],
+)
+def test_distances_too_large_for_the_manoeuvres_are_in_the_way(
+    mission: Mission, distance: float, named: tuple[str, str, str]
+) -> None:
+    why = obstacle(mission, distance)
+    assert why is not None
+    between, reach, step = named
+    assert f"with {between} between the anchors and ranges up to {reach}, manoeuvres of {step} are" in why
+    assert why.endswith("raise max_speed or period")
+    assert obstacle(replace(mission, max_speed=mission.max_speed * 1e3), distance) is None
