@@ -31,6 +31,9 @@ POLISHING_STEPS = 12
 SAME_ANCHOR = FLOOR
 """m: branches that put the anchor so near each other predict the same ranges, to the floor"""
 
+DAMPING = 1e-9
+"""of a fit's curvature, added to it: so a step goes only where the ranges tell something"""
+
 SINGULAR = 1e-14
 """how nearly parallel two columns may be before they count as one (the sine of their angle, squared)"""
 
@@ -221,8 +224,10 @@ def _polished_placement(placement: Placement, sightings: Sequence[Sighting]) -> 
         if cost >= best:
             break
         best, fitted = cost, Placement(wrap(phi), tx, ty)
+        damping = DAMPING * (pp + qq)
+        pp, qq = pp + damping, qq + damping
         determinant = pp * qq - pq * pq
-        if determinant <= SINGULAR * pp * qq:
+        if determinant == 0.0:
             break
         phi -= (qq * gp - pq * gq) / determinant
         psi -= (pp * gq - pq * gp) / determinant
