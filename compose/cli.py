@@ -121,10 +121,15 @@ def _add_sweep(parser: argparse.ArgumentParser) -> None:
     )
     where.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask scheduler that runs already")
     parser.add_argument("--processes", action="store_true", help="trials as processes, over Zenoh")
+    parser.add_argument("--retry", action="store_true", help="play again what was lost before")
     parser.add_argument("-q", "--quiet", action="store_true", help="print only the counts")
 
 
 def _folder(text: str) -> Path:
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        raise argparse.ArgumentTypeError(f"{text!a} is no folder: it is not UTF-8") from None
     if not text:
         raise argparse.ArgumentTypeError("'' is no folder")
     return Path(text).expanduser()

@@ -191,7 +191,7 @@ def test_rows_are_the_same_by_a_scheduler_and_workers_started_by_hand_even_if_on
 
 
 def test_a_scheduler_that_is_not_there_is_one_line(folder: Path) -> None:
-    for address in ("tcp://127.0.0.1:9", "nonsense://x"):
+    for address in ("tcp://127.0.0.1:9", "nonsense://x", "nonsense"):
         ended = sweep(folder, "both.toml", "out", "--scheduler", address)
         assert ended.status == 2
         assert re.fullmatch(rf"tandem sweep: --scheduler: {address} cannot be reached: [^\n]+\n", ended.err)
@@ -251,6 +251,8 @@ def test_trials_that_raise_die_or_hang_are_rows_and_the_others_go_on(folder: Pat
     again = sweep(folder, "astray.toml", "out")
     assert again.status == 3
     assert "trial 1 of cell 0, failed (ValueError: two\\nlines)" in again.out
+    sweep(folder, "astray.toml", "out", "--retry")
+    assert rows(folder / "out") == expected
 
 
 def test_a_campaign_that_is_killed_twice_goes_on_where_it_was(folder: Path) -> None:
@@ -309,6 +311,19 @@ def test_a_trial_that_hangs_does_not_outlive_whoever_ran_it(folder: Path) -> Non
         process.communicate(timeout=30.0)
     until(lambda: not trial_processes(folder), "the trials' processes end with their owner")
     sweep_up(folder)
+
+
+def test_a_folder_may_be_called_anything_and_a_label_stands_as_it_is_written(folder: Path) -> None:
+    name = "two words: 12:30"
+    (folder / "both.toml").write_text(
+        'name = "both"\nscenario = "base.toml"\ntrials = 1\n[[axis]]\nname = "way"\n'
+        'field = "planner.variant"\nvalues = ["paper", "assured"]\nlabels = ["$\\\\nosuch{$ a", "b_c$"]\n'
+    )
+    ended = sweep(folder, "both.toml", name, "-q")
+    assert ended.status in (0, 1), ended.err
+    assert len(rows(folder / name)) == 2
+    assert "$\\nosuch{$ a" in (folder / name / "summary.csv").read_text()
+    assert (folder / name / "figures" / "success-way.png").exists()
 
 
 # --- a campaign's folder ------------------------------------------------------------------------------

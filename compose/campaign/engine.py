@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import dask
 import msgspec
 from distributed import Client, Future, KilledWorker, LocalCluster
-from distributed.comm.addressing import parse_address
+from distributed.comm.addressing import parse_address, parse_host_port
 from distributed.comm.registry import get_backend
 
 from compose.campaign import owner
@@ -41,10 +41,14 @@ LOOPBACK = "127.0.0.1:0"
 def connect(workers: int, scheduler: str | None) -> Iterator[Client]:
     """Whoever plays chunks: so many threads here, or those at the address. Raises UserError."""
     dask.config.set({"distributed.comm.timeouts.connect": CONNECT_S, "distributed.admin.tick.limit": "1h"})
-    logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)  # what is to be said, we say
+    for name in ["distributed", *logging.root.manager.loggerDict]:
+        if name.partition(".")[0] == "distributed":
+            logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # what is to be said, we say
     if scheduler is not None:
         try:
-            get_backend(parse_address(scheduler)[0])
+            scheme, location = parse_address(scheduler)
+            get_backend(scheme)
+            parse_host_port(location)
             client = Client(scheduler, timeout=CONNECT_S, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:
             why = one_line(str(error).splitlines()[0] if str(error) else type(error).__name__)

@@ -38,7 +38,7 @@ DPI = 160
 
 def draw(results: Results, folder: Path) -> None:
     """Draw them anew, each as SVG and PNG, into `folder`."""
-    mpl.rcParams.update({"svg.hashsalt": "tandem", "font.size": 9})
+    mpl.rcParams.update({"svg.hashsalt": "tandem", "font.size": 9, "text.parse_math": False})
     folder.mkdir(exist_ok=True)
     for place, axis in enumerate(results.campaign.axes):
         if len(axis.values) > 1:
@@ -139,8 +139,10 @@ def _meeting(results: Results) -> Figure:
             x, y = np.concatenate([[0.0], np.sort(met), [end]]), np.append(share, share[-1])
             axes.step(x, y, where="post", color=colour, ls=style, lw=1.3, label=label)
     in_orbit.axvline(1.0, color="0.2", lw=1.0)
-    in_orbit.annotate("$T_{max}$", (1.0, 0.02), xytext=(-3, 0), textcoords="offset points", ha="right")
-    in_orbit.set_xlabel("from both in orbit to meeting, over $T_{max}$")
+    in_orbit.annotate(
+        "$T_{max}$", (1.0, 0.02), parse_math=True, xytext=(-3, 0), textcoords="offset points", ha="right"
+    )
+    in_orbit.set_xlabel("from both in orbit to meeting, over $T_{max}$", parse_math=True)
     since_release.set_xlabel("from release to meeting [s]")
     since_release.set_ylabel("share of all trials")
     since_release.set_ylim(0.0, 1.02)

@@ -62,6 +62,11 @@ class Folder:
                 found[cell].add(trial)
         return found
 
+    def forget_lost(self) -> None:
+        """The trials that were lost, to an error or with their process, have no row any more."""
+        table = self.gather()
+        write(self.path / TRIALS, table.filter(table["error"].is_null()))
+
     def ask(self, refused: Mapping[int, str]) -> None:
         """Put down what is about to be played, and each cell's scenario."""
         self.refused = dict(refused)

@@ -32,6 +32,8 @@ class Means(msgspec.Struct, frozen=True):
     processes: bool = False
     """trials as processes over Zenoh"""
     play: str = PLAY
+    retry: bool = False
+    """play again what was lost before"""
 
 
 class Progress(msgspec.Struct, frozen=True):
@@ -70,6 +72,8 @@ def sweep(campaign: Campaign, out: Path, means: Means, inbox: Inbox, progress: P
             for name, count in Counter(names).items():
                 if count > 1:
                     raise BadSpec(f"{campaign.source}: axis: {count} columns would be called '{name}'")
+        if means.retry:
+            folder.forget_lost()
         work = _left(folder, progress)
         stopped, interrupted = None, False
         if work:
@@ -86,6 +90,9 @@ def _left(folder: Folder, progress: Progress) -> list[Work]:
     """What has to be played; only the settings of those cells are worked out."""
     campaign, refused = folder.campaign, dict(folder.refused)
     done = folder.done()
+    beyond = sum([trial >= campaign.trials for trials in done.values() for trial in trials])
+    if beyond:
+        progress.say(f"{folder.path} holds {beyond} trials beyond {campaign.trials} a cell; they are kept")
     work = []
     count = 0
     for cell in folder.cells.values():

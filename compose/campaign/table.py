@@ -109,7 +109,7 @@ def gathered(tables: Sequence[pa.Table]) -> pa.Table:
 
 def read(path: Path, schema: pa.Schema, columns: list[str]) -> pa.Table:
     """Those columns of a file of the schema. Raises OSError or ValueError if it is none."""
-    with pq.ParquetFile(path) as file:
+    with path.open("rb") as opened, pq.ParquetFile(opened) as file:  # a path with a colon it takes for a URI
         if not file.schema_arrow.equals(schema):
             raise ValueError("its columns are others")
         return file.read(columns)
@@ -118,5 +118,6 @@ def read(path: Path, schema: pa.Schema, columns: list[str]) -> pa.Table:
 def write(path: Path, table: pa.Table) -> None:
     """All at once, by renaming."""
     unfinished = path.with_name(path.name + UNFINISHED)
-    pq.write_table(table, unfinished)
+    with unfinished.open("wb") as file:
+        pq.write_table(table, file)
     unfinished.replace(path)

@@ -30,9 +30,8 @@ def main(options: argparse.Namespace) -> int:
     from compose.campaign import figures, report, run  # noqa: PLC0415  # slow, and there may be no extra
 
     out = options.out if options.out is not None else Path(f"sweep-{campaign.name}")
-    means = run.Means(scheduler=options.scheduler, processes=options.processes)
-    if options.workers is not None:
-        means = run.Means(workers=options.workers, processes=options.processes)
+    chosen = {"workers": options.workers} if options.workers is not None else {}
+    means = run.Means(scheduler=options.scheduler, processes=options.processes, retry=options.retry, **chosen)
     visible = sys.stdout.isatty() and not options.quiet
     with report.progress(campaign.name, inbox.say, visible) as progress:
         results = run.sweep(campaign, out, means, inbox, progress)
