@@ -1,4 +1,4 @@
-"""How soon orbits meet: `uv run docs/rendezvous.py [ANGLES] [PLANS]` (1000, 1000).
+"""How soon orbits meet: `uv run docs/rendezvous.py [ANGLES] [PLANS]` (1000, 200).
 
 The mean and the longest time, in ticks, until two robots that drive round their anchors are in range of
 each other, over all pairs of ANGLES starting angles: on the orbits of `assured`; on the paper's, inside
@@ -125,4 +125,4 @@ def main(angles: int, plans: int) -> None:
 
 
 if __name__ == "__main__":
-    main(*(int(argument) for argument in sys.argv[1:]), *(1000, 1000)[len(sys.argv) - 1 :])
+    main(*(int(argument) for argument in sys.argv[1:]), *(1000, 200)[len(sys.argv) - 1 :])
