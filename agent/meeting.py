@@ -68,7 +68,7 @@ def considered(mind: Mind) -> Mind:
     if checked and len(left) == 1 and encounter.pinned_down(left[0], sightings, starts, mission, distance):
         return replace(mind, state=Done(3, Localised(mind.world_pose(left[0]))))
     mover = mind.briefing.role
-    if mover != (encounter.turn(sightings) if checked else "b"):
+    if mover != (encounter.turn(sightings) if checked and variant == "assured" else "b"):
         return mind
     if variant == "assured" and mind.radio.state not in PEER_RESTS:
         return mind

@@ -5,6 +5,8 @@ from __future__ import annotations
 from msgspec.structs import replace
 
 from agent import planner
+from compose.inline import play
+from compose.scenario import parse, shipped
 from protocol.messages import Localised, Undecided
 from protocol.motion import ORIGIN
 from tests.steps import steps
@@ -46,3 +48,14 @@ def test_a_wrong_claim_cannot_be_taken_back() -> None:
     judgement = judge(world.scenario, world.truth, world.verdicts | {"b": GAVE_UP})
     assert judgement is not None
     assert judgement.outcome == "wrong"
+
+
+def test_the_letter_gives_up_where_the_third_mutual_range_settles_nothing() -> None:
+    """b drove its one last manoeuvre; a, which the paper has stand, stands."""
+    text = f'{shipped()["random"].read_text()}\n[planner]\nvariant = "paper"\n'
+    record = play(parse(text, "random", seed=441))
+    assert record.end is not None
+    assert record.end.outcome == "undecided"
+    assert record.end.reason == "b: the third mutual range does not settle where they are"
+    states = [(moment.drives["a"].state, moment.drives["b"].state) for moment in record.moments]
+    assert states[-3:] == [("straight", "standing"), ("waiting", "last-manoeuvre"), ("waiting", "undecided")]

@@ -33,7 +33,7 @@ class Work(msgspec.Struct):
     key: str
     """of its seeds"""
     setting: Setting
-    trials: range | list[int]
+    trials: list[int]
     given: int = 0
     """how many have been handed out"""
     played: int = 0
