@@ -7,14 +7,14 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from agent.belief import Sighting, weigh_placements
-from agent.mind import Done, Mind
+from agent.mind import WORDS, Done, Mind
 from agent.phases import encounter
 from agent.phases.encounter import LastManoeuvre, Standing, Waiting
 from agent.phases.rendezvous import Orbiting, off_anchor
 from agent.phases.seeking import Straight
 from protocol.messages import Localised
 
-PEER_RESTS = ("standing", "waiting")
+PEER_RESTS = (WORDS[Standing], WORDS[Waiting])
 """what it says then: two that move at once may do so in mirror image, and learn nothing"""
 
 
@@ -57,7 +57,7 @@ def considered(mind: Mind) -> Mind:
     sightings = mind.sightings(began if variant == "paper" else 0)
     base = encounter.base([at for at in sightings if off_anchor(at.b, mind.briefing.rendezvous.b)])
     if base is None:  # yet; or, where a report was missed, b was still driving as a went straight
-        again = isinstance(mind.state, Waiting) and mind.hears_peer and mind.radio.state == "standing"
+        again = isinstance(mind.state, Waiting) and mind.hears_peer and mind.radio.state == WORDS[Standing]
         return met(mind) if again and variant == "assured" else mind
     mind = _weighed(mind, sightings, base)
     left = mind.findings.placements

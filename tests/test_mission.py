@@ -16,7 +16,7 @@ from agent.phases.anchor import third_point
 from agent.phases.encounter import SPEEDS, TURN_RATES, last_manoeuvre
 from compose.inline import play
 from compose.record import Moment, Record
-from compose.scenario import load
+from compose.scenario import load, parse
 from protocol.messages import Localised
 from protocol.mission import OPTIMAL_TURN, Mission, Variant, third_point_turn_rate
 from protocol.motion import Pose, compose, step
@@ -328,3 +328,32 @@ def test_a_single_candidate_is_checked_from_where_its_range_changes_most() -> No
     assert plan.drive.v == 1.0
     assert plan.drive.omega == pytest.approx(0.0, abs=1e-9)
     assert predicted(b, a, [ahead], 1.0, 0.0) == [pytest.approx(1.0)]
+
+
+# --- anywhere in the plane ----------------------------------------------------------------------------
+
+
+def test_where_in_the_plane_the_anchors_stand_costs_no_digit() -> None:
+    """Far out, coordinates have fewer of them; what is sensed and driven is the same to the bit."""
+
+    def driven(shift: float) -> list[tuple[float, float, str]]:
+        text = f"""
+            name = "far-out"
+            [mission]
+            sensing_range = 3.0
+            period = 1.0
+            max_speed = 1.0
+            max_turn_rate = 3.0
+            [[robot]]
+            id = "a"
+            anchor = [{shift}, {-shift}]
+            start = [{shift + 1.5}, {0.75 - shift}, 2.0]
+            [[robot]]
+            id = "b"
+            anchor = [{shift + 10.0}, {-shift}]
+            start = [{shift + 9.25}, {1.5 - shift}, 4.0]
+            """
+        moments = play(parse(text, "far-out")).moments
+        return [(d.v, d.omega, d.state) for moment in moments for d in moment.drives.values()]
+
+    assert driven(2.0**19) == driven(0.0)

@@ -29,7 +29,6 @@ SPEEDS = (1.0, -1.0, 0.75, -0.75, 0.5, -0.5, 0.25, -0.25, 0.1, -0.1)
 ELSEWHERE = 1e-6
 """m: a range taken nearer than this to where another was says nothing new"""
 
-
 FAINT = 1e-6
 """1 / rad^2: added to the information there is, so that the first of two missing ranges counts"""
 
@@ -169,7 +168,7 @@ def last_manoeuvre(
         rim = (mission.sensing_range - RANGE_MARGIN) ** 2
         outside = np.sum([distance > rim for distance in squared], axis=0)
         value = np.where(outside == np.min(outside), gap, -np.inf)
-    row, column = np.unravel_index(np.argmax(value), value.shape)
+    row, column = _best(value)
     drive = Controls(float(speed[row, 0]), float(omega[column]))
     return Plan(drive, float(gap[row, column]) if len(candidates) > 1 else None)
 
@@ -191,8 +190,14 @@ def survey(
     pp, pq, qq = information(placement, sightings)
     value = (pp + by_phi**2 + FAINT) * (qq + by_psi**2 + FAINT) - (pq + by_phi * by_psi) ** 2
     value = np.where(apart <= mission.sensing_range - RANGE_MARGIN, value, -np.inf)
-    row, column = np.unravel_index(np.argmax(value), value.shape)
+    row, column = _best(value)
     return Plan(Controls(float(speed[row, 0]), float(omega[column])), None)
+
+
+def _best(value: Array) -> tuple[int, int]:
+    """Row and column of the largest; of several, the first."""
+    row, column = np.unravel_index(np.argmax(value), value.shape)
+    return int(row), int(column)
 
 
 def _ends(pose: Pose, mission: Mission, variant: Variant) -> tuple[Array, Array, Array, Array]:

@@ -20,11 +20,13 @@ import tomli_w
 from compose.campaign.cells import Cell, cells, label
 from compose.campaign.fields import canonical
 from compose.campaign.spec import Campaign
-from compose.campaign.table import UNFINISHED, gathered, of_rows, read, schema_of, write
+from compose.campaign.table import encoded, gathered, of_rows, read, schema_of
 from compose.campaign.trial import Row
 from compose.record import make
 from compose.status import UserError
 
+UNFINISHED = ".unfinished"
+"""ends the name of a file that is being written"""
 TRIALS = "trials.parquet"
 CAMPAIGN = "campaign.json"
 PARTS = "parts"
@@ -65,7 +67,7 @@ class Folder:
     def forget_lost(self) -> None:
         """The trials that were lost, to an error or with their process, have no row any more."""
         table = self.gather()
-        write(self.path / TRIALS, table.filter(table["error"].is_null()))
+        _write(self.path / TRIALS, encoded(table.filter(table["error"].is_null())))
 
     def ask(self, refused: Mapping[int, str]) -> None:
         """Put down what is about to be played, and each cell's scenario."""
@@ -83,12 +85,12 @@ class Folder:
         """Keep the rows of a chunk."""
         if rows:
             name = f"{rows[0].cell:05d}-{rows[0].trial:08d}.parquet"
-            write(self._parts / name, of_rows(rows, self.campaign, self.cells, self.schema))
+            _write(self._parts / name, encoded(of_rows(rows, self.campaign, self.cells, self.schema)))
 
     def gather(self) -> pa.Table:
         """All rows, in order; from now on `trials.parquet` holds them, and there are no parts."""
         table = gathered([self.schema.empty_table(), *self._tables(self.schema.names)])
-        write(self.path / TRIALS, table)
+        _write(self.path / TRIALS, encoded(table))
         for part in self._parts.glob("*"):
             part.unlink()
         if self._parts.exists():
@@ -178,7 +180,8 @@ def _cut(value: Any) -> str:
     return said if len(said) <= MAX_DIFFERENCE else f"{said[: MAX_DIFFERENCE - 3]}..."
 
 
-def _write(path: Path, content: bytes) -> None:
+def _write(path: Path, content: bytes | pa.Buffer) -> None:
+    """All at once, by renaming."""
     unfinished = path.with_name(path.name + UNFINISHED)
     unfinished.write_bytes(content)
     unfinished.replace(path)

@@ -15,9 +15,6 @@ from compose.campaign.fields import canonical
 from compose.campaign.spec import Campaign
 from compose.campaign.trial import RobotRow, Row
 
-UNFINISHED = ".unfinished"
-"""ends the name of a file that is being written"""
-
 _KINDS: dict[str, pa.DataType] = {
     "cell": pa.int32(),
     "trial": pa.int32(),
@@ -115,9 +112,8 @@ def read(path: Path, schema: pa.Schema, columns: list[str]) -> pa.Table:
         return file.read(columns)
 
 
-def write(path: Path, table: pa.Table) -> None:
-    """All at once, by renaming."""
-    unfinished = path.with_name(path.name + UNFINISHED)
-    with unfinished.open("wb") as file:
-        pq.write_table(table, file)
-    unfinished.replace(path)
+def encoded(table: pa.Table) -> pa.Buffer:
+    """What a file of it holds."""
+    file = pa.BufferOutputStream()
+    pq.write_table(table, file)
+    return file.getvalue()
