@@ -24,7 +24,7 @@ from protocol.motion import Pose, wrap
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 from world.referee import errors
 from world.scenario import Scenario
-from world.sensors import anchor_ranges, mutual_ranges
+from world.sensors import anchor_ranges, executed, mutual_ranges
 from world.tick import World, advance, release
 from world.truth import Truth, within_limits
 
@@ -128,8 +128,9 @@ def ticks_csv(record: Record) -> str:
             drive = moment.drives.get(robot)
             driven: list[object] = ["", ""] if moment.truth.tick == last else [0.0, 0.0]
             if drive is not None and moment.truth.tick != last:
-                executed = within_limits(drive.v, drive.omega, record.scenario.mission)
-                driven = [executed.v, executed.omega]
+                asked = within_limits(drive.v, drive.omega, record.scenario.mission)
+                done = executed(asked, record.scenario, robot, moment.truth.tick)
+                driven = [done.v, done.omega]
             said = [drive.phase, drive.state] if drive is not None else ["", ""]
             rows.writerow(
                 [moment.truth.tick, robot, pose.x, pose.y, wrap(pose.heading), *driven]
@@ -145,11 +146,10 @@ def _or_empty(value: float | None) -> object:
 def _mutual(scenario: Scenario, truth: Truth) -> dict[str, float]:
     """Everyone's range to its peer, if there is one."""
     pairs = scenario.pairs()
-    ranges = mutual_ranges(truth, pairs, scenario.mission.sensing_range)
     return {
-        scenario.robots[i].id: rho
-        for pair, rho in zip(pairs, ranges, strict=True)
-        if rho is not None
+        scenario.robots[i].id: mutual.range
+        for pair, mutual in zip(pairs, mutual_ranges(truth, scenario, pairs), strict=True)
+        if mutual is not None and mutual.range is not None
         for i in pair
     }
 
@@ -187,11 +187,10 @@ def summary(record: Record, mode: Mode, wall_s: float | None) -> dict[str, Any]:
 
 def first_contact(record: Record) -> int | None:
     """The first tick at which two peers were in range of each other."""
-    pairs, reach = record.scenario.pairs(), record.scenario.mission.sensing_range
+    pairs = record.scenario.pairs()
     for moment in record.moments:
-        for rho in mutual_ranges(moment.truth, pairs, reach):
-            if rho is not None:
-                return moment.truth.tick
+        if any(mutual is not None for mutual in mutual_ranges(moment.truth, record.scenario, pairs)):
+            return moment.truth.tick
     return None
 
 

@@ -13,7 +13,7 @@ import msgspec
 from msgspec import Meta
 
 from protocol.mission import Anchor, Mission, Role, Variant
-from protocol.motion import Controls, Pose, Run
+from protocol.motion import Controls, Covariance, Pose, Run
 from protocol.rendezvous import Rendezvous
 from protocol.units import (
     Angle,
@@ -30,6 +30,9 @@ Outcome = Literal["localised", "undecided", "alarm", "wrong", "failed"]
 
 BranchKind = Literal["three-ranges", "three-ranges-virtual", "circle", "on-anchor"]
 """How phase 1 told +alpha from -alpha."""
+
+Odds = Annotated[float, Meta(ge=0.0, le=1.0)]
+"""the probability of a hypothesis, given what has been measured"""
 
 MAX_REASON = 300
 """characters"""
@@ -66,6 +69,8 @@ class Localised(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fie
     """The claim to know one's pose in the world frame."""
 
     pose: Pose
+    covariance: Covariance | None = None
+    """of its error; none where sensors are exact, and what is left is rounding"""
 
 
 class Undecided(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="undecided"):
@@ -160,6 +165,11 @@ class Estimate(Message, frozen=True):
     world: tuple[Pose, ...]
     """its pose in the world frame, one for each placement that is left"""
     localised: bool
+    odds: tuple[Odds, ...] = ()
+    """of each in `world`, or while there is none of each in `local`, the likeliest first; they sum to 1.
+    None where sensors are exact: what is possible there is equally so"""
+    covariance: Covariance | None = None
+    """of the first in `world`"""
 
 
 class Truth(Message, frozen=True):
@@ -200,6 +210,10 @@ class Farewell(Message, frozen=True):
     """omega_2 of eq. (8), of the latest; a plans one only where b's has not settled it"""
     separation_m2: Annotated[float, Meta(ge=0.0, le=1e15)] | None
     """J of eq. (8); none where one candidate was left, and nothing to be told apart"""
+    hypotheses: Count | None
+    """about the poses of both, that are left in the end"""
+    odds: Odds | None
+    """of the likeliest of them; none where sensors are exact"""
     reports_sent: Count
     reports_heard: Count
     reports_refused: Count

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import msgspec
+from msgspec import Meta
 
+from protocol.noise import Noise
 from protocol.units import Coordinate, Duration, Length, Speed, TurnRate
 
 Variant = Literal["assured", "paper"]
@@ -50,6 +52,12 @@ class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """v_max"""
     max_turn_rate: TurnRate
     """omega_max"""
+    accuracy: Length = 0.1
+    """m: how well both robots must know where they are before they claim to: the root of the trace of the
+    covariance of their position"""
+    confidence: Annotated[float, Meta(ge=0.5, lt=1.0)] = 0.9999
+    """how probable the hypothesis must be that they claim"""
+    noise: Noise = Noise()
 
     @property
     def first_straight(self) -> float:

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 
 import msgspec
 
-from protocol.units import Angle, AngularVelocity, Coordinate, TickCount, Velocity
+from protocol.units import Angle, AngularVelocity, Coordinate, Moment, TickCount, Velocity
 
 TAU = 2.0 * math.pi
 
@@ -26,6 +26,27 @@ class Pose(msgspec.Struct, frozen=True, array_like=True, gc=False, forbid_unknow
 
 
 ORIGIN = Pose(0.0, 0.0, 0.0)
+
+
+class Covariance(msgspec.Struct, frozen=True, array_like=True, gc=False, forbid_unknown_fields=True):
+    """Of the error of a pose, in m^2, m rad and rad^2: the upper triangle, row by row."""
+
+    xx: Moment
+    xy: Moment
+    xh: Moment
+    yy: Moment
+    yh: Moment
+    hh: Moment
+
+    @property
+    def position_sigma(self) -> float:
+        """m: the root of the trace of the position's part."""
+        return math.sqrt(max(0.0, self.xx + self.yy))
+
+    @property
+    def heading_sigma(self) -> float:
+        """rad"""
+        return math.sqrt(max(0.0, self.hh))
 
 
 class Run(msgspec.Struct, frozen=True, array_like=True, gc=False, forbid_unknown_fields=True):

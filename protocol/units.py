@@ -28,6 +28,12 @@ AngularVelocity = Annotated[float, Meta(ge=-1e6, le=1e6)]
 """rad/s"""
 Angle = Annotated[float, Meta(ge=-1e9, le=1e9)]
 """rad, not wrapped"""
+Sigma = Annotated[float, Meta(ge=0.0, le=1e4)]
+"""m, a standard deviation"""
+Moment = Annotated[float, Meta(ge=-1e15, le=1e15)]
+"""of second order, of m and rad"""
+Probability = Annotated[float, Meta(ge=0.0, le=0.5)]
+Fraction = Annotated[float, Meta(ge=0.0, le=0.5)]
 Tick = Annotated[int, Meta(ge=0, le=2**31)]
 TickCount = Annotated[int, Meta(ge=1, le=2**31)]
 Count = Annotated[int, Meta(ge=0, le=2**53)]

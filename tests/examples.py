@@ -18,7 +18,7 @@ from protocol.messages import (
     Truth,
     Undecided,
 )
-from protocol.motion import Controls, Pose, Run
+from protocol.motion import Controls, Covariance, Pose, Run
 
 POSE = Pose(1.5, -2.5, 0.75)
 
@@ -42,13 +42,15 @@ EXAMPLES: tuple[Message, ...] = (
         verdict=Undecided("no pose explains the anchor ranges"),
     ),
     Report(0, "a", 1, "asleep", None, 0, 0, (), 0, (), 0, 0),
-    Drive(3, "b", 0.5, 0.25, 3, "localised", Localised(POSE)),
+    Drive(3, "b", 0.5, 0.25, 3, "localised", Localised(POSE, Covariance(0.5, 0.25, 0.0, 0.75, -0.5, 1.0))),
+    Drive(5, "b", 0.0, 0.0, 3, "localised", Localised(POSE)),
     Drive(4, "b", 0.0, 0.0, 1, "straight"),
     Estimate(5, "a", (POSE,), (POSE, Pose(0.5, 0.5, 0.5)), localised=True),
+    Estimate(5, "a", (POSE,), (), False, (1.0,), Covariance(0.5, 0.25, 0.0, 0.75, -0.5, 1.0)),
     Truth(6, {"a": POSE, "b": Pose(0.5, 0.5, 0.5)}),
     Missed(8, "b"),
     End(48, "wrong", "a claims a pose that is 1 m off"),
     End(48, "localised", None),
-    Farewell("b", 5, 3, "circle", -2.5, (4, 2), 0.5, 1.5, 3, 4, 1, 2, 3, 600),
-    Farewell("b", 0, 0, None, None, None, None, None, 0, 0, 0, 0, 0, 0),
+    Farewell("b", 5, 3, "circle", -2.5, (4, 2), 0.5, 1.5, 2, 0.75, 3, 4, 1, 2, 3, 600),
+    Farewell("b", 0, 0, None, None, None, None, None, None, None, 0, 0, 0, 0, 0, 0),
 )

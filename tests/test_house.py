@@ -47,12 +47,14 @@ PURE = {
     "world.tick",
     "world.truth",
     "world.sensors",
+    "world.draws",
     "world.channel",
     "world.referee",
     "world.scenario",
     "protocol.messages",
     "protocol.mission",
     "protocol.motion",
+    "protocol.noise",
     "protocol.rendezvous",
     "protocol.units",
 }
@@ -67,6 +69,7 @@ ALLOWED = {
     "numpy",
     "numpy.typing",
     "re",
+    "hashlib",
 }
 IMPURE = {
     "open", "print", "input", "eval", "exec", "compile", "globals", "setattr", "delattr", "breakpoint",

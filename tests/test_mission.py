@@ -164,8 +164,8 @@ def test_a_range_is_taken_up_to_r_and_at_r() -> None:
         return Truth(0, (a, b), (scenario.robots[0].anchor,) * 2)
 
     assert anchor_ranges(at(Pose(3.0, 0.0, 0.0), Pose(10.0, -beyond, 0.0)), scenario) == [3.0, None]
-    assert mutual_ranges(at(Pose(0.0, 0.0, 0.0), Pose(0.0, 3.0, 0.0)), [(0, 1)], 3.0) == [3.0]
-    assert mutual_ranges(at(Pose(0.0, 0.0, 0.0), Pose(0.0, beyond, 0.0)), [(0, 1)], 3.0) == [None]
+    assert mutual_ranges(at(Pose(0.0, 0.0, 0.0), Pose(0.0, 3.0, 0.0)), scenario, [(0, 1)]) == [(3.0,)]
+    assert mutual_ranges(at(Pose(0.0, 0.0, 0.0), Pose(0.0, beyond, 0.0)), scenario, [(0, 1)]) == [None]
 
 
 # --- missions whose parameters bite -------------------------------------------------------------------

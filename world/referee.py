@@ -13,7 +13,10 @@ from world.scenario import Scenario
 from world.truth import Truth
 
 TOLERANCE = 1e-6
-"""m and rad: a claim farther off than this is wrong (sensors are exact)"""
+"""m and rad: a claim farther off than this is wrong where sensors are exact"""
+
+SIGMAS = 5.0
+"""of those that it claims: farther off than this it is wrong where they are not"""
 
 
 class Judgement(msgspec.Struct, frozen=True):
@@ -26,6 +29,16 @@ class Judgement(msgspec.Struct, frozen=True):
 def errors(claim: Pose, truth: Pose) -> tuple[float, float]:
     """How far off `claim` is: m, and rad."""
     return math.hypot(claim.x - truth.x, claim.y - truth.y), abs(wrap(claim.heading - truth.heading))
+
+
+def tolerances(claim: Localised) -> tuple[float, float]:
+    """How far off `claim` may be: m, and rad."""
+    if claim.covariance is None:
+        return TOLERANCE, TOLERANCE
+    return (
+        max(TOLERANCE, SIGMAS * claim.covariance.position_sigma),
+        max(TOLERANCE, SIGMAS * claim.covariance.heading_sigma),
+    )
 
 
 def judge(scenario: Scenario, truth: Truth, verdicts: Mapping[str, Verdict]) -> Judgement | None:
@@ -44,7 +57,8 @@ def judge(scenario: Scenario, truth: Truth, verdicts: Mapping[str, Verdict]) -> 
         verdict = verdicts.get(robot.id)
         if isinstance(verdict, Localised):
             position, heading = errors(verdict.pose, pose)
-            if not (position <= TOLERANCE and heading <= TOLERANCE):
+            far, askew = tolerances(verdict)
+            if not (position <= far and heading <= askew):
                 return Judgement(
                     "wrong", f"{robot.id} claims a pose that is {position:.3g} m and {heading:.3g} rad off"
                 )

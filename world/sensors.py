@@ -1,30 +1,89 @@
-"""What can be measured: ranges to anchors and between peers, within R, bounds included. Exact."""
+"""What can be measured: ranges to anchors and between peers, within R, bounds included; and odometry.
+
+Where the mission has no noise they are exact, and nothing is drawn.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
+from protocol.motion import Controls
+from protocol.noise import Drift
+from world.draws import gaussian, uniform
 from world.scenario import Scenario
 from world.truth import Truth
 
 
 def anchor_ranges(truth: Truth, scenario: Scenario) -> list[float | None]:
-    """m: every robot's range to its own anchor (eq. (1b)), none where that is out of range."""
-    reach = scenario.mission.sensing_range
+    """m: what each robot measures to its own anchor (eq. (1b)); none where that is out of range."""
+    reach, sigma = scenario.mission.sensing_range, scenario.mission.noise.anchor_sigma
     ranges: list[float | None] = []
     for pose, origin, robot in zip(truth.local, truth.origins, scenario.robots, strict=True):
         anchor = robot.anchor
         rho = math.hypot(pose.x - (anchor.x - origin.x), pose.y - (anchor.y - origin.y))
-        ranges.append(rho if rho <= reach else None)
+        if rho <= reach:
+            ranges.append(measured(rho, sigma, scenario, "anchor", robot.id, truth.tick))
+        else:
+            ranges.append(None)
     return ranges
 
 
-def mutual_ranges(truth: Truth, pairs: Sequence[tuple[int, int]], sensing_range: float) -> list[float | None]:
-    """m: the range of every pair; one measurement, told to both; none where that is out of range."""
-    ranges: list[float | None] = []
+class Mutual(NamedTuple):
+    """Of a pair that is in range of each other."""
+
+    range: float | None
+    """m, as it is measured: once, and told to both; none if that failed"""
+
+
+def mutual_ranges(truth: Truth, scenario: Scenario, pairs: Sequence[tuple[int, int]]) -> list[Mutual | None]:
+    """Of every pair; none where the two are out of range."""
+    reach, sigma = scenario.mission.sensing_range, scenario.mission.noise.mutual_sigma
+    ranges: list[Mutual | None] = []
     for i, j in pairs:
         one, other = truth.local[i], truth.local[j]
         rho = math.hypot(one.x - other.x, one.y - other.y)
-        ranges.append(rho if rho <= sensing_range else None)
+        if rho <= reach:
+            robot = scenario.robots[i].id
+            ranges.append(Mutual(measured(rho, sigma, scenario, "mutual", robot, truth.tick)))
+        else:
+            ranges.append(None)
     return ranges
+
+
+def measured(
+    rho: float, sigma: float, scenario: Scenario, sensor: str, robot: str, tick: int
+) -> float | None:
+    """m: what is measured where the distance is `rho`; none of a drop-out."""
+    noise, seed = scenario.mission.noise, scenario.seed
+    if noise.drop_outs and uniform(seed, f"{sensor}-drop-out", robot, tick) < noise.drop_outs:
+        return None
+    if noise.outliers and uniform(seed, f"{sensor}-outlier", robot, tick) < noise.outliers:
+        least, most = noise.outlier_bias
+        rho += least + (most - least) * uniform(seed, f"{sensor}-bias", robot, tick)
+    if sigma:
+        rho = max(0.0, rho + sigma * gaussian(seed, sensor, robot, tick))
+    return rho
+
+
+def executed(asked: Controls, scenario: Scenario, robot: str, tick: int) -> Controls:
+    """What the wheels make of a command over [tick, tick + 1]."""
+    return _disturbed(asked, scenario.mission.noise.actuation, scenario.seed, "actuation", robot, tick)
+
+
+def odometry(driven: Controls, scenario: Scenario, robot: str, tick: int) -> Controls:
+    """What is measured, at `tick`, of what was driven over [tick - 1, tick]."""
+    return _disturbed(driven, scenario.mission.noise.odometry, scenario.seed, "odometry", robot, tick)
+
+
+def _disturbed(controls: Controls, drift: Drift, seed: int, sensor: str, robot: str, tick: int) -> Controls:
+    v, omega = drift.variances(controls.v, controls.omega)
+    if v == omega == 0.0:
+        return controls
+    return Controls(
+        controls.v + math.sqrt(v) * gaussian(seed, f"{sensor}-v", robot, tick) if v else controls.v,
+        controls.omega + math.sqrt(omega) * gaussian(seed, f"{sensor}-omega", robot, tick)
+        if omega
+        else controls.omega,
+    )

@@ -11,7 +11,7 @@ from protocol.motion import REST, Controls, Pose
 from world.channel import heard
 from world.referee import Judgement, judge
 from world.scenario import Scenario
-from world.sensors import anchor_ranges, mutual_ranges
+from world.sensors import anchor_ranges, executed, mutual_ranges, odometry
 from world.truth import Truth, within_limits
 
 
@@ -41,17 +41,22 @@ def release(scenario: Scenario) -> World:
 
 def senses(world: World) -> list[Sense]:
     """What every robot's sensors say now, in the order of the scenario."""
-    scenario, truth, executed = world.scenario, world.truth, world.executed
+    scenario, truth, driven = world.scenario, world.truth, world.executed
     tick, robots = truth.tick, scenario.robots
     contacts: list[tuple[Contact, ...]] = [()] * len(robots)
-    mutual = mutual_ranges(truth, world.pairs, scenario.mission.sensing_range)
-    for (one, other), rho in zip(world.pairs, mutual, strict=True):
-        if rho is not None:
-            contacts[one] = (Contact(robots[other].id, rho, heard(tick)),)
-            contacts[other] = (Contact(robots[one].id, rho, heard(tick)),)
+    for (one, other), mutual in zip(world.pairs, mutual_ranges(truth, scenario, world.pairs), strict=True):
+        if mutual is not None:
+            contacts[one] = (Contact(robots[other].id, mutual.range, heard(tick)),)
+            contacts[other] = (Contact(robots[one].id, mutual.range, heard(tick)),)
     ranges = anchor_ranges(truth, scenario)
     return [
-        Sense(tick, robot.id, executed[i] if executed is not None else None, ranges[i], contacts[i])
+        Sense(
+            tick,
+            robot.id,
+            odometry(driven[i], scenario, robot.id, tick) if driven is not None else None,
+            ranges[i],
+            contacts[i],
+        )
         for i, robot in enumerate(robots)
     ]
 
@@ -60,18 +65,16 @@ def advance(world: World, drives: Mapping[str, Drive]) -> World | Judgement:
     """The world one tick later, or how the run ended. A robot without a Drive stands still."""
     scenario, truth = world.scenario, world.truth
     verdicts = world.verdicts
-    executed = []
+    driven = []
     for robot in scenario.robots:
         drive = drives.get(robot.id)
-        if drive is None:
-            executed.append(REST)
-            continue
-        executed.append(within_limits(drive.v, drive.omega, scenario.mission))
-        if drive.verdict is not None and robot.id not in verdicts:
+        asked = within_limits(drive.v, drive.omega, scenario.mission) if drive is not None else REST
+        driven.append(executed(asked, scenario, robot.id, truth.tick))
+        if drive is not None and drive.verdict is not None and robot.id not in verdicts:
             verdicts = verdicts | {robot.id: drive.verdict}
     if verdicts or truth.tick >= scenario.max_ticks:
         judgement = judge(scenario, truth, verdicts)
         if judgement is not None:
             return judgement
-    moved = truth.moved(executed, scenario.mission.period)
-    return World(scenario, moved, tuple(executed), verdicts, world.pairs)
+    moved = truth.moved(driven, scenario.mission.period)
+    return World(scenario, moved, tuple(driven), verdicts, world.pairs)

@@ -1,0 +1,59 @@
+"""How far sensors and wheels are to be trusted: what the world draws from, and what every robot is told."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+from protocol.units import Fraction, Probability, Range, Sigma
+
+Floor = Annotated[float, Meta(ge=0.0, le=1e4)]
+
+
+class Drift(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """White noise on the v and omega of each tick: a fraction of each, and an absolute part."""
+
+    v: Fraction = 0.0
+    """of v, a standard deviation"""
+    omega: Fraction = 0.0
+    """of omega"""
+    v_floor: Floor = 0.0
+    """m/s, added in squares"""
+    omega_floor: Floor = 0.0
+    """rad/s, added in squares"""
+
+    def variances(self, v: float, omega: float) -> tuple[float, float]:
+        """Of the noise on a manoeuvre, in (m/s)^2 and (rad/s)^2."""
+        return (self.v * v) ** 2 + self.v_floor**2, (self.omega * omega) ** 2 + self.omega_floor**2
+
+
+class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Of ranges: Gaussian, outliers and drop-outs; of wheels: how they move the robot, and are measured.
+
+    Left out, everything is exact.
+    """
+
+    anchor_sigma: Sigma = 0.0
+    """m, of a range to an anchor"""
+    mutual_sigma: Sigma = 0.0
+    """m, of a range between robots"""
+    outliers: Probability = 0.0
+    """that a range has no line of sight, and is too long"""
+    outlier_bias: tuple[Range, Range] = (0.3, 2.0)
+    """m: by how much then, uniform between these"""
+    drop_outs: Probability = 0.0
+    """that a range within R is not measured"""
+    actuation: Drift = Drift()
+    """how what is executed differs from what was asked for"""
+    odometry: Drift = Drift()
+    """how what the odometry measures differs from what was executed"""
+
+    @property
+    def exact(self) -> bool:
+        """Whether there is none: then a range is a fact, and so is silence."""
+        return (
+            self.anchor_sigma == self.mutual_sigma == self.outliers == self.drop_outs == 0.0
+            and self.actuation == self.odometry == Drift()
+        )
