@@ -9,15 +9,17 @@ from msgspec.structs import replace
 
 from agent.belief import Branch, Sighting
 from agent.geometry import Placement
+from agent.hypotheses import Hypothesis
 from agent.logbook import Logbook
 from agent.phases.anchor import ThirdPoint
 from agent.phases.encounter import LastManoeuvre, Plan, Returning, Standing, Waiting
 from agent.phases.rendezvous import Aligning, Orbiting, Radial, Tangent, off_anchor
 from agent.phases.seeking import Backing, Circling, Straight, Turning
+from agent.phases.surveying import Surveying
 from agent.radio import Radio
 from protocol import messages
 from protocol.messages import MAX_REASON, Briefing, Localised, Ranged, Undecided
-from protocol.motion import ORIGIN, Pose, compose
+from protocol.motion import ORIGIN, Covariance, Pose, compose
 from protocol.rendezvous import Orbit
 
 
@@ -32,9 +34,9 @@ class Done(msgspec.Struct, frozen=True):
     verdict: messages.Verdict
 
 
-Phase1 = Straight | Backing | Turning | Circling | ThirdPoint
+Phase1 = Straight | Backing | Turning | Circling | ThirdPoint | Surveying
 Phase2 = Aligning | Radial | Tangent | Orbiting
-Phase3 = Straight | Backing | Turning | Circling | Standing | Waiting | LastManoeuvre | Returning
+Phase3 = Straight | Backing | Turning | Circling | Standing | Waiting | LastManoeuvre | Returning | Surveying
 State = Asleep | Phase1 | Phase2 | Phase3 | Done
 
 WORDS: dict[type, str] = {
@@ -44,6 +46,7 @@ WORDS: dict[type, str] = {
     Turning: "turning",
     Circling: "circling",
     ThirdPoint: "third-point",
+    Surveying: "surveying",
     Aligning: "aligning",
     Radial: "radial",
     Tangent: "tangent",
@@ -68,6 +71,14 @@ class Findings(msgspec.Struct, frozen=True):
     candidates: tuple[int, int] | None = None
     """how many there were at first: all of them, and what silence left"""
     plan: Plan | None = None
+    own: tuple[Hypothesis, ...] = ()
+    """under noise: of where its anchor is"""
+    pair: tuple[Hypothesis, ...] = ()
+    """under noise: of how both lie in <W>"""
+    poses: tuple[Pose, ...] = ()
+    """in <W>, by each of these"""
+    covariance: Covariance | None = None
+    """of the first"""
 
 
 class Mind(msgspec.Struct, frozen=True):
@@ -82,6 +93,8 @@ class Mind(msgspec.Struct, frozen=True):
     mutual: tuple[Ranged, ...] = ()
     findings: Findings = Findings()
     radio: Radio = Radio()
+    near: bool = False
+    """whether the peer is in range in this tick"""
 
     @property
     def orbit(self) -> Orbit:
@@ -91,8 +104,8 @@ class Mind(msgspec.Struct, frozen=True):
 
     @property
     def in_contact(self) -> bool:
-        """Whether the peer has been ranged in this tick."""
-        return bool(self.mutual) and self.mutual[-1].tick == self.tick
+        """Whether the peer is in range in this tick."""
+        return self.near
 
     @property
     def hears_peer(self) -> bool:
@@ -118,6 +131,8 @@ class Mind(msgspec.Struct, frozen=True):
             case Asleep() | ThirdPoint():
                 return 1
             case Straight("anchor") | Backing("anchor") | Turning("anchor") | Circling("anchor"):
+                return 1
+            case Surveying("anchor"):
                 return 1
             case Done(phase, _):
                 return phase

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from agent import meeting, radio
+from agent import meeting, radio, survey
 from agent.belief import ON_ANCHOR, Branch, branches, weigh_branches
 from agent.mind import Asleep, Done, Mind
 from agent.phases import anchor, encounter, rendezvous, seeking
@@ -23,6 +23,7 @@ from agent.phases.anchor import ThirdPoint
 from agent.phases.encounter import LastManoeuvre, Returning, Standing, Waiting
 from agent.phases.rendezvous import Aligning, Orbiting, Radial, Tangent
 from agent.phases.seeking import Backing, Circling, Straight, Turning
+from agent.phases.surveying import Surveying
 from protocol import messages
 from protocol.messages import Drive, Estimate, Localised, Ranged, Report, Sense, Undecided
 from protocol.motion import ORIGIN, REST, Controls, Pose, step
@@ -43,7 +44,10 @@ def observe(mind: Mind, sense: Sense) -> Mind:
     for contact in sense.contacts:
         if contact.peer == mind.briefing.peer and contact.range is not None:
             mutual = (*mutual, Ranged(sense.tick, contact.range))
-    sensed = Mind(mind.briefing, mind.state, sense.tick, odometry, log, mutual, mind.findings, mind.radio)
+    near = any([contact.peer == mind.briefing.peer for contact in sense.contacts])
+    sensed = Mind(
+        mind.briefing, mind.state, sense.tick, odometry, log, mutual, mind.findings, mind.radio, near
+    )
     return _advanced(sensed, sense.anchor_range)
 
 
@@ -79,6 +83,8 @@ def decide(mind: Mind, reports: Sequence[Report] = ()) -> Mind:
             return mind.undecided(f"{mind.briefing.peer} says: {heard.verdict.reason}")
     if not mind.in_contact:
         return mind
+    if _surveys(mind):
+        return survey.heard(mind)
     match mind.state:
         case Aligning() | Radial() | Tangent() | Orbiting() if meeting.meets(mind):
             return meeting.met(mind)
@@ -111,6 +117,8 @@ def estimate(mind: Mind) -> Estimate:
         left = mind.state.branches
     if isinstance(mind.verdict, Localised):
         world: tuple[Pose, ...] = (mind.verdict.pose,)
+    elif mind.findings.poses:
+        world = mind.findings.poses
     else:
         world = tuple(mind.world_pose(placement) for placement in mind.findings.placements)
     return Estimate(
@@ -119,6 +127,8 @@ def estimate(mind: Mind) -> Estimate:
         local=tuple(anchor.local(left, mind.odometry)),
         world=world,
         localised=isinstance(mind.verdict, Localised),
+        odds=tuple(one.odds for one in mind.findings.pair or mind.findings.own),
+        covariance=mind.findings.covariance,
     )
 
 
@@ -127,6 +137,8 @@ def estimate(mind: Mind) -> Estimate:
 
 def _advanced(mind: Mind, anchor_range: float | None) -> Mind:
     """`mind` in the state that its own senses lead to."""
+    if _surveys(mind) and not isinstance(mind.state, Asleep):
+        return survey.sensed(mind, anchor_range)
     match mind.state:
         case Orbiting() | Standing() | Waiting() | Done():
             return mind
@@ -150,6 +162,11 @@ def _advanced(mind: Mind, anchor_range: float | None) -> Mind:
             return mind
 
 
+def _surveys(mind: Mind) -> bool:
+    """Whether sensors are noisy, and more than one look at them may be taken."""
+    return not mind.briefing.mission.noise.exact and mind.briefing.variant == "assured"
+
+
 def _again(mind: Mind, sense: Sense) -> bool:
     """Whether the anchor's range is the last one over again, from where the robot has stood since phase 1."""
     return (
@@ -160,9 +177,13 @@ def _again(mind: Mind, sense: Sense) -> bool:
 
 
 def _released(mind: Mind, rho0: float | None) -> Mind:
+    if rho0 is None and mind.briefing.mission.noise.drop_outs:
+        return mind  # and listens
     if rho0 is None:
         return mind.undecided("the anchor is out of range at the start")
-    if rho0 <= ON_ANCHOR:  # the heading is radial by definition, and nothing is left to find out
+    if (
+        rho0 <= ON_ANCHOR and mind.briefing.mission.noise.exact
+    ):  # the heading is radial by definition, and nothing is left to find out
         return _located(mind, Branch(0.0, ORIGIN), "on-anchor")
     return replace(mind, state=Straight("anchor", mind.odometry, rho0))
 
@@ -206,7 +227,7 @@ def _located(mind: Mind, branch: Branch, kind: messages.BranchKind) -> Mind:
 
 
 def _on_to_orbit(mind: Mind, state: rendezvous.Meeting) -> Mind:
-    onward = rendezvous.onward(state, mind.odometry, mind.start, mind.orbit)
+    onward = rendezvous.onward(state, mind.odometry, mind.start, mind.orbit, mind.briefing.mission)
     return mind if onward is mind.state else replace(mind, state=onward)
 
 
@@ -217,8 +238,8 @@ def _controls(mind: Mind) -> Controls:
     match mind.state:
         case Aligning() | Radial() | Tangent() | Orbiting() if meeting.lingers(mind):
             return REST
-        case Orbiting():
-            return Controls(mind.orbit.v, mind.orbit.omega)
+        case Orbiting(drive):
+            return drive or Controls(mind.orbit.v, mind.orbit.omega)
         case Aligning() | Radial() | Tangent():
             return rendezvous.controls(
                 mind.state, mind.odometry, mind.start, mind.orbit, mind.briefing.mission
@@ -226,6 +247,8 @@ def _controls(mind: Mind) -> Controls:
         case Straight() | Backing() | Turning() | Circling():
             return seeking.controls(mind.state, mind.odometry, mind.briefing.mission)
         case ThirdPoint(drive=controls) | LastManoeuvre(controls) | Returning(controls):
+            return controls
+        case Surveying(drive=controls):
             return controls
         case _:
             return REST

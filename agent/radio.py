@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from agent.logbook import Logbook
-from protocol.messages import Report, Verdict
+from protocol.messages import MAX_REPORT_RANGES, Report, Verdict
 from protocol.motion import Pose
 
 
@@ -28,6 +28,8 @@ class Radio(msgspec.Struct, frozen=True):
     """and so many of its ranges"""
     heard: int = 0
     """reports, repeats included"""
+    ranges_through: int = -1
+    """the peer's ranges are known through this tick; what is not among them was silent"""
 
 
 def contradiction(report: Report) -> str | None:
@@ -51,6 +53,9 @@ def contradiction(report: Report) -> str | None:
 def hear(radio: Radio, report: Report) -> Radio:
     """Late, repeated and overtaken reports change nothing but the count."""
     newer = report.tick > radio.latest
+    known = len(radio.peer.ranges) >= report.ranges_since
+    whole = len(report.ranges) < MAX_REPORT_RANGES
+    told_through = report.tick if whole else report.ranges[-1].tick
     return Radio(
         peer=radio.peer.extended(
             report.since, report.ranges_since, Logbook(report.through, report.runs, report.ranges)
@@ -63,4 +68,5 @@ def hear(radio: Radio, report: Report) -> Radio:
         acknowledged=max(report.heard, radio.acknowledged),
         ranges_acknowledged=max(report.ranges_heard, radio.ranges_acknowledged),
         heard=radio.heard + 1,
+        ranges_through=max(told_through, radio.ranges_through) if known else radio.ranges_through,
     )

@@ -107,8 +107,10 @@ class Robot:
             candidates=findings.candidates,
             last_turn_rate=plan.drive.omega if plan is not None else None,
             separation_m2=plan.separation_m2 if plan is not None else None,
-            hypotheses=len(findings.placements) if findings.candidates is not None else None,
-            odds=None,
+            hypotheses=(
+                len(findings.pair or findings.placements) if findings.candidates is not None else None
+            ),
+            odds=findings.pair[0].odds if findings.pair else None,
             reports_sent=self.reports_sent,
             reports_heard=mind.radio.heard,
             reports_refused=reports_refused,

@@ -64,6 +64,19 @@ class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """A_0 in m: one tick at full speed, shortened where it would come near R."""
         return min(self.max_speed * self.period, FIRST_STRAIGHT_LIMIT * self.sensing_range)
 
+    @property
+    def foothold(self) -> float:
+        """m: how well a robot has to know where its anchor is before it goes to meet the peer.
+
+        The root of the trace of the covariance. The anchors are two points that fix the frame of both robots in
+        <W>, and the peer's is as good.
+        """
+        return min(self.accuracy, FOOTHOLD * self.sensing_range)
+
+
+FOOTHOLD = 0.05
+"""of R: with a worse one, the orbit's margin would take too much of R"""
+
 
 def obstacle(mission: Mission, distance: float) -> str | None:
     """Why robots with anchors `distance` m (D) apart could not be sure of their poses; None if they can."""

@@ -98,7 +98,7 @@ def searching(mission: Mission, distance: float) -> Rendezvous:
     The bound: wherever b waits, at least `2 half` of a's circle is in its range. From outside, a has at most
     `TAU - 2 half` to drive until it is in; and as omega T_s is less than `2 half`, no tick jumps the passage.
     """
-    reach, period = mission.sensing_range - RANGE_MARGIN, mission.period
+    reach, period = mission.sensing_range - RANGE_MARGIN - clearance(mission, distance), mission.period
     waiting = Orbit(WAITING_PLACE * mission.sensing_range, 0.0, 0.0)
     near, far = abs(distance - waiting.radius), distance + waiting.radius
     if far < reach:
@@ -114,6 +114,21 @@ def searching(mission: Mission, distance: float) -> Rendezvous:
             ticks = math.ceil((TAU - 2.0 * half) / (omega * period))
             plan = Rendezvous(Orbit(radius, omega * radius, omega), waiting, ticks * period)
     return plan
+
+
+def clearance(mission: Mission, distance: float) -> float:
+    """m: by how much a and b may be nearer or farther than they think, for what a robot knows when phase 1 is
+    done and how its odometry drifts on the way; none where sensors and wheels are exact."""
+    if mission.noise.exact:
+        return 0.0
+    known = mission.foothold
+    drift = mission.noise.odometry.omega * math.pi / 2 * distance
+    return min(CLEARANCE_SIGMAS * math.hypot(known, drift), CLEARANCE_LIMIT * mission.sensing_range)
+
+
+CLEARANCE_SIGMAS = 3.0
+CLEARANCE_LIMIT = 0.4
+"""of R: with less left of it, a's way round would take too long"""
 
 
 def half_passage(apart: float, radius: float, reach: float) -> float:

@@ -6,7 +6,7 @@ import math
 
 import msgspec
 
-from agent.phases.seeking import ARRIVED, straight, turn
+from agent.phases.seeking import arrived, straight, turn
 from protocol.mission import Mission
 from protocol.motion import Controls, Pose, compose, wrap
 from protocol.rendezvous import Orbit
@@ -33,6 +33,9 @@ class Tangent(msgspec.Struct, frozen=True):
 class Orbiting(msgspec.Struct, frozen=True):
     """Drives round its anchor, eq. (6); or waits there, where that is its part of the plan."""
 
+    drive: Controls | None = None
+    """under noise: what leads back to the circle; or tells more, where it waits"""
+
 
 Meeting = Aligning | Radial | Tangent | Orbiting
 
@@ -44,17 +47,18 @@ def orientation(local: Pose) -> float:
     return wrap(local.heading - math.atan2(local.y, local.x))
 
 
-def onward(state: Meeting, odometry: Pose, start: Pose, orbit: Orbit) -> Meeting:
+def onward(state: Meeting, odometry: Pose, start: Pose, orbit: Orbit, mission: Mission) -> Meeting:
     """The state at `odometry`, whose tick 0 is `start` in the anchor's frame: what is done is passed over."""
+    there, facing = arrived(mission)
     while True:
         match state:
-            case Aligning(heading) if abs(heading - odometry.heading) <= ARRIVED:
+            case Aligning(heading) if abs(heading - odometry.heading) <= facing:
                 state = Radial()
-            case Radial() if abs(left_to_orbit(odometry, start, orbit)) <= ARRIVED:
+            case Radial() if abs(left_to_orbit(odometry, start, orbit)) <= there:
                 if orbit.v == 0.0:
                     return Orbiting()
                 state = Tangent(odometry.heading + math.copysign(math.pi / 2, orbit.omega))
-            case Tangent(heading) if abs(heading - odometry.heading) <= ARRIVED:
+            case Tangent(heading) if abs(heading - odometry.heading) <= facing:
                 return Orbiting()
             case _:
                 return state
@@ -82,5 +86,21 @@ def controls(state: Meeting, odometry: Pose, start: Pose, orbit: Orbit, mission:
             return turn(odometry, heading, mission)
         case Radial():
             return straight(left_to_orbit(odometry, start, orbit), mission)
-        case Orbiting():
-            return Controls(orbit.v, orbit.omega)
+        case Orbiting(drive):
+            return drive or Controls(orbit.v, orbit.omega)
+
+
+def pursuit(local: Pose, orbit: Orbit, mission: Mission) -> Controls:
+    """Round the anchor, back to the circle that noise has led away from (pure pursuit).
+
+    Along the arc to the point of the circle that lies two ticks ahead; from the circle itself, that is eq. (6).
+    """
+    ahead = math.atan2(local.y, local.x) + LOOKAHEAD * orbit.omega * mission.period
+    x, y = orbit.radius * math.cos(ahead) - local.x, orbit.radius * math.sin(ahead) - local.y
+    omega = 2.0 * wrap(math.atan2(y, x) - local.heading) / (LOOKAHEAD * mission.period)
+    limit = mission.max_turn_rate
+    return Controls(orbit.v, min(max(omega, -limit), limit))
+
+
+LOOKAHEAD = 2.0
+"""ticks"""

@@ -18,6 +18,9 @@ from protocol.motion import REST, TAU, Controls, Pose
 ARRIVED = 1e-9
 """m and rad: nearer than this is there; the odometry knows the rest"""
 
+CLOSE = 0.05
+"""rad, and of A_0: nearer than this is there, where wheels are noisy"""
+
 Beacon = Literal["anchor", "peer"]
 
 
@@ -58,6 +61,11 @@ class Circling(msgspec.Struct, frozen=True):
 Seeking = Straight | Backing | Turning | Circling
 
 
+def arrived(mission: Mission) -> tuple[float, float]:
+    """m and rad: how near is there."""
+    return (ARRIVED, ARRIVED) if mission.noise.exact else (CLOSE * mission.first_straight, CLOSE)
+
+
 def travelled(origin: Pose, pose: Pose) -> float:
     """m, as the crow flies."""
     return math.hypot(pose.x - origin.x, pose.y - origin.y)
@@ -75,9 +83,10 @@ def ahead(origin: Pose, pose: Pose) -> float:
 
 def onward(state: Seeking, pose: Pose, measured: bool, mission: Mission, variant: Variant) -> Seeking | None:
     """The state after a tick that led to `pose`; None once there is a second range."""
+    there, facing = arrived(mission)
     match state:
         case Straight(beacon, origin, rho0):
-            if travelled(origin, pose) < mission.first_straight - ARRIVED:
+            if travelled(origin, pose) < mission.first_straight - there:
                 return state
             if measured:
                 return None
@@ -85,11 +94,11 @@ def onward(state: Seeking, pose: Pose, measured: bool, mission: Mission, variant
                 return Backing(beacon, origin, rho0)
             return Turning(beacon, origin, rho0, pose.heading + math.pi / 2)
         case Backing(beacon, origin, rho0):
-            if ahead(origin, pose) > ARRIVED - mission.first_straight:
+            if ahead(origin, pose) > there - mission.first_straight:
                 return state
             return None if measured else Turning(beacon, origin, rho0, pose.heading - math.pi / 2)
         case Turning(beacon, origin, rho0, heading):
-            return state if abs(heading - pose.heading) > ARRIVED else Circling(beacon, origin, rho0)
+            return state if abs(heading - pose.heading) > facing else Circling(beacon, origin, rho0)
         case Circling():
             return None if measured else state
 

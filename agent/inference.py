@@ -1,0 +1,181 @@
+"""What a mind makes of its logs under noise: where its anchor may be, and how the pair may lie in <W>."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from msgspec.structs import replace
+
+from agent.belief import Branch
+from agent.hypotheses import Pair, Weighed, of_anchor, of_pair
+from agent.logbook import Logbook
+from agent.mind import Mind
+from agent.phases.surveying import Held
+from agent.smoothing import SIGMA_FLOOR, Array, Ranges, Track, poses, track
+from protocol.mission import Mission
+from protocol.motion import Covariance, Pose, compose, wrap
+
+
+def path_of(log: Logbook, through: int, period: float) -> Track:
+    """The odometry of a log up to tick `through`."""
+    runs = log.runs
+    ticks = [run.ticks for run in runs]
+    v = np.repeat([run.v for run in runs], ticks)[:through]
+    omega = np.repeat([run.omega for run in runs], ticks)[:through]
+    return track(v, omega, period)
+
+
+def own_anchor(mind: Mind) -> tuple[Weighed, ...]:
+    """Where the robot's anchor may lie in the frame of its odometry."""
+    mission = mind.briefing.mission
+    path = path_of(mind.log, mind.tick, mission.period)
+    ranges = Ranges.of_lists(_told(mind.log, mind.tick), (), (), mission.noise)
+    return of_anchor(mind.findings.own, path, ranges, mission.sensing_range, mission.noise)
+
+
+def _told(log: Logbook, through: int) -> list[tuple[int, float]]:
+    return [(ranged.tick, ranged.range) for ranged in log.ranges if ranged.tick <= through]
+
+
+def with_own(mind: Mind, weighed: Sequence[Weighed]) -> Mind:
+    """`mind`, with these hypotheses of its anchor; where it stands now follows from the likeliest."""
+    own = tuple(one.hypothesis for one in weighed)
+    findings = replace(mind.findings, own=own, branch=branch_of(mind, weighed[0]))
+    return replace(mind, findings=findings)
+
+
+def branch_of(mind: Mind, weighed: Weighed) -> Branch:
+    """The likeliest trajectory; its start is such that the odometry leads to where the robot is now."""
+    mx, my = weighed.hypothesis.guess[:2]
+    path = weighed.fit.paths[0]
+    frame = math.atan2(-my, -mx)
+    c, s = math.cos(frame), math.sin(frame)
+    x, y = float(path.x[-1]) - mx, float(path.y[-1]) - my
+    now = Pose(c * x + s * y, c * y - s * x, float(path.heading[-1]) - frame)
+    start = compose(now, _inverse(mind.odometry))
+    return Branch(wrap(-frame), start)
+
+
+def _inverse(pose: Pose) -> Pose:
+    c, s = math.cos(pose.heading), math.sin(pose.heading)
+    return Pose(-c * pose.x - s * pose.y, s * pose.x - c * pose.y, -pose.heading)
+
+
+def held_alone(weighed: Sequence[Weighed]) -> list[Held]:
+    """For planning: the robot, relative to its anchor."""
+    held = []
+    for one in weighed:
+        mx, my = one.hypothesis.guess[:2]
+        path = one.fit.paths[0]
+        now = np.array((path.x[-1] - mx, path.y[-1] - my, path.heading[-1]))
+        held.append(Held(one.hypothesis.odds, now, one.fit.covariance))
+    return held
+
+
+def settled(weighed: Sequence[Weighed], mission: Mission) -> bool:
+    """Whether what is left to know of the anchor is worth less than moving on."""
+    best = weighed[0]
+    return (
+        best.hypothesis.odds >= SURE_OF_BRANCH
+        and math.sqrt(float(np.trace(best.fit.covariance))) <= mission.foothold
+    )
+
+
+SURE_OF_BRANCH = 0.999
+
+
+def pair_of(mind: Mind) -> Pair:
+    """All that both have measured, up to the last tick that both logs cover;"""
+    peer, briefing = mind.radio.peer, mind.briefing
+    mission = briefing.mission
+    last = min(mind.tick, peer.through, mind.radio.ranges_through)
+    logs = (mind.log, peer) if briefing.role == "a" else (peer, mind.log)
+    mutual = [(ranged.tick, ranged.range) for ranged in mind.mutual if ranged.tick <= last]
+    lists = [_told(log, last) for log in logs]
+    ranges = Ranges.of_lists(lists[0], lists[1], mutual, mission.noise)
+    silent = []
+    for i in range(3):
+        seen = np.ones(last + 1, bool)
+        seen[ranges.tick[ranges.of == i]] = False
+        silent.append(np.flatnonzero(seen))
+    own, other = briefing.anchor, briefing.peer_anchor
+    sign = 1.0 if briefing.role == "a" else -1.0
+    return Pair(
+        (path_of(logs[0], last, mission.period), path_of(logs[1], last, mission.period)),
+        ranges,
+        (silent[0], silent[1], silent[2]),
+        (sign * (other.x - own.x), sign * (other.y - own.y)),
+        mission.sensing_range,
+        mission.noise,
+    )
+
+
+def search(pair: Pair) -> tuple[Weighed, ...]:
+    """Every way in which the two may lie in <W>, looked for anew."""
+    of = []
+    for robot in (0, 1):
+        chosen = pair.ranges.of == robot
+        ranges = Ranges(*[column[chosen] for column in pair.ranges])
+        ranges = ranges._replace(of=np.zeros_like(ranges.of))
+        weighed = of_anchor((), pair.paths[robot], ranges, pair.sensing_range, pair.noise)
+        of.append([one.hypothesis for one in weighed])
+    return of_pair((), of[0], of[1], pair)
+
+
+def held_together(weighed: Sequence[Weighed], pair: Pair) -> list[Held]:
+    """For planning: both poses relative to M1, and their covariance."""
+    return [Held(one.hypothesis.odds, *poses(one.fit, pair.apart)) for one in weighed]
+
+
+def claim(held: Held, robot: int, pair: Pair) -> tuple[Pose, Covariance]:
+    """The pose of one robot, relative to M1, as the mean and the covariance of what is left of the best
+    hypothesis. Ranges confine a robot to an arc, so both are taken to second order (see `bent`)."""
+    mean, covariance = bent(held, pair.apart)
+    i = 3 * robot
+    x, y, heading = mean[i : i + 3].tolist()
+    block = covariance[i : i + 3, i : i + 3]
+    return Pose(x, y, wrap(heading)), Covariance(
+        *[float(block[j, k]) for j, k in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))]
+    )
+
+
+def bent(held: Held, m2: tuple[float, float]) -> tuple[Array, Array]:
+    """Mean and covariance of both poses, where it is range and bearing that are Gaussian: b's from M2, a's
+    from b. To second order; where the ranges are far better than the bearings, this is an arc, and the ellipse
+    of the first order alone would not reach it."""
+    mean, covariance = held.poses.copy(), held.covariance
+    bx, by = mean[3] - m2[0], mean[4] - m2[1]
+    ax, ay = mean[0] - mean[3], mean[1] - mean[4]
+    # by (range, bearing) of b, then of a from b: gradients by the poses
+    rows = np.zeros((4, 6))
+    for k, (x, y), plus, minus in ((0, (bx, by), 3, None), (2, (ax, ay), 0, 3)):
+        rho = max(math.hypot(x, y), SIGMA_FLOOR)
+        for row, (gx, gy) in ((k, (x / rho, y / rho)), (k + 1, (-y / rho**2, x / rho**2))):
+            rows[row, plus : plus + 2] = gx, gy
+            if minus is not None:
+                rows[row, minus : minus + 2] = -gx, -gy
+    polar = rows @ covariance @ rows.T
+    polar = _limited(polar)
+    second = np.zeros((6, 4, 4))
+    for k, (x, y), moved in ((0, (bx, by), (0, 3)), (2, (ax, ay), (0,))):
+        rho = max(math.hypot(x, y), SIGMA_FLOOR)
+        for i in moved:
+            second[i, k + 1, k + 1] = -x
+            second[i + 1, k + 1, k + 1] = -y
+            second[i, k, k + 1] = second[i, k + 1, k] = -y / rho
+            second[i + 1, k, k + 1] = second[i + 1, k + 1, k] = x / rho
+    turned = second @ polar
+    mean += 0.5 * np.trace(turned, axis1=1, axis2=2)
+    covariance = covariance + 0.5 * np.einsum("iab,jba->ij", turned, turned)
+    return mean, covariance
+
+
+def _limited(polar: Array) -> Array:
+    """A bearing that is hardly known is no small angle: its variance counts up to one radian's."""
+    scale = np.ones(4)
+    for k in (1, 3):
+        scale[k] = min(1.0, 1.0 / math.sqrt(max(polar[k, k], 1e-300)))
+    limited: Array = polar * scale[:, None] * scale
+    return limited

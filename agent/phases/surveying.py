@@ -1,0 +1,199 @@
+"""Under noise: where to drive so that the next ranges tell most, alone with the anchor or with the peer.
+
+A manoeuvre is worth what it is expected to leave: the odds of taking the wrong hypothesis (Bhattacharyya's
+bound, by how many sigmas apart the ranges are that they predict), and the variance of the positions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cache
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from agent.phases.seeking import Beacon
+from agent.smoothing import SIGMA_FLOOR, Array
+from protocol.mission import Mission
+from protocol.motion import REST, Controls
+
+AHEAD = 3
+"""ticks that a manoeuvre is looked at: so long would it go on"""
+
+TURNS = 17
+"""values of omega that are compared, from -omega_max to omega_max"""
+
+SPEEDS = (1.0, -1.0, 0.5, -0.5)
+"""values of v, over A_0 / T_s"""
+
+CONFUSION = 10.0
+"""what taking the wrong hypothesis costs, in variances as large as the accuracy asked for"""
+
+LOSS = 1e3
+"""what leaving the beacon's range costs, likewise"""
+
+LIKELY = 0.01
+"""odds from which on a hypothesis has a say in where the beacon is lost"""
+
+
+class Surveying(msgspec.Struct, frozen=True):
+    """Drives where the next ranges are expected to tell most."""
+
+    beacon: Beacon
+    drive: Controls = REST
+
+
+class Choice(NamedTuple):
+    """Manoeuvres to compare, C of them, and where each leads, relative to where it begins."""
+
+    v: Array
+    omega: Array
+    along: Array
+    """m, in the direction of the heading; (C, AHEAD)"""
+    across: Array
+    """m, to the left of it"""
+
+
+@cache
+def choice(mission: Mission) -> Choice:
+    """All of a robot's; the last is to stand."""
+    omega, speed = np.meshgrid(
+        np.linspace(-mission.max_turn_rate, mission.max_turn_rate, TURNS),
+        mission.first_straight / mission.period * np.array(SPEEDS),
+    )
+    v = np.append(speed.ravel(), 0.0)
+    turn = np.append(omega.ravel(), 0.0)
+    half = 0.5 * mission.period * turn
+    chord = mission.period * v * np.sinc(half / math.pi)
+    course = half[:, None] * (2.0 * np.arange(AHEAD) + 1.0)
+    return Choice(
+        v,
+        turn,
+        np.cumsum(chord[:, None] * np.cos(course), 1),
+        np.cumsum(chord[:, None] * np.sin(course), 1),
+    )
+
+
+class Held(NamedTuple):
+    """A hypothesis, as far as planning needs it: poses (x, y in m, heading), of one robot or of both, in a frame
+    in which its anchor is (the first of) `anchors`."""
+
+    odds: float
+    poses: Array
+    covariance: Array
+
+
+def alone(held: Sequence[Held], sigma: float, mission: Mission, within: float | None = None) -> Controls:
+    """The manoeuvre whose ranges to the anchor, at the origin, are expected to tell most.
+
+    The covariance is that of the anchor's place. `within` is how far (m) from it the robot may go.
+    """
+    ways = choice(mission)
+    best = held[0]
+    reach = mission.sensing_range
+    distances = []
+    for one in held:
+        x, y = _ends(ways, one.poses)
+        distances.append(np.maximum(np.hypot(x, y), SIGMA_FLOOR))
+        if one is best:
+            ux, uy = x / distances[0], y / distances[0]
+    in_range = distances[0] <= reach
+    weight = in_range / sigma**2
+    information = np.linalg.inv(best.covariance + np.eye(2) * SIGMA_FLOOR**2)
+    xx = information[0, 0] + np.sum(weight * ux * ux, 1)
+    xy = information[0, 1] + np.sum(weight * ux * uy, 1)
+    yy = information[1, 1] + np.sum(weight * uy * uy, 1)
+    cost = (xx + yy) / np.maximum(xx * yy - xy * xy, 1e-300) / mission.accuracy**2
+    cost += _confusion(held, distances, sigma, reach)
+    limit = within if within is not None else reach
+    for one, distance in zip(held, distances, strict=True):
+        if one.odds >= LIKELY:
+            margin = 3.0 * math.sqrt(max(0.0, float(np.trace(one.covariance)))) if within is None else 0.0
+            cost += LOSS * np.maximum(0.0, distance[:, 0] + min(margin, 0.3 * reach) - limit)
+    i = int(np.argmin(cost))
+    return Controls(float(ways.v[i]), float(ways.omega[i]))
+
+
+def together(
+    held: Sequence[Held],
+    sigmas: tuple[float, float],
+    anchors: tuple[tuple[float, float], tuple[float, float]],
+    mission: Mission,
+) -> tuple[Controls, Controls]:
+    """The manoeuvres of a and b after which both know best where they are.
+
+    `sigmas` are of anchor and mutual ranges, in m; the covariance is that of both poses, (6, 6). First b's, as if
+    a stood; then a's, as b will drive.
+    """
+    ways = choice(mission)
+    stand = len(ways.v) - 1
+    still = np.array([stand])
+    _, b = _best_of(ways, held, sigmas, anchors, mission, still, np.arange(stand + 1))
+    a, _ = _best_of(ways, held, sigmas, anchors, mission, np.arange(stand + 1), np.array([b]))
+    return (
+        Controls(float(ways.v[a]), float(ways.omega[a])),
+        Controls(float(ways.v[b]), float(ways.omega[b])),
+    )
+
+
+def _best_of(ways, held, sigmas, anchors, mission, of_a, of_b) -> tuple[int, int]:
+    """Of the ways `of_a` and `of_b`, one of which is a single one."""
+    reach = mission.sensing_range
+    count = max(len(of_a), len(of_b))
+    distances = []
+    cost = np.zeros(count)
+    for one in held:
+        ax, ay = _ends(ways, one.poses[:3], of_a)
+        bx, by = _ends(ways, one.poses[3:], of_b)
+        dx, dy = ax - bx, ay - by
+        distance = np.maximum(np.hypot(dx, dy), SIGMA_FLOOR)
+        distances.append(distance)
+        if one.odds >= LIKELY:
+            cost += LOSS * np.maximum(0.0, distance[:, 0] - MARGIN * reach)
+        if one is not held[0]:
+            continue
+        rows = np.zeros((count, 3 * AHEAD, 6))
+        nx, ny = dx / distance, dy / distance
+        weight = (distance <= reach) / sigmas[1]
+        for robot, (x, y), sign in ((0, (ax, ay), 1.0), (1, (bx, by), -1.0)):
+            px, py = one.poses[3 * robot : 3 * robot + 2]
+            i = 3 * robot
+            rows[:, :AHEAD, i] = sign * nx * weight
+            rows[:, :AHEAD, i + 1] = sign * ny * weight
+            rows[:, :AHEAD, i + 2] = sign * (ny * (x - px) - nx * (y - py)) * weight
+            ox, oy = x - anchors[robot][0], y - anchors[robot][1]
+            rho = np.maximum(np.hypot(ox, oy), SIGMA_FLOOR)
+            own = (rho <= reach) / rho / sigmas[0]
+            own_rows = slice((robot + 1) * AHEAD, (robot + 2) * AHEAD)
+            rows[:, own_rows, i] = ox * own
+            rows[:, own_rows, i + 1] = oy * own
+            rows[:, own_rows, i + 2] = (oy * (x - px) - ox * (y - py)) * own
+        information = np.linalg.inv(one.covariance + np.eye(6) * SIGMA_FLOOR**2)
+        left = np.linalg.inv(information + np.swapaxes(rows, 1, 2) @ rows)
+        cost += (left[:, 0, 0] + left[:, 1, 1] + left[:, 3, 3] + left[:, 4, 4]) / mission.accuracy**2
+    cost += _confusion(held, distances, sigmas[1], reach)
+    i = int(np.argmin(cost))
+    return int(of_a[i if len(of_a) > 1 else 0]), int(of_b[i if len(of_b) > 1 else 0])
+
+
+MARGIN = 0.9
+"""of R: how far apart two robots may plan to be"""
+
+
+def _confusion(held: Sequence[Held], distances: Sequence[Array], sigma: float, reach: float) -> Array:
+    """What is left of the odds of taking the first hypothesis for another."""
+    left = np.zeros(len(distances[0]))
+    first = np.minimum(distances[0], 1.2 * reach)
+    for one, distance in zip(held[1:], distances[1:], strict=True):
+        gap = np.square((np.minimum(distance, 1.2 * reach) - first) / (1.5 * sigma))
+        left += math.sqrt(held[0].odds * one.odds) * np.exp(-np.minimum(np.sum(gap, 1), 400.0) / 8.0)
+    return CONFUSION * left
+
+
+def _ends(ways: Choice, pose: Array, some: Array | slice = slice(None)) -> tuple[Array, Array]:
+    """m: where the ways lead from `pose`, (C, AHEAD)."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    along, across = ways.along[some], ways.across[some]
+    return pose[0] + c * along - s * across, pose[1] + s * along + c * across

@@ -1,0 +1,175 @@
+"""The mission under noise, as `assured` goes through it: measure until the poses are known as well as was asked.
+
+The order is the paper's. In phase 1 a robot goes on inside its anchor's range until what it does not know yet is
+worth less than moving on; in phase 3 both move, each tick where the next ranges are expected to tell most.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from msgspec.structs import replace
+
+from agent import inference
+from agent.hypotheses import Weighed, of_pair
+from agent.inference import Pair
+from agent.mind import Done, Mind
+from agent.phases import rendezvous, seeking, surveying
+from agent.phases.encounter import Returning
+from agent.phases.rendezvous import Aligning, Orbiting, Radial, Tangent
+from agent.phases.seeking import Backing, Circling, Straight, Turning
+from agent.phases.surveying import Held, Surveying
+from protocol.messages import Localised
+from protocol.motion import REST, Controls, Pose
+
+SEARCHED = frozenset((2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256))
+"""with so many mutual ranges the whole plane is searched again"""
+
+CHECKED = 3
+"""mutual ranges at the least before a claim"""
+
+PLAUSIBLE = 5.0
+"""standard deviations by which chi-square may exceed what it should be, before nothing is claimed"""
+
+
+def sensed(mind: Mind, anchor_range: float | None) -> Mind:
+    """`mind` in the state that its own senses lead to."""
+    match mind.state:
+        case Straight("anchor") | Backing("anchor") | Turning("anchor") | Circling("anchor"):
+            mission, variant = mind.briefing.mission, mind.briefing.variant
+            onward = seeking.onward(mind.state, mind.odometry, anchor_range is not None, mission, variant)
+            return _surveyed(mind) if onward is None else replace(mind, state=onward)
+        case Surveying("anchor"):
+            return _surveyed(mind)
+        case Aligning() | Radial() | Tangent() | Orbiting():
+            return _under_way(mind, anchor_range is not None)
+        case Surveying("peer", drive) if not mind.near:
+            return replace(mind, state=Returning(Controls(-drive.v, -drive.omega), mind.odometry))
+        case Returning() if not mind.near:
+            return _parted(mind)
+        case Returning():
+            return replace(mind, state=Surveying("peer"))
+        case _:
+            return mind
+
+
+def _surveyed(mind: Mind) -> Mind:
+    """Phase 1: what the ranges to the anchor leave possible, and whether that is enough."""
+    weighed = inference.own_anchor(mind)
+    if not weighed:  # one range alone, from wherever
+        return replace(mind, state=Straight("anchor", mind.odometry, mind.log.ranges[-1].range))
+    mind = inference.with_own(mind, weighed)
+    mission = mind.briefing.mission
+    if inference.settled(weighed, mission):
+        kind = "circle" if len(mind.log.ranges) == 2 else "three-ranges"
+        mind = replace(mind, findings=replace(mind.findings, branch_kind=kind))
+        return _parted(mind)
+    sigma = max(mission.noise.anchor_sigma, surveying.SIGMA_FLOOR)
+    drive = surveying.alone(inference.held_alone(weighed), sigma, mission)
+    return replace(mind, state=Surveying("anchor", drive))
+
+
+def _parted(mind: Mind) -> Mind:
+    """To the rendezvous, for the first time or again."""
+    mu = rendezvous.orientation(mind.local_pose)
+    return _under_way(replace(mind, state=Aligning(mind.odometry.heading - mu)), False)
+
+
+def _under_way(mind: Mind, ranged: bool) -> Mind:
+    """Phase 2, with what another range to the anchor adds; b goes on to survey where it waits."""
+    mission = mind.briefing.mission
+    weighed: Sequence[Weighed] = ()
+    if ranged:
+        weighed = inference.own_anchor(mind)
+        mind = inference.with_own(mind, weighed)
+    assert isinstance(mind.state, Aligning | Radial | Tangent | Orbiting)
+    state = rendezvous.onward(mind.state, mind.odometry, mind.start, mind.orbit, mission)
+    if isinstance(state, Orbiting):
+        if mind.orbit.v != 0.0:
+            drive = rendezvous.pursuit(mind.local_pose, mind.orbit, mission)
+        elif weighed:
+            sigma = max(mission.noise.anchor_sigma, surveying.SIGMA_FLOOR)
+            drive = surveying.alone(inference.held_alone(weighed), sigma, mission, mind.orbit.radius)
+        else:
+            drive = REST
+        state = Orbiting(drive)
+    return replace(mind, state=state)
+
+
+# --- with the peer ------------------------------------------------------------------------------------
+
+
+def heard(mind: Mind) -> Mind:
+    """What the robot is set to do once it has heard its peer, in range."""
+    match mind.state:
+        case Done():
+            return mind
+        case Surveying("anchor") | Straight() | Backing() | Turning() | Circling():
+            return mind
+        case _ if mind.radio.start is None:
+            return mind
+        case Surveying("peer") if not mind.hears_peer:
+            return replace(mind, state=Surveying("peer"))
+        case _ if not mind.hears_peer:
+            return mind
+        case _:
+            return _considered(mind)
+
+
+def _considered(mind: Mind) -> Mind:
+    """Both logs in hand: weigh the hypotheses; then claim, or plan what both do next."""
+    if mind.findings.met is None:
+        mind = replace(mind, findings=replace(mind.findings, met=mind.tick))
+    mission, role = mind.briefing.mission, mind.briefing.role
+    pair = inference.pair_of(mind)
+    mutual = int((pair.ranges.of == 2).sum())
+    if mutual < 2:
+        ahead = Controls(mission.first_straight / mission.period, 0.0)
+        return replace(mind, state=Surveying("peer", ahead if role == "a" else REST))
+    searched = mutual in SEARCHED or not mind.findings.pair
+    weighed = inference.search(pair) if searched else of_pair(mind.findings.pair, (), (), pair)
+    held = inference.held_together(weighed, pair)
+    if not searched and _sure(mind, weighed, held, pair, mutual):
+        weighed = inference.search(pair)
+        held = inference.held_together(weighed, pair)
+        searched = True
+    mind = _noted(mind, weighed, held, pair)
+    if searched and _sure(mind, weighed, held, pair, mutual):
+        claim = Localised(mind.findings.poses[0], mind.findings.covariance)
+        return replace(mind, state=Done(3, claim))
+    sigmas = (
+        max(mission.noise.anchor_sigma, surveying.SIGMA_FLOOR),
+        max(mission.noise.mutual_sigma, surveying.SIGMA_FLOOR),
+    )
+    a, b = surveying.together(held, sigmas, ((0.0, 0.0), pair.apart), mission)
+    return replace(mind, state=Surveying("peer", a if role == "a" else b))
+
+
+def _sure(mind: Mind, weighed: Sequence[Weighed], held: Sequence[Held], pair: Pair, mutual: int) -> bool:
+    """Whether both robots' poses are known as well as the mission asks, and the fit is a plausible one."""
+    mission = mind.briefing.mission
+    if mutual < CHECKED or not weighed or weighed[0].hypothesis.odds < mission.confidence:
+        return False
+    free = len(pair.ranges.rho) - 6
+    chi2 = weighed[0].fit.chi2
+    if chi2 > free + PLAUSIBLE * math.sqrt(2.0 * max(free, 1)) + PLAUSIBLE**2:
+        return False
+    _, covariance = inference.bent(held[0], pair.apart)
+    return all(math.sqrt(covariance[i, i] + covariance[i + 1, i + 1]) <= mission.accuracy for i in (0, 3))
+
+
+def _noted(mind: Mind, weighed: Sequence[Weighed], held: Sequence[Held], pair: Pair) -> Mind:
+    """`mind`, with what it now holds possible."""
+    briefing = mind.briefing
+    robot, m1 = (0, briefing.anchor) if briefing.role == "a" else (1, briefing.peer_anchor)
+    claims = [inference.claim(one, robot, pair) for one in held]
+    before = mind.findings.candidates[0] if mind.findings.candidates is not None else len(weighed)
+    findings = replace(
+        mind.findings,
+        pair=tuple(one.hypothesis for one in weighed),
+        poses=tuple(Pose(m1.x + pose.x, m1.y + pose.y, pose.heading) for pose, _ in claims),
+        covariance=claims[0][1] if claims else None,
+        candidates=(before, len(weighed)),
+    )
+    return replace(mind, findings=findings)
