@@ -117,7 +117,8 @@ def of_anchor(
     tick ago; the log is complete, so what is not in `ranges` was silent."""
     seeds = [one.guess[:2] for one in before]
     points = np.array(seeds).reshape(-1, 2)
-    if len(ranges.rho) <= SEED_RANGES or not seeds:
+    lost = len(path.x) - 1 > ranges.tick[-1]
+    if len(ranges.rho) <= SEED_RANGES or lost or not seeds:
         points = np.concatenate((points, _crossings(path, ranges)))
     if not len(points):
         return ()
@@ -233,8 +234,6 @@ def _polished(
         distance = np.maximum(np.hypot(dx, dy), SIGMA_FLOOR)
         return rho - distance, dx / distance, dy / distance, distance
 
-    first = look(points)[0]
-    points = _best(points, mixture(first, np.hypot(sigma, near), noise)[0], near)
     for step in range(POLISHINGS):
         s = np.hypot(sigma, near * 0.1**step)
         residual, ux, uy, _ = look(points)
@@ -408,7 +407,7 @@ def _turned(
         return rho - distance, by_near, by_far
 
     likely = mixture(look(turns)[0], np.hypot(sigma, coarse), pair.noise)[0]
-    turns = _best_turns(turns, likely, lever, coarse, 2 * MOST)
+    turns = _best_turns(turns, likely, lever, coarse, 4 * MOST)
     for step in range(POLISHINGS):
         s = np.hypot(sigma, coarse * 0.2**step)
         residual, by_near, by_far = look(turns)

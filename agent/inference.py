@@ -84,6 +84,7 @@ def settled(weighed: Sequence[Weighed], mission: Mission) -> bool:
 
 
 SURE_OF_BRANCH = 0.999
+ANCHOR_RANGES = 5
 
 
 def pair_of(mind: Mind) -> Pair:

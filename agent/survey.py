@@ -26,7 +26,7 @@ from protocol.motion import REST, Controls, Pose
 SEARCHED = frozenset((2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256))
 """with so many mutual ranges the whole plane is searched again"""
 
-CHECKED = 3
+CHECKED = 8
 """mutual ranges at the least before a claim"""
 
 PLAUSIBLE = 5.0

@@ -28,14 +28,18 @@ TURNS = 17
 SPEEDS = (1.0, -1.0, 0.5, -0.5)
 """values of v, over A_0 / T_s"""
 
+FINE = 0.03
+"""of the accuracy: what is known better than this need not be known better still"""
+
 CONFUSION = 10.0
 """what taking the wrong hypothesis costs, in variances as large as the accuracy asked for"""
 
 LOSS = 1e3
 """what leaving the beacon's range costs, likewise"""
 
-LIKELY = 0.01
-"""odds from which on a hypothesis has a say in where the beacon is lost"""
+
+ASTRAY = 10.0
+"""what leaving the anchor's range costs, of which more is known each tick"""
 
 
 class Surveying(msgspec.Struct, frozen=True):
@@ -99,9 +103,9 @@ def alone(held: Sequence[Held], sigma: float, mission: Mission, within: float | 
         distances.append(np.maximum(np.hypot(x, y), SIGMA_FLOOR))
         if one is best:
             ux, uy = x / distances[0], y / distances[0]
-    in_range = distances[0] <= reach
-    weight = in_range / sigma**2
-    information = np.linalg.inv(best.covariance + np.eye(2) * SIGMA_FLOOR**2)
+    sigma = max(sigma, FINE * mission.accuracy)
+    weight = (distances[0] <= reach) / sigma**2
+    information = np.linalg.inv(best.covariance + np.eye(2) * (FINE * mission.accuracy) ** 2)
     xx = information[0, 0] + np.sum(weight * ux * ux, 1)
     xy = information[0, 1] + np.sum(weight * ux * uy, 1)
     yy = information[1, 1] + np.sum(weight * uy * uy, 1)
@@ -109,9 +113,9 @@ def alone(held: Sequence[Held], sigma: float, mission: Mission, within: float | 
     cost += _confusion(held, distances, sigma, reach)
     limit = within if within is not None else reach
     for one, distance in zip(held, distances, strict=True):
-        if one.odds >= LIKELY:
-            margin = 3.0 * math.sqrt(max(0.0, float(np.trace(one.covariance)))) if within is None else 0.0
-            cost += LOSS * np.maximum(0.0, distance[:, 0] + min(margin, 0.3 * reach) - limit)
+        margin = math.sqrt(max(0.0, float(np.trace(one.covariance)))) if within is None else 0.0
+        loss = LOSS if within is not None else ASTRAY
+        cost += one.odds * loss * np.maximum(0.0, distance[:, 0] + min(margin, 0.1 * reach) - limit)
     i = int(np.argmin(cost))
     return Controls(float(ways.v[i]), float(ways.omega[i]))
 
@@ -141,6 +145,7 @@ def together(
 def _best_of(ways, held, sigmas, anchors, mission, of_a, of_b) -> tuple[int, int]:
     """Of the ways `of_a` and `of_b`, one of which is a single one."""
     reach = mission.sensing_range
+    sigmas = (max(sigmas[0], FINE * mission.accuracy), max(sigmas[1], FINE * mission.accuracy))
     count = max(len(of_a), len(of_b))
     distances = []
     cost = np.zeros(count)
@@ -150,8 +155,7 @@ def _best_of(ways, held, sigmas, anchors, mission, of_a, of_b) -> tuple[int, int
         dx, dy = ax - bx, ay - by
         distance = np.maximum(np.hypot(dx, dy), SIGMA_FLOOR)
         distances.append(distance)
-        if one.odds >= LIKELY:
-            cost += LOSS * np.maximum(0.0, distance[:, 0] - MARGIN * reach)
+        cost += one.odds * LOSS * np.maximum(0.0, distance[:, 0] - MARGIN * reach)
         if one is not held[0]:
             continue
         rows = np.zeros((count, 3 * AHEAD, 6))
@@ -170,9 +174,13 @@ def _best_of(ways, held, sigmas, anchors, mission, of_a, of_b) -> tuple[int, int
             rows[:, own_rows, i] = ox * own
             rows[:, own_rows, i + 1] = oy * own
             rows[:, own_rows, i + 2] = (oy * (x - px) - ox * (y - py)) * own
-        information = np.linalg.inv(one.covariance + np.eye(6) * SIGMA_FLOOR**2)
+        information = np.linalg.inv(one.covariance + np.eye(6) * (FINE * mission.accuracy) ** 2)
         left = np.linalg.inv(information + np.swapaxes(rows, 1, 2) @ rows)
-        cost += (left[:, 0, 0] + left[:, 1, 1] + left[:, 3, 3] + left[:, 4, 4]) / mission.accuracy**2
+        for i, (x, y) in ((0, (ax, ay)), (3, (bx, by))):
+            dx, dy = x[:, -1] - one.poses[i], y[:, -1] - one.poses[i + 1]
+            variance = left[:, i, i] + left[:, i + 1, i + 1] + (dx * dx + dy * dy) * left[:, i + 2, i + 2]
+            variance += 2.0 * (dx * left[:, i + 1, i + 2] - dy * left[:, i, i + 2])
+            cost += variance / mission.accuracy**2
     cost += _confusion(held, distances, sigmas[1], reach)
     i = int(np.argmin(cost))
     return int(of_a[i if len(of_a) > 1 else 0]), int(of_b[i if len(of_b) > 1 else 0])
