@@ -7,7 +7,7 @@ odds, never of one measurement.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -115,15 +115,14 @@ def of_anchor(
 ) -> tuple[Weighed, ...]:
     """Where its anchor may lie in the frame of a robot's odometry: phase 1. `before` is what was left a
     tick ago; the log is complete, so what is not in `ranges` was silent."""
-    seeds = [one.guess[:2] for one in before]
-    points = np.array(seeds).reshape(-1, 2)
+    points = np.array([one.guess[:2] for one in before]).reshape(-1, 2)
     lost = len(path.x) - 1 > ranges.tick[-1]
-    if len(ranges.rho) <= SEED_RANGES or lost or not seeds:
+    if len(ranges.rho) <= SEED_RANGES or lost or not len(points):
         points = np.concatenate((points, _crossings(path, ranges)))
-    if not len(points):
-        return ()
-    variance = np.square(ranges.sigma) + _wandered(path, ranges, noise)
-    points = _polished(points, path, ranges, np.sqrt(variance), noise, sensing_range)
+        if not len(points):
+            return ()
+        variance = np.square(ranges.sigma) + _wandered(path, ranges, noise)
+        points = _polished(points, path, ranges, np.sqrt(variance), noise, sensing_range)
     fits = []
     silent = _missing(ranges.tick, len(path.x))
     for point in points:
@@ -247,23 +246,15 @@ def _polished(
         longest = np.maximum(np.abs(change).max(1, keepdims=True), 1e-12)
         points = points + change * np.minimum(1.0, 0.5 * sensing_range / longest)
     likely = mixture(look(points)[0], np.hypot(sigma, near * 0.1**POLISHINGS), noise)[0]
-    return _best(points, likely, near * 0.1)
+    return _best(points, likely, near * 0.1 + 0.3 * float(np.min(sigma)))
 
 
 def _best(points: Array, likely: Array, near: float) -> Array:
     """The likeliest few, no two of them nearer to each other than `near`."""
-    order = np.argsort(-likely, kind="stable")
-    chosen: list[Array] = []
-    for i in order:
-        if len(chosen) == MOST or likely[order[0]] - likely[i] > UNLIKELY:
-            break
-        point = points[i]
-        if all(abs(point[0] - other[0]) + abs(point[1] - other[1]) > near for other in chosen):
-            chosen.append(point)
-    return np.array(chosen).reshape(-1, points.shape[1])
+    return _distinct(points, likely, near, MOST, lambda one, others: np.abs(others - one).sum(1))
 
 
-UNLIKELY = 40.0
+UNLIKELY = 25.0
 """in log-likelihood: a seed that is so far behind the best is left"""
 
 
@@ -423,18 +414,21 @@ def _turned(
         longest = np.maximum(np.abs(change).max(1, keepdims=True), 1e-12)
         turns = turns + change * np.minimum(1.0, 0.3 / longest)
     likely = mixture(look(turns)[0], np.hypot(sigma, 0.1 * coarse), pair.noise)[0]
-    return _best_turns(turns, likely, lever, 0.1 * coarse, MOST)
+    return _best_turns(turns, likely, lever, 0.1 * coarse + 0.3 * float(np.min(sigma)), MOST)
 
 
 def _best_turns(turns: Array, likely: Array, lever: Array, near: float, most: int) -> Array:
-    order = np.argsort(-likely, kind="stable")
-    chosen: list[Array] = []
-    for i in order:
-        if len(chosen) == most or likely[order[0]] - likely[i] > UNLIKELY:
-            break
-        if all(
-            np.sum(np.abs(np.remainder(turns[i] - other + math.pi, math.tau) - math.pi) * lever) > near
-            for other in chosen
-        ):
-            chosen.append(turns[i])
-    return np.array(chosen).reshape(-1, 2)
+    """The likeliest of `turns`, no two of which lead nearer to each other than `near` (m)."""
+    apart = lambda one, others: np.abs(np.remainder(others - one + math.pi, math.tau) - math.pi) @ lever  # noqa: E731
+    return _distinct(turns, likely, near, most, apart)
+
+
+def _distinct(points: Array, likely: Array, near: float, most: int, apart: Callable[[Array, Array], Array]) -> Array:
+    """The likeliest of `points`, no two of them nearer to each other than `near`; by how far `apart` they are."""
+    left = np.flatnonzero(likely >= np.max(likely) - UNLIKELY)
+    left = left[np.argsort(-likely[left], kind="stable")]
+    chosen = []
+    while len(left) and len(chosen) < most:
+        chosen.append(left[0])
+        left = left[apart(points[left[0]], points[left]) > near]
+    return points[chosen]

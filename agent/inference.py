@@ -78,7 +78,8 @@ def settled(weighed: Sequence[Weighed], mission: Mission) -> bool:
     """Whether what is left to know of the anchor is worth less than moving on."""
     best = weighed[0]
     return (
-        best.hypothesis.odds >= SURE_OF_BRANCH
+        np.count_nonzero(best.fit.weights > 0.5) >= ANCHOR_RANGES
+        and best.hypothesis.odds >= SURE_OF_BRANCH
         and math.sqrt(float(np.trace(best.fit.covariance))) <= mission.foothold
     )
 

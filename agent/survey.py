@@ -23,7 +23,7 @@ from agent.phases.surveying import Held, Surveying
 from protocol.messages import Localised
 from protocol.motion import REST, Controls, Pose
 
-SEARCHED = frozenset((2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256))
+SEARCHED = frozenset(3 * 2**n for n in range(12))
 """with so many mutual ranges the whole plane is searched again"""
 
 CHECKED = 8
@@ -124,7 +124,7 @@ def _considered(mind: Mind) -> Mind:
     mission, role = mind.briefing.mission, mind.briefing.role
     pair = inference.pair_of(mind)
     mutual = int((pair.ranges.of == 2).sum())
-    if mutual < 2:
+    if mutual < 3:
         ahead = Controls(mission.first_straight / mission.period, 0.0)
         return replace(mind, state=Surveying("peer", ahead if role == "a" else REST))
     searched = mutual in SEARCHED or not mind.findings.pair
