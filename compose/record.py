@@ -26,7 +26,7 @@ from world.referee import errors
 from world.scenario import Scenario
 from world.sensors import anchor_ranges, executed, mutual_ranges
 from world.tick import World, advance, release
-from world.truth import Truth, within_limits
+from world.truth import Truth, asked
 
 Mode = Literal["processes", "in-process"]
 WORLD_JOURNAL = "world.journal"
@@ -126,10 +126,10 @@ def ticks_csv(record: Record) -> str:
         mutual = _mutual(record.scenario, moment.truth)
         for i, (robot, pose) in enumerate(zip(ids, moment.truth.poses, strict=True)):
             drive = moment.drives.get(robot)
-            driven: list[object] = ["", ""] if moment.truth.tick == last else [0.0, 0.0]
-            if drive is not None and moment.truth.tick != last:
-                asked = within_limits(drive.v, drive.omega, record.scenario.mission)
-                done = executed(asked, record.scenario, robot, moment.truth.tick)
+            driven: list[object] = ["", ""]
+            if moment.truth.tick != last:
+                command = asked(drive, record.scenario.mission)
+                done = executed(command, record.scenario, robot, moment.truth.tick)
                 driven = [done.v, done.omega]
             said = [drive.phase, drive.state] if drive is not None else ["", ""]
             rows.writerow(
