@@ -15,7 +15,6 @@ from compose.record import Record, first_claim, first_contact, read
 from compose.scenario import run_name
 from protocol.inbox import Inbox
 from protocol.messages import Outcome
-from world.referee import errors
 from world.scenario import Scenario
 
 N = TypeVar("N", int, float)
@@ -145,10 +144,9 @@ def row(trial: Trial, record: Record, wall_s: float) -> Row:
 
 def _robot_row(record: Record, place: int) -> RobotRow:
     robot = record.scenario.robots[place].id
-    farewell, claimed = record.farewells.get(robot), first_claim(record, robot)
-    position = heading = None
-    if claimed is not None:
-        position, heading = errors(claimed[1], record.moments[-1].truth.poses[place])
+    farewell, claimed = record.farewells.get(robot), first_claim(record, place)
+    position = claimed.position_error if claimed is not None else None
+    heading = claimed.heading_error if claimed is not None else None
     if farewell is None:
         return RobotRow(position_error_m=position, heading_error_rad=heading)
     before, left = farewell.candidates if farewell.candidates is not None else (None, None)
