@@ -10,14 +10,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from numpy.typing import NDArray
 from scipy.stats import chi2  # type: ignore[import-untyped]
 
+from compose.campaign import report, run, spec, trial
+from compose.campaign.cells import cells
+from compose.campaign.summary import Counted, counted
+from compose.campaign.table import of_rows, schema_of
 from compose.claim import matrix, nees
 from compose.record import Moment, Record, leave, summary
 from compose.scenario import parse
 from compose.show import result
-from protocol.messages import Drive, End, Localised
+from protocol.messages import Drive, End, Farewell, Localised
 from protocol.motion import Covariance, Pose
 from tests.commands import SECTION_IV, tandem
 from world.referee import Judgement
@@ -157,6 +162,107 @@ def test_the_papers_missions_leave_one_hypothesis_and_no_odds(tmp_path: Path) ->
     told = json.loads((tmp_path / "out" / "summary.json").read_text())["robots"]
     for robot in ("a", "b"):
         assert (told[robot]["hypotheses"], told[robot]["odds"]) == (1, None)
+
+
+# --- a campaign's rows and figures ---------------------------------------------------------------------
+
+HONEST = ["cov_xx", "cov_xy", "cov_xh", "cov_yy", "cov_yh", "cov_hh"]
+SWEEP = 'name = "noisy"\nscenario = "noisy.toml"\ntrials = 3\n'
+
+
+def row_of(record: Record, number: int = 0) -> trial.Row:
+    return trial.row(trial.Trial(0, number, record.scenario, processes=False), record, 0.5)
+
+
+def farewell(robot: str, hypotheses: int, odds: float) -> Farewell:
+    return Farewell(robot, 5, 3, "circle", -2.5, (4, 2), 0.5, 1.5, hypotheses, odds, 3, 4, 0, 0, 0, 600)
+
+
+def test_a_row_has_what_each_robot_claimed() -> None:
+    record = replace(
+        claimed(NOISY, SURE), farewells={"a": farewell("a", 1, 0.99995), "b": farewell("b", 3, 0.6)}
+    )
+    row = row_of(record)
+    a, b = row.robots["a"], row.robots["b"]
+    assert [getattr(a, name) for name in HONEST] == [0.0009, 0.0002, -0.0001, 0.0016, 0.0003, 0.0004]
+    assert (a.hypotheses, a.odds, b.hypotheses, b.odds) == (1, 0.99995, 3, 0.6)
+    assert a.position_sigma_m == pytest.approx(0.05)
+    assert a.nees == row.nees == pytest.approx(summary(record, "in-process", 0.5)["robots"]["a"]["nees"])
+    assert [getattr(b, name) for name in (*HONEST, "nees", "position_sigma_m", "position_error_m")] == [
+        None
+    ] * 9
+    assert (row.hypotheses, row.claims, row.claims_within) == (3, 1, 1)
+
+
+def test_a_row_counts_the_claims_within_three_times_the_accuracy() -> None:
+    assert row_of(claimed(NOISY, SURE, by=0.299)).claims_within == 1
+    assert row_of(claimed(NOISY, SURE, by=0.301)).claims_within == 0
+    generous = NOISY.replace("noise.anchor", "accuracy = 0.2\nnoise.anchor")
+    assert row_of(claimed(generous, SURE, by=0.5)).claims_within == 1
+
+
+def results_of(rows: list[trial.Row], folder: Path) -> run.Results:
+    """Of a campaign of one cell."""
+    (folder / "noisy.toml").write_text(NOISY)
+    (folder / "sweep.toml").write_text(SWEEP)
+    campaign = spec.load(str(folder / "sweep.toml"))
+    (cell,) = cells(campaign)
+    table = of_rows(rows, campaign, {0: cell}, schema_of(campaign, [cell]))
+    return run.Results(campaign, (cell,), table, {0: counted(table)}, None, False, len(rows))
+
+
+def figures_of(rows: list[trial.Row], folder: Path) -> Counted:
+    return results_of(rows, folder).figures[0]
+
+
+def test_a_summary_has_the_mean_nees_with_its_band_and_the_rate_within_three_times_the_accuracy(
+    tmp_path: Path,
+) -> None:
+    rows = [row_of(claimed(NOISY, SURE, by=by), i) for i, by in enumerate((0.01, 0.1, 0.4))]
+    rows += [trial.lost(0, 3, 1, "lost", None), row_of(claimed(EXACT, None, by=0.0), 4)]
+    figures = figures_of(rows, tmp_path)
+    assert (figures.trials, figures.claims, figures.within_3_accuracy) == (5, 4, 0.75)
+    assert figures.nees_mean == pytest.approx(np.mean([row.nees for row in rows[:3]]))
+    assert (figures.nees_low, figures.nees_high) == pytest.approx(
+        (chi2.ppf(0.005, 9) / 3, chi2.ppf(0.995, 9) / 3)
+    )
+
+
+def test_without_claims_a_summary_has_no_nees_and_no_rate(tmp_path: Path) -> None:
+    for rows in ([], [trial.lost(0, 0, 1, "lost", None)]):
+        figures = figures_of(rows, tmp_path)
+        assert figures.claims == 0
+        for name in ("within_3_accuracy", "nees_mean", "nees_low", "nees_high"):
+            assert getattr(figures, name) is None, name
+
+
+def test_a_trial_with_two_claims_counts_once_in_the_mean_nees() -> None:
+    """The errors of a pair go together: twice as many claims are not twice as much evidence."""
+    scenario = parse("max_ticks = 1\n" + NOISY, "noisy")
+    world = release(scenario)
+    poses = world.truth.poses
+    drives = {
+        robot: claims(0, robot, off(pose, by), SURE)
+        for robot, pose, by in zip("ab", poses, (0.01, 0.05), strict=True)
+    }
+    row = row_of(Record(scenario, (Moment(world.truth, drives),), End(0, "localised", None), {}))
+    each = [nees(off(pose, by), pose, SURE) for pose, by in zip(poses, (0.01, 0.05), strict=True)]
+    assert row.claims == 2
+    assert row.nees == pytest.approx(sum(each) / 2)
+
+
+def test_the_table_of_a_campaign_gives_the_nees_where_covariances_are_claimed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report.show(results_of([row_of(claimed(NOISY, SURE))], tmp_path), tmp_path, quiet=False)
+    noisy = capsys.readouterr().out.splitlines()
+    heading = next(line for line in noisy if line.startswith(" cell"))
+    assert heading.split()[-6:] == ["within", "nees", "nees", "low", "nees", "high"]
+    (line,) = (line for line in noisy if line.startswith(" 0 "))
+    assert line.split()[-4:] == ["1.0000", "1.1", "0.0717", "12.8"]
+    assert any(line.startswith("within: claims within 3 x accuracy; nees: ") for line in noisy)
+    report.show(results_of([row_of(claimed(EXACT, None, by=0.0))], tmp_path), tmp_path, quiet=False)
+    assert "nees" not in capsys.readouterr().out
 
 
 # --- the table ----------------------------------------------------------------------------------------
