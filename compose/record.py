@@ -17,16 +17,16 @@ from typing import Any, Literal
 
 import msgspec
 
+from compose.claim import Claim, claim, matrix
 from compose.status import UserError
 from protocol import journal
 from protocol.messages import Drive, End, Farewell, Localised, Missed, Outcome
 from protocol.motion import Pose, wrap
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
-from world.referee import errors
 from world.scenario import Scenario
 from world.sensors import anchor_ranges, executed, mutual_ranges
 from world.tick import World, advance, release
-from world.truth import Truth, within_limits
+from world.truth import Truth, asked
 
 Mode = Literal["processes", "in-process"]
 WORLD_JOURNAL = "world.journal"
@@ -126,10 +126,10 @@ def ticks_csv(record: Record) -> str:
         mutual = _mutual(record.scenario, moment.truth)
         for i, (robot, pose) in enumerate(zip(ids, moment.truth.poses, strict=True)):
             drive = moment.drives.get(robot)
-            driven: list[object] = ["", ""] if moment.truth.tick == last else [0.0, 0.0]
-            if drive is not None and moment.truth.tick != last:
-                asked = within_limits(drive.v, drive.omega, record.scenario.mission)
-                done = executed(asked, record.scenario, robot, moment.truth.tick)
+            driven: list[object] = ["", ""]
+            if moment.truth.tick != last:
+                command = asked(drive, record.scenario.mission)
+                done = executed(command, record.scenario, robot, moment.truth.tick)
                 driven = [done.v, done.omega]
             said = [drive.phase, drive.state] if drive is not None else ["", ""]
             rows.writerow(
@@ -194,29 +194,32 @@ def first_contact(record: Record) -> int | None:
     return None
 
 
-def first_claim(record: Record, robot: str) -> tuple[int, Pose] | None:
-    """When `robot` first claimed to know its pose, and the pose."""
+def first_claim(record: Record, place: int) -> Claim | None:
+    """The first claim to know its pose of the robot at that place in the scenario."""
+    robot = record.scenario.robots[place].id
     for moment in record.moments:
         drive = moment.drives.get(robot)
         if drive is not None and isinstance(drive.verdict, Localised):
-            return moment.truth.tick, drive.verdict.pose
+            return claim(moment.truth.tick, drive.verdict, moment.truth.poses[place])
     return None
 
 
 def _robot_summary(record: Record, place: int) -> dict[str, Any]:
     robot = record.scenario.robots[place].id
     farewell = record.farewells.get(robot)
-    claimed = first_claim(record, robot)
-    truth = record.moments[-1].truth.poses[place] if record.moments else None
-    claim = claimed[1] if claimed is not None else None
-    position, heading = errors(claim, truth) if claim is not None and truth is not None else (None, None)
+    claimed = first_claim(record, place)
+    covariance = claimed.covariance if claimed is not None else None
     return {
         "localised": claimed is not None,
-        "localised_tick": claimed[0] if claimed is not None else None,
-        "estimate": _listed(claim),
-        "truth": _listed(truth),
-        "position_error_m": position,
-        "heading_error_rad": heading,
+        "localised_tick": claimed.tick if claimed is not None else None,
+        "estimate": _listed(claimed.pose) if claimed is not None else None,
+        "covariance": matrix(covariance) if covariance is not None else None,
+        "truth": _listed(record.moments[-1].truth.poses[place]) if record.moments else None,
+        "position_error_m": claimed.position_error if claimed is not None else None,
+        "heading_error_rad": claimed.heading_error if claimed is not None else None,
+        "position_sigma_m": covariance.position_sigma if covariance is not None else None,
+        "heading_sigma_rad": covariance.heading_sigma if covariance is not None else None,
+        "nees": claimed.nees if claimed is not None else None,
         **{field: getattr(farewell, field, None) for field in _SAID},
     }
 
@@ -224,8 +227,8 @@ def _robot_summary(record: Record, place: int) -> dict[str, Any]:
 _SAID = [field for field in Farewell.__struct_fields__ if field != "robot"]
 
 
-def _listed(pose: Pose | None) -> list[float] | None:
-    return [pose.x, pose.y, wrap(pose.heading)] if pose is not None else None
+def _listed(pose: Pose) -> list[float]:
+    return [pose.x, pose.y, wrap(pose.heading)]
 
 
 @cache

@@ -17,7 +17,7 @@ from msgspec import Meta
 
 from compose.status import UserError
 from protocol.messages import Briefing
-from protocol.mission import Anchor, Mission, Role, Variant, obstacle
+from protocol.mission import Anchor, Mission, Role, Variant, noise_obstacle, obstacle
 from protocol.motion import TAU, Pose
 from protocol.rendezvous import Rendezvous, rendezvous, tick_budget
 from protocol.units import NAME, RobotId
@@ -185,6 +185,7 @@ def field_first(error: str) -> str:
 
 
 def _validated(file: ScenarioFile, source: str) -> Scenario:
+    _check_noise(file.mission, source)
     peers = _peers(file.robot, source)
     place = {robot.id: i for i, robot in enumerate(file.robot)}
     placed: list[Placed] = []
@@ -219,6 +220,19 @@ def _validated(file: ScenarioFile, source: str) -> Scenario:
     except MalformedFrame as error:
         raise Unworkable(f"{source}: mission: no robot could be told of it: {error}") from None
     return scenario
+
+
+def _check_noise(mission: Mission, source: str) -> None:
+    """Raises BadScenario, and Unworkable where there is so much of it that no robot could be sure."""
+    least, most = mission.noise.outlier_bias
+    if least > most:
+        raise BadScenario(
+            f"{source}: mission.noise.outlier_bias: the least, {least:.6g} m, is more than the most, "
+            f"{most:.6g} m"
+        )
+    why = noise_obstacle(mission)
+    if why is not None:
+        raise Unworkable(f"{source}: mission.{why}")
 
 
 def _plan(file: ScenarioFile, first: int, second: int, source: str) -> Rendezvous:

@@ -21,8 +21,10 @@ from protocol.messages import Drive, End, Farewell, Missed
 from protocol.wire import MAX_FRAME_BYTES, decode
 from world.scenario import Scenario
 
-COLUMNS = ("is at x, y, heading", "thinks it is at", "error m", "ranges", "reports")
+SIGMA = "sigma m"
+"""a column only where sensors are not exact"""
 LEGEND = "m and rad; ranges to the anchor + to the peer; reports sent / heard"
+SIGMA_LEGEND = "sigma: of the position, as claimed; "
 UNLIMITED = 1000
 """columns, of what is not a terminal"""
 
@@ -61,12 +63,13 @@ def live(scenario: Scenario, folder: Path) -> Iterator[None]:
 
 def result(summary: Mapping[str, Any]) -> None:
     """The table at the end of a run: a line each robot, or a few where the terminal is narrow."""
-    robots = {name: _cells(robot) for name, robot in summary["robots"].items()}
+    exact = all(robot["covariance"] is None for robot in summary["robots"].values())
+    robots = {name: _cells(robot, exact) for name, robot in summary["robots"].items()}
     rows = Table("robot", box=SIMPLE_HEAD, pad_edge=False)
-    for heading in COLUMNS:
+    for heading in next(iter(robots.values())):
         rows.add_column(heading, justify="right")
     for name, cells in robots.items():
-        rows.add_row(name, *cells)
+        rows.add_row(name, *cells.values())
     page = Console(width=UNLIMITED, file=io.StringIO())
     with page.capture() as capture:
         page.print(rows)
@@ -75,20 +78,23 @@ def result(summary: Mapping[str, Any]) -> None:
         lines = [
             line
             for name, cells in robots.items()
-            for line in (name, *(f"  {head}: {cell}" for head, cell in zip(COLUMNS, cells, strict=True)))
+            for line in (name, *(f"  {heading}: {cell}" for heading, cell in cells.items()))
         ]
     title = f"{summary['scenario']}: {outcome_line(summary)}"
-    print(title, "", *lines, "", LEGEND, sep="\n")
+    print(title, "", *lines, "", LEGEND if exact else SIGMA_LEGEND + LEGEND, sep="\n")
 
 
-def _cells(robot: Mapping[str, Any]) -> list[str]:
-    return [
-        _pose(robot["truth"]),
-        _pose(robot["estimate"]),
-        _number(robot["position_error_m"], ".1e"),
-        f"{_number(robot['anchor_ranges'])} + {_number(robot['mutual_ranges'])}",
-        f"{_number(robot['reports_sent'])} / {_number(robot['reports_heard'])}",
-    ]
+def _cells(robot: Mapping[str, Any], exact: bool) -> dict[str, str]:
+    """What stands in its line, by column."""
+    sigma = {} if exact else {SIGMA: _number(robot["position_sigma_m"], ".1e")}
+    return {
+        "is at x, y, heading": _pose(robot["truth"]),
+        "thinks it is at": _pose(robot["estimate"]),
+        "error m": _number(robot["position_error_m"], ".1e"),
+        **sigma,
+        "ranges": f"{_number(robot['anchor_ranges'])} + {_number(robot['mutual_ranges'])}",
+        "reports": f"{_number(robot['reports_sent'])} / {_number(robot['reports_heard'])}",
+    }
 
 
 def _pose(pose: list[float] | None) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 import msgspec
@@ -32,6 +33,10 @@ SHORTEST_STEP = 1e-4
 COARSEST = 2e6
 """(D + R)^2 / A_0, times R / D where that is more than 1, in m: what rounding does to a range, times what
 that does to a pose. Up to here every start tried is localised; far beyond, some never are."""
+
+MOST_RANGES = 1e4
+"""(sigma / accuracy)^2 at most: so many ranges it takes to average sigma down to the accuracy, each of them
+in a tick of its own; a mission has some hundred"""
 
 
 class Anchor(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
@@ -92,6 +97,38 @@ def obstacle(mission: Mission, distance: float) -> str | None:
             f"{step:.3g} m are too short for a pose to be sure to a micrometre in double precision: "
             "raise max_speed or period"
         )
+    return None
+
+
+def noise_obstacle(mission: Mission) -> str | None:
+    """The field, and why no robot could be sure of its pose with such noise; None if it can."""
+    noise, reach, accuracy = mission.noise, mission.sensing_range, mission.accuracy
+    if noise.exact:
+        return None
+    for name, sigma in (("anchor_sigma", noise.anchor_sigma), ("mutual_sigma", noise.mutual_sigma)):
+        if sigma > reach:
+            return (
+                f"noise.{name}: a range that errs by {sigma:.6g} m says less than that there is one, up to "
+                f"mission.sensing_range = {reach:.6g} m"
+            )
+        if (sigma / accuracy) ** 2 > MOST_RANGES:
+            return (
+                f"accuracy: {accuracy:.3g} m is the mean of more than {MOST_RANGES:g} ranges with "
+                f"mission.noise.{name} = {sigma:.3g} m"
+            )
+    if accuracy > reach * math.sqrt(0.5):  # the root of the trace, of a point anywhere in a disc of radius R
+        return (
+            f"accuracy: a robot anywhere in range of its anchor knows where it is to {accuracy:.3g} m, where "
+            f"mission.sensing_range = {reach:.3g} m"
+        )
+    for wheels, drift in (("actuation", noise.actuation), ("odometry", noise.odometry)):
+        if drift.v_floor > mission.max_speed:
+            return f"noise.{wheels}.v_floor: more than mission.max_speed = {mission.max_speed:.6g} m/s"
+        if drift.omega_floor > mission.max_turn_rate:
+            return (
+                f"noise.{wheels}.omega_floor: more than mission.max_turn_rate = "
+                f"{mission.max_turn_rate:.6g} rad/s"
+            )
     return None
 
 

@@ -7,9 +7,10 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from protocol.units import Fraction, Probability, Range, Sigma
+from protocol.units import Fraction, Probability, Sigma
 
 Floor = Annotated[float, Meta(ge=0.0, le=1e4)]
+Bias = Annotated[float, Meta(ge=0.0, le=1e6)]
 
 
 class Drift(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -41,8 +42,8 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """m, of a range between robots"""
     outliers: Probability = 0.0
     """that a range has no line of sight, and is too long"""
-    outlier_bias: tuple[Range, Range] = (0.3, 2.0)
-    """m: by how much then, uniform between these"""
+    outlier_bias: tuple[Bias, Bias] = (0.3, 2.0)
+    """m: by how much then, uniform between these, the least and the most"""
     drop_outs: Probability = 0.0
     """that a range within R is not measured"""
     actuation: Drift = Drift()

@@ -22,10 +22,10 @@ Speed = Annotated[float, Meta(ge=1e-6, le=1e6)]
 """m/s, positive"""
 TurnRate = Annotated[float, Meta(ge=1e-6, le=1e6)]
 """rad/s, positive"""
-Velocity = Annotated[float, Meta(ge=-1e6, le=1e6)]
-"""m/s"""
-AngularVelocity = Annotated[float, Meta(ge=-1e6, le=1e6)]
-"""rad/s"""
+Velocity = Annotated[float, Meta(ge=-1e8, le=1e8)]
+"""m/s: a Speed, and whatever noise adds to it"""
+AngularVelocity = Annotated[float, Meta(ge=-1e8, le=1e8)]
+"""rad/s: a TurnRate, and whatever noise adds to it"""
 Angle = Annotated[float, Meta(ge=-1e9, le=1e9)]
 """rad, not wrapped"""
 Sigma = Annotated[float, Meta(ge=0.0, le=1e4)]

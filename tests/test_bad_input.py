@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from compose.scenario import BadScenario, parse
 from tests.commands import PAPER_1, Ended, several_pairs, tandem, world
 
 LISTEN = ("--listen", "tcp/127.0.0.1:7447")
@@ -137,6 +138,132 @@ def test_a_setting_in_which_no_pose_could_be_sure_is_refused(
     text = changed(text, '"paper"', f'"{variant}"')
     refused_scenario(text, tmp_path, "mission: ")
     refused(tandem("run", "mine.toml", cwd=tmp_path), why)
+
+
+AMOUNTS = {
+    "accuracy": ("0.0", "5e-324", "-0.1", "2e6", "nan", "inf", '"0.1"', "true", "[0.1]"),
+    "confidence": ("0.4", "1.0", "1", "-0.5", "nan", '"sure"', "false"),
+    "noise.anchor_sigma": ("-1e-9", "1.1e4", "nan", "-inf", '"0.1"', "true", "[]"),
+    "noise.mutual_sigma": ("-1e-9", "1.1e4", "nan", "inf", '"0.1"', "true", "{}"),
+    "noise.outliers": ("-0.01", "0.51", "1", "nan", '"few"', "false"),
+    "noise.drop_outs": ("-0.01", "0.51", "1", "nan", '"few"', "false"),
+    "noise.outlier_bias": ("1.0", "[]", "[1.0]", "[1.0, 2.0, 3.0]", '"long"', "{}"),
+    "noise.actuation.v": ("-0.01", "0.51", "nan", '"1 %"', "true"),
+    "noise.actuation.omega": ("-0.01", "0.51", "nan", '"1 %"', "true"),
+    "noise.odometry.v_floor": ("-0.01", "1.1e4", "inf", '"1 %"', "true"),
+    "noise.odometry.omega_floor": ("-0.01", "1.1e4", "inf", '"1 %"', "true"),
+    "noise.actuation": ("0.01", "[0.01]", '"1 %"'),
+    "noise": ("0.01", "[]", '"little"', "true"),
+}
+"""what the fields of noise may not be"""
+
+
+def with_noise(field: str, value: str) -> str:
+    """GOOD with that field of its mission: dotted keys of TOML are tables in tables."""
+    return changed(GOOD, "[mission]\n", f"[mission]\n{field} = {value}\n")
+
+
+def refused_text(text: str, field: str) -> None:
+    """As `refused_scenario`, without a process."""
+    with pytest.raises(BadScenario) as bad:
+        parse(text, "mine.toml")
+    assert str(bad.value).startswith(f"mine.toml: {field}")
+    assert "\n" not in str(bad.value)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [(field, value) for field, values in AMOUNTS.items() for value in values]
+)
+def test_noise_out_of_bounds_is_named(field: str, value: str) -> None:
+    refused_text(with_noise(field, value), f"mission.{field}: ")
+
+
+@pytest.mark.parametrize(
+    ("field", "says"),
+    [
+        ("acuracy", "mission: unknown field 'acuracy'"),
+        ("confidense", "mission: unknown field 'confidense'"),
+        ("noise.sigma", "mission.noise: unknown field 'sigma'"),
+        ("noise.outlier", "mission.noise: unknown field 'outlier'"),
+        ("noise.odometry.w", "mission.noise.odometry: unknown field 'w'"),
+        ("noise.actuation.vfloor", "mission.noise.actuation: unknown field 'vfloor'"),
+    ],
+)
+def test_noise_misspelt_is_named(field: str, says: str) -> None:
+    refused_text(with_noise(field, "0.1"), says)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "says"),
+    [
+        (
+            "noise.outlier_bias",
+            "[2.0, 0.3]",
+            "noise.outlier_bias: the least, 2 m, is more than the most, 0.3 m",
+        ),
+        ("noise.outlier_bias", "[-0.1, 0.3]", "noise.outlier_bias[0]: "),
+        ("noise.outlier_bias", "[0.3, nan]", "noise.outlier_bias[1]: "),
+        ("noise.outlier_bias", "[0.3, 2e6]", "noise.outlier_bias[1]: "),
+        (
+            "noise.anchor_sigma",
+            "3.1",
+            "noise.anchor_sigma: a range that errs by 3.1 m says less than that there",
+        ),
+        (
+            "noise.mutual_sigma",
+            "9.0",
+            "noise.mutual_sigma: a range that errs by 9 m says less than that there",
+        ),
+        (
+            "noise",
+            "{outliers = 0.1}\naccuracy = 2.2",
+            "accuracy: a robot anywhere in range of its anchor knows",
+        ),
+        (
+            "noise.anchor_sigma",
+            "0.11\naccuracy = 0.001",
+            "accuracy: 0.001 m is the mean of more than 10000 ranges",
+        ),
+        (
+            "noise.mutual_sigma",
+            "0.11\naccuracy = 0.001",
+            "accuracy: 0.001 m is the mean of more than 10000 ranges",
+        ),
+        ("noise.actuation.v_floor", "1.1", "noise.actuation.v_floor: more than mission.max_speed = 1 m/s"),
+        (
+            "noise.odometry.omega_floor",
+            "4.0",
+            "noise.odometry.omega_floor: more than mission.max_turn_rate = 3.14",
+        ),
+    ],
+)
+def test_noise_in_which_no_robot_could_be_sure_is_refused(field: str, value: str, says: str) -> None:
+    refused_text(with_noise(field, value), f"mission.{says}")
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "says"),
+    [
+        ("noise.anchor_sigma", "-1", "mission.noise.anchor_sigma: "),
+        ("noise.odometry.w", "0.1", "mission.noise.odometry: unknown field 'w'"),
+        ("noise.outlier_bias", "[2.0, 0.3]", "mission.noise.outlier_bias: "),
+        ("noise.mutual_sigma", "9.0", "mission.noise.mutual_sigma: "),
+    ],
+)
+def test_a_mistake_about_noise_is_one_line_and_status_2(
+    field: str, value: str, says: str, tmp_path: Path
+) -> None:
+    refused_scenario(with_noise(field, value), tmp_path, says)
+
+
+def test_noise_up_to_its_bounds_is_played() -> None:
+    for noise in (
+        "{anchor_sigma = 3.0, mutual_sigma = 3.0, outliers = 0.5, drop_outs = 0.5, outlier_bias = [1, 1]}",
+        "{actuation = {v = 0.5, omega = 0.5, v_floor = 1.0, omega_floor = 3.1}, odometry = {omega = 0.5}}",
+        "{}\naccuracy = 1e6",
+        "{outliers = 0.1}\naccuracy = 2.1\nconfidence = 0.5",
+    ):
+        parse(with_noise("noise", noise), "mine.toml")
 
 
 @pytest.mark.parametrize(

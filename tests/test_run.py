@@ -19,6 +19,7 @@ from tests.commands import PAPER_1, Command, journals, processes_of, tandem
 PAPER_TICKS = {"paper-1": 48, "paper-2": 110}
 COLUMNS = ["tick", "robot", "x", "y", "heading", "v", "omega", "anchor_range", "mutual_range"]
 FLOATS = ["x", "y", "heading", "v", "omega", "anchor_range", "mutual_range"]
+EXACT_WHEELS = dict.fromkeys(("v", "omega", "v_floor", "omega_floor"), 0.0)
 RECORD = ["agent-a.journal", "agent-b.journal", "summary.json", "ticks.csv", "world.journal"]
 
 
@@ -78,6 +79,13 @@ def test_summary_says_everything_that_is_promised_of_a_run(played: tuple[str, Pa
         "period": 1.0,
         "max_speed": 1.0,
         "max_turn_rate": math.pi,
+        "accuracy": 0.1,
+        "confidence": 0.9999,
+        "noise": {
+            **dict.fromkeys(("anchor_sigma", "mutual_sigma", "outliers", "drop_outs"), 0.0),
+            "outlier_bias": [0.3, 2.0],
+            **dict.fromkeys(("actuation", "odometry"), EXACT_WHEELS),
+        },
         "variant": "paper",
         "max_ticks": told["parameters"]["max_ticks"],
     }

@@ -13,19 +13,23 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from itertools import product
 from pathlib import Path
 from signal import SIGINT, SIGKILL, SIGTERM
 from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
+from matplotlib.figure import Figure
 from scipy.stats import binomtest  # type: ignore[import-untyped]
 
-from compose.campaign import run, spec
+from compose.campaign import figures, run, spec
 from compose.campaign.cells import Refused, cells, setting_of, trial_seed
 from compose.campaign.summary import wilson
+from compose.scenario import load
 from compose.status import UserError
 from protocol.inbox import Inbox
+from protocol.noise import Drift, Noise
 from tests.commands import PAPER_1, Command, Ended, tandem, until
 
 HOUSE = Path(__file__).parents[1]
@@ -428,6 +432,58 @@ def test_a_rate_s_interval_is_wilson_s(k: int, n: int) -> None:
     assert wilson(k, n) == pytest.approx((interval.low, interval.high), abs=1e-12)
 
 
+def test_an_axis_reaches_into_tables_that_the_base_scenario_leaves_out(folder: Path) -> None:
+    (folder / "nested.toml").write_text(
+        'name = "nested"\nscenario = "base.toml"\ntrials = 1\n[[axis]]\nname = "noise"\n'
+        'fields = ["mission.noise.odometry.v", "mission.noise.anchor_sigma", "mission.accuracy"]\n'
+        "values = [[0, 0, 0.1], [0.01, 0.02, 0.3]]\n"
+    )
+    assert "noise" not in RANDOM
+    results = played(folder, "nested.toml", "out")
+    for cell, (v, sigma, accuracy) in zip(results.cells, [(0.0, 0.0, 0.1), (0.01, 0.02, 0.3)], strict=True):
+        setting = setting_of(results.campaign, cell)
+        assert not isinstance(setting, Refused)
+        assert load(str(folder / "out" / "cells" / cell.file_name)) == setting.scenario
+        mission = setting.scenario.mission
+        assert mission.noise == Noise(anchor_sigma=sigma, odometry=Drift(v=v))
+        assert mission.accuracy == accuracy
+    assert [row["mission.noise.odometry.v"] for row in rows(folder / "out")] == [0.0, 0.01]
+
+
+@pytest.mark.parametrize("noise", ["3", "[]", '"little"', "{odometry = [1]}", "{odometry = 0.01}"])
+def test_a_base_scenario_whose_table_is_none_is_one_line(noise: str, folder: Path) -> None:
+    (folder / "base.toml").write_text(RANDOM.replace("[mission]", f"[mission]\nnoise = {noise}"))
+    (folder / "bad.toml").write_text(BOTH.replace("robot.b.anchor[0]", "mission.noise.odometry.v"))
+    where = "mission.noise.odometry" if noise.startswith("{") else "mission.noise"
+    with pytest.raises(UserError) as refused:
+        played(folder, "bad.toml", "out")
+    assert str(refused.value) == (
+        f"{folder / 'bad.toml'}: axis[0].field: 'mission.noise.odometry.v': "
+        f"{where} of the base scenario is no table"
+    )
+
+
+def test_a_figure_tells_every_choice_of_the_other_axes_apart_while_they_are_few(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: dict[str, Figure] = {}
+    monkeypatch.setattr(figures, "_save", lambda figure, path: drawn.update({path.name: figure}))
+    third = '[[axis]]\nfield = "mission.noise.outliers"\nvalues = [0, 0.05]\n'
+    third += '[[axis]]\nfield = "max_ticks"\nvalues = [1, 2, 3, 4]\n'
+    (folder / "four.toml").write_text(BOTH + third)
+    figures.draw(played(folder, "four.toml", "out", trials=1), folder / "figures")
+
+    def told_apart(name: str) -> list[str]:
+        return [text.get_text() for text in drawn[name].legends[0].get_texts()]
+
+    both = [f"{variant}, anchor[0] = {d}" for variant in ("paper", "assured") for d in (10, 8)]
+    assert told_apart("success-mission-noise-outliers") == told_apart("success-max_ticks") == both
+    assert told_apart("success-planner-variant") == [
+        f"anchor[0] = {d}, outliers = {share}" for d in (10, 8) for share in (0, 0.05)
+    ]
+    assert told_apart("meeting") == both
+
+
 @pytest.mark.parametrize("name", sorted(spec.shipped()))
 def test_a_campaign_that_ships_can_be_played(name: str) -> None:
     campaign = spec.load(name)
@@ -435,6 +491,30 @@ def test_a_campaign_that_ships_can_be_played(name: str) -> None:
         setting = setting_of(campaign, cell)
         assert isinstance(setting, Refused) or setting.scenario.name == "random"
     assert f"{name:10} " in tandem("scenarios").out
+
+
+def test_the_campaign_of_noise_plays_the_same_starts_in_every_cell() -> None:
+    campaign = spec.load("noise")
+    settings = [setting_of(campaign, cell) for cell in cells(campaign)]
+    assert {cell.key for cell in cells(campaign)} == {"{}"}
+    assert len(settings) == 15 * 2 * 2
+    missions = set()
+    starts = set()
+    for setting in settings:
+        assert not isinstance(setting, Refused)
+        scenario = setting.seeded(7)
+        starts.add(tuple(robot.start for robot in scenario.robots))
+        mission, noise = scenario.mission, scenario.mission.noise
+        fractions = {noise.odometry.v, noise.odometry.omega, noise.actuation.v, noise.actuation.omega}
+        (fraction,) = fractions
+        assert noise.anchor_sigma == noise.mutual_sigma
+        fine = 0.03 if noise.anchor_sigma <= 0.01 else 0.1
+        assert mission.accuracy == (0.3 if fraction == 0.01 else fine)
+        missions.add((noise.anchor_sigma, fraction, noise.outliers, scenario.variant))
+    assert len(starts) == 1
+    assert missions == set(
+        product((0, 0.001, 0.01, 0.05, 0.1), (0, 0.001, 0.01), (0, 0.05), ("paper", "assured"))
+    )
 
 
 # --- a mistake in the spec ----------------------------------------------------------------------------
@@ -472,6 +552,16 @@ JOINT = 'name = "both"\nfields = ["mission.period", "mission.max_speed"]\nvalues
             "robot.b.anchor[0]",
             "robot[2].anchor",
             "axis[0].field: 'robot[2].anchor': the base scenario has no",
+        ),
+        (
+            "robot.b.anchor[0]",
+            "mission.noise.odometry.w",
+            "axis[0].field: 'mission.noise.odometry.w': mission.noise.odometry has no field 'w'",
+        ),
+        (
+            "robot.b.anchor[0]",
+            "mission.noise.outlier_bias[0]",
+            "axis[0].field: 'mission.noise.outlier_bias[0]': the base scenario has no mission.noise.out",
         ),
         ("robot.b.anchor[0]", "robot..anchor", "axis[0].field: 'robot..anchor': no path"),
         (

@@ -41,10 +41,28 @@ def tolerances(claim: Localised) -> tuple[float, float]:
     )
 
 
-def judge(scenario: Scenario, truth: Truth, verdicts: Mapping[str, Verdict]) -> Judgement | None:
+def mistake(claim: Localised, truth: Pose) -> str | None:
+    """How far off `claim` is, in words, if that makes it wrong."""
+    position, heading = errors(claim.pose, truth)
+    far, askew = tolerances(claim)
+    if position <= far and heading <= askew:
+        return None
+    off, covariance = f"{position:.3g} m and {heading:.3g} rad off", claim.covariance
+    if covariance is None:
+        return off
+    return f"{off}, of sigmas {covariance.position_sigma:.3g} m and {covariance.heading_sigma:.3g} rad"
+
+
+def judge(
+    scenario: Scenario,
+    truth: Truth,
+    verdicts: Mapping[str, Verdict],
+    claimed: Mapping[str, Pose] | None = None,
+) -> Judgement | None:
     """The judgement once nothing more can come, or time is up; None while the mission goes on.
 
-    A robot whose peer has given up cannot localise any more.
+    A claim is held against where the robot was when it claimed, as `claimed` says; else against where it
+    is. A robot whose peer has given up cannot localise any more.
     """
     open_cases = [
         robot.id
@@ -56,12 +74,9 @@ def judge(scenario: Scenario, truth: Truth, verdicts: Mapping[str, Verdict]) -> 
     for robot, pose in zip(scenario.robots, truth.poses, strict=True):
         verdict = verdicts.get(robot.id)
         if isinstance(verdict, Localised):
-            position, heading = errors(verdict.pose, pose)
-            far, askew = tolerances(verdict)
-            if not (position <= far and heading <= askew):
-                return Judgement(
-                    "wrong", f"{robot.id} claims a pose that is {position:.3g} m and {heading:.3g} rad off"
-                )
+            why = mistake(verdict, pose if claimed is None else claimed[robot.id])
+            if why is not None:
+                return Judgement("wrong", f"{robot.id} claims a pose that is {why}")
     for robot in scenario.robots:
         verdict = verdicts.get(robot.id)
         if isinstance(verdict, Undecided):

@@ -6,13 +6,13 @@ from collections.abc import Mapping
 
 import msgspec
 
-from protocol.messages import Contact, Drive, Sense, Verdict
-from protocol.motion import REST, Controls, Pose
+from protocol.messages import Contact, Drive, Localised, Sense, Verdict
+from protocol.motion import Controls, Pose
 from world.channel import heard
 from world.referee import Judgement, judge
 from world.scenario import Scenario
 from world.sensors import anchor_ranges, executed, mutual_ranges, odometry
-from world.truth import Truth, within_limits
+from world.truth import Truth, asked
 
 
 class World(msgspec.Struct, frozen=True):
@@ -24,6 +24,8 @@ class World(msgspec.Struct, frozen=True):
     """over the tick before, in the order of the scenario; none at tick 0"""
     verdicts: dict[str, Verdict]
     """everyone's first; nobody takes back what it has claimed"""
+    claimed: dict[str, Pose]
+    """where each of those who claim to be localised was when it did: noise may move it from there"""
     pairs: tuple[tuple[int, int], ...]
     """which robots are each other's peer, by their place in the scenario"""
 
@@ -36,7 +38,7 @@ def release(scenario: Scenario) -> World:
         Pose(robot.start.x - origins[i].x, robot.start.y - origins[i].y, robot.start.heading)
         for i, robot in enumerate(scenario.robots)
     )
-    return World(scenario, Truth(0, local, tuple(origins[i] for i in range(len(local)))), None, {}, pairs)
+    return World(scenario, Truth(0, local, tuple(origins[i] for i in range(len(local)))), None, {}, {}, pairs)
 
 
 def senses(world: World) -> list[Sense]:
@@ -64,17 +66,18 @@ def senses(world: World) -> list[Sense]:
 def advance(world: World, drives: Mapping[str, Drive]) -> World | Judgement:
     """The world one tick later, or how the run ended. A robot without a Drive stands still."""
     scenario, truth = world.scenario, world.truth
-    verdicts = world.verdicts
+    verdicts, claimed = world.verdicts, world.claimed
     driven = []
-    for robot in scenario.robots:
+    for place, robot in enumerate(scenario.robots):
         drive = drives.get(robot.id)
-        asked = within_limits(drive.v, drive.omega, scenario.mission) if drive is not None else REST
-        driven.append(executed(asked, scenario, robot.id, truth.tick))
+        driven.append(executed(asked(drive, scenario.mission), scenario, robot.id, truth.tick))
         if drive is not None and drive.verdict is not None and robot.id not in verdicts:
             verdicts = verdicts | {robot.id: drive.verdict}
+            if isinstance(drive.verdict, Localised):
+                claimed = claimed | {robot.id: truth.poses[place]}
     if verdicts or truth.tick >= scenario.max_ticks:
-        judgement = judge(scenario, truth, verdicts)
+        judgement = judge(scenario, truth, verdicts, claimed)
         if judgement is not None:
             return judgement
     moved = truth.moved(driven, scenario.mission.period)
-    return World(scenario, moved, tuple(driven), verdicts, world.pairs)
+    return World(scenario, moved, tuple(driven), verdicts, claimed, world.pairs)

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import msgspec
 
+from protocol.messages import Drive
 from protocol.mission import Anchor, Mission
-from protocol.motion import Controls, Pose, step
+from protocol.motion import REST, Controls, Pose, step
 
 
 class Truth(msgspec.Struct, frozen=True):
@@ -39,9 +40,11 @@ class Truth(msgspec.Struct, frozen=True):
         )
 
 
-def within_limits(v: float, omega: float, mission: Mission) -> Controls:
-    """What the actuators make of a command: they saturate at v_max and omega_max."""
+def asked(drive: Drive | None, mission: Mission) -> Controls:
+    """The command that a Drive gives: it saturates at v_max and omega_max; without a Drive it is to rest."""
+    if drive is None:
+        return REST
     return Controls(
-        min(max(v, -mission.max_speed), mission.max_speed),
-        min(max(omega, -mission.max_turn_rate), mission.max_turn_rate),
+        min(max(drive.v, -mission.max_speed), mission.max_speed),
+        min(max(drive.omega, -mission.max_turn_rate), mission.max_turn_rate),
     )

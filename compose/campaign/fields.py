@@ -33,10 +33,12 @@ def steps(path: str, base: Mapping[str, Any]) -> Steps:
         match _bare(kind):
             case inspect.StructType(fields=fields):
                 kinds = {field.encode_name: field.type for field in fields}
+                if value is not None and not isinstance(value, Mapping):
+                    raise NoSuchField(f"{so_far} of the base scenario is no table")
                 if step not in kinds:
                     raise NoSuchField(f"{so_far or 'a scenario'} has no field '{step}'")
                 kind = kinds[str(step)]
-                value = value.get(step) if isinstance(value, Mapping) else None
+                value = value.get(step) if value is not None else None
             case inspect.DictType(value_type=kind):
                 value = value.get(step) if isinstance(value, Mapping) else None
             case inspect.ListType() | inspect.TupleType() | inspect.VarTupleType() as many:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +33,8 @@ LOGARITHMIC = 20.0
 """an axis whose largest value is so many times its smallest"""
 FITTING = 60
 """characters that stand side by side below an axis"""
+BESIDE = 96
+"""characters of a legend that stand side by side"""
 APART = 0.45
 """of the room that a name has, for what stands beside each other there"""
 DPI = 160
@@ -152,7 +156,7 @@ def _meeting(results: Results) -> Figure:
 
 
 def _groups(results: Results) -> list[tuple[str, pa.Table]]:
-    """Each cell on its own while there are few; else by the values of one axis."""
+    """Each cell on its own while there are few; else those told apart."""
     axes = results.campaign.axes
     played = [cell for cell in results.cells if results.figures[cell.index].trials]
     if len(played) <= len(STYLES):
@@ -163,43 +167,42 @@ def _groups(results: Results) -> list[tuple[str, pa.Table]]:
             )
             for cell in played
         ]
-    place = _told_apart(results, None)
-    if place is None:
-        return [("all", results.table)]
-    return [
-        (label, table)
-        for i, label in enumerate([_named(axes[place], i) for i in range(len(axes[place].values))])
-        if len(table := _of(results, {cell.index for cell in results.cells if cell.place[place] == i}))
-    ]
+    groups = [(label, _of(results, chosen)) for label, chosen in _apart(results, None)]
+    return [(label, table) for label, table in groups if len(table)]
 
 
 def _lines(results: Results, place: int) -> Iterator[tuple[str, list[pa.Table]]]:
-    """The trials at each value of an axis: a line each value of the axis told apart, the others pooled."""
-    axes = results.campaign.axes
-    apart = _told_apart(results, place)
-    for i in range(len(axes[apart].values)) if apart is not None else (None,):
-        label = _named(axes[apart], i) if apart is not None and i is not None else ""
+    """The trials at each value of an axis, a line for whatever is told apart."""
+    for label, chosen in _apart(results, place):
         yield (
             label,
             [
-                _of(
-                    results,
-                    {
-                        cell.index
-                        for cell in results.cells
-                        if cell.place[place] == x and (apart is None or cell.place[apart] == i)
-                    },
-                )
-                for x in range(len(axes[place].values))
+                _of(results, {i for i in chosen if results.cells[i].place[place] == x})
+                for x in range(len(results.campaign.axes[place].values))
             ],
         )
 
 
-def _told_apart(results: Results, place: int | None) -> int | None:
-    """Another axis with few values: a paired one, if there is one."""
+def _apart(results: Results, place: int | None) -> Iterator[tuple[str, set[int]]]:
+    """The cells of each choice of values of the axes told apart, and what to call it; the others pooled."""
+    axes, apart = results.campaign.axes, _told_apart(results, place)
+    for choice in product(*[range(len(axes[i].values)) for i in apart]):
+        label = ", ".join([_named(axes[i], value) for i, value in zip(apart, choice, strict=True)])
+        yield (
+            label,
+            {cell.index for cell in results.cells if tuple([cell.place[i] for i in apart]) == choice},
+        )
+
+
+def _told_apart(results: Results, place: int | None) -> tuple[int, ...]:
+    """The other axes with few values, paired ones first, while there is a style for each choice of them."""
     axes = results.campaign.axes
-    others = [i for i, axis in enumerate(axes) if i != place and 1 < len(axis.values) <= len(STYLES)]
-    return min(others, key=lambda i: (not axes[i].paired, i), default=None)
+    others = [i for i, axis in enumerate(axes) if i != place and len(axis.values) > 1]
+    apart: list[int] = []
+    for i in sorted(others, key=lambda i: (not axes[i].paired, i)):
+        if math.prod([len(axes[k].values) for k in (*apart, i)]) <= len(STYLES):
+            apart.append(i)
+    return tuple(apart)
 
 
 def _named(axis: Axis, i: int) -> str:
@@ -255,5 +258,8 @@ def _legend(figure: Figure, axes: Axes) -> None:
     """Above, where it hides nothing; none where there is nothing to tell apart."""
     handles, labels = axes.get_legend_handles_labels()
     if any(labels):
-        columns = min(4, len(labels)) if max(map(len, labels)) < 24 else 1
-        figure.legend(handles, labels, loc="outside upper center", ncols=columns, frameon=False)
+        longest = max(map(len, labels))
+        columns = next((count for count in (4, 2) if count * longest < BESIDE), 1)
+        figure.legend(
+            handles, labels, loc="outside upper center", ncols=min(columns, len(labels)), frameon=False
+        )

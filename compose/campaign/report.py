@@ -35,6 +35,9 @@ CHOICES = (
     ("trials", "rate"),
 )
 """of the columns; the first that fits"""
+OF_NOISE = ("within", "nees", "nees low", "nees high")
+"""more of them, where covariances are claimed"""
+NOISE_LEGEND = "within: claims within 3 x accuracy; nees: in the mean, and the 99 % band of true covariances"
 
 
 class _Rate(bars.ProgressColumn):
@@ -74,7 +77,8 @@ def show(results: Results, out: Path, *, quiet: bool) -> None:
     print(f"{results.campaign.name}: {counts} of {len(results.table)} trials in {_cells(len(results.cells))}")
     if quiet:
         return
-    print("", *_lines(results), "", LEGEND, sep="\n")
+    legend = [LEGEND, NOISE_LEGEND] if _noisy(results) else [LEGEND]
+    print("", *_lines(results), "", *legend, sep="\n")
     for index, figures in results.figures.items():
         if figures.refused is not None:
             print(f"cell {index} cannot be played: {figures.refused}")
@@ -92,11 +96,22 @@ def _lines(results: Results) -> list[str]:
     """The table, as wide as there is room."""
     room = Console().width if sys.stdout.isatty() else UNLIMITED
     lines: list[str] = []
-    for columns in CHOICES:
+    for columns in _choices(results):
         lines = _table(results, columns)
         if max(map(cell_len, lines)) <= room:
             break
     return lines
+
+
+def _noisy(results: Results) -> bool:
+    return any(one.nees_mean is not None for one in results.figures.values())
+
+
+def _choices(results: Results) -> tuple[tuple[str, ...], ...]:
+    """Of the columns, the widest first."""
+    if not _noisy(results):
+        return CHOICES
+    return tuple((*columns, *OF_NOISE) for columns in CHOICES) + CHOICES[-1:]
 
 
 def _table(results: Results, columns: Sequence[str]) -> list[str]:
@@ -133,6 +148,10 @@ def _figures(figures: Counted) -> dict[str, str]:
         "max": _number(figures.ticks_max, ".0f"),
         "error p50": _number(figures.error_p50_m, ".1e"),
         "error max": _number(figures.error_max_m, ".1e"),
+        "within": _number(figures.within_3_accuracy, ".4f"),
+        "nees": _number(figures.nees_mean, ".3g"),
+        "nees low": _number(figures.nees_low, ".3g"),
+        "nees high": _number(figures.nees_high, ".3g"),
     }
 
 

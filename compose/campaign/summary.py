@@ -13,15 +13,19 @@ import msgspec
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
+from scipy.special import gammainccinv, gammaincinv  # type: ignore[import-untyped]
 
 from compose.campaign.cells import Cell
 from compose.campaign.fields import canonical
 from compose.campaign.spec import Campaign
+from compose.claim import DEGREES_OF_FREEDOM
 from protocol.messages import Outcome
 
 Floats = NDArray[np.float64]
 CONFIDENCE = 0.95
 """of an interval"""
+NEES_CONFIDENCE = 0.99
+"""of the band of a mean NEES"""
 WORSE = ("wrong", "alarm", "failed", "undecided")
 """outcomes that call for a look, the worst first"""
 
@@ -55,6 +59,15 @@ class Counted(msgspec.Struct, frozen=True):
     """of the worse robot of each trial in which one claimed"""
     error_max_m: float | None
     error_max_rad: float | None
+    claims: int
+    """of a pose, by all robots"""
+    within_3_accuracy: float | None
+    """of these, off by no more than 3 times mission.accuracy"""
+    nees_mean: float | None
+    """over trials, each with the mean of its robots' claims: 3 is expected where covariances are true"""
+    nees_low: float | None
+    """between which bounds that lies in 99 % of campaigns then"""
+    nees_high: float | None
     reports_p50: float | None
     """sent, by all"""
     refused: str | None
@@ -80,6 +93,8 @@ def counted(table: pa.Table, refused: str | None = None) -> Counted:
     low, high = wilson(k, n)
     ticks = column(table, "ticks")[np.array([outcome == "localised" for outcome in outcomes], bool)]
     meeting, error = _known(column(table, "meeting_tick")), _known(column(table, "position_error_m"))
+    claims, nees = int(_known(column(table, "claims")).sum()), _known(column(table, "nees"))
+    nees_low, nees_high = nees_band(len(nees))
     return Counted(
         trials=n,
         **counts,
@@ -96,6 +111,11 @@ def counted(table: pa.Table, refused: str | None = None) -> Counted:
         error_p50_m=_percentile(error, 50),
         error_max_m=_percentile(error, 100),
         error_max_rad=_percentile(_known(column(table, "heading_error_rad")), 100),
+        claims=claims,
+        within_3_accuracy=float(_known(column(table, "claims_within")).sum()) / claims if claims else None,
+        nees_mean=float(nees.mean()) if len(nees) else None,
+        nees_low=nees_low,
+        nees_high=nees_high,
         reports_p50=_percentile(_known(column(table, "reports_sent")), 50),
         refused=refused,
     )
@@ -109,6 +129,20 @@ def wilson(k: int, n: int) -> tuple[float | None, float | None]:
     centre = (k + 0.5 * z * z) / (n + z * z)
     half = z / (n + z * z) * math.sqrt(k * (n - k) / n + 0.25 * z * z)
     return 0.0 if k == 0 else centre - half, 1.0 if k == n else centre + half
+
+
+def nees_band(trials: int) -> tuple[float | None, float | None]:
+    """Between which bounds the mean of so many trials' NEES lies, where covariances are true.
+
+    One robot's sum to a chi-square of 3 degrees of freedom a trial. A trial's mean over its robots varies as
+    much where their errors go together, and less where they do not; so a mean outside is none by chance.
+    """
+    if not trials:
+        return None, None
+    tail = 0.5 * (1.0 - NEES_CONFIDENCE)
+    half = 0.5 * DEGREES_OF_FREEDOM * trials  # chi-square of 2 a is twice a gamma of a
+    low, high = 2.0 * gammaincinv(half, tail) / trials, 2.0 * gammainccinv(half, tail) / trials
+    return float(low), float(high)
 
 
 def column(table: pa.Table, name: str) -> Floats:

@@ -14,6 +14,7 @@ from compose.campaign.cells import Cell
 from compose.campaign.fields import canonical
 from compose.campaign.spec import Campaign
 from compose.campaign.trial import RobotRow, Row
+from protocol.motion import Covariance
 
 _KINDS: dict[str, pa.DataType] = {
     "cell": pa.int32(),
@@ -22,9 +23,11 @@ _KINDS: dict[str, pa.DataType] = {
     **dict.fromkeys(("outcome", "reason", "error", "branch"), pa.string()),
     **dict.fromkeys(("ticks", "first_contact_tick", "orbiting_tick", "meeting_tick"), pa.int64()),
     **dict.fromkeys(("t_max_ticks", "candidates", "candidates_left"), pa.int64()),
+    **dict.fromkeys(("hypotheses", "claims", "claims_within"), pa.int64()),
     **dict.fromkeys(("reports_sent", "reports_heard", "bytes_sent"), pa.int64()),
     **dict.fromkeys(("period_s", "t_max_s", "wall_s", "position_error_m"), pa.float64()),
-    **dict.fromkeys(("heading_error_rad", "alpha"), pa.float64()),
+    **dict.fromkeys(("heading_error_rad", "alpha", "odds", "position_sigma_m", "nees"), pa.float64()),
+    **dict.fromkeys([f"cov_{name}" for name in Covariance.__struct_fields__], pa.float64()),
 }
 _OF_ALL = [field for field in Row.__struct_fields__ if field not in ("cell", "trial", "robots")]
 

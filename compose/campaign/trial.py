@@ -9,16 +9,20 @@ from pathlib import Path
 from typing import TypeVar
 
 import msgspec
+from msgspec.structs import replace
 
 from compose import inline
+from compose.claim import Claim
 from compose.record import Record, first_claim, first_contact, read
 from compose.scenario import run_name
 from protocol.inbox import Inbox
-from protocol.messages import Outcome
-from world.referee import errors
+from protocol.messages import Farewell, Outcome
+from protocol.motion import Covariance
 from world.scenario import Scenario
 
 N = TypeVar("N", int, float)
+WITHIN = 3.0
+"""times mission.accuracy"""
 ROUNDING = 1e-6
 """ticks by which a quotient may miss a whole number"""
 PATIENCE_S = 30.0
@@ -46,6 +50,21 @@ class RobotRow(msgspec.Struct, frozen=True, array_like=True):
     candidates_left: int | None = None
     position_error_m: float | None = None
     heading_error_rad: float | None = None
+    hypotheses: int | None = None
+    """left, about the poses of both"""
+    odds: float | None = None
+    """of the likeliest of them"""
+    position_sigma_m: float | None = None
+    """as claimed: the root of the trace of the position's part of the covariance"""
+    nees: float | None = None
+    """of the claim"""
+    cov_xx: float | None = None
+    """as claimed, in m^2, m rad and rad^2; h is the heading"""
+    cov_xy: float | None = None
+    cov_xh: float | None = None
+    cov_yy: float | None = None
+    cov_yh: float | None = None
+    cov_hh: float | None = None
 
 
 class Row(msgspec.Struct, frozen=True, array_like=True):
@@ -78,6 +97,14 @@ class Row(msgspec.Struct, frozen=True, array_like=True):
     position_error_m: float | None = None
     """of the robot that is farthest off"""
     heading_error_rad: float | None = None
+    hypotheses: int | None = None
+    """left: the most of any robot"""
+    claims: int | None = None
+    """robots that claimed to be localised"""
+    claims_within: int | None = None
+    """of these, how many were off by no more than 3 times mission.accuracy"""
+    nees: float | None = None
+    """the mean of those that claimed a covariance"""
     reports_sent: int | None = None
     """by all"""
     reports_heard: int | None = None
@@ -118,6 +145,8 @@ def row(trial: Trial, record: Record, wall_s: float) -> Row:
     t_max_s = max(robot.rendezvous.bound for robot in scenario.robots)
     met = [_meeting(record, scenario.robots[a].id, scenario.robots[b].id) for a, b in scenario.pairs()]
     said = record.farewells.values()
+    errors = [robot.position_error_m for robot in robots.values() if robot.position_error_m is not None]
+    nees = [robot.nees for robot in robots.values() if robot.nees is not None]
     return Row(
         cell=trial.cell,
         trial=trial.number,
@@ -135,6 +164,10 @@ def row(trial: Trial, record: Record, wall_s: float) -> Row:
         candidates_left=_most([robot.candidates_left for robot in robots.values()]),
         position_error_m=_most([robot.position_error_m for robot in robots.values()]),
         heading_error_rad=_most([robot.heading_error_rad for robot in robots.values()]),
+        hypotheses=_most([robot.hypotheses for robot in robots.values()]),
+        claims=len(errors),
+        claims_within=sum([error <= WITHIN * scenario.mission.accuracy for error in errors]),
+        nees=sum(nees) / len(nees) if nees else None,
         reports_sent=sum([farewell.reports_sent for farewell in said]),
         reports_heard=sum([farewell.reports_heard for farewell in said]),
         bytes_sent=sum([farewell.bytes_sent for farewell in said]),
@@ -145,14 +178,38 @@ def row(trial: Trial, record: Record, wall_s: float) -> Row:
 
 def _robot_row(record: Record, place: int) -> RobotRow:
     robot = record.scenario.robots[place].id
-    farewell, claimed = record.farewells.get(robot), first_claim(record, robot)
-    position = heading = None
-    if claimed is not None:
-        position, heading = errors(claimed[1], record.moments[-1].truth.poses[place])
+    return _claimed(_said(record.farewells.get(robot)), first_claim(record, place))
+
+
+def _said(farewell: Farewell | None) -> RobotRow:
+    """What the robot says of itself in the end."""
     if farewell is None:
-        return RobotRow(position_error_m=position, heading_error_rad=heading)
+        return RobotRow()
     before, left = farewell.candidates if farewell.candidates is not None else (None, None)
-    return RobotRow(farewell.branch, farewell.alpha, before, left, position, heading)
+    return RobotRow(
+        branch=farewell.branch,
+        alpha=farewell.alpha,
+        candidates=before,
+        candidates_left=left,
+        hypotheses=farewell.hypotheses,
+        odds=farewell.odds,
+    )
+
+
+def _claimed(row: RobotRow, claim: Claim | None) -> RobotRow:
+    """`row`, with what became of the robot's claim."""
+    if claim is None:
+        return row
+    row = replace(row, position_error_m=claim.position_error, heading_error_rad=claim.heading_error)
+    covariance = claim.covariance
+    if covariance is None:
+        return row
+    return replace(
+        row,
+        position_sigma_m=covariance.position_sigma,
+        nees=claim.nees,
+        **{f"cov_{name}": getattr(covariance, name) for name in Covariance.__struct_fields__},
+    )
 
 
 def _meeting(record: Record, a: str, b: str) -> tuple[int | None, int | None]:

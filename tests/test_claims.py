@@ -1,0 +1,298 @@
+"""What a robot claims of its pose with a covariance, and what a run then says of it."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+from numpy.typing import NDArray
+from scipy.stats import chi2  # type: ignore[import-untyped]
+
+from compose.campaign import report, run, spec, trial
+from compose.campaign.cells import cells
+from compose.campaign.summary import Counted, counted
+from compose.campaign.table import of_rows, schema_of
+from compose.claim import matrix, nees
+from compose.record import Moment, Record, leave, summary
+from compose.scenario import parse
+from compose.show import result
+from protocol.messages import Drive, End, Farewell, Localised
+from protocol.motion import Covariance, Pose
+from tests.commands import SECTION_IV, tandem
+from world.referee import Judgement
+from world.tick import World, advance, release
+
+FLOOR = 1e-6
+"""m and rad, below which no sigma counts"""
+NOISY = f"""
+name = "noisy"
+{SECTION_IV}
+noise.anchor_sigma = 0.01
+noise.actuation.v_floor = 0.1
+[[robot]]
+id = "a"
+anchor = [0.0, 0.0]
+start = [1.5, 0.0, 1.0]
+[[robot]]
+id = "b"
+anchor = [6.0, 0.0]
+start = [4.0, 0.0, 4.0]
+"""
+EXACT = NOISY.replace("noise", "# noise").replace('"# noisy"', '"noisy"')
+SURE = Covariance(0.0009, 0.0002, -0.0001, 0.0016, 0.0003, 0.0004)
+"""sigmas of 0.05 m and 0.02 rad"""
+
+
+def covariance_of(p: NDArray[np.float64]) -> Covariance:
+    return Covariance(*[float(p[i, j]) for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))])
+
+
+def claims(tick: int, robot: str, pose: Pose, covariance: Covariance | None) -> Drive:
+    return Drive(tick, robot, 0.0, 0.0, 3, "localised", Localised(pose, covariance))
+
+
+def off(pose: Pose, by: float) -> Pose:
+    return Pose(pose.x + by, pose.y, pose.heading)
+
+
+def claimed(text: str, covariance: Covariance | None, *, by: float = 0.03) -> Record:
+    """Robot a claims at once, `by` so many metres off; b never does, and time is up a tick later."""
+    scenario = parse("max_ticks = 1\n" + text, "noisy")
+    world = release(scenario)
+    first = {"a": claims(0, "a", off(world.truth.poses[0], by), covariance)}
+    onward = advance(world, first)
+    assert isinstance(onward, World)
+    judgement = advance(onward, {})
+    assert isinstance(judgement, Judgement)
+    end = End(1, judgement.outcome, judgement.reason)
+    return Record(scenario, (Moment(world.truth, first), Moment(onward.truth, {})), end, {})
+
+
+# --- NEES ---------------------------------------------------------------------------------------------
+
+
+def test_nees_is_the_error_squared_in_units_of_the_covariance() -> None:
+    draw = np.random.default_rng(1)
+    for _ in range(100):
+        root = draw.normal(size=(3, 3)) * [[0.05], [0.02], [0.01]]
+        p, e = root @ root.T, draw.normal(size=3) * 0.1
+        truth = Pose(3.0, -2.0, 1.0)
+        estimate = Pose(truth.x + e[0], truth.y + e[1], truth.heading + e[2])
+        assert nees(estimate, truth, covariance_of(p)) == pytest.approx(e @ np.linalg.solve(p, e), rel=1e-6)
+
+
+def test_nees_wraps_the_error_in_heading() -> None:
+    truth, estimate = Pose(0.0, 0.0, 3.1), Pose(0.0, 0.0, -3.1)
+    assert nees(estimate, truth, SURE) == pytest.approx(
+        nees(Pose(0.0, 0.0, math.tau - 6.2), Pose(0.0, 0.0, 0.0), SURE)
+    )
+    assert nees(Pose(1.0, 2.0, 0.5 + 4 * math.tau), Pose(1.0, 2.0, 0.5), SURE) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_nees_of_errors_that_are_as_claimed_has_a_chi_square_of_three_degrees() -> None:
+    draw, p = np.random.default_rng(2), np.array(matrix(SURE))
+    errors = draw.multivariate_normal(np.zeros(3), p, 4000)
+    values = np.array([nees(Pose(*e), Pose(0.0, 0.0, 0.0), SURE) for e in errors.tolist()])
+    assert abs(values.mean() - 3.0) < 4.5 * math.sqrt(6.0 / len(values))
+    for share in (0.1, 0.5, 0.9, 0.99):
+        assert (values <= chi2.ppf(share, 3)).mean() == pytest.approx(share, abs=0.03)
+
+
+def test_nees_of_a_singular_covariance_counts_no_sigma_below_a_micrometre() -> None:
+    here = Pose(0.0, 0.0, 0.0)
+    nothing = Covariance(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    assert nees(here, here, nothing) == 0.0
+    assert nees(Pose(2.0 * FLOOR, 0.0, 3.0 * FLOOR), here, nothing) == pytest.approx(13.0)
+    along = Covariance(0.02, 0.02, 0.0, 0.02, 0.0, 0.01)  # x and y err by the same
+    assert nees(Pose(0.2, 0.2, 0.0), here, along) == pytest.approx(2.0)
+    assert nees(Pose(FLOOR, -FLOOR, 0.0), here, along) == pytest.approx(2.0)
+    assert nees(Pose(0.1, -0.1, 0.0), here, along) == pytest.approx(0.02 / FLOOR**2)
+
+
+# --- summary.json -------------------------------------------------------------------------------------
+
+
+def robots(record: Record, folder: Path) -> dict[str, dict[str, Any]]:
+    leave(record, summary(record, "in-process", 0.5), folder)
+    told: dict[str, dict[str, Any]] = json.loads((folder / "summary.json").read_text())["robots"]
+    return told
+
+
+def test_summary_says_what_was_claimed_and_what_it_was_worth(tmp_path: Path) -> None:
+    told = robots(claimed(NOISY, SURE), tmp_path)["a"]
+    assert told["covariance"] == [
+        [0.0009, 0.0002, -0.0001],
+        [0.0002, 0.0016, 0.0003],
+        [-0.0001, 0.0003, 0.0004],
+    ]
+    assert told["position_sigma_m"] == pytest.approx(0.05)
+    assert told["heading_sigma_rad"] == pytest.approx(0.02)
+    assert told["position_error_m"] == pytest.approx(0.03)
+    inverse = np.linalg.inv(told["covariance"])
+    assert told["nees"] == pytest.approx(0.03**2 * inverse[0, 0])
+
+
+def test_an_error_is_that_of_the_tick_of_the_claim(tmp_path: Path) -> None:
+    record = claimed(NOISY, SURE)
+    told = robots(record, tmp_path)["a"]
+    last = record.moments[-1].truth.poses[0]
+    assert told["truth"][:2] == [last.x, last.y]
+    assert abs(math.dist(told["estimate"][:2], told["truth"][:2]) - told["position_error_m"]) > 1e-3
+
+
+def test_what_does_not_apply_is_null(tmp_path: Path) -> None:
+    of_covariance = ("covariance", "position_sigma_m", "heading_sigma_rad", "nees")
+    told = robots(claimed(EXACT, None, by=0.0), tmp_path)
+    for robot in ("a", "b"):
+        assert [told[robot][field] for field in of_covariance] == [None] * 4
+    assert told["a"]["position_error_m"] == 0.0
+    told = robots(claimed(NOISY, SURE), tmp_path)
+    for field in (*of_covariance, "estimate", "position_error_m", "hypotheses", "odds"):
+        assert told["b"][field] is None, field
+
+
+def test_the_papers_missions_leave_one_hypothesis_and_no_odds(tmp_path: Path) -> None:
+    assert tandem("run", "paper-1", "--in-process", "-q", "--out", tmp_path / "out").status == 0
+    told = json.loads((tmp_path / "out" / "summary.json").read_text())["robots"]
+    for robot in ("a", "b"):
+        assert (told[robot]["hypotheses"], told[robot]["odds"]) == (1, None)
+
+
+# --- a campaign's rows and figures ---------------------------------------------------------------------
+
+HONEST = ["cov_xx", "cov_xy", "cov_xh", "cov_yy", "cov_yh", "cov_hh"]
+SWEEP = 'name = "noisy"\nscenario = "noisy.toml"\ntrials = 3\n'
+
+
+def row_of(record: Record, number: int = 0) -> trial.Row:
+    return trial.row(trial.Trial(0, number, record.scenario, processes=False), record, 0.5)
+
+
+def farewell(robot: str, hypotheses: int, odds: float) -> Farewell:
+    return Farewell(robot, 5, 3, "circle", -2.5, (4, 2), 0.5, 1.5, hypotheses, odds, 3, 4, 0, 0, 0, 600)
+
+
+def test_a_row_has_what_each_robot_claimed() -> None:
+    record = replace(
+        claimed(NOISY, SURE), farewells={"a": farewell("a", 1, 0.99995), "b": farewell("b", 3, 0.6)}
+    )
+    row = row_of(record)
+    a, b = row.robots["a"], row.robots["b"]
+    assert [getattr(a, name) for name in HONEST] == [0.0009, 0.0002, -0.0001, 0.0016, 0.0003, 0.0004]
+    assert (a.hypotheses, a.odds, b.hypotheses, b.odds) == (1, 0.99995, 3, 0.6)
+    assert a.position_sigma_m == pytest.approx(0.05)
+    assert a.nees == row.nees == pytest.approx(summary(record, "in-process", 0.5)["robots"]["a"]["nees"])
+    assert [getattr(b, name) for name in (*HONEST, "nees", "position_sigma_m", "position_error_m")] == [
+        None
+    ] * 9
+    assert (row.hypotheses, row.claims, row.claims_within) == (3, 1, 1)
+
+
+def test_a_row_counts_the_claims_within_three_times_the_accuracy() -> None:
+    assert row_of(claimed(NOISY, SURE, by=0.299)).claims_within == 1
+    assert row_of(claimed(NOISY, SURE, by=0.301)).claims_within == 0
+    generous = NOISY.replace("noise.anchor", "accuracy = 0.2\nnoise.anchor")
+    assert row_of(claimed(generous, SURE, by=0.5)).claims_within == 1
+
+
+def results_of(rows: list[trial.Row], folder: Path) -> run.Results:
+    """Of a campaign of one cell."""
+    (folder / "noisy.toml").write_text(NOISY)
+    (folder / "sweep.toml").write_text(SWEEP)
+    campaign = spec.load(str(folder / "sweep.toml"))
+    (cell,) = cells(campaign)
+    table = of_rows(rows, campaign, {0: cell}, schema_of(campaign, [cell]))
+    return run.Results(campaign, (cell,), table, {0: counted(table)}, None, False, len(rows))
+
+
+def figures_of(rows: list[trial.Row], folder: Path) -> Counted:
+    return results_of(rows, folder).figures[0]
+
+
+def test_a_summary_has_the_mean_nees_with_its_band_and_the_rate_within_three_times_the_accuracy(
+    tmp_path: Path,
+) -> None:
+    rows = [row_of(claimed(NOISY, SURE, by=by), i) for i, by in enumerate((0.01, 0.1, 0.4))]
+    rows += [trial.lost(0, 3, 1, "lost", None), row_of(claimed(EXACT, None, by=0.0), 4)]
+    figures = figures_of(rows, tmp_path)
+    assert (figures.trials, figures.claims, figures.within_3_accuracy) == (5, 4, 0.75)
+    assert figures.nees_mean == pytest.approx(np.mean([row.nees for row in rows[:3]]))
+    assert (figures.nees_low, figures.nees_high) == pytest.approx(
+        (chi2.ppf(0.005, 9) / 3, chi2.ppf(0.995, 9) / 3)
+    )
+
+
+def test_without_claims_a_summary_has_no_nees_and_no_rate(tmp_path: Path) -> None:
+    for rows in ([], [trial.lost(0, 0, 1, "lost", None)]):
+        figures = figures_of(rows, tmp_path)
+        assert figures.claims == 0
+        for name in ("within_3_accuracy", "nees_mean", "nees_low", "nees_high"):
+            assert getattr(figures, name) is None, name
+
+
+def test_a_trial_with_two_claims_counts_once_in_the_mean_nees() -> None:
+    """The errors of a pair go together: twice as many claims are not twice as much evidence."""
+    scenario = parse("max_ticks = 1\n" + NOISY, "noisy")
+    world = release(scenario)
+    poses = world.truth.poses
+    drives = {
+        robot: claims(0, robot, off(pose, by), SURE)
+        for robot, pose, by in zip("ab", poses, (0.01, 0.05), strict=True)
+    }
+    row = row_of(Record(scenario, (Moment(world.truth, drives),), End(0, "localised", None), {}))
+    each = [nees(off(pose, by), pose, SURE) for pose, by in zip(poses, (0.01, 0.05), strict=True)]
+    assert row.claims == 2
+    assert row.nees == pytest.approx(sum(each) / 2)
+
+
+def test_the_table_of_a_campaign_gives_the_nees_where_covariances_are_claimed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report.show(results_of([row_of(claimed(NOISY, SURE))], tmp_path), tmp_path, quiet=False)
+    noisy = capsys.readouterr().out.splitlines()
+    heading = next(line for line in noisy if line.startswith(" cell"))
+    assert heading.split()[-6:] == ["within", "nees", "nees", "low", "nees", "high"]
+    (line,) = (line for line in noisy if line.startswith(" 0 "))
+    assert line.split()[-4:] == ["1.0000", "1.1", "0.0717", "12.8"]
+    assert any(line.startswith("within: claims within 3 x accuracy; nees: ") for line in noisy)
+    report.show(results_of([row_of(claimed(EXACT, None, by=0.0))], tmp_path), tmp_path, quiet=False)
+    assert "nees" not in capsys.readouterr().out
+
+
+# --- the table ----------------------------------------------------------------------------------------
+
+
+def table(record: Record, capsys: pytest.CaptureFixture[str]) -> list[str]:
+    result(summary(record, "in-process", 0.5))
+    return capsys.readouterr().out.splitlines()
+
+
+def test_the_table_gives_the_claimed_sigma_beside_the_error(capsys: pytest.CaptureFixture[str]) -> None:
+    lines = table(claimed(NOISY, SURE), capsys)
+    heading = next(line for line in lines if line.startswith(" robot"))
+    (a,) = (line for line in lines if line.startswith(" a "))
+    (b,) = (line for line in lines if line.startswith(" b "))
+    assert heading.split()[-6:] == ["error", "m", "sigma", "m", "ranges", "reports"]
+    assert heading.index("sigma m") + len("sigma m") == a.index("5.0e-02") + len("5.0e-02")
+    assert heading.index("error m") + len("error m") == a.index("3.0e-02") + len("3.0e-02")
+    assert b.split()[4:] == ["-"] * 3 + ["-", "+", "-", "-", "/", "-"]
+    assert lines[-1].startswith("sigma: of the position, as claimed; m and rad; ")
+
+
+def test_without_noise_the_table_has_no_sigma(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "sigma" not in "\n".join(table(claimed(EXACT, None), capsys))
+
+
+def test_the_sigma_has_a_line_of_its_own_where_the_terminal_is_narrow(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    lines = table(claimed(NOISY, SURE), capsys)
+    assert lines[lines.index("  error m: 3.0e-02") + 1] == "  sigma m: 5.0e-02"

@@ -1,0 +1,581 @@
+"""The world's noise: what is drawn, from what, and what it does to ranges, wheels and odometry."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from itertools import combinations, pairwise, product
+from pathlib import Path
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from compose import inline
+from compose.record import WORLD_JOURNAL, Moment, Record, read, ticks_csv
+from compose.scenario import load, parse
+from protocol import journal
+from protocol.messages import Drive, Localised, Sense, Undecided
+from protocol.motion import REST, Controls, Covariance, Pose, step
+from protocol.noise import Drift, Noise
+from protocol.wire import decode, encode
+from tests.commands import SECTION_IV, journals, tandem
+from world import sensors
+from world.course import Course
+from world.draws import gaussian, uniform
+from world.referee import Judgement
+from world.scenario import Scenario
+from world.sensors import Mutual, anchor_ranges, executed, mutual_ranges, odometry
+from world.tick import World, advance, release, senses
+from world.truth import Truth
+
+Floats = NDArray[np.float64]
+N = 20_000
+"""draws, where a statistic is looked at"""
+Z = 4.5
+"""standard errors that a statistic may be off: of the seeds, one in 150 000 would be farther"""
+RHO_A, RHO_B, APART = 1.5, 2.0, 2.5
+"""m: the robots of `near` from their anchors, and from each other"""
+
+
+def near(noise: str = "", *, seed: int = 1, max_ticks: int = 500) -> Scenario:
+    """A scenario in which everything is in range from the start."""
+    text = f"""
+        name = "near"
+        seed = {seed}
+        max_ticks = {max_ticks}
+        {SECTION_IV}
+        [mission.noise]
+        {noise}
+        [[robot]]
+        id = "a"
+        anchor = [0.0, 0.0]
+        start = [{RHO_A}, 0.0, 1.0]
+        [[robot]]
+        id = "b"
+        anchor = [6.0, 0.0]
+        start = [{RHO_A + APART}, 0.0, 4.0]
+        """
+    return parse(text, "near")
+
+
+def at_tick(scenario: Scenario, tick: int) -> Truth:
+    """Everyone still where it was released."""
+    return replace(release(scenario).truth, tick=tick)
+
+
+def to_anchors(scenario: Scenario, ticks: int = N) -> list[list[float | None]]:
+    """Every robot's ranges to its anchor, tick after tick."""
+    told = [anchor_ranges(at_tick(scenario, tick), scenario) for tick in range(ticks)]
+    return [list(ranges) for ranges in zip(*told, strict=True)]
+
+
+def mutual(scenario: Scenario, ticks: int = N) -> list[float | None]:
+    """The range between the robots, tick after tick; they are in contact throughout."""
+    told = []
+    for tick in range(ticks):
+        (found,) = mutual_ranges(at_tick(scenario, tick), scenario, scenario.pairs())
+        assert found is not None
+        told.append(found.range)
+    return told
+
+
+def all_ranges(scenario: Scenario, ticks: int = N) -> list[list[float | None]]:
+    """Those of a and of b to their anchors, and those between them."""
+    return [*to_anchors(scenario, ticks), mutual(scenario, ticks)]
+
+
+def known(ranges: Sequence[float | None]) -> Floats:
+    return np.array([rho for rho in ranges if rho is not None])
+
+
+def sent(v: float, omega: float, robot: str = "a", tick: int = 0) -> Drive:
+    return Drive(tick, robot, v, omega, 1, "straight")
+
+
+def has_mean(values: Floats, mean: float, sigma: float) -> bool:
+    return bool(abs(values.mean() - mean) <= Z * sigma / math.sqrt(len(values)))
+
+
+def has_share(hits: int, of: int, share: float) -> bool:
+    return abs(hits / of - share) <= Z * math.sqrt(share * (1.0 - share) / of)
+
+
+def is_gaussian(values: Floats, sigma: float) -> bool:
+    """Of mean 0 and that standard deviation, with as many within one, two and three sigmas as there are."""
+    shares = ((1.0, 0.682689), (2.0, 0.954500), (3.0, 0.997300))
+    within = [has_share(int((np.abs(values) <= k * sigma).sum()), len(values), share) for k, share in shares]
+    spread = abs(values.std() / sigma - 1.0) <= Z / math.sqrt(2.0 * len(values))
+    return has_mean(values, 0.0, sigma) and bool(spread) and all(within)
+
+
+def are_uncorrelated(one: Floats, other: Floats) -> bool:
+    return bool(abs(np.corrcoef(one, other)[0, 1]) <= Z / math.sqrt(len(one)))
+
+
+def is_white(values: Floats) -> bool:
+    return all(are_uncorrelated(values[lag:], values[:-lag]) for lag in (1, 2, 3))
+
+
+# --- what is drawn ------------------------------------------------------------------------------------
+
+
+def test_without_noise_nothing_is_drawn_and_every_tick_is_the_same_to_the_bit(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def drawn(*_: object) -> float:
+        raise AssertionError("something is drawn")
+
+    exact = load("paper-1")
+    without, zero = tmp_path / "without", tmp_path / "zero"
+    for folder in (without, zero):
+        folder.mkdir()
+    table = ticks_csv(inline.play(exact, without))
+    for name in ("gaussian", "uniform"):
+        monkeypatch.setattr(sensors, name, drawn)
+    zeros = Noise(outlier_bias=(0.1, 0.2), actuation=Drift(0.0, 0.0, 0.0, 0.0))
+    assert zeros.exact
+    scenario = replace(exact, mission=replace(exact.mission, noise=zeros))
+    assert ticks_csv(inline.play(scenario, zero)) == table
+    assert len(table.splitlines()) == 1 + 2 * 49
+    for robot in ("a", "b"):
+        assert frames(zero, robot) == frames(without, robot)
+    with pytest.raises(AssertionError, match="something is drawn"):
+        inline.play(near("anchor_sigma = 0.1"))
+
+
+def frames(folder: Path, robot: str) -> list[bytes]:
+    """What a robot sensed, heard and said; not its Briefing, which names the noise."""
+    return list(journal.read(folder / f"agent-{robot}.journal"))[1:]
+
+
+@pytest.mark.parametrize("draw", [uniform, gaussian])
+def test_a_draw_follows_from_seed_sensor_robot_and_tick_alone(
+    draw: Callable[[int, str, str, int], float],
+) -> None:
+    keys = list(product((0, 1, 12), ("x", "y"), ("a", "b"), (0, 1, 23, 123)))
+    values = [draw(*key) for key in keys]
+    assert len(set(values)) == len(keys), "each key has its own"
+    assert [draw(*key) for key in reversed(keys)] == values[::-1], "in whatever order"
+
+
+def test_uniform_draws_are_uniform_between_0_and_1_and_gaussian_ones_gaussian() -> None:
+    flat = np.array([uniform(1, "x", "a", tick) for tick in range(N)])
+    assert 0.0 < flat.min() < flat.max() < 1.0
+    counts = np.histogram(flat, 20, (0.0, 1.0))[0]
+    assert all(has_share(int(count), N, 0.05) for count in counts)
+    bell = np.array([gaussian(1, "x", "a", tick) for tick in range(N)])
+    assert is_gaussian(bell, 1.0)
+    assert is_white(flat)
+    assert is_white(bell)
+
+
+def test_an_outlier_or_a_drop_out_shifts_no_other_draw() -> None:
+    sigmas = "anchor_sigma = 0.01\nmutual_sigma = 0.02\nactuation = {v = 0.1}\nodometry = {omega = 0.1}"
+    plain, rough = near(sigmas), near(f"{sigmas}\noutliers = 0.3\ndrop_outs = 0.2")
+    ticks = 500
+    for clean, seen in zip(all_ranges(plain, ticks), all_ranges(rough, ticks), strict=True):
+        extra = [
+            now - was for was, now in zip(clean, seen, strict=True) if was is not None and now is not None
+        ]
+        assert len(clean) == len(known(clean))
+        assert 0.7 * ticks < len(extra) < 0.9 * ticks
+        biased = [bias for bias in extra if bias != 0.0]
+        assert 0.2 * ticks < len(biased) < 0.4 * len(extra)
+        assert 0.3 < min(biased) < max(biased) < 2.0
+    for tick in range(ticks):
+        asked = Controls(1.0, 0.5)
+        assert executed(asked, plain, "a", tick) == executed(asked, rough, "a", tick)
+        assert odometry(asked, plain, "a", tick) == odometry(asked, rough, "a", tick)
+
+
+def test_other_robots_shift_no_draw() -> None:
+    two = near("anchor_sigma = 0.1\nmutual_sigma = 0.1")
+    far = [
+        replace(one, id=name, peer=peer, anchor=replace(one.anchor, y=90.0), start=replace(one.start, y=90.0))
+        for one, name, peer in zip(two.robots, "cd", "dc", strict=True)
+    ]
+    four = replace(two, robots=(*far, *two.robots))
+    for tick in range(20):
+        assert anchor_ranges(at_tick(four, tick), four)[2:] == anchor_ranges(at_tick(two, tick), two)
+        assert anchor_ranges(at_tick(four, tick), four)[:2] != anchor_ranges(at_tick(two, tick), two)
+        _, ours = mutual_ranges(at_tick(four, tick), four, four.pairs())
+        assert [ours] == mutual_ranges(at_tick(two, tick), two, two.pairs())
+
+
+def test_a_mutual_range_is_measured_once_and_told_to_both() -> None:
+    scenario = near("mutual_sigma = 0.1\noutliers = 0.2\ndrop_outs = 0.2")
+    world = release(scenario)
+    told = set()
+    for tick in range(200):
+        one, other = senses(replace(world, truth=at_tick(scenario, tick)))
+        (by_a,), (by_b,) = one.contacts, other.contacts
+        assert (by_a.peer, by_b.peer) == ("b", "a")
+        assert by_a.range == by_b.range
+        told.add(by_a.range)
+    assert None in told
+    assert len(told) > 150, "each of its own"
+
+
+# --- ranges -------------------------------------------------------------------------------------------
+
+
+def test_ranges_are_gaussian_with_the_sigmas_they_are_told() -> None:
+    ranges = all_ranges(near("anchor_sigma = 0.05\nmutual_sigma = 0.2"))
+    errors = [known(told) - rho for told, rho in zip(ranges, (RHO_A, 2.0, APART), strict=True)]
+    for error, sigma in zip(errors, (0.05, 0.05, 0.2), strict=True):
+        assert len(error) == N
+        assert is_gaussian(error, sigma)
+        assert is_white(error)
+    assert are_uncorrelated(errors[0], errors[1])
+    assert are_uncorrelated(errors[0], errors[2])
+
+
+def test_a_sigma_is_of_its_own_sensor_only() -> None:
+    a, b, both = all_ranges(near("anchor_sigma = 0.05"), 50)
+    assert set(both) == {APART}
+    assert len({*a, *b}) == 100
+    a, b, both = all_ranges(near("mutual_sigma = 0.05"), 50)
+    assert (set(a), set(b)) == ({RHO_A}, {RHO_B})
+    assert len(set(both)) == 50
+
+
+def test_another_seed_is_another_noise() -> None:
+    one, other = (to_anchors(near("anchor_sigma = 0.05", seed=seed), 20)[0] for seed in (1, 2))
+    assert not set(one) & set(other)
+
+
+@pytest.mark.parametrize("share", [0.05, 0.5])
+def test_outliers_have_their_probability_and_a_uniform_positive_bias(share: float) -> None:
+    least, most = 0.4, 1.6
+    scenario = near(f"outliers = {share}\noutlier_bias = [{least}, {most}]")
+    for told, rho in zip(all_ranges(scenario), (RHO_A, RHO_B, APART), strict=True):
+        bias = known(told) - rho
+        biased = bias[bias != 0.0]
+        assert len(bias) == N
+        assert has_share(len(biased), N, share)
+        assert least <= biased.min() < biased.max() <= most
+        quarters = np.histogram(biased, 4, (least, most))[0]
+        assert all(has_share(int(quarter), len(biased), 0.25) for quarter in quarters)
+        assert is_white(bias)
+
+
+def test_biases_are_drawn_for_each_sensor_and_robot() -> None:
+    told = all_ranges(near("outliers = 0.5"))
+    biases = [known(ranges) - rho for ranges, rho in zip(told, (RHO_A, RHO_B, APART), strict=True)]
+    for one, other in combinations(biases, 2):
+        both = (one != 0.0) & (other != 0.0)
+        assert has_share(int(both.sum()), N, 0.25)
+        assert are_uncorrelated(one[both], other[both])
+
+
+def test_outliers_and_sigmas_add_up() -> None:
+    told = known(to_anchors(near("anchor_sigma = 0.1\noutliers = 0.5\noutlier_bias = [1.0, 1.0]"))[0]) - RHO_A
+    upper = told[told > 0.5]
+    assert has_share(len(upper), N, 0.5)
+    assert is_gaussian(upper - 1.0, 0.1)
+    assert is_gaussian(told[told <= 0.5], 0.1)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.5])
+def test_drop_outs_have_their_probability_each_sensor_on_its_own(share: float) -> None:
+    gone = [
+        np.array([rho is None for rho in told], float) for told in all_ranges(near(f"drop_outs = {share}"))
+    ]
+    for dropped in gone:
+        assert has_share(int(dropped.sum()), N, share)
+        assert is_white(dropped)
+    assert are_uncorrelated(gone[0], gone[1])
+    assert are_uncorrelated(gone[0], gone[2])
+
+
+def test_a_range_that_is_dropped_leaves_the_contact() -> None:
+    scenario = near("drop_outs = 0.5")
+    world, dropped = release(scenario), 0
+    for tick in range(100):
+        for sense in senses(replace(world, truth=at_tick(scenario, tick))):
+            (contact,) = sense.contacts
+            assert contact.heard == (tick,)
+            assert contact.range in (None, APART)
+            dropped += contact.range is None
+    assert 50 < dropped < 150
+
+
+def test_reports_are_heard_where_the_range_was_dropped(tmp_path: Path) -> None:
+    """Of a seed that drops every range between the robots, as long as the mission lasts."""
+    dropping = next(
+        seed for seed in range(1000) if mutual(near("drop_outs = 0.5", seed=seed), 4) == [None] * 4
+    )
+    record = inline.play(near("drop_outs = 0.5", seed=dropping, max_ticks=3), tmp_path)
+    said = record.farewells
+    assert (said["a"].mutual_ranges, said["b"].mutual_ranges) == (0, 0)
+    assert said["a"].reports_sent >= 1
+    assert said["a"].reports_heard == said["b"].reports_sent
+    assert said["b"].reports_heard == said["a"].reports_sent
+
+
+def test_who_is_in_range_follows_from_the_distance_and_not_from_what_is_measured() -> None:
+    scenario = near("anchor_sigma = 0.1\nmutual_sigma = 0.1")
+    origins, reach = release(scenario).truth.origins, scenario.mission.sensing_range
+    rim, beyond = (Pose(rho, 0.0, 0.0) for rho in (reach, math.nextafter(reach, 4.0)))
+    for tick in range(100):
+        on_it = Truth(tick, (rim, Pose(0.0, 0.0, 0.0)), origins)
+        off_it = Truth(tick, (beyond, Pose(0.0, 0.0, 0.0)), origins)
+        assert anchor_ranges(on_it, scenario)[0] is not None
+        assert isinstance(mutual_ranges(on_it, scenario, [(0, 1)])[0], Mutual)
+        assert anchor_ranges(off_it, scenario)[0] is None
+        assert mutual_ranges(off_it, scenario, [(0, 1)]) == [None]
+    measured = [anchor_ranges(Truth(tick, (rim, rim), origins), scenario)[0] or 0.0 for tick in range(100)]
+    assert min(measured) < reach < max(measured)
+
+
+def test_a_range_is_never_negative() -> None:
+    scenario = near("anchor_sigma = 0.5")
+    origins = release(scenario).truth.origins
+    here = Pose(0.01, 0.0, 0.0)
+    told = known([anchor_ranges(Truth(tick, (here, here), origins), scenario)[0] for tick in range(100)])
+    assert told.min() == 0.0
+    assert 30 < (told > 0.0).sum() < 70
+
+
+# --- wheels and odometry ------------------------------------------------------------------------------
+
+DRIFT = "{v = 0.02, omega = 0.05}"
+
+
+def test_actuation_noise_moves_the_robot_and_an_exact_odometry_says_how() -> None:
+    world = release(near(f"actuation = {DRIFT}"))
+    onward = advance(world, {"a": sent(1.0, 0.5)})
+    assert isinstance(onward, World)
+    (sense, _), period = senses(onward), world.scenario.mission.period
+    asked, done = Controls(1.0, 0.5), sense.executed
+    assert done is not None
+    assert done.v != asked.v
+    assert done.omega != asked.omega
+    assert onward.truth.local[0] == step(world.truth.local[0], done.v, done.omega, period)
+    assert onward.truth.local[0] != step(world.truth.local[0], asked.v, asked.omega, period)
+
+
+def test_odometry_noise_moves_nobody() -> None:
+    world = release(near(f"odometry = {DRIFT}"))
+    onward = advance(world, {"a": sent(1.0, 0.5)})
+    assert isinstance(onward, World)
+    (sense, _), period = senses(onward), world.scenario.mission.period
+    assert onward.truth.local[0] == step(world.truth.local[0], 1.0, 0.5, period)
+    assert sense.executed is not None
+    assert sense.executed.v != 1.0
+    assert sense.executed.omega != 0.5
+
+
+@pytest.mark.parametrize("act", [executed, odometry], ids=["actuation", "odometry"])
+@pytest.mark.parametrize(("v", "omega"), [(1.0, 0.0), (-0.5, 2.0), (0.0, -1.0), (0.0, 0.0)])
+def test_noise_is_a_fraction_of_v_and_omega_and_a_floor_in_squares(
+    act: Callable[[Controls, Scenario, str, int], Controls], v: float, omega: float
+) -> None:
+    drift = "{v = 0.02, omega = 0.03, v_floor = 0.015, omega_floor = 0.04}"
+    scenario = near(f"actuation = {drift}\nodometry = {drift}")
+    done = [act(Controls(v, omega), scenario, "a", tick) for tick in range(N)]
+    by_v = np.array([controls.v - v for controls in done])
+    by_omega = np.array([controls.omega - omega for controls in done])
+    assert is_gaussian(by_v, math.hypot(0.02 * v, 0.015))
+    assert is_gaussian(by_omega, math.hypot(0.03 * omega, 0.04))
+    assert are_uncorrelated(by_v, by_omega)
+    for values in (by_v, by_omega):
+        assert is_white(values)
+
+
+def test_wheels_and_odometry_err_each_on_their_own_and_each_robot_too() -> None:
+    scenario, asked = near(f"actuation = {DRIFT}\nodometry = {DRIFT}"), Controls(1.0, 1.0)
+    driven, measured = (
+        np.array([act(asked, scenario, "a", tick).v for tick in range(N)]) for act in (executed, odometry)
+    )
+    others = np.array([executed(asked, scenario, "b", tick).v for tick in range(N)])
+    assert are_uncorrelated(driven, measured)
+    assert are_uncorrelated(driven[:-1], measured[1:]), "of the same manoeuvre"
+    assert are_uncorrelated(driven, others)
+
+
+def test_a_robot_at_rest_is_disturbed_by_a_floor_only() -> None:
+    fractions = near(f"actuation = {DRIFT}\nodometry = {DRIFT}")
+    floors = near("actuation = {v_floor = 1e-3}\nodometry = {omega_floor = 1e-3}")
+    for tick in range(100):
+        assert executed(REST, fractions, "a", tick) == odometry(REST, fractions, "a", tick) == REST
+        assert executed(REST, floors, "a", tick).v != 0.0
+        assert executed(REST, floors, "a", tick).omega == 0.0
+        assert odometry(REST, floors, "a", tick).v == 0.0
+        assert odometry(REST, floors, "a", tick).omega != 0.0
+
+
+def test_wheels_saturate_before_they_err() -> None:
+    scenario = near(f"actuation = {DRIFT}")
+    world = release(scenario)
+    onward = advance(world, {"a": sent(1e3, -1e3)})
+    assert isinstance(onward, World)
+    assert onward.executed is not None
+    assert onward.executed[0] == executed(Controls(1.0, -math.pi), scenario, "a", 0)
+
+
+def test_the_fastest_robot_with_the_worst_wheels_can_be_told_what_it_did() -> None:
+    drift = Drift(0.5, 0.5, 1e4, 1e4)
+    noise = Noise(outliers=0.5, outlier_bias=(0.0, 1e6), actuation=drift, odometry=drift)
+    exact = near()
+    mission = replace(exact.mission, max_speed=1e6, max_turn_rate=1e6, noise=noise)
+    scenario = replace(exact, mission=mission)
+    fastest = 0.0
+    for tick in range(2000):
+        done = odometry(executed(Controls(1e6, 1e6), scenario, "a", tick), scenario, "a", tick + 1)
+        sense = Sense(tick, "a", done, anchor_ranges(at_tick(scenario, tick), scenario)[0])
+        assert decode(encode(sense), Sense) == sense
+        fastest = max(fastest, abs(done.v))
+    assert fastest > 3e6
+
+
+# --- what is claimed ----------------------------------------------------------------------------------
+
+
+def claims(tick: int, robot: str, pose: Pose, covariance: Covariance | None = None) -> Drive:
+    return Drive(tick, robot, 0.0, 0.0, 3, "localised", Localised(pose, covariance))
+
+
+def moved_on(world: World, drives: dict[str, Drive]) -> World:
+    onward = advance(world, drives)
+    assert isinstance(onward, World)
+    return onward
+
+
+def test_a_claim_is_held_against_where_the_robot_was_when_it_claimed() -> None:
+    """Wheels with a floor move it on while it waits for its peer's verdict."""
+    at_first = release(near("actuation = {v_floor = 0.1}"))
+    a, b = at_first.truth.poses
+    later = moved_on(at_first, {"a": claims(0, "a", a), "b": sent(0.0, 0.0, "b")})
+    now_a, now_b = later.truth.poses
+    assert math.hypot(now_a.x - a.x, now_a.y - a.y) > 1e-3
+    assert advance(later, {"b": claims(1, "b", now_b)}) == Judgement("localised")
+    stale = advance(later, {"b": claims(1, "b", b)})
+    assert isinstance(stale, Judgement)
+    assert stale.outcome == "wrong"
+    gives_up = Drive(1, "b", 0.0, 0.0, 3, "undecided", Undecided("no way"))
+    assert advance(later, {"b": gives_up}) == Judgement("undecided", "b: no way")
+
+
+def test_a_claim_is_wrong_beyond_five_of_its_sigmas_and_the_reason_says_of_which() -> None:
+    world = release(near("anchor_sigma = 0.01"))
+    a, b = world.truth.poses
+    sure = Covariance(0.0009, 0.0, 0.0, 0.0016, 0.0, 0.0004)  # 0.05 m, 0.02 rad
+    for off, turned, outcome in (
+        (0.249, 0.0, None),
+        (0.251, 0.0, "wrong"),
+        (0.0, 0.099, None),
+        (0.0, 0.101, "wrong"),
+    ):
+        claim = Pose(a.x + off, a.y, a.heading + turned)
+        onward = advance(world, {"a": claims(0, "a", claim, sure), "b": claims(0, "b", b)})
+        assert isinstance(onward, Judgement)
+        assert onward.outcome == (outcome or "localised")
+        assert outcome is None or (onward.reason or "").endswith("rad off, of sigmas 0.05 m and 0.02 rad")
+
+
+# --- the record ---------------------------------------------------------------------------------------
+
+NOISES = {
+    "wheels": "actuation = {v = 0.01, omega = 0.02}",
+    "gaps": "outliers = 0.02\ndrop_outs = 0.1",
+    "everything": "anchor_sigma = 0.01\nmutual_sigma = 0.02\noutliers = 0.05\ndrop_outs = 0.05\n"
+    "actuation = {v = 0.02, omega_floor = 1e-3}\nodometry = {v_floor = 1e-3, omega = 0.05}",
+}
+by_noise = pytest.mark.parametrize("noise", NOISES.values(), ids=NOISES)
+
+
+def noisy(noise: str, folder: Path) -> Path:
+    """A scenario file whose starts are drawn."""
+    file = folder / "noisy.toml"
+    file.write_text(
+        f'name = "noisy"\n{SECTION_IV}[mission.noise]\n{noise}\n'
+        '[[robot]]\nid = "a"\nanchor = [0.0, 0.0]\n[[robot]]\nid = "b"\nanchor = [10.0, 0.0]\n'
+    )
+    return file
+
+
+@by_noise
+@pytest.mark.parametrize("seed", ["10", "11"])
+def test_processes_leave_the_same_bytes_as_one_process(noise: str, seed: str, tmp_path: Path) -> None:
+    file = noisy(noise, tmp_path)
+    for out, mode in (("processes", []), ("one", ["--in-process"])):
+        ended = tandem("run", file, "--seed", seed, "-q", "--out", tmp_path / out, *mode)
+        assert ended.status in (0, 1), ended
+        assert ended.err == ""
+    one, other = tmp_path / "processes", tmp_path / "one"
+    assert len(journals(one)) == 3
+    assert journals(one) == journals(other)
+    assert (one / "ticks.csv").read_bytes() == (other / "ticks.csv").read_bytes()
+    told = [json.loads((folder / "summary.json").read_text()) for folder in (one, other)]
+    assert [summary.pop("mode") for summary in told] == ["processes", "in-process"]
+    assert all(summary.pop("wall_s") > 0.0 for summary in told)
+    assert told[0] == told[1]
+
+
+def driven(scenario: Scenario, folder: Path, ticks: int) -> tuple[list[Truth], list[list[Sense]]]:
+    """The truth and the senses of robots that drive without a mind, with the world's journal in `folder`."""
+    with closing(journal.Journal(folder / WORLD_JOURNAL)) as kept:
+        course = Course(scenario, kept)
+        truths, told = [], []
+        for tick in range(ticks):
+            truths.append(course.world.truth)
+            told.append(course.senses())
+            v, omega = math.cos(tick), math.sin(3.0 * tick)
+            ended = course.drive({robot.id: sent(v, omega, robot.id, tick) for robot in scenario.robots})
+            assert ended is None
+        course.end(Judgement("undecided", "enough"))
+    return truths, told
+
+
+@by_noise
+def test_the_record_folds_to_the_same_truth(noise: str, tmp_path: Path) -> None:
+    truths, _ = driven(near(noise), tmp_path, 60)
+    assert [moment.truth for moment in read(tmp_path).moments] == truths
+
+
+@by_noise
+@pytest.mark.parametrize("seed", [2, 10, 11])
+def test_the_record_of_a_mission_is_read_as_it_was_played(noise: str, seed: int, tmp_path: Path) -> None:
+    played = inline.play(load(str(noisy(noise, tmp_path)), seed=seed), tmp_path)
+    assert read(tmp_path) == played
+
+
+@by_noise
+def test_ticks_gives_what_was_driven_and_measured(noise: str, tmp_path: Path) -> None:
+    """The true v and omega, and the ranges with their noise: those that the robots were told."""
+    scenario = near(noise)
+    _, told = driven(scenario, tmp_path, 60)
+    rows = list(csv.DictReader(ticks_csv(read(tmp_path)).splitlines()))
+    assert len(rows) == 2 * len(told)
+    for i in range(2):
+        own, senses_of = rows[i::2], [sensed[i] for sensed in told]
+        for row, sense in zip(own, senses_of, strict=True):
+            peer = sense.contacts[0].range if sense.contacts else None
+            assert row["anchor_range"] == shortest(sense.anchor_range)
+            assert row["mutual_range"] == shortest(peer)
+        for now, after in pairwise(own):
+            start = Pose(*(float(now[name]) for name in ("x", "y", "heading")))
+            end = step(start, float(now["v"]), float(now["omega"]), scenario.mission.period)
+            assert (end.x, end.y) == pytest.approx((float(after["x"]), float(after["y"])), abs=1e-9)
+
+
+def shortest(value: float | None) -> str:
+    return "" if value is None else repr(value)
+
+
+def test_ticks_gives_what_a_robot_did_of_which_no_drive_came() -> None:
+    """In real time a robot whose Drive came too late is told to rest; a floor moves it all the same."""
+    scenario = near("actuation = {v_floor = 0.1}", max_ticks=1)
+    world = release(scenario)
+    onward = moved_on(world, {})
+    record = Record(scenario, (Moment(world.truth, {}), Moment(onward.truth, {})), None, {})
+    first, *_, last = csv.DictReader(ticks_csv(record).splitlines())
+    assert onward.executed is not None
+    assert float(first["v"]) == onward.executed[0].v != 0.0
+    assert last["v"] == ""
