@@ -30,8 +30,11 @@ NEAR = 0.02
 SAME_SIGMAS = 1.0
 """two fits nearer to each other than this are one, in sigmas"""
 
-SCAN = 120
+SCAN = 72
 """headings of the robot nearer to its anchor that are tried"""
+
+BENT = 0.1
+"""of R: seeds nearer to each other than this are one; along what the ranges leave open, a fit finds its way"""
 
 POLISHINGS = 4
 
@@ -111,12 +114,17 @@ def _log_cdf(x: float) -> float:
 
 
 def of_anchor(
-    before: Iterable[Hypothesis], path: Track, ranges: Ranges, sensing_range: float, noise: Noise
+    before: Iterable[Hypothesis],
+    path: Track,
+    ranges: Ranges,
+    silent: Places,
+    sensing_range: float,
+    noise: Noise,
 ) -> tuple[Weighed, ...]:
     """Where its anchor may lie in the frame of a robot's odometry: phase 1. `before` is what was left a
-    tick ago; the log is complete, so what is not in `ranges` was silent."""
+    tick ago; at the ticks `silent` there was no range."""
     points = np.array([one.guess[:2] for one in before]).reshape(-1, 2)
-    lost = len(path.x) - 1 > ranges.tick[-1]
+    lost = len(silent) and silent[-1] == len(path.x) - 1
     if len(ranges.rho) <= SEED_RANGES or lost or not len(points):
         points = np.concatenate((points, _crossings(path, ranges)))
         if not len(points):
@@ -124,7 +132,6 @@ def of_anchor(
         variance = np.square(ranges.sigma) + _wandered(path, ranges, noise)
         points = _polished(points, path, ranges, np.sqrt(variance), noise, sensing_range)
     fits = []
-    silent = _missing(ranges.tick, len(path.x))
     for point in points:
         one = fit(np.array([*point, 0.0]), [path], ranges, noise)
         fits.append((one, weight_of_anchor(one, silent, ranges.tick, sensing_range, noise)))
@@ -154,19 +161,22 @@ def _within(
         if beyond[worst] > CLEAR * sensing_range:
             continue
         u = np.array((x[worst], y[worst])) / max(math.hypot(x[worst], y[worst]), SIGMA_FLOOR)
-        sigma = math.sqrt(float(u @ place @ u))
+        sigma = math.hypot(math.sqrt(float(u @ place @ u)), EDGE * sensing_range)
         if sign > 0.0:
             weight += silence(beyond, sigma, noise.drop_outs)
         else:
-            weight += _log_cdf(float(beyond[worst]) / max(sigma, SIGMA_FLOOR))
+            weight += _log_cdf(float(beyond[worst]) / sigma)
     return weight
 
+
+EDGE = 0.005
+"""of R: how sharp the rim of a range is taken to be, beside what is not known of the pose"""
 
 CLEAR = 0.5
 """of R: a tick so far out of range tells nothing by its silence"""
 
 
-def _missing(ticks: Places, end: int) -> Places:
+def missing(ticks: Places, end: int) -> Places:
     """The ticks before `end` that are not among `ticks`."""
     silent = np.ones(end, bool)
     silent[ticks] = False
@@ -322,7 +332,7 @@ def _together(one: Fit, pair: Pair) -> float:
             -sign * (c * ny - s * nx),
             sign * (ny * x - nx * y),
         )
-    sigma = math.sqrt(float(gradient @ one.covariance @ gradient))
+    sigma = math.hypot(math.sqrt(float(gradient @ one.covariance @ gradient)), EDGE * pair.sensing_range)
     return silence(beyond, sigma, pair.noise.drop_outs)
 
 
@@ -356,7 +366,7 @@ def placements(of_a: Hypothesis, of_b: Hypothesis, pair: Pair) -> list[tuple[flo
     scan = np.linspace(-math.pi, math.pi, SCAN, endpoint=False)
     c, s = np.cos(scan), np.sin(scan)
     seeds = []
-    for base in sorted({0, len(ticks) // 2, len(ticks) - 1}):
+    for base in sorted({0, len(ticks) - 1}):
         x = dx + c * place[near][0][base] - s * place[near][1][base]
         y = dy + s * place[near][0][base] + c * place[near][1][base]
         gap = np.maximum(np.hypot(x, y), SIGMA_FLOOR)
@@ -397,8 +407,6 @@ def _turned(
         by_far = (dy * fx - dx * fy) / distance
         return rho - distance, by_near, by_far
 
-    likely = mixture(look(turns)[0], np.hypot(sigma, coarse), pair.noise)[0]
-    turns = _best_turns(turns, likely, lever, coarse, 4 * MOST)
     for step in range(POLISHINGS):
         s = np.hypot(sigma, coarse * 0.2**step)
         residual, by_near, by_far = look(turns)
@@ -414,7 +422,8 @@ def _turned(
         longest = np.maximum(np.abs(change).max(1, keepdims=True), 1e-12)
         turns = turns + change * np.minimum(1.0, 0.3 / longest)
     likely = mixture(look(turns)[0], np.hypot(sigma, 0.1 * coarse), pair.noise)[0]
-    return _best_turns(turns, likely, lever, 0.1 * coarse + 0.3 * float(np.min(sigma)), MOST)
+    near = BENT * pair.sensing_range + 0.3 * float(np.min(sigma))
+    return _best_turns(turns, likely, lever, near, MOST)
 
 
 def _best_turns(turns: Array, likely: Array, lever: Array, near: float, most: int) -> Array:
@@ -423,7 +432,9 @@ def _best_turns(turns: Array, likely: Array, lever: Array, near: float, most: in
     return _distinct(turns, likely, near, most, apart)
 
 
-def _distinct(points: Array, likely: Array, near: float, most: int, apart: Callable[[Array, Array], Array]) -> Array:
+def _distinct(
+    points: Array, likely: Array, near: float, most: int, apart: Callable[[Array, Array], Array]
+) -> Array:
     """The likeliest of `points`, no two of them nearer to each other than `near`; by how far `apart` they are."""
     left = np.flatnonzero(likely >= np.max(likely) - UNLIKELY)
     left = left[np.argsort(-likely[left], kind="stable")]

@@ -9,7 +9,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from agent.belief import Branch
-from agent.hypotheses import Pair, Weighed, of_anchor, of_pair
+from agent.hypotheses import Pair, Weighed, missing, of_anchor, of_pair
 from agent.logbook import Logbook
 from agent.mind import Mind
 from agent.phases.surveying import Held
@@ -32,7 +32,11 @@ def own_anchor(mind: Mind) -> tuple[Weighed, ...]:
     mission = mind.briefing.mission
     path = path_of(mind.log, mind.tick, mission.period)
     ranges = Ranges.of_lists(_told(mind.log, mind.tick), (), (), mission.noise)
-    return of_anchor(mind.findings.own, path, ranges, mission.sensing_range, mission.noise)
+    possible = ranges.within(mission.sensing_range)
+    if not len(possible.rho):
+        return ()
+    silent = missing(ranges.tick, mind.tick + 1)
+    return of_anchor(mind.findings.own, path, possible, silent, mission.sensing_range, mission.noise)
 
 
 def _told(log: Logbook, through: int) -> list[tuple[int, float]]:
@@ -97,11 +101,8 @@ def pair_of(mind: Mind) -> Pair:
     mutual = [(ranged.tick, ranged.range) for ranged in mind.mutual if ranged.tick <= last]
     lists = [_told(log, last) for log in logs]
     ranges = Ranges.of_lists(lists[0], lists[1], mutual, mission.noise)
-    silent = []
-    for i in range(3):
-        seen = np.ones(last + 1, bool)
-        seen[ranges.tick[ranges.of == i]] = False
-        silent.append(np.flatnonzero(seen))
+    silent = [missing(ranges.tick[ranges.of == i], last + 1) for i in range(3)]
+    ranges = ranges.within(mission.sensing_range)
     own, other = briefing.anchor, briefing.peer_anchor
     sign = 1.0 if briefing.role == "a" else -1.0
     return Pair(
@@ -121,7 +122,7 @@ def search(pair: Pair) -> tuple[Weighed, ...]:
         chosen = pair.ranges.of == robot
         ranges = Ranges(*[column[chosen] for column in pair.ranges])
         ranges = ranges._replace(of=np.zeros_like(ranges.of))
-        weighed = of_anchor((), pair.paths[robot], ranges, pair.sensing_range, pair.noise)
+        weighed = of_anchor((), pair.paths[robot], ranges, pair.silent[robot], pair.sensing_range, pair.noise)
         of.append([one.hypothesis for one in weighed])
     return of_pair((), of[0], of[1], pair)
 

@@ -223,6 +223,15 @@ class Ranges(NamedTuple):
             np.repeat([max(sigma, SIGMA_FLOOR) for sigma in sigmas], [len(ranges) for ranges in lists]),
         )
 
+    def within(self, sensing_range: float) -> Ranges:
+        """Without those that are so long that they cannot be but outliers, who knows by how much."""
+        possible = self.rho <= sensing_range + IMPOSSIBLE * self.sigma
+        return self if np.all(possible) else Ranges(*[column[possible] for column in self])
+
+
+IMPOSSIBLE = 6.0
+"""sigmas beyond R"""
+
 
 class Predicted(NamedTuple):
     """What a guess predicts of N ranges."""

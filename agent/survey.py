@@ -29,6 +29,9 @@ SEARCHED = frozenset(3 * 2**n for n in range(12))
 CHECKED = 8
 """mutual ranges at the least before a claim"""
 
+ASKEW = 0.2
+"""rad: with a heading less well known than this the ellipse is no likeness of what is possible"""
+
 PLAUSIBLE = 5.0
 """standard deviations by which chi-square may exceed what it should be, before nothing is claimed"""
 
