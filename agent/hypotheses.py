@@ -54,21 +54,24 @@ class Weighed(NamedTuple):
 
     hypothesis: Hypothesis
     fit: Fit
+    silence: float
+    """the log of how likely it makes it to have been in range where it was, and out of it where it was not"""
 
 
 def with_odds(fits: Sequence[tuple[Fit, float]]) -> tuple[Weighed, ...]:
-    """The likeliest first, each once; of those that are left."""
-    ranked = sorted(fits, key=lambda one: -one[1])
-    left: list[tuple[Fit, float]] = []
-    for one, weight in ranked:
-        if ranked[0][1] - weight > -math.log(ODDS_KEPT) or len(left) == MOST:
+    """The likeliest first, each once; of those that are left. A fit comes with what silence says of it."""
+    weighed = [(one.log_likelihood + 0.5 * _log_volume(one) + silent, one, silent) for one, silent in fits]
+    weighed.sort(key=lambda one: -one[0])
+    left: list[tuple[float, Fit, float]] = []
+    for weight, one, silent in weighed:
+        if weighed[0][0] - weight > -math.log(ODDS_KEPT) or len(left) == MOST:
             break
-        if not any(_same(one, other) for other, _ in left):
-            left.append((one, weight))
-    total = sum([math.exp(weight - ranked[0][1]) for _, weight in left])
+        if not any(_same(one, other) for _, other, _ in left):
+            left.append((math.exp(weight - weighed[0][0]), one, silent))
+    total = sum([odds for odds, _, _ in left])
     return tuple(
-        Weighed(Hypothesis(tuple(one.guess.tolist()), math.exp(weight - ranked[0][1]) / total), one)
-        for one, weight in left
+        Weighed(Hypothesis(tuple(one.guess.tolist()), odds / total), one, silent)
+        for odds, one, silent in left
     )
 
 
@@ -134,14 +137,8 @@ def of_anchor(
     fits = []
     for point in points:
         one = fit(np.array([*point, 0.0]), [path], ranges, noise)
-        fits.append((one, weight_of_anchor(one, silent, ranges.tick, sensing_range, noise)))
+        fits.append((one, _within(one, 0, silent, ranges.tick, sensing_range, noise)))
     return with_odds(fits)
-
-
-def weight_of_anchor(one: Fit, silent: Places, ranged: Places, sensing_range: float, noise: Noise) -> float:
-    """The log of how likely the fit is, ranges and silence."""
-    weight = one.log_likelihood + 0.5 * _log_volume(one)
-    return weight + _within(one, 0, silent, ranged, sensing_range, noise)
 
 
 def _within(
@@ -298,12 +295,12 @@ def of_pair(
             for theta_a, theta_b in placements(one, other, pair)
         ]
     fits = [fit(guess, pair.paths, pair.ranges, pair.noise, pair.apart) for guess in guesses]
-    return with_odds([(one, weight_of_pair(one, pair)) for one in fits])
+    return with_odds([(one, _silence(one, pair)) for one in fits])
 
 
-def weight_of_pair(one: Fit, pair: Pair) -> float:
-    """The log of how likely the fit is, ranges and silence."""
-    weight = one.log_likelihood + 0.5 * _log_volume(one)
+def _silence(one: Fit, pair: Pair) -> float:
+    """The log of how likely the fit makes it who was in range of what, and when."""
+    weight = 0.0
     for robot in (0, 1):
         ranged = pair.ranges.tick[pair.ranges.of == robot]
         weight += _within(one, robot, pair.silent[robot], ranged, pair.sensing_range, pair.noise)

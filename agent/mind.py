@@ -14,7 +14,7 @@ from agent.logbook import Logbook
 from agent.phases.anchor import ThirdPoint
 from agent.phases.encounter import LastManoeuvre, Plan, Returning, Standing, Waiting
 from agent.phases.rendezvous import Aligning, Orbiting, Radial, Tangent, off_anchor
-from agent.phases.seeking import Backing, Circling, Straight, Turning
+from agent.phases.seeking import Backing, Circling, Homing, Straight, Turning
 from agent.phases.surveying import Surveying
 from agent.radio import Radio
 from protocol import messages
@@ -34,7 +34,7 @@ class Done(msgspec.Struct, frozen=True):
     verdict: messages.Verdict
 
 
-Phase1 = Straight | Backing | Turning | Circling | ThirdPoint | Surveying
+Phase1 = Straight | Backing | Turning | Circling | ThirdPoint | Surveying | Homing
 Phase2 = Aligning | Radial | Tangent | Orbiting
 Phase3 = Straight | Backing | Turning | Circling | Standing | Waiting | LastManoeuvre | Returning | Surveying
 State = Asleep | Phase1 | Phase2 | Phase3 | Done
@@ -47,6 +47,7 @@ WORDS: dict[type, str] = {
     Circling: "circling",
     ThirdPoint: "third-point",
     Surveying: "surveying",
+    Homing: "homing",
     Aligning: "aligning",
     Radial: "radial",
     Tangent: "tangent",
@@ -132,7 +133,7 @@ class Mind(msgspec.Struct, frozen=True):
                 return 1
             case Straight("anchor") | Backing("anchor") | Turning("anchor") | Circling("anchor"):
                 return 1
-            case Surveying("anchor"):
+            case Surveying("anchor") | Homing():
                 return 1
             case Done(phase, _):
                 return phase

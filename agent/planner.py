@@ -22,7 +22,7 @@ from agent.phases import anchor, encounter, rendezvous, seeking
 from agent.phases.anchor import ThirdPoint
 from agent.phases.encounter import LastManoeuvre, Returning, Standing, Waiting
 from agent.phases.rendezvous import Aligning, Orbiting, Radial, Tangent
-from agent.phases.seeking import Backing, Circling, Straight, Turning
+from agent.phases.seeking import Backing, Circling, Homing, Straight, Turning
 from agent.phases.surveying import Surveying
 from protocol import messages
 from protocol.messages import Drive, Estimate, Localised, Ranged, Report, Sense, Undecided
@@ -250,5 +250,7 @@ def _controls(mind: Mind) -> Controls:
             return controls
         case Surveying(drive=controls):
             return controls
+        case Homing():
+            return seeking.homeward(mind.state, mind.odometry, mind.briefing.mission) or REST
         case _:
             return REST

@@ -18,10 +18,17 @@ from agent.mind import Done, Mind
 from agent.phases import rendezvous, seeking, surveying
 from agent.phases.encounter import Returning
 from agent.phases.rendezvous import Aligning, Orbiting, Radial, Tangent
-from agent.phases.seeking import Backing, Circling, Straight, Turning
+from agent.phases.seeking import Backing, Circling, Homing, Straight, Turning
 from agent.phases.surveying import Held, Surveying
-from protocol.messages import Localised
-from protocol.motion import REST, Controls, Pose
+from agent.smoothing import SIGMA_FLOOR
+from protocol.messages import BranchKind, Localised
+from protocol.motion import ORIGIN, REST, Controls, Pose
+
+LOST = 3
+"""ticks of silence where there should be a range, before the robot goes back"""
+
+MISLED = -8.0
+"""in log-likelihood: less likely than this, it is not the sensors' chance that a hypothesis has against it"""
 
 SEARCHED = frozenset(3 * 2**n for n in range(12))
 """with so many mutual ranges the whole plane is searched again"""
@@ -45,6 +52,11 @@ def sensed(mind: Mind, anchor_range: float | None) -> Mind:
             return _surveyed(mind) if onward is None else replace(mind, state=onward)
         case Surveying("anchor"):
             return _surveyed(mind)
+        case Homing(place):
+            if anchor_range is not None:
+                return _surveyed(mind)
+            there = seeking.homeward(mind.state, mind.odometry, mind.briefing.mission) is None
+            return replace(mind, state=Straight("anchor", place, 0.0)) if there else mind
         case Aligning() | Radial() | Tangent() | Orbiting():
             return _under_way(mind, anchor_range is not None)
         case Surveying("peer", drive) if not mind.near:
@@ -58,19 +70,37 @@ def sensed(mind: Mind, anchor_range: float | None) -> Mind:
 
 
 def _surveyed(mind: Mind) -> Mind:
-    """Phase 1: what the ranges to the anchor leave possible, and whether that is enough."""
+    """Phase 1: what the ranges to the anchor leave possible, and whether that is enough.
+
+    Where no hypothesis explains in which places the anchor was silent, its ranges mislead: then more of them
+    are taken about the place of the last, as at first.
+    """
+    ranged = mind.log.ranges[-1].tick == mind.tick
     weighed = inference.own_anchor(mind)
-    if not weighed:  # one range alone, from wherever
+    if weighed:
+        mind = inference.with_own(mind, weighed)
+    if not ranged and mind.tick - mind.log.ranges[-1].tick >= LOST:
+        return _homeward(mind)
+    if not weighed or weighed[0].silence < MISLED:
+        if not ranged:
+            return _homeward(mind)
         return replace(mind, state=Straight("anchor", mind.odometry, mind.log.ranges[-1].range))
-    mind = inference.with_own(mind, weighed)
     mission = mind.briefing.mission
     if inference.settled(weighed, mission):
-        kind = "circle" if len(mind.log.ranges) == 2 else "three-ranges"
+        kind: BranchKind = "circle" if len(mind.log.ranges) == 2 else "three-ranges"
         mind = replace(mind, findings=replace(mind.findings, branch_kind=kind))
         return _parted(mind)
-    sigma = max(mission.noise.anchor_sigma, surveying.SIGMA_FLOOR)
+    sigma = max(mission.noise.anchor_sigma, SIGMA_FLOOR)
     drive = surveying.alone(inference.held_alone(weighed), sigma, mission)
     return replace(mind, state=Surveying("anchor", drive))
+
+
+def _homeward(mind: Mind) -> Mind:
+    """Back to where the anchor was ranged last; all that is held of where it is, is doubted."""
+    last = mind.log.ranges[-1].tick
+    place = mind.log.pose(ORIGIN, last, mind.briefing.mission.period)
+    findings = replace(mind.findings, own=(), met=None, pair=())
+    return replace(mind, state=Homing(place), findings=findings)
 
 
 def _parted(mind: Mind) -> Mind:
@@ -89,14 +119,20 @@ def _under_way(mind: Mind, ranged: bool) -> Mind:
     assert isinstance(mind.state, Aligning | Radial | Tangent | Orbiting)
     state = rendezvous.onward(mind.state, mind.odometry, mind.start, mind.orbit, mission)
     if isinstance(state, Orbiting):
+        since = state.since or mind.tick
+        silent = mind.tick - mind.log.ranges[-1].tick
+        if mind.orbit.v == 0.0 and silent >= LOST:
+            return _homeward(mind)
+        if mind.tick - since > mind.briefing.rendezvous.bound / mission.period + LOST and not mind.near:
+            return _homeward(mind)
         if mind.orbit.v != 0.0:
             drive = rendezvous.pursuit(mind.local_pose, mind.orbit, mission)
         elif weighed:
-            sigma = max(mission.noise.anchor_sigma, surveying.SIGMA_FLOOR)
+            sigma = max(mission.noise.anchor_sigma, SIGMA_FLOOR)
             drive = surveying.alone(inference.held_alone(weighed), sigma, mission, mind.orbit.radius)
         else:
             drive = REST
-        state = Orbiting(drive)
+        state = Orbiting(drive, since)
     return replace(mind, state=state)
 
 
@@ -108,7 +144,7 @@ def heard(mind: Mind) -> Mind:
     match mind.state:
         case Done():
             return mind
-        case Surveying("anchor") | Straight() | Backing() | Turning() | Circling():
+        case Surveying("anchor") | Straight() | Backing() | Turning() | Circling() | Homing():
             return mind
         case _ if mind.radio.start is None:
             return mind
@@ -142,8 +178,8 @@ def _considered(mind: Mind) -> Mind:
         claim = Localised(mind.findings.poses[0], mind.findings.covariance)
         return replace(mind, state=Done(3, claim))
     sigmas = (
-        max(mission.noise.anchor_sigma, surveying.SIGMA_FLOOR),
-        max(mission.noise.mutual_sigma, surveying.SIGMA_FLOOR),
+        max(mission.noise.anchor_sigma, SIGMA_FLOOR),
+        max(mission.noise.mutual_sigma, SIGMA_FLOOR),
     )
     a, b = surveying.together(held, sigmas, ((0.0, 0.0), pair.apart), mission)
     return replace(mind, state=Surveying("peer", a if role == "a" else b))

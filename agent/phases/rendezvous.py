@@ -35,6 +35,8 @@ class Orbiting(msgspec.Struct, frozen=True):
 
     drive: Controls | None = None
     """under noise: what leads back to the circle; or tells more, where it waits"""
+    since: int = 0
+    """under noise: the tick in which it got there"""
 
 
 Meeting = Aligning | Radial | Tangent | Orbiting

@@ -13,7 +13,7 @@ from typing import Literal
 import msgspec
 
 from protocol.mission import Mission, Variant
-from protocol.motion import REST, TAU, Controls, Pose
+from protocol.motion import REST, TAU, Controls, Pose, wrap
 
 ARRIVED = 1e-9
 """m and rad: nearer than this is there; the odometry knows the rest"""
@@ -56,6 +56,12 @@ class Circling(msgspec.Struct, frozen=True):
     beacon: Beacon
     origin: Pose
     rho0: float
+
+
+class Homing(msgspec.Struct, frozen=True):
+    """Has lost its anchor, and drives back to where it was ranged last."""
+
+    place: Pose
 
 
 Seeking = Straight | Backing | Turning | Circling
@@ -119,6 +125,20 @@ def controls(state: Seeking, pose: Pose, mission: Mission) -> Controls:
                 mission.max_speed / mission.first_straight,
             )
             return Controls(omega * mission.first_straight, omega)
+
+
+def homeward(state: Homing, pose: Pose, mission: Mission) -> Controls | None:
+    """What leads on to its place, backwards where that is the shorter turn; None once there."""
+    there, facing = arrived(mission)
+    distance = travelled(pose, state.place)
+    if distance <= there:
+        return None
+    askew = wrap(math.atan2(state.place.y - pose.y, state.place.x - pose.x) - pose.heading)
+    forward = abs(askew) <= math.pi / 2
+    left = askew if forward else wrap(askew + math.pi)
+    if abs(left) > facing:
+        return turn(pose, pose.heading + left, mission)
+    return straight(distance if forward else -distance, mission)
 
 
 def inside_arc(rho0: float, mission: Mission) -> float:
