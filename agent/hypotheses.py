@@ -12,7 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.smoothing import SIGMA_FLOOR, Array, Fit, Places, Ranges, Track, fit, mixture, wander
+from agent.odometry import Array, Places, Track, wander
+from agent.ranging import SIGMA_FLOOR, Ranges, mixture, turned
+from agent.smoothing import STEPS, Fit, fit
 from protocol.noise import Drift, Noise
 
 ODDS_KEPT = 1e-9
@@ -37,6 +39,9 @@ BENT = 0.1
 """of R: seeds nearer to each other than this are one; along what the ranges leave open, a fit finds its way"""
 
 POLISHINGS = 4
+
+WARM_STEPS = 1
+"""of Gauss-Newton, from where the fit was a tick ago; before a claim it is done to the end"""
 
 
 class Hypothesis(NamedTuple):
@@ -80,7 +85,7 @@ def _same(one: Fit, other: Fit) -> bool:
     change[2::3] = np.remainder(change[2::3] + math.pi, 2.0 * math.pi) - math.pi
     if len(change) == 3:
         change = change[:2]
-    return float(change @ one.solved.information @ change) < SAME_SIGMAS**2
+    return float(change @ one.information @ change) < SAME_SIGMAS**2
 
 
 def silence(beyond: Array, sigma: float, drop_outs: float) -> float:
@@ -135,8 +140,9 @@ def of_anchor(
         variance = np.square(ranges.sigma) + _wandered(path, ranges, noise)
         points = _polished(points, path, ranges, np.sqrt(variance), noise, sensing_range)
     fits = []
+    steps = STEPS if len(ranges.rho) <= SEED_RANGES or lost else WARM_STEPS
     for point in points:
-        one = fit(np.array([*point, 0.0]), [path], ranges, noise)
+        one = fit(np.array([*point, 0.0]), [path], ranges, noise, steps=steps)
         fits.append((one, _within(one, 0, silent, ranges.tick, sensing_range, noise)))
     return with_odds(fits)
 
@@ -182,7 +188,7 @@ def missing(ticks: Places, end: int) -> Places:
 
 def _log_volume(one: Fit) -> float:
     """Of the posterior, in the unknowns: how many guesses share the likelihood of the best one."""
-    return -float(np.linalg.slogdet(one.solved.information)[1])
+    return -float(np.linalg.slogdet(one.information)[1])
 
 
 def _wandered(path: Track, ranges: Ranges, noise: Noise) -> Array:
@@ -287,14 +293,16 @@ def of_pair(
     """How the two may lie in <W>: branch of a, branch of b, and placement. `before` is what was left a tick
     ago; if it is empty, the whole plane is searched."""
     guesses = [np.array(one.guess) for one in before]
+    steps = WARM_STEPS
     if not guesses:
+        steps = STEPS
         guesses = [
             np.array([*one.guess[:2], theta_a, *other.guess[:2], theta_b])
             for one in of_a
             for other in of_b
             for theta_a, theta_b in placements(one, other, pair)
         ]
-    fits = [fit(guess, pair.paths, pair.ranges, pair.noise, pair.apart) for guess in guesses]
+    fits = [fit(guess, pair.paths, pair.ranges, pair.noise, pair.apart, steps) for guess in guesses]
     return with_odds([(one, _silence(one, pair)) for one in fits])
 
 
@@ -302,7 +310,7 @@ def _silence(one: Fit, pair: Pair) -> float:
     """The log of how likely the fit makes it who was in range of what, and when."""
     weight = 0.0
     for robot in (0, 1):
-        ranged = pair.ranges.tick[pair.ranges.of == robot]
+        ranged = pair.ranges.tick[pair.ranges.rows(robot)]
         weight += _within(one, robot, pair.silent[robot], ranged, pair.sensing_range, pair.noise)
     return weight + _together(one, pair)
 
@@ -312,7 +320,7 @@ def _together(one: Fit, pair: Pair) -> float:
     silent = pair.silent[2]
     if not len(silent):
         return 0.0
-    (wx, wy), (vx, vy) = (_placed(one.guess[3 * r : 3 * r + 3], one.paths[r], silent) for r in (0, 1))
+    (wx, wy), (vx, vy) = (turned(one.guess[3 * r : 3 * r + 3], one.paths[r], silent) for r in (0, 1))
     dx, dy = wx - vx - pair.apart[0], wy - vy - pair.apart[1]
     distance = np.hypot(dx, dy)
     k = int(np.argmin(distance))
@@ -333,14 +341,6 @@ def _together(one: Fit, pair: Pair) -> float:
     return silence(beyond, sigma, pair.noise.drop_outs)
 
 
-def _placed(guess: Array, path: Track, ticks: Places) -> tuple[Array, Array]:
-    """m: where the robot is, relative to its anchor, along the axes of <W>."""
-    mx, my, theta = guess
-    c, s = math.cos(theta), math.sin(theta)
-    x, y = path.x[ticks] - mx, path.y[ticks] - my
-    return c * x - s * y, s * x + c * y
-
-
 def placements(of_a: Hypothesis, of_b: Hypothesis, pair: Pair) -> list[tuple[float, float]]:
     """Headings of the odometry frames in <W> that may explain the mutual ranges, the likeliest few.
 
@@ -348,12 +348,12 @@ def placements(of_a: Hypothesis, of_b: Hypothesis, pair: Pair) -> list[tuple[flo
     headings of the other, where the circles about its anchor and about the first robot meet (Section III.C
     with one circle turned), and the others tell which.
     """
-    mutual = pair.ranges.of == 2
+    mutual = pair.ranges.rows(2)
     ticks, rho, sigma = pair.ranges.tick[mutual], pair.ranges.rho[mutual], pair.ranges.sigma[mutual]
     some = np.unique(np.linspace(0, len(ticks) - 1, SEED_RANGES).round().astype(np.intp))
     ticks, rho, sigma = ticks[some], rho[some], sigma[some]
     place = [
-        _placed(np.array([*one.guess[:2], 0.0]), path, ticks)
+        turned(np.array([*one.guess[:2], 0.0]), path, ticks)
         for one, path in zip((of_a, of_b), pair.paths, strict=True)
     ]
     radii = [np.hypot(x, y) for x, y in place]

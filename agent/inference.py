@@ -12,8 +12,10 @@ from agent.belief import Branch
 from agent.hypotheses import Pair, Weighed, missing, of_anchor, of_pair
 from agent.logbook import Logbook
 from agent.mind import Mind
+from agent.odometry import Array, Track, track
 from agent.phases.surveying import Held
-from agent.smoothing import SIGMA_FLOOR, Array, Ranges, Track, poses, track
+from agent.ranging import SIGMA_FLOOR, Ranges
+from agent.smoothing import poses
 from protocol.mission import Mission
 from protocol.motion import Covariance, Pose, compose, wrap
 
@@ -101,7 +103,7 @@ def pair_of(mind: Mind) -> Pair:
     mutual = [(ranged.tick, ranged.range) for ranged in mind.mutual if ranged.tick <= last]
     lists = [_told(log, last) for log in logs]
     ranges = Ranges.of_lists(lists[0], lists[1], mutual, mission.noise)
-    silent = [missing(ranges.tick[ranges.of == i], last + 1) for i in range(3)]
+    silent = [missing(ranges.tick[ranges.rows(kind)], last + 1) for kind in range(3)]
     ranges = ranges.within(mission.sensing_range)
     own, other = briefing.anchor, briefing.peer_anchor
     sign = 1.0 if briefing.role == "a" else -1.0
@@ -119,9 +121,7 @@ def search(pair: Pair) -> tuple[Weighed, ...]:
     """Every way in which the two may lie in <W>, looked for anew."""
     of = []
     for robot in (0, 1):
-        chosen = pair.ranges.of == robot
-        ranges = Ranges(*[column[chosen] for column in pair.ranges])
-        ranges = ranges._replace(of=np.zeros_like(ranges.of))
+        ranges = pair.ranges.only(robot)
         weighed = of_anchor((), pair.paths[robot], ranges, pair.silent[robot], pair.sensing_range, pair.noise)
         of.append([one.hypothesis for one in weighed])
     return of_pair((), of[0], of[1], pair)

@@ -20,7 +20,7 @@ from agent.phases.encounter import Returning
 from agent.phases.rendezvous import Aligning, Orbiting, Radial, Tangent
 from agent.phases.seeking import Backing, Circling, Homing, Straight, Turning
 from agent.phases.surveying import Held, Surveying
-from agent.smoothing import SIGMA_FLOOR
+from agent.ranging import SIGMA_FLOOR
 from protocol.messages import BranchKind, Localised
 from protocol.motion import ORIGIN, REST, Controls, Pose
 
@@ -162,7 +162,7 @@ def _considered(mind: Mind) -> Mind:
         mind = replace(mind, findings=replace(mind.findings, met=mind.tick))
     mission, role = mind.briefing.mission, mind.briefing.role
     pair = inference.pair_of(mind)
-    mutual = int((pair.ranges.of == 2).sum())
+    mutual = pair.ranges.counts[2]
     if mutual < 3:
         ahead = Controls(mission.first_straight / mission.period, 0.0)
         return replace(mind, state=Surveying("peer", ahead if role == "a" else REST))

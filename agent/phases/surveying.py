@@ -14,8 +14,9 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
+from agent.odometry import Array
 from agent.phases.seeking import Beacon
-from agent.smoothing import SIGMA_FLOOR, Array
+from agent.ranging import SIGMA_FLOOR
 from protocol.mission import Mission
 from protocol.motion import REST, Controls
 
