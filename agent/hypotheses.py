@@ -36,9 +36,12 @@ SCAN = 72
 """headings of the robot nearer to its anchor that are tried"""
 
 BENT = 0.1
-"""of R: seeds nearer to each other than this are one; along what the ranges leave open, a fit finds its way"""
+"""of R: seeds nearer than this are one; along what the ranges leave open, a fit finds its way"""
 
 POLISHINGS = 4
+
+ROUGH_STEPS = 2
+"""of Gauss-Newton, from a seed; then it shows which are worth more"""
 
 WARM_STEPS = 1
 """of Gauss-Newton, from where the fit was a tick ago; before a claim it is done to the end"""
@@ -196,12 +199,9 @@ def _wandered(path: Track, ranges: Ranges, noise: Noise) -> Array:
     if noise.odometry == Drift():
         return np.zeros_like(ranges.rho)
     drift = wander(path, noise.odometry, path)
-    position = (
-        drift.c2[0]
-        + drift.c2[2]
-        + 2.0 * path.period * (-path.x * drift.c1[1] + path.y * drift.c1[0])
-        + path.period**2 * (path.x**2 + path.y**2) * drift.c0
-    )
+    turn, bx, by, xx, _, yy = drift.sums
+    lever = path.period
+    position = xx + yy + 2.0 * lever * (path.y * bx - path.x * by) + lever**2 * (path.x**2 + path.y**2) * turn
     spread: Array = 0.5 * np.maximum(position, 0.0)[ranges.tick]
     return spread
 
@@ -293,15 +293,19 @@ def of_pair(
     """How the two may lie in <W>: branch of a, branch of b, and placement. `before` is what was left a tick
     ago; if it is empty, the whole plane is searched."""
     guesses = [np.array(one.guess) for one in before]
-    steps = WARM_STEPS
-    if not guesses:
-        steps = STEPS
-        guesses = [
-            np.array([*one.guess[:2], theta_a, *other.guess[:2], theta_b])
-            for one in of_a
-            for other in of_b
-            for theta_a, theta_b in placements(one, other, pair)
-        ]
+    if guesses:
+        return _fitted(guesses, pair, WARM_STEPS)
+    guesses = [
+        np.array([*one.guess[:2], theta_a, *other.guess[:2], theta_b])
+        for one in of_a
+        for other in of_b
+        for theta_a, theta_b in placements(one, other, pair)
+    ]
+    rough = _fitted(guesses, pair, ROUGH_STEPS)
+    return _fitted([one.fit.guess for one in rough], pair, STEPS)
+
+
+def _fitted(guesses: Sequence[Array], pair: Pair, steps: int) -> tuple[Weighed, ...]:
     fits = [fit(guess, pair.paths, pair.ranges, pair.noise, pair.apart, steps) for guess in guesses]
     return with_odds([(one, _silence(one, pair)) for one in fits])
 
@@ -432,11 +436,11 @@ def _best_turns(turns: Array, likely: Array, lever: Array, near: float, most: in
 def _distinct(
     points: Array, likely: Array, near: float, most: int, apart: Callable[[Array, Array], Array]
 ) -> Array:
-    """The likeliest of `points`, no two of them nearer to each other than `near`; by how far `apart` they are."""
+    """The likeliest of `points`, no two of them nearer to each other than `near`."""
     left = np.flatnonzero(likely >= np.max(likely) - UNLIKELY)
     left = left[np.argsort(-likely[left], kind="stable")]
-    chosen = []
+    chosen: list[int] = []
     while len(left) and len(chosen) < most:
-        chosen.append(left[0])
+        chosen.append(int(left[0]))
         left = left[apart(points[left[0]], points[left]) > near]
     return points[chosen]

@@ -22,85 +22,100 @@ class Track(NamedTuple):
     """A robot's odometry over [0, k], in the frame of tick 0."""
 
     v: Array
-    """m/s, over each tick; shape (k,)"""
+    """m/s, over each tick; (k,)"""
     omega: Array
+    """rad/s"""
     period: float
+    """s"""
     x: Array
-    """m, at each tick; shape (k + 1,)"""
+    """m, at each tick; (k + 1,)"""
     y: Array
     heading: Array
+    """rad, not wrapped"""
+    shift: Array
+    """s: what each m/s of v moves the robot by, over each tick; (2, k)"""
 
 
 def track(v: Array, omega: Array, period: float) -> Track:
     """Dead reckoning, eq. (1a), from the origin."""
-    half = 0.5 * period * omega
-    length = v * period * np.sinc(half / math.pi)
-    heading = np.concatenate(([0.0], np.cumsum(period * omega)))
+    turn = period * omega
+    heading = _summed(turn)
+    half = 0.5 * turn
     course = heading[:-1] + half
-    x = np.concatenate(([0.0], np.cumsum(length * np.cos(course))))
-    y = np.concatenate(([0.0], np.cumsum(length * np.sin(course))))
-    return Track(v, omega, period, x, y, heading)
+    unit = period * _sinc(half)
+    shift = np.empty((2, len(v)))
+    np.multiply(unit, np.cos(course), out=shift[0])
+    np.multiply(unit, np.sin(course), out=shift[1])
+    x, y = _summed(v * shift)
+    return Track(v, omega, period, x, y, heading, shift)
+
+
+def _sinc(half: Array) -> Array:
+    """sin(x) / x"""
+    safe = np.where(half == 0.0, 1.0, half)
+    return np.where(half == 0.0, 1.0, np.sin(safe) / safe)
+
+
+def _summed(values: Array) -> Array:
+    """Of all before each tick, along the last axis; (..., k) -> (..., k + 1)."""
+    sums = np.zeros((*values.shape[:-1], values.shape[-1] + 1))
+    np.cumsum(values, axis=-1, out=sums[..., 1:])
+    return sums
 
 
 class Wander(NamedTuple):
     """What noise in a track's v and omega does to it: sums along it, up to each tick.
 
     Noise e in omega at tick j moves the position at a later tick t, along u, by (lever - u . b_j) e, where
-    lever = T_s u . perp(p_t); noise in v by u . s_j e.
+    lever = T_s u . perp(p_t); noise e in v moves it by u . shift_j e.
     """
 
-    q_v: Array
-    """(m/s)^2: the variances at each tick"""
-    q_omega: Array
+    variances: Array
+    """(m/s)^2 and (rad/s)^2, of v and omega at each tick; (2, k)"""
     b: Array
-    """(2, k)"""
-    s: Array
-    """(2, k)"""
-    c0: Array
-    """sum of q_omega; shape (k + 1,)"""
-    c1: Array
-    """of q_omega b; (2, k + 1)"""
-    c2: Array
-    """of q_omega b b' + q_v s s', its xx, xy, yy; (3, k + 1)"""
+    """m s; (2, k)"""
+    shift: Array
+    """s; (2, k)"""
+    sums: Array
+    """of q_omega; q_omega b, its x and y; q_omega b b' + q_v shift shift', its xx, xy, yy; (6, k + 1)"""
 
 
 def wander(path: Track, drift: Drift, measured: Track) -> Wander:
     """Of `path`, whose odometry measured what `measured` says, with noise of `drift`."""
-    q_v = np.square(drift.v * measured.v) + drift.v_floor**2
-    q_omega = np.square(drift.omega * measured.omega) + drift.omega_floor**2
-    period = path.period
-    half = 0.5 * period * path.omega
-    unit = period * np.sinc(half / math.pi)
-    course = path.heading[:-1] + half
-    c, s = np.cos(course), np.sin(course)
-    length = path.v * unit
-    with np.errstate(divide="ignore", invalid="ignore"):
-        slope = np.where(
-            np.abs(half) < 1e-4, -half / 3.0, (np.cos(half) - np.sinc(half / math.pi)) / half
-        ) * (0.5 * period * period * path.v)
-    along, across = slope, 0.5 * period * length
-    b = np.stack(
-        (
-            -period * path.y[1:] - (along * c - across * s),
-            period * path.x[1:] - (along * s + across * c),
-        )
-    )
-    shift = np.stack((unit * c, unit * s))
-    products = np.stack(
-        (
-            q_omega * b[0] * b[0] + q_v * shift[0] * shift[0],
-            q_omega * b[0] * b[1] + q_v * shift[0] * shift[1],
-            q_omega * b[1] * b[1] + q_v * shift[1] * shift[1],
-        )
-    )
-    return Wander(q_v, q_omega, b, shift, _summed(q_omega[None])[0], _summed(q_omega * b), _summed(products))
+    k, period = len(path.v), path.period
+    variances = np.empty((2, k))
+    variances[0] = np.square(drift.v * measured.v) + drift.v_floor**2
+    variances[1] = np.square(drift.omega * measured.omega) + drift.omega_floor**2
+    sx, sy = path.shift
+    # along the chord, omega changes its length; across it, its direction, by half of what it turns the robot
+    slope = path.v * _shortening(0.5 * period * path.omega, period)
+    across = 0.5 * period * path.v
+    b = np.empty((2, k))
+    b[0] = -period * path.y[1:] - (slope * sx - across * sy)
+    b[1] = period * path.x[1:] - (slope * sy + across * sx)
+    q_v, q_omega = variances
+    terms = np.empty((6, k))
+    terms[0] = q_omega
+    np.multiply(q_omega, b, out=terms[1:3])
+    np.multiply(terms[1], b, out=terms[3:5])
+    np.multiply(terms[2], b[1], out=terms[5])
+    along = q_v * path.shift
+    terms[3] += along[0] * sx
+    terms[4] += along[0] * sy
+    terms[5] += along[1] * sy
+    return Wander(variances, b, path.shift, _summed(terms))
 
 
-def _summed(values: Array) -> Array:
-    """Of all before each tick; shape (n, k) -> (n, k + 1)."""
-    sums = np.zeros((values.shape[0], values.shape[1] + 1))
-    np.cumsum(values, axis=1, out=sums[:, 1:])
-    return sums
+def _shortening(half: Array, period: float) -> Array:
+    """s: by what part a chord changes with omega, d(ln A) / d omega; `half` is omega T_s / 2."""
+    safe = np.where(np.abs(half) < SLIGHT, 1.0, half)
+    by_half = np.where(np.abs(half) < SLIGHT, -half / 3.0, 1.0 / np.tan(safe) - 1.0 / safe)
+    shortening: Array = 0.5 * period * by_half
+    return shortening
+
+
+SLIGHT = 1e-4
+"""rad: less than this, a turn shortens a chord as its series says"""
 
 
 class Seen(NamedTuple):
@@ -127,14 +142,14 @@ class Seen(NamedTuple):
 
 
 def spread(drift: Wander, rows: Seen) -> Array:
-    """m^2: the covariance, between N rows, that noise in the odometry makes; shape (N, N)."""
-    at = np.minimum(rows.tick[:, None], rows.tick[None, :])
+    """m^2: the covariance, between N rows, that noise in the odometry makes; (N, N)."""
+    at = np.minimum(rows.tick[:, None], rows.tick)
+    c0, bx, by, xx, xy, yy = drift.sums[:, at]
     (ux, uy), lever = rows.u, rows.lever
-    c1x, c1y = drift.c1[0][at], drift.c1[1][at]
-    cross = lever[:, None] * (c1x * ux + c1y * uy)
-    xx, xy, yy = drift.c2[0][at], drift.c2[1][at], drift.c2[2][at]
-    quadratic = ux[:, None] * (xx * ux + xy * uy) + uy[:, None] * (xy * ux + yy * uy)
-    covariance: Array = lever[:, None] * lever * drift.c0[at] - cross - cross.T + quadratic
+    column, left, above = lever[:, None], ux[:, None], uy[:, None]
+    cross = column * (bx * ux + by * uy)
+    covariance: Array = column * lever * c0 - cross - cross.T
+    covariance += left * (xx * ux + xy * uy) + above * (xy * ux + yy * uy)
     return covariance
 
 
@@ -156,21 +171,21 @@ class Errors(NamedTuple):
 
 def moved(drift: Wander, rows: Seen, errors: Errors) -> Array:
     """m: by how much `errors` move what the rows look at, to first order; shape (N,)."""
-    turned = _summed(errors.omega[None])[0][rows.tick]
-    shifted = _summed(errors.v * drift.s - errors.omega * drift.b)[:, rows.tick]
-    move: Array = rows.lever * turned + rows.u[0] * shifted[0] + rows.u[1] * shifted[1]
+    moves = np.empty((3, len(errors.v)))
+    moves[0] = errors.omega
+    moves[1:] = errors.v * drift.shift - errors.omega * drift.b
+    turned, x, y = _summed(moves)[:, rows.tick]
+    move: Array = rows.lever * turned + rows.u[0] * x + rows.u[1] * y
     return move
 
 
 def attributed(drift: Wander, rows: Seen, residuals: Array) -> Errors:
     """The odometry's errors that go with `residuals`, weighted by their inverse covariance; shape (N,)."""
-    k = len(drift.q_v)
-    after = [
-        np.cumsum(np.bincount(rows.tick, residuals * weight, k + 1)[::-1])[::-1][1:]
-        for weight in (rows.lever, rows.u[0], rows.u[1])
-    ]
-    lever, x, y = after
+    k = drift.b.shape[1]
+    after = np.zeros((3, k + 1))
+    np.add.at(after, (slice(None), rows.tick), residuals * np.stack((rows.lever, *rows.u)))
+    lever, x, y = np.cumsum(after[:, :0:-1], axis=1)[:, ::-1]
+    q_v, q_omega = drift.variances
     return Errors(
-        drift.q_v * (x * drift.s[0] + y * drift.s[1]),
-        drift.q_omega * (lever - x * drift.b[0] - y * drift.b[1]),
+        q_v * (x * drift.shift[0] + y * drift.shift[1]), q_omega * (lever - x * drift.b[0] - y * drift.b[1])
     )
