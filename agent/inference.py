@@ -84,7 +84,7 @@ def settled(weighed: Sequence[Weighed], mission: Mission) -> bool:
     """Whether what is left to know of the anchor is worth less than moving on."""
     best = weighed[0]
     return (
-        np.count_nonzero(best.fit.weights > 0.5) >= ANCHOR_RANGES
+        int(np.count_nonzero(best.fit.weights > 0.5)) >= ANCHOR_RANGES
         and best.hypothesis.odds >= SURE_OF_BRANCH
         and math.sqrt(float(np.trace(best.fit.covariance))) <= mission.foothold
     )
@@ -130,6 +130,58 @@ def search(pair: Pair) -> tuple[Weighed, ...]:
 def held_together(weighed: Sequence[Weighed], pair: Pair) -> list[Held]:
     """For planning: both poses relative to M1, and their covariance."""
     return [Held(one.hypothesis.odds, *poses(one.fit, pair.apart)) for one in weighed]
+
+
+def missing_for(
+    weighed: Sequence[Weighed], held: Sequence[Held], pair: Pair, mission: Mission, mutual: int
+) -> str | None:
+    """What is lacking before a claim, which needs `mutual` mutual ranges; None if it is nothing."""
+    if pair.ranges.counts[2] < mutual:
+        return f"{pair.ranges.counts[2]} mutual ranges, of {mutual}"
+    if not weighed:
+        return "no hypothesis explains the ranges"
+    odds, free = weighed[0].hypothesis.odds, max(len(pair.ranges.rho) - 6, 1)
+    if odds < mission.confidence:
+        return (
+            f"the likeliest of {len(weighed)} hypotheses has the odds {odds:.6f}, of {mission.confidence:g}"
+        )
+    chi2 = weighed[0].fit.chi2
+    if chi2 > free + PLAUSIBLE * math.sqrt(2.0 * free) + PLAUSIBLE**2:
+        return f"the likeliest hypothesis fits badly: chi-square {chi2:.3g} for {free} degrees of freedom"
+    _, covariance = bent(held[0], pair.apart)
+    for i, robot in ((0, "a"), (3, "b")):
+        position = math.sqrt(covariance[i, i] + covariance[i + 1, i + 1])
+        if position > mission.accuracy:
+            return f"{robot}'s position is known to {position:.3g} m, of {mission.accuracy:g}"
+        heading = math.sqrt(covariance[i + 2, i + 2])
+        if heading > ASKEW:
+            return f"{robot}'s heading is known to {heading:.3g} rad, of {ASKEW:g}"
+    return None
+
+
+ASKEW = 0.2
+"""rad: with a heading less well known than this the ellipse is no likeness of what is possible"""
+
+PLAUSIBLE = 5.0
+"""standard deviations by which chi-square may exceed what it should be, before nothing is claimed"""
+
+
+def with_pair(mind: Mind, weighed: Sequence[Weighed], pair: Pair, mutual: int) -> Mind:
+    """`mind`, with these hypotheses of how both lie in <W>."""
+    briefing = mind.briefing
+    robot, m1 = (0, briefing.anchor) if briefing.role == "a" else (1, briefing.peer_anchor)
+    held = held_together(weighed, pair)
+    claims = [claim(one, robot, pair) for one in held]
+    first, _ = mind.findings.candidates or (len(weighed), 0)
+    findings = replace(
+        mind.findings,
+        pair=tuple(one.hypothesis for one in weighed),
+        poses=tuple(Pose(m1.x + pose.x, m1.y + pose.y, pose.heading) for pose, _ in claims),
+        covariance=claims[0][1] if claims else None,
+        candidates=(first, len(weighed)),
+        missing=missing_for(weighed, held, pair, briefing.mission, mutual),
+    )
+    return replace(mind, findings=findings)
 
 
 def claim(held: Held, robot: int, pair: Pair) -> tuple[Pose, Covariance]:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
+from agent import letter
 from agent.belief import Sighting, weigh_placements
 from agent.mind import WORDS, Done, Mind
 from agent.phases import encounter
@@ -42,7 +43,8 @@ def met(mind: Mind) -> Mind:
     findings = replace(mind.findings, met=mind.tick)
     if mind.briefing.role == "b":
         return replace(mind, state=Standing(), findings=findings)
-    straight = Straight("peer", mind.odometry, mind.mutual[-1].range)
+    rho = mind.mutual[-1].range if mind.mutual else mind.briefing.mission.sensing_range  # a drop-out
+    straight = Straight("peer", mind.odometry, rho)
     return replace(mind, state=straight, findings=findings)
 
 
@@ -52,6 +54,8 @@ def considered(mind: Mind) -> Mind:
     The letter looks at the encounter alone; `assured` also at what was ranged, and what was silent, before.
     """
     mission, distance = mind.briefing.mission, mind.briefing.anchor_distance
+    if not mission.noise.exact:
+        return mind if letter.waits(mind) else letter.considered(mind)
     variant, began = mind.briefing.variant, mind.findings.met
     assert began is not None
     sightings = mind.sightings(began if variant == "paper" else 0)

@@ -80,6 +80,10 @@ class Findings(msgspec.Struct, frozen=True):
     """in <W>, by each of these"""
     covariance: Covariance | None = None
     """of the first"""
+    missing: str | None = None
+    """under noise: what there is to know yet, before it can claim"""
+    returns: int = 0
+    """under noise: how often it went back to its anchor"""
 
 
 class Mind(msgspec.Struct, frozen=True):

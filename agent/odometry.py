@@ -6,7 +6,6 @@ any two ticks follows from sums up to the earlier one.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -183,7 +182,8 @@ def attributed(drift: Wander, rows: Seen, residuals: Array) -> Errors:
     """The odometry's errors that go with `residuals`, weighted by their inverse covariance; shape (N,)."""
     k = drift.b.shape[1]
     after = np.zeros((3, k + 1))
-    np.add.at(after, (slice(None), rows.tick), residuals * np.stack((rows.lever, *rows.u)))
+    for sums, weight in zip(after, (rows.lever, *rows.u), strict=True):
+        np.add.at(sums, rows.tick, residuals * weight)
     lever, x, y = np.cumsum(after[:, :0:-1], axis=1)[:, ::-1]
     q_v, q_omega = drift.variances
     return Errors(

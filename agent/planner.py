@@ -15,7 +15,7 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from agent import meeting, radio, survey
+from agent import letter, meeting, radio, survey
 from agent.belief import ON_ANCHOR, Branch, branches, weigh_branches
 from agent.mind import Asleep, Done, Mind
 from agent.phases import anchor, encounter, rendezvous, seeking
@@ -44,7 +44,7 @@ def observe(mind: Mind, sense: Sense) -> Mind:
     for contact in sense.contacts:
         if contact.peer == mind.briefing.peer and contact.range is not None:
             mutual = (*mutual, Ranged(sense.tick, contact.range))
-    near = any([contact.peer == mind.briefing.peer for contact in sense.contacts])
+    near = any(contact.peer == mind.briefing.peer for contact in sense.contacts)
     sensed = Mind(
         mind.briefing, mind.state, sense.tick, odometry, log, mutual, mind.findings, mind.radio, near
     )
@@ -140,9 +140,9 @@ def _advanced(mind: Mind, anchor_range: float | None) -> Mind:
     if _surveys(mind) and not isinstance(mind.state, Asleep):
         return survey.sensed(mind, anchor_range)
     match mind.state:
-        case Orbiting() | Standing() | Waiting() | Done():
+        case Standing() | Waiting() | Done():
             return mind
-        case Aligning() | Radial() | Tangent():
+        case Aligning() | Radial() | Tangent() | Orbiting():
             return _on_to_orbit(mind, mind.state)
         case Straight(beacon) | Backing(beacon) | Turning(beacon) | Circling(beacon):
             measured = mind.in_contact if beacon == "peer" else anchor_range is not None
@@ -190,6 +190,11 @@ def _released(mind: Mind, rho0: float | None) -> Mind:
 
 def _second_range(mind: Mind) -> Mind:
     """The branches +-alpha, less what silence on the way rules out."""
+    if not mind.briefing.mission.noise.exact:
+        mind, likely = letter.with_branches(mind)
+        if isinstance(mind.state, Circling) and len(likely) == 1:
+            return _located(mind, likely[0], "circle")
+        return _to_third_point(mind, likely)
     rho0, rho = mind.log.ranges[0].range, mind.log.ranges[-1].range
     possible = branches(rho0, mind.odometry, rho)
     left = weigh_branches(possible, mind.seen(), mind.briefing.mission.sensing_range)
@@ -210,10 +215,14 @@ def _to_third_point(mind: Mind, left: tuple[Branch, ...]) -> Mind:
 
 def _third_range(mind: Mind, state: ThirdPoint) -> Mind:
     """The branch that explains the third range, or its absence: the virtual measurement."""
+    measured = mind.log.ranges[-1].tick == mind.tick
+    kind: messages.BranchKind = "three-ranges" if measured else "three-ranges-virtual"
+    if not mind.briefing.mission.noise.exact:
+        mind, likely = letter.with_branches(mind)
+        return _located(mind, likely[0], kind) if likely else _to_third_point(mind, likely)
     left = weigh_branches(state.branches, mind.seen(), mind.briefing.mission.sensing_range)
     if len(left) == 1:
-        measured = mind.log.ranges[-1].tick == mind.tick
-        return _located(mind, left[0], "three-ranges" if measured else "three-ranges-virtual")
+        return _located(mind, left[0], kind)
     if len(left) > 1 and mind.briefing.variant == "paper":
         return mind.undecided("the third range does not tell +alpha from -alpha")
     return _to_third_point(mind, left)
@@ -228,6 +237,8 @@ def _located(mind: Mind, branch: Branch, kind: messages.BranchKind) -> Mind:
 
 def _on_to_orbit(mind: Mind, state: rendezvous.Meeting) -> Mind:
     onward = rendezvous.onward(state, mind.odometry, mind.start, mind.orbit, mind.briefing.mission)
+    if isinstance(onward, Orbiting) and not mind.briefing.mission.noise.exact:
+        onward = Orbiting(rendezvous.pursuit(mind.local_pose, mind.orbit, mind.briefing.mission))
     return mind if onward is mind.state else replace(mind, state=onward)
 
 

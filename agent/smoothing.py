@@ -170,25 +170,30 @@ def _solved(
     jacobian: Array, innovation: Array, variance: Array, wandered: Array | None, invert: bool
 ) -> System:
     columns = np.column_stack((jacobian, innovation))
-    inverse = None
+    covariance, inverse = variance, None
+    weighted: Array
     if wandered is None:
-        covariance = variance
         weighted = columns / variance[:, None]
     else:
         covariance = wandered + np.diag(variance)
         if invert:
-            inverse = np.linalg.inv(covariance)
-            weighted = inverse @ columns
+            inverse = inverse_of(covariance)
+            weighted = np.dot(inverse, columns)
         else:
-            weighted = np.linalg.solve(covariance, columns)
+            weighted = np.asarray(np.linalg.solve(covariance, columns), np.float64)
     information = jacobian.T @ weighted[:, :-1]
     information.flat[:: len(information) + 1] += RIDGE + RIDGE * np.diagonal(information)
-    of_guess = np.linalg.inv(information)
+    of_guess = inverse_of(information)
     change = of_guess @ (jacobian.T @ weighted[:, -1])
     multipliers = weighted[:, -1] - weighted[:, :-1] @ change
     return System(
         jacobian, innovation, covariance, weighted, inverse, information, of_guess, change, multipliers
     )
+
+
+def inverse_of(matrix: Array) -> Array:
+    """Of one matrix, or of each of several."""
+    return np.asarray(np.linalg.inv(matrix), np.float64)
 
 
 def _trust(system: System, weights: Array, sigma: Array, noise: Noise) -> Array:

@@ -6,23 +6,20 @@ worth less than moving on; in phase 3 both move, each tick where the next ranges
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 from msgspec.structs import replace
 
 from agent import inference
 from agent.hypotheses import Weighed, of_pair
-from agent.inference import Pair
 from agent.mind import Done, Mind
 from agent.phases import rendezvous, seeking, surveying
 from agent.phases.encounter import Returning
 from agent.phases.rendezvous import Aligning, Orbiting, Radial, Tangent
 from agent.phases.seeking import Backing, Circling, Homing, Straight, Turning
-from agent.phases.surveying import Held, Surveying
-from agent.ranging import SIGMA_FLOOR
+from agent.phases.surveying import Surveying
 from protocol.messages import BranchKind, Localised
-from protocol.motion import ORIGIN, REST, Controls, Pose
+from protocol.motion import ORIGIN, REST, Controls
 
 LOST = 3
 """ticks of silence where there should be a range, before the robot goes back"""
@@ -36,11 +33,11 @@ SEARCHED = frozenset(3 * 2**n for n in range(12))
 CHECKED = 8
 """mutual ranges at the least before a claim"""
 
-ASKEW = 0.2
-"""rad: with a heading less well known than this the ellipse is no likeness of what is possible"""
+FEW = 3
+"""mutual ranges; with fewer, hypotheses are too many to be of use"""
 
-PLAUSIBLE = 5.0
-"""standard deviations by which chi-square may exceed what it should be, before nothing is claimed"""
+ENOUGH = 60
+"""mutual ranges, after which it is ranges to the anchor that are lacking"""
 
 
 def sensed(mind: Mind, anchor_range: float | None) -> Mind:
@@ -90,8 +87,7 @@ def _surveyed(mind: Mind) -> Mind:
         kind: BranchKind = "circle" if len(mind.log.ranges) == 2 else "three-ranges"
         mind = replace(mind, findings=replace(mind.findings, branch_kind=kind))
         return _parted(mind)
-    sigma = max(mission.noise.anchor_sigma, SIGMA_FLOOR)
-    drive = surveying.alone(inference.held_alone(weighed), sigma, mission)
+    drive = surveying.alone(inference.held_alone(weighed), mission)
     return replace(mind, state=Surveying("anchor", drive))
 
 
@@ -99,7 +95,7 @@ def _homeward(mind: Mind) -> Mind:
     """Back to where the anchor was ranged last; all that is held of where it is, is doubted."""
     last = mind.log.ranges[-1].tick
     place = mind.log.pose(ORIGIN, last, mind.briefing.mission.period)
-    findings = replace(mind.findings, own=(), met=None, pair=())
+    findings = replace(mind.findings, own=(), met=None, pair=(), returns=mind.findings.returns + 1)
     return replace(mind, state=Homing(place), findings=findings)
 
 
@@ -113,23 +109,20 @@ def _under_way(mind: Mind, ranged: bool) -> Mind:
     """Phase 2, with what another range to the anchor adds; b goes on to survey where it waits."""
     mission = mind.briefing.mission
     weighed: Sequence[Weighed] = ()
-    if ranged:
-        weighed = inference.own_anchor(mind)
+    if ranged and (weighed := inference.own_anchor(mind)):
         mind = inference.with_own(mind, weighed)
     assert isinstance(mind.state, Aligning | Radial | Tangent | Orbiting)
     state = rendezvous.onward(mind.state, mind.odometry, mind.start, mind.orbit, mission)
     if isinstance(state, Orbiting):
         since = state.since or mind.tick
         silent = mind.tick - mind.log.ranges[-1].tick
-        if mind.orbit.v == 0.0 and silent >= LOST:
-            return _homeward(mind)
-        if mind.tick - since > mind.briefing.rendezvous.bound / mission.period + LOST and not mind.near:
+        late = mind.tick - since > mind.briefing.rendezvous.bound / mission.period + LOST
+        if (mind.orbit.v == 0.0 and silent >= LOST) or (late and not mind.near):
             return _homeward(mind)
         if mind.orbit.v != 0.0:
             drive = rendezvous.pursuit(mind.local_pose, mind.orbit, mission)
         elif weighed:
-            sigma = max(mission.noise.anchor_sigma, SIGMA_FLOOR)
-            drive = surveying.alone(inference.held_alone(weighed), sigma, mission, mind.orbit.radius)
+            drive = surveying.alone(inference.held_alone(weighed), mission, mind.orbit.radius)
         else:
             drive = REST
         state = Orbiting(drive, since)
@@ -158,57 +151,37 @@ def heard(mind: Mind) -> Mind:
 
 def _considered(mind: Mind) -> Mind:
     """Both logs in hand: weigh the hypotheses; then claim, or plan what both do next."""
+    mission, role = mind.briefing.mission, mind.briefing.role
     if mind.findings.met is None:
         mind = replace(mind, findings=replace(mind.findings, met=mind.tick))
-    mission, role = mind.briefing.mission, mind.briefing.role
     pair = inference.pair_of(mind)
     mutual = pair.ranges.counts[2]
-    if mutual < 3:
-        ahead = Controls(mission.first_straight / mission.period, 0.0)
-        return replace(mind, state=Surveying("peer", ahead if role == "a" else REST))
-    searched = mutual in SEARCHED or not mind.findings.pair
-    weighed = inference.search(pair) if searched else of_pair(mind.findings.pair, (), (), pair)
-    held = inference.held_together(weighed, pair)
-    if not searched and _sure(mind, weighed, held, pair, mutual):
+    if mutual < FEW:
+        return _blindly(mind)
+    known = mind.findings.pair
+    searched = not known or mutual in SEARCHED
+    weighed = inference.search(pair) if searched else of_pair(known, (), (), pair)
+    judged = inference.with_pair(mind, weighed, pair, CHECKED)
+    if judged.findings.missing is None and not searched:
         weighed = inference.search(pair)
-        held = inference.held_together(weighed, pair)
-        searched = True
-    mind = _noted(mind, weighed, held, pair)
-    if searched and _sure(mind, weighed, held, pair, mutual):
-        claim = Localised(mind.findings.poses[0], mind.findings.covariance)
-        return replace(mind, state=Done(3, claim))
-    sigmas = (
-        max(mission.noise.anchor_sigma, SIGMA_FLOOR),
-        max(mission.noise.mutual_sigma, SIGMA_FLOOR),
-    )
-    a, b = surveying.together(held, sigmas, ((0.0, 0.0), pair.apart), mission)
-    return replace(mind, state=Surveying("peer", a if role == "a" else b))
+        judged = inference.with_pair(mind, weighed, pair, CHECKED)
+    if judged.findings.missing is None:
+        return claimed(judged)
+    if role == "a" and mutual >= ENOUGH * (1 + mind.findings.returns):
+        return _homeward(judged)
+    if not weighed:
+        return _blindly(judged)
+    a, b = surveying.together(inference.held_together(weighed, pair), pair.apart, mission)
+    return replace(judged, state=Surveying("peer", a if role == "a" else b))
 
 
-def _sure(mind: Mind, weighed: Sequence[Weighed], held: Sequence[Held], pair: Pair, mutual: int) -> bool:
-    """Whether both robots' poses are known as well as the mission asks, and the fit is a plausible one."""
+def _blindly(mind: Mind) -> Mind:
+    """While nothing is known of how the two lie: b stands, a goes straight on (Section III.C.a)."""
     mission = mind.briefing.mission
-    if mutual < CHECKED or not weighed or weighed[0].hypothesis.odds < mission.confidence:
-        return False
-    free = len(pair.ranges.rho) - 6
-    chi2 = weighed[0].fit.chi2
-    if chi2 > free + PLAUSIBLE * math.sqrt(2.0 * max(free, 1)) + PLAUSIBLE**2:
-        return False
-    _, covariance = inference.bent(held[0], pair.apart)
-    return all(math.sqrt(covariance[i, i] + covariance[i + 1, i + 1]) <= mission.accuracy for i in (0, 3))
+    ahead = Controls(mission.first_straight / mission.period, 0.0)
+    return replace(mind, state=Surveying("peer", ahead if mind.briefing.role == "a" else REST))
 
 
-def _noted(mind: Mind, weighed: Sequence[Weighed], held: Sequence[Held], pair: Pair) -> Mind:
-    """`mind`, with what it now holds possible."""
-    briefing = mind.briefing
-    robot, m1 = (0, briefing.anchor) if briefing.role == "a" else (1, briefing.peer_anchor)
-    claims = [inference.claim(one, robot, pair) for one in held]
-    before = mind.findings.candidates[0] if mind.findings.candidates is not None else len(weighed)
-    findings = replace(
-        mind.findings,
-        pair=tuple(one.hypothesis for one in weighed),
-        poses=tuple(Pose(m1.x + pose.x, m1.y + pose.y, pose.heading) for pose, _ in claims),
-        covariance=claims[0][1] if claims else None,
-        candidates=(before, len(weighed)),
-    )
-    return replace(mind, findings=findings)
+def claimed(mind: Mind) -> Mind:
+    """The likeliest hypothesis is the one."""
+    return replace(mind, state=Done(3, Localised(mind.findings.poses[0], mind.findings.covariance)))

@@ -17,6 +17,10 @@ PREFERENCE = 1e-9
 """a later choice must be better than an earlier one by more than rounding"""
 
 
+SIGMAS = 3.0
+"""of a range: how far inside R a point must lie under noise to count on its range"""
+
+
 class ThirdPoint(msgspec.Struct, frozen=True):
     """Drives to where the branches that are left predict different ranges (eqs. (3) to (5))."""
 
@@ -62,7 +66,7 @@ def _outward(place: Pose, half_turn: float, forward: float) -> tuple[float, floa
 
 def _reach(along: float, across: float, mission: Mission) -> float:
     """m: how far a robot can go before it is out of range, eq. (5); negative where it is already."""
-    rim = mission.sensing_range - RANGE_MARGIN
+    rim = mission.sensing_range - max(RANGE_MARGIN, SIGMAS * mission.noise.anchor_sigma)
     inside = rim * rim - across * across
     return math.sqrt(inside) - along if inside >= 0.0 else -math.inf
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from agent.odometry import Array
+from agent.odometry import Array, Places
 from agent.phases.seeking import Beacon
 from agent.ranging import SIGMA_FLOOR
 from protocol.mission import Mission
@@ -90,7 +90,7 @@ class Held(NamedTuple):
     covariance: Array
 
 
-def alone(held: Sequence[Held], sigma: float, mission: Mission, within: float | None = None) -> Controls:
+def alone(held: Sequence[Held], mission: Mission, within: float | None = None) -> Controls:
     """The manoeuvre whose ranges to the anchor, at the origin, are expected to tell most.
 
     The covariance is that of the anchor's place. `within` is how far (m) from it the robot may go.
@@ -104,7 +104,7 @@ def alone(held: Sequence[Held], sigma: float, mission: Mission, within: float | 
         distances.append(np.maximum(np.hypot(x, y), SIGMA_FLOOR))
         if one is best:
             ux, uy = x / distances[0], y / distances[0]
-    sigma = max(sigma, FINE * mission.accuracy)
+    sigma = max(mission.noise.anchor_sigma, FINE * mission.accuracy)
     weight = (distances[0] <= reach) / sigma**2
     information = np.linalg.inv(best.covariance + np.eye(2) * (FINE * mission.accuracy) ** 2)
     xx = information[0, 0] + np.sum(weight * ux * ux, 1)
@@ -121,32 +121,31 @@ def alone(held: Sequence[Held], sigma: float, mission: Mission, within: float | 
     return Controls(float(ways.v[i]), float(ways.omega[i]))
 
 
-def together(
-    held: Sequence[Held],
-    sigmas: tuple[float, float],
-    anchors: tuple[tuple[float, float], tuple[float, float]],
-    mission: Mission,
-) -> tuple[Controls, Controls]:
+def together(held: Sequence[Held], m2: tuple[float, float], mission: Mission) -> tuple[Controls, Controls]:
     """The manoeuvres of a and b after which both know best where they are.
 
-    `sigmas` are of anchor and mutual ranges, in m; the covariance is that of both poses, (6, 6). First b's, as if
-    a stood; then a's, as b will drive.
+    The covariance is that of both poses, (6, 6), relative to M1; M2 is at `m2`. First b's is chosen, as if a
+    stood; then a's, as b will drive.
     """
     ways = choice(mission)
     stand = len(ways.v) - 1
     still = np.array([stand])
-    _, b = _best_of(ways, held, sigmas, anchors, mission, still, np.arange(stand + 1))
-    a, _ = _best_of(ways, held, sigmas, anchors, mission, np.arange(stand + 1), np.array([b]))
+    _, b = _best_of(ways, held, m2, mission, still, np.arange(stand + 1))
+    a, _ = _best_of(ways, held, m2, mission, np.arange(stand + 1), np.array([b]))
     return (
         Controls(float(ways.v[a]), float(ways.omega[a])),
         Controls(float(ways.v[b]), float(ways.omega[b])),
     )
 
 
-def _best_of(ways, held, sigmas, anchors, mission, of_a, of_b) -> tuple[int, int]:
+def _best_of(
+    ways: Choice, held: Sequence[Held], m2: tuple[float, float], mission: Mission, of_a: Places, of_b: Places
+) -> tuple[int, int]:
     """Of the ways `of_a` and `of_b`, one of which is a single one."""
     reach = mission.sensing_range
-    sigmas = (max(sigmas[0], FINE * mission.accuracy), max(sigmas[1], FINE * mission.accuracy))
+    own_sigma = max(mission.noise.anchor_sigma, FINE * mission.accuracy)
+    sigma = max(mission.noise.mutual_sigma, FINE * mission.accuracy)
+    anchors = ((0.0, 0.0), m2)
     count = max(len(of_a), len(of_b))
     distances = []
     cost = np.zeros(count)
@@ -161,7 +160,7 @@ def _best_of(ways, held, sigmas, anchors, mission, of_a, of_b) -> tuple[int, int
             continue
         rows = np.zeros((count, 3 * AHEAD, 6))
         nx, ny = dx / distance, dy / distance
-        weight = (distance <= reach) / sigmas[1]
+        weight = (distance <= reach) / sigma
         for robot, (x, y), sign in ((0, (ax, ay), 1.0), (1, (bx, by), -1.0)):
             px, py = one.poses[3 * robot : 3 * robot + 2]
             i = 3 * robot
@@ -170,7 +169,7 @@ def _best_of(ways, held, sigmas, anchors, mission, of_a, of_b) -> tuple[int, int
             rows[:, :AHEAD, i + 2] = sign * (ny * (x - px) - nx * (y - py)) * weight
             ox, oy = x - anchors[robot][0], y - anchors[robot][1]
             rho = np.maximum(np.hypot(ox, oy), SIGMA_FLOOR)
-            own = (rho <= reach) / rho / sigmas[0]
+            own = (rho <= reach) / rho / own_sigma
             own_rows = slice((robot + 1) * AHEAD, (robot + 2) * AHEAD)
             rows[:, own_rows, i] = ox * own
             rows[:, own_rows, i + 1] = oy * own
@@ -182,7 +181,7 @@ def _best_of(ways, held, sigmas, anchors, mission, of_a, of_b) -> tuple[int, int
             variance = left[:, i, i] + left[:, i + 1, i + 1] + (dx * dx + dy * dy) * left[:, i + 2, i + 2]
             variance += 2.0 * (dx * left[:, i + 1, i + 2] - dy * left[:, i, i + 2])
             cost += variance / mission.accuracy**2
-    cost += _confusion(held, distances, sigmas[1], reach)
+    cost += _confusion(held, distances, sigma, reach)
     i = int(np.argmin(cost))
     return int(of_a[i if len(of_a) > 1 else 0]), int(of_b[i if len(of_b) > 1 else 0])
 
@@ -201,7 +200,7 @@ def _confusion(held: Sequence[Held], distances: Sequence[Array], sigma: float, r
     return CONFUSION * left
 
 
-def _ends(ways: Choice, pose: Array, some: Array | slice = slice(None)) -> tuple[Array, Array]:
+def _ends(ways: Choice, pose: Array, some: Places | slice = slice(None)) -> tuple[Array, Array]:
     """m: where the ways lead from `pose`, (C, AHEAD)."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     along, across = ways.along[some], ways.across[some]

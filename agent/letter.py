@@ -1,0 +1,75 @@
+"""The paper to the letter where sensors are noisy: its manoeuvres and no others, weighed by likelihood.
+
+It takes the branch that is likeliest, and claims only what the mission asks for: with the few ranges that the letter
+takes it mostly cannot, and says what is missing.
+"""
+
+from __future__ import annotations
+
+import math
+
+from msgspec.structs import replace
+
+from agent import inference
+from agent.belief import Branch
+from agent.geometry import Placement
+from agent.mind import Mind
+from agent.phases import encounter
+from agent.phases.encounter import LastManoeuvre, Standing
+from agent.phases.surveying import Held
+from agent.survey import claimed
+from protocol.motion import ORIGIN, wrap
+
+CHECKED = 3
+"""mutual ranges before a claim"""
+
+LIKELY = 0.05
+"""odds from which on a branch is worth a manoeuvre that tells it from others"""
+
+
+def with_branches(mind: Mind) -> tuple[Mind, tuple[Branch, ...]]:
+    """The branches that are likely, the likeliest first; and `mind`, which takes the first."""
+    weighed = inference.own_anchor(mind)
+    if not weighed:
+        return mind, ()
+    likely = [one for one in weighed if one.hypothesis.odds >= LIKELY]
+    branches = tuple([inference.branch_of(mind, one) for one in likely])
+    own = tuple([one.hypothesis for one in weighed])
+    return replace(mind, findings=replace(mind.findings, own=own)), branches
+
+
+def considered(mind: Mind) -> Mind:
+    """Phase 3, after a's second range and again after b's last manoeuvre."""
+    pair = inference.pair_of(mind)
+    mutual = pair.ranges.counts[2]
+    if mutual < CHECKED - 1:
+        return mind
+    weighed = inference.search(pair)
+    mind = inference.with_pair(mind, weighed, pair, CHECKED)
+    missing = mind.findings.missing
+    if missing is None:
+        return claimed(mind)
+    if mind.findings.plan is not None or not weighed:
+        return mind.undecided(f"the letter takes no more ranges: {missing}")
+    if mind.briefing.role == "a":
+        return mind
+    placements = [_seen_from_b(held) for held in inference.held_together(weighed, pair)]
+    plan = encounter.last_manoeuvre("b", ORIGIN, ORIGIN, placements, mind.briefing.mission, "paper")
+    return replace(
+        mind,
+        state=LastManoeuvre(plan.drive, mind.odometry),
+        findings=replace(mind.findings, plan=plan),
+    )
+
+
+def waits(mind: Mind) -> bool:
+    """Whether b has yet to hear that a has its second range."""
+    return isinstance(mind.state, Standing) and mind.findings.plan is None and mind.radio.state != "waiting"
+
+
+def _seen_from_b(held: Held) -> Placement:
+    """Where a is, and how it is turned, in b's own frame."""
+    ax, ay, a_heading, bx, by, b_heading = held.poses.tolist()
+    c, s = math.cos(b_heading), math.sin(b_heading)
+    dx, dy = ax - bx, ay - by
+    return Placement(wrap(a_heading - b_heading), c * dx + s * dy, c * dy - s * dx)
