@@ -170,7 +170,8 @@ def _surveys(mind: Mind) -> bool:
 def _again(mind: Mind, sense: Sense) -> bool:
     """Whether the anchor's range is the last one over again, from where the robot has stood since phase 1."""
     return (
-        mind.findings.branch is not None
+        mind.briefing.mission.noise.exact
+        and mind.findings.branch is not None
         and sense.executed == REST
         and sense.anchor_range == mind.log.ranges[-1].range
     )

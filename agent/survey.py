@@ -116,8 +116,8 @@ def _under_way(mind: Mind, ranged: bool) -> Mind:
     if isinstance(state, Orbiting):
         since = state.since or mind.tick
         silent = mind.tick - mind.log.ranges[-1].tick
-        late = mind.tick - since > mind.briefing.rendezvous.bound / mission.period + LOST
-        if (mind.orbit.v == 0.0 and silent >= LOST) or (late and not mind.near):
+        late = mind.tick - since > mind.briefing.rendezvous.bound / mission.period + LOST and not mind.near
+        if late if mind.orbit.v else silent >= LOST:
             return _homeward(mind)
         if mind.orbit.v != 0.0:
             drive = rendezvous.pursuit(mind.local_pose, mind.orbit, mission)

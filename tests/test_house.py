@@ -38,7 +38,14 @@ PURE = {
     "agent.meeting",
     "agent.belief",
     "agent.geometry",
+    "agent.hypotheses",
+    "agent.inference",
+    "agent.letter",
     "agent.logbook",
+    "agent.odometry",
+    "agent.ranging",
+    "agent.smoothing",
+    "agent.survey",
     "agent.radio",
     *(
         ".".join(path.relative_to(HOUSE).with_suffix("").parts)
