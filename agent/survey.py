@@ -24,6 +24,9 @@ from protocol.motion import ORIGIN, REST, Controls
 LOST = 3
 """ticks of silence where there should be a range, before the robot goes back"""
 
+LOST_TOGETHER = 6
+"""likewise of b in phase 3, in which it may drive a little outside"""
+
 MISLED = -8.0
 """in log-likelihood: less likely than this, it is not the sensors' chance that a hypothesis has against it"""
 
@@ -56,6 +59,8 @@ def sensed(mind: Mind, anchor_range: float | None) -> Mind:
             return replace(mind, state=Straight("anchor", place, 0.0)) if there else mind
         case Aligning() | Radial() | Tangent() | Orbiting():
             return _under_way(mind, anchor_range is not None)
+        case Surveying("peer") if mind.briefing.role == "b" and _silent(mind) >= LOST_TOGETHER:
+            return _homeward(mind)
         case Surveying("peer", drive) if not mind.near:
             return replace(mind, state=Returning(Controls(-drive.v, -drive.omega), mind.odometry))
         case Returning() if not mind.near:
@@ -76,7 +81,7 @@ def _surveyed(mind: Mind) -> Mind:
     weighed = inference.own_anchor(mind)
     if weighed:
         mind = inference.with_own(mind, weighed)
-    if not ranged and mind.tick - mind.log.ranges[-1].tick >= LOST:
+    if _silent(mind) >= LOST:
         return _homeward(mind)
     if not weighed or weighed[0].silence < MISLED:
         if not ranged:
@@ -89,6 +94,11 @@ def _surveyed(mind: Mind) -> Mind:
         return _parted(mind)
     drive = surveying.alone(inference.held_alone(weighed), mission)
     return replace(mind, state=Surveying("anchor", drive))
+
+
+def _silent(mind: Mind) -> int:
+    """Ticks since the anchor was ranged."""
+    return mind.tick - mind.log.ranges[-1].tick
 
 
 def _homeward(mind: Mind) -> Mind:
@@ -115,9 +125,8 @@ def _under_way(mind: Mind, ranged: bool) -> Mind:
     state = rendezvous.onward(mind.state, mind.odometry, mind.start, mind.orbit, mission)
     if isinstance(state, Orbiting):
         since = state.since or mind.tick
-        silent = mind.tick - mind.log.ranges[-1].tick
         late = mind.tick - since > mind.briefing.rendezvous.bound / mission.period + LOST and not mind.near
-        if late if mind.orbit.v else silent >= LOST:
+        if late if mind.orbit.v else _silent(mind) >= LOST:
             return _homeward(mind)
         if mind.orbit.v != 0.0:
             drive = rendezvous.pursuit(mind.local_pose, mind.orbit, mission)

@@ -155,7 +155,13 @@ def _best_of(
         dx, dy = ax - bx, ay - by
         distance = np.maximum(np.hypot(dx, dy), SIGMA_FLOOR)
         distances.append(distance)
-        cost += one.odds * LOSS * np.maximum(0.0, distance[:, 0] - MARGIN * reach)
+        off_anchor = np.hypot(bx[:, 0] - m2[0], by[:, 0] - m2[1])
+        for beyond in (
+            distance[:, 0] - MARGIN * reach,
+            off_anchor - MARGIN * reach,
+            APART * reach - np.min(distance, 1),
+        ):
+            cost += one.odds * LOSS * np.maximum(0.0, beyond)
         if one is not held[0]:
             continue
         rows = np.zeros((count, 3 * AHEAD, 6))
@@ -187,7 +193,10 @@ def _best_of(
 
 
 MARGIN = 0.9
-"""of R: how far apart two robots may plan to be"""
+"""of R: how far apart two robots may plan to be, and b from its anchor"""
+
+APART = 0.2
+"""of R: how near they may come; nearer, a range tells little of where, and they might touch"""
 
 
 def _confusion(held: Sequence[Held], distances: Sequence[Array], sigma: float, reach: float) -> Array:
