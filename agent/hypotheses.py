@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.odometry import Array, Places, Track, wander
+from agent.odometry import Array, Errors, Places, Track, wander
 from agent.ranging import SIGMA_FLOOR, Ranges, mixture, turned
 from agent.smoothing import STEPS, Fit, fit
 from protocol.noise import Drift, Noise
@@ -55,6 +55,12 @@ class Hypothesis(NamedTuple):
     that frame is turned in <W>"""
     odds: float
     """the probability that it is the true one; of all that are left they sum to 1"""
+    errors: tuple[tuple[tuple[float, ...], tuple[float, ...]], ...] = ()
+    """for each robot, what the odometry's are held to be: in v (m/s) and omega (rad/s), at each tick"""
+
+
+Start = tuple[Array, tuple[Errors, ...]]
+"""a guess, and errors of the odometry, to begin a fit with"""
 
 
 class Weighed(NamedTuple):
@@ -81,6 +87,14 @@ def with_odds(fits: Sequence[tuple[Fit, float]]) -> tuple[Weighed, ...]:
         Weighed(Hypothesis(tuple(one.guess.tolist()), odds / total), one, silent)
         for odds, one, silent in left
     )
+
+
+def _listed(errors: tuple[Errors, ...]) -> tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]:
+    return tuple([(tuple(error.v.tolist()), tuple(error.omega.tolist())) for error in errors])
+
+
+def _errors(hypothesis: Hypothesis) -> tuple[Errors, ...]:
+    return tuple([Errors(np.array(v), np.array(omega)) for v, omega in hypothesis.errors])
 
 
 def _same(one: Fit, other: Fit) -> bool:
@@ -134,20 +148,22 @@ def of_anchor(
 ) -> tuple[Weighed, ...]:
     """Where its anchor may lie in the frame of a robot's odometry: phase 1. `before` is what was left a
     tick ago; at the ticks `silent` there was no range."""
-    points = np.array([one.guess[:2] for one in before]).reshape(-1, 2)
-    lost = len(silent) and silent[-1] == len(path.x) - 1
-    if len(ranges.rho) <= SEED_RANGES or lost or not len(points):
+    known = tuple(before)
+    lost = bool(len(silent)) and silent[-1] == len(path.x) - 1
+    if known and len(ranges.rho) > SEED_RANGES and not lost:
+        starts: list[Start] = [(np.array(one.guess), _errors(one)) for one in known]
+        steps = WARM_STEPS
+    else:
+        points = np.array([one.guess[:2] for one in known]).reshape(-1, 2)
         points = np.concatenate((points, _crossings(path, ranges)))
         if not len(points):
             return ()
         variance = np.square(ranges.sigma) + _wandered(path, ranges, noise)
         points = _polished(points, path, ranges, np.sqrt(variance), noise, sensing_range)
-    fits = []
-    steps = STEPS if len(ranges.rho) <= SEED_RANGES or lost else WARM_STEPS
-    for point in points:
-        one = fit(np.array([*point, 0.0]), [path], ranges, noise, steps=steps)
-        fits.append((one, _within(one, 0, silent, ranges.tick, sensing_range, noise)))
-    return with_odds(fits)
+        starts = [(np.array([*point, 0.0]), ()) for point in points]
+        steps = STEPS
+    fits = [fit(guess, [path], ranges, noise, steps=steps, errors=errors) for guess, errors in starts]
+    return with_odds([(one, _within(one, 0, silent, ranges.tick, sensing_range, noise)) for one in fits])
 
 
 def _within(
@@ -292,21 +308,23 @@ def of_pair(
 ) -> tuple[Weighed, ...]:
     """How the two may lie in <W>: branch of a, branch of b, and placement. `before` is what was left a tick
     ago; if it is empty, the whole plane is searched."""
-    guesses = [np.array(one.guess) for one in before]
-    if guesses:
-        return _fitted(guesses, pair, WARM_STEPS)
-    guesses = [
-        np.array([*one.guess[:2], theta_a, *other.guess[:2], theta_b])
+    known = tuple(before)
+    if known:
+        return _fitted([(np.array(one.guess), _errors(one)) for one in known], pair, WARM_STEPS)
+    seeds: list[Start] = [
+        (np.array([*one.guess[:2], theta_a, *other.guess[:2], theta_b]), ())
         for one in of_a
         for other in of_b
         for theta_a, theta_b in placements(one, other, pair)
     ]
-    rough = _fitted(guesses, pair, ROUGH_STEPS)
-    return _fitted([one.fit.guess for one in rough], pair, STEPS)
+    rough = _fitted(seeds, pair, ROUGH_STEPS)
+    return _fitted([(one.fit.guess, one.fit.errors) for one in rough], pair, STEPS)
 
 
-def _fitted(guesses: Sequence[Array], pair: Pair, steps: int) -> tuple[Weighed, ...]:
-    fits = [fit(guess, pair.paths, pair.ranges, pair.noise, pair.apart, steps) for guess in guesses]
+def _fitted(starts: Sequence[Start], pair: Pair, steps: int) -> tuple[Weighed, ...]:
+    fits = [
+        fit(guess, pair.paths, pair.ranges, pair.noise, pair.apart, steps, errors) for guess, errors in starts
+    ]
     return with_odds([(one, _silence(one, pair)) for one in fits])
 
 

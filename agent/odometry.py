@@ -158,10 +158,10 @@ class Errors(NamedTuple):
     v: Array
     omega: Array
 
-    @staticmethod
-    def none(path: Track) -> Errors:
-        """Before there is a fit."""
-        return Errors(np.zeros_like(path.v), np.zeros_like(path.omega))
+    def through(self, k: int) -> Errors:
+        """The same, and none at the ticks up to `k` that have come since."""
+        more = (0, k - len(self.v))
+        return Errors(np.pad(self.v, more), np.pad(self.omega, more))
 
     def corrected(self, measured: Track) -> Track:
         """The path that was driven."""

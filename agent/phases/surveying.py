@@ -114,6 +114,7 @@ def alone(held: Sequence[Held], mission: Mission, within: float | None = None) -
     cost += _confusion(held, distances, sigma, reach)
     limit = within if within is not None else reach
     for one, distance in zip(held, distances, strict=True):
+        cost += one.odds * LOSS * np.maximum(0.0, ASIDE * reach - distance[:, 0])
         margin = math.sqrt(max(0.0, float(np.trace(one.covariance)))) if within is None else 0.0
         loss = LOSS if within is not None else ASTRAY
         cost += one.odds * loss * np.maximum(0.0, distance[:, 0] + min(margin, 0.1 * reach) - limit)
@@ -160,6 +161,7 @@ def _best_of(
             distance[:, 0] - MARGIN * reach,
             off_anchor - MARGIN * reach,
             APART * reach - np.min(distance, 1),
+            ASIDE * reach - off_anchor,
         ):
             cost += one.odds * LOSS * np.maximum(0.0, beyond)
         if one is not held[0]:
@@ -197,6 +199,9 @@ MARGIN = 0.9
 
 APART = 0.2
 """of R: how near they may come; nearer, a range tells little of where, and they might touch"""
+
+ASIDE = 0.06
+"""of R: how near a robot may come to its anchor; on which side of it, drift would then leave open"""
 
 
 def _confusion(held: Sequence[Held], distances: Sequence[Array], sigma: float, reach: float) -> Array:
