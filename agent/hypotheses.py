@@ -11,13 +11,14 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from msgspec.structs import replace
 
 from agent.odometry import Array, Errors, Places, Track, wander
 from agent.ranging import SIGMA_FLOOR, Ranges, mixture, turned
 from agent.smoothing import STEPS, Fit, fit
 from protocol.noise import Drift, Noise
 
-ODDS_KEPT = 1e-9
+ODDS_KEPT = 1e-7
 """a hypothesis that is less likely than this is given up"""
 
 MOST = 6
@@ -154,16 +155,28 @@ def of_anchor(
         starts: list[Start] = [(np.array(one.guess), _errors(one)) for one in known]
         steps = WARM_STEPS
     else:
-        points = np.array([one.guess[:2] for one in known]).reshape(-1, 2)
-        points = np.concatenate((points, _crossings(path, ranges)))
-        if not len(points):
-            return ()
-        variance = np.square(ranges.sigma) + _wandered(path, ranges, noise)
-        points = _polished(points, path, ranges, np.sqrt(variance), noise, sensing_range)
-        starts = [(np.array([*point, 0.0]), ()) for point in points]
+        places = [one.guess[:2] for one in known]
+        starts = [
+            (np.array([*point, 0.0]), ()) for point in anchors(path, ranges, sensing_range, noise, places)
+        ]
         steps = STEPS
     fits = [fit(guess, [path], ranges, noise, steps=steps, errors=errors) for guess, errors in starts]
     return with_odds([(one, _within(one, 0, silent, ranges.tick, sensing_range, noise)) for one in fits])
+
+
+def anchors(
+    path: Track,
+    ranges: Ranges,
+    sensing_range: float,
+    noise: Noise,
+    known: Sequence[Sequence[float]] = (),
+) -> Array:
+    """Where its anchor may lie in the frame of a robot's odometry (m), by its ranges alone; (n, 2)."""
+    points = np.concatenate((np.array(known).reshape(-1, 2), _crossings(path, ranges)))
+    if not len(points):
+        return points
+    variance = np.square(ranges.sigma) + _wandered(path, ranges, noise)
+    return _polished(points, path, ranges, np.sqrt(variance), noise, sensing_range)
 
 
 def _within(
@@ -302,23 +315,43 @@ class Pair(NamedTuple):
     sensing_range: float
     noise: Noise
 
+    def without_drift(self) -> Pair:
+        """The same, with ranges as much less sure as the odometry's drift makes them."""
+        if self.noise.odometry == Drift():
+            return self
+        variance = np.square(self.ranges.sigma)
+        for robot, path in enumerate(self.paths):
+            wandered = _wandered(path, self.ranges, self.noise)
+            wandered[self.ranges.rows(1 - robot)] = 0.0
+            variance = variance + wandered
+        return self._replace(
+            ranges=self.ranges._replace(sigma=np.sqrt(variance)),
+            noise=replace(self.noise, odometry=Drift()),
+        )
 
-def of_pair(
-    before: Iterable[Hypothesis], of_a: Sequence[Hypothesis], of_b: Sequence[Hypothesis], pair: Pair
-) -> tuple[Weighed, ...]:
-    """How the two may lie in <W>: branch of a, branch of b, and placement. `before` is what was left a tick
-    ago; if it is empty, the whole plane is searched."""
-    known = tuple(before)
-    if known:
-        return _fitted([(np.array(one.guess), _errors(one)) for one in known], pair, WARM_STEPS)
+
+def search(pair: Pair) -> tuple[Weighed, ...]:
+    """How the two may lie in <W>, wherever that is: branch of a, branch of b, and placement.
+
+    First by fits that take the odometry's drift for noise of the ranges; then the likely ones in full.
+    """
+    of_a, of_b = (
+        anchors(path, pair.ranges.only(robot), pair.sensing_range, pair.noise)
+        for robot, path in enumerate(pair.paths)
+    )
     seeds: list[Start] = [
-        (np.array([*one.guess[:2], theta_a, *other.guess[:2], theta_b]), ())
-        for one in of_a
-        for other in of_b
-        for theta_a, theta_b in placements(one, other, pair)
+        (np.array([*a, theta_a, *b, theta_b]), ())
+        for a in of_a
+        for b in of_b
+        for theta_a, theta_b in placements(a, b, pair)
     ]
-    rough = _fitted(seeds, pair, ROUGH_STEPS)
-    return _fitted([(one.fit.guess, one.fit.errors) for one in rough], pair, STEPS)
+    rough = _fitted(seeds, pair.without_drift(), ROUGH_STEPS)
+    return _fitted([(one.fit.guess, ()) for one in rough], pair, STEPS)
+
+
+def follow(before: Sequence[Hypothesis], pair: Pair) -> tuple[Weighed, ...]:
+    """What is left of what was held `before`, after another tick."""
+    return _fitted([(np.array(one.guess), _errors(one)) for one in before], pair, WARM_STEPS)
 
 
 def _fitted(starts: Sequence[Start], pair: Pair, steps: int) -> tuple[Weighed, ...]:
@@ -363,8 +396,10 @@ def _together(one: Fit, pair: Pair) -> float:
     return silence(beyond, sigma, pair.noise.drop_outs)
 
 
-def placements(of_a: Hypothesis, of_b: Hypothesis, pair: Pair) -> list[tuple[float, float]]:
+def placements(of_a: Array, of_b: Array, pair: Pair) -> list[tuple[float, float]]:
     """Headings of the odometry frames in <W> that may explain the mutual ranges, the likeliest few.
+
+    The anchors are at `of_a` and `of_b` (m) in these frames.
 
     The robot nearer to its anchor is turned through all its headings; one mutual range then leaves two
     headings of the other, where the circles about its anchor and about the first robot meet (Section III.C
@@ -375,8 +410,7 @@ def placements(of_a: Hypothesis, of_b: Hypothesis, pair: Pair) -> list[tuple[flo
     some = np.unique(np.linspace(0, len(ticks) - 1, SEED_RANGES).round().astype(np.intp))
     ticks, rho, sigma = ticks[some], rho[some], sigma[some]
     place = [
-        turned(np.array([*one.guess[:2], 0.0]), path, ticks)
-        for one, path in zip((of_a, of_b), pair.paths, strict=True)
+        turned(np.array([*one, 0.0]), path, ticks) for one, path in zip((of_a, of_b), pair.paths, strict=True)
     ]
     radii = [np.hypot(x, y) for x, y in place]
     near, far = (0, 1) if float(np.mean(radii[0])) < float(np.mean(radii[1])) else (1, 0)

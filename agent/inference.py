@@ -9,7 +9,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from agent.belief import Branch
-from agent.hypotheses import Pair, Weighed, missing, of_anchor, of_pair
+from agent.hypotheses import Pair, Weighed, missing, of_anchor
 from agent.logbook import Logbook
 from agent.mind import Mind
 from agent.odometry import Array, Track, track
@@ -115,16 +115,6 @@ def pair_of(mind: Mind) -> Pair:
         mission.sensing_range,
         mission.noise,
     )
-
-
-def search(pair: Pair) -> tuple[Weighed, ...]:
-    """Every way in which the two may lie in <W>, looked for anew."""
-    of = []
-    for robot in (0, 1):
-        ranges = pair.ranges.only(robot)
-        weighed = of_anchor((), pair.paths[robot], ranges, pair.silent[robot], pair.sensing_range, pair.noise)
-        of.append([one.hypothesis for one in weighed])
-    return of_pair((), of[0], of[1], pair)
 
 
 def held_together(weighed: Sequence[Weighed], pair: Pair) -> list[Held]:

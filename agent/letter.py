@@ -1,7 +1,7 @@
 """The paper to the letter where sensors are noisy: its manoeuvres and no others, weighed by likelihood.
 
-It takes the branch that is likeliest, and claims only what the mission asks for: with the few ranges that the letter
-takes it mostly cannot, and says what is missing.
+It takes the branch that is likeliest, and claims only what the mission asks for: with the few ranges that the
+letter takes it mostly cannot, and says what is missing.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from msgspec.structs import replace
 from agent import inference
 from agent.belief import Branch
 from agent.geometry import Placement
+from agent.hypotheses import search
 from agent.mind import Mind
 from agent.phases import encounter
 from agent.phases.encounter import LastManoeuvre, Standing
@@ -44,7 +45,7 @@ def considered(mind: Mind) -> Mind:
     mutual = pair.ranges.counts[2]
     if mutual < CHECKED - 1:
         return mind
-    weighed = inference.search(pair)
+    weighed = search(pair)
     mind = inference.with_pair(mind, weighed, pair, CHECKED)
     missing = mind.findings.missing
     if missing is None:

@@ -26,7 +26,7 @@ STEPS = 8
 STILL = 1e-4
 """sigmas: a step shorter than this is the last"""
 
-SETTLED = 1e-3
+SETTLED = 1e-2
 """weights that change by less than this are what they will be"""
 
 LEAP = 1.0

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from agent import inference
-from agent.hypotheses import Weighed, of_pair
+from agent.hypotheses import Weighed, follow, search
 from agent.mind import Done, Mind
 from agent.phases import rendezvous, seeking, surveying
 from agent.phases.encounter import Returning
@@ -30,14 +30,14 @@ LOST_TOGETHER = 6
 MISLED = -8.0
 """in log-likelihood: less likely than this, it is not the sensors' chance that a hypothesis has against it"""
 
-SEARCHED = frozenset(3 * 2**n for n in range(12))
-"""with so many mutual ranges the whole plane is searched again"""
-
 CHECKED = 8
 """mutual ranges at the least before a claim"""
 
 FEW = 3
 """mutual ranges; with fewer, hypotheses are too many to be of use"""
+
+SEARCHED = frozenset((FEW, *(CHECKED * 2**n for n in range(12))))
+"""with so many mutual ranges the whole plane is searched again"""
 
 ENOUGH = 60
 """mutual ranges, after which it is ranges to the anchor that are lacking"""
@@ -169,10 +169,10 @@ def _considered(mind: Mind) -> Mind:
         return _blindly(mind)
     known = mind.findings.pair
     searched = not known or mutual in SEARCHED
-    weighed = inference.search(pair) if searched else of_pair(known, (), (), pair)
+    weighed = search(pair) if searched else follow(known, pair)
     judged = inference.with_pair(mind, weighed, pair, CHECKED)
     if judged.findings.missing is None and not searched:
-        weighed = inference.search(pair)
+        weighed = search(pair)
         judged = inference.with_pair(mind, weighed, pair, CHECKED)
     if judged.findings.missing is None:
         return claimed(judged)
