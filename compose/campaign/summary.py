@@ -64,10 +64,13 @@ class Counted(msgspec.Struct, frozen=True):
     within_3_accuracy: float | None
     """of these, off by no more than 3 times mission.accuracy"""
     nees_mean: float | None
-    """over trials, each with the mean of its robots' claims: 3 is expected where covariances are true"""
+    """over trials that localised, each with the mean of its robots' claims: 3 is expected where covariances
+    are true"""
     nees_low: float | None
     """between which bounds that lies in 99 % of campaigns then"""
     nees_high: float | None
+    rmse_over_bound: float | None
+    """root mean square of the position errors of all robots, over that of their Cramér-Rao bounds"""
     reports_p50: float | None
     """sent, by all"""
     refused: str | None
@@ -93,7 +96,8 @@ def counted(table: pa.Table, refused: str | None = None) -> Counted:
     low, high = wilson(k, n)
     ticks = column(table, "ticks")[np.array([outcome == "localised" for outcome in outcomes], bool)]
     meeting, error = _known(column(table, "meeting_tick")), _known(column(table, "position_error_m"))
-    claims, nees = int(_known(column(table, "claims")).sum()), _known(column(table, "nees"))
+    right = table.filter(pa.array([outcome == "localised" for outcome in outcomes], pa.bool_()))
+    claims, nees = int(_known(column(table, "claims")).sum()), _known(column(right, "nees"))
     nees_low, nees_high = nees_band(len(nees))
     return Counted(
         trials=n,
@@ -116,9 +120,23 @@ def counted(table: pa.Table, refused: str | None = None) -> Counted:
         nees_mean=float(nees.mean()) if len(nees) else None,
         nees_low=nees_low,
         nees_high=nees_high,
+        rmse_over_bound=_rmse_over_bound(right),
         reports_p50=_percentile(_known(column(table, "reports_sent")), 50),
         refused=refused,
     )
+
+
+def _rmse_over_bound(table: pa.Table) -> float | None:
+    """Of all robots that have a bound."""
+    names = [name.removesuffix("_bound_m") for name in table.schema.names if name.endswith("_bound_m")]
+    if not names or not len(table):
+        return None
+    bounds = np.concatenate([column(table, f"{name}_bound_m") for name in names])
+    errors = np.concatenate([column(table, f"{name}_position_error_m") for name in names])
+    known = ~np.isnan(bounds)
+    if not known.any():
+        return None
+    return float(np.sqrt(np.mean(errors[known] ** 2) / np.mean(bounds[known] ** 2)))
 
 
 def wilson(k: int, n: int) -> tuple[float | None, float | None]:

@@ -26,7 +26,9 @@ _KINDS: dict[str, pa.DataType] = {
     **dict.fromkeys(("hypotheses", "claims", "claims_within"), pa.int64()),
     **dict.fromkeys(("reports_sent", "reports_heard", "bytes_sent"), pa.int64()),
     **dict.fromkeys(("period_s", "t_max_s", "wall_s", "position_error_m"), pa.float64()),
-    **dict.fromkeys(("heading_error_rad", "alpha", "odds", "position_sigma_m", "nees"), pa.float64()),
+    **dict.fromkeys(
+        ("heading_error_rad", "alpha", "odds", "position_sigma_m", "nees", "bound_m"), pa.float64()
+    ),
     **dict.fromkeys([f"cov_{name}" for name in Covariance.__struct_fields__], pa.float64()),
 }
 _OF_ALL = [field for field in Row.__struct_fields__ if field not in ("cell", "trial", "robots")]

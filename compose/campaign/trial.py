@@ -58,6 +58,8 @@ class RobotRow(msgspec.Struct, frozen=True, array_like=True):
     """as claimed: the root of the trace of the position's part of the covariance"""
     nees: float | None = None
     """of the claim"""
+    bound_m: float | None = None
+    """the Cramér-Rao bound on the position, root of the trace, of the trajectories driven until the claim"""
     cov_xx: float | None = None
     """as claimed, in m^2, m rad and rad^2; h is the heading"""
     cov_xy: float | None = None
@@ -142,6 +144,8 @@ def row(trial: Trial, record: Record, wall_s: float) -> Row:
     if end is None:
         return lost(trial.cell, trial.number, scenario.seed, "the record breaks off", wall_s)
     robots = {robot.id: _robot_row(record, i) for i, robot in enumerate(scenario.robots)}
+    for pair in scenario.pairs():
+        robots |= _bounded(robots, record, pair)
     t_max_s = max(robot.rendezvous.bound for robot in scenario.robots)
     met = [_meeting(record, scenario.robots[a].id, scenario.robots[b].id) for a, b in scenario.pairs()]
     said = record.farewells.values()
@@ -210,6 +214,20 @@ def _claimed(row: RobotRow, claim: Claim | None) -> RobotRow:
         nees=claim.nees,
         **{f"cov_{name}": getattr(covariance, name) for name in Covariance.__struct_fields__},
     )
+
+
+def _bounded(robots: dict[str, RobotRow], record: Record, pair: tuple[int, int]) -> dict[str, RobotRow]:
+    """The rows of a pair that has claimed covariances, with the bounds on them."""
+    names = [record.scenario.robots[place].id for place in pair]
+    claims = [first_claim(record, place) for place in pair]
+    if any(robots[name].position_sigma_m is None for name in names):
+        return {}
+    from compose.bound import position_bounds  # noqa: PLC0415  # where sensors are exact, it takes no numpy
+
+    bounds = position_bounds(record, pair, max([one.tick for one in claims if one is not None]))
+    if bounds is None:
+        return {}
+    return {name: replace(robots[name], bound_m=bound) for name, bound in zip(names, bounds, strict=True)}
 
 
 def _meeting(record: Record, a: str, b: str) -> tuple[int | None, int | None]:
