@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import msgpack
+import numpy as np
 import pytest
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
 
-from compose.figures import belief
+from compose.figures import belief, plane
 from compose.figures.robot import Story
 from compose.figures.robot import draw as draw_one
 from compose.inline import play
@@ -69,6 +75,12 @@ def texts(svg: Path) -> set[str]:
         for text in re.findall(r"<!-- (.*?) -->", svg.read_text(), re.DOTALL)
         for line in text.split("\n")
     }
+
+
+def line(axes: Axes, gid: str) -> tuple[list[Any], list[Any]]:
+    """The x and y of the line of that name."""
+    (found,) = [one for one in axes.lines if one.get_gid() == gid]
+    return np.asarray(found.get_xdata()).tolist(), np.asarray(found.get_ydata()).tolist()
 
 
 def ids(svg: Path) -> set[str]:
@@ -138,6 +150,43 @@ def test_each_part_of_a_noisy_mission_is_in_its_picture(noisy: Path, drawn: Path
     ellipses = {int(name.removeprefix("ellipse-")) for name in found if name.startswith("ellipse-")}
     assert 1 < len(ellipses) <= 5
     assert ellipses <= {one.tick for one in held}
+
+
+def test_what_is_drawn_over_time_is_what_the_robot_said_held_against_the_truth(noisy: Path) -> None:
+    story = Story(read(noisy), 0, estimates(noisy, "a"))
+    truth = [moment.truth.poses[0] for moment in story.record.moments]
+    said = [one for one in story.held if one.world]
+    off = [math.hypot(one.world[0].x - truth[one.tick].x, one.world[0].y - truth[one.tick].y) for one in said]
+    errors, odds = Figure().subplots(2)
+    belief.draw_error(errors, story)
+    belief.draw_odds(odds, story)
+    assert line(errors, "error") == ([one.tick for one in said], off)
+    assert line(errors, "sigma")[1] == [one.covariance.position_sigma for one in said if one.covariance]
+    likeliest = line(odds, "odds-1-plane")
+    assert likeliest[0] == [one.tick for one in said]
+    assert likeliest[1] == pytest.approx([one.odds[0] for one in said], abs=1e-5)  # 99.9995 % is the edge
+    assert max(likeliest[1]) < 1.0
+    before = line(odds, "odds-1-anchor")
+    assert before[0] == [one.tick for one in story.held if not one.world]
+    (claimed,) = line(errors, "claim")[0][:1]
+    assert story.held[claimed].localised
+    assert not story.held[claimed - 1].localised
+
+
+def test_an_ellipse_holds_what_is_within_3_sigma(noisy: Path) -> None:
+    story = Story(read(noisy), 0, estimates(noisy, "a"))
+    axes = Figure().subplots()
+    plane.draw(axes, story)
+    last = story.held[-1]
+    assert last.covariance is not None
+    (ellipse,) = axes.findobj(lambda artist: artist.get_gid() == f"ellipse-{last.tick}")
+    assert isinstance(ellipse, Ellipse)
+    outline = ellipse.get_patch_transform().transform(
+        [(1.0, 0.0), (0.0, 1.0), (math.sqrt(0.5), -math.sqrt(0.5))]
+    )
+    sigma = [[last.covariance.xx, last.covariance.xy], [last.covariance.xy, last.covariance.yy]]
+    for point in outline - [last.world[0].x, last.world[0].y]:
+        assert point @ np.linalg.solve(sigma, point) == pytest.approx(9.0)
 
 
 def test_the_same_record_gives_the_same_bytes(noisy: Path, drawn: Path, tmp_path: Path) -> None:
