@@ -87,6 +87,9 @@ def _parser() -> argparse.ArgumentParser:
 
     _add_sweep(command("sweep", "Play a campaign: many trials of a scenario, over axes of its fields."))
 
+    figures = command("figures", "Draw a record: a picture for each of its robots, into DIR/figures.")
+    figures.add_argument("record", type=_folder, metavar="DIR", help="where `tandem run --out DIR` left it")
+
     command("scenarios", "List the scenarios and the campaigns that ship.")
 
     bench = command("bench", "Measure speed, against the bare thing in the same run.")

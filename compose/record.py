@@ -20,7 +20,18 @@ import msgspec
 from compose.claim import Claim, claim, matrix
 from compose.status import UserError
 from protocol import journal
-from protocol.messages import Drive, End, Farewell, Localised, Missed, Outcome
+from protocol.messages import (
+    Briefing,
+    Drive,
+    End,
+    Estimate,
+    Farewell,
+    Localised,
+    Missed,
+    Outcome,
+    Report,
+    Sense,
+)
 from protocol.motion import Pose, wrap
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 from world.scenario import Scenario
@@ -109,6 +120,30 @@ def read(folder: Path) -> Record:
     except MalformedFrame as error:
         raise journal.CorruptJournal(f"{path}: {error}") from None
     return Record(scenario, tuple(moments), end, farewells)
+
+
+def estimates(folder: Path, robot: str) -> tuple[Estimate, ...]:
+    """What `robot` held possible, tick by tick: of its own journal in the record in `folder`.
+
+    Raises OSError if there is none, journal.CorruptJournal if it is damaged before its end, or another's.
+    """
+    path = folder / f"agent-{robot}.journal"
+    found: list[Estimate] = []
+    try:
+        for place, frame in enumerate(journal.read(path)):
+            message = decode(frame, _OF_AN_AGENT, MAX_FRAME_BYTES)
+            if isinstance(message, Briefing) != (place == 0):
+                raise journal.CorruptJournal(f"{path}: an agent's journal begins with its Briefing")
+            if isinstance(message, Briefing) and message.robot != robot:
+                raise journal.CorruptJournal(f"{path} is the journal of {message.robot}")
+            if isinstance(message, Estimate):
+                found.append(message)
+    except MalformedFrame as error:
+        raise journal.CorruptJournal(f"{path}: {error}") from None
+    return tuple(found)
+
+
+_OF_AN_AGENT = Briefing | Sense | Report | Drive | Estimate | Missed | End | Farewell
 
 
 def ticks_csv(record: Record) -> str:

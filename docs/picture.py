@@ -1,24 +1,42 @@
-"""Draws the README's picture: `uv run docs/picture.py`."""
+"""Draws two of the README's pictures: `uv run docs/picture.py`."""
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 from pathlib import Path
 
-import matplotlib as mpl
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle
 
 from compose import inline, scenario
-from compose.record import Record
+from compose.figures.robot import Story, draw
+from compose.figures.style import COLOURS, look
+from compose.record import Record, estimates
 
-COLOURS = {"a": "#0b62a4", "b": "#c4451c"}
-OUT = Path(__file__).with_name("paper-1.svg")
+PAPER = Path(__file__).with_name("paper-1.svg")
+NOISY = Path(__file__).with_name("noisy-a.svg")
 
 
 def main() -> None:
-    """The paper's first simulation, as Fig. 3(a) shows it."""
-    mpl.rcParams.update({"svg.hashsalt": "tandem", "font.size": 9})
+    """The paper's first simulation, and a robot's mission under noise."""
+    with look():
+        draw_paper()
+    draw_noisy()
+
+
+def draw_noisy() -> None:
+    """What `tandem run noisy --out DIR` and `tandem figures DIR` leave in DIR/figures/robot-a.svg."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        record = inline.play(scenario.load("noisy"), folder)
+        svg, _ = draw(Story(record, 0, estimates(folder, "a")), folder / "figures")
+        shutil.copyfile(svg, NOISY)
+
+
+def draw_paper() -> None:
+    """As Fig. 3(a) shows it."""
     figure, axes = plt.subplots(figsize=(7.2, 4.6), layout="constrained")
     record = inline.play(scenario.load("paper-1"))
     draw_anchors(axes, record)
@@ -27,18 +45,17 @@ def main() -> None:
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False)
-    figure.savefig(OUT, metadata={"Date": None})
+    figure.savefig(PAPER, metadata={"Date": None})
 
 
 def draw_anchors(axes: Axes, record: Record) -> None:
     """Each anchor, its sensing range and the orbit about it."""
     for robot in record.scenario.robots:
-        colour, place = COLOURS[robot.id], (robot.anchor.x, robot.anchor.y)
+        colour, place = COLOURS[robot.role], (robot.anchor.x, robot.anchor.y)
         orbit = robot.rendezvous.a if robot.role == "a" else robot.rendezvous.b
         axes.plot(*place, "k+", markersize=10)
-        axes.annotate(
-            "$M_1$" if robot.role == "a" else "$M_2$", place, xytext=(5, 5), textcoords="offset points"
-        )
+        name = "$M_1$" if robot.role == "a" else "$M_2$"
+        axes.annotate(name, place, xytext=(5, 5), textcoords="offset points", parse_math=True)
         axes.add_patch(
             Circle(place, record.scenario.mission.sensing_range, fill=False, ls="--", lw=0.8, color="0.4")
         )
@@ -49,7 +66,7 @@ def draw_robots(axes: Axes, record: Record) -> None:
     """Each robot's true path, where it was released, and where the two find out where they are."""
     for i, robot in enumerate(record.scenario.robots):
         path = [moment.truth.poses[i] for moment in record.moments]
-        colour = COLOURS[robot.id]
+        colour = COLOURS[robot.role]
         axes.plot(
             [p.x for p in path], [p.y for p in path], "-o", ms=2.5, lw=1.2, color=colour, label=robot.id
         )

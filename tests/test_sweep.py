@@ -467,7 +467,7 @@ def test_a_figure_tells_every_choice_of_the_other_axes_apart_while_they_are_few(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drawn: dict[str, Figure] = {}
-    monkeypatch.setattr(figures, "_save", lambda figure, path: drawn.update({path.name: figure}))
+    monkeypatch.setattr(figures, "save", lambda figure, path: drawn.update({path.name: figure}))
     third = '[[axis]]\nfield = "mission.noise.outliers"\nvalues = [0, 0.05]\n'
     third += '[[axis]]\nfield = "max_ticks"\nvalues = [1, 2, 3, 4]\n'
     (folder / "four.toml").write_text(BOTH + third)

@@ -9,7 +9,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import pyarrow as pa
 from matplotlib.axes import Axes
@@ -19,6 +18,7 @@ from matplotlib.ticker import LogFormatter
 from compose.campaign.run import Results
 from compose.campaign.spec import Axis
 from compose.campaign.summary import Counted, column, counted, orbited_over_t_max
+from compose.figures.style import look, save
 
 STYLES = (
     ("#0b3c6f", "-", "o"),
@@ -37,24 +37,18 @@ BESIDE = 96
 """characters of a legend that stand side by side"""
 APART = 0.45
 """of the room that a name has, for what stands beside each other there"""
-DPI = 160
 
 
 def draw(results: Results, folder: Path) -> None:
     """Draw them anew, each as SVG and PNG, into `folder`."""
-    mpl.rcParams.update({"svg.hashsalt": "tandem", "font.size": 9, "text.parse_math": False})
     folder.mkdir(exist_ok=True)
-    for place, axis in enumerate(results.campaign.axes):
-        if len(axis.values) > 1:
-            name = re.sub(r"[^A-Za-z0-9_-]+", "-", axis.name).strip("-")
-            _save(_success(results, place), folder / f"success-{name}")
-            _save(_ticks(results, place), folder / f"ticks-{name}")
-    _save(_meeting(results), folder / "meeting")
-
-
-def _save(figure: Figure, path: Path) -> None:
-    figure.savefig(path.with_suffix(".svg"), metadata={"Date": None})
-    figure.savefig(path.with_suffix(".png"), dpi=DPI)
+    with look():
+        for place, axis in enumerate(results.campaign.axes):
+            if len(axis.values) > 1:
+                name = re.sub(r"[^A-Za-z0-9_-]+", "-", axis.name).strip("-")
+                save(_success(results, place), folder / f"success-{name}")
+                save(_ticks(results, place), folder / f"ticks-{name}")
+        save(_meeting(results), folder / "meeting")
 
 
 def _success(results: Results, place: int) -> Figure:

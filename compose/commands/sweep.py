@@ -4,27 +4,23 @@ from __future__ import annotations
 
 import argparse
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from compose.campaign import spec
-from compose.status import FAILED, LOCALISED, NOT_LOCALISED, STOPPED, UserError
+from compose.lab import need
+from compose.status import FAILED, LOCALISED, NOT_LOCALISED, STOPPED
 from compose.stop import stop_by_signal
 from protocol.inbox import Inbox
 
 if TYPE_CHECKING:
     from compose.campaign.run import Results
 
-LAB = ("distributed", "matplotlib", "pyarrow", "tomli_w")
-
 
 def main(options: argparse.Namespace) -> int:
     """Play the campaign, or what is left of it."""
     campaign = spec.load(options.spec, trials=options.trials, seed=options.seed)
-    missing = [module for module in LAB if find_spec(module) is None]
-    if missing:
-        raise UserError(f"needs {', '.join(missing)}: install `tandem-ranging[lab]`")
+    need("distributed", "matplotlib", "pyarrow", "tomli_w")
     inbox = Inbox("tandem sweep")
     stop_by_signal(inbox)
     from compose.campaign import figures, report, run  # noqa: PLC0415  # slow, and there may be no extra

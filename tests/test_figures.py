@@ -1,0 +1,339 @@
+"""A record's pictures: what is in them is what the record says, and whatever the record, there is one."""
+
+from __future__ import annotations
+
+import math
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+
+from compose.figures import belief, plane
+from compose.figures.robot import Story
+from compose.figures.robot import draw as draw_one
+from compose.inline import play
+from compose.record import estimates, first_claim, read
+from compose.scenario import load, parse
+from protocol.journal import CorruptJournal
+from protocol.journal import read as frames
+from protocol.messages import Estimate
+from tests.commands import PAPER_1, Ended, several_pairs, tandem
+from world.scenario import Scenario
+
+NOISE = "[mission.noise]\nanchor_sigma = 0.05\nmutual_sigma = 0.05\n"
+BRIEF = PAPER_1.replace('variant = "paper"', 'variant = "assured"').replace(
+    "seed = 1", "seed = 1\nmax_ticks = 4"
+)
+
+
+@pytest.fixture(scope="session")
+def noisy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The record of the shipped scenario."""
+    return recorded(load("noisy"), tmp_path_factory.mktemp("noisy"))
+
+
+@pytest.fixture(scope="session")
+def drawn(noisy: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its pictures."""
+    folder = copied(noisy, tmp_path_factory.mktemp("drawn"))
+    assert draw(folder).status == 0
+    return folder / "figures"
+
+
+def recorded(scenario: Scenario, folder: Path) -> Path:
+    play(scenario, folder)
+    return folder
+
+
+def copied(record: Path, folder: Path) -> Path:
+    return Path(shutil.copytree(record, folder, dirs_exist_ok=True))
+
+
+def draw(folder: Path) -> Ended:
+    return tandem("figures", folder)
+
+
+def picture(folder: Path, robot: str) -> Path:
+    """That of one robot, drawn in this process."""
+    record = read(folder)
+    place = [one.id for one in record.scenario.robots].index(robot)
+    svg, _ = draw_one(Story(record, place, estimates(folder, robot)), folder / "figures")
+    return svg
+
+
+def texts(svg: Path) -> set[str]:
+    """Every line of text in it, which Matplotlib leaves as comments beside the outlines."""
+    return {
+        line
+        for text in re.findall(r"<!-- (.*?) -->", svg.read_text(), re.DOTALL)
+        for line in text.split("\n")
+    }
+
+
+def line(axes: Axes, gid: str) -> tuple[list[Any], list[Any]]:
+    """The x and y of the line of that name."""
+    (found,) = [one for one in axes.lines if one.get_gid() == gid]
+    return np.asarray(found.get_xdata()).tolist(), np.asarray(found.get_ydata()).tolist()
+
+
+def ids(svg: Path) -> set[str]:
+    return set(re.findall(r'id="([^"]+)"', svg.read_text()))
+
+
+def cut(journal: Path, count: int) -> None:
+    """Leave the first `count` frames of it, and a torn one."""
+    left = list(frames(journal))[:count]
+    journal.write_bytes(b"".join([msgpack.packb(frame) for frame in left]) + b"\xc4\x10torn")
+
+
+# --- what is in them ------------------------------------------------------------------------------------
+
+
+def test_a_line_a_file_is_printed_and_the_files_are_there(noisy: Path, tmp_path: Path) -> None:
+    folder = copied(noisy, tmp_path)
+    ended = draw(folder)
+    names = ["robot-a.svg", "robot-a.png", "robot-b.svg", "robot-b.png"]
+    assert ended.status == 0
+    assert ended.err == ""
+    assert ended.out.splitlines() == [str(folder / "figures" / name) for name in names]
+    assert {path.name for path in (folder / "figures").iterdir()} == set(names)
+    for name in names:
+        head = (folder / "figures" / name).read_bytes()[:8]
+        assert head.startswith(b"<?xml" if name.endswith("svg") else b"\x89PNG")
+
+
+def test_a_run_draws_nothing_by_itself(tmp_path: Path) -> None:
+    assert tandem("run", "paper-1", "--in-process", "--out", tmp_path / "out").status == 0
+    assert not (tmp_path / "out" / "figures").exists()
+
+
+@pytest.mark.parametrize("place", [0, 1])
+def test_a_picture_says_what_the_robot_claimed_and_how_far_off_it_was(
+    place: int, noisy: Path, drawn: Path
+) -> None:
+    record = read(noisy)
+    claim = first_claim(record, place)
+    assert claim is not None
+    assert claim.covariance is not None
+    robot = record.scenario.robots[place].id
+    words = texts(drawn / f"robot-{robot}.svg")
+    (said,) = [line for line in words if line.startswith("It claims")]
+    assert f"in tick {claim.tick}: off by {claim.position_error:.2g} m" in said
+    assert f"(sigmas {claim.covariance.position_sigma:.2g} m" in said
+    assert f"it claims, tick {claim.tick}" in words
+    assert f"Robot {robot} of noisy, seed {record.scenario.seed}: localised after {claim.tick} ticks" in words
+
+
+def test_a_picture_names_its_axes_with_units_and_what_was_asked_for(drawn: Path) -> None:
+    words = texts(drawn / "robot-a.svg")
+    assert {"x [m]", "y [m]", "error of position [m]", "odds of a hypothesis"} <= words
+    assert {"sigma asked for: 0.1 m", "asked for: 99.99 %", "its sensing range, 3 m"} <= words
+    assert {"1: alone with its anchor", "2: looking for its peer", "3: together"} <= words
+    assert {"anchor of a", "anchor of b", "true path of a", "true path of b"} <= words
+
+
+def test_each_part_of_a_noisy_mission_is_in_its_picture(noisy: Path, drawn: Path) -> None:
+    held = [one for one in estimates(noisy, "a") if one.world]
+    found = ids(drawn / "robot-a.svg")
+    assert {"path-a", "path-b", "anchor-a", "range-b", "met", "final", "estimates"} <= found
+    assert {"error", "sigma", "envelope", "accuracy", "claim", "phase-1", "phase-2", "phase-3"} <= found
+    assert {"odds-1-anchor", "odds-1-plane", "confidence", "near-truth"} <= found
+    assert ("ghosts" in found) == any(len(one.world) > 1 for one in held)
+    assert {f"ellipse-{held[-1].tick}", f"near-{held[-1].tick}"} <= found
+    ellipses = {int(name.removeprefix("ellipse-")) for name in found if name.startswith("ellipse-")}
+    assert 1 < len(ellipses) <= 5
+    assert ellipses <= {one.tick for one in held}
+
+
+def test_what_is_drawn_over_time_is_what_the_robot_said_held_against_the_truth(noisy: Path) -> None:
+    story = Story(read(noisy), 0, estimates(noisy, "a"))
+    truth = [moment.truth.poses[0] for moment in story.record.moments]
+    said = [one for one in story.held if one.world]
+    off = [math.hypot(one.world[0].x - truth[one.tick].x, one.world[0].y - truth[one.tick].y) for one in said]
+    errors, odds = Figure().subplots(2)
+    belief.draw_error(errors, story)
+    belief.draw_odds(odds, story)
+    assert line(errors, "error") == ([one.tick for one in said], off)
+    assert line(errors, "sigma")[1] == [one.covariance.position_sigma for one in said if one.covariance]
+    likeliest = line(odds, "odds-1-plane")
+    assert likeliest[0] == [one.tick for one in said]
+    assert likeliest[1] == pytest.approx([one.odds[0] for one in said], abs=1e-5)  # 99.9995 % is the edge
+    assert max(likeliest[1]) < 1.0
+    before = line(odds, "odds-1-anchor")
+    assert before[0] == [one.tick for one in story.held if not one.world]
+    (claimed,) = line(errors, "claim")[0][:1]
+    assert story.held[claimed].localised
+    assert not story.held[claimed - 1].localised
+
+
+def test_an_ellipse_holds_what_is_within_3_sigma(noisy: Path) -> None:
+    story = Story(read(noisy), 0, estimates(noisy, "a"))
+    axes = Figure().subplots()
+    plane.draw(axes, story)
+    last = story.held[-1]
+    assert last.covariance is not None
+    (ellipse,) = axes.findobj(lambda artist: artist.get_gid() == f"ellipse-{last.tick}")
+    assert isinstance(ellipse, Ellipse)
+    outline = ellipse.get_patch_transform().transform(
+        [(1.0, 0.0), (0.0, 1.0), (math.sqrt(0.5), -math.sqrt(0.5))]
+    )
+    sigma = [[last.covariance.xx, last.covariance.xy], [last.covariance.xy, last.covariance.yy]]
+    for point in outline - [last.world[0].x, last.world[0].y]:
+        assert point @ np.linalg.solve(sigma, point) == pytest.approx(9.0)
+
+
+def test_the_same_record_gives_the_same_bytes(noisy: Path, drawn: Path, tmp_path: Path) -> None:
+    again = copied(noisy, tmp_path)
+    for _ in range(2):  # over what is there, too
+        svg = picture(again, "b")
+        assert svg.read_bytes() == (drawn / svg.name).read_bytes()
+    assert "<dc:date>" not in svg.read_text()
+
+
+def test_an_exact_record_has_counts_for_odds_and_no_ellipse(tmp_path: Path) -> None:
+    svg = picture(recorded(load("paper-1"), tmp_path), "a")
+    words, found = texts(svg), ids(svg)
+    assert {"poses held possible", "one is left", "wrong, if more: 1e-6 m"} <= words
+    assert {"count", "tolerance", "error", "ghosts", "near-truth"} <= found
+    assert not {"envelope", "sigma", "confidence", "accuracy"} & found
+    assert not [name for name in found if name.startswith(("ellipse-", "odds-"))]
+
+
+def test_seconds_stand_below_the_ticks_where_a_tick_is_no_second(tmp_path: Path) -> None:
+    text = PAPER_1.replace("period = 1.0", "period = 0.5").replace("max_speed = 1.0", "max_speed = 2.0")
+    words = texts(picture(recorded(parse(text, "half"), tmp_path), "a"))
+    assert {"10", "5 s"} <= words
+    assert any(line.startswith("tick, and time since release") for line in words)
+
+
+@pytest.mark.parametrize(
+    ("odds", "said"), [(0.5, "50 %"), (0.9999, "99.99 %"), (0.999999, "99.9999 %"), (1e-4, "0.01 %")]
+)
+def test_odds_are_said_in_as_many_digits_as_they_have(odds: float, said: str) -> None:
+    assert belief.percent(odds) == said
+
+
+# --- whatever the record --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("noise", ["", NOISE])
+@pytest.mark.parametrize("variant", ["assured", "paper"])
+def test_a_mission_that_ends_undecided_is_drawn(noise: str, variant: str, tmp_path: Path) -> None:
+    text = BRIEF.replace("assured", variant).replace("[planner]", f"{noise}[planner]")
+    record = play(parse(text, "brief"), tmp_path)
+    assert record.end is not None
+    assert record.end.outcome == "undecided"
+    svg = picture(tmp_path, "b")
+    words = texts(svg)
+    assert "It never claimed to know where it is." in words
+    assert any("undecided after" in line for line in words)
+    assert not {"met", "claim"} & ids(svg)
+
+
+@pytest.mark.parametrize("ticks", [0, 1, 17])
+def test_a_record_that_breaks_off_is_drawn_as_far_as_it_goes(ticks: int, noisy: Path, tmp_path: Path) -> None:
+    folder = copied(noisy, tmp_path)
+    cut(folder / "world.journal", 1 + 2 * ticks)
+    cut(folder / "agent-b.journal", 1 + ticks)
+    assert len(read(folder).moments) == ticks
+    for robot in "ab":
+        words = texts(picture(folder, robot))
+        assert f"Robot {robot} of noisy, seed 5: the record breaks off" in words
+        assert {"anchor of a", "anchor of b", "released"} <= words
+
+
+def test_an_agent_killed_before_its_briefing_has_a_picture_without_estimates(
+    noisy: Path, tmp_path: Path
+) -> None:
+    folder = copied(noisy, tmp_path)
+    (folder / "agent-a.journal").write_bytes(b"")
+    assert "nothing-near" in ids(picture(folder, "a"))
+
+
+def test_each_robot_of_several_pairs_has_a_picture_of_its_own_pair(tmp_path: Path) -> None:
+    recorded(parse(several_pairs(2), "pairs"), tmp_path)
+    assert draw(tmp_path).status == 0
+    assert {path.name for path in (tmp_path / "figures").glob("*.svg")} == {
+        f"robot-{one}.svg" for one in "abcd"
+    }
+    assert {"path-c", "path-d", "anchor-d"} <= ids(tmp_path / "figures" / "robot-c.svg")
+    assert not {"path-a", "anchor-b"} & ids(tmp_path / "figures" / "robot-c.svg")
+
+
+# --- bad input ------------------------------------------------------------------------------------------
+
+
+def refused(ended: Ended, words: str) -> None:
+    assert ended.status == 2, ended
+    assert ended.out == ""
+    assert re.fullmatch(r"tandem figures: [^\n]+\n", ended.err), ended.err
+    assert words in ended.err
+
+
+def test_what_is_no_record_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.write_text("")
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    refused(draw(tmp_path / "nowhere"), "nowhere holds no record: there is no world.journal")
+    refused(draw(empty), "empty holds no record: there is no world.journal")
+    refused(draw(file), "file cannot be read: Not a directory")
+    (empty / "world.journal").write_bytes(b"\xc1 no journal")
+    refused(draw(empty), "world.journal: damaged at byte 0")
+    (empty / "world.journal").write_bytes(b"")
+    refused(draw(empty), "world.journal: ")
+    assert [path.name for path in empty.iterdir()] == ["world.journal"]
+
+
+def test_where_nothing_can_be_written_is_refused(noisy: Path, tmp_path: Path) -> None:
+    folder = copied(noisy, tmp_path)
+    (folder / "figures").write_text("")
+    refused(draw(folder), "figures cannot be written: File exists")
+    (folder / "figures").unlink()
+    (folder / "figures" / "robot-a.svg").mkdir(parents=True)
+    refused(draw(folder), "figures cannot be written: Is a directory")
+
+
+def test_a_robot_without_a_journal_is_named_and_the_others_are_drawn(noisy: Path, tmp_path: Path) -> None:
+    folder = copied(noisy, tmp_path)
+    (folder / "agent-a.journal").unlink()
+    ended = draw(folder)
+    assert ended.status == 3
+    assert ended.err == "tandem figures: no picture of a: agent-a.journal is missing\n"
+    assert {path.name for path in (folder / "figures").iterdir()} == {"robot-b.svg", "robot-b.png"}
+    (folder / "agent-a.journal").write_bytes(b"\xc1")
+    ended = draw(folder)
+    assert ended.status == 3
+    assert re.fullmatch(
+        r"tandem figures: no picture of a: [^\n]*agent-a.journal: damaged at byte 0[^\n]*\n", ended.err
+    )
+
+
+# --- the reader -----------------------------------------------------------------------------------------
+
+
+def test_a_robots_estimates_are_one_a_tick_as_it_journaled_them(noisy: Path) -> None:
+    held = estimates(noisy, "b")
+    assert [one.tick for one in held] == list(range(len(read(noisy).moments)))
+    assert {one.robot for one in held} == {"b"}
+    assert all(isinstance(one, Estimate) for one in held)
+    assert held[-1].localised
+
+
+def test_the_journal_of_another_robot_is_not_taken_for_its_own(noisy: Path, tmp_path: Path) -> None:
+    folder = copied(noisy, tmp_path)
+    shutil.copyfile(folder / "agent-b.journal", folder / "agent-a.journal")
+    with pytest.raises(CorruptJournal, match=r"agent-a\.journal is the journal of b"):
+        estimates(folder, "a")
+    shutil.copyfile(folder / "world.journal", folder / "agent-a.journal")
+    with pytest.raises(CorruptJournal, match=r"agent-a\.journal: "):
+        estimates(folder, "a")
+    with pytest.raises(FileNotFoundError):
+        estimates(folder, "z")
