@@ -47,9 +47,9 @@ def _told(log: Logbook, through: int) -> list[tuple[int, float]]:
 
 def with_own(mind: Mind, weighed: Sequence[Weighed]) -> Mind:
     """`mind`, with these hypotheses of its anchor; where it stands now follows from the likeliest."""
-    own = tuple(one.hypothesis for one in weighed)
-    findings = replace(mind.findings, own=own, branch=branch_of(mind, weighed[0]))
-    return replace(mind, findings=findings)
+    own = tuple([one.hypothesis for one in weighed])
+    branches = tuple([branch_of(mind, one) for one in weighed])
+    return replace(mind, findings=replace(mind.findings, own=own, branches=branches, branch=branches[0]))
 
 
 def branch_of(mind: Mind, weighed: Weighed) -> Branch:
@@ -136,7 +136,7 @@ def missing_for(
             f"the likeliest of {len(weighed)} hypotheses has the odds {odds:.6f}, of {mission.confidence:g}"
         )
     chi2 = weighed[0].fit.chi2
-    if chi2 > free + PLAUSIBLE * math.sqrt(2.0 * free) + PLAUSIBLE**2:
+    if chi2 > plausible(free):
         return f"the likeliest hypothesis fits badly: chi-square {chi2:.3g} for {free} degrees of freedom"
     _, covariance = bent(held[0], pair.apart)
     for i, robot in ((0, "a"), (3, "b")):
@@ -152,8 +152,14 @@ def missing_for(
 ASKEW = 0.2
 """rad: with a heading less well known than this the ellipse is no likeness of what is possible"""
 
-PLAUSIBLE = 5.0
-"""standard deviations by which chi-square may exceed what it should be, before nothing is claimed"""
+PLAUSIBLE = 4.0
+"""standard deviations: less likely than this, a fit is not the sensors' chance, and nothing is claimed"""
+
+
+def plausible(free: int) -> float:
+    """What a chi-square of `free` degrees of freedom hardly ever exceeds (Wilson and Hilferty)."""
+    spread = 2.0 / (9.0 * free)
+    return free * (1.0 - spread + PLAUSIBLE * math.sqrt(spread)) ** 3
 
 
 def with_pair(mind: Mind, weighed: Sequence[Weighed], pair: Pair, mutual: int) -> Mind:

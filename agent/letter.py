@@ -33,10 +33,9 @@ def with_branches(mind: Mind) -> tuple[Mind, tuple[Branch, ...]]:
     weighed = inference.own_anchor(mind)
     if not weighed:
         return mind, ()
-    likely = [one for one in weighed if one.hypothesis.odds >= LIKELY]
-    branches = tuple([inference.branch_of(mind, one) for one in likely])
-    own = tuple([one.hypothesis for one in weighed])
-    return replace(mind, findings=replace(mind.findings, own=own)), branches
+    mind = inference.with_own(mind, weighed)
+    likely = zip(mind.findings.branches, mind.findings.own, strict=True)
+    return mind, tuple([branch for branch, one in likely if one.odds >= LIKELY])
 
 
 def considered(mind: Mind) -> Mind:

@@ -74,6 +74,8 @@ class Findings(msgspec.Struct, frozen=True):
     plan: Plan | None = None
     own: tuple[Hypothesis, ...] = ()
     """under noise: of where its anchor is"""
+    branches: tuple[Branch, ...] = ()
+    """by each of these"""
     pair: tuple[Hypothesis, ...] = ()
     """under noise: of how both lie in <W>"""
     poses: tuple[Pose, ...] = ()

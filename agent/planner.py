@@ -60,7 +60,7 @@ def report(mind: Mind) -> Report:
         robot=mind.briefing.robot,
         phase=mind.phase,
         state=mind.doing,
-        start=mind.findings.branch.start if mind.findings.branch else None,
+        start=mind.findings.branch.start if mind.findings.branch and mind.phase > 1 else None,
         since=since,
         through=news.through,
         runs=news.runs,
@@ -110,15 +110,15 @@ def drive(mind: Mind) -> Drive:
 
 def estimate(mind: Mind) -> Estimate:
     """What the robot holds possible."""
-    left: tuple[Branch, ...] = ()
-    if mind.findings.branch is not None:
+    left = mind.findings.branches
+    if not left and mind.findings.branch is not None:
         left = (mind.findings.branch,)
-    elif isinstance(mind.state, ThirdPoint):
+    elif not left and isinstance(mind.state, ThirdPoint):
         left = mind.state.branches
-    if isinstance(mind.verdict, Localised):
-        world: tuple[Pose, ...] = (mind.verdict.pose,)
-    elif mind.findings.poses:
-        world = mind.findings.poses
+    if mind.findings.poses:
+        world: tuple[Pose, ...] = mind.findings.poses
+    elif isinstance(mind.verdict, Localised):
+        world = (mind.verdict.pose,)
     else:
         world = tuple(mind.world_pose(placement) for placement in mind.findings.placements)
     return Estimate(
