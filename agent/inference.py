@@ -152,7 +152,7 @@ def missing_for(
 ASKEW = 0.2
 """rad: with a heading less well known than this the ellipse is no likeness of what is possible"""
 
-PLAUSIBLE = 4.0
+PLAUSIBLE = 3.0
 """standard deviations: less likely than this, a fit is not the sensors' chance, and nothing is claimed"""
 
 
