@@ -22,7 +22,7 @@ from protocol.messages import BranchKind, Localised
 from protocol.motion import ORIGIN, REST, Controls
 
 LOST = 3
-"""ticks of silence where there should be a range, before the robot goes back"""
+"""strides of silence where there should be a range, before the robot goes back"""
 
 LOST_TOGETHER = 6
 """likewise of b in phase 3, in which it may drive a little outside"""
@@ -51,7 +51,7 @@ def sensed(mind: Mind, anchor_range: float | None) -> Mind:
             onward = seeking.onward(mind.state, mind.odometry, anchor_range is not None, mission, variant)
             return _surveyed(mind) if onward is None else replace(mind, state=onward)
         case Surveying("anchor"):
-            return _surveyed(mind)
+            return _surveyed(mind) if decides(mind) else mind
         case Homing(place):
             if anchor_range is not None:
                 return _surveyed(mind)
@@ -59,7 +59,9 @@ def sensed(mind: Mind, anchor_range: float | None) -> Mind:
             return replace(mind, state=Straight("anchor", place, 0.0)) if there else mind
         case Aligning() | Radial() | Tangent() | Orbiting():
             return _under_way(mind, anchor_range is not None)
-        case Surveying("peer") if mind.briefing.role == "b" and _silent(mind) >= LOST_TOGETHER:
+        case Surveying("peer") if mind.briefing.role == "b" and _silent(
+            mind
+        ) >= LOST_TOGETHER * surveying.stride(mind.briefing.mission):
             return _homeward(mind)
         case Surveying("peer", drive) if not mind.near:
             return replace(mind, state=Returning(Controls(-drive.v, -drive.omega), mind.odometry))
@@ -69,6 +71,11 @@ def sensed(mind: Mind, anchor_range: float | None) -> Mind:
             return replace(mind, state=Surveying("peer"))
         case _:
             return mind
+
+
+def decides(mind: Mind) -> bool:
+    """Whether this is a tick for a new manoeuvre; the same for both robots, so that they choose together."""
+    return mind.tick % surveying.stride(mind.briefing.mission) == 0
 
 
 def _surveyed(mind: Mind) -> Mind:
@@ -81,7 +88,7 @@ def _surveyed(mind: Mind) -> Mind:
     weighed = inference.own_anchor(mind)
     if weighed:
         mind = inference.with_own(mind, weighed)
-    if _silent(mind) >= LOST:
+    if _silent(mind) >= LOST * surveying.stride(mind.briefing.mission):
         return _homeward(mind)
     if not weighed or weighed[0].silence < MISLED:
         if not ranged:
@@ -119,21 +126,21 @@ def _under_way(mind: Mind, ranged: bool) -> Mind:
     """Phase 2, with what another range to the anchor adds; b goes on to survey where it waits."""
     mission = mind.briefing.mission
     weighed: Sequence[Weighed] = ()
-    if ranged and (weighed := inference.own_anchor(mind)):
+    if ranged and decides(mind) and (weighed := inference.own_anchor(mind)):
         mind = inference.with_own(mind, weighed)
     assert isinstance(mind.state, Aligning | Radial | Tangent | Orbiting)
     state = rendezvous.onward(mind.state, mind.odometry, mind.start, mind.orbit, mission)
     if isinstance(state, Orbiting):
         since = state.since or mind.tick
         late = mind.tick - since > mind.briefing.rendezvous.bound / mission.period + LOST and not mind.near
-        if late if mind.orbit.v else _silent(mind) >= LOST:
+        if late if mind.orbit.v else _silent(mind) >= LOST * surveying.stride(mission):
             return _homeward(mind)
         if mind.orbit.v != 0.0:
             drive = rendezvous.pursuit(mind.local_pose, mind.orbit, mission)
         elif weighed:
             drive = surveying.alone(inference.held_alone(weighed), mission, mind.orbit.radius)
         else:
-            drive = REST
+            drive = state.drive or REST
         state = Orbiting(drive, since)
     return replace(mind, state=state)
 
@@ -149,6 +156,8 @@ def heard(mind: Mind) -> Mind:
         case Surveying("anchor") | Straight() | Backing() | Turning() | Circling() | Homing():
             return mind
         case _ if mind.radio.start is None:
+            return mind
+        case Surveying("peer") if not decides(mind):
             return mind
         case Surveying("peer") if not mind.hears_peer:
             return replace(mind, state=Surveying("peer"))

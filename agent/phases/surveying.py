@@ -20,8 +20,11 @@ from agent.ranging import SIGMA_FLOOR
 from protocol.mission import Mission
 from protocol.motion import REST, Controls
 
+STRIDE = 0.25
+"""of R: how far a manoeuvre leads at the least, in as many ticks as that takes"""
+
 AHEAD = 3
-"""ticks that a manoeuvre is looked at: so long would it go on"""
+"""strides that a manoeuvre is looked at: so long would it go on"""
 
 TURNS = 17
 """values of omega that are compared, from -omega_max to omega_max"""
@@ -50,6 +53,11 @@ class Surveying(msgspec.Struct, frozen=True):
     drive: Controls = REST
 
 
+def stride(mission: Mission) -> int:
+    """Ticks that a manoeuvre lasts: from nearer by, a range tells little more."""
+    return max(1, round(STRIDE * mission.sensing_range / mission.first_straight))
+
+
 class Choice(NamedTuple):
     """Manoeuvres to compare, C of them, and where each leads, relative to where it begins."""
 
@@ -64,14 +72,15 @@ class Choice(NamedTuple):
 @cache
 def choice(mission: Mission) -> Choice:
     """All of a robot's; the last is to stand."""
+    period = stride(mission) * mission.period
+    fastest = min(mission.max_turn_rate, math.pi / period)
     omega, speed = np.meshgrid(
-        np.linspace(-mission.max_turn_rate, mission.max_turn_rate, TURNS),
-        mission.first_straight / mission.period * np.array(SPEEDS),
+        np.linspace(-fastest, fastest, TURNS), mission.first_straight / mission.period * np.array(SPEEDS)
     )
     v = np.append(speed.ravel(), 0.0)
     turn = np.append(omega.ravel(), 0.0)
-    half = 0.5 * mission.period * turn
-    chord = mission.period * v * np.sinc(half / math.pi)
+    half = 0.5 * period * turn
+    chord = period * v * np.sinc(half / math.pi)
     course = half[:, None] * (2.0 * np.arange(AHEAD) + 1.0)
     return Choice(
         v,
