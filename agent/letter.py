@@ -24,6 +24,9 @@ from protocol.motion import ORIGIN, wrap
 CHECKED = 3
 """mutual ranges before a claim"""
 
+REDUNDANT = 12
+"""ranges, for six unknowns, before a claim where there are outliers"""
+
 LIKELY = 0.05
 """odds from which on a branch is worth a manoeuvre that tells it from others"""
 
@@ -47,6 +50,8 @@ def considered(mind: Mind) -> Mind:
     weighed = search(pair)
     mind = inference.with_pair(mind, weighed, pair, CHECKED)
     missing = mind.findings.missing
+    if missing is None and mind.briefing.mission.noise.outliers and len(pair.ranges.rho) < REDUNDANT:
+        missing = f"{len(pair.ranges.rho)} ranges, of {REDUNDANT}, cannot rule out that one is an outlier"
     if missing is None:
         return claimed(mind)
     if mind.findings.plan is not None or not weighed:

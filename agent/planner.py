@@ -40,11 +40,12 @@ def observe(mind: Mind, sense: Sense) -> Mind:
         odometry = step(odometry, v, omega, mind.briefing.mission.period)
     if sense.anchor_range is not None and not _again(mind, sense):
         log = log.ranged(sense.anchor_range)
-    mutual = mind.mutual
+    mutual, near = mind.mutual, False
     for contact in sense.contacts:
-        if contact.peer == mind.briefing.peer and contact.range is not None:
-            mutual = (*mutual, Ranged(sense.tick, contact.range))
-    near = any(contact.peer == mind.briefing.peer for contact in sense.contacts)
+        if contact.peer == mind.briefing.peer:
+            near = True
+            if contact.range is not None:
+                mutual = (*mutual, Ranged(sense.tick, contact.range))
     sensed = Mind(
         mind.briefing, mind.state, sense.tick, odometry, log, mutual, mind.findings, mind.radio, near
     )
@@ -140,7 +141,7 @@ def _advanced(mind: Mind, anchor_range: float | None) -> Mind:
     if _surveys(mind) and not isinstance(mind.state, Asleep):
         return survey.sensed(mind, anchor_range)
     match mind.state:
-        case Standing() | Waiting() | Done():
+        case Orbiting(None) | Standing() | Waiting() | Done():
             return mind
         case Aligning() | Radial() | Tangent() | Orbiting():
             return _on_to_orbit(mind, mind.state)
@@ -164,16 +165,16 @@ def _advanced(mind: Mind, anchor_range: float | None) -> Mind:
 
 def _surveys(mind: Mind) -> bool:
     """Whether sensors are noisy, and more than one look at them may be taken."""
-    return not mind.briefing.mission.noise.exact and mind.briefing.variant == "assured"
+    return mind.briefing.variant == "assured" and not mind.briefing.mission.noise.exact
 
 
 def _again(mind: Mind, sense: Sense) -> bool:
     """Whether the anchor's range is the last one over again, from where the robot has stood since phase 1."""
     return (
-        mind.briefing.mission.noise.exact
-        and mind.findings.branch is not None
+        mind.findings.branch is not None
         and sense.executed == REST
         and sense.anchor_range == mind.log.ranges[-1].range
+        and mind.briefing.mission.noise.exact
     )
 
 

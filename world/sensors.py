@@ -57,6 +57,8 @@ def measured(
 ) -> float | None:
     """m: what is measured where the distance is `rho`; none of a drop-out."""
     noise, seed = scenario.mission.noise, scenario.seed
+    if not (sigma or noise.outliers or noise.drop_outs):
+        return rho
     if noise.drop_outs and uniform(seed, f"{sensor}-drop-out", robot, tick) < noise.drop_outs:
         return None
     if noise.outliers and uniform(seed, f"{sensor}-outlier", robot, tick) < noise.outliers:
@@ -79,8 +81,6 @@ def odometry(driven: Controls, scenario: Scenario, robot: str, tick: int) -> Con
 
 def _disturbed(controls: Controls, drift: Drift, seed: int, sensor: str, robot: str, tick: int) -> Controls:
     v, omega = drift.variances(controls.v, controls.omega)
-    if v == omega == 0.0:
-        return controls
     return Controls(
         controls.v + math.sqrt(v) * gaussian(seed, f"{sensor}-v", robot, tick) if v else controls.v,
         controls.omega + math.sqrt(omega) * gaussian(seed, f"{sensor}-omega", robot, tick)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import msgspec
 
@@ -45,22 +45,16 @@ def senses(world: World) -> list[Sense]:
     """What every robot's sensors say now, in the order of the scenario."""
     scenario, truth, driven = world.scenario, world.truth, world.executed
     tick, robots = truth.tick, scenario.robots
+    measured: Sequence[Controls | None] = driven or [None] * len(robots)
+    if driven is not None and not scenario.mission.noise.exact:
+        measured = [odometry(driven[i], scenario, robot.id, tick) for i, robot in enumerate(robots)]
     contacts: list[tuple[Contact, ...]] = [()] * len(robots)
     for (one, other), mutual in zip(world.pairs, mutual_ranges(truth, scenario, world.pairs), strict=True):
         if mutual is not None:
             contacts[one] = (Contact(robots[other].id, mutual.range, heard(tick)),)
             contacts[other] = (Contact(robots[one].id, mutual.range, heard(tick)),)
     ranges = anchor_ranges(truth, scenario)
-    return [
-        Sense(
-            tick,
-            robot.id,
-            odometry(driven[i], scenario, robot.id, tick) if driven is not None else None,
-            ranges[i],
-            contacts[i],
-        )
-        for i, robot in enumerate(robots)
-    ]
+    return [Sense(tick, robot.id, measured[i], ranges[i], contacts[i]) for i, robot in enumerate(robots)]
 
 
 def advance(world: World, drives: Mapping[str, Drive]) -> World | Judgement:
@@ -68,9 +62,11 @@ def advance(world: World, drives: Mapping[str, Drive]) -> World | Judgement:
     scenario, truth = world.scenario, world.truth
     verdicts, claimed = world.verdicts, world.claimed
     driven = []
+    exact = scenario.mission.noise.exact
     for place, robot in enumerate(scenario.robots):
         drive = drives.get(robot.id)
-        driven.append(executed(asked(drive, scenario.mission), scenario, robot.id, truth.tick))
+        done = asked(drive, scenario.mission)
+        driven.append(done if exact else executed(done, scenario, robot.id, truth.tick))
         if drive is not None and drive.verdict is not None and robot.id not in verdicts:
             verdicts = verdicts | {robot.id: drive.verdict}
             if isinstance(drive.verdict, Localised):
