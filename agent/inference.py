@@ -194,8 +194,11 @@ def claim(held: Held, robot: int, pair: Pair) -> tuple[Pose, Covariance]:
 
 def bent(held: Held, m2: tuple[float, float]) -> tuple[Array, Array]:
     """Mean and covariance of both poses, where it is range and bearing that are Gaussian: b's from M2, a's
-    from b. To second order; where the ranges are far better than the bearings, this is an arc, and the ellipse
-    of the first order alone would not reach it."""
+    from b.
+
+    To second order: where ranges are far better known than bearings, what is possible is an arc, which an
+    ellipse of first order does not reach.
+    """
     mean, covariance = held.poses.copy(), held.covariance
     bx, by = mean[3] - m2[0], mean[4] - m2[1]
     ax, ay = mean[0] - mean[3], mean[1] - mean[4]

@@ -1,7 +1,7 @@
 """The path that a robot's odometry tells of, and what the odometry's noise makes of it.
 
-Noise at one tick moves every later position, so errors are correlated along the path; their covariance between
-any two ticks follows from sums up to the earlier one.
+Noise at one tick moves every later position, so errors are correlated along the path; their covariance
+between any two ticks follows from sums up to the earlier one.
 """
 
 from __future__ import annotations

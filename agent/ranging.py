@@ -1,7 +1,7 @@
-"""The ranges of one robot or of both, what a guess at where they are predicts of them, and how likely that is.
+"""The ranges of one robot or of both, what a guess predicts of them, and how likely that makes them.
 
-A guess holds, for each robot, where its anchor lies in the frame of its odometry, and how that frame is turned in
-<W>. Outliers are a mixture: a range is good, or too long by a bias that is uniform.
+A guess holds, for each robot, where its anchor lies in the frame of its odometry, and how that frame is
+turned in <W>. Outliers are a mixture: a range is good, or too long by a bias that is uniform.
 """
 
 from __future__ import annotations

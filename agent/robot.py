@@ -111,6 +111,7 @@ class Robot:
                 len(findings.pair or findings.placements) if findings.candidates is not None else None
             ),
             odds=findings.pair[0].odds if findings.pair else None,
+            missing=findings.missing,
             reports_sent=self.reports_sent,
             reports_heard=mind.radio.heard,
             reports_refused=reports_refused,

@@ -1,9 +1,9 @@
 """Least squares over all ranges of a robot, or of both, with the odometry's drift along the path.
 
-Unknown are, for each robot, where its anchor lies in the frame of its odometry, and how that frame is turned in
-<W>; and the errors of the odometry at every tick, of which there are many. So the fit is done in the space of
-the ranges: what the odometry's noise makes of each two of them is a covariance. Gauss-Newton, with the path
-corrected at each step, ends at the maximum a posteriori of the whole factor graph.
+Unknown are, for each robot, where its anchor lies in the frame of its odometry, and how that frame is
+turned in <W>; and the errors of the odometry at every tick, of which there are many. So the fit is done in
+the space of the ranges: what the odometry's noise makes of each two of them is a covariance. Gauss-Newton,
+with the path corrected at each step, ends at the maximum a posteriori of the whole factor graph.
 
 With exact odometry there is no such covariance, and the fit is that of two or six unknowns.
 """
@@ -240,7 +240,7 @@ SOFT = 0.1
 
 
 def poses(fitted: Fit, apart: tuple[float, float]) -> tuple[Array, Array]:
-    """Of both robots at the last tick, relative to M1 along the axes of <W>: x, y and heading of a, then of b.
+    """Of both robots at the last tick, relative to M1 along the axes of <W>: x, y, heading of a, then of b.
 
     The mean (6,) and the covariance (6, 6), in m and rad.
     """

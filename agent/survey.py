@@ -1,7 +1,7 @@
-"""The mission under noise, as `assured` goes through it: measure until the poses are known as well as was asked.
+"""The mission under noise, as `assured` goes through it: measure until poses are known as well as was asked.
 
-The order is the paper's. In phase 1 a robot goes on inside its anchor's range until what it does not know yet is
-worth less than moving on; in phase 3 both move, each tick where the next ranges are expected to tell most.
+The order is the paper's. In phase 1 a robot goes on inside its anchor's range until what it does not know
+yet is worth less than moving on; in phase 3 both move, each to where the next ranges should tell most.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The Cramér-Rao bound of a pair's poses, for the trajectories that it drove.
 
-The fit that the robots make of their ranges, taken at the truth: true controls, true distances, no step. What is
-left then is the inverse of the Fisher information, odometry integrated out.
+The fit that the robots make of their ranges, taken at the truth: true controls, true distances, no step. What
+is left then is the inverse of the Fisher information, odometry integrated out.
 """
 
 from __future__ import annotations

@@ -214,6 +214,8 @@ class Farewell(Message, frozen=True):
     """about the poses of both, that are left in the end"""
     odds: Odds | None
     """of the likeliest of them; none where sensors are exact"""
+    missing: Text | None
+    """under noise: what there was to know yet, before it could claim"""
     reports_sent: Count
     reports_heard: Count
     reports_refused: Count

@@ -73,8 +73,7 @@ class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def foothold(self) -> float:
         """m: how well a robot has to know where its anchor is before it goes to meet the peer.
 
-        The root of the trace of the covariance. The anchors are two points that fix the frame of both robots in
-        <W>, and the peer's is as good.
+        The root of the trace of the covariance. The anchors are the two points that fix both robots in <W>.
         """
         return min(self.accuracy, FOOTHOLD * self.sensing_range)
 

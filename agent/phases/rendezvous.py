@@ -95,7 +95,7 @@ def controls(state: Meeting, odometry: Pose, start: Pose, orbit: Orbit, mission:
 def pursuit(local: Pose, orbit: Orbit, mission: Mission) -> Controls:
     """Round the anchor, back to the circle that noise has led away from (pure pursuit).
 
-    Along the arc to the point of the circle that lies two ticks ahead; from the circle itself, that is eq. (6).
+    Along the arc to the point of the circle that lies two ticks ahead; from the circle that is eq. (6).
     """
     ahead = math.atan2(local.y, local.x) + LOOKAHEAD * orbit.omega * mission.period
     x, y = orbit.radius * math.cos(ahead) - local.x, orbit.radius * math.sin(ahead) - local.y

@@ -91,12 +91,13 @@ def choice(mission: Mission) -> Choice:
 
 
 class Held(NamedTuple):
-    """A hypothesis, as far as planning needs it: poses (x, y in m, heading), of one robot or of both, in a frame
-    in which its anchor is (the first of) `anchors`."""
+    """A hypothesis, as far as planning needs it."""
 
     odds: float
     poses: Array
+    """x, y in m and heading: (3,) of one robot, relative to its anchor; or (6,) of a and b, relative to M1"""
     covariance: Array
+    """of the anchor's place, (2, 2); or of both poses, (6, 6)"""
 
 
 def alone(held: Sequence[Held], mission: Mission, within: float | None = None) -> Controls:
