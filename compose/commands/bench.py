@@ -7,6 +7,7 @@ A B A B, and the medians are compared.
 from __future__ import annotations
 
 import argparse
+import math
 import subprocess
 import sys
 import tempfile
@@ -16,15 +17,19 @@ from contextlib import contextmanager
 from pathlib import Path
 from statistics import median
 
+from msgspec.structs import replace
 from rich.console import Console
 from rich.progress import Progress, TimeElapsedColumn
 from rich.table import Table
 
+from agent.robot import Robot
 from compose import barrier, inline, local, record, scenario
 from compose.status import LOCALISED
 from protocol import session
 from protocol.inbox import Inbox
 from protocol.journal import Journal
+from protocol.noise import Noise
+from protocol.rendezvous import rendezvous, tick_budget
 from protocol.wire import encode
 from world.course import Course
 from world.process import WorldProcess
@@ -38,6 +43,10 @@ MISSIONS = 200
 """random missions a round, in-process"""
 SEED = 1000
 """of the first of them"""
+NOISY_SIGMA = 0.1
+"""m"""
+NOISY_MISSIONS = 20
+"""random missions with such ranges a round, in-process"""
 BARE_IMPORTS = "import zenoh, numpy, scipy.optimize, msgspec"
 
 
@@ -46,12 +55,12 @@ def main(options: argparse.Namespace) -> int:
     rounds = options.rounds
     console = Console()
     with Progress(*Progress.get_default_columns(), TimeElapsedColumn(), console=console) as progress:
-        task = progress.add_task("tandem bench", total=3 * rounds)
+        task = progress.add_task("tandem bench", total=4 * rounds)
 
         def done() -> None:
             progress.advance(task)
 
-        tables = [_ticks(rounds, done), _missions(rounds, done), _start(rounds, done)]
+        tables = [_ticks(rounds, done), _missions(rounds, done), _noisy(rounds, done), _start(rounds, done)]
     for table in tables:
         console.print(table)
     return LOCALISED
@@ -160,6 +169,58 @@ def _world_alone(played: record.Record) -> float:
         course.senses()
         course.drive(moment.drives)
     return time.perf_counter() - began
+
+
+# --- missions under noise ---------------------------------------------------------------------------
+
+
+def _noisy(rounds: int, done: Callable[[], None]) -> Table:
+    """Random missions with ranges of NOISY_SIGMA in-process on one core, and where their time goes."""
+    noise = Noise(anchor_sigma=NOISY_SIGMA, mutual_sigma=NOISY_SIGMA)
+    scenarios = [_with_noise(scenario.load("random", seed=SEED + i), noise) for i in range(NOISY_MISSIONS)]
+    parts: list[tuple[float, float, float]] = []
+    for _ in range(rounds):
+        parts.append(_parts(scenarios))
+        done()
+    table = _table(f"In-process, one core, ranges of sigma {NOISY_SIGMA:g} m")
+    scale = 1e3 / NOISY_MISSIONS
+    _row(table, "a mission, both robots (at most 150)", [scale * sum(part) for part in parts], "ms")
+    for k, what in enumerate(("phases 1 and 2, each with its anchor", "phase 3, with the peer", "the world")):
+        _row(table, f"of which {what}", [scale * part[k] for part in parts], "ms")
+    return table
+
+
+def _with_noise(exact: Scenario, noise: Noise) -> Scenario:
+    mission = replace(exact.mission, noise=noise)
+    first, second = (robot.anchor for robot in exact.robots)
+    plan = rendezvous(mission, math.dist((first.x, first.y), (second.x, second.y)), exact.variant)
+    robots = tuple([replace(robot, rendezvous=plan) for robot in exact.robots])
+    return replace(exact, mission=mission, robots=robots, max_ticks=tick_budget(mission, plan))
+
+
+def _parts(scenarios: Sequence[Scenario]) -> tuple[float, float, float]:
+    """s: how long the robots take to fold in what they sense, and to decide once in contact; and the world."""
+    sensing = deciding = world = 0.0
+    for one in scenarios:
+        course = Course(one)
+        robots = {robot.id: Robot(one.briefing(robot.id)) for robot in one.robots}
+        end = None
+        while end is None:
+            began = time.perf_counter()
+            senses = course.senses()
+            sensed = time.perf_counter()
+            told = {sense.robot: robots[sense.robot].sense(sense) for sense in senses}
+            heard = time.perf_counter()
+            drives = {}
+            for sense in senses:
+                reports = [told[contact.peer] for contact in sense.contacts for _ in contact.heard]
+                drives[sense.robot] = robots[sense.robot].decide([one for one in reports if one is not None])
+            decided = time.perf_counter()
+            end = course.drive(drives)
+            world += sensed - began + time.perf_counter() - decided
+            sensing += heard - sensed
+            deciding += decided - heard
+    return sensing, deciding, world
 
 
 # --- starting ---------------------------------------------------------------------------------------
