@@ -199,7 +199,7 @@ def _with_noise(exact: Scenario, noise: Noise) -> Scenario:
 
 
 def _parts(scenarios: Sequence[Scenario]) -> tuple[float, float, float]:
-    """s: how long the robots take to fold in what they sense, and to decide once in contact; and the world."""
+    """s: that the robots take to fold in what they sense, and to decide once in contact; and the world."""
     sensing = deciding = world = 0.0
     for one in scenarios:
         course = Course(one)
