@@ -1,0 +1,78 @@
+"""Missions under noise, with Section IV's parameters, whose starts are drawn."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+from compose.inline import play
+from compose.record import Record, summary
+from compose.scenario import parse
+from world.scenario import Scenario
+
+SIGMA = "anchor_sigma = 0.1\nmutual_sigma = 0.1"
+WHEELS = "actuation = {v = 0.01, omega = 0.01}"
+ODOMETRY = "odometry = {v = 0.01, omega = 0.01}"
+
+
+def scenario_of(
+    noise: str,
+    seed: int,
+    *,
+    variant: str = "assured",
+    reach: float = 3.0,
+    period: float = 1.0,
+    turn_rate: float = math.pi,
+    accuracy: float = 0.1,
+    max_ticks: int | None = None,
+) -> Scenario:
+    """The anchors are 10 m apart."""
+    text = f"""
+        name = "survey"
+        {f"max_ticks = {max_ticks}" if max_ticks is not None else ""}
+        planner = {{variant = "{variant}"}}
+        [mission]
+        sensing_range = {reach}
+        period = {period}
+        max_speed = 1.0
+        max_turn_rate = {turn_rate!r}
+        accuracy = {accuracy}
+        [mission.noise]
+        {noise}
+        [[robot]]
+        id = "a"
+        anchor = [0.0, 0.0]
+        [[robot]]
+        id = "b"
+        anchor = [10.0, 0.0]
+        """
+    return parse(text, "survey", seed=seed)
+
+
+@cache
+def survey(noise: str, seed: int, variant: str = "assured", accuracy: float = 0.1) -> Record:
+    """The mission of `scenario_of`, played in this process."""
+    return play(scenario_of(noise, seed, variant=variant, accuracy=accuracy))
+
+
+def assert_localised(record: Record) -> None:
+    """As well as was asked for, in the same tick, and nobody farther off than the claim allows for."""
+    said = summary(record, "in-process", None)
+    assert said["outcome"] == "localised", (record.scenario.seed, said["reason"])
+    robots = said["robots"]
+    assert robots["a"]["localised_tick"] == robots["b"]["localised_tick"] == said["ticks"]
+    accuracy = record.scenario.mission.accuracy
+    for robot in robots.values():
+        off, sigma = robot["position_error_m"], robot["position_sigma_m"]
+        assert sigma <= accuracy
+        assert off <= min(3.0 * accuracy, 5.0 * sigma + ROUNDING), (record.scenario.seed, off, sigma)
+        assert robot["heading_error_rad"] <= 5.0 * robot["heading_sigma_rad"] + ROUNDING
+
+
+ROUNDING = 1e-6
+"""m and rad: what the referee allows for"""
+
+
+def states(record: Record, robot: str) -> list[str]:
+    """What the robot did, tick by tick."""
+    return [moment.drives[robot].state for moment in record.moments]

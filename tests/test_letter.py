@@ -1,0 +1,56 @@
+"""The paper to the letter under noise: its manoeuvres and no others, and no claim that it cannot make."""
+
+from __future__ import annotations
+
+import pytest
+
+from compose.record import summary
+from tests.surveys import SIGMA, states, survey
+
+FINE = "anchor_sigma = 0.001\nmutual_sigma = 0.001"
+SEEDS = range(1, 17)
+ITS_OWN = {
+    "asleep", "straight", "turning", "circling", "third-point", "aligning", "radial", "tangent", "orbiting",
+    "standing", "waiting", "last-manoeuvre", "returning", "localised", "undecided",
+}  # fmt: skip
+"""the states of the paper, as with exact sensors"""
+
+
+@pytest.mark.parametrize("noise", [FINE, SIGMA], ids=["fine", "coarse"])
+def test_the_letter_drives_its_own_manoeuvres_only(noise: str) -> None:
+    for seed in SEEDS:
+        record = survey(noise, seed, "paper")
+        assert {*states(record, "a"), *states(record, "b")} <= ITS_OWN
+
+
+def test_with_fine_ranges_the_letter_mostly_localises() -> None:
+    outcomes = [summary(survey(FINE, seed, "paper"), "in-process", None)["outcome"] for seed in SEEDS]
+    assert outcomes.count("localised") > 0.7 * len(SEEDS)
+
+
+def test_with_coarse_ranges_the_letter_is_undecided_and_says_what_is_missing() -> None:
+    reasons = []
+    for seed in SEEDS:
+        said = summary(survey(SIGMA, seed, "paper"), "in-process", None)
+        assert said["outcome"] == "undecided", seed
+        reasons.append(said["reason"])
+    lacking = [reason for reason in reasons if "the letter takes no more ranges: " in reason]
+    assert len(lacking) > 3
+    for reason in lacking:
+        assert " of " in reason, "so much, of so much"
+
+
+@pytest.mark.parametrize(
+    "noise", [FINE, SIGMA, f"{FINE}\noutliers = 0.05"], ids=["fine", "coarse", "outliers"]
+)
+def test_the_letter_claims_nothing_that_is_wrong(noise: str) -> None:
+    claims = 0
+    for seed in SEEDS:
+        said = summary(survey(noise, seed, "paper"), "in-process", None)
+        assert said["outcome"] != "wrong", (seed, said["reason"])
+        for robot in said["robots"].values():
+            if robot["localised"]:
+                claims += 1
+                assert robot["position_error_m"] <= 5.0 * robot["position_sigma_m"] + 1e-6
+                assert robot["position_sigma_m"] <= 0.1
+    assert claims > 0 or noise == SIGMA

@@ -1,0 +1,191 @@
+"""Where robots drive under noise: in range, apart, within what wheels can do, and where ranges tell most."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from agent.odometry import Array
+from agent.phases.rendezvous import pursuit
+from agent.phases.seeking import Homing, arrived, homeward
+from agent.phases.surveying import AHEAD, Held, alone, choice, stride, together
+from protocol.mission import Mission
+from protocol.motion import REST, Controls, Pose, step
+from protocol.noise import Drift, Noise
+from protocol.rendezvous import Orbit, clearance, rendezvous
+
+SIGMA = 0.1
+MISSION = Mission(3.0, 1.0, 1.0, math.pi, noise=Noise(SIGMA, SIGMA))
+REACH = MISSION.sensing_range
+SETTLED = np.eye(2) * 0.05**2
+"""m^2: of an anchor that is known as well as phase 1 asks for"""
+BOTH_SETTLED = np.diag([0.05**2, 0.05**2, 0.02**2] * 2)
+
+angles = st.floats(-math.pi, math.pi)
+missions = st.builds(
+    Mission,
+    st.floats(0.5, 20.0),
+    st.floats(0.05, 2.0),
+    st.floats(0.1, 3.0),
+    st.floats(0.1, 4.0),
+    noise=st.just(Noise(SIGMA, SIGMA)),
+)
+
+
+def after(pose: Pose, drive: Controls, mission: Mission = MISSION) -> Pose:
+    """Where a manoeuvre leads that is driven for as long as manoeuvres last."""
+    for _ in range(stride(mission)):
+        pose = step(pose, drive.v, drive.omega, mission.period)
+    return pose
+
+
+def held(pose: Pose, odds: float = 1.0, covariance: Array = SETTLED) -> Held:
+    return Held(odds, np.array([pose.x, pose.y, pose.heading]), covariance)
+
+
+# --- manoeuvres ---------------------------------------------------------------------------------------
+
+
+@given(missions)
+def test_no_manoeuvre_is_faster_than_the_robot(mission: Mission) -> None:
+    ways = choice(mission)
+    assert np.max(np.abs(ways.v)) <= mission.max_speed * (1.0 + 1e-12)
+    assert np.max(np.abs(ways.omega)) <= mission.max_turn_rate
+    assert Controls(float(ways.v[-1]), float(ways.omega[-1])) == REST
+
+
+@given(missions)
+def test_a_manoeuvre_leads_a_quarter_of_the_range_however_short_the_tick(mission: Mission) -> None:
+    ticks, straight = stride(mission), mission.first_straight
+    assert ticks >= 1
+    assert ticks == 1 or abs(ticks * straight - 0.25 * mission.sensing_range) <= 0.5 * straight + 1e-9
+
+
+@given(missions, st.integers(0, 68))
+def test_a_manoeuvre_leads_where_the_motion_model_says(mission: Mission, way: int) -> None:
+    ways, pose = choice(mission), Pose(0.0, 0.0, 0.0)
+    for k in range(ways.along.shape[1]):
+        pose = after(pose, Controls(float(ways.v[way]), float(ways.omega[way])), mission)
+        assert (ways.along[way, k], ways.across[way, k]) == pytest.approx((pose.x, pose.y), abs=1e-9)
+
+
+# --- alone --------------------------------------------------------------------------------------------
+
+
+@given(st.floats(0.3, 1.0), angles, angles, st.floats(0.4, 3.0))
+def test_alone_a_robot_stays_as_near_its_anchor_as_it_is_told(
+    part: float, bearing: float, heading: float, within: float
+) -> None:
+    rho = part * within
+    pose = Pose(rho * math.cos(bearing), rho * math.sin(bearing), heading)
+    there = after(pose, alone([held(pose)], MISSION, within))
+    assert math.hypot(there.x, there.y) <= within + 0.02
+
+
+@given(st.floats(0.2, 1.0), angles, angles)
+def test_alone_a_robot_stays_in_range_of_its_anchor(part: float, bearing: float, heading: float) -> None:
+    rho = part * REACH
+    pose = Pose(rho * math.cos(bearing), rho * math.sin(bearing), heading)
+    there = after(pose, alone([held(pose)], MISSION))
+    assert math.hypot(there.x, there.y) <= REACH
+
+
+@given(st.floats(-1.5, 1.5), st.floats(0.4, 1.8))
+def test_of_mirror_images_a_robot_drives_where_their_ranges_differ(along: float, aside: float) -> None:
+    """Ahead and behind the two are alike, and standing tells nothing either."""
+    one, other = Pose(along, aside, 0.0), Pose(along, -aside, 0.0)
+    tight = np.eye(2) * 1e-6
+    drive = alone([held(one, 0.5, tight), held(other, 0.5, tight)], MISSION)
+    gaps = []
+    for _ in range(AHEAD):
+        one, other = after(one, drive), after(other, drive)
+        gaps.append(math.hypot(one.x, one.y) - math.hypot(other.x, other.y))
+    assert math.hypot(*gaps) > 4.0 * SIGMA
+
+
+# --- together -----------------------------------------------------------------------------------------
+
+M2 = (10.0, 0.0)
+
+
+@given(st.floats(0.3, 0.85), angles, angles, st.floats(0.3, 0.85), angles, angles)
+def test_together_robots_keep_in_range_and_apart(
+    off: float, bearing: float, b_heading: float, between: float, towards: float, heading: float
+) -> None:
+    b = Pose(M2[0] + off * REACH * math.cos(bearing), off * REACH * math.sin(bearing), b_heading)
+    a = Pose(b.x + between * REACH * math.cos(towards), b.y + between * REACH * math.sin(towards), heading)
+    poses = np.array([a.x, a.y, a.heading, b.x, b.y, b.heading])
+    by_a, by_b = together([Held(1.0, poses, BOTH_SETTLED)], M2, MISSION)
+    there, peer = after(a, by_a), after(b, by_b)
+    assert 0.15 * REACH < math.hypot(there.x - peer.x, there.y - peer.y) < 0.95 * REACH
+    assert math.hypot(peer.x - M2[0], peer.y - M2[1]) < 0.95 * REACH
+
+
+# --- the circle ---------------------------------------------------------------------------------------
+
+
+@given(st.floats(2.0, 20.0), angles, st.sampled_from([1.0, -1.0]))
+def test_from_the_circle_itself_pursuit_is_eq_6(radius: float, bearing: float, sense: float) -> None:
+    orbit = Orbit(radius, 1.0, sense / radius)
+    local = Pose(radius * math.cos(bearing), radius * math.sin(bearing), bearing + sense * math.pi / 2)
+    drive = pursuit(local, orbit, MISSION)
+    assert (drive.v, drive.omega) == pytest.approx((orbit.v, orbit.omega), abs=1e-9)
+
+
+@given(st.floats(4.0, 20.0), st.floats(-0.8, 0.8), st.floats(-0.5, 0.5), st.sampled_from([1.0, -1.0]))
+def test_from_beside_the_circle_pursuit_leads_back_to_it(
+    radius: float, off: float, askew: float, sense: float
+) -> None:
+    orbit = Orbit(radius, 1.0, sense / radius)
+    local = Pose(radius + off, 0.0, sense * math.pi / 2 + askew)
+    for _ in range(40):
+        drive = pursuit(local, orbit, MISSION)
+        assert drive.v == orbit.v
+        assert abs(drive.omega) <= MISSION.max_turn_rate
+        local = step(local, drive.v, drive.omega, MISSION.period)
+    assert math.hypot(local.x, local.y) == pytest.approx(radius, abs=1e-3)
+
+
+# --- home ---------------------------------------------------------------------------------------------
+
+
+@given(missions, st.booleans(), st.floats(-30.0, 30.0), st.floats(-30.0, 30.0), angles)
+def test_from_anywhere_a_robot_finds_home(
+    mission: Mission, exact: bool, x: float, y: float, heading: float
+) -> None:
+    if exact:
+        mission = replace(mission, noise=Noise())
+    pose, home = Pose(x, y, heading), Homing(Pose(1.0, -2.0, 0.5))
+    far = math.hypot(x - 1.0, y + 2.0)
+    legs = far / (mission.max_speed * mission.period) + math.pi / (mission.max_turn_rate * mission.period)
+    for _ in range(math.ceil(1.2 * legs) + 10):
+        drive = homeward(home, pose, mission)
+        if drive is None:
+            break
+        assert abs(drive.v) <= mission.max_speed
+        assert abs(drive.omega) <= mission.max_turn_rate
+        pose = step(pose, drive.v, drive.omega, mission.period)
+    assert math.hypot(pose.x - 1.0, pose.y + 2.0) <= arrived(mission)[0]
+
+
+# --- the way round ------------------------------------------------------------------------------------
+
+
+def test_exact_sensors_need_no_clearance_and_the_plan_is_as_it_was() -> None:
+    exact = replace(MISSION, noise=Noise())
+    careless = replace(exact, accuracy=1.0, confidence=0.5)
+    assert clearance(exact, 10.0) == clearance(careless, 10.0) == 0.0
+    assert rendezvous(exact, 10.0, "assured") == rendezvous(careless, 10.0, "assured")
+
+
+def test_what_is_not_known_makes_the_way_round_longer() -> None:
+    exact, coarse = replace(MISSION, noise=Noise()), MISSION
+    drifting = replace(MISSION, noise=Noise(SIGMA, SIGMA, odometry=Drift(0.02, 0.02)))
+    assert 0.0 < clearance(coarse, 10.0) < clearance(drifting, 10.0) < 0.5 * REACH
+    bounds = [rendezvous(one, 10.0, "assured").bound for one in (exact, coarse, drifting)]
+    assert bounds == sorted(set(bounds))
