@@ -6,6 +6,7 @@ yet is worth less than moving on; in phase 3 both move, each to where the next r
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from msgspec.structs import replace
@@ -35,6 +36,9 @@ CHECKED = 8
 
 FEW = 3
 """mutual ranges; with fewer, hypotheses are too many to be of use"""
+
+UNLUCKY = 3.0
+"""standard deviations, of the number of drop-outs"""
 
 SEARCHED = frozenset((FEW, *(CHECKED * 2**n for n in range(12))))
 """with so many mutual ranges the whole plane is searched again"""
@@ -90,7 +94,7 @@ def _surveyed(mind: Mind) -> Mind:
         mind = inference.with_own(mind, weighed)
     if _silent(mind) >= LOST * surveying.stride(mind.briefing.mission):
         return _homeward(mind)
-    if not weighed or weighed[0].silence < MISLED:
+    if not weighed or weighed[0].silence < MISLED + _by_drop_outs(mind):
         if not ranged:
             return _homeward(mind)
         return replace(mind, state=Straight("anchor", mind.odometry, mind.log.ranges[-1].range))
@@ -101,6 +105,13 @@ def _surveyed(mind: Mind) -> Mind:
         return _parted(mind)
     drive = surveying.alone(inference.held_alone(weighed), mission)
     return replace(mind, state=Surveying("anchor", drive))
+
+
+def _by_drop_outs(mind: Mind) -> float:
+    """In log-likelihood: what as many drop-outs cost as there may be by now."""
+    p = mind.briefing.mission.noise.drop_outs
+    expected = p * (mind.tick + 1)
+    return (expected + UNLUCKY * math.sqrt(expected)) * math.log(p) if p else 0.0
 
 
 def _silent(mind: Mind) -> int:

@@ -99,6 +99,10 @@ def obstacle(mission: Mission, distance: float) -> str | None:
     return None
 
 
+MOST_OUTLIERS = 0.25
+"""of all ranges: with half of them, 2 claims of 23 tried were wrong"""
+
+
 def noise_obstacle(mission: Mission) -> str | None:
     """The field, and why no robot could be sure of its pose with such noise; None if it can."""
     noise, reach, accuracy = mission.noise, mission.sensing_range, mission.accuracy
@@ -115,6 +119,8 @@ def noise_obstacle(mission: Mission) -> str | None:
                 f"accuracy: {accuracy:.3g} m is the mean of more than {MOST_RANGES:g} ranges with "
                 f"mission.noise.{name} = {sigma:.3g} m"
             )
+    if noise.outliers > MOST_OUTLIERS:
+        return f"noise.outliers: with more than {MOST_OUTLIERS:g} of them, those that agree may all be wrong"
     if accuracy > reach * math.sqrt(0.5):  # the root of the trace, of a point anywhere in a disc of radius R
         return (
             f"accuracy: a robot anywhere in range of its anchor knows where it is to {accuracy:.3g} m, where "

@@ -229,6 +229,7 @@ def test_noise_misspelt_is_named(field: str, says: str) -> None:
             "0.11\naccuracy = 0.001",
             "accuracy: 0.001 m is the mean of more than 10000 ranges",
         ),
+        ("noise.outliers", "0.26", "noise.outliers: with more than 0.25 of them, those that agree may all"),
         ("noise.actuation.v_floor", "1.1", "noise.actuation.v_floor: more than mission.max_speed = 1 m/s"),
         (
             "noise.odometry.omega_floor",
@@ -258,7 +259,7 @@ def test_a_mistake_about_noise_is_one_line_and_status_2(
 
 def test_noise_up_to_its_bounds_is_played() -> None:
     for noise in (
-        "{anchor_sigma = 3.0, mutual_sigma = 3.0, outliers = 0.5, drop_outs = 0.5, outlier_bias = [1, 1]}",
+        "{anchor_sigma = 3.0, mutual_sigma = 3.0, outliers = 0.25, drop_outs = 0.5, outlier_bias = [1, 1]}",
         "{actuation = {v = 0.5, omega = 0.5, v_floor = 1.0, omega_floor = 3.1}, odometry = {omega = 0.5}}",
         "{}\naccuracy = 1e6",
         "{outliers = 0.1}\naccuracy = 2.1\nconfidence = 0.5",

@@ -249,7 +249,7 @@ def test_another_seed_is_another_noise() -> None:
     assert not set(one) & set(other)
 
 
-@pytest.mark.parametrize("share", [0.05, 0.5])
+@pytest.mark.parametrize("share", [0.05, 0.25])
 def test_outliers_have_their_probability_and_a_uniform_positive_bias(share: float) -> None:
     least, most = 0.4, 1.6
     scenario = near(f"outliers = {share}\noutlier_bias = [{least}, {most}]")
@@ -265,18 +265,20 @@ def test_outliers_have_their_probability_and_a_uniform_positive_bias(share: floa
 
 
 def test_biases_are_drawn_for_each_sensor_and_robot() -> None:
-    told = all_ranges(near("outliers = 0.5"))
+    told = all_ranges(near("outliers = 0.25"))
     biases = [known(ranges) - rho for ranges, rho in zip(told, (RHO_A, RHO_B, APART), strict=True)]
     for one, other in combinations(biases, 2):
         both = (one != 0.0) & (other != 0.0)
-        assert has_share(int(both.sum()), N, 0.25)
+        assert has_share(int(both.sum()), N, 0.0625)
         assert are_uncorrelated(one[both], other[both])
 
 
 def test_outliers_and_sigmas_add_up() -> None:
-    told = known(to_anchors(near("anchor_sigma = 0.1\noutliers = 0.5\noutlier_bias = [1.0, 1.0]"))[0]) - RHO_A
+    told = (
+        known(to_anchors(near("anchor_sigma = 0.1\noutliers = 0.25\noutlier_bias = [1.0, 1.0]"))[0]) - RHO_A
+    )
     upper = told[told > 0.5]
-    assert has_share(len(upper), N, 0.5)
+    assert has_share(len(upper), N, 0.25)
     assert is_gaussian(upper - 1.0, 0.1)
     assert is_gaussian(told[told <= 0.5], 0.1)
 

@@ -249,3 +249,22 @@ def test_a_robot_whose_peer_gives_up_under_noise_gives_up_too() -> None:
             assert planner.decide(observed["a"], [told]).verdict == Undecided("b says: no way")
             return
     pytest.fail("they never met")
+
+
+def first_impossible(count: int) -> list[int]:
+    """Seeds of MANY whose first range, of either robot, is longer than any within R can be."""
+    found = (
+        seed
+        for seed in range(4000)
+        if any((first_ranges(scenario_of(MANY, seed), robot, 1)[0] or 0.0) > 3.6 for robot in (0, 1))
+    )
+    return [next(found) for _ in range(count)]
+
+
+def test_who_begins_with_a_range_that_cannot_be_localises_all_the_same() -> None:
+    for seed in first_impossible(4):
+        assert_localised(survey(MANY, seed))
+
+
+def test_drop_outs_that_add_up_do_not_keep_a_robot_in_phase_1() -> None:
+    assert_localised(survey(f"{SIGMA}\noutliers = 0.05\ndrop_outs = 0.1\n{WHEELS}\n{ODOMETRY}", 9))

@@ -145,6 +145,7 @@ def inside_arc(rho0: float, mission: Mission) -> float:
     """2 pi - 2 eta in rad (Section III.A.2): how much of the circle, about a point `rho0` m from the
     beacon, is in its range."""
     radius, reach = mission.first_straight, mission.sensing_range
+    rho0 = min(rho0, reach)  # an outlier may be longer
     cosine = (reach * reach - rho0 * rho0 - radius * radius) / (2.0 * radius * rho0) if rho0 > 0.0 else 1.0
     return TAU - 2.0 * math.acos(min(1.0, max(-1.0, cosine)))
 
