@@ -176,7 +176,7 @@ def test_uniform_draws_are_uniform_between_0_and_1_and_gaussian_ones_gaussian() 
 
 def test_an_outlier_or_a_drop_out_shifts_no_other_draw() -> None:
     sigmas = "anchor_sigma = 0.01\nmutual_sigma = 0.02\nactuation = {v = 0.1}\nodometry = {omega = 0.1}"
-    plain, rough = near(sigmas), near(f"{sigmas}\noutliers = 0.3\ndrop_outs = 0.2")
+    plain, rough = near(sigmas), near(f"{sigmas}\noutliers = 0.25\ndrop_outs = 0.2")
     ticks = 500
     for clean, seen in zip(all_ranges(plain, ticks), all_ranges(rough, ticks), strict=True):
         extra = [
@@ -185,7 +185,7 @@ def test_an_outlier_or_a_drop_out_shifts_no_other_draw() -> None:
         assert len(clean) == len(known(clean))
         assert 0.7 * ticks < len(extra) < 0.9 * ticks
         biased = [bias for bias in extra if bias != 0.0]
-        assert 0.2 * ticks < len(biased) < 0.4 * len(extra)
+        assert 0.15 * ticks < len(biased) < 0.4 * len(extra)
         assert 0.3 < min(biased) < max(biased) < 2.0
     for tick in range(ticks):
         asked = Controls(1.0, 0.5)
