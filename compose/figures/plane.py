@@ -147,10 +147,16 @@ def ages(story: Story) -> dict[int, str]:
 
 
 def legible(story: Story) -> list[tuple[Estimate, Pose]]:
-    """The estimates whose ellipse is drawn, in time: the last, and before it those that it does not hide."""
+    """The estimates whose ellipse is drawn, in time: the last, and before it those that it does not hide.
+
+    Not one larger than R: that says that nothing is known.
+    """
     chosen: list[tuple[Estimate, Pose]] = []
+    largest = story.record.scenario.mission.sensing_range
     for estimate, truth in reversed(story.likeliest):
         if estimate.covariance is None or len(chosen) == ELLIPSES:
+            continue
+        if SIGMAS * estimate.covariance.position_sigma > largest:
             continue
         if chosen:
             after = chosen[-1][0]
