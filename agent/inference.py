@@ -83,15 +83,19 @@ def held_alone(weighed: Sequence[Weighed]) -> list[Held]:
 def settled(weighed: Sequence[Weighed], mission: Mission) -> bool:
     """Whether what is left to know of the anchor is worth less than moving on."""
     best = weighed[0]
+    enough = ANCHOR_RANGES_WITH_OUTLIERS if mission.noise.outliers else ANCHOR_RANGES
     return (
-        int(np.count_nonzero(best.fit.weights > 0.5)) >= ANCHOR_RANGES
+        int(np.count_nonzero(best.fit.weights > 0.5)) >= enough
         and best.hypothesis.odds >= SURE_OF_BRANCH
         and math.sqrt(float(np.trace(best.fit.covariance))) <= mission.foothold
     )
 
 
 SURE_OF_BRANCH = 0.999
-ANCHOR_RANGES = 5
+"""the odds at which a robot takes a branch for the right one and goes to meet its peer"""
+
+ANCHOR_RANGES, ANCHOR_RANGES_WITH_OUTLIERS = 5, 7
+"""to its anchor at the least, before a robot goes: two unknowns, and three that check them"""
 
 
 def pair_of(mind: Mind) -> Pair:

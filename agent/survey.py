@@ -31,7 +31,7 @@ LOST_TOGETHER = 6
 MISLED = -8.0
 """in log-likelihood: less likely than this, it is not the sensors' chance that a hypothesis has against it"""
 
-CHECKED = 8
+CHECKED, CHECKED_WITH_OUTLIERS = 8, 12
 """mutual ranges at the least before a claim"""
 
 FEW = 3
@@ -190,10 +190,11 @@ def _considered(mind: Mind) -> Mind:
     known = mind.findings.pair
     searched = not known or mutual in SEARCHED
     weighed = search(pair) if searched else follow(known, pair)
-    judged = inference.with_pair(mind, weighed, pair, CHECKED)
+    checked = CHECKED_WITH_OUTLIERS if mission.noise.outliers else CHECKED
+    judged = inference.with_pair(mind, weighed, pair, checked)
     if judged.findings.missing is None and not searched:
         weighed = search(pair)
-        judged = inference.with_pair(mind, weighed, pair, CHECKED)
+        judged = inference.with_pair(mind, weighed, pair, checked)
     if judged.findings.missing is None:
         return claimed(judged)
     if role == "a" and mutual >= ENOUGH * (1 + mind.findings.returns):
