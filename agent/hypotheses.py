@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from msgspec.structs import replace
 
-from agent.odometry import Array, Errors, Places, Track, wander
+from agent.odometry import Array, Places, Track, wander
 from agent.ranging import SIGMA_FLOOR, Ranges, mixture, turned
 from agent.smoothing import STEPS, Fit, fit
 from protocol.noise import Drift, Noise
@@ -45,23 +45,17 @@ ROUGH_STEPS = 2
 """of Gauss-Newton, from a seed; then it shows which are worth more"""
 
 WARM_STEPS = 1
-"""of Gauss-Newton, from where the fit was a tick ago; before a claim it is done to the end"""
+"""of Gauss-Newton, from the guess of a tick ago; before a claim it is done to the end"""
 
 
 class Hypothesis(NamedTuple):
     """One way in which all that was measured may have come about."""
 
     guess: tuple[float, ...]
-    """see `smoothing.predict`: of each robot, where its anchor lies in the frame of its odometry, and how
+    """see `ranging.predict`: of each robot, where its anchor lies in the frame of its odometry, and how
     that frame is turned in <W>"""
     odds: float
     """the probability that it is the true one; of all that are left they sum to 1"""
-    errors: tuple[tuple[tuple[float, ...], tuple[float, ...]], ...] = ()
-    """for each robot, what the odometry's are held to be: in v (m/s) and omega (rad/s), at each tick"""
-
-
-Start = tuple[Array, tuple[Errors, ...]]
-"""a guess, and errors of the odometry, to begin a fit with"""
 
 
 class Weighed(NamedTuple):
@@ -88,14 +82,6 @@ def with_odds(fits: Sequence[tuple[Fit, float]]) -> tuple[Weighed, ...]:
         Weighed(Hypothesis(tuple(one.guess.tolist()), odds / total), one, silent)
         for odds, one, silent in left
     )
-
-
-def _listed(errors: tuple[Errors, ...]) -> tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]:
-    return tuple([(tuple(error.v.tolist()), tuple(error.omega.tolist())) for error in errors])
-
-
-def _errors(hypothesis: Hypothesis) -> tuple[Errors, ...]:
-    return tuple([Errors(np.array(v), np.array(omega)) for v, omega in hypothesis.errors])
 
 
 def _same(one: Fit, other: Fit) -> bool:
@@ -152,15 +138,13 @@ def of_anchor(
     known = tuple(before)
     lost = bool(len(silent)) and silent[-1] == len(path.x) - 1
     if known and len(ranges.rho) > SEED_RANGES and not lost:
-        starts: list[Start] = [(np.array(one.guess), _errors(one)) for one in known]
+        starts = [np.array(one.guess) for one in known]
         steps = WARM_STEPS
     else:
         places = [one.guess[:2] for one in known]
-        starts = [
-            (np.array([*point, 0.0]), ()) for point in anchors(path, ranges, sensing_range, noise, places)
-        ]
+        starts = [np.array([*point, 0.0]) for point in anchors(path, ranges, sensing_range, noise, places)]
         steps = STEPS
-    fits = [fit(guess, [path], ranges, noise, steps=steps, errors=errors) for guess, errors in starts]
+    fits = [fit(guess, [path], ranges, noise, steps=steps) for guess in starts]
     return with_odds([(one, _within(one, 0, silent, ranges.tick, sensing_range, noise)) for one in fits])
 
 
@@ -240,6 +224,8 @@ def _crossings(path: Track, ranges: Ranges) -> Array:
 
     Circles that noise has kept apart meet half way.
     """
+    if len(ranges.rho) < 2:
+        return np.empty((0, 2))
     chosen = np.unique(np.linspace(0, len(ranges.rho) - 1, SEED_RANGES).round().astype(np.intp))
     i, j = np.triu_indices(len(chosen), 1)
     i, j = chosen[i], chosen[j]
@@ -339,25 +325,23 @@ def search(pair: Pair) -> tuple[Weighed, ...]:
         anchors(path, pair.ranges.only(robot), pair.sensing_range, pair.noise)
         for robot, path in enumerate(pair.paths)
     )
-    seeds: list[Start] = [
-        (np.array([*a, theta_a, *b, theta_b]), ())
+    seeds = [
+        np.array([*a, theta_a, *b, theta_b])
         for a in of_a
         for b in of_b
         for theta_a, theta_b in placements(a, b, pair)
     ]
     rough = _fitted(seeds, pair.without_drift(), ROUGH_STEPS)
-    return _fitted([(one.fit.guess, ()) for one in rough], pair, STEPS)
+    return _fitted([one.fit.guess for one in rough], pair, STEPS)
 
 
 def follow(before: Sequence[Hypothesis], pair: Pair) -> tuple[Weighed, ...]:
     """What is left of what was held `before`, after another tick."""
-    return _fitted([(np.array(one.guess), _errors(one)) for one in before], pair, WARM_STEPS)
+    return _fitted([np.array(one.guess) for one in before], pair, WARM_STEPS)
 
 
-def _fitted(starts: Sequence[Start], pair: Pair, steps: int) -> tuple[Weighed, ...]:
-    fits = [
-        fit(guess, pair.paths, pair.ranges, pair.noise, pair.apart, steps, errors) for guess, errors in starts
-    ]
+def _fitted(guesses: Sequence[Array], pair: Pair, steps: int) -> tuple[Weighed, ...]:
+    fits = [fit(guess, pair.paths, pair.ranges, pair.noise, pair.apart, steps) for guess in guesses]
     return with_odds([(one, _silence(one, pair)) for one in fits])
 
 

@@ -99,7 +99,7 @@ ANCHOR_RANGES, ANCHOR_RANGES_WITH_OUTLIERS = 5, 7
 
 
 def pair_of(mind: Mind) -> Pair:
-    """All that both have measured, up to the last tick that both logs cover;"""
+    """All that both have measured, up to the last tick that both logs cover."""
     peer, briefing = mind.radio.peer, mind.briefing
     mission = briefing.mission
     last = min(mind.tick, peer.through, mind.radio.ranges_through)

@@ -14,9 +14,9 @@ from agent import inference
 from agent.belief import Branch
 from agent.geometry import Placement
 from agent.hypotheses import search
-from agent.mind import Mind
+from agent.mind import WORDS, Mind
 from agent.phases import encounter
-from agent.phases.encounter import LastManoeuvre, Standing
+from agent.phases.encounter import LastManoeuvre, Standing, Waiting
 from agent.phases.surveying import Held
 from agent.survey import claimed
 from protocol.motion import ORIGIN, wrap
@@ -45,7 +45,7 @@ def considered(mind: Mind) -> Mind:
     """Phase 3, after a's second range and again after b's last manoeuvre."""
     pair = inference.pair_of(mind)
     mutual = pair.ranges.counts[2]
-    if mutual < CHECKED - 1:
+    if len(pair.paths[0].v) < mind.tick or mutual < CHECKED - 1:
         return mind
     weighed = search(pair)
     mind = inference.with_pair(mind, weighed, pair, CHECKED)
@@ -69,7 +69,9 @@ def considered(mind: Mind) -> Mind:
 
 def waits(mind: Mind) -> bool:
     """Whether b has yet to hear that a has its second range."""
-    return isinstance(mind.state, Standing) and mind.findings.plan is None and mind.radio.state != "waiting"
+    return (
+        isinstance(mind.state, Standing) and mind.findings.plan is None and mind.radio.state != WORDS[Waiting]
+    )
 
 
 def _seen_from_b(held: Held) -> Placement:

@@ -158,11 +158,6 @@ class Errors(NamedTuple):
     v: Array
     omega: Array
 
-    def through(self, k: int) -> Errors:
-        """The same, and none at the ticks up to `k` that have come since."""
-        more = (0, k - len(self.v))
-        return Errors(np.pad(self.v, more), np.pad(self.omega, more))
-
     def corrected(self, measured: Track) -> Track:
         """The path that was driven."""
         return track(measured.v + self.v, measured.omega + self.omega, measured.period)

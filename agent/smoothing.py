@@ -48,8 +48,6 @@ class Fit(NamedTuple):
     guess: Array
     paths: tuple[Track, ...]
     """as driven, by this fit"""
-    errors: tuple[Errors, ...]
-    """of the odometry, by this fit; none where it is exact"""
     log_likelihood: float
     """of the ranges, the odometry's errors integrated out"""
     residuals: Array
@@ -100,18 +98,12 @@ def fit(
     noise: Noise,
     apart: tuple[float, float] = (0.0, 0.0),
     steps: int = STEPS,
-    errors: tuple[Errors, ...] = (),
 ) -> Fit:
-    """Gauss-Newton from `guess` (see `predict`), and from what the odometry's `errors` are held to be.
-
-    Outliers lose their weight on the way.
-    """
+    """Gauss-Newton from `guess` (see `predict`); outliers lose their weight on the way."""
     free = slice(0, 2) if len(measured) == 1 else slice(0, 6)
     paths: tuple[Track, ...] = tuple(measured)
     drifts: tuple[Wander, ...] = ()
-    if errors:
-        errors = tuple([error.through(len(path.v)) for error, path in zip(errors, measured, strict=True)])
-        paths = tuple([error.corrected(path) for error, path in zip(errors, measured, strict=True)])
+    errors: tuple[Errors, ...] = ()
     guess, weights = guess.copy(), np.ones_like(ranges.rho)
     drifting = noise.odometry != Drift()
     for step in range(steps + 1):
@@ -147,7 +139,6 @@ def fit(
     return Fit(
         guess,
         paths,
-        errors,
         _log_likelihood(system, chi2, residuals, weights, ranges.sigma, noise),
         residuals,
         weights,

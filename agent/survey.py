@@ -13,7 +13,7 @@ from msgspec.structs import replace
 
 from agent import inference
 from agent.hypotheses import Weighed, follow, search
-from agent.mind import Done, Mind
+from agent.mind import Asleep, Done, Mind
 from agent.phases import rendezvous, seeking, surveying
 from agent.phases.encounter import Returning
 from agent.phases.rendezvous import Aligning, Orbiting, Radial, Tangent
@@ -56,11 +56,11 @@ def sensed(mind: Mind, anchor_range: float | None) -> Mind:
             return _surveyed(mind) if onward is None else replace(mind, state=onward)
         case Surveying("anchor"):
             return _surveyed(mind) if decides(mind) else mind
-        case Homing(place):
+        case Homing():
             if anchor_range is not None:
                 return _surveyed(mind)
             there = seeking.homeward(mind.state, mind.odometry, mind.briefing.mission) is None
-            return replace(mind, state=Straight("anchor", place, 0.0)) if there else mind
+            return replace(mind, state=Straight("anchor", mind.odometry, 0.0)) if there else mind
         case Aligning() | Radial() | Tangent() | Orbiting():
             return _under_way(mind, anchor_range is not None)
         case Surveying("peer") if mind.briefing.role == "b" and _silent(
@@ -143,7 +143,11 @@ def _under_way(mind: Mind, ranged: bool) -> Mind:
     state = rendezvous.onward(mind.state, mind.odometry, mind.start, mind.orbit, mission)
     if isinstance(state, Orbiting):
         since = state.since or mind.tick
-        late = mind.tick - since > mind.briefing.rendezvous.bound / mission.period + LOST and not mind.near
+        late = (
+            mind.tick - since
+            > mind.briefing.rendezvous.bound / mission.period + LOST * surveying.stride(mission)
+            and not mind.near
+        )
         if late if mind.orbit.v else _silent(mind) >= LOST * surveying.stride(mission):
             return _homeward(mind)
         if mind.orbit.v != 0.0:
@@ -151,7 +155,7 @@ def _under_way(mind: Mind, ranged: bool) -> Mind:
         elif weighed:
             drive = surveying.alone(inference.held_alone(weighed), mission, mind.orbit.radius)
         else:
-            drive = state.drive or REST
+            drive = REST if decides(mind) else state.drive or REST
         state = Orbiting(drive, since)
     return replace(mind, state=state)
 
@@ -162,7 +166,7 @@ def _under_way(mind: Mind, ranged: bool) -> Mind:
 def heard(mind: Mind) -> Mind:
     """What the robot is set to do once it has heard its peer, in range."""
     match mind.state:
-        case Done():
+        case Done() | Asleep():
             return mind
         case Surveying("anchor") | Straight() | Backing() | Turning() | Circling() | Homing():
             return mind
@@ -184,11 +188,14 @@ def _considered(mind: Mind) -> Mind:
     if mind.findings.met is None:
         mind = replace(mind, findings=replace(mind.findings, met=mind.tick))
     pair = inference.pair_of(mind)
+    if len(pair.paths[0].v) < mind.tick:  # the peer's log is behind, and catches up
+        return replace(mind, state=Surveying("peer"))
     mutual = pair.ranges.counts[2]
     if mutual < FEW:
         return _blindly(mind)
     known = mind.findings.pair
-    searched = not known or mutual in SEARCHED
+    before = sum([ranged.tick <= mind.tick - surveying.stride(mission) for ranged in mind.mutual])
+    searched = not known or any(before < count <= mutual for count in SEARCHED)
     weighed = search(pair) if searched else follow(known, pair)
     checked = CHECKED_WITH_OUTLIERS if mission.noise.outliers else CHECKED
     judged = inference.with_pair(mind, weighed, pair, checked)

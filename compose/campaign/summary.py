@@ -64,8 +64,8 @@ class Counted(msgspec.Struct, frozen=True):
     within_3_accuracy: float | None
     """of these, off by no more than 3 times mission.accuracy"""
     nees_mean: float | None
-    """over trials that localised, each with the mean of its robots' claims: 3 is expected where covariances
-    are true"""
+    """over trials that were not wrong, each with the mean of its robots' claims: 3 is expected where
+    covariances are true"""
     nees_low: float | None
     """between which bounds that lies in 99 % of campaigns then"""
     nees_high: float | None
@@ -96,7 +96,7 @@ def counted(table: pa.Table, refused: str | None = None) -> Counted:
     low, high = wilson(k, n)
     ticks = column(table, "ticks")[np.array([outcome == "localised" for outcome in outcomes], bool)]
     meeting, error = _known(column(table, "meeting_tick")), _known(column(table, "position_error_m"))
-    right = table.filter(pa.array([outcome == "localised" for outcome in outcomes], pa.bool_()))
+    right = table.filter(pa.array([outcome != "wrong" for outcome in outcomes], pa.bool_()))
     claims, nees = int(_known(column(table, "claims")).sum()), _known(column(right, "nees"))
     nees_low, nees_high = nees_band(len(nees))
     return Counted(
