@@ -16,7 +16,7 @@ from protocol.motion import TAU, Pose, Run, chord, compose, follow, step, wrap
 EXACT = 1e-9
 ROUNDING = 1e-7
 """m: residuals of any solution, however ill-conditioned"""
-DOUBLE_ROOT = 5e-2
+DOUBLE_ROOT = 1e-1
 """m and rad: two square roots, one after the other, of what rounding leaves"""
 
 angles = st.floats(-math.pi, math.pi)
