@@ -1,0 +1,401 @@
+"""What noise makes of a path and of its ranges, and what a fit makes of both: held against brute force."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from agent.odometry import Errors, Seen, Track, attributed, moved, spread, track, wander
+from agent.ranging import Ranges, predict
+from agent.smoothing import STILL, Fit, fit, poses
+from protocol.motion import ORIGIN, Pose, compose, step
+from protocol.noise import Drift, Noise
+
+Array = NDArray[np.float64]
+
+SMALL = 1e-5
+"""by what a variable is moved, to see a derivative"""
+
+speeds = st.floats(-2.0, 2.0)
+turns = st.one_of(st.floats(-4.0, 4.0), st.sampled_from((0.0, 1e-4, -1e-4)))
+manoeuvres = st.lists(st.tuples(speeds, turns), min_size=1, max_size=8)
+periods = st.floats(0.2, 2.0)
+shares = st.floats(0.0, 0.1)
+drifts = st.builds(Drift, shares, shares, shares, shares)
+lengths = st.floats(-5.0, 5.0)
+seeds = st.integers(0, 2**32 - 1)
+some = settings(max_examples=50)
+few = settings(max_examples=20)
+
+
+def derivative(of: Callable[[Array], Array], at: Array) -> Array:
+    """By central differences; (rows, unknowns)."""
+    sides = [(of(at + one) - of(at - one)) / (2.0 * SMALL) for one in SMALL * np.eye(len(at))]
+    return np.stack(sides, -1)
+
+
+def near(expected: Array) -> object:
+    """To as many digits as differences give."""
+    return pytest.approx(expected, rel=1e-6, abs=1e-7 * max(1.0, float(np.max(np.abs(expected)))))
+
+
+def variances(drift: Drift, measured: Track) -> Array:
+    """Of the noise in v at each tick, then of that in omega."""
+    ticks = zip(measured.v.tolist(), measured.omega.tolist(), strict=True)
+    return np.array([drift.variances(v, omega) for v, omega in ticks]).T.ravel()
+
+
+# --- the path -----------------------------------------------------------------------------------------
+
+
+def track_of(driven: list[tuple[float, float]], period: float) -> Track:
+    v, omega = np.array(driven).T
+    return track(v, omega, period)
+
+
+@some
+@given(manoeuvres, periods)
+def test_a_track_is_where_the_steps_lead(driven: list[tuple[float, float]], period: float) -> None:
+    path, poses = track_of(driven, period), [ORIGIN]
+    for v, omega in driven:
+        poses.append(step(poses[-1], v, omega, period))
+    assert np.stack((path.x, path.y, path.heading), 1) == pytest.approx(
+        np.array([(pose.x, pose.y, pose.heading) for pose in poses]), abs=1e-9
+    )
+
+
+class Looks(NamedTuple):
+    """Rows along a path, and the derivatives of what they look at."""
+
+    path: Track
+    rows: Seen
+    by_noise: Array
+    """in v at each tick, then in omega; (rows, 2 k)"""
+
+
+@st.composite
+def looks(draw: st.DrawFn) -> Looks:
+    """At positions, in any direction and as if through any glass; or at headings."""
+    path = track_of(draw(manoeuvres), draw(periods))
+    k = len(path.v)
+    kinds = st.tuples(st.integers(0, k), lengths, lengths, st.booleans())
+    seen = draw(st.lists(kinds, min_size=1, max_size=6))
+    ticks = np.array([tick for tick, *_ in seen], np.intp)
+    heading = np.array([turned for *_, turned in seen])
+    u = np.where(heading, 0.0, np.array([(x, y) for _, x, y, _ in seen]).T)
+    rows = Seen.positions(path, ticks, u)
+    rows.lever[heading] = path.period
+
+    def looked_at(noise: Array) -> Array:
+        other = track(path.v + noise[:k], path.omega + noise[k:], path.period)
+        return np.where(heading, other.heading[ticks], u[0] * other.x[ticks] + u[1] * other.y[ticks])
+
+    return Looks(path, rows, derivative(looked_at, np.zeros(2 * k)))
+
+
+@some
+@given(looks(), drifts)
+def test_noise_of_the_odometry_spreads_along_the_path(look: Looks, drift: Drift) -> None:
+    covariance = look.by_noise @ np.diag(variances(drift, look.path)) @ look.by_noise.T
+    assert spread(wander(look.path, drift, look.path), look.rows) == near(covariance)
+
+
+@some
+@given(looks(), drifts, seeds)
+def test_errors_of_the_odometry_move_every_later_place(look: Looks, drift: Drift, seed: int) -> None:
+    errors = np.random.default_rng(seed).normal(size=(2, len(look.path.v)))
+    move = moved(wander(look.path, drift, look.path), look.rows, Errors(*errors))
+    assert move == near(look.by_noise @ errors.ravel())
+
+
+@some
+@given(looks(), drifts, seeds)
+def test_what_is_seen_off_its_place_is_attributed_to_the_noise_before(
+    look: Looks, drift: Drift, seed: int
+) -> None:
+    off = np.random.default_rng(seed).normal(size=len(look.rows.tick))
+    errors = attributed(wander(look.path, drift, look.path), look.rows, off)
+    expected = variances(drift, look.path) * (look.by_noise.T @ off)
+    assert np.concatenate(errors) == near(expected)
+
+
+@few
+@given(manoeuvres, periods, drifts)
+def test_noise_has_the_size_of_what_was_measured_and_the_course_of_what_was_driven(
+    driven: list[tuple[float, float]], period: float, drift: Drift
+) -> None:
+    path, measured = track_of(driven, period), track_of([(1.0, -0.5)] * len(driven), period)
+    wandered = wander(path, drift, measured)
+    assert wandered.variances.ravel() == pytest.approx(variances(drift, measured))
+    assert wandered.b == pytest.approx(wander(path, drift, path).b)
+
+
+# --- the ranges ---------------------------------------------------------------------------------------
+
+
+class Told(NamedTuple):
+    """What two robots have measured, and what is true."""
+
+    measured: tuple[Track, Track]
+    ranges: Ranges
+    noise: Noise
+    apart: tuple[float, float]
+    """m: M2 - M1"""
+    guess: Array
+    """the true one"""
+    poses: Array
+    """the true last poses, relative to M1"""
+
+
+K = 10
+"""ticks that both drive"""
+
+
+def told(seed: int, noise: Noise) -> Told:
+    """Both drive about their anchors at random, and are ranged in each tick."""
+    draw = np.random.default_rng(seed)
+    apart = draw.uniform(-4.0, 4.0, 2)
+    measured, guess, tracks = [], [], []
+    for anchor in (np.zeros(2), apart):
+        v, omega = draw.uniform(0.3, 1.5, K), draw.uniform(-2.0, 2.0, K)
+        odometry = track(v, omega, 0.8)
+        error = np.sqrt(variances(noise.odometry, odometry)) * draw.normal(size=2 * K)
+        pose = Pose(draw.uniform(-2.0, 2.0), draw.uniform(-2.0, 2.0), draw.uniform(-3.0, 3.0))
+        guess += [*placed(pose), pose.heading]
+        driven = [Pose(float(anchor[0]) + pose.x, float(anchor[1]) + pose.y, pose.heading)]
+        for rate, turn in (np.stack((v, omega)) + error.reshape(2, K)).T.tolist():
+            driven.append(step(driven[-1], rate, turn, odometry.period))
+        measured.append(odometry)
+        tracks.append(np.array([(one.x, one.y, one.heading) for one in driven]))
+    a, b = tracks
+    ways = (a[:, :2], b[:, :2] - apart, a[:, :2] - b[:, :2])
+    sigmas = (noise.anchor_sigma, noise.anchor_sigma, noise.mutual_sigma)
+    first, second, mutual = (
+        list(enumerate((np.hypot(*way.T) + sigma * draw.normal(size=K + 1)).tolist()))
+        for way, sigma in zip(ways, sigmas, strict=True)
+    )
+    ranges = Ranges.of_lists(first, second, mutual, noise)
+    return Told(
+        (measured[0], measured[1]),
+        ranges,
+        noise,
+        (float(apart[0]), float(apart[1])),
+        np.array(guess),
+        np.concatenate((a[-1], b[-1])),
+    )
+
+
+def placed(start: Pose) -> tuple[float, float]:
+    """Where the anchor lies in the frame of a robot's odometry that begins at `start`, relative to it."""
+    c, s = math.cos(start.heading), math.sin(start.heading)
+    return -c * start.x - s * start.y, s * start.x - c * start.y
+
+
+def distances(told: Told, guess: Array) -> Array:
+    return predict(guess, told.measured, told.ranges, told.apart).distance
+
+
+def clear(told: Told) -> bool:
+    """Whether nobody is so near to what it is ranged from that a distance has no derivative, and the ranges
+    tell where both are."""
+    predicted = predict(told.guess, told.measured, told.ranges, told.apart)
+    return (
+        float(np.min(predicted.distance)) > 0.1
+        and float(np.linalg.svd(predicted.jacobian, compute_uv=False)[-1]) > 0.3
+    )
+
+
+EXACT = Noise()
+
+
+@few
+@given(seeds)
+def test_the_true_guess_predicts_the_true_ranges(seed: int) -> None:
+    one = told(seed, EXACT)
+    assert distances(one, one.guess) == pytest.approx(one.ranges.rho, abs=1e-12)
+
+
+@some
+@given(seeds)
+def test_a_range_changes_with_the_guess_as_predicted(seed: int) -> None:
+    one = told(seed, EXACT)
+    assume(clear(one))
+    predicted = predict(one.guess, one.measured, one.ranges, one.apart)
+    by_guess = derivative(lambda guess: distances(one, guess), one.guess)
+    assert predicted.jacobian == pytest.approx(by_guess, abs=1e-6)
+
+
+@some
+@given(seeds)
+def test_a_range_looks_at_a_robot_along_its_direction(seed: int) -> None:
+    """Moved in the frame of its odometry, the robot's range changes by as much."""
+    one = told(seed, EXACT)
+    assume(clear(one))
+    predicted = predict(one.guess, one.measured, one.ranges, one.apart)
+    for robot in (0, 1):
+
+        def moved_by(shift: Array, robot: int = robot) -> Array:
+            paths = list(one.measured)
+            path = paths[robot]
+            paths[robot] = path._replace(x=path.x + shift[0], y=path.y + shift[1])
+            return predict(one.guess, paths, one.ranges, one.apart).distance
+
+        direction = predicted.directions[robot].T
+        assert direction == pytest.approx(derivative(moved_by, np.zeros(2)), abs=1e-6)
+
+
+# --- the fit ------------------------------------------------------------------------------------------
+
+noises = st.builds(
+    Noise,
+    st.floats(1e-3, 0.05),
+    st.floats(1e-3, 0.05),
+    odometry=st.builds(
+        Drift, *[st.sampled_from((0.0, 1e-3, 1e-2))] * 2, *[st.sampled_from((0.0, 1e-3, 5e-3))] * 2
+    ),
+)
+
+
+def fitted(told: Told, guess: Array) -> Fit:
+    return fit(guess, told.measured, told.ranges, told.noise, told.apart)
+
+
+def nudged(told: Told, seed: int, by: float) -> Array:
+    """m and rad"""
+    guess: Array = told.guess + by * np.random.default_rng(seed).uniform(-1.0, 1.0, 6)
+    return guess
+
+
+def converged(one: Fit) -> bool:
+    return float(one.system.change @ one.information @ one.system.change) < STILL**2
+
+
+@some
+@given(seeds)
+def test_exact_ranges_and_an_exact_odometry_give_the_truth(seed: int) -> None:
+    one = told(seed, EXACT)
+    assume(clear(one))
+    found = fitted(one, nudged(one, seed, 0.02))
+    assert found.guess == pytest.approx(one.guess, abs=1e-9)
+    assert poses(found, one.apart)[0] == pytest.approx(one.poses, abs=1e-9)
+
+
+@few
+@given(seeds)
+def test_one_robot_finds_its_anchor_and_leaves_the_heading_alone(seed: int) -> None:
+    one = told(seed, EXACT)
+    assume(clear(one))
+    begin = nudged(one, seed, 0.02)[:3]
+    found = fit(begin, one.measured[:1], one.ranges.only(0), EXACT)
+    assert found.guess == pytest.approx([*one.guess[:2], begin[2]], abs=1e-9)
+    assert found.covariance.shape == (2, 2)
+
+
+def information_of(told: Told, found: Fit) -> tuple[Array, Array, Array]:
+    """The Fisher information of the guess and of all noise, by differences; the gradient of the log-posterior
+    by them; and the derivatives of the last poses. What has no variance is no unknown."""
+    variance = np.concatenate([variances(told.noise.odometry, path) for path in told.measured])
+    free = variance > 0.0
+    errors = [np.concatenate(error) for error in found.errors] or [np.zeros(2 * K)] * 2
+    noise = np.concatenate(errors)
+
+    def seen(unknowns: Array) -> Array:
+        moved = noise.copy()
+        moved[free] = unknowns[6:]
+        paths = [
+            track(path.v + by[:K], path.omega + by[K:], path.period)
+            for path, by in zip(told.measured, moved.reshape(2, 2 * K), strict=True)
+        ]
+        ranges = predict(unknowns[:6], paths, told.ranges, told.apart).distance
+        ends = [end_of(path, unknowns[i : i + 3]) for path, i in zip(paths, (0, 3), strict=True)]
+        return np.concatenate((ranges, *ends))
+
+    at = np.concatenate((found.guess, noise[free]))
+    by_ranges, by_poses = np.split(derivative(seen, at), [len(told.ranges.rho)])
+    weight = 1.0 / np.square(told.ranges.sigma)
+    prior = np.concatenate((np.zeros(6), 1.0 / variance[free]))
+    residuals = told.ranges.rho - seen(at)[: len(weight)]
+    gradient = by_ranges.T @ (weight * residuals) - prior * np.concatenate((np.zeros(6), noise[free]))
+    return (by_ranges.T * weight) @ by_ranges + np.diag(prior), gradient, by_poses
+
+
+def end_of(path: Track, guess: Array) -> Array:
+    """The last pose, relative to the anchor."""
+    mx, my, turn = guess.tolist()
+    x, y, heading = float(path.x[-1]), float(path.y[-1]), float(path.heading[-1])
+    end = compose(Pose(0.0, 0.0, turn), Pose(x - mx, y - my, heading))
+    return np.array((end.x, end.y, end.heading))
+
+
+@few
+@given(seeds, noises)
+def test_a_fit_ends_where_no_pose_and_no_error_of_the_odometry_is_likelier(seed: int, noise: Noise) -> None:
+    one = told(seed, noise)
+    assume(clear(one))
+    found = fitted(one, one.guess)
+    assume(converged(found))
+    information, gradient, _ = information_of(one, found)
+    covariance = np.linalg.inv(information)
+    left = (covariance @ gradient) / np.sqrt(np.diagonal(covariance))
+    assert np.max(np.abs(left)) < 0.01, "sigmas"
+
+
+@few
+@given(seeds, noises)
+def test_the_covariance_of_both_poses_is_that_of_all_unknowns_at_once(seed: int, noise: Noise) -> None:
+    one = told(seed, noise)
+    assume(clear(one))
+    found = fitted(one, one.guess)
+    assume(converged(found))
+    information, _, by_poses = information_of(one, found)
+    expected = by_poses @ np.linalg.solve(information, by_poses.T)
+    sigmas = np.sqrt(np.diagonal(expected))
+    _, covariance = poses(found, one.apart)
+    assert covariance / np.outer(sigmas, sigmas) == pytest.approx(
+        expected / np.outer(sigmas, sigmas), abs=1e-4
+    )
+
+
+@few
+@given(seeds)
+def test_without_drift_the_covariance_is_the_inverse_of_the_ranges_information(seed: int) -> None:
+    one = told(seed, Noise(0.01, 0.03))
+    assume(clear(one))
+    found = fitted(one, one.guess)
+    by_guess = derivative(lambda guess: distances(one, guess), found.guess)
+    information = by_guess.T @ np.diag(1.0 / np.square(one.ranges.sigma)) @ by_guess
+    sigmas = np.sqrt(np.diagonal(np.linalg.inv(information)))
+    expected = np.linalg.inv(information) / np.outer(sigmas, sigmas)
+    assert found.covariance / np.outer(sigmas, sigmas) == pytest.approx(expected, abs=1e-5)
+
+
+ROUGH = Noise(0.01, 0.01, outliers=0.05, outlier_bias=(0.3, 2.0), odometry=Drift(0.001, 0.001))
+
+
+@some
+@given(seeds, st.integers(0, 3 * K + 2), st.floats(0.3, 2.0))
+def test_an_outlier_moves_a_fit_no_farther_than_its_absence(seed: int, which: int, bias: float) -> None:
+    one = told(seed, ROUGH)
+    assume(clear(one))
+    rho = one.ranges.rho.copy()
+    rho[which] += bias
+    spoilt = fitted(one._replace(ranges=one.ranges._replace(rho=rho)), nudged(one, seed, 0.2))
+    without = fitted(one._replace(ranges=dropped(one.ranges, which)), one.guess)
+    assert spoilt.weights[which] < 1e-3
+    off = (spoilt.guess - without.guess) / np.sqrt(np.diagonal(without.covariance))
+    assert np.max(np.abs(off)) < 0.1, "sigmas"
+
+
+def dropped(ranges: Ranges, which: int) -> Ranges:
+    counts = [K + 1, K + 1, K + 1]
+    counts[which // (K + 1)] -= 1
+    left = np.arange(len(ranges.rho)) != which
+    first, second, mutual = counts
+    return Ranges(ranges.rho[left], ranges.tick[left], ranges.sigma[left], (first, second, mutual))
