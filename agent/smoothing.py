@@ -126,7 +126,8 @@ def fit(
         trust = _trust(system, weights, ranges.sigma, noise) if noise.outliers else weights
         change = system.change
         still = float(change @ system.information @ change) < STILL**2
-        if step == steps or (still and float(np.max(np.abs(trust - weights))) < SETTLED):
+        still = still and float(np.max(np.abs(trust - weights))) < SETTLED
+        if step == steps or (still and (errors or not drifting)):  # a path is corrected at least once
             break
         weights = trust
         change = change * min(1.0, LEAP / max(float(np.max(np.abs(change))), LEAP))

@@ -376,6 +376,19 @@ def test_without_drift_the_covariance_is_the_inverse_of_the_ranges_information(s
     assert found.covariance / np.outer(sigmas, sigmas) == pytest.approx(expected, abs=1e-5)
 
 
+def test_a_fit_that_begins_where_one_ended_ends_there_too() -> None:
+    """Straight at its anchor nothing bends, and the guess is right at once; the path is corrected even so."""
+    measured, driven = (track(np.full(8, v), np.zeros(8), 1.0) for v in (1.0, 1.01))
+    told = [(tick, 20.0 - x) for tick, x in enumerate(driven.x.tolist())]
+    noise = Noise(0.01, odometry=Drift(v=0.05))
+    ranges = Ranges.of_lists(told, (), (), noise)
+    first = fit(np.array((20.0, 0.0, 0.0)), [measured], ranges, noise)
+    again = fit(first.guess, [measured], ranges, noise)
+    assert again.guess == pytest.approx(first.guess, abs=1e-9)
+    assert again.paths[0].x[-1] == pytest.approx(first.paths[0].x[-1], abs=1e-9)
+    assert first.paths[0].x[-1] == pytest.approx(driven.x[-1], abs=0.01)
+
+
 ROUGH = Noise(0.01, 0.01, outliers=0.05, outlier_bias=(0.3, 2.0), odometry=Drift(0.001, 0.001))
 
 
