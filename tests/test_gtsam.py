@@ -47,7 +47,7 @@ STEPS = 200
 
 SIGMAS = ((0.01, 0.01), (0.02, 0.05), (0.1, 0.1))
 """m, of ranges to anchors and between robots"""
-DRIFTS = (Drift(), Drift(0.001, 0.001), Drift(0.01, 0.01), Drift(0.001, 0.01, 0.002, 0.001))
+DRIFTS = (Drift(), Drift(0.001, 0.001), Drift(0.01, 0.01), Drift(0.001, 0.01, 0.02, 0.005))
 SETTINGS = tuple(product(SIGMAS, DRIFTS))
 """missions go through them in turn; neither T_s nor v_max is 1 in any, so that none can be forgotten"""
 
