@@ -48,6 +48,8 @@ class Fit(NamedTuple):
     guess: Array
     paths: tuple[Track, ...]
     """as driven, by this fit"""
+    errors: tuple[Errors, ...]
+    """of the odometry, by this fit; none where it is exact"""
     log_likelihood: float
     """of the ranges, the odometry's errors integrated out"""
     residuals: Array
@@ -140,6 +142,7 @@ def fit(
     return Fit(
         guess,
         paths,
+        errors,
         _log_likelihood(system, chi2, residuals, weights, ranges.sigma, noise),
         residuals,
         weights,
