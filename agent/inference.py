@@ -9,13 +9,13 @@ import numpy as np
 from msgspec.structs import replace
 
 from agent.belief import Branch
-from agent.hypotheses import Pair, Weighed, missing, of_anchor
+from agent.hypotheses import Weighed, missing, of_anchor
 from agent.logbook import Logbook
 from agent.mind import Mind
 from agent.odometry import Array, Track, track
 from agent.phases.surveying import Held
-from agent.ranging import SIGMA_FLOOR, Ranges
-from agent.smoothing import poses
+from agent.ranging import SIGMA_FLOOR, Pair, Ranges
+from agent.smoothing import deviation, poses
 from protocol.mission import Mission
 from protocol.motion import Covariance, Pose, compose, wrap
 
@@ -87,7 +87,7 @@ def settled(weighed: Sequence[Weighed], mission: Mission) -> bool:
     return (
         int(np.count_nonzero(best.fit.weights > 0.5)) >= enough
         and best.hypothesis.odds >= SURE_OF_BRANCH
-        and math.sqrt(float(np.trace(best.fit.covariance))) <= mission.foothold
+        and deviation(float(np.trace(best.fit.covariance))) <= mission.foothold
     )
 
 
@@ -140,21 +140,32 @@ def missing_for(
             f"the likeliest of {len(weighed)} hypotheses has the odds {odds:.6f}, of {mission.confidence:g}"
         )
     chi2 = weighed[0].fit.chi2
-    if chi2 > plausible(free):
+    if not chi2 <= plausible(free):
         return f"the likeliest hypothesis fits badly: chi-square {chi2:.3g} for {free} degrees of freedom"
     _, covariance = bent(held[0], pair.apart)
     for i, robot in ((0, "a"), (3, "b")):
-        position = math.sqrt(covariance[i, i] + covariance[i + 1, i + 1])
-        if position > mission.accuracy:
+        position = deviation(covariance[i, i] + covariance[i + 1, i + 1])
+        if not position <= mission.accuracy:
             return f"{robot}'s position is known to {position:.3g} m, of {mission.accuracy:g}"
-        heading = math.sqrt(covariance[i + 2, i + 2])
-        if heading > ASKEW:
+        heading = deviation(covariance[i + 2, i + 2])
+        if not heading <= ASKEW:
             return f"{robot}'s heading is known to {heading:.3g} rad, of {ASKEW:g}"
     return None
 
 
+def finished(mind: Mind, weighed: Sequence[Weighed]) -> Mind:
+    """`mind`, which claims nothing by a fit that has not found its minimum."""
+    if mind.findings.missing is not None or weighed[0].fit.last_step <= FINISHED:
+        return mind
+    missing = f"the likeliest hypothesis still moves, by {weighed[0].fit.last_step:.3g} sigmas"
+    return replace(mind, findings=replace(mind.findings, missing=missing))
+
+
 ASKEW = 0.2
 """rad: with a heading less well known than this the ellipse is no likeness of what is possible"""
+
+FINISHED = 0.1
+"""sigmas: a fit whose last step was longer than this has not found its minimum"""
 
 PLAUSIBLE = 3.0
 """standard deviations: less likely than this, a fit is not the sensors' chance, and nothing is claimed"""

@@ -48,7 +48,7 @@ def considered(mind: Mind) -> Mind:
     if len(pair.paths[0].v) < mind.tick or mutual < CHECKED - 1:
         return mind
     weighed = search(pair)
-    mind = inference.with_pair(mind, weighed, pair, CHECKED)
+    mind = inference.finished(inference.with_pair(mind, weighed, pair, CHECKED), weighed)
     missing = mind.findings.missing
     if missing is None and mind.briefing.mission.noise.outliers and len(pair.ranges.rho) < REDUNDANT:
         missing = f"{len(pair.ranges.rho)} ranges, of {REDUNDANT}, cannot rule out that one is an outlier"

@@ -100,7 +100,7 @@ class Mind(msgspec.Struct, frozen=True):
     mutual: tuple[Ranged, ...] = ()
     findings: Findings = Findings()
     radio: Radio = Radio()
-    near: bool = False
+    in_contact: bool = False
     """whether the peer is in range in this tick"""
 
     @property
@@ -108,11 +108,6 @@ class Mind(msgspec.Struct, frozen=True):
         """This robot's part of the rendezvous."""
         plan = self.briefing.rendezvous
         return plan.a if self.briefing.role == "a" else plan.b
-
-    @property
-    def in_contact(self) -> bool:
-        """Whether the peer is in range in this tick."""
-        return self.near
 
     @property
     def hears_peer(self) -> bool:

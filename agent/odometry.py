@@ -163,7 +163,7 @@ class Errors(NamedTuple):
         return track(measured.v + self.v, measured.omega + self.omega, measured.period)
 
 
-def moved(drift: Wander, rows: Seen, errors: Errors) -> Array:
+def shifted(drift: Wander, rows: Seen, errors: Errors) -> Array:
     """m: by how much `errors` move what the rows look at, to first order; shape (N,)."""
     moves = np.empty((3, len(errors.v)))
     moves[0] = errors.omega

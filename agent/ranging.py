@@ -70,6 +70,19 @@ class Ranges(NamedTuple):
         return Ranges(self.rho[possible], self.tick[possible], self.sigma[possible], (first, second, mutual))
 
 
+class Pair(NamedTuple):
+    """All that both robots have measured; robot 0 is the paper's a."""
+
+    paths: tuple[Track, Track]
+    ranges: Ranges
+    silent: tuple[Places, Places, Places]
+    """the ticks at which a, b and the two together were not ranged"""
+    apart: tuple[float, float]
+    """m: M2 - M1 in <W>"""
+    sensing_range: float
+    noise: Noise
+
+
 class Predicted(NamedTuple):
     """What a guess predicts of N ranges."""
 
@@ -104,7 +117,7 @@ def predict(guess: Array, paths: Sequence[Track], ranges: Ranges, apart: tuple[f
     if len(paths) == 2 and ranges.counts[2]:
         rows = ranges.rows(2)
         (ax, ay), (bx, by) = (
-            turned(guess[3 * robot : 3 * robot + 3], path, ticks[rows]) for robot, path in enumerate(paths)
+            placed(guess[3 * robot : 3 * robot + 3], path, ticks[rows]) for robot, path in enumerate(paths)
         )
         dx, dy = ax - bx - apart[0], ay - by - apart[1]
         gap = np.maximum(np.hypot(dx, dy), TINY)
@@ -124,7 +137,7 @@ TINY = 1e-12
 """m: nearer than this, a direction is none"""
 
 
-def turned(guess: Array, path: Track, ticks: Places) -> tuple[Array, Array]:
+def placed(guess: Array, path: Track, ticks: Places) -> tuple[Array, Array]:
     """m: where a robot is at `ticks`, relative to its anchor, along the axes of <W>."""
     mx, my, theta = guess
     c, s = math.cos(theta), math.sin(theta)

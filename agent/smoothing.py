@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.odometry import Array, Errors, Places, Seen, Track, Wander, attributed, moved, spread, wander
+from agent.odometry import Array, Errors, Places, Seen, Track, Wander, attributed, shifted, spread, wander
 from agent.ranging import Ranges, mixture, outliers, predict
 from protocol.noise import Drift, Noise
 
@@ -37,6 +37,9 @@ RIDGE = 1e-12
 
 FAR = 100.0
 """m: how little an outlier is taken to tell"""
+
+GRAIN = 1e-12
+"""of the largest variance that drift makes: no range is taken to be better, so that floats can tell it"""
 
 BLIND = 1e-9
 """of a range's information: what the others say of it is taken to be no less than this"""
@@ -62,6 +65,8 @@ class Fit(NamedTuple):
     """its inverse"""
     chi2: float
     """the squared innovations, over their covariance"""
+    last_step: float
+    """sigmas: the step of Gauss-Newton that would have come next"""
     ticks: Places
     """of the ranges"""
     directions: tuple[Array, ...]
@@ -119,7 +124,7 @@ def fit(
             )
             wandered = _wandered(drifts, seen)
             for drift, rows, error in zip(drifts, seen, errors, strict=False):
-                innovation = innovation + moved(drift, rows, error)
+                innovation = innovation + shifted(drift, rows, error)
         if noise.outliers and step == 0:
             loose = np.zeros_like(residuals) if wandered is None else np.diagonal(wandered)
             weights = mixture(residuals, np.sqrt(np.square(ranges.sigma) + loose), noise)[1]
@@ -127,8 +132,8 @@ def fit(
         system = _solved(predicted.jacobian[:, free], innovation, variance, wandered, bool(noise.outliers))
         trust = _trust(system, weights, ranges.sigma, noise) if noise.outliers else weights
         change = system.change
-        still = float(change @ system.information @ change) < STILL**2
-        still = still and float(np.max(np.abs(trust - weights))) < SETTLED
+        last_step = math.sqrt(abs(float(change @ system.information @ change)))
+        still = last_step < STILL and float(np.max(np.abs(trust - weights))) < SETTLED
         if step == steps or (still and (errors or not drifting)):  # a path is corrected at least once
             break
         weights = trust
@@ -149,6 +154,7 @@ def fit(
         system.of_guess,
         system.information,
         chi2,
+        last_step,
         ranges.tick,
         predicted.directions,
         drifts,
@@ -179,7 +185,7 @@ def _solved(
     if wandered is None:
         weighted = columns / variance[:, None]
     else:
-        covariance = wandered + np.diag(variance)
+        covariance = wandered + np.diag(variance + GRAIN * float(np.max(np.diagonal(wandered))))
         if invert:
             inverse = inverse_of(covariance)
             weighted = np.dot(inverse, columns)
@@ -193,6 +199,11 @@ def _solved(
     return System(
         jacobian, innovation, covariance, weighted, inverse, information, of_guess, change, multipliers
     )
+
+
+def deviation(variance: float) -> float:
+    """The standard deviation; infinite where rounding has left a variance that is none."""
+    return math.sqrt(variance) if variance >= 0.0 else math.inf
 
 
 def inverse_of(matrix: Array) -> Array:

@@ -37,6 +37,9 @@ CHECKED, CHECKED_WITH_OUTLIERS = 8, 12
 FEW = 3
 """mutual ranges; with fewer, hypotheses are too many to be of use"""
 
+OFF_RADIUS = 0.5
+"""rad: a robot that turns out to head so far off the radius turns onto it again"""
+
 UNLUCKY = 3.0
 """standard deviations, of the number of drop-outs"""
 
@@ -67,9 +70,9 @@ def sensed(mind: Mind, anchor_range: float | None) -> Mind:
             mind
         ) >= LOST_TOGETHER * surveying.stride(mind.briefing.mission):
             return _homeward(mind)
-        case Surveying("peer", drive) if not mind.near:
+        case Surveying("peer", drive) if not mind.in_contact:
             return replace(mind, state=Returning(Controls(-drive.v, -drive.omega), mind.odometry))
-        case Returning() if not mind.near:
+        case Returning() if not mind.in_contact:
             return _parted(mind)
         case Returning():
             return replace(mind, state=Surveying("peer"))
@@ -139,16 +142,17 @@ def _under_way(mind: Mind, ranged: bool) -> Mind:
     weighed: Sequence[Weighed] = ()
     if ranged and decides(mind) and (weighed := inference.own_anchor(mind)):
         mind = inference.with_own(mind, weighed)
+        if isinstance(mind.state, Radial) and abs(rendezvous.orientation(mind.local_pose)) > OFF_RADIUS:
+            return _parted(mind)
     assert isinstance(mind.state, Aligning | Radial | Tangent | Orbiting)
     state = rendezvous.onward(mind.state, mind.odometry, mind.start, mind.orbit, mission)
+    patience: float = LOST * surveying.stride(mission)
+    if mind.orbit.v == 0.0 and isinstance(state, Radial | Orbiting) and _silent(mind) >= patience:
+        return _homeward(mind)
     if isinstance(state, Orbiting):
         since = state.since or mind.tick
-        late = (
-            mind.tick - since
-            > mind.briefing.rendezvous.bound / mission.period + LOST * surveying.stride(mission)
-            and not mind.near
-        )
-        if late if mind.orbit.v else _silent(mind) >= LOST * surveying.stride(mission):
+        patience += mind.briefing.rendezvous.bound / mission.period
+        if mind.orbit.v != 0.0 and mind.tick - since > patience and not mind.in_contact:
             return _homeward(mind)
         if mind.orbit.v != 0.0:
             drive = rendezvous.pursuit(mind.local_pose, mind.orbit, mission)
@@ -202,6 +206,7 @@ def _considered(mind: Mind) -> Mind:
     if judged.findings.missing is None and not searched:
         weighed = search(pair)
         judged = inference.with_pair(mind, weighed, pair, checked)
+    judged = inference.finished(judged, weighed)
     if judged.findings.missing is None:
         return claimed(judged)
     if role == "a" and mutual >= ENOUGH * (1 + mind.findings.returns):

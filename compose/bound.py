@@ -13,7 +13,7 @@ import numpy as np
 
 from agent.odometry import Track, track
 from agent.ranging import Ranges
-from agent.smoothing import fit, poses
+from agent.smoothing import deviation, fit, poses
 from compose.record import Record
 from protocol.motion import Controls, Pose
 from world.sensors import anchor_ranges, executed, mutual_ranges
@@ -52,7 +52,7 @@ def position_bounds(record: Record, pair: tuple[int, int], tick: int) -> tuple[f
     apart = (anchors[1].x - anchors[0].x, anchors[1].y - anchors[0].y)
     at_truth = fit(np.array(guess), tracks, Ranges.of_lists(own[0], own[1], mutual, noise), noise, apart, 0)
     covariance = poses(at_truth, apart)[1]
-    a, b = (math.sqrt(covariance[i, i] + covariance[i + 1, i + 1]) for i in (0, 3))
+    a, b = (deviation(covariance[i, i] + covariance[i + 1, i + 1]) for i in (0, 3))
     return a, b
 
 

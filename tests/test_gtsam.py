@@ -19,8 +19,9 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from agent import inference, planner
-from agent.hypotheses import Pair, Weighed, search
+from agent.hypotheses import Weighed, search
 from agent.mind import Done, Mind
+from agent.ranging import Pair
 from agent.smoothing import Fit, poses
 from compose.inline import play
 from compose.scenario import parse

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from agent import geometry
 from agent.geometry import Placement, same_placement
-from agent.hypotheses import Pair, Weighed, missing, of_anchor, search, silence
+from agent.hypotheses import Weighed, missing, of_anchor, search, silence
 from agent.odometry import Array, track
-from agent.ranging import Ranges
+from agent.ranging import Pair, Ranges
 from agent.smoothing import fit, poses
 from protocol.motion import Pose, step, wrap
 from protocol.noise import Drift, Noise

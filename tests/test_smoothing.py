@@ -12,7 +12,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from agent.odometry import Errors, Seen, Track, attributed, moved, spread, track, wander
+from agent.odometry import Errors, Seen, Track, attributed, shifted, spread, track, wander
 from agent.ranging import Ranges, predict
 from agent.smoothing import STILL, Fit, fit, poses
 from protocol.motion import ORIGIN, Pose, compose, step
@@ -111,7 +111,7 @@ def test_noise_of_the_odometry_spreads_along_the_path(look: Looks, drift: Drift)
 @given(looks(), drifts, seeds)
 def test_errors_of_the_odometry_move_every_later_place(look: Looks, drift: Drift, seed: int) -> None:
     errors = np.random.default_rng(seed).normal(size=(2, len(look.path.v)))
-    move = moved(wander(look.path, drift, look.path), look.rows, Errors(*errors))
+    move = shifted(wander(look.path, drift, look.path), look.rows, Errors(*errors))
     assert move == near(look.by_noise @ errors.ravel())
 
 

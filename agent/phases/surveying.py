@@ -39,11 +39,10 @@ CONFUSION = 10.0
 """what taking the wrong hypothesis costs, in variances as large as the accuracy asked for"""
 
 LOSS = 1e3
-"""what leaving the beacon's range costs, likewise"""
-
+"""per m: what it costs to be where no range is to be had or none tells, likewise"""
 
 ASTRAY = 10.0
-"""what leaving the anchor's range costs, of which more is known each tick"""
+"""per m: the same, alone with the anchor, of which more is known each tick"""
 
 
 class Surveying(msgspec.Struct, frozen=True):
@@ -217,11 +216,21 @@ ASIDE = 0.06
 def _confusion(held: Sequence[Held], distances: Sequence[Array], sigma: float, reach: float) -> Array:
     """What is left of the odds of taking the first hypothesis for another."""
     left = np.zeros(len(distances[0]))
-    first = np.minimum(distances[0], 1.2 * reach)
+    first = np.minimum(distances[0], RIM * reach)
     for one, distance in zip(held[1:], distances[1:], strict=True):
-        gap = np.square((np.minimum(distance, 1.2 * reach) - first) / (1.5 * sigma))
-        left += math.sqrt(held[0].odds * one.odds) * np.exp(-np.minimum(np.sum(gap, 1), 400.0) / 8.0)
+        gap = np.square((np.minimum(distance, RIM * reach) - first) / (COARSE * sigma))
+        left += math.sqrt(held[0].odds * one.odds) * np.exp(-np.minimum(np.sum(gap, 1), SURE) / 8.0)
     return CONFUSION * left
+
+
+RIM = 1.2
+"""of R: so far off, a silence tells a prediction from one in range, and how far off it was does not matter"""
+
+COARSE = 1.5
+"""by how much ranges are taken to be worse than they are, as the poses are not known either"""
+
+SURE = 400.0
+"""sigmas, squared: hypotheses that differ by more are told apart; further apart is no better"""
 
 
 def _ends(ways: Choice, pose: Array, some: Places | slice = slice(None)) -> tuple[Array, Array]:
