@@ -44,6 +44,7 @@ PURE = {
     "agent.logbook",
     "agent.odometry",
     "agent.ranging",
+    "agent.seeding",
     "agent.smoothing",
     "agent.survey",
     "agent.radio",
