@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from agent.odometry import Errors, Seen, Track, attributed, shifted, spread, track, wander
 from agent.ranging import Ranges, predict
-from agent.smoothing import STILL, Fit, fit, poses
+from agent.smoothing import STILL, Fit, deviation, fit, poses
 from protocol.motion import ORIGIN, Pose, compose, step
 from protocol.noise import Drift, Noise
 
@@ -412,3 +412,20 @@ def dropped(ranges: Ranges, which: int) -> Ranges:
     left = np.arange(len(ranges.rho)) != which
     first, second, mutual = counts
     return Ranges(ranges.rho[left], ranges.tick[left], ranges.sigma[left], (first, second, mutual))
+
+
+def test_a_variance_that_rounding_has_made_negative_is_no_knowledge() -> None:
+    assert deviation(-1e-18) == deviation(math.nan) == math.inf
+    assert deviation(4.0) == 2.0
+
+
+def test_exact_ranges_and_strides_of_a_kilometre_leave_a_covariance_that_can_be_inverted() -> None:
+    """The drift of wheels is 10^7 times what ranges are known to, twice from the same place."""
+    path = track(np.array([1e3, -1e3, 1e3, 0.0, 0.0]), np.array([0.3, -0.2, 0.4, 0.0, 0.0]), 1.0)
+    anchor = np.array((400.0, 300.0, 0.0))
+    rho = np.hypot(path.x - anchor[0], path.y - anchor[1])
+    ranges = Ranges.of_lists(list(enumerate(rho.tolist())), (), (), EXACT)
+    found = fit(anchor + (1.0, -1.0, 0.0), [path], ranges, Noise(odometry=Drift(0.01, 0.01)))
+    assert found.guess == pytest.approx(anchor, abs=1e-3)
+    assert np.min(np.linalg.eigvalsh(found.covariance)) > 0.0
+    assert found.last_step < STILL

@@ -10,8 +10,13 @@ from functools import partial
 import pytest
 from msgspec.structs import replace
 
+import agent.survey
 from agent import planner
+from agent.hypotheses import Weighed, search
 from agent.mind import Mind
+from agent.phases.rendezvous import Aligning, Radial, orientation
+from agent.ranging import Pair
+from agent.survey import OFF_RADIUS
 from compose.inline import play
 from compose.record import Record, summary
 from protocol.messages import Undecided
@@ -268,3 +273,40 @@ def test_who_begins_with_a_range_that_cannot_be_localises_all_the_same() -> None
 
 def test_drop_outs_that_add_up_do_not_keep_a_robot_in_phase_1() -> None:
     assert_localised(survey(f"{SIGMA}\noutliers = 0.05\ndrop_outs = 0.1\n{WHEELS}\n{ODOMETRY}", 9))
+
+
+# --- what is doubted on the way -----------------------------------------------------------------------
+
+
+def test_a_robot_that_turns_out_to_head_off_its_radius_turns_onto_it_again() -> None:
+    """Set off as if it were aligned, a robot finds by its next range which way it heads."""
+    world = release(scenario_of(SIGMA, SHORT))
+    minds = {robot.id: Mind(world.scenario.briefing(robot.id)) for robot in world.scenario.robots}
+    misled = False
+    while isinstance(world, World):
+        for sense in senses(world):
+            mind = planner.observe(minds[sense.robot], sense)
+            if sense.robot == "b" and not misled and isinstance(mind.state, Aligning):
+                off = abs(orientation(mind.local_pose))
+                assert off > 2.0 * OFF_RADIUS, "it has to turn, and is not let"
+                mind, misled = replace(mind, state=Radial()), True
+            minds[sense.robot] = planner.decide(mind)
+            if misled and sense.robot == "b":
+                assert isinstance(mind.state, Radial | Aligning), "neither lost nor on its circle"
+                if isinstance(mind.state, Aligning):
+                    return
+        onward = advance(world, {robot: planner.drive(mind) for robot, mind in minds.items()})
+        assert isinstance(onward, World)
+        world = onward
+
+
+def test_nothing_is_claimed_by_a_fit_that_still_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+    ticks = len(survey(SIGMA, SHORT).moments)
+
+    def searched(pair: Pair) -> tuple[Weighed, ...]:
+        return tuple([one._replace(fit=one.fit._replace(last_step=0.5)) for one in search(pair)])
+
+    monkeypatch.setattr(agent.survey, "search", searched)
+    record = play(scenario_of(SIGMA, SHORT, max_ticks=ticks + 2))
+    assert summary(record, "in-process", None)["outcome"] == "undecided"
+    assert all("still moves" in (farewell.missing or "") for farewell in record.farewells.values())
