@@ -1,0 +1,100 @@
+"""What an agent's journal tells: the briefing, then tick after tick what came in and what was answered."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import msgspec
+from msgspec.structs import replace
+
+from agent.robot import Told
+from protocol.journal import CorruptJournal
+from protocol.messages import Briefing, Drive, End, Estimate, Farewell, Missed, Report, Sense
+from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
+
+KINDS = Briefing | Sense | Report | Drive | Estimate | Missed | End | Farewell
+"""what stands in an agent's journal"""
+
+
+class Step(msgspec.Struct, frozen=True):
+    """One tick, in the order of the journal; what is none or empty did not come, or not any more."""
+
+    sense: Sense
+    frame: bytes
+    """that the Sense came in"""
+    report: Told | None = None
+    """to the peer, in contact"""
+    heard: tuple[Told, ...] = ()
+    missed: tuple[str, ...] = ()
+    """peers whose report did not come in time"""
+    drive: Drive | None = None
+    estimate: Estimate | None = None
+
+
+class Past(msgspec.Struct, frozen=True):
+    """A journal, whole or up to where it breaks off."""
+
+    briefing: Briefing
+    steps: tuple[Step, ...]
+    end: End | None = None
+    farewell: Farewell | None = None
+
+
+def past(frames: Iterable[bytes], source: object) -> Past:
+    """What `frames` tell. Raises CorruptJournal, whose text begins with `source`."""
+    briefing: Briefing | None = None
+    steps: list[Step] = []
+    end: End | None = None
+    farewell: Farewell | None = None
+    for place, frame in enumerate(frames):
+        message = _message(frame, source)
+        if (place == 0) != isinstance(message, Briefing):
+            raise CorruptJournal(f"{source}: an agent's journal begins with its Briefing, and has but one")
+        match message:
+            case Briefing():
+                briefing = message
+            case End() if end is None:
+                end = message
+            case Farewell() if end is not None and farewell is None:
+                farewell = message
+            case Sense() if end is None and (not steps or steps[-1].drive is not None):
+                steps.append(Step(message, frame))
+            case Report() | Missed() | Drive() | Estimate() if steps and end is None:
+                assert briefing is not None
+                steps[-1] = _with(steps[-1], message, frame, briefing.robot, source)
+            case _:
+                raise _out_of_order(message, source)
+    if briefing is None:
+        raise CorruptJournal(f"{source}: there is no Briefing in it")
+    return Past(briefing, tuple(steps), end, farewell)
+
+
+def _message(frame: bytes, source: object) -> Any:
+    try:
+        return decode(frame, KINDS, MAX_FRAME_BYTES)
+    except MalformedFrame as error:
+        raise CorruptJournal(f"{source}: {error}") from None
+
+
+def _with(step: Step, message: object, frame: bytes, robot: str, source: object) -> Step:
+    """`step`, and what came next in it."""
+    match message:
+        case Estimate(tick=step.sense.tick) if step.drive is not None and step.estimate is None:
+            return replace(step, estimate=message)
+        case Drive(tick=step.sense.tick) if step.drive is None:
+            return replace(step, drive=message)
+        case Missed(tick=step.sense.tick) if step.drive is None:
+            return replace(step, missed=(*step.missed, message.robot))
+        case Report(tick=step.sense.tick) if message.robot == robot and step.report is None:
+            return replace(step, report=Told(message, frame))
+        case Report() if message.robot != robot and step.drive is None:
+            return replace(step, heard=(*step.heard, Told(message, frame)))
+        case _:
+            raise _out_of_order(message, source)
+
+
+def _out_of_order(message: object, source: object) -> CorruptJournal:
+    tick = getattr(message, "tick", None)
+    at = f" of tick {tick}" if tick is not None else ""
+    return CorruptJournal(f"{source}: a {type(message).__name__}{at} is out of order")
