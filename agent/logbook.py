@@ -17,6 +17,16 @@ class Logbook(msgspec.Struct, frozen=True):
     runs: tuple[Run, ...] = ()
     ranges: tuple[Ranged, ...] = ()
 
+    @property
+    def moved(self) -> int:
+        """The tick by which the last manoeuvre that was no rest had ended."""
+        at_rest = 0
+        for run in reversed(self.runs):
+            if run.v != 0.0 or run.omega != 0.0:
+                break
+            at_rest += run.ticks
+        return self.through - at_rest
+
     def drove(self, v: float, omega: float, ticks: int = 1) -> Logbook:
         """The log after `ticks` more of one manoeuvre."""
         runs = self.runs

@@ -23,7 +23,7 @@ def meets(mind: Mind) -> bool:
     """Whether phase 3 begins, once in contact: by the letter when both orbit, else as soon as it can."""
     if mind.briefing.variant == "paper":
         return isinstance(mind.state, Orbiting) and (mind.radio.phase == 3 or mind.radio.state == mind.doing)
-    return mind.radio.phase == 3 or (mind.hears_peer and mind.radio.start is not None and mind.off_anchor)
+    return mind.radio.phase == 3 or (mind.radio.start is not None and mind.off_anchor)
 
 
 def lingers(mind: Mind) -> bool:
@@ -59,9 +59,11 @@ def considered(mind: Mind) -> Mind:
     variant, began = mind.briefing.variant, mind.findings.met
     assert began is not None
     sightings = mind.sightings(began if variant == "paper" else 0)
+    if sightings and sightings[-1].tick < mind.log.moved:  # what this robot did last is not answered yet
+        return mind
     base = encounter.base([at for at in sightings if off_anchor(at.b, mind.briefing.rendezvous.b)])
     if base is None:  # yet; or, where a report was missed, b was still driving as a went straight
-        again = isinstance(mind.state, Waiting) and mind.hears_peer and mind.radio.state == WORDS[Standing]
+        again = isinstance(mind.state, Waiting) and mind.radio.state == WORDS[Standing]
         return met(mind) if again and variant == "assured" else mind
     mind = _weighed(mind, sightings, base)
     left = mind.findings.placements

@@ -101,6 +101,13 @@ def _add_scenario(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scenario", metavar="SCENARIO", help="a name that ships, or a TOML file")
     parser.add_argument("--seed", type=_natural, metavar="N", help="instead of the scenario's")
     parser.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="FAULT",
+        help="of the radio, such as 'a->b: loss=0.3, delay=0..3'",
+    )
+    parser.add_argument(
         "--rate", type=_positive, metavar="X", help="in real time, X times as fast; else in lockstep"
     )
 

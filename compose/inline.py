@@ -9,6 +9,7 @@ from compose.record import WORLD_JOURNAL, Moment, Record
 from protocol.journal import Journal
 from protocol.messages import Drive, End, Farewell
 from world.course import Course
+from world.faults import MAX_DELAY
 from world.scenario import Scenario
 
 
@@ -26,19 +27,21 @@ def play(scenario: Scenario, out: Path | None = None) -> Record:
     robots = {robot: Robot(scenario.briefing(robot), journals.get(robot)) for robot in ids}
     moments: list[Moment] = []
     end: End | None = None
+    told: dict[tuple[str, int], Told] = {}
     while end is None:
         senses = course.senses()
-        told: dict[str, Told] = {}
         for sense in senses:
             report = robots[sense.robot].sense(sense)
             if report is not None:
-                told[sense.robot] = report
+                told[sense.robot, sense.tick] = report
         drives: dict[str, Drive] = {}
         for sense in senses:
-            heard = [told[contact.peer] for contact in sense.contacts for _ in contact.heard]
+            heard = [told[contact.peer, tick] for contact in sense.contacts for tick in contact.heard]
             drives[sense.robot] = robots[sense.robot].decide(heard)
             if out is not None:
                 robots[sense.robot].estimate()
+        if len(told) > MAX_DELAY * len(ids):
+            told = {key: one for key, one in told.items() if key[1] >= course.tick - MAX_DELAY - 1}
         moments.append(Moment(course.world.truth, drives))
         end = course.drive(drives)
     farewells: dict[str, Farewell] = {robot: robots[robot].farewell(end) for robot in ids}

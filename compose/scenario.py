@@ -7,7 +7,7 @@ import random
 import re
 import secrets
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,6 +15,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
+from compose.faults import BadFault, FaultTable, fault, table_of
 from compose.status import UserError
 from protocol.messages import Briefing
 from protocol.mission import Anchor, Mission, Role, Variant, noise_obstacle, obstacle
@@ -22,6 +23,7 @@ from protocol.motion import TAU, Pose
 from protocol.rendezvous import Rendezvous, rendezvous, tick_budget
 from protocol.units import NAME, RobotId
 from protocol.wire import MalformedFrame, decode, encode
+from world.faults import Fault
 from world.scenario import Placed, Scenario
 
 MAX_TICKS = 10**9
@@ -75,6 +77,8 @@ class ScenarioFile(_Table, frozen=True):
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
     max_ticks: Annotated[int, Meta(ge=1, le=MAX_TICKS)] | None = None
     planner: PlannerTable = PlannerTable()
+    fault: list[FaultTable] = []
+    """of the radio, one befalling a report after the other"""
 
 
 class Setting(msgspec.Struct, frozen=True):
@@ -121,10 +125,10 @@ def check_rate(scenario: Scenario, rate: float | None) -> None:
         )
 
 
-def load(source: str, *, seed: int | None = None) -> Scenario:
+def load(source: str, *, seed: int | None = None, faults: Sequence[str] = ()) -> Scenario:
     """The scenario of that name, or in the file at that path; `seed` overrides its own.
 
-    Raises BadScenario.
+    `faults` are added to its own. Raises BadScenario.
     """
     path = shipped().get(source, Path(source))
     try:
@@ -134,7 +138,7 @@ def load(source: str, *, seed: int | None = None) -> Scenario:
         raise BadScenario(f"{source}: neither a file nor a scenario that ships ({names})") from None
     except ValueError as error:
         raise BadScenario(f"{source}: {error}") from None
-    return parse(text, source, seed=seed)
+    return parse(text, source, seed=seed, faults=faults)
 
 
 def read_text(path: Path) -> str:
@@ -149,9 +153,9 @@ def read_text(path: Path) -> str:
         raise ValueError("cannot be read: it is not UTF-8 text") from None
 
 
-def parse(text: str, source: str, *, seed: int | None = None) -> Scenario:
-    """The scenario in `text`. Raises BadScenario, whose text begins with `source`."""
-    setting = validate(table_in(text, source), source)
+def parse(text: str, source: str, *, seed: int | None = None, faults: Sequence[str] = ()) -> Scenario:
+    """The scenario in `text`, with `faults`. Raises BadScenario, whose text begins with `source`."""
+    setting = validate(table_in(text, source), source, faults)
     return setting.scenario if seed is None else setting.seeded(seed)
 
 
@@ -163,12 +167,22 @@ def table_in(text: str, source: str) -> dict[str, Any]:
         raise BadScenario(f"{source}: not TOML: {error}") from None
 
 
-def validate(table: Mapping[str, Any], source: str) -> Setting:
-    """The setting that the table of a scenario file describes. Raises BadScenario and Unworkable."""
+def validate(table: Mapping[str, Any], source: str, faults: Sequence[str] = ()) -> Setting:
+    """The setting that the table of a scenario file describes, with `faults`.
+
+    Raises BadScenario and Unworkable.
+    """
     try:
         file = msgspec.convert(table, ScenarioFile)
     except msgspec.ValidationError as error:
         raise BadScenario(f"{source}: {field_first(str(error))}") from None
+    for text in faults:
+        try:
+            added = msgspec.convert(table_of(text), FaultTable)
+            fault(added, _pairs(file.robot, source))
+        except BadFault as error:
+            raise BadScenario(f"--fault '{text}': {error}") from None
+        file.fault.append(added)
     return Setting(file, _validated(file, source))
 
 
@@ -213,6 +227,7 @@ def _validated(file: ScenarioFile, source: str) -> Scenario:
         mission=file.mission,
         variant=file.planner.variant,
         robots=tuple(placed),
+        faults=_faults(file, source),
     )
     try:
         for one in scenario.robots:
@@ -220,6 +235,20 @@ def _validated(file: ScenarioFile, source: str) -> Scenario:
     except MalformedFrame as error:
         raise Unworkable(f"{source}: mission: no robot could be told of it: {error}") from None
     return scenario
+
+
+def _faults(file: ScenarioFile, source: str) -> tuple[Fault, ...]:
+    found = []
+    for i, table in enumerate(file.fault):
+        try:
+            found.append(fault(table, _pairs(file.robot, source)))
+        except BadFault as error:
+            raise BadScenario(f"{source}: fault[{i}].{error}") from None
+    return tuple(found)
+
+
+def _pairs(robots: list[RobotTable], source: str) -> list[tuple[str, str]]:
+    return list(_peers(robots, source).items())
 
 
 def _check_noise(mission: Mission, source: str) -> None:

@@ -63,6 +63,8 @@ class Contact(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_field
     range: Range | None
     heard: tuple[Tick, ...]
     """the ticks of those of the peer's reports that reach this robot now, in order"""
+    damaged: tuple[Tick, ...] = ()
+    """of those that reach it damaged, and are refused"""
 
 
 class Localised(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="localised"):
@@ -221,7 +223,9 @@ class Farewell(Message, frozen=True):
     reports_refused: Count
     """malformed, or not from whom they said"""
     reports_unheard: Count
-    """that arrived, though no Sense listed them"""
+    """that arrived, though they were not sent in contact"""
+    reports_lost: Count
+    """that were sent in contact, and never heard"""
     frames_refused: Count
     """of all kinds"""
     bytes_sent: Count

@@ -9,6 +9,7 @@ from protocol.mission import Anchor, Mission, Role, Variant
 from protocol.motion import Pose
 from protocol.rendezvous import Rendezvous
 from protocol.units import RobotId, Tick
+from world.faults import Fault
 
 
 class Placed(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
@@ -31,6 +32,8 @@ class Scenario(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fiel
     mission: Mission
     variant: Variant
     robots: tuple[Placed, ...]
+    faults: tuple[Fault, ...] = ()
+    """of the radio"""
 
     def pairs(self) -> tuple[tuple[int, int], ...]:
         """Which robots are each other's peer, by their place; a first."""

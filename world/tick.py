@@ -8,7 +8,7 @@ import msgspec
 
 from protocol.messages import Contact, Drive, Localised, Sense, Verdict
 from protocol.motion import Controls, Pose
-from world.channel import heard
+from world.channel import Air, carried, of_plan
 from world.referee import Judgement, judge
 from world.scenario import Scenario
 from world.sensors import anchor_ranges, executed, mutual_ranges, odometry
@@ -28,6 +28,8 @@ class World(msgspec.Struct, frozen=True):
     """where each of those who claim to be localised was when it did: noise may move it from there"""
     pairs: tuple[tuple[int, int], ...]
     """which robots are each other's peer, by their place in the scenario"""
+    air: tuple[Air, ...] = ()
+    """in this tick: of each pair the link from the first to the second, then back; none without faults"""
 
 
 def release(scenario: Scenario) -> World:
@@ -38,7 +40,9 @@ def release(scenario: Scenario) -> World:
         Pose(robot.start.x - origins[i].x, robot.start.y - origins[i].y, robot.start.heading)
         for i, robot in enumerate(scenario.robots)
     )
-    return World(scenario, Truth(0, local, tuple(origins[i] for i in range(len(local)))), None, {}, {}, pairs)
+    truth = Truth(0, local, tuple(origins[i] for i in range(len(local))))
+    still = (Air(),) * (2 * len(pairs)) if scenario.faults else ()
+    return World(scenario, truth, None, {}, {}, pairs, _carried(still, scenario, truth, pairs))
 
 
 def senses(world: World) -> list[Sense]:
@@ -49,10 +53,12 @@ def senses(world: World) -> list[Sense]:
     if driven is not None and not scenario.mission.noise.exact:
         measured = [odometry(driven[i], scenario, robot.id, tick) for i, robot in enumerate(robots)]
     contacts: list[tuple[Contact, ...]] = [()] * len(robots)
-    for (one, other), mutual in zip(world.pairs, mutual_ranges(truth, scenario, world.pairs), strict=True):
+    mutuals = mutual_ranges(truth, scenario, world.pairs)
+    for i, ((one, other), mutual) in enumerate(zip(world.pairs, mutuals, strict=True)):
         if mutual is not None:
-            contacts[one] = (Contact(robots[other].id, mutual.range, heard(tick)),)
-            contacts[other] = (Contact(robots[one].id, mutual.range, heard(tick)),)
+            to_other, to_one = world.air[2 * i : 2 * i + 2] if world.air else (Air((tick,)), Air((tick,)))
+            contacts[one] = (Contact(robots[other].id, mutual.range, to_one.heard, to_one.damaged),)
+            contacts[other] = (Contact(robots[one].id, mutual.range, to_other.heard, to_other.damaged),)
     ranges = anchor_ranges(truth, scenario)
     return [Sense(tick, robot.id, measured[i], ranges[i], contacts[i]) for i, robot in enumerate(robots)]
 
@@ -76,4 +82,28 @@ def advance(world: World, drives: Mapping[str, Drive]) -> World | Judgement:
         if judgement is not None:
             return judgement
     moved = truth.moved(driven, scenario.mission.period)
-    return World(scenario, moved, tuple(driven), verdicts, claimed, world.pairs)
+    air = _carried(world.air, scenario, moved, world.pairs)
+    return World(scenario, moved, tuple(driven), verdicts, claimed, world.pairs, air)
+
+
+def _carried(
+    air: Sequence[Air], scenario: Scenario, truth: Truth, pairs: Sequence[tuple[int, int]]
+) -> tuple[Air, ...]:
+    """The air of every link at the tick of `truth`, a tick after `air`."""
+    if not air:
+        return ()
+    mutuals = mutual_ranges(truth, scenario, pairs)
+    ids = [robot.id for robot in scenario.robots]
+    links = [(way, mutual) for pair, mutual in zip(pairs, mutuals, strict=True) for way in (pair, pair[::-1])]
+    return tuple(
+        [
+            carried(
+                before,
+                of_plan(scenario.faults, ids[sender], ids[receiver]),
+                scenario.seed,
+                truth.tick,
+                in_contact=mutual is not None,
+            )
+            for before, ((sender, receiver), mutual) in zip(air, links, strict=True)
+        ]
+    )

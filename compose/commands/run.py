@@ -18,7 +18,7 @@ from world.scenario import Scenario
 
 def main(options: argparse.Namespace) -> int:
     """Play the mission, as processes or in this one."""
-    scenario = load(options.scenario, seed=options.seed)
+    scenario = load(options.scenario, seed=options.seed, faults=options.fault)
     if options.out is not None and any(options.out.glob("*.journal")):
         raise UserError(f"--out: {options.out} holds a record already; choose another folder")
     return _in_process(options, scenario) if options.in_process else _as_processes(options, scenario)

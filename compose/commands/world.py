@@ -23,7 +23,10 @@ from world.scenario import Scenario
 
 def main(options: argparse.Namespace) -> int:
     """Play the world's part."""
-    scenario = handed() if options.launched else load(options.scenario, seed=options.seed)
+    if options.launched:
+        scenario = handed()
+    else:
+        scenario = load(options.scenario, seed=options.seed, faults=options.fault)
     check_rate(scenario, options.rate)
     inbox = Inbox("tandem world")
     if options.launched:

@@ -1,0 +1,103 @@
+"""A fault plan as a user writes it: `[[fault]]` in a file, or `--fault "a->b: loss=0.3, delay=0..3"`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta
+from msgspec.structs import asdict
+
+from world.faults import Chance, Delay, Fault, Link, Window
+
+_LINK = re.compile(r"\s*(?P<one>[A-Za-z0-9_-]+)\s*(?P<way><->|->)\s*(?P<other>[A-Za-z0-9_-]+)\s*")
+_NUMBER = re.compile(r"[0-9]*\.?[0-9]+(?:[eE]-?[0-9]+)?")
+EVERYWHERE = "*"
+
+
+class BadFault(ValueError):
+    """A fault that cannot be; the text names the field and what is wrong."""
+
+
+class FaultTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """[[fault]]: see `world.faults.Fault`."""
+
+    link: str = EVERYWHERE
+    """a->b, a<->b, or * for all"""
+    loss: Chance = 0.0
+    burst_start: Chance = 0.0
+    burst_end: Chance = 1.0
+    burst_loss: Chance = 1.0
+    partition: bool = False
+    delay: Delay | Annotated[list[Delay], Meta(min_length=2, max_length=2)] = 0
+    duplicate: Chance = 0.0
+    reorder: Chance = 0.0
+    corrupt: Chance = 0.0
+    reports_per_tick: Annotated[float, Meta(gt=0.0, le=1e3)] | None = None
+    ticks: Window | None = None
+    contact_ticks: Window | None = None
+
+
+def fault(table: FaultTable, pairs: Iterable[tuple[str, str]]) -> Fault:
+    """The fault that `table` describes, among robots that come in these `pairs`. Raises BadFault."""
+    least, most = table.delay if isinstance(table.delay, list) else (table.delay, table.delay)
+    for name, window in (
+        ("delay", (least, most)),
+        ("ticks", table.ticks),
+        ("contact_ticks", table.contact_ticks),
+    ):
+        if window is not None and window[0] > window[1]:
+            raise BadFault(f"{name}: from {window[0]} to {window[1]} is backwards")
+    if table.burst_start > 0.0 and table.burst_end == 0.0:
+        raise BadFault("burst_end: a burst that never ends is a partition")
+    return Fault(**asdict(table) | {"link": _link(table.link, list(pairs)), "delay": (least, most)})
+
+
+def _link(text: str, pairs: Sequence[tuple[str, str]]) -> Link | None:
+    if text.strip() == EVERYWHERE:
+        return None
+    match = _LINK.fullmatch(text)
+    if match is None:
+        raise BadFault(f"link: '{text}' is none; one looks like a->b, a<->b or *")
+    one, other = match["one"], match["other"]
+    if (one, other) not in pairs and (other, one) not in pairs:
+        raise BadFault(f"link: '{one}' and '{other}' are no pair of the scenario")
+    return Link(one, other, both=match["way"] == "<->")
+
+
+def table_of(text: str) -> dict[str, Any]:
+    """The table that `text` stands for: `LINK: NAME=VALUE, ...`, without LINK for all. Raises BadFault."""
+    link, colon, rest = text.rpartition(":")
+    table: dict[str, Any] = {"link": link.strip()} if colon else {}
+    for part in rest.split(","):
+        name, equals, value = (piece.strip() for piece in part.partition("="))
+        if not name:
+            raise BadFault(f"'{text}' says nothing; one looks like a->b: loss=0.3, delay=0..3")
+        if name in table:
+            raise BadFault(f"{name}: said twice")
+        table[name] = _value(name, value) if equals else True
+    try:
+        msgspec.convert(table, FaultTable)
+    except msgspec.ValidationError as error:
+        raise BadFault(_named(str(error))) from None
+    return table
+
+
+def _named(error: str) -> str:
+    """msgspec's error, with the field in front."""
+    what, _, where = error.partition(" - at `$")
+    unknown = re.fullmatch(r"Object contains unknown field `(.*)`", what)
+    if unknown is not None:
+        known = ", ".join(FaultTable.__struct_fields__[1:])
+        return f"there is no '{unknown[1]}'; there are {known}"
+    return f"{where.strip('.`')}: {what[0].lower()}{what[1:]}".replace("`", "'")
+
+
+def _value(name: str, text: str) -> float | list[float]:
+    numbers = text.split("..")
+    if len(numbers) > 2 or not all(_NUMBER.fullmatch(number) for number in numbers):
+        raise BadFault(f"{name}: '{text}' is neither a number nor a range such as 0..3")
+    values = [int(number) if number.isdigit() else float(number) for number in numbers]
+    return values if len(values) == 2 else values[0]

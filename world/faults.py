@@ -1,0 +1,72 @@
+"""What may befall the reports on their way: a fault plan, of which every accident follows from the seed."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from protocol.units import RobotId, Tick
+
+MAX_DELAY = 50
+"""ticks: so long agents keep a report that no Sense has listed yet"""
+
+Chance = Annotated[float, Meta(ge=0.0, le=1.0)]
+Delay = Annotated[int, Meta(ge=0, le=MAX_DELAY)]
+Window = tuple[Tick, Tick]
+"""ticks, the first inside and the last outside"""
+Way = Literal["->", "<->"]
+
+
+class Link(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """From one robot to its peer, or both ways."""
+
+    sender: RobotId
+    receiver: RobotId
+    both: bool
+
+    def leads(self, sender: str, receiver: str) -> bool:
+        """Whether a report from `sender` to `receiver` takes it."""
+        if (self.sender, self.receiver) == (sender, receiver):
+            return True
+        return self.both and (self.sender, self.receiver) == (receiver, sender)
+
+
+class Fault(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """What may befall a report on a link; several faults befall it one after the other."""
+
+    link: Link | None = None
+    """all of them, where there is none"""
+    loss: Chance = 0.0
+    """the probability that it is lost"""
+    burst_start: Chance = 0.0
+    """per tick in contact, the probability that a burst begins (Gilbert and Elliott's chain)"""
+    burst_end: Chance = 1.0
+    """and that it ends: the mean length of a burst is 1 / burst_end"""
+    burst_loss: Chance = 1.0
+    """the probability that a report is lost in a burst"""
+    partition: bool = False
+    """all are lost"""
+    delay: tuple[Delay, Delay] = (0, 0)
+    """ticks until it is heard, uniform between these, both included"""
+    duplicate: Chance = 0.0
+    """the probability that it comes twice, each with a delay of its own"""
+    reorder: Chance = 0.0
+    """the probability that it comes a tick later still, after what was sent then"""
+    corrupt: Chance = 0.0
+    """the probability that it comes damaged, and is refused"""
+    reports_per_tick: Annotated[float, Meta(gt=0.0, le=1e3)] | None = None
+    """how many may come in a tick, in the mean; what is more is lost"""
+    ticks: Window | None = None
+    """when the fault is there; always, where neither window is given"""
+    contact_ticks: Window | None = None
+    """likewise, counted in ticks in which the two have been in contact"""
+
+    def active(self, tick: int, contacts: int) -> bool:
+        """Whether it is there in `tick`, before which the two have been in contact in `contacts` ticks."""
+        return _inside(self.ticks, tick) and _inside(self.contact_ticks, contacts)
+
+
+def _inside(window: Window | None, tick: int) -> bool:
+    return window is None or window[0] <= tick < window[1]
