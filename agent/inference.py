@@ -98,21 +98,32 @@ ANCHOR_RANGES, ANCHOR_RANGES_WITH_OUTLIERS = 5, 7
 """to its anchor at the least, before a robot goes: two unknowns, and three that check them"""
 
 
+def known_through(mind: Mind) -> int:
+    """The last tick that both logs cover."""
+    return min(mind.tick, mind.radio.peer.through, mind.radio.ranges_through)
+
+
+def answered(mind: Mind) -> bool:
+    """Whether the peer has told of everything up to where this robot has come to rest, or is now."""
+    return known_through(mind) >= mind.log.moved(mind.briefing.mission.noise.unrest)
+
+
 def pair_of(mind: Mind) -> Pair:
-    """All that both have measured, up to the last tick that both logs cover."""
+    """All that both have measured: its own up to now, the peer's up to the last tick that both logs cover."""
     peer, briefing = mind.radio.peer, mind.briefing
-    mission = briefing.mission
-    last = min(mind.tick, peer.through, mind.radio.ranges_through)
-    logs = (mind.log, peer) if briefing.role == "a" else (peer, mind.log)
+    mission, last = briefing.mission, known_through(mind)
+    logs, ends = ((mind.log, peer), (mind.tick, last, last))
+    if briefing.role == "b":
+        logs, ends = ((peer, mind.log), (last, mind.tick, last))
     mutual = [(ranged.tick, ranged.range) for ranged in mind.mutual if ranged.tick <= last]
-    lists = [_told(log, last) for log in logs]
+    lists = [_told(log, end) for log, end in zip(logs, ends, strict=False)]
     ranges = Ranges.of_lists(lists[0], lists[1], mutual, mission.noise)
-    silent = [missing(ranges.tick[ranges.rows(kind)], last + 1) for kind in range(3)]
+    silent = [missing(ranges.tick[ranges.rows(kind)], ends[kind] + 1) for kind in range(3)]
     ranges = ranges.within(mission.sensing_range)
     own, other = briefing.anchor, briefing.peer_anchor
     sign = 1.0 if briefing.role == "a" else -1.0
     return Pair(
-        (path_of(logs[0], last, mission.period), path_of(logs[1], last, mission.period)),
+        (path_of(logs[0], ends[0], mission.period), path_of(logs[1], ends[1], mission.period)),
         ranges,
         (silent[0], silent[1], silent[2]),
         (sign * (other.x - own.x), sign * (other.y - own.y)),
@@ -130,8 +141,8 @@ def missing_for(
     weighed: Sequence[Weighed], held: Sequence[Held], pair: Pair, mission: Mission, mutual: int
 ) -> str | None:
     """What is lacking before a claim, which needs `mutual` mutual ranges; None if it is nothing."""
-    if pair.ranges.counts[2] < mutual:
-        return f"{pair.ranges.counts[2]} mutual ranges, of {mutual}"
+    if len(pair.places) < mutual:
+        return f"{len(pair.places)} mutual ranges, of {mutual}"
     if not weighed:
         return "no hypothesis explains the ranges"
     odds, free = weighed[0].hypothesis.odds, max(len(pair.ranges.rho) - 6, 1)

@@ -45,7 +45,7 @@ def considered(mind: Mind) -> Mind:
     """Phase 3, after a's second range and again after b's last manoeuvre."""
     pair = inference.pair_of(mind)
     mutual = pair.ranges.counts[2]
-    if len(pair.paths[0].v) < mind.tick or mutual < CHECKED - 1:
+    if inference.known_through(mind) < mind.tick or mutual < CHECKED - 1:
         return mind
     weighed = search(pair)
     mind = inference.finished(inference.with_pair(mind, weighed, pair, CHECKED), weighed)

@@ -17,12 +17,14 @@ class Logbook(msgspec.Struct, frozen=True):
     runs: tuple[Run, ...] = ()
     ranges: tuple[Ranged, ...] = ()
 
-    @property
-    def moved(self) -> int:
-        """The tick by which the last manoeuvre that was no rest had ended."""
+    def moved(self, unrest: tuple[float, float] = (0.0, 0.0)) -> int:
+        """The tick by which the last manoeuvre that was no rest had ended.
+
+        A robot at rest may measure up to `unrest`, in m/s and rad/s.
+        """
         at_rest = 0
         for run in reversed(self.runs):
-            if run.v != 0.0 or run.omega != 0.0:
+            if abs(run.v) > unrest[0] or abs(run.omega) > unrest[1]:
                 break
             at_rest += run.ticks
         return self.through - at_rest

@@ -59,7 +59,7 @@ def considered(mind: Mind) -> Mind:
     variant, began = mind.briefing.variant, mind.findings.met
     assert began is not None
     sightings = mind.sightings(began if variant == "paper" else 0)
-    if sightings and sightings[-1].tick < mind.log.moved:  # what this robot did last is not answered yet
+    if sightings and sightings[-1].tick < mind.log.moved():  # what this robot did last is not answered yet
         return mind
     base = encounter.base([at for at in sightings if off_anchor(at.b, mind.briefing.rendezvous.b)])
     if base is None:  # yet; or, where a report was missed, b was still driving as a went straight

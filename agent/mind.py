@@ -15,7 +15,7 @@ from agent.phases.anchor import ThirdPoint
 from agent.phases.encounter import LastManoeuvre, Plan, Returning, Standing, Waiting
 from agent.phases.rendezvous import Aligning, Orbiting, Radial, Tangent, off_anchor
 from agent.phases.seeking import Backing, Circling, Homing, Straight, Turning
-from agent.phases.surveying import Surveying
+from agent.phases.surveying import Listening, Surveying
 from agent.radio import Radio
 from protocol import messages
 from protocol.messages import MAX_REASON, Briefing, Localised, Ranged, Undecided
@@ -36,8 +36,9 @@ class Done(msgspec.Struct, frozen=True):
 
 Phase1 = Straight | Backing | Turning | Circling | ThirdPoint | Surveying | Homing
 Phase2 = Aligning | Radial | Tangent | Orbiting
-Phase3 = Straight | Backing | Turning | Circling | Standing | Waiting | LastManoeuvre | Returning | Surveying
-State = Asleep | Phase1 | Phase2 | Phase3 | Done
+Phase3 = Straight | Backing | Turning | Circling | Standing | Waiting | LastManoeuvre | Returning
+Noisy3 = Surveying | Listening
+State = Asleep | Phase1 | Phase2 | Phase3 | Noisy3 | Done
 
 WORDS: dict[type, str] = {
     Asleep: "asleep",
@@ -48,6 +49,7 @@ WORDS: dict[type, str] = {
     ThirdPoint: "third-point",
     Surveying: "surveying",
     Homing: "homing",
+    Listening: "listening",
     Aligning: "aligning",
     Radial: "radial",
     Tangent: "tangent",
@@ -84,6 +86,8 @@ class Findings(msgspec.Struct, frozen=True):
     """of the first"""
     missing: str | None = None
     """under noise: what there is to know yet, before it can claim"""
+    sought: int = 0
+    """under noise: mutual ranges from places of their own, when the whole plane was last searched"""
     returns: int = 0
     """under noise: how often it went back to its anchor"""
 

@@ -128,7 +128,8 @@ class Seen(NamedTuple):
 
     @staticmethod
     def positions(path: Track, tick: Places, u: Array) -> Seen:
-        """Rows that look at its position."""
+        """Rows that look at its position; those that do not, as their u is 0, may be of later ticks."""
+        tick = np.minimum(tick, len(path.v))
         return Seen(tick, u, path.period * (u[1] * path.x[tick] - u[0] * path.y[tick]))
 
     def then(self, more: Seen) -> Seen:

@@ -18,6 +18,9 @@ from protocol.noise import Noise
 SIGMA_FLOOR = 1e-6
 """m: no range is taken to be better than this"""
 
+ELSEWHERE = 0.01
+"""of R: a range from no farther off than this says again what the last one said"""
+
 IMPOSSIBLE = 6.0
 """sigmas beyond R: a range so long is an outlier, whatever the guess"""
 
@@ -81,6 +84,17 @@ class Pair(NamedTuple):
     """m: M2 - M1 in <W>"""
     sensing_range: float
     noise: Noise
+
+    @property
+    def places(self) -> Places:
+        """Which of the mutual ranges were taken from elsewhere than the last: one robot had moved."""
+        ticks = self.ranges.tick[self.ranges.rows(2)]
+        moved = np.zeros(len(ticks), bool)
+        moved[:1] = True
+        for path in self.paths:
+            x, y = path.x[ticks], path.y[ticks]
+            moved[1:] |= np.hypot(np.diff(x), np.diff(y)) > ELSEWHERE * self.sensing_range
+        return np.flatnonzero(moved)
 
 
 class Predicted(NamedTuple):

@@ -71,7 +71,7 @@ def _loosened(path: Track, ranges: Ranges, noise: Noise) -> Array:
     turn, bx, by, xx, _, yy = drift.sums
     lever = path.period
     position = xx + yy + 2.0 * lever * (path.y * bx - path.x * by) + lever**2 * (path.x**2 + path.y**2) * turn
-    along: Array = 0.5 * np.maximum(position, 0.0)[ranges.tick]
+    along: Array = 0.5 * np.maximum(position, 0.0)[np.minimum(ranges.tick, len(path.v))]
     return along
 
 
@@ -169,7 +169,8 @@ def placements(of_a: Array, of_b: Array, pair: Pair) -> list[tuple[float, float]
     """
     mutual = pair.ranges.rows(2)
     ticks, rho, sigma = pair.ranges.tick[mutual], pair.ranges.rho[mutual], pair.ranges.sigma[mutual]
-    some = np.unique(np.linspace(0, len(ticks) - 1, SEED_RANGES).round().astype(np.intp))
+    places = pair.places
+    some = places[np.unique(np.linspace(0, len(places) - 1, SEED_RANGES).round().astype(np.intp))]
     ticks, rho, sigma = ticks[some], rho[some], sigma[some]
     place = [
         placed(np.array([*one, 0.0]), path, ticks) for one, path in zip((of_a, of_b), pair.paths, strict=True)

@@ -18,7 +18,7 @@ from agent.phases import rendezvous, seeking, surveying
 from agent.phases.encounter import Returning
 from agent.phases.rendezvous import Aligning, Orbiting, Radial, Tangent
 from agent.phases.seeking import Backing, Circling, Homing, Straight, Turning
-from agent.phases.surveying import Surveying
+from agent.phases.surveying import Listening, Surveying
 from protocol.messages import BranchKind, Localised
 from protocol.motion import ORIGIN, REST, Controls
 
@@ -66,11 +66,11 @@ def sensed(mind: Mind, anchor_range: float | None) -> Mind:
             return replace(mind, state=Straight("anchor", mind.odometry, 0.0)) if there else mind
         case Aligning() | Radial() | Tangent() | Orbiting():
             return _under_way(mind, anchor_range is not None)
-        case Surveying("peer") if mind.briefing.role == "b" and _silent(
+        case Surveying("peer") | Listening() if mind.briefing.role == "b" and _silent(
             mind
         ) >= LOST_TOGETHER * surveying.stride(mind.briefing.mission):
             return _homeward(mind)
-        case Surveying("peer", drive) if not mind.in_contact:
+        case Surveying("peer", drive) | Listening(drive) if not mind.in_contact:
             return replace(mind, state=Returning(Controls(-drive.v, -drive.omega), mind.odometry))
         case Returning() if not mind.in_contact:
             return _parted(mind)
@@ -176,12 +176,10 @@ def heard(mind: Mind) -> Mind:
             return mind
         case _ if mind.radio.start is None:
             return mind
-        case Surveying("peer") if not decides(mind):
+        case Surveying("peer") | Listening() if not decides(mind):
             return mind
-        case Surveying("peer") if not mind.hears_peer:
-            return replace(mind, state=Surveying("peer"))
-        case _ if not mind.hears_peer:
-            return mind
+        case _ if not inference.answered(mind):
+            return replace(mind, state=Listening())
         case _:
             return _considered(mind)
 
@@ -192,15 +190,14 @@ def _considered(mind: Mind) -> Mind:
     if mind.findings.met is None:
         mind = replace(mind, findings=replace(mind.findings, met=mind.tick))
     pair = inference.pair_of(mind)
-    if len(pair.paths[0].v) < mind.tick:  # the peer's log is behind, and catches up
-        return replace(mind, state=Surveying("peer"))
-    mutual = pair.ranges.counts[2]
+    mutual = len(pair.places)
     if mutual < FEW:
         return _blindly(mind)
     known = mind.findings.pair
-    before = sum([ranged.tick <= mind.tick - surveying.stride(mission) for ranged in mind.mutual])
-    searched = not known or any(before < count <= mutual for count in SEARCHED)
+    searched = not known or any(mind.findings.sought < count <= mutual for count in SEARCHED)
     weighed = search(pair) if searched else follow(known, pair)
+    if searched:
+        mind = replace(mind, findings=replace(mind.findings, sought=mutual))
     checked = CHECKED_WITH_OUTLIERS if mission.noise.outliers else CHECKED
     judged = inference.with_pair(mind, weighed, pair, checked)
     if judged.findings.missing is None and not searched:

@@ -23,7 +23,7 @@ from protocol.motion import TAU, Pose
 from protocol.rendezvous import Rendezvous, rendezvous, tick_budget
 from protocol.units import NAME, RobotId
 from protocol.wire import MalformedFrame, decode, encode
-from world.faults import Fault
+from world.faults import Fault, hold_up
 from world.scenario import Placed, Scenario
 
 MAX_TICKS = 10**9
@@ -31,6 +31,8 @@ MAX_ROBOTS = 200
 """so many that the truth about all of them fits a frame"""
 Place = Annotated[float, Meta(ge=-1e6, le=1e6)]
 """m: nobody gets so far from there that `units.Coordinate` would not hold it"""
+EXCHANGES = 20
+"""reports for which a mission may have to wait as long as they hardly ever take"""
 NEAREST_ANCHORS = 1e-3
 """m: that is one anchor, not two"""
 TICK_S = (5e-4, 3600.0)
@@ -217,7 +219,10 @@ def _validated(file: ScenarioFile, source: str) -> Scenario:
                 f"outside mission.sensing_range = {file.mission.sensing_range:.9g} m"
             )
         placed.append(Placed(robot.id, peer, role, Anchor(*robot.anchor), start, plans[robot.id]))
+    faults = _faults(file, source)
     budget = max(tick_budget(file.mission, plan) for plan in plans.values())
+    if faults:
+        budget += EXCHANGES * hold_up(faults)
     if file.max_ticks is None and budget > MAX_TICKS:
         raise Unworkable(f"{source}: mission: to meet could take {budget} ticks, more than {MAX_TICKS}")
     scenario = Scenario(
@@ -227,7 +232,7 @@ def _validated(file: ScenarioFile, source: str) -> Scenario:
         mission=file.mission,
         variant=file.planner.variant,
         robots=tuple(placed),
-        faults=_faults(file, source),
+        faults=faults,
     )
     try:
         for one in scenario.robots:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated
 
 import msgspec
@@ -59,5 +60,16 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         ranges = self.anchor_sigma or self.mutual_sigma or self.outliers or self.drop_outs
         return not ranges and self.actuation == self.odometry == Drift()
 
+    @property
+    def unrest(self) -> tuple[float, float]:
+        """m/s and rad/s: more than this is hardly ever measured by a robot that was told to stand."""
+        return (
+            UNREST * math.hypot(self.actuation.v_floor, self.odometry.v_floor),
+            UNREST * math.hypot(self.actuation.omega_floor, self.odometry.omega_floor),
+        )
+
+
+UNREST = 6.0
+"""standard deviations"""
 
 EXACT = Noise()

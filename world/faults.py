@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+import math
+from collections.abc import Sequence
+from typing import Annotated
 
 import msgspec
 from msgspec import Meta
@@ -16,7 +18,6 @@ Chance = Annotated[float, Meta(ge=0.0, le=1.0)]
 Delay = Annotated[int, Meta(ge=0, le=MAX_DELAY)]
 Window = tuple[Tick, Tick]
 """ticks, the first inside and the last outside"""
-Way = Literal["->", "<->"]
 
 
 class Link(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
@@ -66,6 +67,34 @@ class Fault(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=
     def active(self, tick: int, contacts: int) -> bool:
         """Whether it is there in `tick`, before which the two have been in contact in `contacts` ticks."""
         return _inside(self.ticks, tick) and _inside(self.contact_ticks, contacts)
+
+    @property
+    def let_through(self) -> float:
+        """The share of reports that it lets through where it is always there."""
+        bursty = self.burst_start / (self.burst_start + self.burst_end) if self.burst_start else 0.0
+        share = (1.0 - self.loss) * (1.0 - self.corrupt) * (1.0 - bursty * self.burst_loss)
+        return share * min(1.0, self.reports_per_tick or 1.0)
+
+
+def hold_up(plan: Sequence[Fault]) -> int:
+    """Ticks within which a report gets through that is told again every tick; hardly ever it takes more.
+
+    Windows of no contact are counted whole; what never lets anything through is not waited for.
+    """
+    through, burst, ticks = 1.0, 1.0, 0
+    for fault in plan:
+        window = fault.ticks or fault.contact_ticks
+        ticks += fault.delay[1] + (fault.reorder > 0.0)
+        if window is not None and (fault.partition or not fault.let_through):
+            ticks += window[1] - window[0]
+        elif not fault.partition and fault.let_through:
+            through *= fault.let_through
+            burst = max(burst, 1.0 / fault.burst_end if fault.burst_start else 1.0)
+    return ticks + math.ceil(UNLUCKY * max(burst, 1.0 / through))
+
+
+UNLUCKY = 20.0
+"""times its mean: a wait so long has the probability e^-20"""
 
 
 def _inside(window: Window | None, tick: int) -> bool:

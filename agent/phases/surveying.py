@@ -52,6 +52,12 @@ class Surveying(msgspec.Struct, frozen=True):
     drive: Controls = REST
 
 
+class Listening(msgspec.Struct, frozen=True):
+    """Stands in the peer's range, and waits for what it has not been told of it yet."""
+
+    drive: Controls = REST
+
+
 def stride(mission: Mission) -> int:
     """Ticks that a manoeuvre lasts: from nearer by, a range tells little more."""
     return max(1, round(STRIDE * mission.sensing_range / mission.first_straight))
