@@ -87,7 +87,7 @@ class Findings(msgspec.Struct, frozen=True):
     missing: str | None = None
     """under noise: what there is to know yet, before it can claim"""
     sought: int = 0
-    """under noise: mutual ranges from places of their own, when the whole plane was last searched"""
+    """under noise: how many mutual ranges there were when the whole plane was last searched"""
     returns: int = 0
     """under noise: how often it went back to its anchor"""
 

@@ -169,7 +169,7 @@ def placements(of_a: Array, of_b: Array, pair: Pair) -> list[tuple[float, float]
     """
     mutual = pair.ranges.rows(2)
     ticks, rho, sigma = pair.ranges.tick[mutual], pair.ranges.rho[mutual], pair.ranges.sigma[mutual]
-    places = pair.places
+    places = pair.places if len(pair.places) >= SEED_RANGES else np.arange(len(ticks))
     some = places[np.unique(np.linspace(0, len(places) - 1, SEED_RANGES).round().astype(np.intp))]
     ticks, rho, sigma = ticks[some], rho[some], sigma[some]
     place = [

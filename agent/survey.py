@@ -190,7 +190,7 @@ def _considered(mind: Mind) -> Mind:
     if mind.findings.met is None:
         mind = replace(mind, findings=replace(mind.findings, met=mind.tick))
     pair = inference.pair_of(mind)
-    mutual = len(pair.places)
+    mutual = pair.ranges.counts[2]
     if mutual < FEW:
         return _blindly(mind)
     known = mind.findings.pair
@@ -206,7 +206,7 @@ def _considered(mind: Mind) -> Mind:
     judged = inference.finished(judged, weighed)
     if judged.findings.missing is None:
         return claimed(judged)
-    if role == "a" and mutual >= ENOUGH * (1 + mind.findings.returns):
+    if role == "a" and len(pair.places) >= ENOUGH * (1 + mind.findings.returns):
         return _homeward(judged)
     if not weighed:
         return _blindly(judged)
