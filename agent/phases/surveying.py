@@ -121,7 +121,7 @@ def alone(held: Sequence[Held], mission: Mission, within: float | None = None) -
             ux, uy = x / distances[0], y / distances[0]
     sigma = max(mission.noise.anchor_sigma, FINE * mission.accuracy)
     weight = (distances[0] <= reach) / sigma**2
-    information = np.linalg.inv(best.covariance + np.eye(2) * (FINE * mission.accuracy) ** 2)
+    information = _information(best.covariance, mission)
     xx = information[0, 0] + np.sum(weight * ux * ux, 1)
     xy = information[0, 1] + np.sum(weight * ux * uy, 1)
     yy = information[1, 1] + np.sum(weight * uy * uy, 1)
@@ -197,8 +197,7 @@ def _best_of(
             rows[:, own_rows, i] = ox * own
             rows[:, own_rows, i + 1] = oy * own
             rows[:, own_rows, i + 2] = (oy * (x - px) - ox * (y - py)) * own
-        information = np.linalg.inv(one.covariance + np.eye(6) * (FINE * mission.accuracy) ** 2)
-        left = np.linalg.inv(information + np.swapaxes(rows, 1, 2) @ rows)
+        left = np.linalg.inv(_information(one.covariance, mission) + np.swapaxes(rows, 1, 2) @ rows)
         for i, (x, y) in ((0, (ax, ay)), (3, (bx, by))):
             dx, dy = x[:, -1] - one.poses[i], y[:, -1] - one.poses[i + 1]
             variance = left[:, i, i] + left[:, i + 1, i + 1] + (dx * dx + dy * dy) * left[:, i + 2, i + 2]
@@ -217,6 +216,14 @@ APART = 0.2
 
 ASIDE = 0.06
 """of R: how near a robot may come to its anchor; on which side of it, drift would then leave open"""
+
+
+def _information(covariance: Array, mission: Mission) -> Array:
+    """Its inverse; what is hardly known counts as known to 2 R and half a turn."""
+    variances, axes = np.linalg.eigh(covariance)
+    most = max(4.0 * mission.sensing_range**2, math.pi**2)
+    information: Array = axes / (np.clip(variances, 0.0, most) + (FINE * mission.accuracy) ** 2) @ axes.T
+    return information
 
 
 def _confusion(held: Sequence[Held], distances: Sequence[Array], sigma: float, reach: float) -> Array:
