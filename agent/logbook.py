@@ -63,6 +63,10 @@ class Logbook(msgspec.Struct, frozen=True):
         news = told.ranges[known - ranges_since :] if ranges_since <= known else ()
         return Logbook(book.through, book.runs, self.ranges + news)
 
+    def between(self, first: int, last: int) -> tuple[Run, ...]:
+        """What was driven over [first, last], as few runs."""
+        return Logbook().extended(0, 0, Logbook(last - first, _between(self.runs, first, last))).runs
+
     def pose(self, start: Pose, tick: int, period: float) -> Pose:
         """Where the robot was at `tick`, if it was at `start` at tick 0."""
         return follow(start, _between(self.runs, 0, tick), period)

@@ -13,7 +13,7 @@ from agent.phases import encounter
 from agent.phases.encounter import LastManoeuvre, Standing, Waiting
 from agent.phases.rendezvous import Orbiting, off_anchor
 from agent.phases.seeking import Straight
-from protocol.messages import Localised
+from protocol.messages import Alarm, Localised
 
 PEER_RESTS = (WORDS[Standing], WORDS[Waiting])
 """what it says then: two that move at once may do so in mirror image, and learn nothing"""
@@ -69,7 +69,7 @@ def considered(mind: Mind) -> Mind:
     left = mind.findings.placements
     checked = encounter.redundant(sightings, base)
     if not left:
-        return mind.undecided("no placement explains the mutual ranges")
+        return mind.alarmed(Alarm("a path that no placement brings together with the mutual ranges"))
     starts = [start for start in (mind.start, mind.radio.start) if start is not None]
     if checked and len(left) == 1 and encounter.pinned_down(left[0], sightings, starts, mission, distance):
         return replace(mind, state=Done(3, Localised(mind.world_pose(left[0]))))

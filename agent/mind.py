@@ -18,7 +18,7 @@ from agent.phases.seeking import Backing, Circling, Homing, Straight, Turning
 from agent.phases.surveying import Listening, Surveying
 from agent.radio import Radio
 from protocol import messages
-from protocol.messages import MAX_REASON, Briefing, Localised, Ranged, Undecided
+from protocol.messages import MAX_REASON, Alarm, Briefing, Localised, Ranged, Undecided
 from protocol.motion import ORIGIN, Covariance, Pose, compose
 from protocol.rendezvous import Orbit
 
@@ -67,6 +67,8 @@ class Findings(msgspec.Struct, frozen=True):
     branch: Branch | None = None
     """the one that is left after phase 1"""
     branch_kind: messages.BranchKind | None = None
+    parted: int | None = None
+    """the tick in which phase 1 was over, for the first time"""
     met: int | None = None
     """the tick in which phase 3 began"""
     placements: tuple[Placement, ...] = ()
@@ -151,6 +153,8 @@ class Mind(msgspec.Struct, frozen=True):
         match self.state:
             case Done(_, Localised()):
                 return "localised"
+            case Done(_, Alarm()):
+                return "alarm"
             case Done(_, Undecided()):
                 return "undecided"
             case state:
@@ -164,6 +168,10 @@ class Mind(msgspec.Struct, frozen=True):
     def undecided(self, reason: str) -> Mind:
         """It cannot go on, and does not guess."""
         return replace(self, state=Done(self.phase, Undecided(reason[:MAX_REASON])))
+
+    def alarmed(self, alarm: Alarm) -> Mind:
+        """The peer tells what cannot be so."""
+        return replace(self, state=Done(self.phase, alarm))
 
     @property
     def start(self) -> Pose:

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from agent import letter, meeting, radio, survey
+from agent import letter, lying, meeting, radio, survey, trust
 from agent.belief import ON_ANCHOR, Branch, branches, weigh_branches
 from agent.mind import Asleep, Done, Mind
 from agent.phases import anchor, encounter, rendezvous, seeking
@@ -25,7 +25,7 @@ from agent.phases.rendezvous import Aligning, Orbiting, Radial, Tangent
 from agent.phases.seeking import Backing, Circling, Homing, Straight, Turning
 from agent.phases.surveying import Surveying
 from protocol import messages
-from protocol.messages import Drive, Estimate, Localised, Ranged, Report, Sense, Undecided
+from protocol.messages import Alarm, Drive, Estimate, Localised, Ranged, Report, Sense, Undecided
 from protocol.motion import ORIGIN, REST, Controls, Pose, step
 
 # --- a tick -----------------------------------------------------------------------------------------
@@ -55,13 +55,18 @@ def observe(mind: Mind, sense: Sense) -> Mind:
 def report(mind: Mind) -> Report:
     """What the peer has not acknowledged yet."""
     since, ranges_since = mind.radio.acknowledged, mind.radio.ranges_acknowledged
-    news = mind.log.after(since, ranges_since)
+    log, start = mind.log, mind.findings.branch.start if mind.findings.branch and mind.phase > 1 else None
+    if (lie := mind.briefing.lie) is not None:
+        findings = mind.findings
+        log = lying.told(log, lie, findings.parted, findings.met, mind.briefing.mission.period)
+        start = lying.start(start, lie) if start is not None else None
+    news = log.after(since, ranges_since)
     return Report(
         tick=mind.tick,
         robot=mind.briefing.robot,
         phase=mind.phase,
         state=mind.doing,
-        start=mind.findings.branch.start if mind.findings.branch and mind.phase > 1 else None,
+        start=start,
         since=since,
         through=news.through,
         runs=news.runs,
@@ -76,12 +81,9 @@ def report(mind: Mind) -> Report:
 def decide(mind: Mind, reports: Sequence[Report] = ()) -> Mind:
     """What the robot is set to do once it has heard its peer."""
     if reports:
-        heard = mind.radio
-        for told in reports:
-            heard = radio.hear(heard, told)
-        mind = replace(mind, radio=heard)
-        if isinstance(heard.verdict, Undecided) and mind.verdict is None:
-            return mind.undecided(f"{mind.briefing.peer} says: {heard.verdict.reason}")
+        mind = _heard(mind, reports)
+        if mind.verdict is not None:
+            return mind
     if not mind.in_contact:
         return mind
     if _surveys(mind):
@@ -131,6 +133,23 @@ def estimate(mind: Mind) -> Estimate:
         odds=tuple(one.odds for one in mind.findings.pair or mind.findings.own),
         covariance=mind.findings.covariance,
     )
+
+
+def _heard(mind: Mind, reports: Sequence[Report]) -> Mind:
+    """`mind`, with all that `reports` tell; and its verdict, if that cannot be so, or the peer gives up."""
+    for told in reports:
+        heard = radio.hear(mind.radio, told)
+        doubt = trust.objection(mind.radio, heard, told, mind.briefing) if mind.verdict is None else None
+        mind = replace(mind, radio=heard)
+        if doubt is not None:
+            return mind.alarmed(doubt)
+    if mind.verdict is None:
+        match mind.radio.verdict:
+            case Undecided(reason):
+                return mind.undecided(f"{mind.briefing.peer} says: {reason}")
+            case Alarm(claim):
+                return mind.undecided(f"{mind.briefing.peer} does not believe it: {claim}")
+    return mind
 
 
 # --- what a tick changes ----------------------------------------------------------------------------
@@ -232,7 +251,7 @@ def _third_range(mind: Mind, state: ThirdPoint) -> Mind:
 
 def _located(mind: Mind, branch: Branch, kind: messages.BranchKind) -> Mind:
     """Phase 1 is done: its pose relative to the anchor is known."""
-    mind = replace(mind, findings=replace(mind.findings, branch=branch, branch_kind=kind))
+    mind = replace(mind, findings=replace(mind.findings, branch=branch, branch_kind=kind, parted=mind.tick))
     mu = rendezvous.orientation(mind.local_pose)
     return _on_to_orbit(mind, Aligning(mind.odometry.heading - mu))
 

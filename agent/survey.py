@@ -104,7 +104,8 @@ def _surveyed(mind: Mind) -> Mind:
     mission = mind.briefing.mission
     if inference.settled(weighed, mission):
         kind: BranchKind = "circle" if len(mind.log.ranges) == 2 else "three-ranges"
-        mind = replace(mind, findings=replace(mind.findings, branch_kind=kind))
+        parted = mind.tick if mind.findings.parted is None else mind.findings.parted
+        mind = replace(mind, findings=replace(mind.findings, branch_kind=kind, parted=parted))
         return _parted(mind)
     drive = surveying.alone(inference.held_alone(weighed), mission)
     return replace(mind, state=Surveying("anchor", drive))

@@ -17,6 +17,7 @@ from msgspec import Meta
 
 from compose.faults import BadFault, FaultTable, fault, table_of
 from compose.status import UserError
+from protocol.lie import Lie
 from protocol.messages import Briefing
 from protocol.mission import Anchor, Mission, Role, Variant, noise_obstacle, obstacle
 from protocol.motion import TAU, Pose
@@ -68,6 +69,8 @@ class RobotTable(_Table, frozen=True):
     """x, y in m, heading in rad; drawn from the seed inside the sensing range where it is left out"""
     peer: RobotId | None = None
     """needed only with more than two robots"""
+    lie: Lie | None = None
+    """what it tells its peer instead of the truth"""
 
 
 class ScenarioFile(_Table, frozen=True):
@@ -218,7 +221,7 @@ def _validated(file: ScenarioFile, source: str) -> Scenario:
                 f"{source}: robot[{i}].start: '{robot.id}' is {rho0:.9g} m from its anchor, "
                 f"outside mission.sensing_range = {file.mission.sensing_range:.9g} m"
             )
-        placed.append(Placed(robot.id, peer, role, Anchor(*robot.anchor), start, plans[robot.id]))
+        placed.append(Placed(robot.id, peer, role, Anchor(*robot.anchor), start, plans[robot.id], robot.lie))
     faults = _faults(file, source)
     budget = max(tick_budget(file.mission, plan) for plan in plans.values())
     if faults:

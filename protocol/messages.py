@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from protocol.lie import Lie
 from protocol.mission import Anchor, Mission, Role, Variant
 from protocol.motion import Controls, Covariance, Pose, Run
 from protocol.rendezvous import Rendezvous
@@ -81,7 +82,18 @@ class Undecided(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fie
     reason: Text
 
 
-Verdict = Localised | Undecided
+class Alarm(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="alarm"):
+    """The peer tells what cannot be so."""
+
+    claim: Text
+    """of the peer"""
+    residual: Annotated[float, Meta(ge=0.0, le=1e15)] | None = None
+    """by how much it cannot: m, m/s or rad; under noise sigmas; none where nothing comes near it"""
+    p_value: Odds = 0.0
+    """how probable that much is, if the peer is honest"""
+
+
+Verdict = Localised | Undecided | Alarm
 
 
 class Briefing(Message, frozen=True):
@@ -96,6 +108,8 @@ class Briefing(Message, frozen=True):
     mission: Mission
     variant: Variant
     rendezvous: Rendezvous
+    lie: Lie | None
+    """what it is told to tell its peer, instead of the truth"""
     tick_s: Annotated[float, Meta(gt=0.0, le=1e6)] | None
     """s of wall time that a tick lasts; none in lockstep, where no decision depends on a time-out"""
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import msgspec
 
-from protocol.messages import Localised, Outcome, Undecided, Verdict
+from protocol.messages import Alarm, Localised, Outcome, Undecided, Verdict
 from protocol.motion import Pose, wrap
 from world.scenario import Scenario
 from world.truth import Truth
@@ -67,7 +67,7 @@ def judge(
     open_cases = [
         robot.id
         for robot in scenario.robots
-        if robot.id not in verdicts and not isinstance(verdicts.get(robot.peer), Undecided)
+        if robot.id not in verdicts and not isinstance(verdicts.get(robot.peer), Undecided | Alarm)
     ]
     if open_cases and truth.tick < scenario.max_ticks:
         return None
@@ -77,6 +77,10 @@ def judge(
             why = mistake(verdict, pose if claimed is None else claimed[robot.id])
             if why is not None:
                 return Judgement("wrong", f"{robot.id} claims a pose that is {why}")
+    for robot in scenario.robots:
+        verdict = verdicts.get(robot.id)
+        if isinstance(verdict, Alarm):
+            return Judgement("alarm", f"{robot.id}: {robot.peer} tells {verdict.claim}")
     for robot in scenario.robots:
         verdict = verdicts.get(robot.id)
         if isinstance(verdict, Undecided):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
+from protocol.lie import Lie
 from protocol.messages import Briefing
 from protocol.mission import Anchor, Mission, Role, Variant
 from protocol.motion import Pose
@@ -21,6 +22,7 @@ class Placed(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields
     anchor: Anchor
     start: Pose
     rendezvous: Rendezvous
+    lie: Lie | None = None
 
 
 class Scenario(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="scenario"):
@@ -59,5 +61,6 @@ class Scenario(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fiel
             mission=self.mission,
             variant=self.variant,
             rendezvous=own.rendezvous,
+            lie=own.lie,
             tick_s=tick_s,
         )
