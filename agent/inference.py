@@ -9,6 +9,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from agent.belief import Branch
+from agent.doubt import DOUBTFUL, FINISHED, doubt
 from agent.hypotheses import Weighed, missing, of_anchor
 from agent.logbook import Logbook
 from agent.mind import Mind
@@ -145,14 +146,14 @@ def missing_for(
         return f"{len(pair.places)} mutual ranges, of {mutual}"
     if not weighed:
         return "no hypothesis explains the ranges"
-    odds, free = weighed[0].hypothesis.odds, max(len(pair.ranges.rho) - 6, 1)
+    odds = weighed[0].hypothesis.odds
     if odds < mission.confidence:
         return (
             f"the likeliest of {len(weighed)} hypotheses has the odds {odds:.6f}, of {mission.confidence:g}"
         )
-    chi2 = weighed[0].fit.chi2
-    if not chi2 <= plausible(free):
-        return f"the likeliest hypothesis fits badly: chi-square {chi2:.3g} for {free} degrees of freedom"
+    against = doubt(weighed[0].fit, pair)
+    if not against.p_value >= DOUBTFUL:
+        return f"the likeliest hypothesis is in doubt: {against.what}"
     _, covariance = bent(held[0], pair.apart)
     for i, robot in ((0, "a"), (3, "b")):
         position = deviation(covariance[i, i] + covariance[i + 1, i + 1])
@@ -174,18 +175,6 @@ def finished(mind: Mind, weighed: Sequence[Weighed]) -> Mind:
 
 ASKEW = 0.2
 """rad: with a heading less well known than this the ellipse is no likeness of what is possible"""
-
-FINISHED = 0.1
-"""sigmas: a fit whose last step was longer than this has not found its minimum"""
-
-PLAUSIBLE = 3.0
-"""standard deviations: less likely than this, a fit is not the sensors' chance, and nothing is claimed"""
-
-
-def plausible(free: int) -> float:
-    """What a chi-square of `free` degrees of freedom hardly ever exceeds (Wilson and Hilferty)."""
-    spread = 2.0 / (9.0 * free)
-    return free * (1.0 - spread + PLAUSIBLE * math.sqrt(spread)) ** 3
 
 
 def with_pair(mind: Mind, weighed: Sequence[Weighed], pair: Pair, mutual: int) -> Mind:

@@ -90,6 +90,8 @@ class Findings(msgspec.Struct, frozen=True):
     """under noise: what there is to know yet, before it can claim"""
     sought: int = 0
     """under noise: how many mutual ranges there were when the whole plane was last searched"""
+    doubts: int = 0
+    """under noise: how often on end the ranges have spoken against what the peer tells"""
     returns: int = 0
     """under noise: how often it went back to its anchor"""
 

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from agent import inference
+from agent.doubt import DOUBTFUL, LOOKS, UNBELIEVABLE, Doubt, doubt
 from agent.hypotheses import Weighed, follow, search
 from agent.mind import Asleep, Done, Mind
 from agent.phases import rendezvous, seeking, surveying
@@ -201,18 +202,31 @@ def _considered(mind: Mind) -> Mind:
         mind = replace(mind, findings=replace(mind.findings, sought=mutual))
     checked = CHECKED_WITH_OUTLIERS if mission.noise.outliers else CHECKED
     judged = inference.with_pair(mind, weighed, pair, checked)
-    if judged.findings.missing is None and not searched:
-        weighed = search(pair)
+    doubted = len(pair.places) >= checked and bool(weighed) and doubt(weighed[0].fit, pair).p_value < DOUBTFUL
+    if (judged.findings.missing is None or doubted) and not searched:
+        weighed, searched = search(pair), True
         judged = inference.with_pair(mind, weighed, pair, checked)
     judged = inference.finished(judged, weighed)
     if judged.findings.missing is None:
         return claimed(judged)
+    if doubted and searched and weighed:
+        judged = _doubted(judged, doubt(weighed[0].fit, pair))
+        if judged.verdict is not None:
+            return judged
     if role == "a" and len(pair.places) >= ENOUGH * (1 + mind.findings.returns):
         return _homeward(judged)
     if not weighed:
         return _blindly(judged)
     a, b = surveying.together(inference.held_together(weighed, pair), pair.apart, mission)
     return replace(judged, state=Surveying("peer", a if role == "a" else b))
+
+
+def _doubted(mind: Mind, against: Doubt) -> Mind:
+    """`mind`, in doubt of its peer; alarmed, if that is not the first time."""
+    looks = mind.findings.doubts + 1 if against.p_value < UNBELIEVABLE else 0
+    if looks >= LOOKS:
+        return mind.alarmed(against.alarm)
+    return replace(mind, findings=replace(mind.findings, doubts=looks))
 
 
 def _blindly(mind: Mind) -> Mind:
