@@ -17,8 +17,8 @@ DOUBTFUL = 1e-3
 UNBELIEVABLE = 1e-6
 """less probable than this, and so over again, it is not chance that the peer has against it"""
 
-LOOKS = 3
-"""searches of the whole plane, each with more ranges, before an alarm: the first may have missed the truth"""
+LOOKS = 5
+"""searches of the whole plane, each with more ranges, before an alarm: one may have missed the truth"""
 
 
 FINISHED = 0.1
@@ -45,14 +45,13 @@ def doubt(fit: Fit, pair: Pair) -> Doubt:
     between the anchors, which is known, that it has to fit.
     """
     free = max(len(fit.residuals) - 6, 1)
-    chi2 = max(fit.chi2 - fit.last_step**2, 0.0)  # what it would be after another step
-    sigmas = _normal(chi2, free)
+    sigmas = _normal(fit.chi2, free)
     misfit = 0.5 * math.erfc(sigmas / math.sqrt(2.0))
     stretched = abs(_stretched(fit, pair)) if fit.last_step <= FINISHED else 0.0
     apart = math.erfc(stretched / math.sqrt(2.0))
     if apart < misfit:
         return Doubt("a way that puts the anchors at another distance from each other", stretched, apart)
-    what = f"what fits the ranges badly: chi-square {chi2:.3g} for {free} degrees of freedom"
+    what = f"what fits the ranges badly: chi-square {fit.chi2:.3g} for {free} degrees of freedom"
     return Doubt(what, max(sigmas, 0.0), misfit)
 
 
