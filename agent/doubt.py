@@ -14,7 +14,7 @@ from protocol.messages import Alarm
 DOUBTFUL = 1e-3
 """less probable than this, a fit is not what a robot claims by: it takes more ranges"""
 
-UNBELIEVABLE = 1e-6
+UNBELIEVABLE = 2e-5
 """less probable than this, and so over again, it is not chance that the peer has against it"""
 
 LOOKS = 5

@@ -1,0 +1,262 @@
+"""A peer that lies is found out: by what it told before, by what it can drive, by the ranges. Nobody else is."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from agent import lying, planner, radio, trust
+from agent.logbook import Logbook
+from compose.inline import play
+from compose.record import Record, summary
+from compose.scenario import BadScenario, parse, shipped
+from protocol.lie import Kind, Lie, Part
+from protocol.messages import Alarm, Ranged, Report, Undecided
+from protocol.motion import ORIGIN, Pose, Run, follow
+from tests.steps import Step, steps
+
+DEGREE = math.pi / 180.0
+PARTS: tuple[Part, ...] = ("phase-1", "orbit", "encounter", "all")
+SIZES: dict[Kind, tuple[float, ...]] = {
+    "scale": (0.5, 0.99, 1.01),
+    "rotate": (15.0 * DEGREE, DEGREE),
+    "shift": (-0.3, 0.01),
+}
+OF_DRIVES = [Lie(kind, size, part) for kind, sizes in SIZES.items() for size in sizes for part in PARTS]
+OF_STARTS = [Lie("radius", 0.01), Lie("radius", 0.3), Lie("heading", DEGREE), Lie("heading", 0.5)]
+FINE = "noise = {anchor_sigma = 0.01, mutual_sigma = 0.01}\n"
+
+
+def mission(seed: int, lies: dict[str, Lie], noise: str = "") -> Record:
+    """A random mission, in which those robots tell those lies."""
+    text = shipped()["random"].read_text().replace("[mission]\n", f"[mission]\n{noise}")
+    scenario = parse(text, "random", seed=seed)
+    robots = tuple(replace(robot, lie=lies.get(robot.id)) for robot in scenario.robots)
+    return play(replace(scenario, robots=robots, max_ticks=400))
+
+
+def outcome(record: Record) -> str:
+    return str(summary(record, "in-process", None)["outcome"])
+
+
+# --- exact sensors ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("liar", ["a", "b"])
+@pytest.mark.parametrize(
+    "lie", [*OF_DRIVES, *OF_STARTS], ids=lambda lie: f"{lie.kind}-{lie.part}-{lie.size:.2g}"
+)
+def test_every_lie_about_a_drive_or_a_start_is_an_alarm(lie: Lie, liar: str) -> None:
+    for seed in range(6):
+        record = mission(seed, {liar: lie})
+        if not _tells_otherwise(record, liar, lie):
+            continue
+        assert outcome(record) == "alarm", seed
+        assert record.end is not None
+        peer = "b" if liar == "a" else "a"
+        assert (record.end.reason or "").startswith(f"{peer}: {liar} tells "), record.end.reason
+
+
+def _tells_otherwise(record: Record, liar: str, lie: Lie) -> bool:
+    """Whether there was anything to lie about: in that part of its log the robot has driven."""
+    phases = {"phase-1": 1, "orbit": 2, "encounter": 3}
+    return lie.part == "all" or any(
+        drive.phase == phases[lie.part] and (drive.v if lie.kind == "scale" else drive.v or drive.omega)
+        for moment in record.moments
+        for drive in [moment.drives[liar]]
+    )
+
+
+def test_turning_its_whole_story_about_its_anchor_tells_nothing_false() -> None:
+    """The frame of an anchor has no direction of its own: nobody can find out, and nobody is misled."""
+    for seed in range(6):
+        for liar in ("a", "b"):
+            assert outcome(mission(seed, {liar: Lie("reframe", 1.0)})) == "localised"
+
+
+def test_two_liars_are_no_more_believed_than_one() -> None:
+    for seed in range(6):
+        assert outcome(mission(seed, {"a": Lie("heading", 0.1), "b": Lie("radius", 0.2)})) == "alarm"
+
+
+def test_the_liar_hears_that_it_is_not_believed_and_gives_up() -> None:
+    record = mission(0, {"a": Lie("scale", 0.5)})
+    last = record.moments[-1].drives
+    assert isinstance(last["b"].verdict, Alarm)
+    met = next(step for step in steps("paper-1") if step.heard["a"])
+    told = [replace(report, verdict=Alarm("a tall story")) for report in met.heard["a"]]
+    verdict = planner.decide(met.observed["a"], told).verdict
+    assert verdict == Undecided("b does not believe it: a tall story")
+
+
+# --- noisy sensors ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "lie",
+    [Lie("scale", 0.5, "orbit"), Lie("scale", 0.5, "encounter"), Lie("rotate", 15.0 * DEGREE, "encounter")],
+    ids=lambda lie: f"{lie.kind}-{lie.part}",
+)
+def test_under_noise_a_lie_that_is_large_beside_it_is_an_alarm(lie: Lie) -> None:
+    """Of a, whose way from its anchor to the encounter stands in no range of its own."""
+    for seed in range(3):
+        record = mission(seed, {"a": lie}, FINE)
+        assert outcome(record) == "alarm", seed
+        alarm = next(
+            drive.verdict
+            for moment in record.moments
+            for drive in moment.drives.values()
+            if isinstance(drive.verdict, Alarm)
+        )
+        assert alarm.p_value < 1e-4
+        assert alarm.residual is not None
+        assert alarm.residual > 3.0
+
+
+def test_under_noise_the_honest_are_believed() -> None:
+    for seed in range(8):
+        assert outcome(mission(seed, {}, FINE)) == "localised", seed
+
+
+# --- what is held against a report --------------------------------------------------------------------
+
+
+def told_to_a(phase: int) -> tuple[Step, Report]:
+    """The first report that a hears in `phase` of b, and the step in which it does."""
+    step = next(step for step in steps("paper-1") if step.heard["a"] and step.heard["a"][0].phase == phase)
+    return step, step.heard["a"][0]
+
+
+def objection(step: Step, *reports: Report) -> Alarm | None:
+    """Of a, to the last of `reports`, after it has heard the others."""
+    mind = step.observed["a"]
+    for report in reports[:-1]:
+        mind = replace(mind, radio=radio.hear(mind.radio, report))
+    return trust.objection(mind.radio, radio.hear(mind.radio, reports[-1]), reports[-1], mind.briefing)
+
+
+def test_what_an_honest_peer_tells_is_believed_and_so_is_what_it_tells_again() -> None:
+    step, report = told_to_a(2)
+    assert objection(step, report) is None
+    assert objection(step, report, report) is None
+
+
+def test_a_second_story_is_held_against_the_first() -> None:
+    step, report = told_to_a(2)
+    last = report.runs[-1]
+    slower = replace(report, runs=(*report.runs[:-1], Run(last.ticks, 0.5 * last.v, last.omega)))
+    assert "otherwise before" in _claim(objection(step, report, slower))
+    farther = replace(report, ranges=(Ranged(report.ranges[0].tick, 0.5), *report.ranges[1:]))
+    assert "otherwise before" in _claim(objection(step, report, farther))
+    assert report.start is not None
+    elsewhere = replace(report, start=replace(report.start, heading=report.start.heading + 1e-9))
+    assert "a start" in _claim(objection(step, report, elsewhere))
+
+
+def test_a_drive_beyond_v_max_or_omega_max_is_not_believed() -> None:
+    step, report = told_to_a(2)
+    first = report.runs[0]
+    for run in (Run(first.ticks, 1.001, first.omega), Run(first.ticks, first.v, -3.15)):
+        alarm = objection(step, replace(report, runs=(run, *report.runs[1:])))
+        assert "at the most" in _claim(alarm)
+
+
+def test_ranges_to_its_anchor_have_to_be_of_the_path_it_tells() -> None:
+    step, report = told_to_a(2)
+    one = report.ranges[1]
+    ranges = (report.ranges[0], Ranged(one.tick, one.range + 1e-4), *report.ranges[2:])
+    alarm = objection(step, replace(report, ranges=ranges))
+    assert f"at tick {one.tick}" in _claim(alarm)
+    assert alarm is not None
+    assert alarm.residual == pytest.approx(1e-4)
+
+
+def test_who_says_that_it_orbits_is_on_its_orbit_and_heads_along_it() -> None:
+    step, report = told_to_a(2)
+    assert report.state == "orbiting"
+    last = report.runs[-1]
+    late = (*report.runs[:-1], Run(last.ticks - 1, last.v, last.omega))
+    straight = replace(report, runs=(*late, Run(1, last.v, 0.0)))
+    assert "off the orbit" in _claim(objection(step, straight))
+    turned = replace(report, runs=(*late, Run(1, 0.0, 1.0)))
+    assert "heading" in _claim(objection(step, turned))
+
+
+def _claim(alarm: Alarm | None) -> str:
+    return alarm.claim if alarm is not None else ""
+
+
+# --- lying --------------------------------------------------------------------------------------------
+
+runs = st.builds(Run, st.integers(1, 5), st.floats(-1.0, 1.0), st.floats(-3.0, 3.0))
+logs = st.lists(runs, min_size=1, max_size=8).map(
+    lambda runs: Logbook().extended(0, 0, Logbook(sum(run.ticks for run in runs), tuple(runs)))
+)
+ticks = st.none() | st.integers(0, 40)
+
+
+@settings(max_examples=100)
+@given(logs, st.sampled_from([*OF_DRIVES, *OF_STARTS]), ticks, ticks, st.integers(1, 40))
+def test_a_liar_tells_the_same_story_as_it_grows(
+    log: Logbook, lie: Lie, parted: int | None, later: int | None, seen: int
+) -> None:
+    """What it told of its first ticks it still tells when there are more of them."""
+    met = None if parted is None or later is None else parted + later
+    seen = min(seen, log.through)
+    young = Logbook(seen, log.between(0, seen))
+    known = [tick if tick is not None and tick <= seen else None for tick in (parted, met)]
+    whole = lying.told(log, lie, parted, met, 1.0)
+    assert whole.through == log.through
+    assert lying.told(young, lie, known[0], known[1], 1.0).between(0, seen) == whole.between(0, seen)
+
+
+@settings(max_examples=50)
+@given(logs, st.integers(0, 10), st.integers(0, 10), st.floats(-3.0, 3.0))
+def test_a_rotation_turns_what_was_driven_in_its_part_and_nothing_after(
+    log: Logbook, parted: int, orbit: int, angle: float
+) -> None:
+    told = lying.told(log, Lie("rotate", angle, "orbit"), parted, parted + orbit, 1.0)
+    true_end = follow(ORIGIN, log.between(0, log.through), 1.0)
+    told_end = follow(ORIGIN, told.between(0, log.through), 1.0)
+    over = orbit > 0 and parted + orbit < log.through
+    inside = orbit > 0 and parted < log.through and not over
+    assert told_end.heading - true_end.heading == pytest.approx(angle if inside else 0.0, abs=1e-9)
+
+
+def test_a_false_radius_goes_with_false_ranges_and_moves_the_start_only() -> None:
+    log = Logbook(3, (Run(3, 1.0, 0.0),), (Ranged(0, 1.0), Ranged(1, 0.2)))
+    lie = Lie("radius", -0.5)
+    assert lying.told(log, lie, None, None, 1.0).ranges == (Ranged(0, 0.5), Ranged(1, 0.0))
+    assert lying.start(Pose(1.0, 0.0, 2.0), lie) == Pose(0.5, 0.0, 2.0)
+
+
+# --- the scenario -------------------------------------------------------------------------------------
+
+
+def test_a_scenario_says_who_lies_and_how() -> None:
+    text = (
+        shipped()["paper-1"].read_text().replace('id = "b"', 'id = "b"\nlie = {kind = "scale", size = 0.5}')
+    )
+    scenario = parse(text, "paper-1")
+    assert [robot.lie for robot in scenario.robots] == [None, Lie("scale", 0.5, "all")]
+    assert [scenario.briefing(robot).lie for robot in ("a", "b")] == [None, Lie("scale", 0.5, "all")]
+
+
+@pytest.mark.parametrize(
+    ("lie", "words"),
+    [
+        ('{kind = "boast", size = 1.0}', ("robot[1].lie.kind", "boast")),
+        ('{kind = "scale"}', ("robot[1].lie", "size")),
+        ('{kind = "scale", size = 1e9}', ("robot[1].lie.size",)),
+        ('{kind = "shift", size = 1.0, part = "lunch"}', ("robot[1].lie.part", "lunch")),
+    ],
+)
+def test_a_lie_that_cannot_be_told_is_refused_by_its_field(lie: str, words: tuple[str, ...]) -> None:
+    text = shipped()["paper-1"].read_text().replace('id = "b"', f'id = "b"\nlie = {lie}')
+    with pytest.raises(BadScenario) as error:
+        parse(text, "mine")
+    assert all(word in str(error.value) for word in ("mine", *words)), str(error.value)
