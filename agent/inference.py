@@ -9,7 +9,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from agent.belief import Branch
-from agent.doubt import DOUBTFUL, FINISHED, doubt
+from agent.doubt import DOUBTFUL, FINISHED, Doubt, doubt
 from agent.hypotheses import Weighed, missing, of_anchor
 from agent.logbook import Logbook
 from agent.mind import Mind
@@ -139,19 +139,16 @@ def held_together(weighed: Sequence[Weighed], pair: Pair) -> list[Held]:
 
 
 def missing_for(
-    weighed: Sequence[Weighed], held: Sequence[Held], pair: Pair, mission: Mission, mutual: int
+    weighed: Sequence[Weighed], held: Sequence[Held], against: Doubt | None, pair: Pair, mission: Mission
 ) -> str | None:
-    """What is lacking before a claim, which needs `mutual` mutual ranges; None if it is nothing."""
-    if len(pair.places) < mutual:
-        return f"{len(pair.places)} mutual ranges, of {mutual}"
-    if not weighed:
+    """What is lacking before a claim, there being ranges enough; None if it is nothing."""
+    if against is None:
         return "no hypothesis explains the ranges"
     odds = weighed[0].hypothesis.odds
     if odds < mission.confidence:
         return (
             f"the likeliest of {len(weighed)} hypotheses has the odds {odds:.6f}, of {mission.confidence:g}"
         )
-    against = doubt(weighed[0].fit, pair)
     if not against.p_value >= DOUBTFUL:
         return f"the likeliest hypothesis is in doubt: {against.what}"
     _, covariance = bent(held[0], pair.apart)
@@ -178,10 +175,13 @@ ASKEW = 0.2
 
 
 def with_pair(mind: Mind, weighed: Sequence[Weighed], pair: Pair, mutual: int) -> Mind:
-    """`mind`, with these hypotheses of how both lie in <W>."""
+    """`mind`, with these hypotheses of how both lie in <W>; a claim needs `mutual` mutual ranges."""
     briefing = mind.briefing
     robot, m1 = (0, briefing.anchor) if briefing.role == "a" else (1, briefing.peer_anchor)
     held = held_together(weighed, pair)
+    enough = len(pair.places) >= mutual
+    against = doubt(weighed[0].fit, pair) if enough and weighed else None
+    missing = missing_for(weighed, held, against, pair, briefing.mission)
     claims = [claim(one, robot, pair) for one in held]
     first, _ = mind.findings.candidates or (len(weighed), 0)
     findings = replace(
@@ -190,7 +190,8 @@ def with_pair(mind: Mind, weighed: Sequence[Weighed], pair: Pair, mutual: int) -
         poses=tuple(Pose(m1.x + pose.x, m1.y + pose.y, pose.heading) for pose, _ in claims),
         covariance=claims[0][1] if claims else None,
         candidates=(first, len(weighed)),
-        missing=missing_for(weighed, held, pair, briefing.mission, mutual),
+        against=against,
+        missing=missing if enough else f"{len(pair.places)} mutual ranges, of {mutual}",
     )
     return replace(mind, findings=findings)
 

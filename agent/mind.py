@@ -8,6 +8,7 @@ import msgspec
 from msgspec.structs import replace
 
 from agent.belief import Branch, Sighting
+from agent.doubt import Doubt
 from agent.geometry import Placement
 from agent.hypotheses import Hypothesis
 from agent.logbook import Logbook
@@ -90,6 +91,10 @@ class Findings(msgspec.Struct, frozen=True):
     """under noise: what there is to know yet, before it can claim"""
     sought: int = 0
     """under noise: how many mutual ranges there were when the whole plane was last searched"""
+    against: Doubt | None = None
+    """under noise: what most speaks against the first"""
+    p_value: float | None = None
+    """under noise: the least of all searches of the whole plane"""
     doubts: int = 0
     """under noise: how often on end the ranges have spoken against what the peer tells"""
     returns: int = 0

@@ -119,6 +119,7 @@ class Robot:
             ),
             odds=findings.pair[0].odds if findings.pair else None,
             missing=findings.missing,
+            p_value=findings.p_value,
             reports_sent=self.reports_sent,
             reports_heard=mind.radio.heard,
             reports_refused=reports_refused + self._damaged,

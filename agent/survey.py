@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from agent import inference
-from agent.doubt import DOUBTFUL, LOOKS, UNBELIEVABLE, Doubt, doubt
+from agent.doubt import DOUBTFUL, LOOKS, UNBELIEVABLE
 from agent.hypotheses import Weighed, follow, search
 from agent.mind import Asleep, Done, Mind
 from agent.phases import rendezvous, seeking, surveying
@@ -202,17 +202,16 @@ def _considered(mind: Mind) -> Mind:
         mind = replace(mind, findings=replace(mind.findings, sought=mutual))
     checked = CHECKED_WITH_OUTLIERS if mission.noise.outliers else CHECKED
     judged = inference.with_pair(mind, weighed, pair, checked)
-    doubted = len(pair.places) >= checked and bool(weighed) and doubt(weighed[0].fit, pair).p_value < DOUBTFUL
-    if (judged.findings.missing is None or doubted) and not searched:
+    if (judged.findings.missing is None or _in_doubt(judged)) and not searched:
         weighed, searched = search(pair), True
         judged = inference.with_pair(mind, weighed, pair, checked)
     judged = inference.finished(judged, weighed)
+    if searched:
+        judged = _doubted(judged)
+    if judged.verdict is not None:
+        return judged
     if judged.findings.missing is None:
         return claimed(judged)
-    if doubted and searched and weighed:
-        judged = _doubted(judged, doubt(weighed[0].fit, pair))
-        if judged.verdict is not None:
-            return judged
     if role == "a" and len(pair.places) >= ENOUGH * (1 + mind.findings.returns):
         return _homeward(judged)
     if not weighed:
@@ -221,12 +220,21 @@ def _considered(mind: Mind) -> Mind:
     return replace(judged, state=Surveying("peer", a if role == "a" else b))
 
 
-def _doubted(mind: Mind, against: Doubt) -> Mind:
-    """`mind`, in doubt of its peer; alarmed, if that is not the first time."""
-    looks = mind.findings.doubts + 1 if against.p_value < UNBELIEVABLE else 0
-    if looks >= LOOKS:
-        return mind.alarmed(against.alarm)
-    return replace(mind, findings=replace(mind.findings, doubts=looks))
+def _in_doubt(mind: Mind) -> bool:
+    against = mind.findings.against
+    return against is not None and against.p_value < DOUBTFUL
+
+
+def _doubted(mind: Mind) -> Mind:
+    """`mind`, after a search of the whole plane; alarmed, if its peer is beyond belief over and over."""
+    findings = mind.findings
+    against = findings.against
+    if against is None:
+        return mind
+    least = min(against.p_value, findings.p_value if findings.p_value is not None else 1.0)
+    doubts = findings.doubts + 1 if against.p_value < UNBELIEVABLE else 0
+    mind = replace(mind, findings=replace(findings, doubts=doubts, p_value=least))
+    return mind.alarmed(against.alarm) if doubts >= LOOKS else mind
 
 
 def _blindly(mind: Mind) -> Mind:

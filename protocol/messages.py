@@ -232,6 +232,8 @@ class Farewell(Message, frozen=True):
     """of the likeliest of them; none where sensors are exact"""
     missing: Text | None
     """under noise: what there was to know yet, before it could claim"""
+    p_value: Odds | None
+    """under noise: the least with which the ranges spoke against what the peer told"""
     reports_sent: Count
     reports_heard: Count
     reports_refused: Count

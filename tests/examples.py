@@ -51,6 +51,8 @@ EXAMPLES: tuple[Message, ...] = (
     Missed(8, "b"),
     End(48, "wrong", "a claims a pose that is 1 m off"),
     End(48, "localised", None),
-    Farewell("b", 5, 3, "circle", -2.5, (4, 2), 0.5, 1.5, 2, 0.75, "8 mutual ranges", 3, 4, 1, 2, 5, 3, 600),
-    Farewell("b", 0, 0, None, None, None, None, None, None, None, None, 0, 0, 0, 0, 0, 0, 0),
+    Farewell(
+        "b", 5, 3, "circle", -2.5, (4, 2), 0.5, 1.5, 2, 0.75, "8 mutual ranges", 0.25, 3, 4, 1, 2, 5, 3, 600
+    ),
+    Farewell("b", 0, 0, None, None, None, None, None, None, None, None, None, 0, 0, 0, 0, 0, 0, 0),
 )

@@ -175,9 +175,8 @@ def row_of(record: Record, number: int = 0) -> trial.Row:
 
 
 def farewell(robot: str, hypotheses: int, odds: float) -> Farewell:
-    return Farewell(
-        robot, 5, 3, "circle", -2.5, (4, 2), 0.5, 1.5, hypotheses, odds, None, 3, 4, 0, 0, 0, 0, 600
-    )
+    counts = (3, 4, 0, 0, 0, 0, 600)
+    return Farewell(robot, 5, 3, "circle", -2.5, (4, 2), 0.5, 1.5, hypotheses, odds, None, None, *counts)
 
 
 def test_a_row_has_what_each_robot_claimed() -> None:

@@ -1,4 +1,4 @@
-"""A peer that lies is found out: by what it told before, by what it can drive, by the ranges. Nobody else is."""
+"""A peer that lies is found out: by what it told before, or can drive, or by ranges. Nobody else is."""
 
 from __future__ import annotations
 

@@ -54,6 +54,8 @@ class RobotRow(msgspec.Struct, frozen=True, array_like=True):
     """left, about the poses of both"""
     odds: float | None = None
     """of the likeliest of them"""
+    p_value: float | None = None
+    """the least with which the ranges spoke against what its peer told"""
     position_sigma_m: float | None = None
     """as claimed: the root of the trace of the position's part of the covariance"""
     nees: float | None = None
@@ -197,6 +199,7 @@ def _said(farewell: Farewell | None) -> RobotRow:
         candidates_left=left,
         hypotheses=farewell.hypotheses,
         odds=farewell.odds,
+        p_value=farewell.p_value,
     )
 
 
