@@ -27,7 +27,7 @@ _KINDS: dict[str, pa.DataType] = {
     **dict.fromkeys(("reports_sent", "reports_heard", "bytes_sent"), pa.int64()),
     **dict.fromkeys(("period_s", "t_max_s", "wall_s", "position_error_m"), pa.float64()),
     **dict.fromkeys(
-        ("heading_error_rad", "alpha", "odds", "position_sigma_m", "nees", "bound_m"), pa.float64()
+        ("heading_error_rad", "alpha", "odds", "p_value", "position_sigma_m", "nees", "bound_m"), pa.float64()
     ),
     **dict.fromkeys([f"cov_{name}" for name in Covariance.__struct_fields__], pa.float64()),
 }
