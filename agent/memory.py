@@ -5,6 +5,8 @@ The planner decides everything once more, and what it decides must be what is on
 
 from __future__ import annotations
 
+from collections import deque
+
 import msgspec
 
 from agent.past import past
@@ -44,9 +46,12 @@ def remember(record: Retrace) -> Memory | None:
         return None
     lived = past(record.frames, record.path)
     robot = Robot(lived.briefing, record)
+    told: deque[Told] = deque(maxlen=REPORTS_TOLD)
     for step in lived.steps:
         try:
-            robot.sense(step.sense, step.frame)
+            report = robot.sense(step.sense, step.frame)
+            if report is not None:  # though it be torn on record
+                told.append(report)
             if step.drive is not None:
                 robot.decide(step.heard, step.missed)
                 robot.estimate()
@@ -64,10 +69,8 @@ def remember(record: Retrace) -> Memory | None:
         briefing=lived.briefing,
         robot=robot,
         sense=sense,
-        told=tuple([step.report for step in latest[-REPORTS_TOLD:] if step.report is not None]),
-        heard=tuple(
-            [told for step in latest for told in step.heard if now - told.report.tick <= REPORTS_KEPT]
-        ),
+        told=tuple(told),
+        heard=tuple([one for step in latest for one in step.heard if now - one.report.tick <= REPORTS_KEPT]),
         end=lived.end if lived.farewell is not None else None,
         farewell=lived.farewell,
     )

@@ -206,7 +206,7 @@ class AgentProcess:
             if told is not None:
                 self._told.append(told)
                 self._send_report(told)
-        elif sense.tick == known:
+        elif sense == self._sense:
             self._say_again()
         else:
             self._out_of_step(sense.tick, known)
@@ -217,6 +217,10 @@ class AgentProcess:
         Raises NoWorld.
         """
         now = time.monotonic()
+        if tick == known:
+            raise NoWorld(
+                f"the record is another run's: in this one, {self._id} senses otherwise at tick {tick}"
+            )
         if self._tick_s is not None:
             if tick < known:
                 return

@@ -12,8 +12,8 @@ import msgspec
 
 Point = Literal["sense", "report", "journal", "drive"]
 """How far a tick has come. An agent's: its Sense is there, and nothing on record; its Report is sent; its
-Drive is on record, and not sent; it is sent. The world's: no Sense is sent; all are; all Drives are on record,
-and nobody has moved; all Drives are there, and not on record."""
+Drive is on record, and not sent; it is sent. The world's: no Sense is sent; all are; all Drives are on
+record, and nobody has moved; all Drives are there, and not on record."""
 
 WORLD = "world"
 _FORM = re.compile(
@@ -54,7 +54,7 @@ def parse(text: str) -> Kill:
     match = _FORM.fullmatch(text)
     if match is None:
         raise BadKill(
-            f"'{text}' is no kill; like a@17, b@20:report, world@30:journal+5s or a@17:drive+never, "
+            f"'{text}' is no kill; one is a@17, b@20:report, world@30:journal+5s or a@17:drive+never, "
             "and the points of a tick are sense, report, journal, drive"
         )
     after = None if match["never"] else float(match["after"] or 0.0)

@@ -34,8 +34,12 @@ class Retrace:
         except OSError as error:
             raise CannotRecord(f"{path} cannot be opened: {error.strerror or error}") from None
         lock(self._file, path)
-        self.frames = self._found()
-        """what is on record"""
+        try:
+            self.frames = self._found()
+            """what is on record"""
+        except BaseException:
+            self.close()
+            raise
 
     def _found(self) -> list[bytes]:
         try:
