@@ -10,6 +10,8 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import zenoh
 
@@ -150,7 +152,8 @@ class AgentProcess:
         session.subscribe(link, keys.sense(run, self._id), inbox, "sense")
         session.subscribe(link, keys.report(run, briefing.peer, self._id), inbox, "report")
         session.watch_liveliness(link, keys.world_alive(run), inbox)
-        self._token = session.show_alive(link, keys.robot_alive(run, self._id))
+        self._show_alive = partial(session.show_alive, link, keys.robot_alive(run, self._id))
+        self._token = self._show_alive()
 
     def play(self) -> End:
         """The whole run, to its End. Raises NoWorld, or Interrupted when told to stop."""
@@ -224,11 +227,19 @@ class AgentProcess:
         if self._tick_s is not None:
             if tick < known:
                 return
-            self._behind = self._behind or now
+            if self._behind is None:
+                self._behind = now
+                self._appear()  # who appears is told what it has missed
             if now - self._behind < BEHIND_S:
                 return
         late = "too late" if tick > known else "started again without its record"
         raise NoWorld(f"{late}: the world is at tick {tick}, {self._id} knows it up to {known}")
+
+    def _appear(self) -> None:
+        """Go and come, as the world sees it."""
+        gone: Any = self._token  # its method is not typed
+        gone.undeclare()
+        self._token = self._show_alive()
 
     def _set_due(self) -> None:
         if self._tick_s is not None:

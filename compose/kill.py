@@ -6,7 +6,7 @@ import os
 import re
 import signal
 from collections.abc import Callable, Sequence
-from typing import Literal, cast
+from typing import Literal, cast, get_args
 
 import msgspec
 
@@ -15,6 +15,7 @@ Point = Literal["sense", "report", "journal", "drive"]
 Drive is on record, and not sent; it is sent. The world's: no Sense is sent; all are; all Drives are on
 record, and nobody has moved; all Drives are there, and not on record."""
 
+POINTS: tuple[Point, ...] = get_args(Point)
 WORLD = "world"
 _FORM = re.compile(
     r"(?P<who>[A-Za-z0-9_-]{1,32})@(?P<tick>[0-9]{1,9})(?::(?P<point>sense|report|journal|drive))?"
