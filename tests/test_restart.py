@@ -13,6 +13,7 @@ from signal import SIGKILL
 
 import msgpack
 import pytest
+import zenoh
 from msgspec.structs import replace
 
 from agent.memory import remember
@@ -35,6 +36,9 @@ from world.scenario import Scenario
 
 PARTS = ("agent-a", "agent-b", "world")
 LOCALISED = "localised after 48 ticks\n"
+REPEAT_S = 0.25
+AT_ONCE_S = 10.0
+"""less than the 30 s of its patience"""
 
 
 @pytest.fixture(scope="module")
@@ -328,6 +332,37 @@ def test_a_world_that_is_killed_after_its_end_collects_the_farewells(
         ended = {name: shell.ended() for name, shell in shells(tmp_path, free_endpoint(), folder).items()}
     assert {name: end.status for name, end in ended.items()} == {"world": 0, "a": 0, "b": 0}, ended
     same(tmp_path, undisturbed)
+
+
+def test_an_agent_says_farewell_until_a_world_has_it_on_record(tmp_path: Path) -> None:
+    scenario, endpoint, run = load("paper-1"), free_endpoint(), "mine"
+    there = Inbox("test")
+
+    def farewell_of(link: zenoh.Session) -> bytes:
+        session.subscribe(link, keys.drive(run, "a"), there, "drive")
+        session.watch_liveliness(link, keys.robot_alive(run, "*"), there)
+        publisher = session.publisher(link, keys.sense(run, "a"))
+        _token = session.show_alive(link, keys.world_alive(run))
+        while True:
+            arrival = there.next(REPEAT_S)
+            if arrival.topic == "drive":
+                assert isinstance(decode(arrival.frame, Farewell), Farewell)
+                return arrival.frame
+            publisher.put(encode(End(0, "undecided", "for a test")))
+
+    with ExitStack() as folder:
+        with session.open_router(endpoint) as link:
+            session.answer(link, keys.briefing(run, "*"), lambda _: scenario.briefing("a"))
+            _token = session.show_alive(link, keys.world_alive(run))
+            agent = folder.enter_context(Command("agent", "a", "--connect", endpoint, "--out", tmp_path))
+            first = farewell_of(link)
+        agent.until_says("the world has gone after its End; waiting 30 s for it")
+        there = Inbox("test")
+        with session.open_router(endpoint, BOUND_S) as link:
+            assert farewell_of(link) == first
+            assert agent.running
+            session.publisher(link, keys.sense(run, "a")).put(first)
+            assert agent.ended(AT_ONCE_S).status == 1
 
 
 # --- what is said again -------------------------------------------------------------------------------
