@@ -1,40 +1,40 @@
 """The agent's process: Zenoh in, journal, planner, Zenoh out. It knows nothing but what it is told.
 
 It reacts to what arrives and never steps twice: a Sense heard again makes it send again what it
-answered, so whatever is lost, late or doubled costs time and changes nothing.
+answered, so whatever is lost, late or doubled costs time and changes nothing. So does a process that is
+killed, its peer's or the world's: whoever is started again is told again what it must know.
 """
 
 from __future__ import annotations
 
 import time
-from pathlib import Path
+from collections import deque
+from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import zenoh
 
 from agent import radio
-from agent.robot import Robot, Told
+from agent.memory import REPORTS_KEPT, REPORTS_TOLD, Memory
+from agent.robot import Told
 from protocol import keys, session
 from protocol.inbox import Arrival, Inbox
-from protocol.journal import Journal
-from protocol.messages import Briefing, End, Report, Sense
+from protocol.messages import Briefing, End, Farewell, Report, Sense
 from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode, encode
 
 REPORT_SHARE = 0.5
 """of a tick in real time: how long to wait for the peer's report"""
-REPORTS_KEPT = 64
-"""ticks for which a report is kept that no Sense has listed yet"""
 QUERY_S = 2.0
 """how long to wait for the answer to one query"""
 SESSION_S = 3.0
-"""how long to look for a world through one session"""
+"""how long to look for a world through one session, or to wait for a robot's former process to be gone"""
 ASK_AGAIN_S = 0.05
 """how long to wait before looking for a world again"""
 FIRST_WORD_S = 5.0
 """how long an agent looks for its world before it says so"""
-
-
-FAREWELL_S = 3.0
-"""how long an agent stays after the End for the world to hear its Farewell"""
+BEHIND_S = 3.0
+"""in real time: how long what lies between what it knows and what it hears may be outstanding"""
 
 
 class Unwelcome(Exception):
@@ -63,23 +63,31 @@ class Search:
         if waited >= FIRST_WORD_S and not self._told:
             self._told = True
             self._inbox.say(f"no {self._what} yet; looking for one for {self._wait:g} s")
+        self.pause()
+
+    def pause(self) -> None:
+        """Wait a moment, with a world in sight. Raises Interrupted when told to stop."""
         self._inbox.next(ASK_AGAIN_S)
 
 
 def join(link: zenoh.Session, run: str | None, robot: str, search: Search) -> tuple[str, Briefing] | None:
     """The run that `robot` belongs to, and its briefing; `run` may name it. None after SESSION_S without.
 
-    Raises Unwelcome if there are several runs, if the world has no such robot, or if somebody plays it
-    already; whatever `search` raises while there is no world.
+    A robot's former process may have ended just now, and seem to be there for a moment. Raises Unwelcome
+    if there are several runs, if the world has no such robot, or if somebody plays it all the time; whatever
+    `search` raises while there is no world.
     """
     until = time.monotonic() + SESSION_S
+    played: str | None = None
     while time.monotonic() < until:
         worlds = [keys.run_of(key) for key in session.alive(link, keys.world_alive(run or "*"), QUERY_S)]
         if len(worlds) > 1:
             raise Unwelcome(f"several runs are alive: {', '.join(worlds)}; choose one with --run")
+        played = None
         for world in worlds:
             if session.alive(link, keys.robot_alive(world, robot), QUERY_S):
-                raise Unwelcome(f"robot '{robot}' is in run '{world}' already")
+                played = world
+                continue
             answer = session.ask(link, keys.briefing(world, robot), QUERY_S)
             if isinstance(answer, str):
                 raise Unwelcome(answer)
@@ -88,7 +96,12 @@ def join(link: zenoh.Session, run: str | None, robot: str, search: Search) -> tu
                     return world, decode(answer, Briefing)
                 except MalformedFrame as error:
                     raise Unwelcome(f"the world's briefing is not understood: {error}") from None
-        search.go_on()
+        if played is None:
+            search.go_on()
+        else:
+            search.pause()
+    if played is not None:
+        raise Unwelcome(f"robot '{robot}' is in run '{played}' already")
     return None
 
 
@@ -97,37 +110,41 @@ class AgentProcess:
 
     def __init__(
         self,
-        briefing: Briefing,
+        memory: Memory,
         link: zenoh.Session,
         run: str,
         inbox: Inbox,
         *,
-        out: Path | None = None,
-        fsync: bool = False,
         patience: float = 30.0,
+        reached: Callable[[str, int], None] | None = None,
     ) -> None:
-        """The journal goes to `out`; `patience` (s) bounds the wait for the world.
-
-        Raises journal.CannotRecord.
-        """
+        """`patience` (s) bounds the wait for the world; `reached` is told how far each tick has come."""
+        briefing = memory.briefing
         self._id = briefing.robot
         self._inbox = inbox
         self._patience = patience
+        self._reached = reached
         self._tick_s = briefing.tick_s
-        self._sense: Sense | None = None
+        self._robot = memory.robot
+        self._memory = memory
+        self._sense = memory.sense
         """the latest"""
         self._due: float | None = None
         """in real time: when to go on without the reports that it lists"""
-        self._reports: dict[int, Told] = {}
+        if self._sense is not None and self._robot.drive is None:
+            self._set_due()
+        self._behind: float | None = None
+        """in real time: since when a Sense is outstanding that came before one it has heard"""
+        self._told = deque(memory.told, maxlen=REPORTS_TOLD)
+        """its own latest reports"""
+        self._reports = {told.report.tick: told for told in memory.heard}
         """the peer's, by tick, as they came"""
-        self._listed: set[int] = set()
+        self._listed = set(self._reports)
         """those of them that a Sense has listed"""
         self._unheard = 0
         """those that went without"""
         self._estimate_wanted = False
 
-        journal = Journal(out / f"agent-{self._id}.journal", fsync=fsync) if out is not None else None
-        self._robot = Robot(briefing, journal)
         self._drive = session.publisher(link, keys.drive(run, self._id))
         self._report = session.publisher(link, keys.report(run, self._id, briefing.peer))
         self._estimate = session.publisher(link, keys.estimate(run, self._id))
@@ -135,10 +152,13 @@ class AgentProcess:
         session.subscribe(link, keys.sense(run, self._id), inbox, "sense")
         session.subscribe(link, keys.report(run, briefing.peer, self._id), inbox, "report")
         session.watch_liveliness(link, keys.world_alive(run), inbox)
-        self._token = session.show_alive(link, keys.robot_alive(run, self._id))
+        self._show_alive = partial(session.show_alive, link, keys.robot_alive(run, self._id))
+        self._token = self._show_alive()
 
     def play(self) -> End:
         """The whole run, to its End. Raises NoWorld, or Interrupted when told to stop."""
+        if self._memory.end is not None and self._memory.farewell is not None:
+            return self._part(self._memory.end, self._memory.farewell)
         patience = self._patience + (self._tick_s or 0.0)
         give_up = time.monotonic() + patience
         while True:
@@ -147,7 +167,7 @@ class AgentProcess:
                 case "sense":
                     message = self._accepted(arrival)
                     if isinstance(message, End):
-                        return self._part(message)
+                        return self._part(message, self._farewell(message))
                     if message is not None:
                         give_up = time.monotonic() + patience
                         self._on_sense(message, arrival.frame)
@@ -176,17 +196,54 @@ class AgentProcess:
 
     def _on_sense(self, sense: Sense, frame: bytes) -> None:
         known = self._sense.tick if self._sense is not None else -1
-        if sense.tick > known + 1:
-            raise NoWorld(f"too late: the world is at tick {sense.tick}, {self._id} knows it up to {known}")
         if sense.tick == known + 1:
+            if self._reached is not None:
+                self._reached("sense", sense.tick)
+            if self._due is not None:  # the world goes on; what has not come is missed
+                self._due = 0.0
+                self._decide_when_all_is_heard()
+            self._behind = None
             self._sense = sense
-            if self._tick_s is not None:
-                self._due = time.monotonic() + REPORT_SHARE * self._tick_s
+            self._set_due()
             told = self._robot.sense(sense, frame)
             if told is not None:
-                self._report.put(told.frame)
-        elif sense.tick == known:
+                self._told.append(told)
+                self._send_report(told)
+        elif sense == self._sense:
             self._say_again()
+        else:
+            self._out_of_step(sense.tick, known)
+
+    def _out_of_step(self, tick: int, known: int) -> None:
+        """The world is elsewhere. In real time it tells what lies between; in lockstep one has lost its past.
+
+        Raises NoWorld.
+        """
+        now = time.monotonic()
+        if tick == known:
+            raise NoWorld(
+                f"the record is another run's: in this one, {self._id} senses otherwise at tick {tick}"
+            )
+        if self._tick_s is not None:
+            if tick < known:
+                return
+            if self._behind is None:
+                self._behind = now
+                self._appear()  # who appears is told what it has missed
+            if now - self._behind < BEHIND_S:
+                return
+        late = "too late" if tick > known else "started again without its record"
+        raise NoWorld(f"{late}: the world is at tick {tick}, {self._id} knows it up to {known}")
+
+    def _appear(self) -> None:
+        """Go and come, as the world sees it."""
+        gone: Any = self._token  # its method is not typed
+        gone.undeclare()
+        self._token = self._show_alive()
+
+    def _set_due(self) -> None:
+        if self._tick_s is not None:
+            self._due = time.monotonic() + REPORT_SHARE * self._tick_s
 
     def _on_report(self, arrival: Arrival) -> None:
         try:
@@ -224,7 +281,7 @@ class AgentProcess:
                     missed.append(contact.peer)
         drive = self._robot.decide(heard, missed)
         self._due = None
-        self._drive.put(self._robot.drive_frame)
+        self._send_drive(drive.tick)
         if self._robot.journaled or self._estimate_wanted:
             estimate = self._robot.estimate()
             if self._estimate_wanted:
@@ -239,31 +296,53 @@ class AgentProcess:
             self._unheard += tick not in self._listed
             self._listed.discard(tick)
 
-    def _say_again(self) -> None:
-        if self._robot.told is not None:
-            self._report.put(self._robot.told.frame)
-        if self._robot.drive is not None:
-            self._drive.put(self._robot.drive_frame)
+    def _send_report(self, told: Told) -> None:
+        self._report.put(told.frame)
+        if self._reached is not None:
+            self._reached("report", told.report.tick)
 
-    def _part(self, end: End) -> End:
-        """Answer the End, as often as it is said, until the world has gone."""
+    def _send_drive(self, tick: int) -> None:
+        if self._reached is not None:
+            self._reached("journal", tick)
+        self._drive.put(self._robot.drive_frame)
+        if self._reached is not None:
+            self._reached("drive", tick)
+
+    def _say_again(self) -> None:
+        """All that whoever was started again may have lost: earlier reports, too, if the peer is near."""
+        if self._robot.told is not None:
+            oldest = self._robot.told.report.tick - REPORTS_TOLD
+            for told in self._told:
+                if told.report.tick > oldest:
+                    self._send_report(told)
+        if self._robot.drive is not None:
+            self._send_drive(self._robot.drive.tick)
+
+    def _farewell(self, end: End) -> Farewell:
         self._forget_reports(before=end.tick + REPORTS_KEPT + 1)
-        farewell = encode(
-            self._robot.farewell(
-                end,
-                reports_refused=self._inbox.refused["report"],
-                reports_unheard=self._unheard,
-                frames_refused=self._inbox.refused.total(),
-            )
+        return self._robot.farewell(
+            end,
+            reports_refused=self._inbox.refused["report"],
+            reports_unheard=self._unheard,
+            frames_refused=self._inbox.refused.total(),
         )
-        self._drive.put(farewell)
-        give_up = time.monotonic() + FAREWELL_S
+
+    def _part(self, end: End, farewell: Farewell) -> End:
+        """Answer the End, as often as it is said, until the world says that it has the answer on record."""
+        frame = encode(farewell)
+        self._drive.put(frame)
+        give_up = time.monotonic() + self._patience
         while (left := give_up - time.monotonic()) > 0.0:
             arrival = self._inbox.next(left)
-            if arrival.topic == "gone":
-                break
             if arrival.topic == "sense":
-                self._drive.put(farewell)
+                if arrival.frame == frame:
+                    break
+                message = self._accepted(arrival)
+                if isinstance(message, Sense):
+                    self._out_of_step(message.tick, end.tick)
+                self._drive.put(frame)
+            elif arrival.topic == "gone":
+                self._inbox.say(f"the world has gone after its End; waiting {self._patience:g} s for it")
         return end
 
     def _want_estimate(self, wanted: bool) -> None:

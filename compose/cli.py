@@ -11,6 +11,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import NoReturn, TextIO
 
+from compose import kill
 from compose.status import BROKEN_PIPE, BUG, FAILED, USER_ERROR, UserError
 from protocol.inbox import one_line
 from protocol.units import NAME
@@ -66,6 +67,15 @@ def _parser() -> argparse.ArgumentParser:
     _add_scenario(run)
     _add_playing(run)
     run.add_argument("--in-process", action="store_true", help="without processes or network")
+    run.add_argument(
+        "--kill",
+        type=_kill,
+        action="append",
+        default=[],
+        metavar="WHO@TICK",
+        help="kill that robot's process, or the world, in that tick, and start it again; "
+        "WHO@TICK[:sense|report|journal|drive][+5s|+never]",
+    )
 
     world = command("world", "Play the world's part; robots join from wherever they reach it.")
     _add_scenario(world)
@@ -83,6 +93,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     for sub in (world, agent):
         sub.add_argument("--launched", action="store_true", help=argparse.SUPPRESS)  # by `tandem run`
+        sub.add_argument("--kill", type=_kill, action="append", default=[], help=argparse.SUPPRESS)
         sub.add_argument("--fsync", action="store_true", help="the journal survives a power cut")
 
     _add_sweep(command("sweep", "Play a campaign: many trials of a scenario, over axes of its fields."))
@@ -179,3 +190,10 @@ def _name(text: str) -> str:
     if not re.search(NAME, text):
         raise argparse.ArgumentTypeError(f"'{text}' is no name: letters, digits, - and _ only")
     return text
+
+
+def _kill(text: str) -> kill.Kill:
+    try:
+        return kill.parse(text)
+    except kill.BadKill as error:
+        raise argparse.ArgumentTypeError(str(error)) from None

@@ -10,10 +10,11 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from compose.kill import WORLD, Kill, taken
 from compose.status import ENDED
 from protocol.inbox import Inbox
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
@@ -47,12 +48,15 @@ def free_endpoint() -> str:
 class _Child:
     """A process of the run. It is in a session of its own: Ctrl-C reaches it only through the launcher."""
 
-    def __init__(self, name: str, arguments: list[str], inbox: Inbox) -> None:
+    def __init__(self, name: str, arguments: list[str], inbox: Inbox, kills: Sequence[Kill]) -> None:
         self.name = name
+        self.kills = list(kills)
+        """those that it is to take"""
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # gone with the child
         # -P: the user's directory may hold a folder called world, or agent
         self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "compose", *arguments],
+            [sys.executable, "-P", "-m", "compose", *arguments]
+            + [word for kill in kills for word in ("--kill", kill.text)],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=self._errors,
@@ -111,48 +115,112 @@ def handed() -> Scenario:
 
 
 def play(
-    scenario: Scenario, out: Path, inbox: Inbox, *, run: str, rate: float | None, patience: float
-) -> None:
-    """Play `scenario`; journals go to `out`.
+    scenario: Scenario,
+    out: Path,
+    inbox: Inbox,
+    *,
+    run: str,
+    rate: float | None,
+    patience: float,
+    kills: Sequence[Kill] = (),
+) -> list[Kill]:
+    """Play `scenario`; journals go to `out`. A process takes its `kills` and is started again.
 
-    Raises ChildFailed, or Interrupted when `inbox` says so; no process is left then, either.
+    Returns those that never came. Raises ChildFailed, or Interrupted when `inbox` says so; no process is left
+    then, either.
     """
-    endpoint = free_endpoint()
-    shared = ["--launched", "--run", run, "--out", str(out), "--patience", str(patience)]
-    real_time = ["--rate", str(rate)] if rate is not None else []
-    children = [_Child("world", ["world", scenario.name, "--listen", endpoint, *shared, *real_time], inbox)]
-    children[0].hand(encode(scenario))
+    launched = _Run(scenario, out, inbox, run=run, rate=rate, patience=patience)
     try:
-        for robot in scenario.robots:
-            arguments = ["agent", robot.id, "--connect", endpoint, *shared]
-            children.append(_Child(f"agent {robot.id}", arguments, inbox))
-        _watch({child.name: child for child in children}, inbox)
+        for name in launched.names:
+            launched.start(name, [kill for kill in kills if kill.process == name])
+        launched.watch()
     finally:
-        _stop(children)
-        for child in children:
+        launched.stop()
+    return [kill for child in launched.children.values() for kill in child.kills]
+
+
+class _Run:
+    """The processes of one run, by name, and those that are to be started again."""
+
+    def __init__(
+        self, scenario: Scenario, out: Path, inbox: Inbox, *, run: str, rate: float | None, patience: float
+    ) -> None:
+        self._scenario = scenario
+        self._inbox = inbox
+        self._arguments = self._named(out, run, rate, patience)
+        self.names = list(self._arguments)
+        self.children: dict[str, _Child] = {}
+        self._due: dict[str, float] = {}
+        """when to start again who has been killed"""
+
+    def _named(self, out: Path, run: str, rate: float | None, patience: float) -> dict[str, list[str]]:
+        endpoint = free_endpoint()
+        shared = ["--launched", "--run", run, "--out", str(out), "--patience", str(patience)]
+        real_time = ["--rate", str(rate)] if rate is not None else []
+        world = ["world", self._scenario.name, "--listen", endpoint, *shared, *real_time]
+        robots = [robot.id for robot in self._scenario.robots]
+        return {WORLD: world} | {
+            f"agent {robot}": ["agent", robot, "--connect", endpoint, *shared] for robot in robots
+        }
+
+    def start(self, name: str, kills: Sequence[Kill]) -> None:
+        """Start it, for the first time or again."""
+        self.children[name] = _Child(name, self._arguments[name], self._inbox, kills)
+        if name == WORLD:
+            self.children[name].hand(encode(self._scenario))
+
+    def watch(self) -> None:
+        """Until all have ended; the agents have FOLLOW_S to follow the world. Raises ChildFailed."""
+        running = set(self.names)
+        while running:
+            arrival = self._inbox.next(self._patience(WORLD in running))
+            if arrival.topic == "nothing" and not self._due:
+                return
+            if arrival.topic == "ended":
+                child = self.children[arrival.key]
+                if child.status != ENDED:
+                    self._bury(child)
+                    continue
+                running.discard(child.name)
+                if child.name == WORLD:
+                    self._due.clear()
+            for name in [name for name, due in self._due.items() if time.monotonic() >= due]:
+                del self._due[name]
+                self.start(name, self.children[name].kills)
+
+    def _patience(self, world_runs: bool) -> float | None:
+        """How long to wait for what comes next."""
+        if self._due:
+            return min(self._due.values()) - time.monotonic()
+        return None if world_runs else FOLLOW_S
+
+    def _bury(self, child: _Child) -> None:
+        """It is to be started again if it took a kill. Raises ChildFailed if not, or if it is never to be."""
+        said = child.said()
+        kill = taken(child.kills, said) if child.status == -signal.SIGKILL else None
+        if kill is None:
+            raise ChildFailed(f"{child.name} {_how(child.status)}{said and ': ' + said}")
+        if kill.after is None:
+            raise ChildFailed(f"{child.name} was killed at tick {kill.tick} (--kill {kill.text})")
+        child.kills.remove(kill)
+        child.end(0.0)
+        when = f" in {kill.after:g} s" if kill.after else ""
+        self._inbox.say(f"{child.name} was killed at tick {kill.tick}, and is started again{when}")
+        self._due[child.name] = time.monotonic() + kill.after
+
+    def stop(self) -> None:
+        """Leave nobody behind."""
+        _stop(self.children.values())
+        for child in self.children.values():
             if child.status == ENDED and (said := child.said()):
                 print(said, file=sys.stderr)
-
-
-def _watch(children: Mapping[str, _Child], inbox: Inbox) -> None:
-    """Until all have ended; the agents have FOLLOW_S to follow the world."""
-    running = set(children)
-    while running:
-        arrival = inbox.next(None if "world" in running else FOLLOW_S)
-        if arrival.topic == "nothing":
-            return
-        child = children[arrival.key]
-        running.discard(child.name)
-        if child.status != ENDED:
-            raise ChildFailed(f"{child.name} {_how(child.status)}{child.said() and ': ' + child.said()}")
 
 
 def _how(status: int) -> str:
     return f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
 
 
-def _stop(children: Sequence[_Child]) -> None:
-    """Leave nobody behind."""
+def _stop(children: Iterable[_Child]) -> None:
     for child in children:
         if child.running:
             child.stop()

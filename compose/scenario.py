@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
+import platform
 import random
 import re
 import secrets
@@ -114,9 +116,12 @@ def shipped(folder: str = "scenarios") -> dict[str, Path]:
     return {file.stem: file for file in sorted(path.glob("*.toml"))}
 
 
-def run_name(scenario: Scenario) -> str:
-    """A name for a run of it that no other run has."""
-    return f"{scenario.name}-{secrets.token_hex(3)}"
+def run_name(scenario: Scenario, out: Path | None = None) -> str:
+    """A name for a run of it that no other run has; the same again for one that goes on in `out`."""
+    mark = secrets.token_hex(3)
+    if out is not None:
+        mark = hashlib.blake2s(f"{platform.node()}:{out.resolve()}".encode(), digest_size=3).hexdigest()
+    return f"{scenario.name}-{mark}"
 
 
 def check_rate(scenario: Scenario, rate: float | None) -> None:

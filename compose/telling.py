@@ -11,6 +11,9 @@ from pathlib import Path
 
 from compose import record
 from compose.status import UserError, status_of
+from protocol.inbox import Inbox
+from protocol.journal import Journal
+from protocol.retrace import Retrace
 from world.scenario import Scenario
 
 
@@ -57,3 +60,11 @@ def break_off(options: argparse.Namespace, folder: Path, reason: str, began: flo
         played = record.read(folder)
         summary = record.summary(played, "processes", round(time.perf_counter() - began, 6))
         record.leave(played, summary | {"reason": reason}, folder)
+
+
+def going_on(old: Retrace, inbox: Inbox) -> Journal:
+    """The journal of `old`, to be written on; says so if its end was torn. Raises CannotRecord."""
+    journal, cut = old.go_on()
+    if cut:
+        inbox.say(f"{old.path}: the last {cut} bytes were torn, and are cut off")
+    return journal

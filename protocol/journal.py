@@ -2,16 +2,19 @@
 
 A journal is a plain stream of msgpack byte strings, one a frame, so that any msgpack library reads it.
 It holds no wall-clock time. Each write is one system call: a process that is killed loses nothing it
-had journaled, and at worst leaves a last frame torn, which reading ignores.
+had journaled, and at worst leaves a last frame torn, which reading ignores. Who writes a journal has it
+locked, so no two processes write one.
 """
 
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import TracebackType
+from typing import Protocol
 
 import msgpack
 
@@ -34,27 +37,42 @@ class CorruptJournal(ValueError):
     """A journal that is damaged before its end."""
 
 
-class Journal:
-    """An open journal. A new file, never an old one: what is on record stays."""
+class Sink(Protocol):
+    """What takes frames, in order."""
 
-    def __init__(self, path: Path, *, fsync: bool = False) -> None:
-        """Raises RecordExists if `path` is there already, CannotRecord if it cannot be written."""
+    def write(self, *frames: bytes) -> None:
+        """All of `frames`, at once."""
+
+
+class Journal:
+    """An open journal. A new file, never an old one: what is on record stays, and goes on by a `Retrace`."""
+
+    def __init__(self, path: Path, *, fsync: bool = False, file: int | None = None) -> None:
+        """`file` is one that is open and locked already.
+
+        Raises RecordExists if `path` is there otherwise, CannotRecord if it cannot be written.
+        """
         self.path = path
         self._fsync = fsync
+        self._file = self._new() if file is None else file
+
+    def _new(self) -> int:
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            file = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
         except OSError as error:
-            if path.exists():
-                raise RecordExists(f"{path} is there already; choose another folder") from None
+            if self.path.exists():
+                raise RecordExists(f"{self.path} is there already; choose another folder") from None
             raise self._cannot(error) from None
+        lock(file, self.path)
+        return file
 
     def write(self, *frames: bytes) -> None:
         """All of `frames`, in one write, on the disk's side of the process when it returns.
 
         Raises CannotRecord when the disk takes no more.
         """
-        data = b"".join([_packer.pack(frame) for frame in frames])
+        data = packed(frames)
         try:
             if os.write(self._file, data) != len(data):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -79,6 +97,22 @@ class Journal:
         self.close()
 
 
+def lock(file: int, path: Path) -> None:
+    """Have `file` alone while it is open. Raises CannotRecord, and closes it, if another process has it."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(file)
+        raise CannotRecord(f"{path} is in use by another process; choose another folder") from None
+    except OSError:  # a file system without locks
+        pass
+
+
+def packed(frames: Iterable[bytes]) -> bytes:
+    """`frames` as they stand in a journal."""
+    return b"".join([_packer.pack(frame) for frame in frames])
+
+
 def read(path: Path) -> Iterator[bytes]:
     """The frames of the journal at `path`, up to its end or its torn tail.
 
@@ -93,7 +127,8 @@ class Tail:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._read = 0
+        self.whole = 0
+        """bytes of what has been read"""
 
     def news(self) -> list[bytes]:
         """The frames that have come since the last time; what is torn waits for the rest.
@@ -101,7 +136,7 @@ class Tail:
         Raises OSError, CorruptJournal like `read`.
         """
         with self.path.open("rb") as file:
-            file.seek(self._read)
+            file.seek(self.whole)
             data = file.read()
         unpacker = msgpack.Unpacker(max_buffer_size=0)
         unpacker.feed(data)
@@ -117,6 +152,6 @@ class Tail:
             if torn.startswith(_LONGEST[:1]) and torn > _LONGEST:
                 raise ValueError("a frame of impossible length")
         except (ValueError, msgpack.UnpackException) as error:
-            raise CorruptJournal(f"{self.path}: damaged at byte {self._read + whole}: {error}") from None
-        self._read += whole
+            raise CorruptJournal(f"{self.path}: damaged at byte {self.whole + whole}: {error}") from None
+        self.whole += whole
         return frames

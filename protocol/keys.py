@@ -16,7 +16,7 @@ def briefing(run: str, robot: str) -> str:
 
 
 def sense(run: str, robot: str) -> str:
-    """World to that robot: Sense, and End when it is over."""
+    """World to that robot: Sense; End when it is over; then its own Farewell, which is on record."""
     return f"{ROOT}/{run}/robot/{robot}/sense"
 
 

@@ -12,6 +12,7 @@ import os
 import re
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NoReturn
@@ -28,6 +29,8 @@ CLOSE_TIMEOUT_S = 2.0
 """Zenoh's own close can take ten seconds under loss; the process ends without it"""
 RETRY_MS = 50
 """a client looks for a world that went away as often"""
+LISTEN_AGAIN_S = 0.1
+"""how long to wait before trying once more to have a port"""
 
 MSGPACK = zenoh.Encoding("application/msgpack")
 
@@ -88,15 +91,23 @@ def _closing(session: zenoh.Session) -> Iterator[zenoh.Session]:
 
 
 @contextmanager
-def open_router(listen: str) -> Iterator[zenoh.Session]:
-    """The world's session, listening on `listen`. Raises BadEndpoint or CannotListen."""
+def open_router(listen: str, wait: float = 0.0) -> Iterator[zenoh.Session]:
+    """The world's session, listening on `listen`; waits `wait` seconds for it to be free.
+
+    Raises BadEndpoint or CannotListen.
+    """
     check_endpoint(listen)
-    config = _config("router", [listen], [])
-    try:
-        session = zenoh.open(config)
-    except zenoh.ZError as error:
-        taken = "in use" in str(error)
-        raise CannotListen(f"{listen}: {'already in use' if taken else 'cannot listen there'}") from None
+    give_up = time.monotonic() + wait
+    while True:
+        try:
+            session = zenoh.open(_config("router", [listen], []))
+            break
+        except zenoh.ZError as error:
+            taken = "in use" in str(error)
+            if not taken or time.monotonic() >= give_up:
+                why = "already in use" if taken else "cannot listen there"
+                raise CannotListen(f"{listen}: {why}") from None
+        time.sleep(LISTEN_AGAIN_S)
     with _closing(session):
         yield session
 

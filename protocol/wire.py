@@ -32,6 +32,11 @@ def encode(message: msgspec.Struct) -> bytes:
     return _HEAD.pack(VERSION, zlib.crc32(body)) + body
 
 
+def is_sound(frame: bytes) -> bool:
+    """Whether `frame` is one of this version, and undamaged, whatever it says."""
+    return len(frame) > _HEAD.size and _HEAD.unpack_from(frame) == (VERSION, zlib.crc32(frame[_HEAD.size :]))
+
+
 @overload
 def decode(frame: bytes, kind: type[M], limit: int = ...) -> M: ...
 @overload

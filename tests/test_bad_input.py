@@ -402,13 +402,17 @@ def test_an_agents_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    "command",
-    [("run", "paper-2"), ("run", "paper-2", "--in-process"), ("world", "paper-2", *LISTEN)],
+    ("command", "says"),
+    [
+        (("run", "paper-2"), " holds a record already"),
+        (("run", "paper-2", "--in-process"), " holds a record already"),
+        (("world", "paper-2", *LISTEN), "/world.journal: damaged at byte 0"),
+    ],
     ids=["run", "in-process", "world"],
 )
-def test_a_record_is_never_overwritten(command: tuple[str, ...], tmp_path: Path) -> None:
+def test_a_record_is_never_overwritten(command: tuple[str, ...], says: str, tmp_path: Path) -> None:
     (tmp_path / "world.journal").write_text("precious")
-    refused(tandem(*command, "--out", tmp_path), f"--out: {tmp_path}", "already", "another folder")
+    refused(tandem(*command, "--out", tmp_path), f"--out: {tmp_path}{says}", "; choose another folder")
     assert [path.name for path in tmp_path.iterdir()] == ["world.journal"]
     assert (tmp_path / "world.journal").read_text() == "precious"
 
@@ -417,5 +421,6 @@ def test_an_agents_record_is_never_overwritten(tmp_path: Path) -> None:
     (tmp_path / "agent-a.journal").write_text("precious")
     with world("paper-1") as (_, endpoint):
         ended = tandem("agent", "a", "--connect", endpoint, "--out", tmp_path)
-    refused(ended, f"--out: {tmp_path}", "already", "another folder")
+    says = f"--out: {tmp_path}/agent-a.journal: damaged at byte 0"
+    refused(ended, says, "; choose another folder")
     assert (tmp_path / "agent-a.journal").read_text() == "precious"

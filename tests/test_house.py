@@ -29,7 +29,7 @@ BELOW = {
 }
 """what each room may import of the house"""
 
-SHELL = {"protocol.session", "protocol.journal", "protocol.inbox"}
+SHELL = {"protocol.session", "protocol.journal", "protocol.retrace", "protocol.inbox"}
 """the rooms' windows: files, networks, clocks"""
 
 PURE = {

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from protocol.journal import Journal
+from protocol.journal import CorruptJournal, Sink
 from protocol.messages import Drive, End, Farewell, Missed, Sense
+from protocol.retrace import Otherwise, Retrace
 from protocol.wire import encode
+from world.past import past
 from world.referee import Judgement
 from world.scenario import Scenario
 from world.tick import advance, release, senses
@@ -18,8 +20,16 @@ class Course:
     The journal holds the scenario, every tick's Drives (in the scenario's order), End and the Farewells.
     """
 
-    def __init__(self, scenario: Scenario, journal: Journal | None = None) -> None:
+    def __init__(self, scenario: Scenario, journal: Sink | None = None) -> None:
         self.world = release(scenario)
+        self.over: End | None = None
+        """once the run is"""
+        self.witnesses: tuple[str, ...] = ()
+        """who answered in the tick that was the last, if they ended the run"""
+        self.parted: dict[str, Farewell] = {}
+        """what they said to that, as far as it is on record"""
+        self.missed: dict[str, list[Sense]] = {}
+        """what robots have sensed since they last answered in time; a process that comes back may not know"""
         self._journal = journal
         if journal is not None:
             journal.write(encode(scenario))
@@ -33,31 +43,88 @@ class Course:
         """What every robot senses now, in the order of the scenario."""
         return senses(self.world)
 
+    def keep(self, journal: Sink) -> None:
+        """Go on journaling there."""
+        self._journal = journal
+
     def drive(self, drives: Mapping[str, Drive]) -> End | None:
         """One tick on; or the end. A robot that is not in `drives` stands still."""
-        world = self.world
+        self.record(drives)
+        return self.advance(drives)
+
+    def record(self, drives: Mapping[str, Drive]) -> None:
+        """First half of `drive`: the tick is on record."""
         if self._journal is not None:
-            tick = world.truth.tick
-            ids = [robot.id for robot in world.scenario.robots]
             self._journal.write(
-                *[encode(drives[robot] if robot in drives else Missed(tick, robot)) for robot in ids]
+                *[
+                    encode(drives[robot.id] if robot.id in drives else Missed(self.tick, robot.id))
+                    for robot in self.world.scenario.robots
+                ]
             )
-        onward = advance(world, drives)
+
+    def advance(self, drives: Mapping[str, Drive]) -> End | None:
+        """Second half of `drive`: everyone has moved."""
+        if self.missed or len(drives) < len(self.world.scenario.robots):
+            self._note_missed(drives)
+        onward = advance(self.world, drives)
         if isinstance(onward, Judgement):
+            self.witnesses = tuple(drives)
             return self.end(onward)
         self.world = onward
         return None
 
+    def _note_missed(self, drives: Mapping[str, Drive]) -> None:
+        for sense in self.senses():
+            if sense.robot in drives:
+                self.missed.pop(sense.robot, None)
+            else:
+                self.missed.setdefault(sense.robot, []).append(sense)
+
     def end(self, judgement: Judgement) -> End:
         """The run is over."""
-        end = End(self.tick, judgement.outcome, judgement.reason)
+        self.over = End(self.tick, judgement.outcome, judgement.reason)
         if self._journal is not None:
-            self._journal.write(encode(end))
-        return end
+            self._journal.write(encode(self.over))
+        return self.over
 
     def farewells(self, farewells: Iterable[Farewell]) -> None:
         """What the robots answered to the End; those that answered."""
-        if self._journal is not None:
-            said = {farewell.robot: farewell for farewell in farewells}
-            ids = [robot.id for robot in self.world.scenario.robots if robot.id in said]
-            self._journal.write(*[encode(said[robot]) for robot in ids])
+        said = {farewell.robot: farewell for farewell in farewells}
+        ids = [robot.id for robot in self.world.scenario.robots]
+        latest = max([ids.index(robot) for robot in self.parted], default=-1)
+        new = [said[robot] for robot in ids[latest + 1 :] if robot in said]
+        self.parted |= {farewell.robot: farewell for farewell in new}
+        if self._journal is not None and new:
+            self._journal.write(*[encode(farewell) for farewell in new])
+
+
+def again(scenario: Scenario, record: Retrace) -> Course:
+    """The course of the run that `record` tells, as far as it has come; of none, if there is nothing in it.
+
+    Raises CorruptJournal, also if it is that of another scenario, or if the world once went on otherwise.
+    """
+    course = Course(scenario)
+    course.keep(record)
+    if record.frames:
+        _retrace(course, record)
+    else:
+        record.write(encode(scenario))
+    return course
+
+
+def _retrace(course: Course, record: Retrace) -> None:
+    lived = past(record.frames, record.path)
+    if lived.scenario != course.world.scenario:
+        raise CorruptJournal(f"{record.path}: the record of another scenario, {lived.scenario.name}")
+    try:
+        record.write(encode(lived.scenario))
+        for drives in lived.ticks:
+            course.drive(drives)
+        if lived.end is not None and course.over is None:
+            course.end(Judgement(lived.end.outcome, lived.end.reason))
+        course.farewells(lived.farewells)
+    except Otherwise:
+        raise CorruptJournal(
+            f"{record.path}: on record the world went on otherwise at tick {course.tick}: "
+            "the journal is another version's"
+        ) from None

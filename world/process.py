@@ -2,31 +2,30 @@
 
 Lockstep goes as fast as the answers come, and no decision depends on a time-out. As long as somebody
 has not answered, everyone hears its Sense again: when a robot appears, and every REPEAT_S. That one
-rule serves late starters, lost messages and restarted agents. In real time a tick lasts its period, and
-a robot whose Drive did not come stands still.
+rule serves late starters, lost messages and restarted agents; and a world that is started again, which
+says to everyone what it would have said. In real time a tick lasts its period, and a robot whose Drive did
+not come stands still.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import zenoh
 
 from protocol import keys, session
 from protocol.inbox import NOTHING, Arrival, Inbox
-from protocol.journal import Journal
 from protocol.messages import Drive, End, Farewell, Message, Sense, Truth
 from protocol.wire import MalformedFrame, decode, encode
 from world.course import Course
 from world.referee import Judgement
-from world.scenario import Scenario
 
 REPEAT_S = 0.25
 """how often what is unanswered is said again"""
 FAREWELL_S = 2.0
-"""how long the world waits for the robots' last word"""
+"""how long the world waits for the last word of robots that had not answered any more"""
 
 
 class NoAnswer(TimeoutError):
@@ -38,18 +37,23 @@ class WorldProcess:
 
     def __init__(
         self,
-        scenario: Scenario,
+        course: Course,
         link: zenoh.Session,
         run: str,
-        journal: Journal,
         inbox: Inbox,
         *,
         rate: float | None = None,
         patience: float = 30.0,
+        reached: Callable[[str, int], None] | None = None,
     ) -> None:
-        """`rate` is real time's speed, lockstep without; `patience` (s) bounds every wait for an answer."""
+        """`course` may have come some way. `rate` is real time's speed, lockstep without.
+
+        `patience` (s) bounds every wait for an answer; `reached` is told how far each tick has come.
+        """
+        scenario = course.world.scenario
         self._scenario = scenario
-        self._course = Course(scenario, journal)
+        self._course = course
+        self._reached = reached
         self._period = scenario.mission.period / rate if rate is not None else None
         self._tick_s = self._period or 0.0
         self._patience = patience
@@ -72,20 +76,30 @@ class WorldProcess:
 
     def play(self) -> End:
         """The whole run, to its End. Raises Interrupted when told to stop."""
+        course = self._course
         due: float | None = None
         began: float | None = None
-        end: End | None = None
+        end = course.over
+        expected = self._robots if end is not None else []
+        if course.tick > 0 and self._period is not None:  # its clock goes on; not everyone is back yet
+            due = time.monotonic() + self._period
         try:
             while end is None:
-                drives = self._answers(self._course.senses(), due)
-                end = self._course.drive(drives)
+                drives = self._answers(course.senses(), due)
+                if self._reached is not None:
+                    self._reached("drive", course.tick)
+                course.record(drives)
+                if self._reached is not None:
+                    self._reached("journal", course.tick)
+                end = course.advance(drives)
                 began = time.monotonic() if began is None else began
                 if self._period is not None:
                     due = max((due or began) + self._period, time.monotonic())
         except NoAnswer as silence:
-            end = self._course.end(Judgement("failed", str(silence)))
+            end = course.end(Judgement("failed", str(silence)))
         self.playing_s = time.monotonic() - began if began is not None else 0.0
-        self._course.farewells(self._farewells(end))
+        course.farewells(self._farewells(end, expected))
+        self._put({robot: encode(farewell) for robot, farewell in course.parted.items()})
         if refused := self._inbox.refused.total():
             self._inbox.say(f"refused {refused} frames in all")
         return end
@@ -96,7 +110,11 @@ class WorldProcess:
         """Everyone's Drive; in real time, where `due` is when the tick ends, those that came until then."""
         tick = self._course.tick
         frames = {sense.robot: encode(sense) for sense in senses}
+        if self._reached is not None:
+            self._reached("sense", tick)
         self._put(frames)
+        if self._reached is not None:
+            self._reached("report", tick)
         self._show_truth()
         drives: dict[str, Drive] = {}
         now = time.monotonic()
@@ -109,6 +127,8 @@ class WorldProcess:
                 if isinstance(drive, Drive) and drive.tick == tick and drive.robot not in drives:
                     drives[drive.robot] = drive
                     self._answered = now
+            if arrival.topic == "alive":
+                self._tell_missed(keys.robot_of(arrival.key))
             if arrival.topic == "alive" or (due is None and now >= repeat):
                 repeat = now + REPEAT_S
                 self._put(frames)
@@ -121,6 +141,11 @@ class WorldProcess:
     def _put(self, frames: Mapping[str, bytes]) -> None:
         for robot, frame in frames.items():
             self._sense[robot].put(frame)
+
+    def _tell_missed(self, robot: str) -> None:
+        """In real time, what the others have been told while `robot` was away."""
+        for sense in self._course.missed.get(robot, ()):
+            self._sense[robot].put(encode(sense))
 
     def _next(self, timeout: float) -> Arrival:
         arrival = self._inbox.next(timeout)
@@ -165,20 +190,34 @@ class WorldProcess:
             return f"this world has no robot '{robot}'; it has {', '.join(self._robots)}"
         return self._scenario.briefing(robot, self._period)
 
-    def _farewells(self, end: End) -> list[Farewell]:
-        """Tell everyone that it is over, until everyone has answered or left."""
+    def _farewells(self, end: End, expected: Collection[str]) -> list[Farewell]:
+        """Tell everyone that it is over, until everyone has answered or left.
+
+        Who answered in the last tick is waited for with patience, though it be started again; `expected`, and
+        whoever else is there, for FAREWELL_S.
+        """
         frames = dict.fromkeys(self._robots, encode(end))
-        said: dict[str, Farewell] = {}
-        now = repeat = time.monotonic()
-        give_up = now + FAREWELL_S
-        while now < give_up and self._alive - said.keys():
+        said = dict(self._course.parted)
+        now = repeat = began = time.monotonic()
+        told = False
+        while True:
+            last_words = set(self._course.witnesses) - said.keys()
+            others = self._alive.union(expected) - said.keys()
+            give_up = began + (self._patience if last_words else FAREWELL_S)
+            if now >= give_up or not (last_words or others):
+                return list(said.values())
+            if last_words and now >= began + FAREWELL_S and not told:
+                told = True
+                names = ", ".join(sorted(last_words))
+                self._inbox.say(f"waiting {self._patience:g} s for the last word of {names}")
             if now >= repeat:
                 repeat = now + REPEAT_S
                 self._put(frames)
             arrival = self._next(min(repeat, give_up) - now)
+            if arrival.topic == "alive":
+                repeat = time.monotonic()
             if arrival.topic == "drive":
                 farewell = self._accepted(arrival, Drive | Farewell)
                 if isinstance(farewell, Farewell):
                     said[farewell.robot] = farewell
             now = time.monotonic()
-        return list(said.values())

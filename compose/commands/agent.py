@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
+from agent.memory import Memory, remember
 from agent.process import AgentProcess, NoWorld, Search, Unwelcome, join
+from agent.robot import Robot
+from compose import kill
 from compose.record import ended, make
 from compose.status import ENDED, FAILED, STOPPED, UserError, status_of
 from compose.stop import stop_by_signal, stop_with_launcher
+from compose.telling import going_on
 from protocol import session
 from protocol.inbox import Inbox, Interrupted
-from protocol.journal import CannotRecord
-from protocol.messages import End
+from protocol.journal import CannotRecord, CorruptJournal, Journal
+from protocol.messages import Briefing, End
+from protocol.retrace import Retrace
+
+STILL_THERE_S = 3.0
+"""how long an agent whose mission has ended looks for a world that may not know its last word"""
 
 
 def main(options: argparse.Namespace) -> int:
@@ -26,6 +35,8 @@ def main(options: argparse.Namespace) -> int:
         raise UserError(f"--connect: {error}") from None
     except CannotRecord as error:
         raise UserError(f"--out: {error}") from None
+    except CorruptJournal as error:
+        raise UserError(f"--out: {error}; choose another folder") from None
     except Unwelcome as error:
         raise UserError(str(error)) from None
     except NoWorld as error:
@@ -41,19 +52,52 @@ def main(options: argparse.Namespace) -> int:
 
 
 def _play(options: argparse.Namespace, inbox: Inbox) -> End:
+    session.check_endpoint(options.connect)
+    path: Path | None = options.out / f"agent-{options.id}.journal" if options.out is not None else None
+    old = Retrace(path, fsync=options.fsync) if path is not None and path.exists() else None
+    memory = remember(old) if old is not None else None
+    end = memory.end if memory is not None else None
     which = f"world of run '{options.run}'" if options.run else "world"
-    search = Search(f"{which} at {options.connect}", options.wait, inbox)
+    wait = options.wait if end is None else min(options.wait, STILL_THERE_S)
+    search = Search(f"{which} at {options.connect}", wait, inbox)
     while True:
-        with session.open_client(options.connect, search.go_on) as link:
-            joined = join(link, options.run, options.id, search)
-            if joined is None:  # a session that has lost its link finds nothing; a new one may
-                continue
-            run, briefing = joined
-            if options.out is not None:
-                make(options.out)
-            process = AgentProcess(
-                briefing, link, run, inbox, out=options.out, fsync=options.fsync, patience=options.patience
-            )
-            if not (options.quiet or options.launched):
-                print(f"{options.id}: in run {run}, with {briefing.peer}", flush=True)
-            return process.play()
+        try:
+            with session.open_client(options.connect, search.go_on) as link:
+                joined = join(link, options.run, options.id, search)
+                if joined is None:  # a session that has lost its link finds nothing; a new one may
+                    continue
+                run, briefing = joined
+                if memory is not None and old is not None and memory.briefing != briefing:
+                    raise CorruptJournal(f"{old.path}: another run's: its briefing is not this world's")
+                memory = _ready(options, briefing, old, memory, inbox)
+                process = AgentProcess(
+                    memory, link, run, inbox, patience=options.patience, reached=kill.taker(options.kill)
+                )
+                if not (options.quiet or options.launched):
+                    where = f", again, from tick {memory.sense.tick} on" if memory.sense is not None else ""
+                    print(f"{options.id}: in run {run}, with {briefing.peer}{where}", flush=True)
+                return process.play()
+        except NoWorld:
+            if end is None:
+                raise
+            return end
+
+
+def _ready(
+    options: argparse.Namespace,
+    briefing: Briefing,
+    old: Retrace | None,
+    memory: Memory | None,
+    inbox: Inbox,
+) -> Memory:
+    """What the robot knows, its journal open to be written on. Raises CannotRecord."""
+    journal: Journal | None = None
+    if old is not None:
+        journal = going_on(old, inbox)
+    elif options.out is not None:
+        make(options.out)
+        journal = Journal(options.out / f"agent-{options.id}.journal", fsync=options.fsync)
+    if memory is None:
+        return Memory(briefing, Robot(briefing, journal))
+    memory.robot.keep(journal)
+    return memory

@@ -125,7 +125,7 @@ def _mission_rate(played: Scenario) -> float:
             session.open_router(endpoint) as link,
             Journal(out / record.WORLD_JOURNAL) as journal,
         ):
-            process = WorldProcess(played, link, "bench", journal, Inbox("tandem bench"))
+            process = WorldProcess(Course(played, journal), link, "bench", Inbox("tandem bench"))
             end = process.play()
             return end.tick / process.playing_s
 

@@ -6,6 +6,7 @@ import argparse
 import time
 
 from compose import local
+from compose.kill import WORLD
 from compose.record import folder_for, read
 from compose.scenario import check_rate, load, run_name
 from compose.status import FAILED, STOPPED, UserError
@@ -21,6 +22,12 @@ def main(options: argparse.Namespace) -> int:
     scenario = load(options.scenario, seed=options.seed, faults=options.fault)
     if options.out is not None and any(options.out.glob("*.journal")):
         raise UserError(f"--out: {options.out} holds a record already; choose another folder")
+    for kill in options.kill:
+        ids = [robot.id for robot in scenario.robots]
+        if kill.who not in (*ids, WORLD):
+            raise UserError(
+                f"--kill: {kill.text}: there is no '{kill.who}'; there are {', '.join(ids)}, {WORLD}"
+            )
     return _in_process(options, scenario) if options.in_process else _as_processes(options, scenario)
 
 
@@ -29,6 +36,8 @@ def _in_process(options: argparse.Namespace, scenario: Scenario) -> int:
 
     if options.rate is not None:
         raise UserError("--rate: --in-process knows no real time")
+    if options.kill:
+        raise UserError("--kill: --in-process has no processes to kill")
     began = time.perf_counter()
     if options.out is None:
         return conclude(options, inline.play(scenario), None, "in-process", began)
@@ -48,13 +57,14 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario) -> int:
         began = time.perf_counter()
         try:
             with progress(options, scenario, folder):
-                local.play(
+                spared = local.play(
                     scenario,
                     folder,
                     inbox,
                     run=run_name(scenario),
                     rate=options.rate,
                     patience=options.patience,
+                    kills=options.kill,
                 )
         except local.ChildFailed as failure:
             inbox.say(f"failed: {failure}")
@@ -64,4 +74,6 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario) -> int:
             inbox.say(f"stopped by {signal_name}")
             break_off(options, folder, f"stopped by {signal_name}", began)
             return STOPPED
+        for kill in spared:
+            inbox.say(f"--kill {kill.text}: never came")
         return conclude(options, read(folder), folder, "processes", began)

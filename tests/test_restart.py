@@ -1,0 +1,572 @@
+"""Whoever is killed, wherever in a tick, is started again and goes on: the run ends with the same bytes."""
+
+from __future__ import annotations
+
+import csv
+import os
+import re
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from signal import SIGKILL
+
+import msgpack
+import pytest
+import zenoh
+from msgspec.structs import replace
+
+from agent.memory import remember
+from agent.past import past
+from agent.robot import Robot
+from compose.inline import play
+from compose.kill import BadKill, parse
+from compose.local import free_endpoint
+from compose.scenario import load
+from protocol import journal, keys, session
+from protocol.inbox import Inbox
+from protocol.journal import CannotRecord, CorruptJournal, Journal
+from protocol.messages import Contact, Drive, End, Farewell, Missed, Report, Sense
+from protocol.retrace import Retrace
+from protocol.wire import MAX_FRAME_BYTES, decode, encode
+from tests.commands import BOUND_S, PAPER_1, Command, Ended, journals, processes_of, tandem, world
+from world.course import Course, again
+from world.past import past as world_past
+from world.scenario import Scenario
+
+PARTS = ("agent-a", "agent-b", "world")
+LOCALISED = "localised after 48 ticks\n"
+REPEAT_S = 0.25
+AT_ONCE_S = 10.0
+"""less than the 30 s of its patience"""
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The record of the paper's first mission: in range of each other from tick 46 to its end, 48."""
+    out = tmp_path_factory.mktemp("undisturbed") / "out"
+    assert tandem("run", "paper-1", "--in-process", "-q", "--out", out).status == 0
+    return out
+
+
+def same(out: Path, undisturbed: Path) -> None:
+    assert journals(out) == journals(undisturbed)
+    assert (out / "ticks.csv").read_bytes() == (undisturbed / "ticks.csv").read_bytes()
+
+
+def options(kills: str) -> list[str]:
+    return [word for kill in kills.split() for word in ("--kill", kill)]
+
+
+# --- killed, and started again ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "kills",
+    [
+        "a@7 a@46:report a@20:journal a@31:drive",
+        "b@0:drive b@47:report b@33 b@48:journal",
+        "world@0 world@46:report world@30:drive world@48:journal",
+        "a@47:report b@47:report",
+        "a@12 world@12:report b@48:drive",
+        "b@46 b@46 b@46:drive",
+        "a@48:journal b@48:drive world@48:drive",
+    ],
+)
+def test_a_run_whose_processes_are_killed_ends_with_the_same_record(
+    kills: str, undisturbed: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    ended = tandem("run", "paper-1", "-q", "--out", out, *options(kills))
+    assert ended[:2] == (0, LOCALISED), ended
+    killed = re.findall(
+        r"^tandem run: (?:agent )?(\w+) was killed at tick (\d+), and", ended.err, re.MULTILINE
+    )
+    assert sorted("@".join(one) for one in killed) == sorted(re.findall(r"\w+@\d+", kills))
+    same(out, undisturbed)
+    assert not processes_of(out)
+
+
+def test_a_robot_that_comes_back_later_is_waited_for_even_after_the_last_tick(
+    undisturbed: Path, tmp_path: Path
+) -> None:
+    ended = tandem("run", "paper-1", "-q", "--out", tmp_path / "out", "--kill", "a@48:drive+0.5s")
+    said = "tandem run: agent a was killed at tick 48, and is started again in 0.5 s\n"
+    assert ended[:2] == (0, LOCALISED), ended
+    assert ended.err.startswith(said)
+    same(tmp_path / "out", undisturbed)
+
+
+def test_a_point_that_never_comes_is_told(undisturbed: Path, tmp_path: Path) -> None:
+    kills = options("b@900 a@3:report world@49:drive+never")
+    ended = tandem("run", "paper-1", "-q", "--out", tmp_path / "out", *kills)
+    assert ended[:2] == (0, LOCALISED)
+    assert sorted(ended.err.splitlines()) == [
+        "tandem run: --kill a@3:report: never came",
+        "tandem run: --kill b@900: never came",
+        "tandem run: --kill world@49:drive+never: never came",
+    ]
+    same(tmp_path / "out", undisturbed)
+
+
+@pytest.mark.parametrize("who", ["b", "world"])
+def test_a_process_that_is_never_started_again_ends_the_run_at_once(who: str, tmp_path: Path) -> None:
+    ended = tandem("run", "paper-1", "-q", "--out", tmp_path / "out", "--kill", f"{who}@17+never")
+    name = "world" if who == "world" else f"agent {who}"
+    assert ended == (3, "", f"tandem run: failed: {name} was killed at tick 17 (--kill {who}@17+never)\n")
+    assert not processes_of(tmp_path / "out")
+
+
+def test_a_robot_that_comes_back_too_late_fails_the_run_by_the_patience(tmp_path: Path) -> None:
+    kill = ("--kill", "a@17+600s", "--patience", "10")
+    ended = tandem("run", "paper-1", "-q", "--out", tmp_path / "out", *kill)
+    assert ended[:2] == (3, "failed after 16 ticks (no answer from a (not there) at tick 17 for 10 s)\n")
+    assert not processes_of(tmp_path / "out")
+
+
+def test_in_real_time_whoever_is_away_stands_still_and_is_told_what_it_missed(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    ended = tandem("run", "paper-2", "--rate", "20", "-q", "--out", out, *options("a@20 world@60:report"))
+    assert ended.status == 0, ended
+    with (out / "ticks.csv").open(newline="") as file:
+        away = [row for row in csv.DictReader(file) if row["state"] == ""]
+    assert "a" in {row["robot"] for row in away}
+    assert {(row["v"], row["omega"]) for row in away} == {("0.0", "0.0")}
+    kinds = Scenario | Drive | Missed | End | Farewell
+    messages = [decode(frame, kinds, MAX_FRAME_BYTES) for frame in journal.read(out / "world.journal")]
+    assert sum(isinstance(message, Missed) for message in messages) == len(away)
+    for robot in ("a", "b"):
+        lived = past(journal.read(out / f"agent-{robot}.journal"), robot)
+        assert [step.sense.tick for step in lived.steps] == list(range(len(lived.steps)))
+
+
+# --- what is typed ------------------------------------------------------------------------------------
+
+
+def test_a_kill_is_read_as_it_is_written() -> None:
+    fields = [(kill.who, kill.tick, kill.point, kill.after) for kill in map(parse, (
+        "a@17", "b-2@0:report", "world@30:journal+5s", "a@1:drive+never", "a@1+0.25s"
+    ))]  # fmt: skip
+    assert fields == [
+        ("a", 17, "sense", 0.0),
+        ("b-2", 0, "report", 0.0),
+        ("world", 30, "journal", 5.0),
+        ("a", 1, "drive", None),
+        ("a", 1, "sense", 0.25),
+    ]
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "a", "a@", "@17", "a17", "a@-1", "a@1.5", "a@17:", "a@17:drives", "a@17+", "a@17+5", "a@17+5m"]
+    + ["a@17+-1s", "a@17+nans", "a@17+never:drive", " a@17", "a@17\n", "a b@17", "a@²", "a@17:sense:sense"],
+)
+def test_a_mistyped_kill_is_none(text: str) -> None:
+    with pytest.raises(BadKill, match="is no kill"):
+        parse(text)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--kill", "a17"], "--kill: 'a17' is no kill"),
+        (["--kill"], "--kill"),
+        (["--kill", "z@17"], "--kill: z@17: there is no 'z'; there are a, b, world"),
+        (["--kill", "a@17", "--in-process"], "--kill: --in-process has no processes to kill"),
+    ],
+)
+def test_a_mistake_about_kills_is_one_line(arguments: list[str], says: str, tmp_path: Path) -> None:
+    ended = tandem("run", "paper-1", "--out", "out", *arguments, cwd=tmp_path)
+    refused(ended, says)
+    assert list(tmp_path.iterdir()) == []
+
+
+def refused(ended: Ended, *words: str) -> None:
+    assert ended[:2] == (2, ""), ended
+    assert re.fullmatch(r"tandem[^\n]*: [^\n]+\n", ended.err), ended.err
+    for word in words:
+        assert word in ended.err
+
+
+# --- a record that breaks off -------------------------------------------------------------------------
+
+
+def cuts(data: bytes) -> list[int]:
+    """Places to tear a journal at: all over it, and closer in its last ticks."""
+    return [*range(0, len(data), 211), *range(len(data) - 1200, len(data) + 1, 7), len(data)]
+
+
+@pytest.mark.parametrize("robot", ["a", "b"])
+def test_an_agents_journal_torn_anywhere_is_finished_with_the_same_bytes(
+    robot: str, undisturbed: Path, tmp_path: Path
+) -> None:
+    data = (undisturbed / f"agent-{robot}.journal").read_bytes()
+    whole = past(journal.read(undisturbed / f"agent-{robot}.journal"), robot)
+    assert whole.end is not None
+    torn = tmp_path / "torn.journal"
+    for cut in cuts(data):
+        torn.write_bytes(data[:cut])
+        old = Retrace(torn)
+        memory = remember(old)
+        assert torn.stat().st_size == cut
+        book, lost = old.go_on()
+        assert torn.stat().st_size >= cut - lost
+        with book:
+            body = Robot(whole.briefing, book) if memory is None else memory.robot
+            body.keep(book)
+            known = memory.sense.tick if memory is not None and memory.sense is not None else -1
+            for step in whole.steps[max(known, 0) :]:
+                if step.sense.tick > known:
+                    body.sense(step.sense, step.frame)
+                if body.drive is None:
+                    body.decide(step.heard)
+                    body.estimate()
+            if memory is None or memory.farewell is None:
+                body.farewell(whole.end)
+        assert torn.read_bytes() == data, cut
+
+
+def test_a_worlds_journal_torn_anywhere_is_finished_with_the_same_bytes(
+    undisturbed: Path, tmp_path: Path
+) -> None:
+    data = (undisturbed / "world.journal").read_bytes()
+    whole = world_past(list(journal.read(undisturbed / "world.journal")), "world")
+    torn = tmp_path / "torn.journal"
+    for cut in cuts(data):
+        torn.write_bytes(data[:cut])
+        old = Retrace(torn)
+        course = again(load("paper-1"), old)
+        assert torn.stat().st_size == cut
+        book, _ = old.go_on()
+        with book:
+            course.keep(book)
+            for drives in whole.ticks[course.tick :]:
+                if course.over is None:
+                    course.drive(drives)
+            course.farewells(whole.farewells)
+        assert torn.read_bytes() == data, cut
+
+
+def shells(out: Path, endpoint: str, folder: ExitStack) -> dict[str, Command]:
+    parts = {
+        "world": ("world", "paper-1", "--listen", endpoint),
+        "a": ("agent", "a", "--connect", endpoint),
+        "b": ("agent", "b", "--connect", endpoint),
+    }
+    return {name: folder.enter_context(Command(*part, "--out", out)) for name, part in parts.items()}
+
+
+def at_tick(frames: list[bytes], tick: int) -> int:
+    """How many bytes of a journal stand before the first frame that names `tick`, its head left out."""
+    for place, frame in enumerate(frames):
+        if place and msgpack.unpackb(frame[5:])[1] == tick:
+            return len(journal.packed(frames[:place]))
+    raise AssertionError(f"no tick {tick}")
+
+
+@pytest.mark.parametrize("tick", [20, 47])
+def test_torn_tails_are_cut_off_told_and_survived(tick: int, undisturbed: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    for name, more in zip(PARTS, (61, 9, 30), strict=True):
+        path = undisturbed / f"{name}.journal"
+        keep = at_tick(list(journal.read(path)), tick) + more
+        (out / path.name).write_bytes(path.read_bytes()[:keep])
+    with ExitStack() as folder:
+        ended = {name: shell.ended() for name, shell in shells(out, free_endpoint(), folder).items()}
+    assert {name: end.status for name, end in ended.items()} == {"world": 0, "a": 0, "b": 0}, ended
+    for name, end in ended.items():
+        part = "world" if name == "world" else f"agent {name}"
+        file = re.escape(f"{out / part.replace(' ', '-')}.journal")
+        said = rf"tandem {part}: {file}: the last \d+ bytes were torn, and are cut off"
+        assert re.search(said, end.err, re.MULTILINE), ended
+    assert f", again, at tick {tick}: waiting for a, b" in ended["world"].out
+    same(out, undisturbed)
+
+
+def test_a_world_and_an_agent_that_are_killed_go_on_by_the_same_commands(
+    undisturbed: Path, tmp_path: Path
+) -> None:
+    endpoint = free_endpoint()
+    clock = ("world", "paper-1", "--listen", endpoint, "--out", tmp_path)
+    a, b = (("agent", robot, "--connect", endpoint, "--out", tmp_path) for robot in ("a", "b"))
+    with ExitStack() as folder:
+        first = folder.enter_context(Command(*clock))
+        first.until_says("waiting for a, b")
+        agent = folder.enter_context(Command(*a))
+        agent.until_answered("a", tmp_path)
+        agent.tell(SIGKILL)
+        agent = folder.enter_context(Command(*a))
+        agent.until_says("again, from tick 0 on")
+        first.tell(SIGKILL)
+        agent.until_says("the world has gone; waiting 30 s for it")
+        second = folder.enter_context(Command(*clock))
+        second.until_says("waiting for a, b")
+        last = folder.enter_context(Command(*b))
+        assert [part.ended().status for part in (second, agent, last)] == [0, 0, 0]
+    same(tmp_path, undisturbed)
+
+
+def test_who_has_ended_says_so_again(undisturbed: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    for name, data in journals(undisturbed).items():
+        (out / name).write_bytes(data)
+    endpoint = free_endpoint()
+    agent = tandem("agent", "a", "--connect", endpoint, "--out", out, "--wait", "0.2")
+    assert agent == (0, "a: localised after 48 ticks\n", "")
+    clock = tandem("world", "paper-1", "--listen", endpoint, "--out", out, "-q")
+    assert clock == (0, LOCALISED, "")
+    same(out, undisturbed)
+
+
+def test_a_world_that_is_killed_after_its_end_collects_the_farewells(
+    undisturbed: Path, tmp_path: Path
+) -> None:
+    for name, data in journals(undisturbed).items():
+        (tmp_path / name).write_bytes(data)
+    frames = list(journal.read(undisturbed / "world.journal"))
+    (tmp_path / "world.journal").write_bytes(journal.packed(frames[:-2]))
+    frames = list(journal.read(undisturbed / "agent-b.journal"))
+    (tmp_path / "agent-b.journal").write_bytes(journal.packed(frames[:-2]))
+    with ExitStack() as folder:
+        ended = {name: shell.ended() for name, shell in shells(tmp_path, free_endpoint(), folder).items()}
+    assert {name: end.status for name, end in ended.items()} == {"world": 0, "a": 0, "b": 0}, ended
+    same(tmp_path, undisturbed)
+
+
+def test_an_agent_says_farewell_until_a_world_has_it_on_record(tmp_path: Path) -> None:
+    scenario, endpoint, run = load("paper-1"), free_endpoint(), "mine"
+    there = Inbox("test")
+
+    def farewell_of(link: zenoh.Session) -> bytes:
+        session.subscribe(link, keys.drive(run, "a"), there, "drive")
+        session.watch_liveliness(link, keys.robot_alive(run, "*"), there)
+        publisher = session.publisher(link, keys.sense(run, "a"))
+        _token = session.show_alive(link, keys.world_alive(run))
+        while True:
+            arrival = there.next(REPEAT_S)
+            if arrival.topic == "drive":
+                assert isinstance(decode(arrival.frame, Farewell), Farewell)
+                return arrival.frame
+            publisher.put(encode(End(0, "undecided", "for a test")))
+
+    with ExitStack() as folder:
+        with session.open_router(endpoint) as link:
+            session.answer(link, keys.briefing(run, "*"), lambda _: scenario.briefing("a"))
+            _token = session.show_alive(link, keys.world_alive(run))
+            agent = folder.enter_context(Command("agent", "a", "--connect", endpoint, "--out", tmp_path))
+            first = farewell_of(link)
+        agent.until_says("the world has gone after its End; waiting 30 s for it")
+        there = Inbox("test")
+        with session.open_router(endpoint, BOUND_S) as link:
+            assert farewell_of(link) == first
+            assert agent.running
+            session.publisher(link, keys.sense(run, "a")).put(first)
+            assert agent.ended(AT_ONCE_S).status == 1
+
+
+# --- what is said again -------------------------------------------------------------------------------
+
+
+def test_a_repeated_sense_makes_an_agent_say_all_its_latest_reports_again(tmp_path: Path) -> None:
+    scenario, endpoint, run = load("paper-1"), free_endpoint(), "mine"
+    reports: SimpleQueue[int] = SimpleQueue()
+    there = Inbox("test")
+    senses = [Sense(tick, "a", None, 2.5, (Contact("b", 2.0, ()),)) for tick in range(70)]
+    senses[1:] = [replace(sense, executed=None) for sense in senses[1:]]
+    latest = list(range(69 - 59, 70))
+
+    def heard(ticks: list[int]) -> None:
+        assert [next_of(reports) for _ in ticks] == ticks
+
+    with session.open_router(endpoint) as link:
+        session.answer(link, keys.briefing(run, "*"), lambda _: scenario.briefing("a"))
+        session.watch_liveliness(link, keys.robot_alive(run, "*"), there)
+        link.declare_subscriber(
+            keys.report(run, "a", "b"),
+            lambda sample: reports.put(decode(sample.payload.to_bytes(), Report).tick),
+        )
+        publisher = session.publisher(link, keys.sense(run, "a"))
+        _token = session.show_alive(link, keys.world_alive(run))
+        part = ("agent", "a", "--connect", endpoint, "--out", tmp_path)
+        with Command(*part) as agent:
+            assert there.next(BOUND_S).topic == "alive"
+            for sense in senses:
+                publisher.put(encode(sense))
+            heard(list(range(70)))
+            publisher.put(encode(senses[-1]))
+            heard(latest)
+            os.kill(agent.pid, SIGKILL)
+        assert there.next(BOUND_S).topic == "gone"
+        with Command(*part):
+            assert there.next(BOUND_S).topic == "alive"
+            publisher.put(encode(senses[-1]))
+            heard(latest)
+    assert reports.empty()
+
+
+def next_of(queue: SimpleQueue[int]) -> int:
+    try:
+        return queue.get(timeout=BOUND_S)
+    except Empty:
+        raise AssertionError("nothing more came") from None
+
+
+# --- refused ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def record(undisturbed: Path, tmp_path: Path) -> Path:
+    """One to be spoilt: a copy of the undisturbed run's, without its end."""
+    for name in PARTS:
+        frames = list(journal.read(undisturbed / f"{name}.journal"))
+        (tmp_path / f"{name}.journal").write_bytes(journal.packed(frames[:60]))
+    return tmp_path
+
+
+@pytest.fixture
+def paper_1() -> Iterator[str]:
+    with world("paper-1") as (_, endpoint):
+        yield endpoint
+
+
+@pytest.fixture
+def paper_2() -> Iterator[str]:
+    with world("paper-2") as (_, endpoint):
+        yield endpoint
+
+
+def refuses(out: Path, *arguments: str, says: str) -> None:
+    before = journals(out)
+    refused(tandem(*arguments, "--out", out), "--out: ", says, "choose another folder")
+    assert journals(out) == before
+
+
+def spoil(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0x10
+    path.write_bytes(data)
+
+
+def test_a_corrupt_journal_is_refused(record: Path) -> None:
+    for name in ("agent-a", "world"):
+        spoil(record / f"{name}.journal")
+    unused = free_endpoint()
+    file = f"{record / 'agent-a.journal'}: "
+    refuses(record, "agent", "a", "--connect", unused, says=file)
+    refuses(record, "world", "paper-1", "--listen", unused, says=f"{record / 'world.journal'}: ")
+
+
+def test_a_journal_that_is_damaged_anywhere_is_not_mistaken_for_a_torn_one(
+    record: Path, tmp_path: Path
+) -> None:
+    good = (record / "agent-b.journal").read_bytes()
+    frames = list(journal.read(record / "agent-b.journal"))
+    last = len(journal.packed(frames[:-1]))
+    path = tmp_path / "damaged.journal"
+    for place in range(0, last, 11):
+        for bit in (0, 1, 5, 7):
+            data = bytearray(good)
+            data[place] ^= 1 << bit
+            path.write_bytes(data)
+            with pytest.raises(CorruptJournal, match=r"damaged\.journal: "):
+                _remembered(path)
+            assert path.read_bytes() == data
+
+
+def _remembered(path: Path) -> None:
+    with closing(Retrace(path)) as old:
+        remember(old)
+
+
+def test_the_worlds_record_of_another_scenario_is_refused(record: Path) -> None:
+    says = f"{record / 'world.journal'}: the record of another scenario, paper-1"
+    refuses(record, "world", "paper-2", "--listen", free_endpoint(), says=says)
+
+
+def test_an_agents_record_of_another_briefing_is_refused(record: Path, tmp_path: Path) -> None:
+    scenario = tmp_path / "farther.toml"
+    scenario.write_text(PAPER_1.replace("anchor = [10.0", "anchor = [10.5"))
+    says = f"{record / 'agent-a.journal'}: another run's: its briefing is not this world's"
+    with world(scenario) as (_, endpoint):
+        refuses(record, "agent", "a", "--connect", endpoint, says=says)
+
+
+def test_an_agents_record_in_which_it_sensed_otherwise_is_no_use(record: Path, paper_2: str) -> None:
+    path = record / "agent-a.journal"
+    path.write_bytes(journal.packed(list(journal.read(path))[:4]))
+    with Command("agent", "b", "--connect", paper_2):  # whose briefings are those of paper-1
+        ended = tandem("agent", "a", "--connect", paper_2, "--out", record)
+    said = "the record is another run's: in this one, a senses otherwise at tick 0"
+    assert (ended.status, ended.err) == (3, f"tandem agent a: {said}\n")
+
+
+def test_a_record_on_which_it_decided_otherwise_is_refused(record: Path) -> None:
+    path = record / "agent-a.journal"
+    frames = list(journal.read(path))
+    place = next(i for i, frame in enumerate(frames) if frame[5:].find(b"drive\x0c") > 0)
+    drive = decode(frames[place], Drive)
+    assert drive.tick == 12
+    frames[place] = encode(replace(drive, v=drive.v / 2.0))
+    path.write_bytes(journal.packed(frames))
+    says = f"{path}: on record it decided otherwise at tick 12: the journal is another version's"
+    refuses(record, "agent", "a", "--connect", free_endpoint(), says=says)
+
+
+def test_a_journal_that_another_process_has_is_refused(record: Path) -> None:
+    with closing(Retrace(record / "agent-a.journal")), closing(Retrace(record / "world.journal")):
+        for name, part in (
+            ("agent-a", ("agent", "a", "--connect", free_endpoint())),
+            ("world", ("world", "paper-1", "--listen", free_endpoint())),
+        ):
+            refuses(record, *part, says=f"{record / name}.journal is in use by another process")
+
+
+def test_a_journal_is_locked_as_long_as_it_is_open(tmp_path: Path) -> None:
+    path = tmp_path / "a.journal"
+    with Journal(path) as book:
+        book.write(b"one")
+        with pytest.raises(CannotRecord, match="in use by another process"):
+            Retrace(path)
+    Retrace(path).close()
+
+
+def test_a_world_that_has_lost_its_record_is_told_so(record: Path, paper_1: str) -> None:
+    with Command("agent", "b", "--connect", paper_1):
+        ended = tandem("agent", "a", "--connect", paper_1, "--out", record)
+    tick = past(journal.read(record / "agent-a.journal"), "a").steps[-1].sense.tick
+    assert ended.status == 3
+    said = f"started again without its record: the world is at tick 0, a knows it up to {tick}"
+    assert ended.err == f"tandem agent a: {said}\n"
+
+
+def test_a_run_is_a_new_one(record: Path) -> None:
+    before = journals(record)
+    ended = tandem("run", "paper-1", "--out", record)
+    refused(ended, f"--out: {record} holds a record already; choose another folder")
+    assert journals(record) == before
+
+
+def test_an_empty_journal_is_begun(tmp_path: Path) -> None:
+    (tmp_path / "world.journal").touch()
+    old = Retrace(tmp_path / "world.journal")
+    course = again(load("paper-1"), old)
+    book, cut = old.go_on()
+    with book:
+        assert (course.tick, cut) == (0, 0)
+    with Journal(tmp_path / "new") as new:
+        Course(load("paper-1"), new)
+    assert (tmp_path / "world.journal").read_bytes() == (tmp_path / "new").read_bytes()
+
+
+def test_a_mission_under_noise_is_folded_to_the_bit(tmp_path: Path) -> None:
+    scenario = load("noisy")
+    play(scenario, tmp_path)
+    for robot in ("a", "b"):
+        with closing(Retrace(tmp_path / f"agent-{robot}.journal")) as old:
+            memory = remember(old)
+            assert memory is not None
+            assert memory.farewell is not None
+    with closing(Retrace(tmp_path / "world.journal")) as old:
+        assert again(scenario, old).parted.keys() == {"a", "b"}
