@@ -11,7 +11,7 @@ import msgspec
 
 from agent import planner
 from agent.mind import Mind
-from protocol.journal import Journal
+from protocol.journal import Sink
 from protocol.messages import Briefing, Drive, End, Farewell, Missed, Report, Sense
 from protocol.wire import encode
 
@@ -26,7 +26,7 @@ class Told(msgspec.Struct, frozen=True):
 class Robot:
     """One robot's mind, and the record of what went in and came out of it."""
 
-    def __init__(self, briefing: Briefing, journal: Journal | None = None) -> None:
+    def __init__(self, briefing: Briefing, journal: Sink | None = None) -> None:
         self.mind = Mind(briefing)
         self.told: Told | None = None
         """the report of this tick, if there was anyone to hear it"""

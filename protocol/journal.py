@@ -12,6 +12,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
+from typing import Protocol
 
 import msgpack
 
@@ -32,6 +33,24 @@ class RecordExists(CannotRecord):
 
 class CorruptJournal(ValueError):
     """A journal that is damaged before its end."""
+
+
+class Sink(Protocol):
+    """What takes frames, in order."""
+
+    def write(self, *frames: bytes) -> None:
+        """All of `frames`, at once."""
+
+
+class Kept:
+    """A journal that is kept in memory, for whoever judges the run as soon as it is over."""
+
+    def __init__(self) -> None:
+        self.frames: list[bytes] = []
+
+    def write(self, *frames: bytes) -> None:
+        """All of `frames`."""
+        self.frames += frames
 
 
 class Journal:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from protocol.journal import Journal
+from protocol.journal import Sink
 from protocol.messages import Drive, End, Farewell, Missed, Sense
 from protocol.wire import encode
 from world.referee import Judgement
@@ -18,7 +18,7 @@ class Course:
     The journal holds the scenario, every tick's Drives (in the scenario's order), End and the Farewells.
     """
 
-    def __init__(self, scenario: Scenario, journal: Journal | None = None) -> None:
+    def __init__(self, scenario: Scenario, journal: Sink | None = None) -> None:
         self.world = release(scenario)
         self._journal = journal
         if journal is not None:
