@@ -90,6 +90,9 @@ def _parser() -> argparse.ArgumentParser:
     figures = command("figures", "Draw a record: a picture for each of its robots, into DIR/figures.")
     figures.add_argument("record", type=_folder, metavar="DIR", help="where `tandem run --out DIR` left it")
 
+    audit = command("audit", "Judge a record: what its journals say, held against the world and the planner.")
+    audit.add_argument("record", type=_folder, metavar="DIR", help="where `tandem run --out DIR` left it")
+
     command("scenarios", "List the scenarios and the campaigns that ship.")
 
     bench = command("bench", "Measure speed, against the bare thing in the same run.")
