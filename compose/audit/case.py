@@ -47,7 +47,7 @@ class Case(msgspec.Struct, frozen=True):
 
     @property
     def forced(self) -> bool:
-        """Whether the world did not wait for every answer: in real time, or where it has lost its patience."""
+        """Whether the world did not wait for every answer: in real time, or with its patience lost."""
         failed = self.history.end is not None and self.history.end.outcome == "failed"
         return failed or any(past.briefing.tick_s is not None for past in self.pasts.values())
 

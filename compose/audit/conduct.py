@@ -35,7 +35,7 @@ def decision(case: Case) -> Checks:
 
 
 def _answers(again: Robot, robot: str, step: Step, *, cut: bool) -> Checks:
-    """What `again` does in that tick, held against the record, which lacks the end of a tick if it is `cut`."""
+    """What `again` does in that tick, held against the record, which lacks its end if it is `cut`."""
     tick = step.sense.tick
     told = again.sense(step.sense, step.frame)
     if told is not None and step.report is not None:
