@@ -179,6 +179,7 @@ class AgentProcess:
         if sense.tick > known + 1:
             raise NoWorld(f"too late: the world is at tick {sense.tick}, {self._id} knows it up to {known}")
         if sense.tick == known + 1:
+            self._decide_when_all_is_heard(overdue=True)  # in real time the world has gone on without it
             self._sense = sense
             if self._tick_s is not None:
                 self._due = time.monotonic() + REPORT_SHARE * self._tick_s
@@ -208,7 +209,7 @@ class AgentProcess:
 
     # --- what is done about it ---
 
-    def _decide_when_all_is_heard(self) -> None:
+    def _decide_when_all_is_heard(self, *, overdue: bool = False) -> None:
         if self._sense is None or self._robot.drive is not None:
             return
         heard: list[Told] = []
@@ -218,7 +219,7 @@ class AgentProcess:
                 told = self._reports.get(tick)
                 if told is not None:
                     heard.append(told)
-                elif self._due is None or time.monotonic() < self._due:
+                elif not overdue and (self._due is None or time.monotonic() < self._due):
                     return
                 else:
                     missed.append(contact.peer)
