@@ -127,6 +127,12 @@ def _add_sweep(parser: argparse.ArgumentParser) -> None:
     )
     where.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask scheduler that runs already")
     parser.add_argument("--processes", action="store_true", help="trials as processes, over Zenoh")
+    parser.add_argument(
+        "--audit",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="judge every trial's journals, as `tandem audit` does (it takes most of the time)",
+    )
     parser.add_argument("--retry", action="store_true", help="play again what was lost before")
     parser.add_argument("-q", "--quiet", action="store_true", help="print only the counts")
 
