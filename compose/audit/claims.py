@@ -30,7 +30,7 @@ def claim(case: Case) -> Checks:
         why = mistake(made, case.history.ticks[tick].world.truth.poses[place])
         yield None if why is None else Violation("claim", tick, placed.id, f"it claims a pose that is {why}")
         past = case.pasts.get(placed.id)
-        if past is not None and tick < len(past.steps):
+        if past is not None and tick < len(past.steps) and past.steps[tick].drive is not None:
             yield _redundant(case, placed, past, tick)
     yield _outcome(case)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from agent.past import Past, Step
@@ -71,10 +72,20 @@ def report(case: Case) -> Checks:
     """Every report that was heard is, to the byte, what the peer has on record as sent."""
     for robot, past in case.pasts.items():
         peer = case.pasts.get(past.briefing.peer)
+        if peer is None:
+            continue
         for step in past.steps:
             for told in step.heard:
-                if peer is not None and (told.report.tick < len(peer.steps) or peer.farewell is not None):
+                if told.report.tick < _on_record(peer):
                     yield _as_sent(robot, step, told, peer)
+
+
+def _on_record(peer: Past) -> float:
+    """Of the ticks before this, the peer's journal holds every report that it sent."""
+    if peer.farewell is not None:
+        return math.inf
+    cut = peer.steps and peer.steps[-1].drive is None and peer.steps[-1].report is None
+    return len(peer.steps) - 1 if cut else len(peer.steps)
 
 
 def _as_sent(robot: str, step: Step, told: Told, peer: Past) -> Violation | None:
