@@ -132,11 +132,12 @@ def lost(cell: int, trial: int, seed: int, error: str, wall_s: float | None) -> 
 def play(trial: Trial) -> Row:
     """Play it. What it raises becomes a row with that error."""
     began = time.perf_counter()
-    record, findings = (_as_processes if trial.processes else _in_process)(trial.scenario, audit=trial.audit)
+    record, findings = (_as_processes if trial.processes else in_process)(trial.scenario, audit=trial.audit)
     return row(trial, record, time.perf_counter() - began, findings)
 
 
-def _in_process(scenario: Scenario, *, audit: bool) -> tuple[Record, Findings | None]:
+def in_process(scenario: Scenario, *, audit: bool) -> tuple[Record, Findings | None]:
+    """Its run in this process; its journals are kept only to be judged."""
     if not audit:
         return inline.play(scenario), None
     kept = {name: Kept() for name in inline.journals(scenario)}

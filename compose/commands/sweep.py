@@ -45,10 +45,10 @@ def main(options: argparse.Namespace) -> int:
         return STOPPED if results.interrupted else FAILED
     figures.draw(results, out / "figures")
     report.show(results, out, quiet=options.quiet)
-    return _status(results)
+    return status_of(results)
 
 
-def _status(results: Results) -> int:
+def status_of(results: Results) -> int:
     """As of a mission: localised only where all are; failed where any is, or breaks a rule."""
     counts = [figures.failed + figures.violations for figures in results.figures.values()]
     if any(counts):
