@@ -9,7 +9,7 @@ from agent.past import Past, Step
 from agent.robot import Robot
 from compose.audit.case import Case
 from compose.audit.findings import Checks, Violation, difference, said
-from protocol.messages import End, Estimate, Farewell, Message, Report
+from protocol.messages import End, Farewell, Message, Report
 from protocol.mission import Mission
 from protocol.motion import Controls
 from protocol.wire import decode, encode
@@ -39,21 +39,24 @@ def _answers(again: Robot, robot: str, step: Step, *, cut: bool) -> Checks:
     tick = step.sense.tick
     told = again.sense(step.sense, step.frame)
     if told is not None and step.report is not None:
-        yield _same(tick, robot, step.report.report, told.report)
+        yield _same(tick, robot, step.report.report, told.frame)
     elif told is not None and not (cut and step.drive is None):
         yield Violation("decision", tick, robot, "it sent no Report, expected one")
     elif step.report is not None:
         yield Violation("decision", tick, robot, "it sent a Report, expected none: nobody is in contact")
     if step.drive is not None:
-        yield _same(tick, robot, step.drive, again.decide(step.heard, step.missed))
+        again.decide(step.heard, step.missed)
+        yield _same(tick, robot, step.drive, again.drive_frame)
     if step.estimate is not None:
-        yield _same(tick, robot, step.estimate, decode(again.estimate(), Estimate))
+        yield _same(tick, robot, step.estimate, again.estimate())
 
 
-def _same(tick: int, robot: str, found: Message, expected: Message) -> Violation | None:
-    if encode(found) == encode(expected):
+def _same(tick: int, robot: str, found: Message, expected: bytes) -> Violation | None:
+    """What is on record is what the frame `expected` says."""
+    if encode(found) == expected:
         return None
-    return Violation("decision", tick, robot, f"in its {type(found).__name__}, {difference(found, expected)}")
+    wanted = decode(expected, type(found))
+    return Violation("decision", tick, robot, f"in its {type(found).__name__}, {difference(found, wanted)}")
 
 
 def _last_word(again: Robot, robot: str, end: End, found: Farewell) -> Violation | None:
@@ -64,7 +67,7 @@ def _last_word(again: Robot, robot: str, end: End, found: Farewell) -> Violation
         reports_unheard=found.reports_unheard,
         frames_refused=found.frames_refused,
     )
-    return _same(end.tick, robot, found, expected)
+    return _same(end.tick, robot, found, encode(expected))
 
 
 def limits(case: Case) -> Checks:
