@@ -41,6 +41,18 @@ class Past(msgspec.Struct, frozen=True):
     farewell: Farewell | None = None
 
 
+class OutOfOrder(CorruptJournal):
+    """A frame that is sound, and stands where none of its kind can."""
+
+    def __init__(self, message: msgspec.Struct, place: int, source: object) -> None:
+        self.place = place
+        """how many frames stand before it"""
+        self.tick: int | None = getattr(message, "tick", None)
+        at = f" of tick {self.tick}" if self.tick is not None else ""
+        self.what = f"a {type(message).__name__}{at} is out of order"
+        super().__init__(f"{source}: {self.what}")
+
+
 def past(frames: Iterable[bytes], source: object) -> Past:
     """What `frames` tell. Raises CorruptJournal, whose text begins with `source`."""
     briefing: Briefing | None = None
@@ -49,10 +61,10 @@ def past(frames: Iterable[bytes], source: object) -> Past:
     farewell: Farewell | None = None
     for place, frame in enumerate(frames):
         message = _message(frame, source)
-        if (place == 0) != isinstance(message, Briefing):
-            raise CorruptJournal(f"{source}: an agent's journal begins with its Briefing, and has but one")
+        if place == 0 and not isinstance(message, Briefing):
+            raise CorruptJournal(f"{source}: an agent's journal begins with its Briefing")
         match message:
-            case Briefing():
+            case Briefing() if place == 0:
                 briefing = message
             case End() if end is None:
                 end = message
@@ -62,9 +74,12 @@ def past(frames: Iterable[bytes], source: object) -> Past:
                 steps.append(Step(message, frame))
             case Report() | Missed() | Drive() | Estimate() if steps and end is None:
                 assert briefing is not None
-                steps[-1] = _with(steps[-1], message, frame, briefing.robot, source)
+                onward = _with(steps[-1], message, frame, briefing.robot)
+                if onward is None:
+                    raise OutOfOrder(message, place, source)
+                steps[-1] = onward
             case _:
-                raise _out_of_order(message, source)
+                raise OutOfOrder(message, place, source)
     if briefing is None:
         raise CorruptJournal(f"{source}: there is no Briefing in it")
     return Past(briefing, tuple(steps), end, farewell)
@@ -77,8 +92,8 @@ def _message(frame: bytes, source: object) -> Any:
         raise CorruptJournal(f"{source}: {error}") from None
 
 
-def _with(step: Step, message: object, frame: bytes, robot: str, source: object) -> Step:
-    """`step`, and what came next in it."""
+def _with(step: Step, message: object, frame: bytes, robot: str) -> Step | None:
+    """`step`, and what came next in it; none where that cannot come next."""
     match message:
         case Estimate(tick=step.sense.tick) if step.drive is not None and step.estimate is None:
             return replace(step, estimate=message)
@@ -91,10 +106,4 @@ def _with(step: Step, message: object, frame: bytes, robot: str, source: object)
         case Report() if message.robot != robot and step.drive is None:
             return replace(step, heard=(*step.heard, Told(message, frame)))
         case _:
-            raise _out_of_order(message, source)
-
-
-def _out_of_order(message: object, source: object) -> CorruptJournal:
-    tick = getattr(message, "tick", None)
-    at = f" of tick {tick}" if tick is not None else ""
-    return CorruptJournal(f"{source}: a {type(message).__name__}{at} is out of order")
+            return None

@@ -101,6 +101,9 @@ def _parser() -> argparse.ArgumentParser:
     figures = command("figures", "Draw a record: a picture for each of its robots, into DIR/figures.")
     figures.add_argument("record", type=_folder, metavar="DIR", help="where `tandem run --out DIR` left it")
 
+    audit = command("audit", "Judge a record: what its journals say, held against the world and the planner.")
+    audit.add_argument("record", type=_folder, metavar="DIR", help="where `tandem run --out DIR` left it")
+
     command("scenarios", "List the scenarios and the campaigns that ship.")
 
     bench = command("bench", "Measure speed, against the bare thing in the same run.")
@@ -142,6 +145,12 @@ def _add_sweep(parser: argparse.ArgumentParser) -> None:
     )
     where.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask scheduler that runs already")
     parser.add_argument("--processes", action="store_true", help="trials as processes, over Zenoh")
+    parser.add_argument(
+        "--audit",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="judge every trial's journals, as `tandem audit` does (it takes most of the time)",
+    )
     parser.add_argument("--retry", action="store_true", help="play again what was lost before")
     parser.add_argument("-q", "--quiet", action="store_true", help="print only the counts")
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 
 from agent.robot import Robot, Told
-from compose.record import WORLD_JOURNAL, Moment, Record
-from protocol.journal import Journal
+from compose.record import WORLD_JOURNAL, Moment, Record, agent_journal
+from protocol.journal import Journal, Sink
 from protocol.messages import Drive, End, Farewell
 from world.course import Course
 from world.faults import MAX_DELAY
@@ -18,13 +20,24 @@ def play(scenario: Scenario, out: Path | None = None) -> Record:
 
     Raises journal.CannotRecord if `out` holds a record, or cannot be written.
     """
+    if out is None:
+        return played(scenario, {})
+    with ExitStack() as open_ones:
+        return played(
+            scenario, {name: open_ones.enter_context(Journal(out / name)) for name in journals(scenario)}
+        )
+
+
+def journals(scenario: Scenario) -> list[str]:
+    """What its journals are called."""
+    return [*[agent_journal(robot.id) for robot in scenario.robots], WORLD_JOURNAL]
+
+
+def played(scenario: Scenario, sinks: Mapping[str, Sink]) -> Record:
+    """The run of `scenario`, whose journals go to `sinks`, by name: all of them, or none."""
     ids = [robot.id for robot in scenario.robots]
-    journals: dict[str, Journal] = {}
-    if out is not None:
-        journals = {robot: Journal(out / f"agent-{robot}.journal") for robot in ids}
-    world_journal = Journal(out / WORLD_JOURNAL) if out is not None else None
-    course = Course(scenario, world_journal)
-    robots = {robot: Robot(scenario.briefing(robot), journals.get(robot)) for robot in ids}
+    course = Course(scenario, sinks.get(WORLD_JOURNAL))
+    robots = {robot: Robot(scenario.briefing(robot), sinks.get(agent_journal(robot))) for robot in ids}
     moments: list[Moment] = []
     end: End | None = None
     told: dict[tuple[str, int], Told] = {}
@@ -38,7 +51,7 @@ def play(scenario: Scenario, out: Path | None = None) -> Record:
         for sense in senses:
             heard = [told[contact.peer, tick] for contact in sense.contacts for tick in contact.heard]
             drives[sense.robot] = robots[sense.robot].decide(heard)
-            if out is not None:
+            if robots[sense.robot].journaled:
                 robots[sense.robot].estimate()
         if len(told) > MAX_DELAY * len(ids):
             told = {key: one for key, one in told.items() if key[1] >= course.tick - MAX_DELAY - 1}
@@ -46,7 +59,4 @@ def play(scenario: Scenario, out: Path | None = None) -> Record:
         end = course.drive(drives)
     farewells: dict[str, Farewell] = {robot: robots[robot].farewell(end) for robot in ids}
     course.farewells(farewells.values())
-    for journal in [*journals.values(), world_journal]:
-        if journal is not None:
-            journal.close()
     return Record(scenario, tuple(moments), end, farewells)

@@ -18,29 +18,22 @@ from typing import Any, Literal
 import msgspec
 
 from compose.claim import Claim, claim, matrix
+from compose.history import history
 from compose.status import UserError
 from protocol import journal
-from protocol.messages import (
-    Briefing,
-    Drive,
-    End,
-    Estimate,
-    Farewell,
-    Localised,
-    Missed,
-    Outcome,
-    Report,
-    Sense,
-)
+from protocol.messages import Drive, End, Estimate, Farewell, Localised, Outcome
 from protocol.motion import Pose, wrap
-from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 from world.scenario import Scenario
 from world.sensors import anchor_ranges, executed, mutual_ranges
-from world.tick import World, advance, release
 from world.truth import Truth, asked
 
 Mode = Literal["processes", "in-process"]
 WORLD_JOURNAL = "world.journal"
+
+
+def agent_journal(robot: str) -> str:
+    """The name of the file that `robot` keeps its record in."""
+    return f"agent-{robot}.journal"
 
 
 @contextmanager
@@ -92,34 +85,11 @@ def read(folder: Path) -> Record:
     Raises OSError if there is none, journal.CorruptJournal if it is damaged before its end.
     """
     path = folder / WORLD_JOURNAL
-    frames = journal.read(path)
-    moments: list[Moment] = []
-    farewells: dict[str, Farewell] = {}
-    end: End | None = None
-    try:
-        scenario = decode(next(frames, b""), Scenario, MAX_FRAME_BYTES)
-        world = release(scenario)
-        drives: dict[str, Drive] = {}
-        missed = 0
-        for frame in frames:
-            match decode(frame, Drive | Missed | End | Farewell):
-                case Drive() as drive:
-                    drives[drive.robot] = drive
-                case Missed():
-                    missed += 1
-                case End() as end:
-                    continue
-                case Farewell() as farewell:
-                    farewells[farewell.robot] = farewell
-            if len(drives) + missed == len(scenario.robots):
-                moments.append(Moment(world.truth, drives))
-                onward = advance(world, drives)
-                drives, missed = {}, 0
-                if isinstance(onward, World):
-                    world = onward
-    except MalformedFrame as error:
-        raise journal.CorruptJournal(f"{path}: {error}") from None
-    return Record(scenario, tuple(moments), end, farewells)
+    told = history(journal.read(path), path)
+    if told.disorder is not None:
+        raise journal.CorruptJournal(f"{path}: {told.disorder.what}")
+    moments = tuple([Moment(tick.world.truth, tick.drives) for tick in told.ticks])
+    return Record(told.scenario, moments, told.end, told.farewells)
 
 
 def estimates(folder: Path, robot: str) -> tuple[Estimate, ...]:
@@ -127,23 +97,29 @@ def estimates(folder: Path, robot: str) -> tuple[Estimate, ...]:
 
     Raises OSError if there is none, journal.CorruptJournal if it is damaged before its end, or another's.
     """
-    path = folder / f"agent-{robot}.journal"
-    found: list[Estimate] = []
+    from agent.past import past  # noqa: PLC0415  # whoever launches, and reads how it went, needs no planner
+
+    path = folder / agent_journal(robot)
+    frames = list(journal.read(path))
+    if not frames:
+        return ()  # killed before it was briefed
+    told = past(frames, path)
+    if told.briefing.robot != robot:
+        raise journal.CorruptJournal(f"{path} is the journal of {told.briefing.robot}")
+    return tuple([step.estimate for step in told.steps if step.estimate is not None])
+
+
+@contextmanager
+def legible(folder: Path) -> Iterator[None]:
+    """Whatever keeps the record in `folder` from being read is a line for the user. Raises UserError."""
     try:
-        for place, frame in enumerate(journal.read(path)):
-            message = decode(frame, _OF_AN_AGENT, MAX_FRAME_BYTES)
-            if isinstance(message, Briefing) != (place == 0):
-                raise journal.CorruptJournal(f"{path}: an agent's journal begins with its Briefing")
-            if isinstance(message, Briefing) and message.robot != robot:
-                raise journal.CorruptJournal(f"{path} is the journal of {message.robot}")
-            if isinstance(message, Estimate):
-                found.append(message)
-    except MalformedFrame as error:
-        raise journal.CorruptJournal(f"{path}: {error}") from None
-    return tuple(found)
-
-
-_OF_AN_AGENT = Briefing | Sense | Report | Drive | Estimate | Missed | End | Farewell
+        yield
+    except FileNotFoundError:
+        raise UserError(f"{folder} holds no record: there is no {WORLD_JOURNAL}") from None
+    except OSError as error:
+        raise UserError(f"{folder} cannot be read: {error.strerror or error}") from None
+    except journal.CorruptJournal as error:
+        raise UserError(str(error)) from None
 
 
 def ticks_csv(record: Record) -> str:

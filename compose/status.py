@@ -7,6 +7,10 @@ ENDED = 0
 """of a process that `tandem run` launched: its mission came to an End, whichever"""
 NOT_LOCALISED = 1
 """the mission came to its end, otherwise"""
+CLEAN = 0
+"""of an audit: nothing was found"""
+VIOLATED = 1
+"""something was"""
 USER_ERROR = 2
 FAILED = 3
 """the run itself was lost"""

@@ -44,6 +44,17 @@ class Sink(Protocol):
         """All of `frames`, at once."""
 
 
+class Kept:
+    """A journal that is kept in memory, for whoever judges the run as soon as it is over."""
+
+    def __init__(self) -> None:
+        self.frames: list[bytes] = []
+
+    def write(self, *frames: bytes) -> None:
+        """All of `frames`."""
+        self.frames += frames
+
+
 class Journal:
     """An open journal. A new file, never an old one: what is on record stays, and goes on by a `Retrace`."""
 

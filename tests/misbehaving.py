@@ -7,10 +7,17 @@ import sys
 import tempfile
 import threading
 from pathlib import Path
+from unittest.mock import patch
 
+from msgspec.structs import replace
+
+from agent import planner
+from agent.robot import Robot
+from compose import inline
 from compose.campaign import run, spec, trial
 from compose.stop import stop_by_signal
 from protocol.inbox import Inbox
+from protocol.wire import encode
 
 
 def astray(one: trial.Trial) -> trial.Row:
@@ -23,6 +30,25 @@ def astray(one: trial.Trial) -> trial.Row:
         case 5:
             threading.Event().wait()
     return trial.play(one)
+
+
+def boastful(one: trial.Trial) -> trial.Row:
+    """In the third trial of a cell robots say that they know where they are before they do."""
+    if one.number != 2:
+        return trial.play(one)
+    with patch.object(inline, "Robot", Boaster):
+        return trial.play(one)
+
+
+class Boaster(Robot):
+    """A robot whose estimates do not follow from what it knows."""
+
+    def estimate(self) -> bytes:
+        """Says that it is localised."""
+        frame = encode(replace(planner.estimate(self.mind), localised=True))
+        assert self._journal is not None
+        self._journal.write(frame)
+        return frame
 
 
 def endless(one: trial.Trial) -> trial.Row:

@@ -275,6 +275,8 @@ def loaded_by(module: str) -> set[str]:
         ("agent.planner", {"zenoh", "scipy", "rich", "world", "compose"}),
         ("compose.inline", {"zenoh", "rich"}),
         ("compose.campaign.worker", {"zenoh", "rich", "distributed", "dask", "pyarrow", "matplotlib"}),
+        ("compose.commands.audit", {"zenoh", "rich", "distributed", "matplotlib", "pyarrow"}),
+        ("compose.record", {"zenoh", "numpy", "scipy", "rich", "agent"}),
         ("compose.commands.figures", {"zenoh", "numpy", "rich", "distributed", "matplotlib"}),
         ("compose.commands.sweep", {"zenoh", "rich", "distributed", "dask", "pyarrow", "matplotlib"}),
     ],

@@ -23,9 +23,11 @@ import pytest
 from matplotlib.figure import Figure
 from scipy.stats import binomtest  # type: ignore[import-untyped]
 
-from compose.campaign import figures, run, spec
+from compose.campaign import figures, report, run, spec
 from compose.campaign.cells import Refused, cells, setting_of, trial_seed
 from compose.campaign.summary import wilson
+from compose.campaign.worker import PLAY
+from compose.commands.sweep import status_of
 from compose.scenario import load
 from compose.status import UserError
 from protocol.inbox import Inbox
@@ -114,12 +116,16 @@ def played(
     *,
     trials: int | None = None,
     workers: int = 2,
+    play: str = PLAY,
+    audit: bool = True,
     done: Callable[[int], None] = lambda _: None,
 ) -> run.Results:
     """The campaign, as the command plays it, but for figures and what is said."""
     silent = run.Progress(say=print, begin=lambda *_: None, done=done)
     campaign = spec.load(str(folder / source), trials=trials)
-    return run.sweep(campaign, folder / out, run.Means(workers=workers), Inbox("test"), silent)
+    return run.sweep(
+        campaign, folder / out, run.Means(workers=workers, play=play, audit=audit), Inbox("test"), silent
+    )
 
 
 def sweep_up(folder: Path) -> None:
@@ -151,6 +157,7 @@ def test_rows_are_the_same_as_processes_over_zenoh(folder: Path) -> None:
     played(folder, "both.toml", "inline", trials=1)
     assert sweep(folder, "both.toml", "zenoh", "--trials", "1", "--processes").status in (0, 1)
     assert rows(folder / "zenoh") == rows(folder / "inline")
+    assert {row["violations"] for row in rows(folder / "zenoh")} == {0}
 
 
 def dask(stack: ExitStack, module: str, *arguments: str | Path, cwd: Path) -> subprocess.Popen[bytes]:
@@ -408,6 +415,43 @@ def test_the_command_that_the_table_prints_plays_the_trial_again(folder: Path) -
         for name in ("branch", "alpha", "position_error_m", "heading_error_rad"):
             assert row[f"{robot}_{name}"] == said[name]
     assert row["bytes_sent"] == sum(robot["bytes_sent"] for robot in summary["robots"].values())
+
+
+# --- every trial is judged ------------------------------------------------------------------------------
+
+
+def test_a_trial_that_breaks_a_rule_fails_the_campaign_and_is_named(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    results = played(folder, "both.toml", "out", trials=4, play="tests.misbehaving:boastful")
+    found = rows(folder / "out")
+    assert [row["violations"] > 0 for row in found] == [row["trial"] == 2 for row in found]
+    first = "tick 0, a, decision: in its Estimate, localised is true, expected false"
+    assert {row["first_violation"] for row in found} == {first, None}
+    summary = summary_rows(folder / "out")
+    assert [(row["audited"], row["clean"]) for row in summary] == [("4", "3")] * 4
+    assert [int(row["violations"]) for row in summary] == [
+        row["violations"] for row in found if row["trial"] == 2
+    ]
+    assert status_of(results) == 3
+    report.show(results, folder / "out", quiet=True)
+    said = capsys.readouterr().out.splitlines()
+    assert said[-1] == f"audited: 16 of 16 trials, 12 clean; trial 2 of cell 0: {first}"
+    report.show(results, folder / "out", quiet=False)
+    said = capsys.readouterr().out.splitlines()
+    assert any(line.startswith("to look at first: trial 2 of cell 0, ") and first in line for line in said)
+    heading = next(line for line in said if line.startswith(" cell")).split()
+    line = next(line for line in said if line.startswith(" 0 ")).split()
+    assert line[heading.index("clean")] == "3"
+
+
+def test_a_campaign_without_audit_says_nothing_of_it(folder: Path) -> None:
+    ended = sweep(folder, "both.toml", "out", "--trials", "1", "--no-audit")
+    assert "audited" not in ended.out
+    assert {(row["violations"], row["first_violation"]) for row in rows(folder / "out")} == {(None, None)}
+    assert [(row["audited"], row["clean"], row["violations"]) for row in summary_rows(folder / "out")] == [
+        ("0", "0", "0")
+    ] * 4
 
 
 def test_a_setting_in_which_nobody_can_meet_is_a_refused_cell(folder: Path) -> None:

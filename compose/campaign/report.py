@@ -26,7 +26,7 @@ RATE_OVER_S = 10.0
 """what the rate is averaged over"""
 OUTCOMES = ("localised", "undecided", "alarm", "wrong", "failed")
 LEGEND = "rate: 95 % interval (Wilson); ticks: of trials that localised; error: m, of the worse robot"
-WIDEST = (*OUTCOMES, "rate", "rate_low", "rate_high", "p50", "p95", "max", "error p50", "error max")
+WIDEST = (*OUTCOMES, "clean", "rate", "rate_low", "rate_high", "p50", "p95", "max", "error p50", "error max")
 CHOICES = (
     ("trials", *WIDEST),
     ("trials", *WIDEST[:-2]),
@@ -75,6 +75,8 @@ def show(results: Results, out: Path, *, quiet: bool) -> None:
     total = {name: sum([getattr(one, name) for one in results.figures.values()]) for name in OUTCOMES}
     counts = ", ".join([f"{count} {name}" for name, count in total.items() if count])
     print(f"{results.campaign.name}: {counts} of {len(results.table)} trials in {_cells(len(results.cells))}")
+    if any(one.audited for one in results.figures.values()):
+        print(_audited(results))
     if quiet:
         return
     legend = [LEGEND, NOISE_LEGEND] if _noisy(results) else [LEGEND]
@@ -90,6 +92,15 @@ def show(results: Results, out: Path, *, quiet: bool) -> None:
         print(f"to look at first: trial {note.trial} of cell {note.cell}, {how}{why}; any trial again:")
         print(f"  tandem run {file} --seed {note.seed} --out record")
     print(f"results: {out}")
+
+
+def _audited(results: Results) -> str:
+    """How many trials were judged, and the first violation."""
+    figures = results.figures.values()
+    audited, clean = sum([one.audited for one in figures]), sum([one.clean for one in figures])
+    note = noted(results.table) if clean < audited else None
+    first = f"; trial {note.trial} of cell {note.cell}: {note.why}" if note is not None else ""
+    return f"audited: {audited} of {len(results.table)} trials, {clean} clean{first}"
 
 
 def _lines(results: Results) -> list[str]:
@@ -140,6 +151,7 @@ def _figures(figures: Counted) -> dict[str, str]:
     return {
         "trials": str(figures.trials),
         **{name: str(getattr(figures, name)) for name in OUTCOMES},
+        "clean": str(figures.clean) if figures.audited else "-",
         "rate": _number(figures.rate, ".4f"),
         "rate_low": _number(figures.rate_low, ".4f"),
         "rate_high": _number(figures.rate_high, ".4f"),

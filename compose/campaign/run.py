@@ -31,6 +31,8 @@ class Means(msgspec.Struct, frozen=True):
     """the address of Dask's"""
     processes: bool = False
     """trials as processes over Zenoh"""
+    audit: bool = True
+    """judge every trial's journals"""
     play: str = PLAY
     retry: bool = False
     """play again what was lost before"""
@@ -119,7 +121,8 @@ def _left(folder: Folder, progress: Progress) -> list[Work]:
 
 
 def _play(folder: Folder, work: list[Work], means: Means, inbox: Inbox, progress: Progress) -> None:
-    orders = Orders(folder.campaign.seed, means.processes, folder.campaign.trial_timeout, means.play)
+    campaign = folder.campaign
+    orders = Orders(campaign.seed, means.processes, campaign.trial_timeout, means.play, means.audit)
 
     def keep(rows: list[Row]) -> None:
         folder.add(rows)

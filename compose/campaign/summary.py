@@ -73,12 +73,18 @@ class Counted(msgspec.Struct, frozen=True):
     """root mean square of the position errors of all robots, over that of their Cramér-Rao bounds"""
     reports_p50: float | None
     """sent, by all"""
+    audited: int
+    """trials"""
+    clean: int
+    """of these, without a violation"""
+    violations: int
+    """in all"""
     refused: str | None
     """why no mission can be played in this setting"""
 
 
 class Noted(msgspec.Struct, frozen=True):
-    """A trial that deserves a look: the worst outcome; where all localised, the longest."""
+    """A trial that deserves a look: one that breaks a rule; else the worst outcome; else the longest."""
 
     cell: int
     trial: int
@@ -99,6 +105,7 @@ def counted(table: pa.Table, refused: str | None = None) -> Counted:
     right = table.filter(pa.array([outcome != "wrong" for outcome in outcomes], pa.bool_()))
     claims, nees = int(_known(column(table, "claims")).sum()), _known(column(right, "nees"))
     nees_low, nees_high = nees_band(len(nees))
+    violations = _known(column(table, "violations"))
     return Counted(
         trials=n,
         **counts,
@@ -122,6 +129,9 @@ def counted(table: pa.Table, refused: str | None = None) -> Counted:
         nees_high=nees_high,
         rmse_over_bound=_rmse_over_bound(right),
         reports_p50=_percentile(_known(column(table, "reports_sent")), 50),
+        audited=len(violations),
+        clean=int((violations == 0.0).sum()),
+        violations=int(violations.sum()),
         refused=refused,
     )
 
@@ -207,7 +217,11 @@ def noted(table: pa.Table) -> Noted | None:
         return None
     outcomes = table["outcome"].to_pylist()
     worst = next((outcome for outcome in WORSE if outcome in outcomes), None)
-    place = outcomes.index(worst) if worst is not None else int(np.nanargmax(column(table, "ticks")))
+    broken = np.flatnonzero(column(table, "violations") > 0.0)
+    if len(broken):
+        place = int(broken[0])
+    else:
+        place = outcomes.index(worst) if worst is not None else int(np.nanargmax(column(table, "ticks")))
     found = table.slice(place, 1).to_pylist()[0]
     return Noted(
         cell=found["cell"],
@@ -215,7 +229,7 @@ def noted(table: pa.Table) -> Noted | None:
         seed=found["seed"],
         outcome=found["outcome"],
         ticks=found["ticks"],
-        why=found["error"] or found["reason"],
+        why=found["first_violation"] or found["error"] or found["reason"],
     )
 
 

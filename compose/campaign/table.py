@@ -20,10 +20,10 @@ _KINDS: dict[str, pa.DataType] = {
     "cell": pa.int32(),
     "trial": pa.int32(),
     "seed": pa.int64(),
-    **dict.fromkeys(("outcome", "reason", "error", "branch"), pa.string()),
+    **dict.fromkeys(("outcome", "reason", "error", "branch", "first_violation"), pa.string()),
     **dict.fromkeys(("ticks", "first_contact_tick", "orbiting_tick", "meeting_tick"), pa.int64()),
     **dict.fromkeys(("t_max_ticks", "candidates", "candidates_left"), pa.int64()),
-    **dict.fromkeys(("hypotheses", "claims", "claims_within"), pa.int64()),
+    **dict.fromkeys(("hypotheses", "claims", "claims_within", "violations"), pa.int64()),
     **dict.fromkeys(("reports_sent", "reports_heard", "bytes_sent"), pa.int64()),
     **dict.fromkeys(("period_s", "t_max_s", "wall_s", "position_error_m"), pa.float64()),
     **dict.fromkeys(

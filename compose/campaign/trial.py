@@ -12,10 +12,13 @@ import msgspec
 from msgspec.structs import replace
 
 from compose import inline
+from compose.audit import judge
+from compose.audit.findings import Findings
 from compose.claim import Claim
 from compose.record import Record, first_claim, first_contact, read
 from compose.scenario import run_name
 from protocol.inbox import Inbox
+from protocol.journal import Kept
 from protocol.messages import Farewell, Outcome
 from protocol.motion import Covariance
 from world.scenario import Scenario
@@ -38,6 +41,8 @@ class Trial(msgspec.Struct, frozen=True):
     scenario: Scenario
     processes: bool
     """over Zenoh, instead of in this process"""
+    audit: bool = False
+    """whether its journals are judged, as soon as it is over"""
 
 
 class RobotRow(msgspec.Struct, frozen=True, array_like=True):
@@ -114,6 +119,9 @@ class Row(msgspec.Struct, frozen=True, array_like=True):
     reports_heard: int | None = None
     bytes_sent: int | None = None
     """of reports, by all"""
+    violations: int | None = None
+    """that the audit found; none if there was none"""
+    first_violation: str | None = None
     wall_s: float | None = None
     robots: dict[str, RobotRow] = {}
 
@@ -126,22 +134,31 @@ def lost(cell: int, trial: int, seed: int, error: str, wall_s: float | None) -> 
 def play(trial: Trial) -> Row:
     """Play it. What it raises becomes a row with that error."""
     began = time.perf_counter()
-    record = _as_processes(trial.scenario) if trial.processes else inline.play(trial.scenario)
-    return row(trial, record, time.perf_counter() - began)
+    record, findings = (_as_processes if trial.processes else in_process)(trial.scenario, audit=trial.audit)
+    return row(trial, record, time.perf_counter() - began, findings)
 
 
-def _as_processes(scenario: Scenario) -> Record:
+def in_process(scenario: Scenario, *, audit: bool) -> tuple[Record, Findings | None]:
+    """Its run in this process; its journals are kept only to be judged."""
+    if not audit:
+        return inline.play(scenario), None
+    kept = {name: Kept() for name in inline.journals(scenario)}
+    record = inline.played(scenario, kept)
+    return record, judge.judge({name: journal.frames for name, journal in kept.items()})
+
+
+def _as_processes(scenario: Scenario, *, audit: bool) -> tuple[Record, Findings | None]:
     from compose import local  # noqa: PLC0415  # in-process trials do without
 
     with tempfile.TemporaryDirectory(prefix="tandem-") as folder:
         out = Path(folder)
         inbox = Inbox("tandem sweep")
         local.play(scenario, out, inbox, run=run_name(scenario), rate=None, patience=PATIENCE_S)
-        return read(out)
+        return read(out), judge.audit(out) if audit else None
 
 
-def row(trial: Trial, record: Record, wall_s: float) -> Row:
-    """What is kept of a record."""
+def row(trial: Trial, record: Record, wall_s: float, findings: Findings | None = None) -> Row:
+    """What is kept of a record, and of what its audit found."""
     scenario, end = record.scenario, record.end
     if end is None:
         return lost(trial.cell, trial.number, scenario.seed, "the record breaks off", wall_s)
@@ -177,6 +194,8 @@ def row(trial: Trial, record: Record, wall_s: float) -> Row:
         reports_sent=sum([farewell.reports_sent for farewell in said]),
         reports_heard=sum([farewell.reports_heard for farewell in said]),
         bytes_sent=sum([farewell.bytes_sent for farewell in said]),
+        violations=len(findings.violations) if findings is not None else None,
+        first_violation=findings.violations[0].line if findings is not None and findings.violations else None,
         wall_s=round(wall_s, 6),
         robots=robots,
     )

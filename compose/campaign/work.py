@@ -57,6 +57,7 @@ class Orders(msgspec.Struct, frozen=True):
     timeout: float
     """s"""
     play: str
+    audit: bool
 
 
 def chunks_of(
@@ -71,7 +72,14 @@ def chunks_of(
             seeds = tuple([trial_seed(orders.seed, source.key, trial) for trial in trials])
             yield (
                 Chunk(
-                    source.cell, trials, seeds, source.setting, orders.processes, orders.timeout, orders.play
+                    source.cell,
+                    trials,
+                    seeds,
+                    source.setting,
+                    orders.processes,
+                    orders.timeout,
+                    orders.play,
+                    orders.audit,
                 ),
                 source,
             )

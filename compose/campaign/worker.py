@@ -48,6 +48,8 @@ class Chunk(msgspec.Struct, frozen=True):
     """s of wall time that a trial may last"""
     play: str = PLAY
     """module:function, from a trial to its row"""
+    audit: bool = False
+    """each of them"""
 
     def after(self, done: int) -> Chunk:
         """What is left of it after so many trials."""
@@ -104,7 +106,8 @@ def _played(chunk: Chunk, number: int, seed: int) -> trial.Row:
     began = time.perf_counter()
     try:
         player = _function(chunk.play)
-        return player(trial.Trial(chunk.cell, number, chunk.setting.seeded(seed), chunk.processes))
+        scenario = chunk.setting.seeded(seed)
+        return player(trial.Trial(chunk.cell, number, scenario, chunk.processes, chunk.audit))
     except BaseException as error:  # noqa: BLE001  # a trial that tries to end the process is lost, too
         said = one_line(f"{type(error).__name__}: {error}")[:MAX_ERROR]
         return trial.lost(chunk.cell, number, seed, said, time.perf_counter() - began)

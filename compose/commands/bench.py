@@ -24,6 +24,7 @@ from rich.table import Table
 
 from agent.robot import Robot
 from compose import barrier, inline, local, record, scenario
+from compose.campaign.trial import in_process
 from compose.status import LOCALISED
 from protocol import session
 from protocol.inbox import Inbox
@@ -146,6 +147,7 @@ def _missions(rounds: int, done: Callable[[], None]) -> Table:
     scenarios = [scenario.load("random", seed=SEED + i) for i in range(MISSIONS)]
     whole: list[float] = []
     world_part: list[float] = []
+    audited: list[float] = []
     ticks = sum(len(inline.play(one).moments) for one in scenarios)
     for _ in range(rounds):
         began = time.perf_counter()
@@ -153,11 +155,17 @@ def _missions(rounds: int, done: Callable[[], None]) -> Table:
             inline.play(one)
         whole.append(time.perf_counter() - began)
         world_part.append(sum(_world_alone(inline.play(one)) for one in scenarios))
+        began = time.perf_counter()
+        for one in scenarios:
+            in_process(one, audit=True)
+        audited.append(time.perf_counter() - began)
         done()
     table = _table("In-process, one core")
     _row(table, f"{MISSIONS} random missions (at least 300)", [MISSIONS / s for s in whole], "missions/s")
     _row(table, f"a tick, of {ticks / MISSIONS:.1f} a mission", [1e6 * s / ticks for s in whole], "us")
     _row(table, "of which the world", [1e6 * s / ticks for s in world_part], "us")
+    _row(table, "the same missions, audited", [MISSIONS / s for s in audited], "missions/s")
+    _row(table, "of those without", [plain / s for plain, s in zip(whole, audited, strict=True)], "")
     return table
 
 

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from compose.lab import need
-from compose.record import WORLD_JOURNAL, Record, estimates, read
+from compose.record import agent_journal, estimates, legible, read
 from compose.status import ENDED, FAILED, UserError
 from protocol.inbox import one_line
 from protocol.journal import CorruptJournal
@@ -17,7 +17,8 @@ from protocol.messages import Estimate
 def main(options: argparse.Namespace) -> int:
     """Draw each robot of the record; FAILED if one of them has left no journal that can be read."""
     need("matplotlib")
-    record = _record(options.record)
+    with legible(options.record):
+        record = read(options.record)
     from compose.figures import robot  # noqa: PLC0415  # slow, and there may be no extra
 
     folder = options.record / "figures"
@@ -37,25 +38,14 @@ def main(options: argparse.Namespace) -> int:
     return status
 
 
-def _record(folder: Path) -> Record:
-    try:
-        return read(folder)
-    except FileNotFoundError:
-        raise UserError(f"{folder} holds no record: there is no {WORLD_JOURNAL}") from None
-    except OSError as error:
-        raise UserError(f"{folder} cannot be read: {error.strerror or error}") from None
-    except CorruptJournal as error:
-        raise UserError(str(error)) from None
-
-
 def _estimates(folder: Path, robot: str) -> tuple[Estimate, ...] | None:
     """None, and a line that says why, where they cannot be read."""
     try:
         return estimates(folder, robot)
     except FileNotFoundError:
-        why = f"agent-{robot}.journal is missing"
+        why = f"{agent_journal(robot)} is missing"
     except OSError as error:
-        why = f"agent-{robot}.journal cannot be read: {error.strerror or error}"
+        why = f"{agent_journal(robot)} cannot be read: {error.strerror or error}"
     except CorruptJournal as error:
         why = str(error)
     print(one_line(f"tandem figures: no picture of {robot}: {why}"), file=sys.stderr)

@@ -27,7 +27,13 @@ def main(options: argparse.Namespace) -> int:
 
     out = options.out if options.out is not None else Path(f"sweep-{campaign.name}")
     chosen = {"workers": options.workers} if options.workers is not None else {}
-    means = run.Means(scheduler=options.scheduler, processes=options.processes, retry=options.retry, **chosen)
+    means = run.Means(
+        scheduler=options.scheduler,
+        processes=options.processes,
+        audit=options.audit,
+        retry=options.retry,
+        **chosen,
+    )
     visible = sys.stdout.isatty() and not options.quiet
     with report.progress(campaign.name, inbox.say, visible) as progress:
         results = run.sweep(campaign, out, means, inbox, progress)
@@ -39,12 +45,12 @@ def main(options: argparse.Namespace) -> int:
         return STOPPED if results.interrupted else FAILED
     figures.draw(results, out / "figures")
     report.show(results, out, quiet=options.quiet)
-    return _status(results)
+    return status_of(results)
 
 
-def _status(results: Results) -> int:
-    """As of a mission: localised only where all are; failed where any is."""
-    counts = [figures.failed for figures in results.figures.values()]
+def status_of(results: Results) -> int:
+    """As of a mission: localised only where all are; failed where any is, or breaks a rule."""
+    counts = [figures.failed + figures.violations for figures in results.figures.values()]
     if any(counts):
         return FAILED
     localised = sum([figures.localised for figures in results.figures.values()])

@@ -1,0 +1,118 @@
+"""Whether nobody was wrong, or could have been; and whether it ended as the referee says."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from agent.letter import CHECKED as CHECKED_BY_LETTER
+from agent.letter import REDUNDANT
+from agent.past import Past
+from agent.phases.encounter import ELSEWHERE
+from agent.phases.seeking import travelled
+from agent.survey import CHECKED, CHECKED_WITH_OUTLIERS
+from compose.audit.case import Case
+from compose.audit.findings import Checks, Violation
+from protocol.messages import Localised
+from protocol.motion import Pose
+from world.referee import Judgement, mistake
+from world.scenario import Placed
+
+PLACES = 3
+"""different relative placements that exact ranges must have been taken from: two leave several solutions"""
+
+
+def claim(case: Case) -> Checks:
+    """Whoever claimed to be localised was right, and had a redundant range; the End is the referee's."""
+    for place, placed in enumerate(case.history.scenario.robots):
+        tick, made = _first_claim(case, placed.id)
+        if made is None:
+            continue
+        why = mistake(made, case.history.ticks[tick].world.truth.poses[place])
+        yield None if why is None else Violation("claim", tick, placed.id, f"it claims a pose that is {why}")
+        past = case.pasts.get(placed.id)
+        if past is not None and tick < len(past.steps) and past.steps[tick].drive is not None:
+            yield _redundant(case, placed, past, tick)
+    yield _outcome(case)
+
+
+def _first_claim(case: Case, robot: str) -> tuple[int, Localised | None]:
+    """What it claimed, and when; whatever it says later, it has said that."""
+    for tick, one in enumerate(case.history.ticks):
+        drive = one.drives.get(robot)
+        if drive is not None and isinstance(drive.verdict, Localised):
+            return tick, drive.verdict
+    return 0, None
+
+
+def _redundant(case: Case, placed: Placed, past: Past, tick: int) -> Violation | None:
+    """It had as many ranges as a claim takes, until the last tick of which it had heard the peer's log."""
+    scenario = case.history.scenario
+    noise = scenario.mission.noise
+    told = [told.report.through for step in past.steps[: tick + 1] for told in step.heard]
+    through = min(max(told, default=-1), tick)
+    mutual = _ranged(past, through)
+    if noise.exact:
+        places = _places(case, placed, mutual)
+        return _too_few(tick, placed, "relative placements with a mutual range", places, PLACES)
+    if scenario.variant == "assured":
+        least = CHECKED_WITH_OUTLIERS if noise.outliers else CHECKED
+        return _too_few(tick, placed, "mutual ranges", len(mutual), least)
+    peer = case.pasts.get(placed.peer)
+    if noise.outliers and peer is not None:
+        ranges = len(mutual) + sum([_anchored(one, through) for one in (past, peer)])
+        return _too_few(tick, placed, "ranges", ranges, REDUNDANT)
+    return _too_few(tick, placed, "mutual ranges", len(mutual), CHECKED_BY_LETTER)
+
+
+def _too_few(tick: int, placed: Placed, what: str, found: int, expected: int) -> Violation | None:
+    if found >= expected:
+        return None
+    return Violation(
+        "claim", tick, placed.id, f"it claims by {found} {what}, expected {expected} at the least"
+    )
+
+
+def _ranged(past: Past, through: int) -> list[int]:
+    """The ticks of its mutual ranges."""
+    return [
+        step.sense.tick
+        for step in past.steps[: through + 1]
+        if any(contact.range is not None for contact in step.sense.contacts)
+    ]
+
+
+def _anchored(past: Past, through: int) -> int:
+    """How many ranges to its anchor it had."""
+    return sum([step.sense.anchor_range is not None for step in past.steps[: through + 1]])
+
+
+def _places(case: Case, placed: Placed, ticks: Sequence[int]) -> int:
+    """From how many different relative placements of the pair the ranges of those ticks were taken."""
+    ids = [robot.id for robot in case.history.scenario.robots]
+    one, other = ids.index(placed.id), ids.index(placed.peer)
+    found: list[tuple[Pose, Pose]] = []
+    for tick in ticks:
+        local = case.history.ticks[tick].world.truth.local
+        here = local[one], local[other]
+        if all(
+            any(travelled(*both) > ELSEWHERE for both in zip(here, there, strict=True)) for there in found
+        ):
+            found.append(here)
+    return len(found)
+
+
+def _outcome(case: Case) -> Violation | None:
+    """The End is what the referee says, by the truth; a run may have failed before he says anything."""
+    end, judgement = case.history.end, case.history.judgement
+    if end is None:
+        return None
+    found = Judgement(end.outcome, end.reason)
+    if judgement is not None and found != judgement:
+        return Violation("claim", end.tick, None, f"it ends {_told(found)}, expected {_told(judgement)}")
+    if judgement is None and end.outcome != "failed":
+        return Violation("claim", end.tick, None, f"it ends {_told(found)}, expected it to go on")
+    return None
+
+
+def _told(judgement: Judgement) -> str:
+    return f"{judgement.outcome} ({judgement.reason})" if judgement.reason else judgement.outcome

@@ -1,0 +1,60 @@
+"""The audit of a record: every rule held against it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from pathlib import Path
+
+from compose.audit.case import Case, case_of
+from compose.audit.claims import claim
+from compose.audit.conduct import decision, limits, log
+from compose.audit.findings import Checks, Count, Findings, Violation
+from compose.audit.journals import briefing, order
+from compose.audit.wires import contact, report, sense
+from compose.record import WORLD_JOURNAL
+from protocol import journal
+
+RULES: tuple[Callable[[Case], Checks], ...] = (
+    order,
+    briefing,
+    sense,
+    contact,
+    report,
+    decision,
+    limits,
+    log,
+    claim,
+)
+"""each by its name; where one violation follows from another, it comes later"""
+
+
+def audit(folder: Path) -> Findings:
+    """What there is to find in the record in `folder`.
+
+    Raises OSError if there is none, journal.CorruptJournal if a frame in it cannot be understood, or stands
+    in the journal of another robot.
+    """
+    journals = {WORLD_JOURNAL: journal.read(folder / WORLD_JOURNAL)}
+    for path in folder.glob("agent-*.journal"):
+        with suppress(FileNotFoundError):
+            journals[path.name] = journal.read(path)
+    return judge(journals, folder)
+
+
+def judge(journals: Mapping[str, Iterable[bytes]], folder: object = "the record") -> Findings:
+    """What there is to find in the frames of `journals`, by name; `folder` is where errors say they are.
+
+    Raises journal.CorruptJournal like `audit`.
+    """
+    case = case_of(journals, folder)
+    counts: list[Count] = []
+    violations: list[Violation] = []
+    for rule in RULES:
+        checks = list(rule(case))
+        found = [check for check in checks if check is not None]
+        counts.append(Count(rule.__name__, len(checks), len(found)))
+        violations += found
+    violations.sort(key=lambda one: -1 if one.tick is None else one.tick)
+    history = case.history
+    return Findings(history.scenario.name, len(history.ticks), tuple(counts), tuple(violations))

@@ -1,0 +1,39 @@
+"""`tandem audit`: whether a record keeps the rules."""
+
+from __future__ import annotations
+
+import argparse
+
+from compose.audit.findings import Findings
+from compose.audit.judge import audit
+from compose.record import legible
+from compose.status import CLEAN, VIOLATED
+from protocol.inbox import one_line
+
+SHOWN = 20
+"""violations that are told in full"""
+
+
+def main(options: argparse.Namespace) -> int:
+    """Judge the record, and say what there is to find."""
+    with legible(options.record):
+        findings = audit(options.record)
+    _show(findings)
+    return VIOLATED if findings.violations else CLEAN
+
+
+def _show(findings: Findings) -> None:
+    print(f"{findings.scenario}: {_count(len(findings.violations))} in {findings.ticks} ticks\n")
+    print(f"{'rule':10}{'checks':>8}{'violations':>12}")
+    for one in findings.counts:
+        print(f"{one.rule:10}{one.checks:>8}{one.violations:>12}")
+    if findings.violations:
+        print()
+    for violation in findings.violations[:SHOWN]:
+        print(one_line(violation.line))
+    if len(findings.violations) > SHOWN:
+        print(f"and {len(findings.violations) - SHOWN} more")
+
+
+def _count(violations: int) -> str:
+    return "one violation" if violations == 1 else f"{violations or 'no'} violations"

@@ -1,0 +1,721 @@
+"""The judge: an honest record keeps every rule, and whatever is planted in one is found, named and placed."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from signal import SIGCONT, SIGSTOP
+from typing import Any
+
+import msgpack
+import pytest
+from msgspec.structs import replace
+
+from agent import planner
+from agent.mind import Mind
+from agent.robot import Robot
+from compose import inline
+from compose.audit.findings import Findings, Violation
+from compose.audit.judge import RULES, audit, judge
+from compose.record import WORLD_JOURNAL, agent_journal, read
+from compose.scenario import load, parse
+from protocol import journal
+from protocol.journal import CorruptJournal, Kept
+from protocol.messages import (
+    Briefing,
+    Contact,
+    Drive,
+    End,
+    Estimate,
+    Farewell,
+    Localised,
+    Missed,
+    Report,
+    Sense,
+    Undecided,
+)
+from protocol.motion import Covariance, Run
+from protocol.wire import MAX_FRAME_BYTES, decode, encode
+from tests.commands import SECTION_IV, Command, Ended, process_of, several_pairs, tandem
+from tests.test_real_time import missed
+from world.course import Course
+from world.referee import Judgement
+from world.scenario import Scenario
+
+KINDS = Scenario | Briefing | Sense | Report | Drive | Estimate | Missed | End | Farewell
+Found = tuple[int | None, str | None, str]
+"""tick, robot and rule of a violation"""
+NOISE = f"""
+name = "noise"
+seed = SEED
+{SECTION_IV}
+noise.anchor_sigma = 0.01
+noise.mutual_sigma = 0.01
+noise.outliers = 0.05
+noise.drop_outs = 0.1
+noise.actuation = {{v = 0.01, omega = 0.01, v_floor = 1e-4, omega_floor = 1e-4}}
+noise.odometry = {{v = 0.01, omega = 0.01, v_floor = 1e-4, omega_floor = 1e-4}}
+[planner]
+variant = "VARIANT"
+[[robot]]
+id = "a"
+anchor = [0.0, 0.0]
+[[robot]]
+id = "b"
+anchor = [6.0, 0.0]
+"""
+LAST = 48
+"""the tick in which paper-1 ends"""
+A, B = agent_journal("a"), agent_journal("b")
+
+
+def noise(seed: int, variant: str) -> Scenario:
+    return parse(NOISE.replace("SEED", str(seed)).replace("VARIANT", variant), "noise")
+
+
+def kept(scenario: Scenario) -> dict[str, list[bytes]]:
+    """The journals of its run in this process."""
+    books = {name: Kept() for name in inline.journals(scenario)}
+    inline.played(scenario, books)
+    return {name: book.frames for name, book in books.items()}
+
+
+def found(findings: Findings) -> list[Found]:
+    return [(one.tick, one.robot, one.rule) for one in findings.violations]
+
+
+def checks(findings: Findings) -> dict[str, int]:
+    return {one.rule: one.checks for one in findings.counts}
+
+
+# --- honest runs ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        *[pytest.param(load(name), id=name) for name in ("paper-1", "paper-2", "noisy")],
+        *[pytest.param(load("random", seed=seed), id=f"random-{seed}") for seed in range(40)],
+        *[pytest.param(load("noisy", seed=seed), id=f"noisy-{seed}") for seed in range(3)],
+        *[pytest.param(noise(seed, "assured"), id=f"noise-{seed}") for seed in range(3)],
+        *[pytest.param(noise(seed, "paper"), id=f"letter-{seed}") for seed in range(3)],
+        pytest.param(parse(several_pairs(3), "pairs"), id="three-pairs"),
+    ],
+)
+def test_an_honest_run_keeps_every_rule(scenario: Scenario) -> None:
+    journals = kept(scenario)
+    findings = judge(journals)
+    assert findings.violations == ()
+    made, ticks, robots = checks(findings), findings.ticks, len(scenario.robots)
+    assert list(made) == [rule.__name__ for rule in RULES]
+    assert made["briefing"] == robots
+    assert made["sense"] == robots * ticks
+    assert (
+        made["decision"] == 2 * robots * ticks + made["log"] + robots
+    )  # Drives, Estimates; Reports; Farewells
+    assert made["order"] == 1 + robots * (2 * ticks + 3)
+    heard = [decode(frame, KINDS, MAX_FRAME_BYTES) for name in journals for frame in journals[name]]
+    assert made["report"] == made["log"] == sum(isinstance(one, Report) for one in heard) / 2
+
+
+def test_journals_in_memory_are_those_on_disk(tmp_path: Path) -> None:
+    scenario = load("paper-1")
+    inline.play(scenario, tmp_path)
+    journals = kept(scenario)
+    assert {path.name: list(journal.read(path)) for path in tmp_path.iterdir()} == journals
+    assert audit(tmp_path) == judge(journals)
+
+
+def test_a_run_as_processes_keeps_every_rule_and_the_command_says_so(tmp_path: Path) -> None:
+    assert tandem("run", "noisy", "--out", tmp_path / "out", "-q").status == 0
+    ended = tandem("audit", tmp_path / "out")
+    assert (ended.status, ended.err) == (0, "")
+    lines = ended.out.splitlines()
+    ticks = len(read(tmp_path / "out").moments)
+    assert lines[:3] == [f"noisy: no violations in {ticks} ticks", "", "rule        checks  violations"]
+    assert [line.split()[0] for line in lines[3:]] == [rule.__name__ for rule in RULES]
+    assert [line.split()[2] for line in lines[3:]] == ["0"] * len(RULES)
+    assert lines[5].split() == ["sense", str(2 * ticks), "0"]
+
+
+def test_a_run_in_real_time_in_which_drives_were_missed_keeps_every_rule(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with Command("run", "paper-2", "--rate", "20", "--out", out, "-q") as run:
+        run.until_written(out / WORLD_JOURNAL, 3000)
+        stopped = process_of(out, "agent", "a")
+        os.kill(stopped, SIGSTOP)
+        run.until(lambda: missed(out / WORLD_JOURNAL, "a") >= 3, "three of a's Drives are missed")
+        os.kill(stopped, SIGCONT)
+        assert run.ended().status == 0
+    findings = audit(out)
+    assert findings.violations == ()
+    senses = [step for step in messages(out / A) if isinstance(step, Sense)]
+    assert len(senses) == findings.ticks > 100
+
+
+def test_a_run_that_failed_was_failed_by_nobody_on_record() -> None:
+    """The world ends it when nobody answers any more; a robot that did answers the End."""
+    scenario = load("paper-1")
+    books = {name: Kept() for name in inline.journals(scenario)}
+    course = Course(scenario, books[WORLD_JOURNAL])
+    robots = {robot: Robot(scenario.briefing(robot), books[agent_journal(robot)]) for robot in "ab"}
+    for _ in range(5):
+        drives = {}
+        for sense in course.senses():
+            robots[sense.robot].sense(sense)
+            drives[sense.robot] = robots[sense.robot].decide()
+            robots[sense.robot].estimate()
+        assert course.drive(drives) is None
+    a, _ = course.senses()
+    robots["a"].sense(a)
+    robots["a"].decide()
+    robots["a"].estimate()
+    end = course.end(Judgement("failed", "no answer from b at tick 5 for 30 s"))
+    course.farewells([robots["a"].farewell(end)])
+    findings = judge({name: book.frames for name, book in books.items()})
+    assert found(findings) == [(4, "b", "order")]
+    assert findings.violations[0].what == "its journal breaks off here, expected End and Farewell"
+
+
+# --- a record that breaks off -----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def paper_1() -> dict[str, list[bytes]]:
+    return kept(load("paper-1"))
+
+
+@pytest.mark.parametrize("name", [WORLD_JOURNAL, A, B])
+def test_a_journal_that_breaks_off_anywhere_breaks_no_other_rule(
+    name: str, paper_1: dict[str, list[bytes]]
+) -> None:
+    whole = paper_1[name]
+    for count in range(name == WORLD_JOURNAL, len(whole)):
+        findings = judge(paper_1 | {name: whole[:count]})
+        if name == WORLD_JOURNAL and count >= len(whole) - 2:  # a Farewell is lacking, or both
+            assert {one.what for one in findings.violations} == {"the world has no Farewell of it"}
+            continue
+        (violation,) = findings.violations
+        left = [decode(frame, KINDS, MAX_FRAME_BYTES) for frame in whole[:count]]
+        ticks = [one.tick for one in left if isinstance(one, Sense)]
+        if name == WORLD_JOURNAL:
+            ticks = [one.tick for one in left[:-1] if isinstance(one, Drive) and one.robot == "b"]
+            ticks += [one.tick for one in left[-1:] if isinstance(one, Drive) and one.robot == "b"]
+        robot = {A: "a", B: "b"}.get(name)
+        assert (violation.rule, violation.robot, violation.tick) == (
+            "order",
+            robot,
+            ticks[-1] if ticks else None,
+        )
+        assert "its journal breaks off here" in violation.what
+
+
+def test_a_robot_that_has_left_no_journal_is_named(paper_1: dict[str, list[bytes]]) -> None:
+    findings = judge({name: frames for name, frames in paper_1.items() if name != B})
+    assert [one.line for one in findings.violations] == ["no tick, b, order: it has left no journal"]
+    assert checks(findings)["decision"] == 2 * (LAST + 1) + 3 + 1
+
+
+# --- what is planted ----------------------------------------------------------------------------------------
+
+
+def messages(path: Path) -> list[Any]:
+    return [decode(frame, KINDS, MAX_FRAME_BYTES) for frame in journal.read(path)]
+
+
+def written(path: Path, told: Iterable[Any]) -> None:
+    """The journal of these messages, each in a frame with a good CRC."""
+    path.write_bytes(b"".join([msgpack.packb(encode(message)) for message in told]))
+
+
+@pytest.fixture(scope="session")
+def honest(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The record of paper-1."""
+    folder = tmp_path_factory.mktemp("honest")
+    inline.play(load("paper-1"), folder)
+    return folder
+
+
+@pytest.fixture
+def folder(honest: Path, tmp_path: Path) -> Path:
+    """A copy of it."""
+    return Path(shutil.copytree(honest, tmp_path / "record"))
+
+
+def plant(path: Path, *edits: tuple[Callable[[Any], bool], Callable[[Any], Any]]) -> None:
+    """Change the one message that each of `edits` picks, to another, or to several, or to none."""
+    told = messages(path)
+    for picks, change in edits:
+        (place,) = [i for i, message in enumerate(told) if picks(message)]
+        put = change(told[place])
+        told[place : place + 1] = put if isinstance(put, list) else [put]
+    written(path, told)
+
+
+def of(kind: type, tick: int | None = None, robot: str | None = None) -> Callable[[Any], bool]:
+    """Picks the message of that kind, tick and robot."""
+    return lambda message: (
+        isinstance(message, kind)
+        and (tick is None or getattr(message, "tick", None) == tick)
+        and (robot is None or getattr(message, "robot", None) == robot)
+    )
+
+
+def to(**fields: Any) -> Callable[[Any], Any]:
+    return lambda message: replace(message, **fields)
+
+
+def nothing(_: Any) -> list[Any]:
+    return []
+
+
+def what(findings: Findings, rule: str) -> list[str]:
+    return [one.what for one in findings.violations if one.rule == rule]
+
+
+def test_drives_in_another_order_are_found_and_what_follows_is_not_read(folder: Path) -> None:
+    told = messages(folder / WORLD_JOURNAL)
+    a, b = (i for i, one in enumerate(told) if isinstance(one, Drive) and one.tick == 12)
+    told[a], told[b] = told[b], told[a]
+    written(folder / WORLD_JOURNAL, told)
+    findings = audit(folder)
+    assert [one.line for one in findings.violations] == [
+        "tick 12, the world, order: a Drive of b of tick 12 is out of order"
+    ]
+    assert findings.ticks == 12
+
+
+@pytest.mark.parametrize("kind", [Sense, Drive, Estimate])
+def test_a_frame_that_an_agent_has_not_journaled_is_missed(kind: type, folder: Path) -> None:
+    plant(folder / A, (of(kind, 12), nothing))
+    findings = audit(folder)
+    assert found(findings) == [(12, "a", "order")]
+
+
+def test_a_tick_that_an_agent_has_left_out_is_missed(folder: Path) -> None:
+    told = [one for one in messages(folder / A) if getattr(one, "tick", None) != 12]
+    written(folder / A, told)
+    assert [one.line for one in audit(folder).violations] == [
+        "tick 12, a, order: a Sense of tick 13 stands where that of tick 12 should"
+    ]
+
+
+def test_a_drive_that_the_world_was_not_given_is_found(folder: Path) -> None:
+    plant(folder / A, (of(Drive, 12), to(omega=0.25)))
+    findings = audit(folder)
+    assert found(findings) == [(12, "a", "order"), (12, "a", "decision")]
+    assert what(findings, "order") == ["the world's Drive of it: omega is 0.15384615384615385, expected 0.25"]
+    assert what(findings, "decision") == ["in its Drive, omega is 0.25, expected 0.15384615384615385"]
+
+
+def test_a_drive_that_the_world_has_changed_is_found_and_leads_elsewhere(folder: Path) -> None:
+    plant(folder / WORLD_JOURNAL, (of(Drive, 40, "b"), to(v=0.5)))
+    findings = audit(folder)
+    assert found(findings)[:2] == [(40, "b", "order"), (41, "b", "sense")]
+    assert {(robot, rule) for tick, robot, rule in found(findings)[1:]} <= {
+        ("a", "sense"), ("b", "sense"), ("a", "contact"), ("b", "contact"), (None, "claim"), ("b", "claim")
+    }  # fmt: skip
+
+
+def test_a_drive_that_was_missed_in_lockstep_is_found(folder: Path) -> None:
+    plant(folder / WORLD_JOURNAL, (of(Drive, LAST, "a"), lambda _: Missed(LAST, "a")))
+    assert (LAST, "a", "order") in found(audit(folder))
+    assert "the world went without its Drive, expected it to wait" in what(audit(folder), "order")
+
+
+def test_a_report_that_was_missed_in_lockstep_is_found(folder: Path) -> None:
+    plant(folder / A, (of(Report, LAST, "b"), lambda _: Missed(LAST, "b")))
+    findings = audit(folder)
+    assert (LAST, "a", "order") in found(findings)
+    assert {rule for _, _, rule in found(findings)} == {"order", "decision", "claim"}  # by two ranges
+    assert {(tick, robot) for tick, robot, _ in found(findings)} == {(LAST, "a")}
+
+
+def test_an_end_and_a_farewell_that_are_told_otherwise_are_found(folder: Path) -> None:
+    plant(folder / A, (of(End), to(reason="none")), (of(Farewell), to(reports_heard=2)))
+    findings = audit(folder)
+    assert found(findings) == [(LAST, "a", "order")] * 2 + [(LAST, "a", "decision")]
+    assert what(findings, "order")[1] == "the world's Farewell of it: reports_heard is 3, expected 2"
+    assert what(findings, "decision") == ["in its Farewell, reports_heard is 2, expected 3"]
+
+
+@pytest.mark.parametrize("lacking", ["a", "b"])
+def test_a_farewell_that_the_world_has_not_got_is_missed(lacking: str, folder: Path) -> None:
+    plant(folder / WORLD_JOURNAL, (of(Farewell, robot=lacking), nothing))
+    assert [one.line for one in audit(folder).violations] == [
+        f"tick 48, {lacking}, order: the world has no Farewell of it"
+    ]
+
+
+def test_farewells_in_another_order_are_found(folder: Path) -> None:
+    told = messages(folder / WORLD_JOURNAL)
+    written(folder / WORLD_JOURNAL, [*told[:-2], told[-1], told[-2]])
+    assert found(audit(folder)) == [(None, None, "order"), (LAST, "a", "order")]
+
+
+def test_an_agent_that_ended_before_the_world_did_is_found(folder: Path) -> None:
+    told = [one for one in messages(folder / A) if getattr(one, "tick", None) != LAST or isinstance(one, End)]
+    written(folder / A, told)
+    findings = audit(folder)
+    assert (LAST, "a", "order") in found(findings)
+    assert what(findings, "order") == ["it went through 48 ticks, expected 49"]
+    assert {rule for _, _, rule in found(findings)} == {"order", "report", "decision"}
+
+
+def test_a_briefing_that_is_not_the_scenarios_is_found(folder: Path) -> None:
+    plant(folder / B, (of(Briefing), lambda told: replace(told, mission=replace(told.mission, accuracy=0.2))))
+    findings = audit(folder)
+    assert found(findings) == [(None, "b", "briefing")]
+    assert findings.violations[0].line.startswith("no tick, b, briefing: mission is ")
+
+
+def test_how_long_a_tick_lasts_is_not_the_scenarios_to_say(folder: Path) -> None:
+    for name in (A, B):
+        plant(folder / name, (of(Briefing), to(tick_s=0.5)))
+    assert found(audit(folder)) == []
+
+
+def test_a_sense_that_is_off_in_its_last_bit_is_found(folder: Path) -> None:
+    off = 2.1064680198465729
+    plant(folder / A, (of(Sense, 47), to(contacts=(Contact("b", off, (47,)),))))
+    findings = audit(folder)
+    assert found(findings) == [(47, "a", "sense")]
+    assert what(findings, "sense") == [
+        'contacts is [["b",2.106468019846573,[47]]], expected [["b",2.1064680198465724,[47]]]'
+    ]
+
+
+def test_a_sense_that_tells_of_another_manoeuvre_is_found(folder: Path) -> None:
+    sensed = messages(folder / A)
+    (before,) = [one for one in sensed if of(Sense, 30)(one)]
+    plant(folder / A, (of(Sense, 30), to(executed=replace(before.executed, v=-0.0, omega=0.0))))
+    findings = audit(folder)
+    assert found(findings)[0] == (30, "a", "sense")
+    assert len(what(findings, "sense")) == 1
+    assert {(robot, rule) for _, robot, rule in found(findings)} == {
+        ("a", "sense"), ("a", "decision"), ("a", "log")
+    }  # fmt: skip
+
+
+FAR = Report(20, "a", 2, "orbiting", None, 0, 0, (), 0, (), 0, 0)
+"""of a tick in which nobody is near"""
+
+
+def test_a_report_that_was_sent_out_of_contact_is_found(folder: Path) -> None:
+    plant(folder / A, (of(Sense, 20), lambda sense: [sense, FAR]))
+    findings = audit(folder)
+    assert found(findings) == [(20, "a", "contact"), (20, "a", "decision")]
+    assert what(findings, "contact") == ["it sent a report, expected none: out of contact"]
+
+
+def test_a_report_that_was_heard_out_of_contact_is_found(folder: Path) -> None:
+    plant(folder / A, (of(Sense, 20), lambda sense: [sense, FAR]))
+    plant(folder / B, (of(Sense, 20), lambda sense: [sense, FAR]))
+    findings = audit(folder)
+    heard = [one.what for one in findings.violations if one.robot == "b" and one.rule == "contact"]
+    assert heard == [
+        "it heard the reports of ticks [20], expected []",
+        "it heard the report of tick 20, expected none: out of contact at tick 20",
+    ]
+
+
+def test_a_late_report_from_out_of_contact_is_found(folder: Path) -> None:
+    """Heard in contact, and listed; but not sent in contact."""
+    late = replace(FAR, tick=45)
+    plant(folder / A, (of(Sense, 45), lambda sense: [sense, late]))
+    plant(
+        folder / B,
+        (
+            of(Sense, 46),
+            lambda sense: replace(sense, contacts=(Contact("a", sense.contacts[0].range, (46, 45)),)),
+        ),
+        (of(Report, 46, "a"), lambda report: [report, late]),
+    )
+    findings = audit(folder)
+    (heard,) = [one for one in findings.violations if one.robot == "b" and one.rule == "contact"]
+    assert heard.line == (
+        "tick 46, b, contact: it heard the report of tick 45, expected none: out of contact at tick 45"
+    )
+    assert (46, "b", "sense") in found(findings)
+
+
+def test_a_report_that_no_sense_has_listed_is_found(folder: Path) -> None:
+    plant(folder / A, (of(Report, 47, "b"), lambda report: [report, report]))
+    findings = audit(folder)
+    assert found(findings)[0] == (47, "a", "contact")
+    assert what(findings, "contact") == ["it heard the reports of ticks [47,47], expected [47]"]
+    assert {(robot, rule) for _, robot, rule in found(findings)[1:]} == {("a", "decision")}  # it counts them
+
+
+def test_a_report_that_was_listed_and_not_heard_is_found(folder: Path) -> None:
+    plant(folder / B, (of(Report, LAST, "a"), nothing))
+    findings = audit(folder)
+    assert found(findings)[0] == (LAST, "b", "contact")
+    assert what(findings, "contact") == ["it heard the reports of ticks [], expected [48]"]
+    assert set(found(findings)[1:]) == {(LAST, "b", "decision"), (LAST, "b", "claim")}  # by two ranges
+
+
+def test_a_report_that_was_changed_on_its_way_is_found(folder: Path) -> None:
+    plant(folder / B, (of(Report, LAST, "a"), to(state="radial")))
+    findings = audit(folder)
+    assert found(findings) == [(LAST, "b", "report")]
+    assert what(findings, "report") == ['in the report of tick 48, state is "radial", expected "waiting"']
+
+
+def test_a_report_that_was_never_sent_is_found(folder: Path) -> None:
+    plant(folder / B, (of(Sense, 20), lambda sense: [sense, FAR]))
+    findings = audit(folder)
+    assert what(findings, "report") == ["it heard a report of tick 20, which a never sent"]
+    assert {(robot, rule) for _, robot, rule in found(findings)} == {
+        ("b", "contact"), ("b", "report"), ("b", "decision")
+    }  # fmt: skip
+
+
+def test_an_estimate_that_does_not_follow_is_found(folder: Path) -> None:
+    plant(folder / A, (of(Estimate, 12), to(localised=True)))
+    findings = audit(folder)
+    assert found(findings) == [(12, "a", "decision")]
+    assert what(findings, "decision") == ["in its Estimate, localised is true, expected false"]
+
+
+def test_a_report_that_does_not_follow_is_found_at_its_sender(folder: Path) -> None:
+    for name in (A, B):
+        plant(folder / name, (of(Report, LAST, "a"), to(state="radial")))
+    assert found(audit(folder)) == [(LAST, "a", "decision")]
+
+
+def test_a_planner_that_fails_on_its_inputs_is_a_violation_and_no_crash(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(mind: Mind) -> Drive:
+        if mind.tick == 12 and mind.briefing.robot == "a":
+            raise ZeroDivisionError("12")
+        return drive(mind)
+
+    drive = planner.drive
+    monkeypatch.setattr(planner, "drive", fails)
+    assert [one.line for one in audit(folder).violations] == [
+        "tick 12, a, decision: the planner cannot go on from its inputs: ZeroDivisionError: 12"
+    ]
+
+
+@pytest.mark.parametrize("beyond", [{"v": 1.5}, {"v": -1.5}, {"omega": 3.2}])
+def test_a_drive_beyond_the_limits_is_found(beyond: dict[str, float], folder: Path) -> None:
+    for name in (A, WORLD_JOURNAL):
+        plant(folder / name, (of(Drive, LAST, "a"), to(**beyond)))
+    findings = audit(folder)
+    assert found(findings) == [(LAST, "a", "decision"), (LAST, "a", "limits")]
+    ((quantity, value),) = beyond.items()
+    most = {"v": "1", "omega": "3.14159"}[quantity]
+    assert what(findings, "limits") == [f"it asked for {quantity} = {value:g}, expected {most} at the most"]
+
+
+def test_a_manoeuvre_beyond_the_limits_is_found(folder: Path) -> None:
+    (before,) = [one for one in messages(folder / B) if of(Sense, LAST)(one)]
+    plant(folder / B, (of(Sense, LAST), to(executed=replace(before.executed, v=1.0 + 1e-9))))
+    findings = audit(folder)
+    assert what(findings, "limits") == ["it drove v = 1, expected 1 at the most"]
+    assert {(tick, robot) for tick, robot, _ in found(findings)} == {(LAST, "b")}
+    assert {rule for _, _, rule in found(findings)} == {"sense", "decision", "limits", "log"}
+
+
+def lied(folder: Path, change: Callable[[Report], Report]) -> Findings:
+    """Of a record in which a has told b otherwise, in its report of tick 48."""
+    for name in (A, B):
+        plant(folder / name, (of(Report, LAST, "a"), change))
+    return audit(folder)
+
+
+def test_a_manoeuvre_that_was_told_otherwise_is_found(folder: Path) -> None:
+    findings = lied(folder, to(runs=(Run(1, 0.9, 0.0), Run(1, 0.0, 0.0))))
+    assert (LAST, "a", "log") in found(findings)
+    assert what(findings, "log") == ["it told of (0.9, 0) until tick 47, expected [1.0,0.0]"]
+    assert {rule for _, _, rule in found(findings)} == {"log", "decision"}
+
+
+@pytest.mark.parametrize("tick", [5, 7])
+def test_a_range_that_was_told_otherwise_is_found(tick: int, folder: Path) -> None:
+    """Another than was measured; or one where nothing was."""
+
+    def change(report: Report) -> Report:
+        first, second, third = report.ranges
+        ranges = {5: (first, replace(second, range=2.5), third), 7: (first, second, replace(third, tick=7))}
+        return replace(report, ranges=ranges[tick])
+
+    for name in (A, B):
+        plant(folder / name, (of(Report, 46, "a"), change))
+    findings = audit(folder)
+    assert (46, "a", "log") in found(findings)
+    measured = {
+        5: "2.5 m at tick 5, expected 2.462210793129148",
+        7: "2.462210793129148 m at tick 7, expected null",
+    }
+    assert what(findings, "log") == [f"it told of {measured[tick]}"]
+    assert {rule for _, _, rule in found(findings)} == {"log", "decision"}
+
+
+def test_a_log_that_makes_no_sense_is_found(folder: Path) -> None:
+    findings = lied(folder, to(runs=(Run(2**31, 0.0, 0.0),)))
+    assert what(findings, "log") == ["it told manoeuvres that do not fill [46, 48]"]
+
+
+def claims(pose: Any, covariance: Covariance | None = None) -> Callable[[Any], Any]:
+    return to(verdict=Localised(pose, covariance))
+
+
+def test_a_claim_that_is_wrong_is_found_and_so_is_an_end_that_hides_it(folder: Path) -> None:
+    pose = read(folder).moments[LAST].truth.poses[0]
+    for name in (A, WORLD_JOURNAL):
+        plant(folder / name, (of(Drive, LAST, "a"), claims(replace(pose, x=pose.x + 2e-6))))
+    findings = audit(folder)
+    assert found(findings) == [(LAST, "a", "decision"), (LAST, "a", "claim"), (LAST, None, "claim")]
+    assert what(findings, "claim") == [
+        "it claims a pose that is 2e-06 m and 0 rad off",
+        "it ends localised, expected wrong (a claims a pose that is 2e-06 m and 0 rad off)",
+    ]
+
+
+def test_a_claim_without_a_redundant_range_is_found(folder: Path) -> None:
+    pose = read(folder).moments[47].truth.poses[0]
+    for name in (A, WORLD_JOURNAL):
+        plant(folder / name, (of(Drive, 47, "a"), claims(pose)))
+    findings = audit(folder)
+    assert found(findings) == [(47, "a", "decision"), (47, "a", "claim")]
+    assert what(findings, "claim") == [
+        "it claims by 2 relative placements with a mutual range, expected 3 at the least"
+    ]
+
+
+def test_ranges_taken_twice_in_the_same_place_are_not_redundant(folder: Path) -> None:
+    """In real time: neither moved before the third range."""
+    pose = read(folder).moments[47].truth.poses[0]
+    for name in (A, WORLD_JOURNAL):
+        plant(folder / name, (of(Drive, LAST, "a"), claims(pose)))
+    plant(folder / B, (of(Drive, 47), to(v=0.0, omega=0.0)))
+    plant(folder / WORLD_JOURNAL, (of(Drive, 47, "b"), to(v=0.0, omega=0.0)))
+    findings = audit(folder)
+    assert "it claims by 2 relative placements with a mutual range, expected 3 at the least" in what(
+        findings, "claim"
+    )
+
+
+@pytest.mark.parametrize(
+    ("variant", "says"),
+    [
+        ("assured", "mutual ranges, expected 12 at the least"),
+        ("paper", "ranges, expected 12 at the least"),
+    ],
+)
+def test_a_claim_by_too_few_noisy_ranges_is_found(variant: str, says: str, tmp_path: Path) -> None:
+    inline.play(noise(1, variant), tmp_path)
+    record = read(tmp_path)
+    first = next(one.tick for one in messages(tmp_path / A) if isinstance(one, Sense) and one.contacts)
+    pose = record.moments[first].truth.poses[0]
+    sure = Covariance(1e-6, 0.0, 0.0, 1e-6, 0.0, 1e-6)
+    for name in (A, WORLD_JOURNAL):
+        plant(tmp_path / name, (of(Drive, first, "a"), claims(pose, sure)))
+    findings = audit(tmp_path)
+    assert (first, "a", "claim") in found(findings)
+    assert what(findings, "claim")[0].startswith("it claims by ")
+    assert what(findings, "claim")[0].endswith(says)
+
+
+def test_an_end_that_is_not_the_referees_is_found(folder: Path) -> None:
+    for name in (A, B, WORLD_JOURNAL):
+        plant(folder / name, (of(End), to(outcome="undecided", reason="a: tired")))
+    assert [one.line for one in audit(folder).violations] == [
+        "tick 48, the world, claim: it ends undecided (a: tired), expected localised"
+    ]
+
+
+def test_a_run_that_ends_before_the_referee_says_so_is_found(folder: Path) -> None:
+    for robot, name in (("a", A), ("b", B)):
+        plant(folder / name, (of(Drive, LAST), to(verdict=None)))
+        plant(folder / WORLD_JOURNAL, (of(Drive, LAST, robot), to(verdict=None)))
+    findings = audit(folder)
+    assert (LAST, None, "order") in found(findings)  # the End of tick 48 has no place after its Drives
+    assert {rule for _, _, rule in found(findings)} == {"order", "decision"}
+
+
+def test_a_robot_that_gave_up_and_a_run_that_is_said_to_be_localised_are_found(folder: Path) -> None:
+    for name in (A, WORLD_JOURNAL):
+        plant(folder / name, (of(Drive, LAST, "a"), to(verdict=Undecided("tired"))))
+    findings = audit(folder)
+    assert found(findings) == [(LAST, "a", "decision"), (LAST, None, "claim")]
+    assert what(findings, "claim") == ["it ends localised, expected undecided (a: tired)"]
+
+
+def test_nothing_is_claimed_of_another_pair(tmp_path: Path) -> None:
+    inline.play(parse(several_pairs(3), "pairs"), tmp_path)
+    plant(tmp_path / agent_journal("d"), (of(Estimate, 3), to(localised=True)))
+    assert found(audit(tmp_path)) == [(3, "d", "decision")]
+
+
+# --- the command -----------------------------------------------------------------------------------------
+
+
+def test_the_command_tells_the_first_twenty_and_how_many_more(folder: Path) -> None:
+    told = messages(folder / A)
+    written(folder / A, [replace(one, localised=True) if isinstance(one, Estimate) else one for one in told])
+    ended = tandem("audit", folder)
+    assert (ended.status, ended.err) == (1, "")
+    lines = ended.out.splitlines()
+    assert lines[0] == "paper-1: 48 violations in 49 ticks"
+    assert re.fullmatch(r"decision +204 +48", lines[8])
+    assert lines[12:14] == ["", "tick 0, a, decision: in its Estimate, localised is true, expected false"]
+    assert len(lines[13:]) == 21
+    assert lines[-1] == "and 28 more"
+
+
+def refused(ended: Ended, words: str) -> None:
+    assert ended.status == 2, ended
+    assert ended.out == ""
+    assert re.fullmatch(r"tandem audit: [^\n]+\n", ended.err), ended.err
+    assert words in ended.err
+
+
+def test_what_is_no_record_is_refused(tmp_path: Path) -> None:
+    file, empty = tmp_path / "file", tmp_path / "empty"
+    file.write_text("")
+    empty.mkdir()
+    refused(tandem("audit", tmp_path / "nowhere"), "nowhere holds no record: there is no world.journal")
+    refused(tandem("audit", empty), "empty holds no record: there is no world.journal")
+    refused(tandem("audit", file), "file cannot be read: Not a directory")
+    refused(tandem("audit", ""), "'' is no folder")
+
+
+@pytest.mark.parametrize("name", [WORLD_JOURNAL, A])
+def test_a_journal_that_cannot_be_understood_is_refused_and_named(name: str, folder: Path) -> None:
+    data = bytearray((folder / name).read_bytes())
+    data[len(data) // 2] ^= 1
+    (folder / name).write_bytes(data)
+    refused(tandem("audit", folder), f"{name}: ")
+
+
+def spoilt(folder: Path, name: str, frames: Sequence[bytes]) -> str:
+    """Why a record with this journal cannot be judged."""
+    (folder / name).write_bytes(b"".join([msgpack.packb(frame) for frame in frames]))
+    with pytest.raises(CorruptJournal) as error:
+        audit(folder)
+    return str(error.value)
+
+
+def test_journals_that_are_none_are_refused(honest: Path, folder: Path) -> None:
+    world, a = list(journal.read(honest / WORLD_JOURNAL)), list(journal.read(honest / A))
+    assert f"{A} is the journal of b" in spoilt(folder, A, list(journal.read(honest / B)))
+    assert f"{A}: " in spoilt(folder, A, [*a[:5], encode(load("paper-1"))])
+    assert f"{A}: an agent's journal begins with its Briefing" in spoilt(folder, A, a[1:])
+    assert f"{WORLD_JOURNAL}: " in spoilt(folder, WORLD_JOURNAL, [])
+    assert f"{WORLD_JOURNAL}: " in spoilt(folder, WORLD_JOURNAL, world[1:])
+    scenario = load("paper-1")
+    first, second = scenario.robots
+    for robots in ((first,), (first, first), (first, replace(second, role="a")), ()):
+        lone = encode(replace(scenario, robots=robots))
+        assert f"{WORLD_JOURNAL}: " in spoilt(folder, WORLD_JOURNAL, [lone, *world[1:]])
+
+
+def test_a_violation_is_one_line() -> None:
+    assert Violation("order", None, None, "x").line == "no tick, the world, order: x"
