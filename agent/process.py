@@ -287,13 +287,14 @@ class AgentProcess:
             if self._estimate_wanted:
                 self._estimate.put(estimate)
         self._listed.update(told.report.tick for told in heard)
+        self._listed.update(*[contact.damaged for contact in self._sense.contacts])
         self._forget_reports(before=drive.tick - REPORTS_KEPT)
 
     def _forget_reports(self, before: int) -> None:
         """Those of ticks `before`, counting what nobody has asked for."""
         for tick in [tick for tick in self._reports if tick < before]:
             del self._reports[tick]
-            self._unheard += tick not in self._listed
+            self._unheard += tick not in self._listed and tick not in self._robot.unheard
             self._listed.discard(tick)
 
     def _send_report(self, told: Told) -> None:

@@ -33,8 +33,9 @@ class Robot:
         self.drive: Drive | None = None
         """the Drive of this tick; none before it is decided"""
         self.reports_sent = 0
-        self._damaged = 0
-        self._unheard: set[int] = set()
+        self.damaged = 0
+        """reports that came damaged"""
+        self.unheard: set[int] = set()
         """ticks in which the peer said a report that has not come yet"""
         self.bytes_sent = 0
         self._frame: bytes | None = None
@@ -66,9 +67,9 @@ class Robot:
         self.mind = planner.observe(self.mind, sense)
         self.told = self.drive = self._frame = None
         for contact in sense.contacts:
-            self._unheard.add(sense.tick)
-            self._unheard.difference_update(contact.heard, contact.damaged)
-            self._damaged += len(contact.damaged)
+            self.unheard.add(sense.tick)
+            self.unheard.difference_update(contact.heard, contact.damaged)
+            self.damaged += len(contact.damaged)
         if sense.contacts:
             report = planner.report(self.mind)
             self.told = Told(report, encode(report))
@@ -126,9 +127,9 @@ class Robot:
             p_value=findings.p_value,
             reports_sent=self.reports_sent,
             reports_heard=mind.radio.heard,
-            reports_refused=reports_refused + self._damaged,
+            reports_refused=reports_refused + self.damaged,
             reports_unheard=reports_unheard,
-            reports_lost=len(self._unheard),
+            reports_lost=len(self.unheard),
             frames_refused=frames_refused,
             bytes_sent=self.bytes_sent,
         )

@@ -21,7 +21,7 @@ from compose import inline
 from compose.audit.findings import Findings, Violation
 from compose.audit.judge import RULES, audit, judge
 from compose.record import WORLD_JOURNAL, agent_journal, read
-from compose.scenario import load, parse
+from compose.scenario import load, parse, shipped
 from protocol import journal
 from protocol.journal import CorruptJournal, Kept
 from protocol.messages import (
@@ -384,7 +384,7 @@ def test_a_sense_that_is_off_in_its_last_bit_is_found(folder: Path) -> None:
     findings = audit(folder)
     assert found(findings) == [(47, "a", "sense")]
     assert what(findings, "sense") == [
-        'contacts is [["b",2.106468019846573,[47]]], expected [["b",2.1064680198465724,[47]]]'
+        'contacts is [["b",2.106468019846573,[47],[]]], expected [["b",2.1064680198465724,[47],[]]]'
     ]
 
 
@@ -664,9 +664,9 @@ def test_the_command_tells_the_first_twenty_and_how_many_more(folder: Path) -> N
     assert (ended.status, ended.err) == (1, "")
     lines = ended.out.splitlines()
     assert lines[0] == "paper-1: 48 violations in 49 ticks"
-    assert re.fullmatch(r"decision +204 +48", lines[8])
-    assert lines[12:14] == ["", "tick 0, a, decision: in its Estimate, localised is true, expected false"]
-    assert len(lines[13:]) == 21
+    assert re.fullmatch(r"decision +204 +48", lines[9])
+    assert lines[13:15] == ["", "tick 0, a, decision: in its Estimate, localised is true, expected false"]
+    assert len(lines[14:]) == 21
     assert lines[-1] == "and 28 more"
 
 
@@ -719,3 +719,36 @@ def test_journals_that_are_none_are_refused(honest: Path, folder: Path) -> None:
 
 def test_a_violation_is_one_line() -> None:
     assert Violation("order", None, None, "x").line == "no tick, the world, order: x"
+
+
+# --- the radio -------------------------------------------------------------------------------------------
+
+
+def test_what_befell_the_reports_is_listed_and_another_plan_is_found(tmp_path: Path) -> None:
+    text = shipped()["random"].read_text()
+    inline.play(parse(text, "random", faults=["b->a: loss=0.5, delay=0..2, corrupt=0.2"]), tmp_path)
+    findings = audit(tmp_path)
+    assert found(findings) == []
+    to_a, to_b = findings.radio
+    assert (to_a.link, to_b.link) == ("b->a", "a->b")
+    assert to_b.heard == to_b.sent == to_a.sent
+    assert to_b.late == to_b.twice == to_b.damaged == to_b.lost == 0
+    assert to_a.lost > 0 < to_a.damaged
+    assert to_a.heard + to_a.damaged + to_a.lost - to_a.twice == to_a.sent
+    told = tandem("audit", tmp_path).out
+    assert re.search(r"^b->a +\d+ +\d+", told, re.MULTILINE)
+
+    lost = next(
+        one
+        for one in messages(tmp_path / A)
+        if isinstance(one, Sense) and one.contacts and not one.contacts[0].heard
+    )
+    heard = replace(lost, contacts=(replace(lost.contacts[0], heard=(lost.tick,)),))
+    plant(tmp_path / A, (of(Sense, lost.tick), to(contacts=heard.contacts)))
+    assert (lost.tick, "a", "faults") in found(audit(tmp_path))
+
+
+def test_a_liar_that_tells_what_it_was_told_to_tell_breaks_no_rule(tmp_path: Path) -> None:
+    text = shipped()["random"].read_text().replace('id = "b"', 'id = "b"\nlie = {kind = "scale", size = 0.5}')
+    inline.play(parse(text, "random"), tmp_path)
+    assert found(audit(tmp_path)) == []

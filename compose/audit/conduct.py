@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from agent import radio
-from agent.past import Past, Step
+from agent.past import Step
 from agent.robot import Robot
 from compose.audit.case import Case
 from compose.audit.findings import Checks, Violation, difference, said
@@ -63,7 +63,7 @@ def _last_word(again: Robot, robot: str, end: End, found: Farewell) -> Violation
     """The Farewell; what the wire brought that was no use, only the process knows."""
     expected = again.farewell(
         end,
-        reports_refused=found.reports_refused,
+        reports_refused=found.reports_refused - again.damaged,
         reports_unheard=found.reports_unheard,
         frames_refused=found.frames_refused,
     )
@@ -97,20 +97,18 @@ def _within(tick: int, robot: str, how: str, controls: Controls, mission: Missio
 
 
 def log(case: Case) -> Checks:
-    """What a robot told of its manoeuvres and ranges is what its own Senses say."""
+    """What a robot told of its manoeuvres and ranges is what its own Senses say.
+
+    Who was told to lie tells, to the bit, what its lie makes of that; to which `decision` holds it.
+    """
     for robot, past in case.pasts.items():
-        driven, ranged = _truthful(past)
+        if past.briefing.lie is not None:
+            continue
+        driven = [step.sense.executed for step in past.steps]
+        ranged = [step.sense.anchor_range for step in past.steps]
         for step in past.steps:
             if step.report is not None:
                 yield _as_it_was(step.sense.tick, robot, step.report.report, driven, ranged)
-
-
-def _truthful(past: Past) -> tuple[list[Controls | None], list[float | None]]:
-    """What a log has to say: the manoeuvre over [k - 1, k] and the anchor's range at k, for each tick k.
-
-    A robot that is told to lie is honest where it says what it was told to: that belongs here.
-    """
-    return [step.sense.executed for step in past.steps], [step.sense.anchor_range for step in past.steps]
 
 
 def _as_it_was(

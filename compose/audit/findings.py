@@ -41,6 +41,22 @@ class Count(msgspec.Struct, frozen=True):
     violations: int
 
 
+class Befallen(msgspec.Struct, frozen=True):
+    """A link, and what became of the reports on it, as Senses have it; a copy counts for itself."""
+
+    link: str
+    sent: int
+    """in contact"""
+    heard: int
+    late: int
+    """of these: not in the tick in which they were sent"""
+    twice: int
+    """of these: heard before"""
+    damaged: int
+    lost: int
+    """that nobody heard, not even damaged"""
+
+
 class Findings(msgspec.Struct, frozen=True):
     """Of a whole record."""
 
@@ -51,6 +67,8 @@ class Findings(msgspec.Struct, frozen=True):
     """a rule each"""
     violations: tuple[Violation, ...]
     """the earliest first"""
+    radio: tuple[Befallen, ...] = ()
+    """of each link, under a fault plan"""
 
 
 def difference(found: msgspec.Struct, expected: msgspec.Struct) -> str:

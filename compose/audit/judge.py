@@ -11,6 +11,7 @@ from compose.audit.claims import claim
 from compose.audit.conduct import decision, limits, log
 from compose.audit.findings import Checks, Count, Findings, Violation
 from compose.audit.journals import briefing, order
+from compose.audit.radio import befallen, faults
 from compose.audit.wires import contact, report, sense
 from compose.record import WORLD_JOURNAL
 from protocol import journal
@@ -19,6 +20,7 @@ RULES: tuple[Callable[[Case], Checks], ...] = (
     order,
     briefing,
     sense,
+    faults,
     contact,
     report,
     decision,
@@ -56,5 +58,5 @@ def judge(journals: Mapping[str, Iterable[bytes]], folder: object = "the record"
         counts.append(Count(rule.__name__, len(checks), len(found)))
         violations += found
     violations.sort(key=lambda one: -1 if one.tick is None else one.tick)
-    history = case.history
-    return Findings(history.scenario.name, len(history.ticks), tuple(counts), tuple(violations))
+    name, ticks = case.history.scenario.name, len(case.history.ticks)
+    return Findings(name, ticks, tuple(counts), tuple(violations), befallen(case))

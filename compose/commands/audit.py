@@ -27,6 +27,12 @@ def _show(findings: Findings) -> None:
     print(f"{'rule':10}{'checks':>8}{'violations':>12}")
     for one in findings.counts:
         print(f"{one.rule:10}{one.checks:>8}{one.violations:>12}")
+    if findings.radio:
+        print(f"\n{'link':16}{'sent':>8}{'heard':>8}{'late':>8}{'twice':>8}{'damaged':>9}{'lost':>8}")
+    for link in findings.radio:
+        print(
+            f"{link.link:16}{link.sent:>8}{link.heard:>8}{link.late:>8}{link.twice:>8}{link.damaged:>9}{link.lost:>8}"
+        )
     if findings.violations:
         print()
     for violation in findings.violations[:SHOWN]:
