@@ -12,7 +12,11 @@ from msgspec import Meta
 from protocol.units import RobotId, Tick
 
 MAX_DELAY = 50
-"""ticks: so long agents keep a report that no Sense has listed yet"""
+"""ticks, of all the faults on a link together"""
+MAX_FAULTS = 8
+"""on a link: each may double what those before it have doubled"""
+LATEST = MAX_DELAY + MAX_FAULTS
+"""ticks after which no report is heard, each fault having reordered it, too; agents keep it longer"""
 
 Chance = Annotated[float, Meta(ge=0.0, le=1.0)]
 Delay = Annotated[int, Meta(ge=0, le=MAX_DELAY)]
@@ -63,6 +67,10 @@ class Fault(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=
     """when the fault is there; always, where neither window is given"""
     contact_ticks: Window | None = None
     """likewise, counted in ticks in which the two have been in contact"""
+
+    def on(self, sender: str, receiver: str) -> bool:
+        """Whether it is on the way from `sender` to `receiver`."""
+        return self.link is None or self.link.leads(sender, receiver)
 
     def active(self, tick: int, contacts: int) -> bool:
         """Whether it is there in `tick`, before which the two have been in contact in `contacts` ticks."""
