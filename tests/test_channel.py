@@ -152,6 +152,19 @@ def test_bursts_are_as_long_and_as_many_as_gilbert_and_elliott_say(contact: list
     assert abs(sum(lost) / len(lost) - share) <= Z * spread / math.sqrt(len(lost))
 
 
+def test_the_first_contact_is_in_a_burst_as_often_as_any_other() -> None:
+    plan = [Fault(burst_start=0.02, burst_end=0.01)]
+    at_first = [not flown(plan, [False] * 5 + [True], seed)[-1].heard for seed in range(2000)]
+    assert has_share(sum(at_first), 2000, 2.0 / 3.0)
+
+
+def test_a_burst_goes_on_while_the_two_are_out_of_contact() -> None:
+    plan = [Fault(burst_start=1e-9, burst_end=1e-9)]
+    for seed in range(20):
+        heard = [bool(air.heard) for air in flown(plan, ([True] * 5 + [False] * 5) * 5, seed)]
+        assert heard.count(True) in {0, 25}
+
+
 def test_in_a_burst_as_many_are_lost_as_the_plan_says() -> None:
     always = Fault(burst_start=1.0, burst_end=1e-9, burst_loss=0.4)
     assert has_share(heard_at_once([always]).count(False), N, 0.4)

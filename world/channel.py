@@ -75,8 +75,8 @@ def carried(air: Air, links: Links, seed: int, tick: int, *, in_contact: bool) -
         active = [fault.active(tick, air.contacts) for _, fault in links.faults]
         bursts = tuple(
             [
-                _burst(burst, fault, _draw(seed, i, "burst", links, tick)) if there else burst
-                for (i, fault), burst, there in zip(links.faults, bursts, active, strict=True)
+                _burst(burst if air.contacts else None, fault, _draw(seed, i, "burst", links, tick))
+                for (i, fault), burst in zip(links.faults, bursts, strict=True)
             ]
         )
         flying += tuple(_sent(links, bursts, active, seed, tick))
@@ -92,8 +92,10 @@ def carried(air: Air, links: Links, seed: int, tick: int, *, in_contact: bool) -
     )
 
 
-def _burst(burst: bool, fault: Fault, draw: float) -> bool:
-    """The chain's next state."""
+def _burst(burst: bool | None, fault: Fault, draw: float) -> bool:
+    """The chain's next state; its first is as if it had always gone on, as it does outside windows."""
+    if burst is None:
+        return draw < fault.bursty
     return draw >= fault.burst_end if burst else draw < fault.burst_start
 
 

@@ -77,10 +77,14 @@ class Fault(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=
         return _inside(self.ticks, tick) and _inside(self.contact_ticks, contacts)
 
     @property
+    def bursty(self) -> float:
+        """The share of ticks in contact that are in a burst."""
+        return self.burst_start / (self.burst_start + self.burst_end) if self.burst_start else 0.0
+
+    @property
     def let_through(self) -> float:
         """The share of reports that it lets through where it is always there."""
-        bursty = self.burst_start / (self.burst_start + self.burst_end) if self.burst_start else 0.0
-        share = (1.0 - self.loss) * (1.0 - self.corrupt) * (1.0 - bursty * self.burst_loss)
+        share = (1.0 - self.loss) * (1.0 - self.corrupt) * (1.0 - self.bursty * self.burst_loss)
         return share * min(1.0, self.reports_per_tick or 1.0)
 
 

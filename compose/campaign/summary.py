@@ -45,8 +45,10 @@ class Counted(msgspec.Struct, frozen=True):
     rate_low: float | None
     rate_high: float | None
     """Wilson's interval"""
-    ticks_p50: float | None
+    ticks_p10: float | None
     """until all was known; of trials that localised"""
+    ticks_p50: float | None
+    ticks_p90: float | None
     ticks_p95: float | None
     ticks_max: float | None
     meeting_tick_p50: float | None
@@ -73,6 +75,9 @@ class Counted(msgspec.Struct, frozen=True):
     """root mean square of the position errors of all robots, over that of their Cramér-Rao bounds"""
     reports_p50: float | None
     """sent, by all"""
+    reports_lost: int
+    """of all trials"""
+    reports_refused: int
     refused: str | None
     """why no mission can be played in this setting"""
 
@@ -105,7 +110,9 @@ def counted(table: pa.Table, refused: str | None = None) -> Counted:
         rate=k / n if n else None,
         rate_low=low,
         rate_high=high,
+        ticks_p10=_percentile(ticks, 10),
         ticks_p50=_percentile(ticks, 50),
+        ticks_p90=_percentile(ticks, 90),
         ticks_p95=_percentile(ticks, 95),
         ticks_max=_percentile(ticks, 100),
         meeting_tick_p50=_percentile(meeting, 50),
@@ -122,6 +129,8 @@ def counted(table: pa.Table, refused: str | None = None) -> Counted:
         nees_high=nees_high,
         rmse_over_bound=_rmse_over_bound(right),
         reports_p50=_percentile(_known(column(table, "reports_sent")), 50),
+        reports_lost=int(_known(column(table, "reports_lost")).sum()),
+        reports_refused=int(_known(column(table, "reports_refused")).sum()),
         refused=refused,
     )
 
