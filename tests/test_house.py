@@ -56,6 +56,7 @@ PURE = {
     "world.truth",
     "world.sensors",
     "world.draws",
+    "world.faults",
     "world.channel",
     "world.referee",
     "world.scenario",

@@ -48,7 +48,7 @@ def draw(results: Results, folder: Path) -> None:
             if len(axis.values) > 1:
                 name = re.sub(r"[^A-Za-z0-9_-]+", "-", axis.name).strip("-")
                 save(_success(results, place), folder / f"success-{name}")
-                save(_ticks(results, place), folder / f"ticks-{name}")
+                save(ticks_against(results, place), folder / f"ticks-{name}")
         save(_meeting(results), folder / "meeting")
 
 
@@ -87,7 +87,7 @@ def _rates(figures: Sequence[Counted]) -> tuple[Any, Any, Any]:
     return rates, np.minimum(low, rates), np.maximum(high, rates)
 
 
-def _ticks(results: Results, place: int) -> Figure:
+def ticks_against(results: Results, place: int) -> Figure:
     """Median and maximum of the ticks that trials took which localised; 10 to 90 %, or up to 95 %.
 
     Between numbers that is a band, above names a line.
