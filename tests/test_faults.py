@@ -105,6 +105,40 @@ def test_what_is_lost_costs_ticks() -> None:
     assert ticks[0] < ticks[1] < ticks[2]
 
 
+@pytest.mark.parametrize("way", ["a->b", "b->a", "a<->b"])
+@pytest.mark.parametrize("begin", [0, 2])
+def test_a_partition_costs_what_it_lasts_since_nobody_goes_on_unanswered(begin: int, way: str) -> None:
+    cut = 30
+    for seed in range(1, 9):
+        whole, parted = (
+            inline.play(load("random", seed=seed, faults=faults))
+            for faults in ([], [f"{way}: partition, contact_ticks={begin}..{begin + cut}"])
+        )
+        assert localises(parted)
+        assert parted.moments[-1].truth.tick == whole.moments[-1].truth.tick + cut
+
+
+@pytest.mark.parametrize("delay", [1, 7, 20])
+def test_a_delay_costs_three_times_what_it_lasts(delay: int) -> None:
+    """Once before they can meet, once before the last manoeuvre, and once before the claim."""
+    for seed in range(1, 9):
+        prompt, late = (
+            inline.play(load("random", seed=seed, faults=faults)) for faults in ([], [f"delay={delay}"])
+        )
+        assert localises(late)
+        assert late.moments[-1].truth.tick == prompt.moments[-1].truth.tick + 3 * delay
+
+
+def test_under_noise_a_robot_that_has_not_been_answered_stands_and_listens() -> None:
+    quiet = scenario_of(NOISE, 1)
+    record = inline.play(replace(quiet, faults=load("random", faults=["delay=6"]).faults, max_ticks=3000))
+    assert localises(record)
+    drives = [moment.drives[robot] for moment in record.moments for robot in "ab"]
+    listening = [drive for drive in drives if drive.state == "listening"]
+    assert len(listening) > 20
+    assert all((drive.phase, drive.v, drive.omega) == (3, 0.0, 0.0) for drive in listening)
+
+
 def test_two_that_never_hear_each_other_claim_nothing() -> None:
     scenario = load("random", faults=["partition"])
     record = inline.play(replace(scenario, max_ticks=300))
@@ -169,7 +203,7 @@ class Played(NamedTuple):
         (RANDOM + ROUGH, []),
         (RANDOM, PLANS["all together"]),
         (RANDOM.replace("[planner]", f"[mission.noise]\n{NOISE}\n[planner]"), PLANS["bursts"]),
-        (several_pairs(2), ["a->b: loss=0.5", "c<->d: delay=1..4, corrupt=0.3"]),
+        (several_pairs(2), ["loss=0.3, reorder=0.5", "c<->d: delay=1..4, corrupt=0.3"]),
     ],
     ids=["of a file", "all together", "noise", "two pairs"],
 )
