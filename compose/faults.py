@@ -10,7 +10,7 @@ import msgspec
 from msgspec import Meta
 from msgspec.structs import asdict
 
-from world.faults import Chance, Delay, Fault, Link, Window
+from world.faults import MAX_DELAY, MAX_FAULTS, Chance, Delay, Fault, Link, Window
 
 _LINK = re.compile(r"\s*(?P<one>[A-Za-z0-9_-]+)\s*(?P<way><->|->)\s*(?P<other>[A-Za-z0-9_-]+)\s*")
 _NUMBER = re.compile(r"[0-9]*\.?[0-9]+(?:[eE]-?[0-9]+)?")
@@ -55,6 +55,22 @@ def fault(table: FaultTable, pairs: Iterable[tuple[str, str]]) -> Fault:
     return Fault(**asdict(table) | {"link": _link(table.link, list(pairs)), "delay": (least, most)})
 
 
+def added(plan: Sequence[Fault], table: FaultTable, pairs: Sequence[tuple[str, str]]) -> tuple[Fault, ...]:
+    """`plan` with the fault that `table` describes; `pairs` both ways. Raises BadFault."""
+    plan = (*plan, fault(table, pairs))
+    for sender, receiver in pairs:
+        if plan[-1].on(sender, receiver):
+            on_it = [one for one in plan if one.on(sender, receiver)]
+            if len(on_it) > MAX_FAULTS:
+                raise BadFault(f"link: more than {MAX_FAULTS} faults from '{sender}' to '{receiver}'")
+            late = sum([one.delay[1] for one in on_it])
+            if late > MAX_DELAY:
+                raise BadFault(
+                    f"delay: from '{sender}' to '{receiver}' up to {late} ticks in all, more than {MAX_DELAY}"
+                )
+    return plan
+
+
 def _link(text: str, pairs: Sequence[tuple[str, str]]) -> Link | None:
     if text.strip() == EVERYWHERE:
         return None
@@ -88,7 +104,7 @@ def table_of(text: str) -> dict[str, Any]:
 def _named(error: str) -> str:
     """msgspec's error, with the field in front."""
     what, _, where = error.partition(" - at `$")
-    unknown = re.fullmatch(r"Object contains unknown field `(.*)`", what)
+    unknown = re.fullmatch(r"Object contains unknown field `(.*)`", what, re.DOTALL)
     if unknown is not None:
         known = ", ".join(FaultTable.__struct_fields__[1:])
         return f"there is no '{unknown[1]}'; there are {known}"

@@ -11,7 +11,7 @@ from compose.record import WORLD_JOURNAL, Moment, Record, agent_journal
 from protocol.journal import Journal, Sink
 from protocol.messages import Drive, End, Farewell
 from world.course import Course
-from world.faults import MAX_DELAY
+from world.faults import LATEST
 from world.scenario import Scenario
 
 
@@ -53,8 +53,8 @@ def played(scenario: Scenario, sinks: Mapping[str, Sink]) -> Record:
             drives[sense.robot] = robots[sense.robot].decide(heard)
             if robots[sense.robot].journaled:
                 robots[sense.robot].estimate()
-        if len(told) > MAX_DELAY * len(ids):
-            told = {key: one for key, one in told.items() if key[1] >= course.tick - MAX_DELAY - 1}
+        if len(told) > LATEST * len(ids):
+            told = {key: one for key, one in told.items() if key[1] > course.tick - LATEST}
         moments.append(Moment(course.world.truth, drives))
         end = course.drive(drives)
     farewells: dict[str, Farewell] = {robot: robots[robot].farewell(end) for robot in ids}

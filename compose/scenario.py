@@ -17,7 +17,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from compose.faults import BadFault, FaultTable, fault, table_of
+from compose.faults import BadFault, FaultTable, added, table_of
 from compose.status import UserError
 from protocol.lie import Lie
 from protocol.messages import Briefing
@@ -186,14 +186,7 @@ def validate(table: Mapping[str, Any], source: str, faults: Sequence[str] = ()) 
         file = msgspec.convert(table, ScenarioFile)
     except msgspec.ValidationError as error:
         raise BadScenario(f"{source}: {field_first(str(error))}") from None
-    for text in faults:
-        try:
-            added = msgspec.convert(table_of(text), FaultTable)
-            fault(added, _pairs(file.robot, source))
-        except BadFault as error:
-            raise BadScenario(f"--fault '{text}': {error}") from None
-        file.fault.append(added)
-    return Setting(file, _validated(file, source))
+    return Setting(file, _validated(file, source, faults))
 
 
 def field_first(error: str) -> str:
@@ -208,7 +201,7 @@ def field_first(error: str) -> str:
     return f"{match['where']}: {what}" if match["where"] else what
 
 
-def _validated(file: ScenarioFile, source: str) -> Scenario:
+def _validated(file: ScenarioFile, source: str, told: Sequence[str]) -> Scenario:
     _check_noise(file.mission, source)
     peers = _peers(file.robot, source)
     place = {robot.id: i for i, robot in enumerate(file.robot)}
@@ -227,16 +220,16 @@ def _validated(file: ScenarioFile, source: str) -> Scenario:
                 f"outside mission.sensing_range = {file.mission.sensing_range:.9g} m"
             )
         placed.append(Placed(robot.id, peer, role, Anchor(*robot.anchor), start, plans[robot.id], robot.lie))
-    faults = _faults(file, source)
+    faults = _faults(file, told, list(peers.items()), source)
     budget = max(tick_budget(file.mission, plan) for plan in plans.values())
-    if faults:
-        budget += EXCHANGES * hold_up(faults)
-    if file.max_ticks is None and budget > MAX_TICKS:
-        raise Unworkable(f"{source}: mission: to meet could take {budget} ticks, more than {MAX_TICKS}")
+    held_up = EXCHANGES * hold_up(faults) if faults else 0
+    if file.max_ticks is None and budget + held_up > MAX_TICKS:
+        what = "mission: to meet" if budget > MAX_TICKS else "fault: what befalls the reports"
+        raise Unworkable(f"{source}: {what} could take {budget + held_up} ticks, more than {MAX_TICKS}")
     scenario = Scenario(
         name=file.name,
         seed=file.seed,
-        max_ticks=file.max_ticks if file.max_ticks is not None else budget,
+        max_ticks=file.max_ticks if file.max_ticks is not None else budget + held_up,
         mission=file.mission,
         variant=file.planner.variant,
         robots=tuple(placed),
@@ -250,18 +243,22 @@ def _validated(file: ScenarioFile, source: str) -> Scenario:
     return scenario
 
 
-def _faults(file: ScenarioFile, source: str) -> tuple[Fault, ...]:
-    found = []
+def _faults(
+    file: ScenarioFile, told: Sequence[str], pairs: Sequence[tuple[str, str]], source: str
+) -> tuple[Fault, ...]:
+    """The plan: those of the file, then those of the command line; `pairs` both ways."""
+    plan: tuple[Fault, ...] = ()
     for i, table in enumerate(file.fault):
         try:
-            found.append(fault(table, _pairs(file.robot, source)))
+            plan = added(plan, table, pairs)
         except BadFault as error:
             raise BadScenario(f"{source}: fault[{i}].{error}") from None
-    return tuple(found)
-
-
-def _pairs(robots: list[RobotTable], source: str) -> list[tuple[str, str]]:
-    return list(_peers(robots, source).items())
+    for text in told:
+        try:
+            plan = added(plan, msgspec.convert(table_of(text), FaultTable), pairs)
+        except BadFault as error:
+            raise BadScenario(f"--fault '{text}': {error}") from None
+    return plan
 
 
 def _check_noise(mission: Mission, source: str) -> None:

@@ -25,6 +25,8 @@ class Flying(NamedTuple):
     overtaken: bool
     """whether it comes after those that were sent in the tick in which it is due"""
     damaged: bool
+    copy: int
+    """which of the copies: bit i is set where the fault at place i has made it"""
 
 
 class Air(msgspec.Struct, frozen=True):
@@ -58,9 +60,7 @@ class Links(NamedTuple):
 
 def of_plan(plan: Sequence[Fault], sender: str, receiver: str) -> Links:
     """What of `plan` is on the way from `sender` to `receiver`."""
-    on_it = [
-        (i, fault) for i, fault in enumerate(plan) if fault.link is None or fault.link.leads(sender, receiver)
-    ]
+    on_it = [(i, fault) for i, fault in enumerate(plan) if fault.on(sender, receiver)]
     return Links(sender, receiver, tuple(on_it))
 
 
@@ -75,8 +75,8 @@ def carried(air: Air, links: Links, seed: int, tick: int, *, in_contact: bool) -
         active = [fault.active(tick, air.contacts) for _, fault in links.faults]
         bursts = tuple(
             [
-                _burst(burst, fault, _draw(seed, i, "burst", links, tick)) if there else burst
-                for (i, fault), burst, there in zip(links.faults, bursts, active, strict=True)
+                _burst(burst if air.contacts else None, fault, _draw(seed, i, "burst", links, tick))
+                for (i, fault), burst in zip(links.faults, bursts, strict=True)
             ]
         )
         flying += tuple(_sent(links, bursts, active, seed, tick))
@@ -92,8 +92,10 @@ def carried(air: Air, links: Links, seed: int, tick: int, *, in_contact: bool) -
     )
 
 
-def _burst(burst: bool, fault: Fault, draw: float) -> bool:
-    """The chain's next state."""
+def _burst(burst: bool | None, fault: Fault, draw: float) -> bool:
+    """The chain's next state; its first is as if it had always gone on, as it does outside windows."""
+    if burst is None:
+        return draw < fault.bursty
     return draw >= fault.burst_end if burst else draw < fault.burst_start
 
 
@@ -103,23 +105,17 @@ def _draw(seed: int, fault: int, what: str, links: Links, tick: int) -> float:
 
 def _sent(links: Links, bursts: Sequence[bool], active: Sequence[bool], seed: int, tick: int) -> list[Flying]:
     """The copies of the report of `tick` that are not lost at once."""
-    copies = [Flying(tick, tick, overtaken=False, damaged=False)]
+    copies = [Flying(tick, tick, overtaken=False, damaged=False, copy=0)]
     for (i, fault), burst, there in zip(links.faults, bursts, active, strict=True):
         if there:
-            copies = [
-                copy
-                for number, one in enumerate(copies)
-                for copy in _befallen(one, number, i, fault, burst, links, seed)
-            ]
+            copies = [copy for one in copies for copy in _befallen(one, i, fault, burst, links, seed)]
     return copies
 
 
-def _befallen(
-    one: Flying, number: int, place: int, fault: Fault, burst: bool, links: Links, seed: int
-) -> list[Flying]:
-    """What becomes of the copy of that `number`."""
+def _befallen(one: Flying, place: int, fault: Fault, burst: bool, links: Links, seed: int) -> list[Flying]:
+    """What becomes of a copy."""
 
-    def happens(what: str, chance: float, copy: int = number) -> bool:
+    def happens(what: str, chance: float, copy: int = one.copy) -> bool:
         return chance > 0.0 and _draw(seed, place, f"{what}/{copy}", links, one.tick) < chance
 
     if fault.partition or happens("loss", fault.loss) or (burst and happens("burst-loss", fault.burst_loss)):
@@ -127,25 +123,30 @@ def _befallen(
     twice = happens("duplicate", fault.duplicate)
     least, most = fault.delay
     copies = []
-    for k in (number, ~number) if twice else (number,):
+    for k in (one.copy, one.copy | 1 << place) if twice else (one.copy,):
         due = one.due + least
         if most > least:
             due += int(_draw(seed, place, f"delay/{k}", links, one.tick) * (most - least + 1))
         overtaken = happens("reorder", fault.reorder, k)
         damaged = happens("corrupt", fault.corrupt, k)
-        copies.append(Flying(due + overtaken, one.tick, one.overtaken or overtaken, one.damaged or damaged))
+        copies.append(
+            Flying(due + overtaken, one.tick, one.overtaken or overtaken, one.damaged or damaged, copy=k)
+        )
     return copies
 
 
 def _let_through(
     due: Sequence[Flying], links: Links, air: Air, tick: int
 ) -> tuple[list[Flying], tuple[float, ...]]:
-    """Those of `due` for which every fault's bandwidth has room, and the room that is left."""
+    """Those of `due` for which every fault's bandwidth has room, and the room that is left.
+
+    What is left is kept, up to one report's: else of 0.6 a tick only one in two ticks would come.
+    """
     rates = [
         fault.reports_per_tick if fault.active(tick, air.contacts) else None for _, fault in links.faults
     ]
     room = [
-        min(before + rate, max(1.0, rate)) if rate is not None else before
+        min(before, 1.0) + rate if rate is not None else before
         for before, rate in zip(air.room or (1.0,) * len(rates), rates, strict=True)
     ]
     coming = []

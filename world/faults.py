@@ -12,7 +12,11 @@ from msgspec import Meta
 from protocol.units import RobotId, Tick
 
 MAX_DELAY = 50
-"""ticks: so long agents keep a report that no Sense has listed yet"""
+"""ticks, of all the faults on a link together"""
+MAX_FAULTS = 8
+"""on a link: each may double what those before it have doubled"""
+LATEST = MAX_DELAY + MAX_FAULTS
+"""ticks after which no report is heard, each fault having reordered it, too; agents keep it longer"""
 
 Chance = Annotated[float, Meta(ge=0.0, le=1.0)]
 Delay = Annotated[int, Meta(ge=0, le=MAX_DELAY)]
@@ -64,15 +68,23 @@ class Fault(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=
     contact_ticks: Window | None = None
     """likewise, counted in ticks in which the two have been in contact"""
 
+    def on(self, sender: str, receiver: str) -> bool:
+        """Whether it is on the way from `sender` to `receiver`."""
+        return self.link is None or self.link.leads(sender, receiver)
+
     def active(self, tick: int, contacts: int) -> bool:
         """Whether it is there in `tick`, before which the two have been in contact in `contacts` ticks."""
         return _inside(self.ticks, tick) and _inside(self.contact_ticks, contacts)
 
     @property
+    def bursty(self) -> float:
+        """The share of ticks in contact that are in a burst."""
+        return self.burst_start / (self.burst_start + self.burst_end) if self.burst_start else 0.0
+
+    @property
     def let_through(self) -> float:
         """The share of reports that it lets through where it is always there."""
-        bursty = self.burst_start / (self.burst_start + self.burst_end) if self.burst_start else 0.0
-        share = (1.0 - self.loss) * (1.0 - self.corrupt) * (1.0 - bursty * self.burst_loss)
+        share = (1.0 - self.loss) * (1.0 - self.corrupt) * (1.0 - self.bursty * self.burst_loss)
         return share * min(1.0, self.reports_per_tick or 1.0)
 
 

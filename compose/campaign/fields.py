@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import re
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 import msgspec
@@ -43,9 +44,10 @@ def steps(path: str, base: Mapping[str, Any]) -> Steps:
                 value = value.get(step) if isinstance(value, Mapping) else None
             case inspect.ListType() | inspect.TupleType() | inspect.VarTupleType() as many:
                 listed = value if isinstance(value, Sequence) else ()
-                place = _place(step, listed, so_far)
+                spare = not isinstance(many, inspect.TupleType) and _may_be_empty(many.item_type)
+                place = _place(step, listed, so_far, spare=spare)
                 kind = many.item_types[place] if isinstance(many, inspect.TupleType) else many.item_type
-                value = listed[place]
+                value = listed[place] if place < len(listed) else None
                 walked.append(place)
                 continue
             case _:
@@ -60,9 +62,15 @@ def with_value(table: Mapping[str, Any], way: Steps, value: Any) -> dict[str, An
     """A copy of `table` in which the field at `way` is `value`."""
     changed = copy.deepcopy(dict(table))
     inner: Any = changed
-    for step in way[:-1]:
-        inner = inner.setdefault(step, {}) if isinstance(inner, dict) else inner[step]
-    inner[way[-1]] = copy.deepcopy(value)
+    for step, then in pairwise((*way, None)):
+        if isinstance(step, int):
+            inner.extend([{} for _ in range(step + 1 - len(inner))])
+        if then is None:
+            inner[step] = copy.deepcopy(value)
+        elif isinstance(step, int):
+            inner = inner[step]
+        else:
+            inner = inner.setdefault(step, [] if isinstance(then, int) else {})
     return changed
 
 
@@ -94,10 +102,16 @@ def _bare(kind: inspect.Type) -> inspect.Type:
     return kind
 
 
-def _place(step: str | int, listed: Sequence[Any], so_far: str) -> int:
-    """Where in a list: as the path says, or of the table with that id."""
+def _may_be_empty(kind: inspect.Type) -> bool:
+    """Whether it is a table of which every field may be left out, as of a fault; then so may the table."""
+    bare = _bare(kind)
+    return isinstance(bare, inspect.StructType) and not any(field.required for field in bare.fields)
+
+
+def _place(step: str | int, listed: Sequence[Any], so_far: str, *, spare: bool) -> int:
+    """Where in a list: as the path says, with `spare` beyond its end, too; or of the table with that id."""
     if isinstance(step, int):
-        if step >= len(listed):
+        if step >= len(listed) and not spare:
             raise NoSuchField(f"the base scenario has no {so_far}[{step}]")
         return step
     ids = [one.get("id") if isinstance(one, Mapping) else None for one in listed]

@@ -35,6 +35,7 @@ FITTING = 60
 """characters that stand side by side below an axis"""
 BESIDE = 96
 """characters of a legend that stand side by side"""
+_NUMBER = re.compile(r"[0-9]+(?:\.[0-9]+)?").fullmatch
 APART = 0.45
 """of the room that a name has, for what stands beside each other there"""
 
@@ -47,7 +48,7 @@ def draw(results: Results, folder: Path) -> None:
             if len(axis.values) > 1:
                 name = re.sub(r"[^A-Za-z0-9_-]+", "-", axis.name).strip("-")
                 save(_success(results, place), folder / f"success-{name}")
-                save(_ticks(results, place), folder / f"ticks-{name}")
+                save(ticks_against(results, place), folder / f"ticks-{name}")
         save(_meeting(results), folder / "meeting")
 
 
@@ -86,9 +87,13 @@ def _rates(figures: Sequence[Counted]) -> tuple[Any, Any, Any]:
     return rates, np.minimum(low, rates), np.maximum(high, rates)
 
 
-def _ticks(results: Results, place: int) -> Figure:
-    """Median, 95 % and maximum of the ticks that trials took which localised."""
+def ticks_against(results: Results, place: int) -> Figure:
+    """Median and maximum of the ticks that trials took which localised; 10 to 90 %, or up to 95 %.
+
+    Between numbers that is a band, above names a line.
+    """
     axis = results.campaign.axes[place]
+    joined = _numbers(axis) is not None
     figure, axes, at = _against(axis)
     lines = list(_lines(results, place))
     for i, (label, tables) in enumerate(lines):
@@ -99,17 +104,23 @@ def _ticks(results: Results, place: int) -> Figure:
             if (figures := counted(table)).ticks_p50 is not None
         ]
         where = np.array([x for x, _ in points]) + _aside(axis, i, len(lines))
-        middle, most, top = (
-            np.array([getattr(figures, name) for _, figures in points], float)
-            for name in ("ticks_p50", "ticks_p95", "ticks_max")
+        low, middle, high, most, top = (
+            np.array([getattr(figures, f"ticks_{name}") for _, figures in points], float)
+            for name in ("p10", "p50", "p90", "p95", "max")
         )
         axes.plot(
             where, middle, color=colour, ls=_joined(axis, style), marker=marker, ms=4, label=label or "median"
         )
-        axes.vlines(where, middle, most, color=colour, lw=1.2)
-        axes.plot(where, most, color=colour, ls="", marker="_", ms=7)
+        if joined:
+            axes.fill_between(where, low, high, color=colour, alpha=0.15, lw=0.0)
+        else:
+            axes.vlines(where, middle, most, color=colour, lw=1.2)
+            axes.plot(where, most, color=colour, ls="", marker="_", ms=7)
         axes.plot(where, top, color=colour, ls="", marker=marker, ms=4, mfc="white")
-    axes.plot([], [], color="0.3", ls="", marker="|", ms=8, label="up to 95 %")
+    if joined:
+        axes.fill_between([], [], color="0.3", alpha=0.15, lw=0.0, label="10 to 90 %")
+    else:
+        axes.plot([], [], color="0.3", ls="", marker="|", ms=8, label="up to 95 %")
     axes.plot([], [], color="0.3", ls="", marker="o", ms=4, mfc="white", label="maximum")
     axes.set_ylabel("ticks until localised (median)")
     axes.set_yscale("log")
@@ -229,8 +240,10 @@ def _against(axis: Axis) -> tuple[Figure, Axes, list[float]]:
 
 
 def _numbers(axis: Axis) -> list[float] | None:
-    """The values of the axis, if they are numbers."""
-    if len(axis.fields) > 1 or axis.labels is not None:
+    """The values of the axis, or what they are called, if they are numbers."""
+    if axis.labels is not None:
+        return [float(label) for label in axis.labels] if all(map(_NUMBER, axis.labels)) else None
+    if len(axis.fields) > 1:
         return None
     values = [value for (value,) in axis.values]
     if any(isinstance(value, bool) or not isinstance(value, int | float) for value in values):

@@ -45,8 +45,10 @@ class Counted(msgspec.Struct, frozen=True):
     rate_low: float | None
     rate_high: float | None
     """Wilson's interval"""
-    ticks_p50: float | None
+    ticks_p10: float | None
     """until all was known; of trials that localised"""
+    ticks_p50: float | None
+    ticks_p90: float | None
     ticks_p95: float | None
     ticks_max: float | None
     meeting_tick_p50: float | None
@@ -79,6 +81,9 @@ class Counted(msgspec.Struct, frozen=True):
     """of these, without a violation"""
     violations: int
     """in all"""
+    reports_lost: int
+    """of all trials"""
+    reports_refused: int
     refused: str | None
     """why no mission can be played in this setting"""
 
@@ -112,7 +117,9 @@ def counted(table: pa.Table, refused: str | None = None) -> Counted:
         rate=k / n if n else None,
         rate_low=low,
         rate_high=high,
+        ticks_p10=_percentile(ticks, 10),
         ticks_p50=_percentile(ticks, 50),
+        ticks_p90=_percentile(ticks, 90),
         ticks_p95=_percentile(ticks, 95),
         ticks_max=_percentile(ticks, 100),
         meeting_tick_p50=_percentile(meeting, 50),
@@ -132,6 +139,8 @@ def counted(table: pa.Table, refused: str | None = None) -> Counted:
         audited=len(violations),
         clean=int((violations == 0.0).sum()),
         violations=int(violations.sum()),
+        reports_lost=int(_known(column(table, "reports_lost")).sum()),
+        reports_refused=int(_known(column(table, "reports_refused")).sum()),
         refused=refused,
     )
 

@@ -117,6 +117,9 @@ class Row(msgspec.Struct, frozen=True, array_like=True):
     reports_sent: int | None = None
     """by all"""
     reports_heard: int | None = None
+    reports_refused: int | None = None
+    reports_lost: int | None = None
+    """sent in contact, and never heard"""
     bytes_sent: int | None = None
     """of reports, by all"""
     violations: int | None = None
@@ -193,6 +196,8 @@ def row(trial: Trial, record: Record, wall_s: float, findings: Findings | None =
         nees=sum(nees) / len(nees) if nees else None,
         reports_sent=sum([farewell.reports_sent for farewell in said]),
         reports_heard=sum([farewell.reports_heard for farewell in said]),
+        reports_refused=sum([farewell.reports_refused for farewell in said]),
+        reports_lost=sum([farewell.reports_lost for farewell in said]),
         bytes_sent=sum([farewell.bytes_sent for farewell in said]),
         violations=len(findings.violations) if findings is not None else None,
         first_violation=findings.violations[0].line if findings is not None and findings.violations else None,

@@ -1,0 +1,108 @@
+"""A measurement: random fault plans, played as processes and in one process; are all journals the same bytes?
+
+    uv run python -m tests.same_plans 20
+
+A line for each plan, and a verdict; exit status 0 if all are the same. The number of a plan is its seed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import sys
+import tempfile
+from pathlib import Path
+
+from compose.scenario import parse
+from tests.commands import SECTION_IV, journals, tandem
+from tests.surveys import ODOMETRY, SIGMA, WHEELS
+
+EXACT, RANGES, ALL_NOISE = "", SIGMA, f"{SIGMA}\noutliers = 0.05\n{WHEELS}\n{ODOMETRY}"
+MAX_TICKS = 300
+"""a plan that lets next to nothing through ends undecided, which is to be the same both ways, too"""
+
+
+def main(count: int) -> int:
+    """Play `count` of them; 0 if every journal is the same both ways."""
+    different = 0
+    for number in range(1, count + 1):
+        text = scenario(random.Random(number))
+        parse(text, f"plan {number}")
+        with tempfile.TemporaryDirectory(prefix="tandem-same-") as folder:
+            outcomes, found = played(text, Path(folder))
+        same = found[0] == found[1] != {} and outcomes[0] == outcomes[1]
+        different += not same
+        told = f"{len(found[0])} journals, {sum(map(len, found[0].values()))} bytes"
+        print(
+            f"{number:3} {'same' if same else 'DIFFERENT'}: {outcomes[0]}; {told}; {said(text)}", flush=True
+        )
+        if not same:
+            for name in sorted(found[0].keys() | found[1].keys()):
+                if found[0].get(name) != found[1].get(name):
+                    print(f"    {name} differs; as processes {outcomes[0]}, in one process {outcomes[1]}")
+    print(f"{count - different} of {count} plans: the same bytes both ways")
+    return 1 if different else 0
+
+
+def played(text: str, folder: Path) -> tuple[list[str], list[dict[str, bytes]]]:
+    """As processes, then in one: how it ended, and the journals."""
+    (folder / "plan.toml").write_text(text)
+    outcomes, found = [], []
+    for out, mode in (("processes", []), ("one-process", ["--in-process"])):
+        ended = tandem("run", "plan.toml", "-q", "--out", out, *mode, cwd=folder)
+        outcomes.append(ended.out.strip() or ended.err.strip())
+        found.append(journals(folder / out))
+    return outcomes, found
+
+
+def scenario(draw: random.Random) -> str:
+    """A scenario with a plan of one to four faults; a third of them under noise, a fifth with two pairs."""
+    noise = draw.choice((EXACT, EXACT, EXACT, EXACT, RANGES, ALL_NOISE))
+    variant = draw.choice(("assured", "assured", "assured", "paper"))
+    pairs = 2 if draw.random() < 0.2 and not noise else 1
+    anchors = [(10.0 * (i % 2), 40.0 * (i // 2)) for i in range(2 * pairs)]
+    robots = "".join(
+        f'[[robot]]\nid = "{robot}"\npeer = "{peer}"\nanchor = [{x}, {y}]\n'
+        for robot, peer, (x, y) in zip("abcd", "badc", anchors, strict=False)
+    )
+    faults = "".join(f"[[fault]]\n{fault(draw, pairs)}" for _ in range(draw.randint(1, 4)))
+    table = f"[mission.noise]\n{noise}\n" if noise else ""
+    return (
+        f'name = "plan"\nseed = {draw.randrange(2**32)}\nmax_ticks = {MAX_TICKS}\n'
+        f'planner = {{variant = "{variant}"}}\n{SECTION_IV}{table}{robots}{faults}'
+    )
+
+
+def fault(draw: random.Random, pairs: int) -> str:
+    """The table of one."""
+    links = ["*", "a->b", "b->a", "a<->b", *(["c->d", "c<->d"] if pairs == 2 else [])]
+    lines = [f'link = "{draw.choice(links)}"']
+    least, most = sorted((draw.randrange(11), draw.randrange(11)))
+    begin, ticks = draw.randrange(10), draw.randrange(30)
+    may_say = (
+        f"loss = {draw.uniform(0.0, 0.9):.3f}",
+        f"burst_start = {draw.uniform(0.0, 0.5):.3f}\nburst_end = {draw.uniform(0.05, 1.0):.3f}",
+        f"delay = [{least}, {most}]",
+        f"duplicate = {draw.random():.3f}",
+        f"reorder = {draw.random():.3f}",
+        f"corrupt = {draw.uniform(0.0, 0.8):.3f}",
+        f"reports_per_tick = {draw.uniform(0.1, 2.0):.3f}",
+        f"partition = true\ncontact_ticks = [{begin}, {begin + ticks}]",
+    )
+    lines += [line for line in may_say if draw.random() < 0.4]
+    return "\n".join(lines) + "\n"
+
+
+def said(text: str) -> str:
+    """The plan, in a line."""
+    variant = "paper" if '"paper"' in text else "assured"
+    noise = "noisy" if "mission.noise" in text else "exact"
+    pairs = text.count("[[robot]]") // 2
+    faults = [" ".join(part.split()) for part in text.split("[[fault]]")[1:]]
+    return f"{variant}, {noise}, {pairs} pair{'s' if pairs > 1 else ''}; {' | '.join(faults)}"
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("count", type=int, nargs="?", default=20)
+    sys.exit(main(parser.parse_args().count))

@@ -1,0 +1,126 @@
+"""Campaigns over faults: those that ship say what their labels say, and rows count what was lost."""
+
+from __future__ import annotations
+
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from compose import inline
+from compose.campaign import figures, run, spec
+from compose.campaign.cells import Refused, cells, setting_of
+from compose.campaign.fields import NoSuchField, steps, with_value
+from compose.campaign.trial import Trial, row
+from compose.scenario import load
+from protocol.inbox import Inbox
+from world.faults import Fault
+from world.scenario import Scenario
+
+ALWAYS = 10**9
+LOSSES = (0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95)
+TICKS = (0, 1, 2, 5, 10, 20)
+WINDOWS = (0, 1, 5, 10, 20, 50)
+
+
+def scenarios(name: str) -> list[Scenario]:
+    """One for each cell of the campaign `name`, with the same seed; all of them face the same starts."""
+    campaign = spec.load(name)
+    found = []
+    for cell in cells(campaign):
+        assert cell.key == "{}"
+        setting = setting_of(campaign, cell)
+        assert not isinstance(setting, Refused)
+        found.append(setting.seeded(7))
+    assert len({tuple(robot.start for robot in scenario.robots) for scenario in found}) == 1
+    return found
+
+
+def there(scenario: Scenario) -> Fault:
+    """The one of its faults that is there."""
+    (fault,) = [fault for fault in scenario.faults if fault.ticks == (0, ALWAYS)]
+    return fault
+
+
+def test_the_campaign_of_loss_loses_what_it_says() -> None:
+    for (share, bursts), scenario in zip(product(LOSSES, (False, True)), scenarios("loss"), strict=True):
+        fault = there(scenario)
+        assert fault.let_through == pytest.approx(1.0 - share)
+        if bursts:
+            assert (fault.loss, 1.0 / fault.burst_end) == (0.0, 20.0)
+
+
+def test_the_campaign_of_delay_delays_by_what_it_says() -> None:
+    for (ticks, how), scenario in zip(product(TICKS, range(3)), scenarios("delay"), strict=True):
+        fault = there(scenario)
+        assert fault.delay == (ticks if how == 0 else 0, ticks)
+        assert (fault.reorder, fault.duplicate) == ((0.0, 0.0) if how == 0 else (0.3, 0.3))
+        assert fault.corrupt == (0.1 if how == 2 else 0.0)
+        assert fault.bursty == pytest.approx(0.9 if how == 2 else 0.0)
+
+
+def test_the_campaign_of_partitions_cuts_when_and_which_way_it_says() -> None:
+    ways = ("a->b", "b->a", "a<->b")
+    for (ticks, begin, way), scenario in zip(
+        product(WINDOWS, (0, 2), ways), scenarios("partition"), strict=True
+    ):
+        (fault,) = [fault for fault in scenario.faults if fault.partition]
+        assert fault.contact_ticks == (begin, begin + ticks)
+        assert fault.on("a", "b") == (way != "b->a")
+        assert fault.on("b", "a") == (way != "a->b")
+
+
+def test_a_fault_may_be_varied_that_the_base_scenario_leaves_out() -> None:
+    bases: tuple[dict[str, Any], ...] = ({}, {"fault": []}, {"fault": [{"loss": 0.5}]})
+    for base in bases:
+        changed = with_value(base, steps("fault[1].delay", base), [0, 3])
+        assert changed["fault"] == [*(base.get("fault") or [{}]), {"delay": [0, 3]}]
+        assert with_value(base, steps("fault", base), [{"loss": 0.1}])["fault"] == [{"loss": 0.1}]
+    with pytest.raises(NoSuchField, match=r"fault\[0\] has no field 'los'"):
+        steps("fault[0].los", {})
+    with pytest.raises(NoSuchField, match=r"the base scenario has no robot\[2\]"):
+        steps("robot[2].anchor", {"robot": [{}, {}]})
+
+
+def test_a_row_counts_what_was_lost_and_refused() -> None:
+    scenario = load("random", faults=["loss=0.5, corrupt=0.3"])
+    record = inline.play(scenario)
+    found = row(Trial(0, 0, scenario, processes=False), record, 0.1)
+    said = record.farewells.values()
+    assert found.reports_lost == sum([one.reports_lost for one in said]) > 0
+    assert found.reports_refused == sum([one.reports_refused for one in said]) > 0
+    heard = sum([one.reports_heard for one in said])
+    assert found.reports_sent == heard + found.reports_lost + found.reports_refused
+
+
+SMALL = """
+name = "small"
+scenario = "random"
+trials = 3
+[[axis]]
+name = "lost"
+fields = ["fault[0].loss"]
+labels = LABELS
+values = [[0.0], [0.5]]
+"""
+
+
+@pytest.mark.parametrize(("labels", "curve"), [('["0", "0.5"]', True), ('["none", "half"]', False)])
+def test_labels_that_are_numbers_make_a_curve_with_a_band(labels: str, curve: bool, tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(SMALL.replace("LABELS", labels))
+    campaign = spec.load(str(tmp_path / "small.toml"))
+    silent = run.Progress(say=print, begin=lambda *_: None, done=lambda _: None)
+    results = run.sweep(campaign, tmp_path / "out", run.Means(workers=1), Inbox("test"), silent)
+    (axes,) = figures.ticks_against(results, 0).axes
+    median = axes.lines[0]
+    assert median.get_linestyle() == ("-" if curve else "None")
+    assert np.asarray(median.get_xdata()).tolist() == ([0.0, 0.5] if curve else [0.0, 1.0])
+    assert ("10 to 90 %" in axes.get_legend_handles_labels()[1]) == curve
+    found = [results.figures[cell.index] for cell in results.cells]
+    assert [one.localised for one in found] == [3, 3]
+    assert found[0].reports_lost == 0 < found[1].reports_lost
+    for one in found:
+        in_order = [one.ticks_p10, one.ticks_p50, one.ticks_p90, one.ticks_p95, one.ticks_max]
+        assert in_order == sorted(in_order, key=lambda ticks: ticks or 0.0)
