@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 
+from compose.campaign import lies
 from compose.campaign.run import Results
 from compose.campaign.spec import Axis
 from compose.campaign.summary import Counted, column, counted, orbited_over_t_max
@@ -50,6 +51,10 @@ def draw(results: Results, folder: Path) -> None:
                 save(_success(results, place), folder / f"success-{name}")
                 save(ticks_against(results, place), folder / f"ticks-{name}")
         save(_meeting(results), folder / "meeting")
+        if (of_lies := lies.axis_of_lies(results)) is not None:
+            save(lies.outcomes(results, of_lies), folder / "lies")
+            if (roc := lies.roc(results, of_lies)) is not None:
+                save(roc, folder / "roc")
 
 
 def _success(results: Results, place: int) -> Figure:
