@@ -16,93 +16,20 @@ from typing import Any
 import zenoh
 
 from agent import radio
+from agent.joining import NoWorld
 from agent.memory import REPORTS_KEPT, REPORTS_TOLD, Memory
 from agent.robot import Told
 from protocol import keys, session
 from protocol.inbox import Arrival, Inbox
-from protocol.messages import Briefing, End, Farewell, Report, Sense
+from protocol.messages import End, Farewell, Report, Sense
 from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode, encode
 
 REPORT_SHARE = 0.5
 """of a tick in real time: how long to wait for the peer's report"""
-QUERY_S = 2.0
-"""how long to wait for the answer to one query"""
-SESSION_S = 3.0
-"""how long to look for a world through one session, or to wait for a robot's former process to be gone"""
-ASK_AGAIN_S = 0.05
-"""how long to wait before looking for a world again"""
-FIRST_WORD_S = 5.0
-"""how long an agent looks for its world before it says so"""
+LAST_WORD_S = 0.5
+"""how long what the world has said may outlast its sign of life"""
 BEHIND_S = 3.0
 """in real time: how long what lies between what it knows and what it hears may be outstanding"""
-
-
-class Unwelcome(Exception):
-    """There is a world, but this robot cannot join it; says why."""
-
-
-class NoWorld(TimeoutError):
-    """There is no world within the wait, or none to go on with; says so."""
-
-
-class Search:
-    """Looking for a world, for `wait` seconds at the most, and saying so after FIRST_WORD_S."""
-
-    def __init__(self, what: str, wait: float, inbox: Inbox) -> None:
-        self._what = what
-        self._wait = wait
-        self._inbox = inbox
-        self._began = time.monotonic()
-        self._told = False
-
-    def go_on(self) -> None:
-        """Wait a moment. Raises NoWorld when that has been too long, Interrupted when told to stop."""
-        waited = time.monotonic() - self._began
-        if waited >= self._wait:
-            raise NoWorld(f"no {self._what}; gave up after {self._wait:g} s")
-        if waited >= FIRST_WORD_S and not self._told:
-            self._told = True
-            self._inbox.say(f"no {self._what} yet; looking for one for {self._wait:g} s")
-        self.pause()
-
-    def pause(self) -> None:
-        """Wait a moment, with a world in sight. Raises Interrupted when told to stop."""
-        self._inbox.next(ASK_AGAIN_S)
-
-
-def join(link: zenoh.Session, run: str | None, robot: str, search: Search) -> tuple[str, Briefing] | None:
-    """The run that `robot` belongs to, and its briefing; `run` may name it. None after SESSION_S without.
-
-    A robot's former process may have ended just now, and seem to be there for a moment. Raises Unwelcome
-    if there are several runs, if the world has no such robot, or if somebody plays it all the time; whatever
-    `search` raises while there is no world.
-    """
-    until = time.monotonic() + SESSION_S
-    played: str | None = None
-    while time.monotonic() < until:
-        worlds = [keys.run_of(key) for key in session.alive(link, keys.world_alive(run or "*"), QUERY_S)]
-        if len(worlds) > 1:
-            raise Unwelcome(f"several runs are alive: {', '.join(worlds)}; choose one with --run")
-        played = None
-        for world in worlds:
-            if session.alive(link, keys.robot_alive(world, robot), QUERY_S):
-                played = world
-                continue
-            answer = session.ask(link, keys.briefing(world, robot), QUERY_S)
-            if isinstance(answer, str):
-                raise Unwelcome(answer)
-            if answer is not None:
-                try:
-                    return world, decode(answer, Briefing)
-                except MalformedFrame as error:
-                    raise Unwelcome(f"the world's briefing is not understood: {error}") from None
-        if played is None:
-            search.go_on()
-        else:
-            search.pause()
-    if played is not None:
-        raise Unwelcome(f"robot '{robot}' is in run '{played}' already")
-    return None
 
 
 class AgentProcess:
@@ -333,8 +260,9 @@ class AgentProcess:
         frame = encode(farewell)
         self._drive.put(frame)
         give_up = time.monotonic() + self._patience
+        gone = False
         while (left := give_up - time.monotonic()) > 0.0:
-            arrival = self._inbox.next(left)
+            arrival = self._inbox.next(min(left, LAST_WORD_S) if gone else left)
             if arrival.topic == "sense":
                 if arrival.frame == frame:
                     break
@@ -343,7 +271,10 @@ class AgentProcess:
                     self._out_of_step(message.tick, end.tick)
                 self._drive.put(frame)
             elif arrival.topic == "gone":
+                gone = True  # what it said before may be on its way
+            elif gone and arrival.topic == "nothing":
                 self._inbox.say(f"the world has gone after its End; waiting {self._patience:g} s for it")
+                gone = False
         return end
 
     def _want_estimate(self, wanted: bool) -> None:

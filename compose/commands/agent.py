@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from agent.joining import NoWorld, Search, Unwelcome, join
 from agent.memory import Memory, remember
-from agent.process import AgentProcess, NoWorld, Search, Unwelcome, join
+from agent.process import AgentProcess
 from agent.robot import Robot
 from compose import kill
 from compose.record import ended, make
