@@ -51,16 +51,26 @@ def met(mind: Mind) -> Mind:
 def considered(mind: Mind) -> Mind:
     """Both logs in hand: weigh the placements; then claim, plan the last manoeuvre, or go on.
 
+    Not before the peer has told of everything up to where this robot stands; and not twice of the same.
+    """
+    if not mind.briefing.mission.noise.exact:
+        return mind if letter.waits(mind) else letter.considered(mind)
+    assert isinstance(mind.state, Standing | Waiting)
+    last = min(mind.tick, mind.radio.peer.through)
+    if last < mind.log.moved() or last == mind.state.through:
+        return mind
+    return _settled(replace(mind, state=replace(mind.state, through=last)))
+
+
+def _settled(mind: Mind) -> Mind:
+    """The same, where sensors are exact.
+
     The letter looks at the encounter alone; `assured` also at what was ranged, and what was silent, before.
     """
     mission, distance = mind.briefing.mission, mind.briefing.anchor_distance
-    if not mission.noise.exact:
-        return mind if letter.waits(mind) else letter.considered(mind)
     variant, began = mind.briefing.variant, mind.findings.met
     assert began is not None
     sightings = mind.sightings(began if variant == "paper" else 0)
-    if sightings and sightings[-1].tick < mind.log.moved():  # what this robot did last is not answered yet
-        return mind
     base = encounter.base([at for at in sightings if off_anchor(at.b, mind.briefing.rendezvous.b)])
     if base is None:  # yet; or, where a report was missed, b was still driving as a went straight
         again = isinstance(mind.state, Waiting) and mind.radio.state == WORDS[Standing]

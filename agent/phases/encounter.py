@@ -42,9 +42,15 @@ SURE = 5e-7
 class Standing(msgspec.Struct, frozen=True):
     """b stands, and waits for a's second range; or, back from a manoeuvre, for word from a."""
 
+    through: int = -1
+    """ranges are weighed through this tick"""
+
 
 class Waiting(msgspec.Struct, frozen=True):
     """a stands: it has its second range, and b makes the last manoeuvre; a too, where that is not enough."""
+
+    through: int = -1
+    """ranges are weighed through this tick"""
 
 
 class LastManoeuvre(msgspec.Struct, frozen=True):
@@ -75,7 +81,12 @@ class Plan(NamedTuple):
 
 def base(sightings: Sequence[Sighting]) -> tuple[Sighting, Sighting] | None:
     """The two ranges that eq. (7) is solved from: the first two between which only a has moved."""
-    ranged = [sighting for sighting in sightings if sighting.range is not None]
+    ranged: list[Sighting] = []
+    for sighting in sightings:
+        if sighting.range is not None and not (
+            ranged and (ranged[-1].a, ranged[-1].b) == (sighting.a, sighting.b)  # both have stood since
+        ):
+            ranged.append(sighting)
     for first in ranged:
         for second in ranged:
             if first.tick < second.tick and travelled(first.b, second.b) < ELSEWHERE < travelled(
