@@ -9,14 +9,14 @@ import numpy as np
 from msgspec.structs import replace
 
 from agent.belief import Branch
-from agent.doubt import DOUBTFUL, FINISHED, Doubt, doubt
-from agent.hypotheses import Weighed, missing, of_anchor
+from agent.estimation.doubt import DOUBTFUL, FINISHED, Doubt, doubt
+from agent.estimation.hypotheses import Weighed, missing, of_anchor
+from agent.estimation.odometry import Array, Track, track
+from agent.estimation.ranging import SIGMA_FLOOR, Pair, Ranges
+from agent.estimation.smoothing import deviation, poses
 from agent.logbook import Logbook
 from agent.mind import Mind
-from agent.odometry import Array, Track, track
 from agent.phases.surveying import Held
-from agent.ranging import SIGMA_FLOOR, Pair, Ranges
-from agent.smoothing import deviation, poses
 from protocol.mission import Mission
 from protocol.motion import Covariance, Pose, compose, wrap
 

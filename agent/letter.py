@@ -12,8 +12,8 @@ from msgspec.structs import replace
 
 from agent import inference
 from agent.belief import Branch
+from agent.estimation.hypotheses import search
 from agent.geometry import Placement
-from agent.hypotheses import search
 from agent.mind import WORDS, Mind
 from agent.phases import encounter
 from agent.phases.encounter import LastManoeuvre, Standing, Waiting

@@ -8,9 +8,9 @@ import msgspec
 from msgspec.structs import replace
 
 from agent.belief import Branch, Sighting
-from agent.doubt import Doubt
+from agent.estimation.doubt import Doubt
+from agent.estimation.hypotheses import Hypothesis
 from agent.geometry import Placement
-from agent.hypotheses import Hypothesis
 from agent.logbook import Logbook
 from agent.phases.anchor import ThirdPoint
 from agent.phases.encounter import LastManoeuvre, Plan, Returning, Standing, Waiting

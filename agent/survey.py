@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from agent import inference
-from agent.doubt import DOUBTFUL, LOOKS, UNBELIEVABLE
-from agent.hypotheses import Weighed, follow, search
+from agent.estimation.doubt import DOUBTFUL, LOOKS, UNBELIEVABLE
+from agent.estimation.hypotheses import Weighed, follow, search
 from agent.mind import Asleep, Done, Mind
 from agent.phases import rendezvous, seeking, surveying
 from agent.phases.encounter import Returning

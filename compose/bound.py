@@ -11,9 +11,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from agent.odometry import Track, track
-from agent.ranging import Ranges
-from agent.smoothing import deviation, fit, poses
+from agent.estimation.odometry import Track, track
+from agent.estimation.ranging import Ranges
+from agent.estimation.smoothing import deviation, fit, poses
 from compose.record import Record
 from protocol.motion import Controls, Pose
 from world.sensors import anchor_ranges, executed, mutual_ranges

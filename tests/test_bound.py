@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from agent.odometry import Array
+from agent.estimation.odometry import Array
 from compose.bound import position_bounds
 from compose.record import Record, summary
 from protocol.motion import Controls, Pose, step

@@ -2,7 +2,7 @@
 
 Fifty missions are played and recorded. What both robots had measured when they claimed is read back from
 their journals, twice: into a mind, for the fit that the claim came of; and into a graph of every pose and
-every manoeuvre, which has nothing in common with `agent.smoothing` but the model.
+every manoeuvre, which has nothing in common with `agent.estimation.smoothing` but the model.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from agent import inference, planner
-from agent.hypotheses import Weighed, search
+from agent.estimation.hypotheses import Weighed, search
+from agent.estimation.ranging import Pair
+from agent.estimation.smoothing import Fit, poses
 from agent.mind import Done, Mind
-from agent.ranging import Pair
-from agent.smoothing import Fit, poses
 from compose.inline import play
 from compose.scenario import parse
 from protocol import journal

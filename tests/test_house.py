@@ -37,23 +37,18 @@ PURE = {
     "agent.mind",
     "agent.meeting",
     "agent.belief",
-    "agent.doubt",
     "agent.geometry",
-    "agent.hypotheses",
     "agent.inference",
     "agent.letter",
     "agent.logbook",
     "agent.lying",
-    "agent.odometry",
-    "agent.ranging",
-    "agent.seeding",
-    "agent.smoothing",
     "agent.survey",
     "agent.trust",
     "agent.radio",
     *(
         ".".join(path.relative_to(HOUSE).with_suffix("").parts)
-        for path in sorted((HOUSE / "agent" / "phases").glob("*.py"))
+        for floor in ("phases", "estimation")
+        for path in sorted((HOUSE / "agent" / floor).glob("*.py"))
     ),
     "world.tick",
     "world.truth",

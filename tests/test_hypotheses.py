@@ -12,11 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agent import geometry
+from agent.estimation.hypotheses import Weighed, missing, of_anchor, search, silence
+from agent.estimation.odometry import Array, track
+from agent.estimation.ranging import Pair, Ranges
+from agent.estimation.smoothing import fit, poses
 from agent.geometry import Placement, same_placement
-from agent.hypotheses import Weighed, missing, of_anchor, search, silence
-from agent.odometry import Array, track
-from agent.ranging import Pair, Ranges
-from agent.smoothing import fit, poses
 from protocol.motion import Pose, step, wrap
 from protocol.noise import Drift, Noise
 

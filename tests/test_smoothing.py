@@ -12,9 +12,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from agent.odometry import Errors, Seen, Track, attributed, shifted, spread, track, wander
-from agent.ranging import Ranges, predict
-from agent.smoothing import STILL, Fit, deviation, fit, poses
+from agent.estimation.odometry import Errors, Seen, Track, attributed, shifted, spread, track, wander
+from agent.estimation.ranging import Ranges, predict
+from agent.estimation.smoothing import STILL, Fit, deviation, fit, poses
 from protocol.motion import ORIGIN, Pose, compose, step
 from protocol.noise import Drift, Noise
 

@@ -12,10 +12,10 @@ from msgspec.structs import replace
 
 import agent.survey
 from agent import planner
-from agent.hypotheses import Weighed, search
+from agent.estimation.hypotheses import Weighed, search
+from agent.estimation.ranging import Pair
 from agent.mind import Mind
 from agent.phases.rendezvous import Aligning, Radial, orientation
-from agent.ranging import Pair
 from agent.survey import OFF_RADIUS
 from compose.inline import play
 from compose.record import Record, summary

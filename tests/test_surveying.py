@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from agent.odometry import Array
+from agent.estimation.odometry import Array
 from agent.phases.rendezvous import pursuit
 from agent.phases.seeking import Homing, arrived, homeward
 from agent.phases.surveying import AHEAD, Held, alone, choice, stride, together

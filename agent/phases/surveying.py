@@ -14,9 +14,9 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from agent.odometry import Array, Places
+from agent.estimation.odometry import Array, Places
+from agent.estimation.ranging import SIGMA_FLOOR
 from agent.phases.seeking import Beacon
-from agent.ranging import SIGMA_FLOOR
 from protocol.mission import Mission
 from protocol.motion import REST, Controls
 

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.ranging import Pair
-from agent.smoothing import Fit
+from agent.estimation.ranging import Pair
+from agent.estimation.smoothing import Fit
 from protocol.messages import Alarm
 
 DOUBTFUL = 1e-3

@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.odometry import Array, Places, Track
-from agent.ranging import SIGMA_FLOOR, Pair, Ranges, placed
-from agent.seeding import MOST, SEED_RANGES, anchors, placements, without_drift
-from agent.smoothing import STEPS, Fit, deviation, fit
+from agent.estimation.odometry import Array, Places, Track
+from agent.estimation.ranging import SIGMA_FLOOR, Pair, Ranges, placed
+from agent.estimation.seeding import MOST, SEED_RANGES, anchors, placements, without_drift
+from agent.estimation.smoothing import STEPS, Fit, deviation, fit
 from protocol.noise import Noise
 
 ODDS_KEPT = 1e-7

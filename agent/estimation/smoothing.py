@@ -16,8 +16,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.odometry import Array, Errors, Places, Seen, Track, Wander, attributed, shifted, spread, wander
-from agent.ranging import Ranges, mixture, outliers, predict
+from agent.estimation.odometry import (
+    Array,
+    Errors,
+    Places,
+    Seen,
+    Track,
+    Wander,
+    attributed,
+    shifted,
+    spread,
+    wander,
+)
+from agent.estimation.ranging import Ranges, mixture, outliers, predict
 from protocol.noise import Drift, Noise
 
 STEPS = 8

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.odometry import Array, Places, Seen, Track
+from agent.estimation.odometry import Array, Places, Seen, Track
 from protocol.noise import Noise
 
 SIGMA_FLOOR = 1e-6

@@ -13,8 +13,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from msgspec.structs import replace
 
-from agent.odometry import Array, Track, wander
-from agent.ranging import SIGMA_FLOOR, Pair, Ranges, mixture, placed
+from agent.estimation.odometry import Array, Track, wander
+from agent.estimation.ranging import SIGMA_FLOOR, Pair, Ranges, mixture, placed
 from protocol.noise import Drift, Noise
 
 SEED_RANGES = 10
