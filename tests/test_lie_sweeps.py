@@ -1,0 +1,100 @@
+"""The campaign over lies: its labels say what is told, and its pictures what became of it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from compose.campaign import figures, lies, run, spec
+from compose.campaign.cells import Refused, cells, setting_of
+from protocol.inbox import Inbox
+from protocol.lie import Lie
+
+SPEC = """
+name = "few-lies"
+scenario = "random"
+trials = 4
+seed = 3
+
+[[axis]]
+name = "lie"
+field = "robot.a.lie"
+paired = true
+labels = ["honest", "scale orbit 0.5", "rotate encounter 15 deg"]
+values = [
+    {kind = "scale", part = "all", size = 1.0},
+    {kind = "scale", part = "orbit", size = 0.5},
+    {kind = "rotate", part = "encounter", size = 0.26},
+]
+
+[[axis]]
+name = "sigma"
+paired = true
+fields = ["mission.noise.anchor_sigma", "mission.noise.mutual_sigma"]
+labels = ["0 m", "0.01 m"]
+values = [[0.0, 0.0], [0.01, 0.01]]
+"""
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> run.Results:
+    """A few missions with a few lies, played."""
+    folder = tmp_path_factory.mktemp("lies")
+    (folder / "few.toml").write_text(SPEC)
+    progress = run.Progress(say=lambda _: None, begin=lambda *_: None, done=lambda _: None)
+    campaign = spec.load(str(folder / "few.toml"))
+    return run.sweep(campaign, folder / "out", run.Means(workers=1), Inbox("test"), progress)
+
+
+def test_the_campaign_that_ships_tells_the_lies_of_its_labels() -> None:
+    campaign = spec.load("lies")
+    seen: dict[str, Lie | None] = {}
+    for cell in cells(campaign):
+        setting = setting_of(campaign, cell)
+        assert not isinstance(setting, Refused)
+        a, b = setting.scenario.robots
+        assert b.lie is None
+        seen[campaign.axes[0].label(cell.place[0])] = a.lie
+    assert seen.pop("honest") == Lie("scale", 1.0), "which is no lie"
+    for label, lie in seen.items():
+        assert lie is not None
+        kind, *part, size = label.removesuffix(" deg").removesuffix(" m").split()
+        assert (lie.kind, lie.part) == (kind, part[0] if part else "all")
+        assert lie.size == pytest.approx(math.radians(float(size)) if "deg" in label else float(size))
+
+
+def test_honest_missions_localise_and_lies_are_alarms(results: run.Results) -> None:
+    outcomes: dict[tuple[int, ...], set[str]] = {cell.place: set() for cell in results.cells}
+    places = {cell.index: cell.place for cell in results.cells}
+    for row in results.table.to_pylist():
+        outcomes[places[row["cell"]]].add(row["outcome"])
+    assert outcomes == {(i, j): {"alarm" if i else "localised"} for i in range(3) for j in range(2)}
+
+
+def test_the_pictures_show_what_became_of_each_lie(results: run.Results, tmp_path: Path) -> None:
+    figures.draw(results, tmp_path)
+    assert {"lies.svg", "lies.png", "roc.svg", "roc.png"} <= {path.name for path in tmp_path.iterdir()}
+    place = lies.axis_of_lies(results)
+    assert place == 0
+    exact, noisy = lies.outcomes(results, place).axes
+    for panel in (exact, noisy):
+        widths = [[bar.get_width() for bar in bars] for bars in panel.containers]
+        assert np.allclose(widths, [[0.0, 1.0, 1.0], [0.0] * 3, [1.0, 0.0, 0.0], [0.0] * 3])
+    roc = lies.roc(results, place)
+    assert roc is not None
+    (panel,) = roc.axes
+    assert [line.get_label() for line in panel.lines] == ["scale orbit", "rotate encounter"]
+    assert all(np.all(line.get_ydata() == 1.0) for line in panel.lines), "every lie before any honest one"
+
+
+def test_a_campaign_without_lies_has_no_such_pictures(tmp_path: Path) -> None:
+    (tmp_path / "few.toml").write_text('name = "few"\nscenario = "random"\ntrials = 2\nseed = 1\n')
+    progress = run.Progress(say=lambda _: None, begin=lambda *_: None, done=lambda _: None)
+    campaign = spec.load(str(tmp_path / "few.toml"))
+    results = run.sweep(campaign, tmp_path / "out", run.Means(workers=1), Inbox("test"), progress)
+    assert lies.axis_of_lies(results) is None
+    figures.draw(results, tmp_path / "figures")
+    assert not (tmp_path / "figures" / "roc.svg").exists()
