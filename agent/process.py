@@ -29,7 +29,12 @@ REPORT_SHARE = 0.5
 LAST_WORD_S = 0.5
 """how long what the world has said may outlast its sign of life"""
 BEHIND_S = 3.0
-"""in real time: how long what lies between what it knows and what it hears may be outstanding"""
+"""how long the world must go on saying what is out of step, and nothing else, to be believed: a stranger may
+say anything, and in real time what lies between may be outstanding"""
+ENDED_S = 1.0
+"""how long an End of another tick must be said; the world says its own for twice as long, or more"""
+AGAIN_S = 0.05
+"""how often to say again what was said: to one frame may answer as many as there are reports to tell"""
 
 
 class AgentProcess:
@@ -60,8 +65,11 @@ class AgentProcess:
         """in real time: when to go on without the reports that it lists"""
         if self._sense is not None and self._robot.drive is None:
             self._set_due()
-        self._behind: float | None = None
-        """in real time: since when a Sense is outstanding that came before one it has heard"""
+        self._odd: tuple[Sense | End, float] | None = None
+        """what has been said out of step, with nothing in step since; and since when"""
+        self._world_there = True
+        self._said_again = 0.0
+        """when all was last said again"""
         self._told = deque(memory.told, maxlen=REPORTS_TOLD)
         """its own latest reports"""
         self._reports = {told.report.tick: told for told in memory.heard}
@@ -93,20 +101,26 @@ class AgentProcess:
             match arrival.topic:
                 case "sense":
                     message = self._accepted(arrival)
-                    if isinstance(message, End):
+                    if isinstance(message, End) and self._is_over(message):
                         return self._part(message, self._farewell(message))
-                    if message is not None:
+                    if isinstance(message, Sense) and self._on_sense(message, arrival.frame):
                         give_up = time.monotonic() + patience
-                        self._on_sense(message, arrival.frame)
                 case "report":
                     self._on_report(arrival)
-                case "gone":
-                    self._inbox.say(f"the world has gone; waiting {patience:g} s for it")
+                case "gone" | "alive":
+                    self._world_there, self._odd = arrival.topic == "alive", None
+                    if not self._world_there:
+                        self._inbox.say(f"the world has gone; waiting {patience:g} s for it")
                 case _:
                     pass
             self._decide_when_all_is_heard()
             if time.monotonic() > give_up:
                 raise NoWorld(f"nothing heard from the world for {patience:g} s")
+
+    @property
+    def _known(self) -> int:
+        """The tick of its latest Sense."""
+        return self._sense.tick if self._sense is not None else -1
 
     # --- what arrives ---
 
@@ -121,46 +135,65 @@ class AgentProcess:
             return None
         return message
 
-    def _on_sense(self, sense: Sense, frame: bytes) -> None:
-        known = self._sense.tick if self._sense is not None else -1
-        if sense.tick == known + 1:
+    def _is_over(self, end: End) -> bool:
+        return end.tick == self._known or self._persists(end, ENDED_S)
+
+    def _on_sense(self, sense: Sense, frame: bytes) -> bool:
+        """Whether it is in step. Raises NoWorld."""
+        if sense.tick == self._known + 1:
             if self._reached is not None:
                 self._reached("sense", sense.tick)
             if self._due is not None:  # the world goes on; what has not come is missed
                 self._due = 0.0
                 self._decide_when_all_is_heard()
-            self._behind = None
+            self._odd = None
             self._sense = sense
             self._set_due()
             told = self._robot.sense(sense, frame)
             if told is not None:
                 self._told.append(told)
                 self._send_report(told)
-        elif sense == self._sense:
+            return True
+        if sense == self._sense:
+            self._odd = None
             self._say_again()
-        else:
-            self._out_of_step(sense.tick, known)
+            return True
+        self._out_of_step(sense, self._known)
+        return False
 
-    def _out_of_step(self, tick: int, known: int) -> None:
-        """The world is elsewhere. In real time it tells what lies between; in lockstep one has lost its past.
+    def _out_of_step(self, sense: Sense, known: int) -> None:
+        """The world is elsewhere, if it stays there: one of the two has lost its past, or comes too late.
 
-        Raises NoWorld.
+        In real time it tells what lies between. Raises NoWorld.
         """
-        now = time.monotonic()
+        tick = sense.tick
+        if self._tick_s is not None and tick < known:
+            return  # told once more of what was missed
+        if self._tick_s is not None and tick > known and self._odd is None:
+            self._appear()  # who appears is told what it has missed
+        if not self._persists(sense, BEHIND_S):
+            return
         if tick == known:
             raise NoWorld(
                 f"the record is another run's: in this one, {self._id} senses otherwise at tick {tick}"
             )
-        if self._tick_s is not None:
-            if tick < known:
-                return
-            if self._behind is None:
-                self._behind = now
-                self._appear()  # who appears is told what it has missed
-            if now - self._behind < BEHIND_S:
-                return
         late = "too late" if tick > known else "started again without its record"
         raise NoWorld(f"{late}: the world is at tick {tick}, {self._id} knows it up to {known}")
+
+    def _persists(self, message: Sense | End, bound_s: float) -> bool:
+        """Whether the world has said `message`, and nothing in step, for `bound_s`; until then it is refused.
+
+        In lockstep it would say the same over and over; in real time its Senses go on.
+        """
+        now = time.monotonic()
+        goes_on = self._tick_s is not None and isinstance(message, Sense)
+        if self._odd is None or not (message == self._odd[0] or goes_on):
+            self._odd = message, now
+        if self._world_there and now - self._odd[1] >= bound_s:
+            return True
+        if not goes_on:
+            self._inbox.refused["sense"] += 1  # it is told once it is believed
+        return False
 
     def _appear(self) -> None:
         """Go and come, as the world sees it."""
@@ -184,11 +217,12 @@ class AgentProcess:
         if wrong is not None:
             self._inbox.refuse(arrival, wrong)
             return
-        now = self._sense.tick if self._sense is not None else 0
-        if abs(report.tick - now) <= REPORTS_KEPT:
-            self._reports.setdefault(report.tick, Told(report, arrival.frame))
-        else:
+        if self._tick_s is None and report.tick > self._known + 1:
+            self._inbox.refuse(arrival, "it is of a tick to come")
+        elif abs(report.tick - max(self._known, 0)) > REPORTS_KEPT:
             self._unheard += 1
+        elif self._reports.setdefault(report.tick, Told(report, arrival.frame)).frame != arrival.frame:
+            self._inbox.refuse(arrival, "it was told otherwise before")
 
     # --- what is done about it ---
 
@@ -238,6 +272,9 @@ class AgentProcess:
 
     def _say_again(self) -> None:
         """All that whoever was started again may have lost: earlier reports, too, if the peer is near."""
+        if time.monotonic() < self._said_again + AGAIN_S:
+            return
+        self._said_again = time.monotonic()
         if self._robot.told is not None:
             oldest = self._robot.told.report.tick - REPORTS_TOLD
             for told in self._told:
@@ -259,6 +296,7 @@ class AgentProcess:
         """Answer the End, as often as it is said, until the world says that it has the answer on record."""
         frame = encode(farewell)
         self._drive.put(frame)
+        self._odd = None
         give_up = time.monotonic() + self._patience
         gone = False
         while (left := give_up - time.monotonic()) > 0.0:
@@ -268,9 +306,14 @@ class AgentProcess:
                     break
                 message = self._accepted(arrival)
                 if isinstance(message, Sense):
-                    self._out_of_step(message.tick, end.tick)
-                self._drive.put(frame)
+                    self._out_of_step(message, end.tick)
+                elif message is not None:
+                    self._odd = None
+                    self._drive.put(frame)
+            elif arrival.topic == "alive":
+                self._world_there, self._odd = True, None
             elif arrival.topic == "gone":
+                self._world_there = False
                 gone = True  # what it said before may be on its way
             elif gone and arrival.topic == "nothing":
                 self._inbox.say(f"the world has gone after its End; waiting {self._patience:g} s for it")

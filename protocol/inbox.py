@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 from collections import Counter
 from queue import Empty, SimpleQueue
 from typing import Literal, NamedTuple
@@ -11,6 +12,12 @@ Topic = Literal["sense", "drive", "report", "alive", "gone", "ended", "stop", "n
 
 COMPLAINTS = 100
 """kinds of malformed frames that are told, each once; the rest is only counted"""
+COMPLAINT = 300
+"""characters that are told of each"""
+ROOM_BYTES = 1 << 22
+"""what may wait of one topic: thousands of frames, more than any mission has waiting"""
+ARRIVAL_BYTES = 200
+"""what a frame takes beside its own bytes, about"""
 
 
 class Interrupted(Exception):
@@ -29,18 +36,35 @@ NOTHING = Arrival("nothing")
 
 
 class Inbox:
-    """A queue that callbacks and signal handlers fill, and one thread empties, with a bound on each wait."""
+    """A queue that callbacks and signal handlers fill, and one thread empties, with a bound on each wait.
+
+    What comes faster than it is emptied must not grow without end. Each topic has ROOM_BYTES of its own, so a
+    flood of one leaves the others their room; a frame for which there is none is refused. Should that be one
+    that the mission needs, it is lost as on any bad link, and said again.
+    """
 
     def __init__(self, owner: str) -> None:
         self.refused = Counter[Topic]()
-        """frames that were malformed, or not from whom they said"""
+        """frames that were malformed, not from whom they said, out of step, or more than there is room for"""
         self._owner = owner
         self._queue: SimpleQueue[Arrival] = SimpleQueue()
         self._complaints: set[tuple[str, str]] = set()
+        self._waiting = Counter[Topic]()
+        """bytes"""
+        self._dropped = Counter[tuple[Topic, str]]()
+        """by topic and key, those for which there was no room, until they are counted as refused"""
+        self._lock = threading.RLock()  # a signal handler may interrupt its holder
 
     def put(self, topic: Topic, key: str = "", frame: bytes = b"") -> None:
         """From any thread, and from a signal handler."""
-        self._queue.put(Arrival(topic, key, frame))
+        arrival = Arrival(topic, key, frame)
+        with self._lock:
+            waiting = self._waiting[topic]
+            if waiting and waiting + _size(arrival) > ROOM_BYTES:
+                self._dropped[topic, key] += 1
+                return
+            self._waiting[topic] = waiting + _size(arrival)
+        self._queue.put(arrival)
 
     def next(self, timeout: float | None) -> Arrival:
         """The next arrival; NOTHING after `timeout` seconds without. Raises Interrupted on "stop"."""
@@ -48,6 +72,10 @@ class Inbox:
             arrival = self._queue.get(timeout=max(timeout, 0.0) if timeout is not None else None)
         except Empty:
             return NOTHING
+        with self._lock:
+            self._waiting[arrival.topic] -= _size(arrival)
+        if self._dropped:
+            self._count_dropped()
         if arrival.topic == "stop":
             raise Interrupted(arrival.key)
         return arrival
@@ -55,14 +83,29 @@ class Inbox:
     def refuse(self, arrival: Arrival, why: object) -> None:
         """Count a frame that cannot be used; tell of each kind once."""
         self.refused[arrival.topic] += 1
-        complaint = (arrival.key, str(why))
+        self._complain(arrival.key, str(why)[:COMPLAINT])
+
+    def _count_dropped(self) -> None:
+        with self._lock:
+            dropped, self._dropped = self._dropped, Counter()
+        for (topic, key), frames in dropped.items():
+            self.refused[topic] += frames
+            self._complain(key, "too many wait")
+
+    def _complain(self, key: str, why: str) -> None:
+        complaint = (key, why)
         if complaint not in self._complaints and len(self._complaints) < COMPLAINTS:
             self._complaints.add(complaint)
-            self.say(f"refused a frame on {arrival.key}: {why}")
+            self.say(f"refused a frame on {key}: {why}")
 
     def say(self, line: str) -> None:
         """Tell whoever watches the process."""
         print(one_line(f"{self._owner}: {line}"), file=sys.stderr, flush=True)
+
+
+def _size(arrival: Arrival) -> int:
+    """About what it takes while it waits."""
+    return len(arrival.frame) + len(arrival.key) + ARRIVAL_BYTES
 
 
 def one_line(text: str) -> str:

@@ -11,22 +11,40 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
 import zenoh
+from msgspec.structs import replace
 
-from protocol import keys, session
+from compose.local import free_endpoint
+from compose.scenario import load
+from protocol import inbox, keys, session
+from protocol.inbox import Arrival, Inbox, Interrupted, Topic
 from protocol.journal import read
-from protocol.messages import Drive, Report, Sense
-from protocol.motion import ORIGIN
-from protocol.wire import encode
-from tests.commands import LONG, LONG_JOURNAL_BYTES, LONG_TICKS, Command, several_pairs, tandem, until, world
+from protocol.messages import Contact, Drive, End, Farewell, Message, Report, Sense
+from protocol.motion import ORIGIN, REST
+from protocol.wire import decode, encode
+from tests.commands import (
+    BOUND_S,
+    LONG,
+    LONG_JOURNAL_BYTES,
+    LONG_TICKS,
+    Command,
+    several_pairs,
+    tandem,
+    until,
+    world,
+)
+from tests.storm import rage, stranger_at
 
 RUN = "mine"
 TIMES = 3
 """each frame is put so often, and must be told of once"""
 VOLLEYS = 12
+STORM = 3000
+SETTLED_MB = 4.0
 
 GENUINE = {
     "sense": (Sense(0, "a", None, 1.0), 1 << 20),
@@ -100,15 +118,6 @@ def bad_frames(topic: str) -> dict[bytes, str]:
     if topic == "sense":  # it costs the robot its link, and never arrives: see below
         del frames[bytes(limit + 1)]
     return frames
-
-
-def stranger_at(endpoint: str) -> zenoh.Session:
-    """A session with nothing of our configuration: ours cannot even send what is oversized."""
-    config = zenoh.Config()
-    config.insert_json5("mode", json.dumps("client"))
-    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
-    config.insert_json5("scouting/multicast/enabled", "false")
-    return zenoh.open(config)
 
 
 def publishers(link: zenoh.Session) -> dict[str, zenoh.Publisher]:
@@ -228,3 +237,110 @@ def test_the_frame_that_the_nonsense_is_made_of_is_itself_understood(topic: str)
     """Else all of it would be refused for one and the same reason."""
     message, _ = GENUINE[topic]
     assert msgspec.msgpack.decode(encode(message)[5:], type=type(message)) == message
+
+
+def test_a_storm_of_mutated_frames_on_every_key_disturbs_nothing(tmp_path: Path) -> None:
+    """Each process refuses all that it must, and nothing else; memory settles in the first half."""
+    tally = rage(STORM, seed=7, distance=40.0, folder=tmp_path)
+    assert (tally.frames, tally.statuses, tally.outcome, tally.same) == (STORM, [0, 0, 0], "localised", True)
+    for process, sizes in tally.memory.items():
+        assert tally.accounted(process), (process, tally.fates, tally.refused)
+        assert sizes[-1] - sizes[2] < SETTLED_MB
+    assert tally.late >= tally.fates["world", "passed over"]
+    assert "Traceback" not in tally.said
+
+
+# --- what a robot makes of well-formed frames, with this test for its world and its peer ----------------
+
+
+def test_a_robot_refuses_what_is_out_of_step_and_hears_a_repeated_report_once(tmp_path: Path) -> None:
+    scenario, endpoint, said = load("paper-1"), free_endpoint(), Inbox("test")
+
+    def told(tick: int, **otherwise: object) -> Report:
+        return replace(Report(tick, "b", 1, "straight", None, 0, 0, (), 0, (), 0, 0), **otherwise)
+
+    def sense(tick: int) -> Sense:
+        return Sense(tick, "a", REST if tick else None, 2.5, (Contact("b", 2.0, (tick,)),))
+
+    with session.open_router(endpoint) as link:
+        session.answer(link, keys.briefing(RUN, "*"), lambda _: scenario.briefing("a"))
+        session.subscribe(link, keys.drive(RUN, "a"), said, "drive")
+        session.watch_liveliness(link, keys.robot_alive(RUN, "*"), said)
+        world_says = session.publisher(link, keys.sense(RUN, "a"))
+        peer_says = session.publisher(link, keys.report(RUN, "b", "a"))
+
+        def play(tick: int, *reports: Report) -> None:
+            """Its Drive of `tick` comes, and no other."""
+            for report in reports:
+                peer_says.put(encode(report))
+            world_says.put(encode(sense(tick)))
+            assert answer(said, Drive).tick == tick
+
+        _token = session.show_alive(link, keys.world_alive(RUN))
+        with Command("agent", "a", "--connect", endpoint, "--out", tmp_path) as agent:
+            assert said.next(BOUND_S).topic == "alive"
+            play(0, told(0), told(0), told(0, robot="a"), told(0, robot="c"), told(0, state="otherwise"))
+            play(1, told(1), told(2, state="too early"), told(0), told(0))
+            play(2, told(2, state="as it is"), told(900), told(0, heard=1))
+            for odd in (sense(0), sense(1), sense(4), sense(900), End(1, "failed", None)):
+                world_says.put(encode(odd))
+            world_says.put(encode(replace(sense(2), anchor_range=1.0)))
+            world_says.put(encode(End(900, "localised", None)))
+            play(3, told(3))
+            world_says.put(encode(End(3, "undecided", "for a test")))
+            farewell = answer(said, Farewell)
+            world_says.put(encode(sense(1)))
+            world_says.put(encode(farewell))
+            assert agent.ended().status == 1
+    assert (farewell.reports_heard, farewell.reports_unheard) == (4, 0)
+    assert farewell.reports_refused == 6
+    assert farewell.frames_refused == 6 + 7
+
+
+def answer(said: Inbox, kind: type[Message]) -> Any:
+    arrival = said.next(BOUND_S)
+    assert arrival.topic == "drive"
+    return decode(arrival.frame, kind)
+
+
+# --- a flood ------------------------------------------------------------------------------------------
+
+
+def flooded(topic: Topic, key: str, size: int) -> tuple[Inbox, int]:
+    """An inbox in which frames of `size` bytes wait on `key`, and how many came beyond its room."""
+    full = Inbox("test")
+    room = inbox.ROOM_BYTES // (size + len(key) + inbox.ARRIVAL_BYTES)
+    for _ in range(room + 1000):
+        full.put(topic, key, bytes(size))
+    return full, 1000
+
+
+@pytest.mark.parametrize("size", [0, 100, 40_000])
+def test_what_floods_a_topic_is_bounded_counted_and_told_once(
+    size: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    full, dropped = flooded("report", "some/key", size)
+    waiting = 0
+    while full.next(0.0) is not inbox.NOTHING:
+        waiting += 1
+    assert inbox.ROOM_BYTES / 2 < waiting * (size + 208) <= inbox.ROOM_BYTES
+    assert full.refused == {"report": dropped}
+    assert capsys.readouterr().err == "test: refused a frame on some/key: too many wait\n"
+    full.put("report", "some/key", b"again")
+    assert full.next(0.0) == Arrival("report", "some/key", b"again")
+
+
+def test_a_flood_leaves_other_topics_their_room() -> None:
+    full, _ = flooded("report", "some/key", 1000)
+    full.put("sense", "another", b"needed")
+    full.put("stop", "SIGTERM")
+    came: list[Arrival] = []
+    with pytest.raises(Interrupted, match="SIGTERM"):
+        came.extend(iter(partial(full.next, 0.0), inbox.NOTHING))
+    assert came[-1] == Arrival("sense", "another", b"needed")
+
+
+def test_one_frame_larger_than_all_the_room_is_told_of() -> None:
+    alone = Inbox("test")
+    alone.put("sense", "key", bytes(inbox.ROOM_BYTES + 1))
+    assert len(alone.next(0.0).frame) == inbox.ROOM_BYTES + 1

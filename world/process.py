@@ -62,6 +62,8 @@ class WorldProcess:
         self._alive: set[str] = set()
         self._answered = time.monotonic()
         """when a robot last appeared, or answered something new"""
+        self._late = 0
+        """Drives of ticks that are over"""
         self._truth_wanted = False
         self.playing_s = 0.0
         """wall time since everyone had answered the first Sense"""
@@ -101,7 +103,8 @@ class WorldProcess:
         course.farewells(self._farewells(end, expected))
         self._put({robot: encode(farewell) for robot, farewell in course.parted.items()})
         if refused := self._inbox.refused.total():
-            self._inbox.say(f"refused {refused} frames in all")
+            late = f", and left aside {self._late} of ticks past" if self._late else ""
+            self._inbox.say(f"refused {refused} frames in all{late}")
         return end
 
     # --- a tick ---
@@ -123,8 +126,8 @@ class WorldProcess:
             arrival = self._next((repeat if due is None else due) - now)
             now = time.monotonic()
             if arrival.topic == "drive":
-                drive = self._accepted(arrival, Drive)
-                if isinstance(drive, Drive) and drive.tick == tick and drive.robot not in drives:
+                drive = self._answer(arrival)
+                if drive is not None and drive.robot not in drives:
                     drives[drive.robot] = drive
                     self._answered = now
             if arrival.topic == "alive":
@@ -167,6 +170,19 @@ class WorldProcess:
             self._inbox.refuse(arrival, f"it says it is from '{message.robot}'")
             return None
         return message
+
+    def _answer(self, arrival: Arrival) -> Drive | None:
+        """The Drive that arrived, if it is of this tick."""
+        drive = self._accepted(arrival, Drive)
+        if not isinstance(drive, Drive):
+            return None
+        if drive.tick == self._course.tick:
+            return drive
+        if drive.tick > self._course.tick:
+            self._inbox.refuse(arrival, "it is of a tick to come")
+        else:
+            self._late += 1
+        return None
 
     def _who_is_missing(self, drives: Mapping[str, Drive]) -> str:
         missing = [robot for robot in self._robots if robot not in drives]

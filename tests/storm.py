@@ -1,0 +1,451 @@
+"""Mutated frames on every key of a running mission: `python -m tests.storm 1000000`.
+
+No test: it takes long (`tests/test_bad_frames.py` plays a short one). A stranger's session puts so many
+frames, drawn from a seed, evenly over the ticks of a mission of two pairs. Robots c and d are played here, by
+the record of the same mission in one process: they answer a tick once its frames are put, so the mission
+lasts as long as the storm, and no more than two ticks' frames wait anywhere.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import random
+import re
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import zenoh
+from msgspec.structs import replace
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from compose import inline
+from compose.record import leave, summary
+from compose.scenario import load
+from protocol import keys, session
+from protocol.inbox import Inbox
+from protocol.journal import read
+from protocol.messages import Briefing, Drive, End, Estimate, Farewell, Report, Sense
+from protocol.motion import Controls
+from protocol.wire import MAX_SENT_BYTES, decode, encode
+from tests.commands import BOUND_S, SECTION_IV, Command, until, world
+from world.scenario import Scenario
+
+RUN = "storm"
+CALM_TICKS = 12
+"""at the end, so that the last frame is in before the End"""
+LINK_BYTES = 47_000
+"""a little less than what breaks a low-latency link"""
+PLAYED, PUPPETS = ("a", "b"), ("c", "d")
+MOMENTS = 5
+"""when memory is looked at, from the first frame to the last"""
+
+Fate = Literal["refused", "passed over", "either", "unheard"]
+"""what must become of a frame: counted as refused; none of this tick's, and left aside; one or the other,
+by what has come before; or nobody listens"""
+
+
+def scenario(distance: float) -> str:
+    """Two pairs. Those of the first meet late; then a hears b, late and twice, and b does not hear a."""
+    return f"""
+name = "storm"
+seed = 3
+{SECTION_IV}
+[[robot]]
+id = "a"
+peer = "b"
+anchor = [0.0, 0.0]
+[[robot]]
+id = "b"
+peer = "a"
+anchor = [{distance}, 0.0]
+[[robot]]
+id = "c"
+peer = "d"
+anchor = [0.0, 4000.0]
+[[robot]]
+id = "d"
+peer = "c"
+anchor = [10.0, 4000.0]
+[[fault]]
+link = "a->b"
+partition = true
+contact_ticks = [0, 90]
+[[fault]]
+link = "b->a"
+delay = [0, 9]
+duplicate = 0.2
+"""
+
+
+class Shot(NamedTuple):
+    """A frame of the storm."""
+
+    kind: str
+    key: str
+    frame: bytes
+    fate: Fate
+
+
+class Genuine:
+    """Every frame of a mission, by key and tick, as it was played undisturbed in one process."""
+
+    def __init__(self, played: Scenario, folder: Path) -> None:
+        record = inline.play(played, folder)
+        leave(record, summary(record, "in-process", None), folder)
+        self.ticks = record.moments[-1].truth.tick
+        self.farewells = {robot: encode(farewell) for robot, farewell in record.farewells.items()}
+        self.by_key: dict[str, dict[int, bytes]] = {}
+        peers = {robot.id: robot.peer for robot in played.robots}
+        for robot, peer in peers.items():
+            for frame in read(folder / f"agent-{robot}.journal"):
+                message: Any = decode(frame, Briefing | Sense | Report | Drive | Estimate | End | Farewell)
+                match message:
+                    case Sense():
+                        key = keys.sense(RUN, robot)
+                    case Drive():
+                        key = keys.drive(RUN, robot)
+                    case Estimate():
+                        key = keys.estimate(RUN, robot)
+                    case Report() if message.robot == robot:
+                        key = keys.report(RUN, robot, peer)
+                    case _:
+                        continue
+                self.by_key.setdefault(key, {})[message.tick] = frame
+
+
+class Storm:
+    """Draws frames, each for the tick in which it is put."""
+
+    def __init__(self, genuine: Genuine, seed: int) -> None:
+        self._draw = random.Random(seed)
+        self._genuine = genuine.by_key
+        self._last = genuine.ticks
+        self.acted_on = [
+            key
+            for one, other in (PLAYED, PLAYED[::-1])
+            for key in (keys.sense(RUN, one), keys.drive(RUN, one), keys.report(RUN, one, other))
+        ]
+        """keys by which somebody of a, b and the world acts on frames"""
+        self.watched = [
+            keys.truth(RUN),
+            keys.briefing(RUN, "a"),
+            keys.world_alive(RUN),
+            *[key for one in PLAYED for key in (keys.estimate(RUN, one), keys.robot_alive(RUN, one))],
+        ]
+        """others of the mission, and nothing put on them changes anything"""
+        self.ghost = keys.drive(RUN, "ghost")
+        kinds: dict[Callable[[str, int], Shot], int] = {
+            self.truncated: 15,
+            self.flipped: 15,
+            self.swapped: 15,
+            self.huge: 1,
+            self.replayed: 15,
+            self.old: 12,
+            self.posing: 12,
+            self.to_come: 12,
+            self.again: 3,
+        }
+        self._kinds, self._weights = list(kinds), list(kinds.values())
+
+    def shot(self, tick: int) -> Shot:
+        """The next, while `tick` is played."""
+        [kind] = self._draw.choices(self._kinds, self._weights)
+        if self._draw.random() < 0.1:
+            shot = kind(self._draw.choice(self.acted_on), tick)
+            return shot._replace(key=self._draw.choice(self.watched), fate="unheard")
+        return kind(self._draw.choice(self.acted_on), tick)
+
+    def truncated(self, key: str, tick: int) -> Shot:
+        frame = self._any(tick)
+        return Shot("truncated", key, frame[: self._draw.randrange(len(frame))], "refused")
+
+    def flipped(self, key: str, tick: int) -> Shot:
+        frame = bytearray(self._any(tick))
+        for bit in self._draw.sample(range(8 * len(frame)), self._draw.randint(1, 3)):
+            frame[bit // 8] ^= 1 << bit % 8
+        return Shot("bits flipped", key, bytes(frame), "refused")
+
+    def swapped(self, key: str, tick: int) -> Shot:
+        other = self._draw.choice([other for other in self._genuine if other != key])
+        return Shot("of another key", key, self._of(other, tick), "refused")
+
+    def huge(self, key: str, _: int) -> Shot:
+        size = self._draw.choice([MAX_SENT_BYTES, MAX_SENT_BYTES + 1, LINK_BYTES])
+        return Shot("huge", key, self._draw.randbytes(1) * size, "refused")
+
+    def replayed(self, key: str, tick: int) -> Shot:
+        """As it was, of the right sender."""
+        topic = _topic(key)
+        old = [past for past in self._genuine[key] if past <= tick - 2] if topic == "report" else []
+        if tick < 2 or (topic == "report" and not old):
+            return self.truncated(key, tick)
+        past = self._draw.choice(old) if old else self._draw.randrange(tick - 1)
+        fate: Fate = "refused" if topic == "sense" else "passed over"
+        return Shot(f"{topic} replayed", key, self._genuine[key][past], fate)
+
+    def old(self, key: str, tick: int) -> Shot:
+        """Well-formed, of a tick that is over, and not what was said then."""
+        if tick < 2:
+            return self.truncated(key, tick)
+        past = self._draw.randrange(max(0, tick - 80), tick - 1)
+        message = self._forged(key, past)
+        fates: dict[type, Fate] = {Drive: "passed over", Report: "either"}
+        kind = type(message).__name__
+        return Shot(f"{kind} of an old tick", key, encode(message), fates.get(type(message), "refused"))
+
+    def to_come(self, key: str, _: int) -> Shot:
+        message = self._forged(key, self._last + self._draw.randint(3, 10 ** self._draw.randint(1, 9)))
+        return Shot(f"{type(message).__name__} of a tick to come", key, encode(message), "refused")
+
+    def posing(self, key: str, tick: int) -> Shot:
+        """By the key of one robot, from another; or for it."""
+        robot = keys.robot_of(key)
+        message = replace(self._forged(key, tick, end=False), robot="c" if robot == "a" else "a")
+        if _topic(key) == "drive" and self._draw.random() < 0.3:
+            return Shot("from another", self.ghost, encode(replace(message, robot="ghost")), "refused")
+        return Shot("from another", key, encode(message), "refused")
+
+    def again(self, key: str, tick: int) -> Shot:
+        """What its robot has just been told, or tells, as it is."""
+        frame = self._genuine[key].get(tick)
+        if frame is None:
+            return self.flipped(key, tick)
+        return Shot("of this tick, again", key, frame, "either")
+
+    def _any(self, tick: int) -> bytes:
+        return self._of(self._draw.choice(list(self._genuine)), tick)
+
+    def _of(self, key: str, tick: int) -> bytes:
+        """A genuine frame that `key` carries, of about `tick` if there is one."""
+        told = self._genuine[key]
+        near = max(0, tick - self._draw.randrange(100))
+        return told[near] if near in told else self._draw.choice(list(told.values()))
+
+    def _forged(self, key: str, tick: int, *, end: bool = True) -> Any:
+        """Of `tick`, and nothing that is ever said."""
+        robot, some = keys.robot_of(key), self._draw.uniform(0.01, 3.0)
+        match _topic(key):
+            case "sense" if end and self._draw.random() < 0.3:
+                return End(tick, "localised" if some < 1.0 else "failed", None)
+            case "sense":
+                return Sense(tick, robot, Controls(some / 3.0, some), some)
+            case "drive":
+                return Drive(tick, robot, some / 3.0, -some, 2, "storming")
+            case _:
+                return Report(tick, robot, 1, "storming", None, 0, 0, (), 0, (), 0, self._draw.randint(0, 1))
+
+
+def _topic(key: str) -> str:
+    return {"sense": "sense", "drive": "drive"}.get(key.split("/")[4], "report")
+
+
+class Tally:
+    """What was put, and what became of it."""
+
+    def __init__(self) -> None:
+        self.fates: Counter[tuple[str, Fate]] = Counter()
+        """by who gets it, and what must become of it"""
+        self.kinds: Counter[tuple[str, str]] = Counter()
+        """by kind, and what it was put on"""
+        self.memory: dict[str, list[float]] = {}
+        """MB of each process, at MOMENTS"""
+        self.seconds = 0.0
+        self.statuses: list[int] = []
+        self.refused: dict[str, int] = {}
+        """by process"""
+        self.late = 0
+        """Drives that the world has left aside"""
+        self.outcome = ""
+        self.same = False
+        """whether `ticks.csv` is that of the undisturbed mission"""
+        self.said = ""
+
+    @property
+    def frames(self) -> int:
+        """In all."""
+        return self.kinds.total()
+
+    def note(self, shot: Shot) -> None:
+        """It was put."""
+        self.fates[_recipient(shot.key), shot.fate] += 1
+        self.kinds[shot.kind, _topic(shot.key) if shot.fate != "unheard" else "others"] += 1
+
+    def accounted(self, process: str) -> bool:
+        """Whether it has refused what it must, and nothing that it must not."""
+        must = self.fates[process, "refused"]
+        return must <= self.refused[process] <= must + self.fates[process, "either"]
+
+
+def _recipient(key: str) -> str:
+    """The process that gets what is put on `key`, of those that act on it."""
+    chunks = key.split("/")
+    return {"sense": chunks[3], "to": chunks[-1]}.get(chunks[4] if len(chunks) > 4 else "", "world")
+
+
+def rage(
+    frames: int, seed: int, distance: float, folder: Path, advance: Callable[[], None] = lambda: None
+) -> Tally:
+    """A storm of so many frames, on a mission whose anchors are `distance` apart; `advance` hears of each."""
+    file, out, alone = folder / "storm.toml", folder / "out", folder / "alone"
+    alone.mkdir()
+    file.write_text(scenario(distance))
+    genuine = Genuine(load(str(file)), alone)
+    tally, storm = Tally(), Storm(genuine, seed)
+    with world(file, "--run", RUN, "--out", out) as (clock, endpoint), ExitStack() as others:
+        agents = {
+            robot: others.enter_context(Command("agent", robot, "--connect", endpoint, "--out", out, "-q"))
+            for robot in PLAYED
+        }
+        for robot, agent in agents.items():
+            agent.until_answered(robot, out)
+        processes = {"world": clock, **agents}
+        publishers = _publishers(others.enter_context(stranger_at(endpoint)), storm)
+        stormy = genuine.ticks - CALM_TICKS
+        began = time.monotonic()
+        looks = iter(range(MOMENTS))
+        due = next(looks)
+        for tick in others.enter_context(_ticks(endpoint, genuine)):
+            while tally.frames < min(frames, -(-frames * (tick + 1) // stormy)):
+                if tally.frames * (MOMENTS - 1) >= due * frames:
+                    _look(processes, tally)
+                    due = next(looks)
+                shot = storm.shot(tick)
+                publishers[shot.key].put(shot.frame)
+                tally.note(shot)
+                advance()
+            if tally.frames == frames and not tally.seconds:
+                tally.seconds = time.monotonic() - began
+                _look(processes, tally)
+        tally.statuses = [process.ended().status for process in processes.values()]
+        tally.said = "".join(process.err for process in processes.values())
+        totals = re.search(r"refused (\d+) frames in all(?:, and left aside (\d+))?", clock.err)
+    result = json.loads((out / "summary.json").read_text())
+    tally.outcome = result["outcome"]
+    tally.refused = {robot: result["robots"][robot]["frames_refused"] for robot in PLAYED}
+    tally.refused["world"], tally.late = (
+        (int(number or 0) for number in totals.groups()) if totals else (0, 0)
+    )
+    tally.same = (out / "ticks.csv").read_bytes() == (alone / "ticks.csv").read_bytes()
+    return tally
+
+
+def stranger_at(endpoint: str) -> zenoh.Session:
+    """A session with nothing of our configuration: ours cannot even send what is oversized."""
+    config = zenoh.Config()
+    config.insert_json5("mode", json.dumps("client"))
+    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    return zenoh.open(config)
+
+
+def _publishers(link: zenoh.Session, storm: Storm) -> dict[str, zenoh.Publisher]:
+    """One for each key, once everybody listens: a put before that would be lost."""
+    heeded = [*storm.acted_on, storm.ghost]
+    found = {key: session.publisher(link, key) for key in (*heeded, *storm.watched)}
+    heard: dict[str, bool] = {}
+    for key in heeded:
+        session.on_matching(found[key], partial(heard.__setitem__, key))
+    until(lambda: all(heard.get(key) for key in heeded), "everyone listens")
+    return found
+
+
+@contextmanager
+def _ticks(endpoint: str, genuine: Genuine) -> Iterator[Iterator[int]]:
+    """The ticks of the mission. The puppets answer each when the next is asked for."""
+
+    def nobody() -> None:
+        raise AssertionError("no world")
+
+    inbox = Inbox("storm")
+    with session.open_client(endpoint, nobody) as link:
+        drives = {robot: session.publisher(link, keys.drive(RUN, robot)) for robot in PUPPETS}
+        for robot in PUPPETS:
+            session.subscribe(link, keys.sense(RUN, robot), inbox, "sense")
+        tokens = [session.show_alive(link, keys.robot_alive(RUN, robot)) for robot in PUPPETS]
+        yield _played(inbox, drives, genuine)
+        del tokens
+
+
+def _played(inbox: Inbox, drives: dict[str, zenoh.Publisher], genuine: Genuine) -> Iterator[int]:
+    latest = -1
+    parted: set[str] = set()
+    while len(parted) < len(PUPPETS):
+        arrival = inbox.next(BOUND_S)
+        assert arrival.topic == "sense", "the world is silent"
+        robot = keys.robot_of(arrival.key)
+        message: Sense | End | Farewell = decode(arrival.frame, Sense | End | Farewell)
+        match message:
+            case Sense(tick):
+                if tick > latest:
+                    latest = tick
+                    yield tick
+                drives[robot].put(genuine.by_key[keys.drive(RUN, robot)][tick])
+            case End():
+                drives[robot].put(genuine.farewells[robot])
+            case Farewell():
+                parted.add(robot)
+
+
+def _look(processes: dict[str, Command], tally: Tally) -> None:
+    for name, process in processes.items():
+        status = Path(f"/proc/{process.pid}/status").read_text()
+        found = re.search(r"VmRSS:\s*(\d+) kB", status)
+        assert found is not None
+        tally.memory.setdefault(name, []).append(int(found[1]) / 1024)
+
+
+def tables(tally: Tally) -> Sequence[Table]:
+    """What was put, and what became of it."""
+    topics = ("sense", "drive", "report", "others")
+    put = Table("kind", *topics, title="frames put, by what they were put on")
+    for kind in sorted({kind for kind, _ in tally.kinds}):
+        put.add_row(kind, *[f"{count:,}" if (count := tally.kinds[kind, topic]) else "" for topic in topics])
+    fates: tuple[Fate, ...] = ("refused", "either", "passed over")
+    became = Table("process", *fates, "refused by it", title="what must become of them, and what did")
+    memory = Table(
+        "process", *[f"{100 * i // (MOMENTS - 1)} %" for i in range(MOMENTS)], title="resident memory, MB"
+    )
+    for process, sizes in tally.memory.items():
+        counts = [f"{tally.fates[process, fate]:,}" for fate in fates]
+        became.add_row(process, *counts, f"{tally.refused[process]:,}")
+        memory.add_row(process, *[f"{size:.1f}" for size in sizes])
+    return put, became, memory
+
+
+def main(arguments: argparse.Namespace) -> int:
+    """Let it storm, and print what became of it."""
+    console = Console()
+    with tempfile.TemporaryDirectory(prefix="storm-") as folder, Progress(console=console) as progress:
+        bar = progress.add_task("storm", total=arguments.frames)
+        tally = rage(
+            arguments.frames, arguments.seed, arguments.distance, Path(folder), lambda: progress.advance(bar)
+        )
+    for table in tables(tally):
+        console.print(table)
+    console.print(
+        f"{tally.frames:,} frames in {tally.seconds:.0f} s, {tally.frames / tally.seconds:,.0f} a second; "
+        f"{tally.outcome}, {'the same' if tally.same else 'ANOTHER'} ticks.csv; "
+        f"the world left aside {tally.late:,} Drives of ticks past; statuses {tally.statuses}"
+    )
+    good = tally.outcome == "localised" and tally.same and all(map(tally.accounted, tally.memory))
+    if not good:
+        console.print(tally.said)
+    return 0 if good else 1
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("frames", type=int)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--distance", type=float, default=1000.0, help="m; the mission's ticks grow with it")
+    sys.exit(main(parser.parse_args()))
