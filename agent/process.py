@@ -30,8 +30,8 @@ REPORT_SHARE = 0.5
 LAST_WORD_S = 0.5
 """how long what the world has said may outlast its sign of life"""
 SILENCE_S = 3.0
-"""a link over which the world has said nothing for so long is replaced; Zenoh, which takes `session.LEASE_S` to
-find out, makes most links anew by itself, but now and then one that is connected, and over which nothing comes"""
+"""a link over which the world has said nothing for so long is replaced, though Zenoh gives one up after
+`session.LEASE_S` and connects again: now and then nothing comes over such a link, for good"""
 BEHIND_S = 3.0
 """in real time: how long what lies between what it knows and what it hears may be outstanding"""
 

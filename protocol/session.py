@@ -94,8 +94,10 @@ def _closing(session: zenoh.Session) -> Iterator[zenoh.Session]:
 
 
 @contextmanager
-def open_router(listen: str, wait: float = 0.0) -> Iterator[zenoh.Session]:
+def open_router(listen: str, wait: float = 0.0, connect: Sequence[str] = ()) -> Iterator[zenoh.Session]:
     """The world's session, listening on `listen`; waits `wait` seconds for it to be free.
+
+    A router between it and its robots is one that also connects to it.
 
     Raises BadEndpoint or CannotListen.
     """
@@ -103,7 +105,7 @@ def open_router(listen: str, wait: float = 0.0) -> Iterator[zenoh.Session]:
     give_up = time.monotonic() + wait
     while True:
         try:
-            session = zenoh.open(_config("router", [listen], []))
+            session = zenoh.open(_config("router", [listen], connect))
             break
         except zenoh.ZError as error:
             taken = "in use" in str(error)
