@@ -92,7 +92,7 @@ class Run:
         clock = f"tcp/{HOSTS['world']}:{PORT}"
         rate = ["--rate", RATE] if case.real_time else []
         self.parts = {"world": self._part("world", "world", str(self.scenario), "--listen", clock, *rate)}
-        self.parts["world"].until_says("waiting for")
+        self.parts["world"].until_written(self.out / "world.journal", 1)  # which it does when it listens
         endpoint = f"tcp/{HOSTS['router']}:{PORT}" if case.routed else clock
         if case.routed:
             self.start_router()

@@ -11,6 +11,8 @@ from signal import SIGCONT, SIGSTOP
 
 import pytest
 
+from compose.local import free_endpoint
+from compose.scenario import load
 from protocol import journal, keys, session
 from protocol.inbox import Inbox
 from protocol.messages import Drive, End, Farewell, Missed
@@ -149,6 +151,18 @@ def test_stopped_for_longer_than_the_patience_a_process_fails_the_run(
         assert f"no answer from {name[-1]} (not there) at tick " in said
         assert f" for {PATIENCE_S:g} s" in said
     assert not processes_of(out)
+
+
+def test_a_link_over_which_nothing_comes_is_replaced_by_another() -> None:
+    endpoint, briefing, inbox = free_endpoint(), load("paper-1").briefing("a", None), Inbox("a mute world")
+    with session.open_router(endpoint) as link:
+        session.watch_liveliness(link, keys.robot_alive("mute", "a"), inbox)
+        session.answer(link, keys.briefing("mute", "*"), lambda _key: briefing)
+        _token = session.show_alive(link, keys.world_alive("mute"))
+        with Command("agent", "a", "--connect", endpoint, "--patience", "20") as agent:
+            for topic in ("alive", "gone", "alive"):
+                until(lambda topic=topic: inbox.next(0.1).topic == topic, f"a is {topic}")  # type: ignore[misc]
+                assert agent.running
 
 
 # --- in real time -------------------------------------------------------------------------------------
