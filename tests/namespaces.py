@@ -47,6 +47,11 @@ class Case(NamedTuple):
     happens: Callable[[Network, Run], None]
     """returns when all is well again"""
 
+    @property
+    def by(self) -> str:
+        """What else its name says."""
+        return ", through a router" if self.routed and self.what.startswith("link") else ""
+
 
 class Network:
     """The hosts and the switch between them."""
@@ -240,7 +245,7 @@ def main(wanted: str) -> int:
             print(f"{'case':54} {'outcome':32} {'resumed after s':>16} {'same bytes':>11}", flush=True)
             for case in CASES:
                 time_kept = f"--rate {RATE}" if case.real_time else "lockstep"
-                name = f"{case.what}, {time_kept}{', through a router' if case.routed else ''}"
+                name = f"{case.what}, {time_kept}{case.by}"
                 if wanted not in name:
                     continue
                 ended, resumed, same = play(case, network, expected)
