@@ -2,7 +2,8 @@
 
 It reacts to what arrives and never steps twice: a Sense heard again makes it send again what it
 answered, so whatever is lost, late or doubled costs time and changes nothing. So does a process that is
-killed, its peer's or the world's: whoever is started again is told again what it must know.
+killed, its peer's or the world's: whoever is started again is told again what it must know. So do a process
+that is stopped, and a link that goes down: one over which nothing comes any more is replaced.
 """
 
 from __future__ import annotations
@@ -16,18 +17,21 @@ from typing import Any
 import zenoh
 
 from agent import radio
-from agent.joining import NoWorld
+from agent.joining import ASK_AGAIN_S, NoWorld
 from agent.memory import REPORTS_KEPT, REPORTS_TOLD, Memory
 from agent.robot import Told
 from protocol import keys, session
-from protocol.inbox import Arrival, Inbox
-from protocol.messages import End, Farewell, Report, Sense
+from protocol.inbox import NOTHING, Arrival, Inbox
+from protocol.messages import End, Report, Sense
 from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode, encode
 
 REPORT_SHARE = 0.5
 """of a tick in real time: how long to wait for the peer's report"""
 LAST_WORD_S = 0.5
 """how long what the world has said may outlast its sign of life"""
+SILENCE_S = 3.0
+"""a link over which the world has said nothing for so long is replaced, though Zenoh gives one up after
+`session.LEASE_S` and connects again: now and then nothing comes over such a link, for good"""
 BEHIND_S = 3.0
 """how long the world must go on saying what is out of step, and nothing else, to be believed: a stranger may
 say anything, and in real time what lies between may be outstanding"""
@@ -37,13 +41,16 @@ AGAIN_S = 0.05
 """how often to say again what was said: to one frame may answer as many as there are reports to tell"""
 
 
+class LinkLost(Exception):
+    """Nothing comes over this link any more; over another the world may be there."""
+
+
 class AgentProcess:
-    """One robot in one run."""
+    """One robot in one run, over one link after the other."""
 
     def __init__(
         self,
         memory: Memory,
-        link: zenoh.Session,
         run: str,
         inbox: Inbox,
         *,
@@ -53,10 +60,15 @@ class AgentProcess:
         """`patience` (s) bounds the wait for the world; `reached` is told how far each tick has come."""
         briefing = memory.briefing
         self._id = briefing.robot
+        self._peer = briefing.peer
+        self._run = run
         self._inbox = inbox
         self._patience = patience
-        self._reached = reached
         self._tick_s = briefing.tick_s
+        self._silence = patience + (self._tick_s or 0.0)
+        """how long to wait for something new from the world"""
+        self._give_up = time.monotonic() + self._silence
+        self._reached = reached
         self._robot = memory.robot
         self._memory = memory
         self._sense = memory.sense
@@ -79,43 +91,72 @@ class AgentProcess:
         self._unheard = 0
         """those that went without"""
         self._estimate_wanted = False
+        self.end: End | None = memory.end if memory.farewell is not None else None
+        """once the world has said it"""
+        self._farewell = memory.farewell
 
-        self._drive = session.publisher(link, keys.drive(run, self._id))
-        self._report = session.publisher(link, keys.report(run, self._id, briefing.peer))
-        self._estimate = session.publisher(link, keys.estimate(run, self._id))
-        session.on_matching(self._estimate, self._want_estimate)
-        session.subscribe(link, keys.sense(run, self._id), inbox, "sense")
-        session.subscribe(link, keys.report(run, briefing.peer, self._id), inbox, "report")
-        session.watch_liveliness(link, keys.world_alive(run), inbox)
-        self._show_alive = partial(session.show_alive, link, keys.robot_alive(run, self._id))
-        self._token = self._show_alive()
+    def play(self, link: zenoh.Session) -> End:
+        """The run over `link`, to its End.
 
-    def play(self) -> End:
-        """The whole run, to its End. Raises NoWorld, or Interrupted when told to stop."""
-        if self._memory.end is not None and self._memory.farewell is not None:
-            return self._part(self._memory.end, self._memory.farewell)
-        patience = self._patience + (self._tick_s or 0.0)
-        give_up = time.monotonic() + patience
-        while True:
-            arrival = self._inbox.next((self._due or give_up) - time.monotonic())
+        Raises LinkLost; NoWorld; or Interrupted when told to stop.
+        """
+        self._attach(link)
+        while self.end is None:
+            arrival = self._next(self._due)
             match arrival.topic:
                 case "sense":
                     message = self._accepted(arrival)
                     if isinstance(message, End) and self._is_over(message):
-                        return self._part(message, self._farewell(message))
-                    if isinstance(message, Sense) and self._on_sense(message, arrival.frame):
-                        give_up = time.monotonic() + patience
+                        self._conclude(message)
+                    elif isinstance(message, Sense) and self._on_sense(message, arrival.frame):
+                        self._give_up = time.monotonic() + self._silence
                 case "report":
                     self._on_report(arrival)
                 case "gone" | "alive":
                     self._world_there, self._odd = arrival.topic == "alive", None
                     if not self._world_there:
-                        self._inbox.say(f"the world has gone; waiting {patience:g} s for it")
+                        self._inbox.say(f"the world has gone; waiting {self._silence:g} s for it")
                 case _:
                     pass
-            self._decide_when_all_is_heard()
-            if time.monotonic() > give_up:
-                raise NoWorld(f"nothing heard from the world for {patience:g} s")
+            if self.end is None:
+                self._decide_when_all_is_heard()
+                self._check_patience()
+        return self._part(self.end)
+
+    def unanswered(self) -> None:
+        """Wait a moment for another link. Raises NoWorld when that has been too long, or Interrupted."""
+        self._inbox.next(ASK_AGAIN_S)
+        self._check_patience()
+
+    # --- the link ---
+
+    def _attach(self, link: zenoh.Session) -> None:
+        me, peer, run = self._id, self._peer, self._run
+        self._drive = session.publisher(link, keys.drive(run, me))
+        self._report = session.publisher(link, keys.report(run, me, peer))
+        self._estimate = session.publisher(link, keys.estimate(run, me))
+        session.on_matching(self._estimate, self._want_estimate)
+        session.subscribe(link, keys.sense(run, me), self._inbox, "sense")
+        session.subscribe(link, keys.report(run, peer, me), self._inbox, "report")
+        session.watch_liveliness(link, keys.world_alive(run), self._inbox)
+        self._show_alive = partial(session.show_alive, link, keys.robot_alive(run, me))
+        self._token = self._show_alive()
+        self._heard_at = time.monotonic()
+
+    def _next(self, until: float | None) -> Arrival:
+        """What arrives next, NOTHING after `until`. Raises LinkLost if the world is silent for too long."""
+        now = time.monotonic()
+        lost = self._heard_at + SILENCE_S + (self._tick_s or 0.0)
+        arrival = self._inbox.next(min(until or self._give_up, self._give_up, lost) - now)
+        if arrival.topic == "sense":
+            self._heard_at = time.monotonic()
+        elif arrival is NOTHING and time.monotonic() >= lost:
+            raise LinkLost
+        return arrival
+
+    def _check_patience(self) -> None:
+        if time.monotonic() > self._give_up:
+            raise NoWorld(f"nothing heard from the world for {self._silence:g} s")
 
     @property
     def _known(self) -> int:
@@ -283,24 +324,26 @@ class AgentProcess:
         if self._robot.drive is not None:
             self._send_drive(self._robot.drive.tick)
 
-    def _farewell(self, end: End) -> Farewell:
+    def _conclude(self, end: End) -> None:
         self._forget_reports(before=end.tick + REPORTS_KEPT + 1)
-        return self._robot.farewell(
+        self._farewell = self._robot.farewell(
             end,
             reports_refused=self._inbox.refused["report"],
             reports_unheard=self._unheard,
             frames_refused=self._inbox.refused.total(),
         )
+        self.end = end
+        self._give_up = time.monotonic() + self._patience
 
-    def _part(self, end: End, farewell: Farewell) -> End:
+    def _part(self, end: End) -> End:
         """Answer the End, as often as it is said, until the world says that it has the answer on record."""
-        frame = encode(farewell)
+        assert self._farewell is not None
+        frame = encode(self._farewell)
         self._drive.put(frame)
         self._odd = None
-        give_up = time.monotonic() + self._patience
         gone = False
-        while (left := give_up - time.monotonic()) > 0.0:
-            arrival = self._inbox.next(min(left, LAST_WORD_S) if gone else left)
+        while (now := time.monotonic()) < self._give_up:
+            arrival = self._next(now + LAST_WORD_S if gone else None)
             if arrival.topic == "sense":
                 if arrival.frame == frame:
                     break

@@ -29,6 +29,8 @@ CLOSE_TIMEOUT_S = 2.0
 """Zenoh's own close can take ten seconds under loss; the process ends without it"""
 RETRY_MS = 50
 """a client looks for a world that went away as often"""
+LEASE_S = 2.0
+"""a link on which nothing has come for so long is given up, and made anew: its peer is stopped, or cut off"""
 LISTEN_AGAIN_S = 0.1
 """how long to wait before trying once more to have a port"""
 
@@ -70,6 +72,7 @@ def _config(mode: str, listen: Sequence[str], connect: Sequence[str]) -> zenoh.C
         "scouting/delay": 0,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
+        "transport/link/tx/lease": int(LEASE_S * 1000),
         "transport/unicast/lowlatency": True,
         "transport/unicast/qos/enabled": False,
     }.items():
@@ -91,8 +94,10 @@ def _closing(session: zenoh.Session) -> Iterator[zenoh.Session]:
 
 
 @contextmanager
-def open_router(listen: str, wait: float = 0.0) -> Iterator[zenoh.Session]:
+def open_router(listen: str, wait: float = 0.0, connect: Sequence[str] = ()) -> Iterator[zenoh.Session]:
     """The world's session, listening on `listen`; waits `wait` seconds for it to be free.
+
+    A router between it and its robots is one that also connects to it.
 
     Raises BadEndpoint or CannotListen.
     """
@@ -100,7 +105,7 @@ def open_router(listen: str, wait: float = 0.0) -> Iterator[zenoh.Session]:
     give_up = time.monotonic() + wait
     while True:
         try:
-            session = zenoh.open(_config("router", [listen], []))
+            session = zenoh.open(_config("router", [listen], connect))
             break
         except zenoh.ZError as error:
             taken = "in use" in str(error)

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from signal import Signals
@@ -87,12 +87,18 @@ class Ended(NamedTuple):
 class Command:
     """A process of `tandem`, in a session of its own; told to stop, then killed, where its `with` ends."""
 
-    def __init__(self, *arguments: str | Path, cwd: Path | None = None, terminal: int | None = None) -> None:
-        """`terminal` takes its standard output, if given."""
+    def __init__(
+        self,
+        *arguments: str | Path,
+        cwd: Path | None = None,
+        terminal: int | None = None,
+        through: Sequence[str] = (),
+    ) -> None:
+        """`terminal` takes its standard output, if given; `through` is a command that becomes it."""
         self._out = tempfile.TemporaryFile()  # noqa: SIM115  # closed with the command
         self._err = tempfile.TemporaryFile()  # noqa: SIM115
         self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "compose", *map(str, arguments)],
+            [*through, sys.executable, "-P", "-m", "compose", *map(str, arguments)],
             stdin=subprocess.DEVNULL,
             stdout=self._out if terminal is None else terminal,
             stderr=self._err,

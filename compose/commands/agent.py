@@ -7,7 +7,7 @@ from pathlib import Path
 
 from agent.joining import NoWorld, Search, Unwelcome, join
 from agent.memory import Memory, remember
-from agent.process import AgentProcess
+from agent.process import AgentProcess, LinkLost
 from agent.robot import Robot
 from compose import kill
 from compose.record import ended, make
@@ -61,24 +61,32 @@ def _play(options: argparse.Namespace, inbox: Inbox) -> End:
     which = f"world of run '{options.run}'" if options.run else "world"
     wait = options.wait if end is None else min(options.wait, STILL_THERE_S)
     search = Search(f"{which} at {options.connect}", wait, inbox)
+    process: AgentProcess | None = None
     while True:
         try:
-            with session.open_client(options.connect, search.go_on) as link:
-                joined = join(link, options.run, options.id, search)
-                if joined is None:  # a session that has lost its link finds nothing; a new one may
-                    continue
-                run, briefing = joined
-                if memory is not None and old is not None and memory.briefing != briefing:
-                    raise CorruptJournal(f"{old.path}: another run's: its briefing is not this world's")
-                memory = _ready(options, briefing, old, memory, inbox)
-                process = AgentProcess(
-                    memory, link, run, inbox, patience=options.patience, reached=kill.taker(options.kill)
-                )
-                if not (options.quiet or options.launched):
-                    where = f", again, from tick {memory.sense.tick} on" if memory.sense is not None else ""
-                    print(f"{options.id}: in run {run}, with {briefing.peer}{where}", flush=True)
-                return process.play()
+            with session.open_client(
+                options.connect, search.go_on if process is None else process.unanswered
+            ) as link:
+                if process is None:
+                    joined = join(link, options.run, options.id, search)
+                    if joined is None:  # a session that has lost its link finds nothing; a new one may
+                        continue
+                    run, briefing = joined
+                    if memory is not None and old is not None and memory.briefing != briefing:
+                        raise CorruptJournal(f"{old.path}: another run's: its briefing is not this world's")
+                    memory = _ready(options, briefing, old, memory, inbox)
+                    process = AgentProcess(
+                        memory, run, inbox, patience=options.patience, reached=kill.taker(options.kill)
+                    )
+                    if not (options.quiet or options.launched):
+                        again = memory.sense
+                        where = f", again, from tick {again.tick} on" if again is not None else ""
+                        print(f"{options.id}: in run {run}, with {briefing.peer}{where}", flush=True)
+                return process.play(link)
+        except LinkLost:
+            continue
         except NoWorld:
+            end = process.end if process is not None else end
             if end is None:
                 raise
             return end

@@ -1,0 +1,269 @@
+"""A measurement: a world and two agents on hosts of their own; links go down, a router is killed.
+
+    uv run python -m tests.namespaces
+
+No test: it needs root and `ip` (Debian's iproute2), and says so where it has not. Each host is a network
+namespace; one more, the switch, holds a bridge. Nothing outside of them is touched, and nothing is left.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from protocol import journal, session
+from protocol.messages import Drive, End, Farewell, Missed
+from protocol.wire import MAX_FRAME_BYTES, decode
+from tests.commands import LONG, PAPER_1, Command, Ended, journals, size, tandem, until
+from world.scenario import Scenario
+
+HOSTS = {"world": "10.77.0.1", "a": "10.77.0.2", "b": "10.77.0.3", "router": "10.77.0.4"}
+PORT = 7447
+DOWN_S = (0.5, 3.0, 20.0)
+RATE = "10"
+MIDDLE = {False: 20_000, True: 1_500}
+"""bytes of the world's journal when it happens, in lockstep and in real time"""
+ASSURED = PAPER_1.replace('"paper"', '"assured"').replace("10.0, 0.0", "20.0, 0.0").replace("11.3", "21.3")
+"""for real time, in which the missions of `paper` bear no robot that stands still"""
+
+
+class Case(NamedTuple):
+    """What happens in the middle of a run."""
+
+    what: str
+    real_time: bool
+    routed: bool
+    """the agents reach the world through a router"""
+    happens: Callable[[Network, Run], None]
+    """returns when all is well again"""
+
+    @property
+    def by(self) -> str:
+        """What else its name says."""
+        return ", through a router" if self.routed and self.what.startswith("link") else ""
+
+
+class Network:
+    """The hosts and the switch between them."""
+
+    def __init__(self, stack: ExitStack) -> None:
+        self._prefix = f"tandem-{os.getpid()}-"
+        self._switch = self._namespace("switch", stack)
+        _ip("-n", self._switch, "link", "add", "bridge", "type", "bridge")
+        _ip("-n", self._switch, "link", "set", "bridge", "up")
+        for host, address in HOSTS.items():
+            name = self._namespace(host, stack)
+            veth = ("type", "veth", "peer", "name", "eth", "netns", name)
+            _ip("link", "add", "name", host, "netns", self._switch, *veth)
+            _ip("-n", self._switch, "link", "set", "dev", host, "master", "bridge", "up")
+            _ip("-n", name, "address", "add", f"{address}/24", "dev", "eth")
+            _ip("-n", name, "link", "set", "lo", "up")
+            _ip("-n", name, "link", "set", "eth", "up")
+
+    def _namespace(self, host: str, stack: ExitStack) -> str:
+        name = self._prefix + host
+        _ip("netns", "add", name)
+        stack.callback(_ip, "netns", "delete", name)
+        return name
+
+    def link(self, host: str, state: str) -> None:
+        """Set the link between `host` and the switch "up" or "down"."""
+        _ip("-n", self._switch, "link", "set", "dev", host, state)
+
+    def on(self, host: str) -> list[str]:
+        """The command that becomes one on `host`."""
+        return ["ip", "netns", "exec", self._prefix + host]
+
+
+class Run:
+    """A mission under way."""
+
+    def __init__(self, case: Case, network: Network, folder: Path, stack: ExitStack) -> None:
+        self.out = folder / "out"
+        self._network = network
+        self._stack = stack
+        self.scenario = folder / "scenario.toml"
+        self.scenario.write_text(ASSURED if case.real_time else LONG)
+        clock = f"tcp/{HOSTS['world']}:{PORT}"
+        rate = ["--rate", RATE] if case.real_time else []
+        self.parts = {"world": self._part("world", "world", str(self.scenario), "--listen", clock, *rate)}
+        self.parts["world"].until_written(self.out / "world.journal", 1)  # which it does when it listens
+        endpoint = f"tcp/{HOSTS['router']}:{PORT}" if case.routed else clock
+        if case.routed:
+            self.start_router()
+        for robot in ("a", "b"):
+            self.parts[robot] = self._part(robot, "agent", robot, "--connect", endpoint)
+
+    def _part(self, host: str, *arguments: str) -> Command:
+        through = self._network.on(host)
+        return self._stack.enter_context(Command(*arguments, "--out", self.out, "-q", through=through))
+
+    def start_router(self) -> None:
+        """The router between the world and the agents."""
+        endpoints = [f"tcp/{HOSTS[host]}:{PORT}" for host in ("router", "world")]
+        arguments = [sys.executable, "-m", "tests.namespaces", "--router", *endpoints]
+        self.router = subprocess.Popen([*self._network.on("router"), *arguments])
+        self._stack.callback(_end, self.router)
+
+    def written(self) -> int:
+        """How much the world has on record."""
+        return size(self.out / "world.journal")
+
+    def answered(self) -> int:
+        """The latest tick in which both answered."""
+        kinds = Scenario | Drive | Missed | End | Farewell
+        both: dict[int, int] = {}
+        for frame in journal.read(self.out / "world.journal"):
+            message = decode(frame, kinds, MAX_FRAME_BYTES)
+            if isinstance(message, Drive):
+                both[message.tick] = both.get(message.tick, 0) + 1
+        return max([tick for tick, number in both.items() if number == 2], default=-1)
+
+    @property
+    def running(self) -> bool:
+        """Whether the world is."""
+        return self.parts["world"].running
+
+
+def down(seconds: float) -> Callable[[Network, Run], None]:
+    """The link of a goes down for so long."""
+
+    def happens(network: Network, _run: Run) -> None:
+        network.link("a", "down")
+        try:
+            time.sleep(seconds)
+        finally:
+            network.link("a", "up")
+
+    return happens
+
+
+def killed(seconds: float) -> Callable[[Network, Run], None]:
+    """The router is killed, and started again after so long."""
+
+    def happens(_network: Network, run: Run) -> None:
+        run.router.kill()
+        run.router.wait()
+        time.sleep(seconds)
+        run.start_router()
+
+    return happens
+
+
+CASES = [
+    *(
+        Case(f"link of a down for {seconds:g} s", real_time, routed, down(seconds))
+        for routed in (False, True)
+        for real_time in (False, True)
+        for seconds in DOWN_S
+    ),
+    *(
+        Case(f"router killed for {seconds:g} s", real_time, True, killed(seconds))
+        for real_time in (False, True)
+        for seconds in (0.0, 3.0)
+    ),
+]
+
+
+def play(case: Case, network: Network, expected: dict[str, bytes]) -> tuple[dict[str, Ended], float, str]:
+    """How everyone ended, the time until both robots answered again, and whether the bytes are the same."""
+    with tempfile.TemporaryDirectory(prefix="tandem-hosts-") as folder, ExitStack() as stack:
+        run = Run(case, network, Path(folder), stack)
+        run.parts["world"].until_written(run.out / "world.journal", MIDDLE[case.real_time])
+        case.happens(network, run)
+        before, well = run.answered(), time.monotonic()
+        if run.running:
+            until(lambda: not run.running or run.answered() > before, "both answer again")
+        resumed = time.monotonic() - well
+        ended = {name: part.ended() for name, part in run.parts.items()}
+        found = journals(run.out) | {"ticks.csv": (run.out / "ticks.csv").read_bytes()}
+    if case.real_time:
+        return ended, resumed, "-"
+    return ended, resumed, "yes" if found == expected else "NO"
+
+
+def local() -> dict[str, bytes]:
+    """The record of the mission in lockstep, played in one process."""
+    with tempfile.TemporaryDirectory(prefix="tandem-hosts-") as folder:
+        scenario, out = Path(folder) / "scenario.toml", Path(folder) / "out"
+        scenario.write_text(LONG)
+        assert tandem("run", scenario, "--in-process", "-q", "--out", out).status == 0
+        return journals(out) | {"ticks.csv": (out / "ticks.csv").read_bytes()}
+
+
+def route(listen: str, connect: str) -> None:
+    """Be the router, until killed."""
+    with session.open_router(listen, connect=[connect]):
+        signal.pause()
+
+
+@contextmanager
+def hosts() -> Iterator[Network]:
+    """Raises Unable."""
+    if os.geteuid() != 0:
+        raise Unable("not root")
+    if shutil.which("ip") is None:
+        raise Unable("no command `ip`; Debian's package is iproute2")
+    with ExitStack() as stack:
+        try:
+            network = Network(stack)
+        except subprocess.CalledProcessError as error:
+            raise Unable(f"network namespaces are not permitted: {error.stderr.strip()}") from None
+        yield network
+
+
+class Unable(Exception):
+    """There can be no namespaces here; says why."""
+
+
+def _ip(*arguments: str) -> None:
+    subprocess.run(["ip", *arguments], check=True, capture_output=True, text=True)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.kill()
+    process.wait()
+
+
+def main(wanted: str) -> int:
+    """Play the cases that have `wanted` in their names, a line for each; 0 if all are as they should be."""
+    wrong = 0
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(130))  # clean up, then too
+    try:
+        with hosts() as network:
+            expected = local()
+            print(f"{'case':54} {'outcome':32} {'resumed after s':>16} {'same bytes':>11}", flush=True)
+            for case in CASES:
+                time_kept = f"--rate {RATE}" if case.real_time else "lockstep"
+                name = f"{case.what}, {time_kept}{case.by}"
+                if wanted not in name:
+                    continue
+                ended, resumed, same = play(case, network, expected)
+                outcome = ended["world"].out.strip() or ended["world"].err.strip()
+                print(f"{name:54} {outcome:32} {resumed:16.2f} {same:>11}", flush=True)
+                if same == "NO" or any(end.status != 0 for end in ended.values()):
+                    wrong += 1
+                    print("\n".join(f"    {name}: {end}" for name, end in ended.items()), flush=True)
+    except Unable as why:
+        print(f"skipped: {why}")
+    return int(wrong > 0)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    parser.add_argument("wanted", nargs="?", default="", help="only cases whose names have this")
+    parser.add_argument("--router", nargs=2, metavar=("LISTEN", "CONNECT"), help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.router is not None:
+        route(*arguments.router)
+    sys.exit(main(arguments.wanted))

@@ -1,0 +1,216 @@
+"""Whoever is stopped and continued costs the others time, and nothing else; or the run ends, and says who."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from signal import SIGCONT, SIGSTOP
+
+import pytest
+
+from compose.local import free_endpoint
+from compose.scenario import load
+from protocol import journal, keys, session
+from protocol.inbox import Inbox
+from protocol.messages import Drive, End, Farewell, Missed
+from protocol.wire import MAX_FRAME_BYTES, decode
+from tests.commands import (
+    LONG,
+    LONG_TICKS,
+    PAPER_1,
+    Command,
+    process_of,
+    processes_of,
+    size,
+    tandem,
+    until,
+)
+from world.scenario import Scenario
+
+NAMES = ("agent a", "agent b", "world")
+PATIENCE_S = 6.0
+"""longer than Zenoh's lease"""
+ASSURED = PAPER_1.replace('"paper"', '"assured"').replace("10.0, 0.0", "20.0, 0.0").replace("11.3", "21.3")
+LOCALISED = f"localised after {LONG_TICKS} ticks\n"
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The scenario LONG, and its record in `out` beside it."""
+    path = tmp_path_factory.mktemp("undisturbed") / "long.toml"
+    path.write_text(LONG)
+    assert tandem("run", path, "--in-process", "-q", "--out", path.parent / "out").status == 0
+    return path
+
+
+def same(out: Path, undisturbed: Path) -> bool:
+    expected = undisturbed.parent / "out"
+    ticks = [(folder / "ticks.csv").read_bytes() for folder in (out, expected)]
+    return journal_bytes(out) == journal_bytes(expected) and ticks[0] == ticks[1]
+
+
+def journal_bytes(out: Path) -> list[bytes]:
+    return [path.read_bytes() for path in sorted(out.glob("*.journal"))]
+
+
+def states(pid: int) -> set[str]:
+    """Of all its threads: T is stopped."""
+    return {
+        (task / "stat").read_text().rpartition(")")[2].split()[0]
+        for task in Path(f"/proc/{pid}/task").iterdir()
+    }
+
+
+def stop(pid: int) -> None:
+    os.kill(pid, SIGSTOP)
+    until(lambda: states(pid) == {"T"}, "it has stopped")
+
+
+@pytest.fixture
+def assured(tmp_path: Path) -> Path:
+    """A scenario of the variant that is sure, for whom standing still is no harm."""
+    path = tmp_path / "assured.toml"
+    path.write_text(ASSURED)
+    return path
+
+
+@contextmanager
+def watched(out: Path, name: str) -> Iterator[Inbox]:
+    """What a bystander hears of the process: that it is alive, and that its link is given up."""
+    words = next(words for words in processes_of(out).values() if "world" in words)
+    option = {word: words[place + 1] for place, word in enumerate(words) if word in ("--listen", "--run")}
+    run = option["--run"]
+    inbox = Inbox("a bystander")
+    with session.open_client(option["--listen"], lambda: None) as link:
+        robot = name.removeprefix("agent ")
+        key = keys.world_alive(run) if name == "world" else keys.robot_alive(run, robot)
+        session.watch_liveliness(link, key, inbox)
+        until(lambda: inbox.next(0.0).topic == "alive", f"{name} is alive")
+        yield inbox
+
+
+def given_up(bystander: Inbox) -> bool:
+    return bystander.next(0.1).topic == "gone"
+
+
+# --- lockstep -----------------------------------------------------------------------------------------
+
+
+def test_stopped_for_a_moment_each_in_turn_a_run_goes_on(undisturbed: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with Command("run", undisturbed, "--out", out, "-q") as run:
+        for turn in range(9):
+            run.until_written(out / "world.journal", 2_000 + 8_000 * turn)
+            pid = process_of(out, *NAMES[turn % 3].split())
+            stop(pid)
+            written = size(out / "world.journal")
+            os.kill(pid, SIGCONT)
+            run.until_written(out / "world.journal", written + 1)
+        assert run.ended() == (0, LOCALISED, "")
+    assert same(out, undisturbed)
+    assert not processes_of(out)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_stopped_until_its_link_is_given_up_a_process_goes_on(
+    name: str, undisturbed: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    with Command("run", undisturbed, "--out", out, "-q") as run:
+        run.until_written(out / "world.journal", 2_000)
+        pid = process_of(out, *name.split())
+        with watched(out, name) as bystander:
+            stop(pid)
+            until(lambda: given_up(bystander), "its link is given up")
+        written = size(out / "world.journal")
+        assert written < size(undisturbed.parent / "out" / "world.journal"), "it was stopped too late"
+        os.kill(pid, SIGCONT)
+        ended = run.ended()
+    assert ended[:2] == (0, LOCALISED), ended
+    assert same(out, undisturbed)
+    assert not processes_of(out)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_stopped_for_longer_than_the_patience_a_process_fails_the_run(
+    name: str, undisturbed: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    with Command("run", undisturbed, "--out", out, "-q", "--patience", str(PATIENCE_S)) as run:
+        run.until_written(out / "world.journal", 2_000)
+        stop(process_of(out, *name.split()))
+        ended = run.ended()
+    said = ended.out + ended.err
+    assert ended.status == 3, ended
+    if name == "world":
+        assert f"nothing heard from the world for {PATIENCE_S:g} s" in said
+    else:
+        assert f"no answer from {name[-1]} (not there) at tick " in said
+        assert f" for {PATIENCE_S:g} s" in said
+    assert not processes_of(out)
+
+
+def test_a_link_over_which_nothing_comes_is_replaced_by_another() -> None:
+    endpoint, briefing, inbox = free_endpoint(), load("paper-1").briefing("a", None), Inbox("a mute world")
+    with session.open_router(endpoint) as link:
+        session.watch_liveliness(link, keys.robot_alive("mute", "a"), inbox)
+        session.answer(link, keys.briefing("mute", "*"), lambda _key: briefing)
+        _token = session.show_alive(link, keys.world_alive("mute"))
+        with Command("agent", "a", "--connect", endpoint, "--patience", "20") as agent:
+            for topic in ("alive", "gone", "alive"):
+                until(lambda topic=topic: inbox.next(0.1).topic == topic, f"a is {topic}")  # type: ignore[misc]
+                assert agent.running
+
+
+# --- in real time -------------------------------------------------------------------------------------
+
+
+def test_in_real_time_who_is_stopped_stands_still_from_the_next_period_on(
+    assured: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    with Command("run", assured, "--rate", "20", "--out", out, "-q") as run:
+        run.until_written(out / "world.journal", 1500)
+        pid = process_of(out, "agent", "a")
+        with watched(out, "agent a") as bystander:
+            stop(pid)
+            answered = ticks(out) + 1  # whose Sense may have come before
+            until(lambda: given_up(bystander), "its link is given up")
+            continued = ticks(out)
+        os.kill(pid, SIGCONT)
+        assert run.ended().status == 0
+    with (out / "ticks.csv").open(newline="") as file:
+        rows = {int(row["tick"]): row for row in csv.DictReader(file) if row["robot"] == "a"}
+    away = [rows[tick] for tick in range(answered + 1, continued)]
+    assert len(away) >= 20
+    assert {(row["v"], row["omega"], row["state"]) for row in away} == {("0.0", "0.0", "")}
+    assert rows[len(rows) - 1]["state"] == "localised"
+    missed = {message.tick for message in played(out) if isinstance(message, Missed) and message.robot == "a"}
+    assert {int(row["tick"]) for row in away} <= missed
+
+
+def test_in_real_time_a_world_that_is_stopped_goes_on(assured: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with Command("run", assured, "--rate", "20", "--out", out, "-q") as run:
+        run.until_written(out / "world.journal", 1500)
+        pid = process_of(out, "world")
+        with watched(out, "world") as bystander:
+            stop(pid)
+            until(lambda: given_up(bystander), "its link is given up")
+        os.kill(pid, SIGCONT)
+        ended = run.ended()
+    assert ended.status == 0, ended
+    assert not processes_of(out)
+
+
+def played(out: Path) -> list[Scenario | Drive | Missed | End | Farewell]:
+    kinds = Scenario | Drive | Missed | End | Farewell
+    return [decode(frame, kinds, MAX_FRAME_BYTES) for frame in journal.read(out / "world.journal")]
+
+
+def ticks(out: Path) -> int:
+    """The latest tick that is on record."""
+    return max(message.tick for message in played(out) if isinstance(message, Drive | Missed))
