@@ -70,6 +70,8 @@ class AgentProcess:
         self._world_there = True
         self._said_again = 0.0
         """when all was last said again"""
+        self._again: float | None = None
+        """when to do so once more, if it was asked for too soon"""
         self._told = deque(memory.told, maxlen=REPORTS_TOLD)
         """its own latest reports"""
         self._reports = {told.report.tick: told for told in memory.heard}
@@ -97,7 +99,7 @@ class AgentProcess:
         patience = self._patience + (self._tick_s or 0.0)
         give_up = time.monotonic() + patience
         while True:
-            arrival = self._inbox.next((self._due or give_up) - time.monotonic())
+            arrival = self._next(self._due or give_up)
             match arrival.topic:
                 case "sense":
                     message = self._accepted(arrival)
@@ -116,6 +118,15 @@ class AgentProcess:
             self._decide_when_all_is_heard()
             if time.monotonic() > give_up:
                 raise NoWorld(f"nothing heard from the world for {patience:g} s")
+
+    def _next(self, until: float) -> Arrival:
+        """The next arrival until then; says again what is asked for, once that is due."""
+        if self._again is not None:
+            if time.monotonic() >= self._again:
+                self._say_again()
+            else:
+                until = min(until, self._again)
+        return self._inbox.next(until - time.monotonic())
 
     @property
     def _known(self) -> int:
@@ -272,9 +283,11 @@ class AgentProcess:
 
     def _say_again(self) -> None:
         """All that whoever was started again may have lost: earlier reports, too, if the peer is near."""
-        if time.monotonic() < self._said_again + AGAIN_S:
+        now = time.monotonic()
+        if now < self._said_again + AGAIN_S:
+            self._again = self._said_again + AGAIN_S
             return
-        self._said_again = time.monotonic()
+        self._said_again, self._again = now, None
         if self._robot.told is not None:
             oldest = self._robot.told.report.tick - REPORTS_TOLD
             for told in self._told:
