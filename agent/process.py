@@ -82,6 +82,8 @@ class AgentProcess:
         self._world_there = True
         self._said_again = 0.0
         """when all was last said again"""
+        self._again: float | None = None
+        """when to do so once more, if it was asked for too soon"""
         self._told = deque(memory.told, maxlen=REPORTS_TOLD)
         """its own latest reports"""
         self._reports = {told.report.tick: told for told in memory.heard}
@@ -144,10 +146,16 @@ class AgentProcess:
         self._heard_at = time.monotonic()
 
     def _next(self, until: float | None) -> Arrival:
-        """What arrives next, NOTHING after `until`. Raises LinkLost if the world is silent for too long."""
+        """What arrives next, NOTHING after `until`; says again what is asked for, once that is due.
+
+        Raises LinkLost if the world is silent for too long.
+        """
         now = time.monotonic()
+        if self._again is not None and now >= self._again:
+            self._say_again()
         lost = self._heard_at + SILENCE_S + (self._tick_s or 0.0)
-        arrival = self._inbox.next(min(until or self._give_up, self._give_up, lost) - now)
+        first = min(until or self._give_up, self._give_up, lost, self._again or lost)
+        arrival = self._inbox.next(first - now)
         if arrival.topic == "sense":
             self._heard_at = time.monotonic()
         elif arrival is NOTHING and time.monotonic() >= lost:
@@ -313,9 +321,11 @@ class AgentProcess:
 
     def _say_again(self) -> None:
         """All that whoever was started again may have lost: earlier reports, too, if the peer is near."""
-        if time.monotonic() < self._said_again + AGAIN_S:
+        now = time.monotonic()
+        if now < self._said_again + AGAIN_S:
+            self._again = self._said_again + AGAIN_S
             return
-        self._said_again = time.monotonic()
+        self._said_again, self._again = now, None
         if self._robot.told is not None:
             oldest = self._robot.told.report.tick - REPORTS_TOLD
             for told in self._told:

@@ -44,7 +44,7 @@ TIMES = 3
 """each frame is put so often, and must be told of once"""
 VOLLEYS = 12
 STORM = 3000
-SETTLED_MB = 4.0
+SETTLED_MB = 8.0
 
 GENUINE = {
     "sense": (Sense(0, "a", None, 1.0), 1 << 20),
