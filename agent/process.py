@@ -97,12 +97,11 @@ class AgentProcess:
         """once the world has said it"""
         self._farewell = memory.farewell
 
-    def play(self, link: zenoh.Session) -> End:
-        """The run over `link`, to its End.
+    def play(self) -> End:
+        """The run over the link that it is attached to, to its End.
 
         Raises LinkLost; NoWorld; or Interrupted when told to stop.
         """
-        self._attach(link)
         while self.end is None:
             arrival = self._next(self._due)
             match arrival.topic:
@@ -132,7 +131,8 @@ class AgentProcess:
 
     # --- the link ---
 
-    def _attach(self, link: zenoh.Session) -> None:
+    def attach(self, link: zenoh.Session) -> None:
+        """From now on, this is the link over which it hears and is heard."""
         me, peer, run = self._id, self._peer, self._run
         self._drive = session.publisher(link, keys.drive(run, me))
         self._report = session.publisher(link, keys.report(run, me, peer))

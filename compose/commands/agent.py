@@ -78,11 +78,14 @@ def _play(options: argparse.Namespace, inbox: Inbox) -> End:
                     process = AgentProcess(
                         memory, run, inbox, patience=options.patience, reached=kill.taker(options.kill)
                     )
+                    process.attach(link)
                     if not (options.quiet or options.launched):
                         again = memory.sense
                         where = f", again, from tick {again.tick} on" if again is not None else ""
                         print(f"{options.id}: in run {run}, with {briefing.peer}{where}", flush=True)
-                return process.play(link)
+                else:
+                    process.attach(link)
+                return process.play()
         except LinkLost:
             continue
         except NoWorld:
