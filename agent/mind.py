@@ -123,11 +123,6 @@ class Mind(msgspec.Struct, frozen=True):
         return plan.a if self.briefing.role == "a" else plan.b
 
     @property
-    def hears_peer(self) -> bool:
-        """Whether the peer's report of this tick has been heard."""
-        return self.radio.latest == self.tick
-
-    @property
     def off_anchor(self) -> bool:
         """Whether b, be it this robot or the peer, is where it can be met; phase 1 is done by both."""
         assert self.radio.start is not None

@@ -70,7 +70,6 @@ class AgentProcess:
         self._give_up = time.monotonic() + self._silence
         self._reached = reached
         self._robot = memory.robot
-        self._memory = memory
         self._sense = memory.sense
         """the latest"""
         self._due: float | None = None

@@ -25,11 +25,6 @@ class Testimony(msgspec.Struct, frozen=True):
     missing: bool = False
     """there is no such journal"""
 
-    @property
-    def complete(self) -> bool:
-        """Whether it goes on to the robot's Farewell."""
-        return self.past is not None and self.past.farewell is not None
-
 
 class Case(msgspec.Struct, frozen=True):
     """A run, before the judge."""
