@@ -1,7 +1,7 @@
 """The paper to the letter where sensors are noisy: its manoeuvres and no others, weighed by likelihood.
 
 It takes the branch that is likeliest, and claims only what the mission asks for: with the few ranges that the
-letter takes it mostly cannot, and says what is missing.
+letter takes it mostly cannot, with outliers never, and says what is missing.
 """
 
 from __future__ import annotations
@@ -18,14 +18,11 @@ from agent.mind import WORDS, Mind
 from agent.phases import encounter
 from agent.phases.encounter import LastManoeuvre, Standing, Waiting
 from agent.phases.surveying import Held
-from agent.survey import claimed
+from agent.survey import CHECKED_WITH_OUTLIERS, claimed
 from protocol.motion import ORIGIN, wrap
 
 CHECKED = 3
-"""mutual ranges before a claim"""
-
-REDUNDANT = 12
-"""ranges, for six unknowns, before a claim where there are outliers"""
+"""mutual ranges before a claim; where there are outliers as many as in `survey`, and it takes fewer"""
 
 LIKELY = 0.05
 """odds from which on a branch is worth a manoeuvre that tells it from others"""
@@ -48,10 +45,9 @@ def considered(mind: Mind) -> Mind:
     if inference.known_through(mind) < mind.tick or mutual < CHECKED - 1:
         return mind
     weighed = search(pair)
-    mind = inference.finished(inference.with_pair(mind, weighed, pair, CHECKED), weighed)
+    checked = CHECKED_WITH_OUTLIERS if mind.briefing.mission.noise.outliers else CHECKED
+    mind = inference.finished(inference.with_pair(mind, weighed, pair, checked), weighed)
     missing = mind.findings.missing
-    if missing is None and mind.briefing.mission.noise.outliers and len(pair.ranges.rho) < REDUNDANT:
-        missing = f"{len(pair.ranges.rho)} ranges, of {REDUNDANT}, cannot rule out that one is an outlier"
     if missing is None:
         return claimed(mind)
     if mind.findings.plan is not None or not weighed:

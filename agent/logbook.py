@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from itertools import pairwise
 
 import msgspec
 
@@ -65,7 +66,10 @@ class Logbook(msgspec.Struct, frozen=True):
 
     def between(self, first: int, last: int) -> tuple[Run, ...]:
         """What was driven over [first, last], as few runs."""
-        return Logbook().extended(0, 0, Logbook(last - first, _between(self.runs, first, last))).runs
+        runs = _between(self.runs, first, last)
+        if all(one.v != other.v or one.omega != other.omega for one, other in pairwise(runs)):
+            return runs
+        return Logbook().extended(0, 0, Logbook(last - first, runs)).runs
 
     def pose(self, start: Pose, tick: int, period: float) -> Pose:
         """Where the robot was at `tick`, if it was at `start` at tick 0."""
@@ -92,8 +96,13 @@ def _dated(runs: Iterable[Run]) -> Iterator[tuple[int, Run]]:
 
 def _between(runs: tuple[Run, ...], first: int, last: int) -> tuple[Run, ...]:
     """What was driven over [first, last]."""
-    return tuple(
-        Run(min(begin + run.ticks, last) - max(begin, first), run.v, run.omega)
-        for begin, run in _dated(runs)
-        if begin < last and begin + run.ticks > first
-    )
+    found: list[Run] = []
+    end = 0
+    for run in runs:
+        begin, end = end, end + run.ticks
+        if begin >= last:
+            break
+        if end > first:
+            whole = begin >= first and end <= last
+            found.append(run if whole else Run(min(end, last) - max(begin, first), run.v, run.omega))
+    return tuple(found)

@@ -16,7 +16,7 @@ from agent.phases.anchor import ThirdPoint
 from agent.phases.encounter import LastManoeuvre, Plan, Returning, Standing, Waiting
 from agent.phases.rendezvous import Aligning, Orbiting, Radial, Tangent, off_anchor
 from agent.phases.seeking import Backing, Circling, Homing, Straight, Turning
-from agent.phases.surveying import Listening, Surveying
+from agent.phases.surveying import Listening, Retreating, Surveying
 from agent.radio import Radio
 from protocol import messages
 from protocol.messages import MAX_REASON, Alarm, Briefing, Localised, Ranged, Undecided
@@ -38,7 +38,7 @@ class Done(msgspec.Struct, frozen=True):
 Phase1 = Straight | Backing | Turning | Circling | ThirdPoint | Surveying | Homing
 Phase2 = Aligning | Radial | Tangent | Orbiting
 Phase3 = Straight | Backing | Turning | Circling | Standing | Waiting | LastManoeuvre | Returning
-Noisy3 = Surveying | Listening
+Noisy3 = Surveying | Listening | Retreating
 State = Asleep | Phase1 | Phase2 | Phase3 | Noisy3 | Done
 
 WORDS: dict[type, str] = {
@@ -59,12 +59,15 @@ WORDS: dict[type, str] = {
     Waiting: "waiting",
     LastManoeuvre: "last-manoeuvre",
     Returning: "returning",
+    Retreating: "retreating",
 }
 
 
 class Findings(msgspec.Struct, frozen=True):
     """What phases 1 and 3 have found out, beside the state."""
 
+    possible: tuple[Branch, ...] = ()
+    """where sensors are exact: what the first two ranges left, before silence was weighed"""
     branch: Branch | None = None
     """the one that is left after phase 1"""
     branch_kind: messages.BranchKind | None = None

@@ -23,7 +23,7 @@ from agent.phases.anchor import ThirdPoint
 from agent.phases.encounter import LastManoeuvre, Returning, Standing, Waiting
 from agent.phases.rendezvous import Aligning, Orbiting, Radial, Tangent
 from agent.phases.seeking import Backing, Circling, Homing, Straight, Turning
-from agent.phases.surveying import Surveying
+from agent.phases.surveying import Retreating, Surveying
 from protocol import messages
 from protocol.messages import Alarm, Drive, Estimate, Localised, Ranged, Report, Sense, Undecided
 from protocol.motion import ORIGIN, REST, Controls, Pose, step
@@ -218,6 +218,7 @@ def _second_range(mind: Mind) -> Mind:
         return _to_third_point(mind, likely)
     rho0, rho = mind.log.ranges[0].range, mind.log.ranges[-1].range
     possible = branches(rho0, mind.odometry, rho)
+    mind = replace(mind, findings=replace(mind.findings, possible=possible))
     left = weigh_branches(possible, mind.seen(), mind.briefing.mission.sensing_range)
     if isinstance(mind.state, Circling) and len(left) == 1:
         return _located(mind, left[0], "circle")
@@ -280,7 +281,7 @@ def _controls(mind: Mind) -> Controls:
             return seeking.controls(mind.state, mind.odometry, mind.briefing.mission)
         case ThirdPoint(drive=controls) | LastManoeuvre(controls) | Returning(controls):
             return controls
-        case Surveying(drive=controls):
+        case Surveying(drive=controls) | Retreating(controls):
             return controls
         case Homing():
             return seeking.homeward(mind.state, mind.odometry, mind.briefing.mission) or REST

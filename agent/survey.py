@@ -12,14 +12,13 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from agent import inference
-from agent.estimation.doubt import DOUBTFUL, LOOKS, UNBELIEVABLE
+from agent.estimation.doubt import DOUBTFUL, LOOKS, UNBELIEVABLE, WARY
 from agent.estimation.hypotheses import Weighed, follow, search
 from agent.mind import Asleep, Done, Mind
 from agent.phases import rendezvous, seeking, surveying
-from agent.phases.encounter import Returning
 from agent.phases.rendezvous import Aligning, Orbiting, Radial, Tangent
 from agent.phases.seeking import Backing, Circling, Homing, Straight, Turning
-from agent.phases.surveying import Listening, Surveying
+from agent.phases.surveying import Listening, Retreating, Surveying
 from protocol.messages import BranchKind, Localised
 from protocol.motion import ORIGIN, REST, Controls
 
@@ -67,16 +66,8 @@ def sensed(mind: Mind, anchor_range: float | None) -> Mind:
             return replace(mind, state=Straight("anchor", mind.odometry, 0.0)) if there else mind
         case Aligning() | Radial() | Tangent() | Orbiting():
             return _under_way(mind, anchor_range is not None)
-        case Surveying("peer") | Listening() if mind.briefing.role == "b" and _silent(
-            mind
-        ) >= LOST_TOGETHER * surveying.stride(mind.briefing.mission):
-            return _homeward(mind)
-        case Surveying("peer", drive) | Listening(drive) if not mind.in_contact:
-            return replace(mind, state=Returning(Controls(-drive.v, -drive.omega), mind.odometry))
-        case Returning() if not mind.in_contact:
-            return _parted(mind)
-        case Returning():
-            return replace(mind, state=Surveying("peer"))
+        case Surveying("peer") | Listening() | Retreating():
+            return _beside(mind)
         case _:
             return mind
 
@@ -169,6 +160,22 @@ def _under_way(mind: Mind, ranged: bool) -> Mind:
 # --- with the peer ------------------------------------------------------------------------------------
 
 
+def _beside(mind: Mind) -> Mind:
+    """Phase 3, by whether the peer, and for b its anchor, are in range."""
+    stride = surveying.stride(mind.briefing.mission)
+    match mind.state:
+        case Retreating(_, since) if mind.tick - since < 2 * stride:
+            return mind
+        case Retreating():
+            return replace(mind, state=Surveying("peer")) if mind.in_contact else _parted(mind)
+        case _ if mind.briefing.role == "b" and _silent(mind) >= LOST_TOGETHER * stride:
+            return _homeward(mind)
+        case Surveying(_, drive) | Listening(drive) if not mind.in_contact:
+            return replace(mind, state=Retreating(Controls(0.0 - drive.v, 0.0 - drive.omega), mind.tick))
+        case _:
+            return mind
+
+
 def heard(mind: Mind) -> Mind:
     """What the robot is set to do once it has heard its peer, in range."""
     match mind.state:
@@ -177,6 +184,8 @@ def heard(mind: Mind) -> Mind:
         case Surveying("anchor") | Straight() | Backing() | Turning() | Circling() | Homing():
             return mind
         case _ if mind.radio.start is None:
+            return mind
+        case Retreating():
             return mind
         case Surveying("peer") | Listening() if not decides(mind):
             return mind
@@ -202,7 +211,7 @@ def _considered(mind: Mind) -> Mind:
         mind = replace(mind, findings=replace(mind.findings, sought=mutual))
     checked = CHECKED_WITH_OUTLIERS if mission.noise.outliers else CHECKED
     judged = inference.with_pair(mind, weighed, pair, checked)
-    if (judged.findings.missing is None or _in_doubt(judged)) and not searched:
+    if (judged.findings.missing is None or _against(judged, DOUBTFUL)) and not searched:
         weighed, searched = search(pair), True
         judged = inference.with_pair(mind, weighed, pair, checked)
     judged = inference.finished(judged, weighed)
@@ -210,7 +219,8 @@ def _considered(mind: Mind) -> Mind:
         judged = _doubted(judged)
     if judged.verdict is not None:
         return judged
-    if judged.findings.missing is None:
+    few = len(pair.places) < 2 * checked
+    if judged.findings.missing is None and not (few and _against(judged, WARY)):
         return claimed(judged)
     if role == "a" and len(pair.places) >= ENOUGH * (1 + mind.findings.returns):
         return _homeward(judged)
@@ -220,9 +230,10 @@ def _considered(mind: Mind) -> Mind:
     return replace(judged, state=Surveying("peer", a if role == "a" else b))
 
 
-def _in_doubt(mind: Mind) -> bool:
+def _against(mind: Mind, bound: float) -> bool:
+    """Whether what most speaks against the likeliest hypothesis is less probable than `bound`."""
     against = mind.findings.against
-    return against is not None and against.p_value < DOUBTFUL
+    return against is not None and against.p_value < bound
 
 
 def _doubted(mind: Mind) -> Mind:

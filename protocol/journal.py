@@ -18,11 +18,13 @@ from typing import Protocol
 
 import msgpack
 
-from protocol.wire import MAX_FRAME_BYTES
+from protocol.wire import MAX_FRAME_BYTES, is_sound
 
 _packer = msgpack.Packer()
 _LONGEST = b"\xc6" + MAX_FRAME_BYTES.to_bytes(4, "big")
 """how the longest frame begins"""
+_HEADS = {0xC4: 1, 0xC5: 2, 0xC6: 4}
+"""how a byte string begins in msgpack, and how many bytes its length then takes"""
 
 
 class CannotRecord(OSError):
@@ -129,8 +131,31 @@ def read(path: Path) -> Iterator[bytes]:
 
     Raises OSError if it cannot be read, CorruptJournal where something stands that is no frame.
     """
+    return iter(torn(path)[0])
+
+
+def torn(path: Path) -> tuple[list[bytes], int]:
+    """The frames of the journal at `path`, and how many bytes stand behind them: of a torn write.
+
+    Raises like `read`.
+    """
     tail = Tail(path)
-    return iter(tail.news())
+    frames = tail.news()
+    if _holds_a_frame(tail.torn) or len(packed(frames)) != tail.whole:
+        raise CorruptJournal(f"{path}: damaged at byte {tail.whole}: a frame of a wrong length")
+    return frames, len(tail.torn)
+
+
+def _holds_a_frame(rest: bytes) -> bool:
+    """Whether a whole frame stands in what looks like a torn one: then it is not its end that is missing."""
+    for place in range(1, len(rest)):
+        width = _HEADS.get(rest[place])
+        if width is not None:
+            begin = place + 1 + width
+            size = int.from_bytes(rest[place + 1 : begin])
+            if begin + size <= len(rest) and is_sound(rest[begin : begin + size]):
+                return True
+    return False
 
 
 class Tail:
@@ -140,11 +165,13 @@ class Tail:
         self.path = path
         self.whole = 0
         """bytes of what has been read"""
+        self.torn = b""
+        """what stood behind them the last time"""
 
     def news(self) -> list[bytes]:
         """The frames that have come since the last time; what is torn waits for the rest.
 
-        Raises OSError, CorruptJournal like `read`.
+        Raises OSError if it cannot be read, CorruptJournal where something stands that is no frame.
         """
         with self.path.open("rb") as file:
             file.seek(self.whole)
@@ -159,8 +186,9 @@ class Tail:
                     raise ValueError("no frame")  # it is the file that is wrong
                 frames.append(frame)
                 whole = unpacker.tell()
-            torn = data[whole : whole + len(_LONGEST)]
-            if torn.startswith(_LONGEST[:1]) and torn > _LONGEST:
+            self.torn = data[whole:]
+            head = self.torn[: len(_LONGEST)]
+            if head.startswith(_LONGEST[:1]) and head > _LONGEST:
                 raise ValueError("a frame of impossible length")
         except (ValueError, msgpack.UnpackException) as error:
             raise CorruptJournal(f"{self.path}: damaged at byte {self.whole + whole}: {error}") from None

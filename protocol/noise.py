@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cached_property
 from typing import Annotated
 
 import msgspec
@@ -31,7 +32,7 @@ class Drift(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return (self.v * v) ** 2 + self.v_floor**2, (self.omega * omega) ** 2 + self.omega_floor**2
 
 
-class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
     """Of ranges: Gaussian, outliers and drop-outs; of wheels: how they move the robot, and are measured.
 
     Left out, everything is exact.
@@ -52,11 +53,9 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     odometry: Drift = Drift()
     """how what the odometry measures differs from what was executed"""
 
-    @property
+    @cached_property
     def exact(self) -> bool:
         """Whether there is none: then a range is a fact, and so is silence."""
-        if self == EXACT:  # mostly, and at once
-            return True
         ranges = self.anchor_sigma or self.mutual_sigma or self.outliers or self.drop_outs
         return not ranges and self.actuation == self.odometry == Drift()
 
@@ -71,5 +70,3 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 UNREST = 6.0
 """standard deviations"""
-
-EXACT = Noise()

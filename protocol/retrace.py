@@ -9,11 +9,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from protocol.journal import CannotRecord, CorruptJournal, Journal, Tail, lock, packed
-from protocol.wire import is_sound
-
-_HEADS = {0xC4: 1, 0xC5: 2, 0xC6: 4}
-"""how a byte string begins in msgpack, and how many bytes its length then takes"""
+from protocol.journal import CannotRecord, Journal, lock, packed, torn
 
 
 class Otherwise(ValueError):
@@ -35,22 +31,14 @@ class Retrace:
             raise CannotRecord(f"{path} cannot be opened: {error.strerror or error}") from None
         lock(self._file, path)
         try:
-            self.frames = self._found()
+            self.frames, _ = torn(path)
             """what is on record"""
+        except OSError as error:
+            self.close()
+            raise CannotRecord(f"{path} cannot be read: {error.strerror or error}") from None
         except BaseException:
             self.close()
             raise
-
-    def _found(self) -> list[bytes]:
-        try:
-            tail = Tail(self.path)
-            frames = tail.news()
-            torn = self.path.read_bytes()[tail.whole :]
-        except OSError as error:
-            raise CannotRecord(f"{self.path} cannot be read: {error.strerror or error}") from None
-        if _holds_a_frame(torn) or len(packed(frames)) != tail.whole:
-            raise CorruptJournal(f"{self.path}: damaged at byte {tail.whole}: a frame of a wrong length")
-        return frames
 
     def write(self, *frames: bytes) -> None:
         """Meet `frames` again; what is beyond the record is kept for `go_on`. Raises Otherwise."""
@@ -79,15 +67,3 @@ class Retrace:
     def close(self) -> None:
         """Leave it as it is."""
         os.close(self._file)
-
-
-def _holds_a_frame(torn: bytes) -> bool:
-    """Whether a whole frame stands in what looks like a torn one: then it is not its end that is missing."""
-    for place in range(1, len(torn)):
-        width = _HEADS.get(torn[place])
-        if width is not None:
-            begin = place + 1 + width
-            size = int.from_bytes(torn[place + 1 : begin])
-            if begin + size <= len(torn) and is_sound(torn[begin : begin + size]):
-                return True
-    return False

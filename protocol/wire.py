@@ -28,8 +28,13 @@ class MalformedFrame(ValueError):
 
 def encode(message: msgspec.Struct) -> bytes:
     """The frame of `message`."""
-    body = _encoder.encode(message)
-    return _HEAD.pack(VERSION, zlib.crc32(body)) + body
+    said = _encoder.encode(message)
+    return _HEAD.pack(VERSION, zlib.crc32(said)) + said
+
+
+def body(frame: bytes) -> bytes:
+    """What stands in `frame` behind its head: msgpack."""
+    return frame[_HEAD.size :]
 
 
 def is_sound(frame: bytes) -> bool:
@@ -52,13 +57,13 @@ def decode(frame: bytes, kind: Any, limit: int = MAX_SENT_BYTES) -> Any:
     version, crc = _HEAD.unpack_from(frame)
     if version != VERSION:
         raise MalformedFrame(f"protocol version {version}, this is version {VERSION}")
-    body = memoryview(frame)[_HEAD.size :]
-    if zlib.crc32(body) != crc:
+    said = memoryview(frame)[_HEAD.size :]
+    if zlib.crc32(said) != crc:
         raise MalformedFrame("damaged: the CRC does not match")
     decoder = _decoders.get(kind)
     if decoder is None:
         decoder = _decoders[kind] = msgspec.msgpack.Decoder(kind)
     try:
-        return decoder.decode(body)
+        return decoder.decode(said)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise MalformedFrame(str(error)) from None

@@ -8,7 +8,7 @@ from protocol.journal import CorruptJournal, Sink
 from protocol.messages import Drive, End, Farewell, Missed, Sense
 from protocol.retrace import Otherwise, Retrace
 from protocol.wire import encode
-from world.past import past
+from world.history import history
 from world.referee import Judgement
 from world.scenario import Scenario
 from world.tick import advance, release, senses
@@ -113,16 +113,18 @@ def again(scenario: Scenario, record: Retrace) -> Course:
 
 
 def _retrace(course: Course, record: Retrace) -> None:
-    lived = past(record.frames, record.path)
+    lived = history(record.frames, record.path)
+    if lived.disorder is not None:
+        raise CorruptJournal(f"{record.path}: {lived.disorder.what}")
     if lived.scenario != course.world.scenario:
         raise CorruptJournal(f"{record.path}: the record of another scenario, {lived.scenario.name}")
     try:
         record.write(encode(lived.scenario))
-        for drives in lived.ticks:
-            course.drive(drives)
+        for tick in lived.ticks:
+            course.drive(tick.drives)
         if lived.end is not None and course.over is None:
             course.end(Judgement(lived.end.outcome, lived.end.reason))
-        course.farewells(lived.farewells)
+        course.farewells(lived.farewells.values())
     except Otherwise:
         raise CorruptJournal(
             f"{record.path}: on record the world went on otherwise at tick {course.tick}: "

@@ -14,7 +14,10 @@ from protocol.messages import Alarm
 DOUBTFUL = 1e-3
 """less probable than this, a fit is not what a robot claims by: it takes more ranges"""
 
-UNBELIEVABLE = 2e-5
+WARY = 1e-2
+"""the same, while a robot has not got twice as many mutual ranges as a claim takes"""
+
+UNBELIEVABLE = 2e-4
 """less probable than this, and so over again, it is not chance that the peer has against it"""
 
 LOOKS = 5
@@ -56,9 +59,12 @@ def doubt(fit: Fit, pair: Pair) -> Doubt:
 
 
 def _normal(chi2: float, free: int) -> float:
-    """The chi-square of `free` degrees of freedom, as a standard normal variable (Wilson and Hilferty)."""
+    """The chi-square of `free` degrees of freedom, as a standard normal variable (Wilson and Hilferty).
+
+    Rounding may leave one below zero to a fit that has not found its minimum (see `inference.finished`).
+    """
     spread = 2.0 / (9.0 * free)
-    return float(((chi2 / free) ** (1.0 / 3.0) - (1.0 - spread)) / math.sqrt(spread))
+    return float(((max(chi2, 0.0) / free) ** (1.0 / 3.0) - (1.0 - spread)) / math.sqrt(spread))
 
 
 def _stretched(fit: Fit, pair: Pair) -> float:

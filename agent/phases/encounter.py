@@ -71,12 +71,46 @@ Resting = Standing | Waiting
 State = Resting | LastManoeuvre | Returning
 
 
+class Question(NamedTuple):
+    """Which of `candidates` is true: what the last manoeuvre is to answer."""
+
+    mover: Role
+    a: Pose
+    """in <a(M1)>"""
+    b: Pose
+    """in <b(M2)>"""
+    candidates: tuple[Placement, ...]
+
+
 class Plan(NamedTuple):
     """A last manoeuvre, and what it is expected to tell."""
 
     drive: Controls
     separation_m2: float | None
     """J of eq. (8): the least difference of two predicted squared ranges; none for one candidate"""
+    question: Question
+
+
+class Reach(NamedTuple):
+    """The manoeuvres that are compared, and where each ends, in the frame of the mover's anchor."""
+
+    v: Array
+    """(S, 1)"""
+    omega: Array
+    """(W,)"""
+    x: Array
+    """(S, W)"""
+    y: Array
+
+
+class Compared(NamedTuple):
+    """What each of the manoeuvres in `reach` would tell."""
+
+    reach: Reach
+    gap: Array
+    """J in m^2, (S, W); for one candidate, by how much the squared range would shrink"""
+    value: Array
+    """the same; -inf for manoeuvres that are not to be taken"""
 
 
 def base(sightings: Sequence[Sighting]) -> tuple[Sighting, Sighting] | None:
@@ -165,10 +199,20 @@ def last_manoeuvre(
     which silence then names. A single candidate is checked by the range that changes most, towards it:
     silence would check nothing.
     """
-    speed, omega, x, y = _ends(a if mover == "a" else b, mission, variant)
+    question = Question(mover, a, b, tuple(candidates))
+    reach, gap, value = compared(question, mission, variant)
+    row, column = _best(value)
+    drive = Controls(float(reach.v[row, 0]), float(reach.omega[column]))
+    return Plan(drive, float(gap[row, column]) if len(candidates) > 1 else None, question)
+
+
+def compared(question: Question, mission: Mission, variant: Variant) -> Compared:
+    """What `last_manoeuvre` chooses from: the largest value."""
+    mover, a, b, candidates = question
+    reach = reachable(a if mover == "a" else b, mission, variant)
     squared: list[Array] = []
     for candidate in candidates:
-        (ax, ay), (bx, by) = _placed(mover, a, b, candidate, x, y)
+        (ax, ay), (bx, by) = _placed(mover, a, b, candidate, reach.x, reach.y)
         squared.append(np.square(ax - bx) + np.square(ay - by))
     if len(squared) == 1:
         gap = travelled(b, candidates[0].place(a)) ** 2 - squared[0]
@@ -179,9 +223,7 @@ def last_manoeuvre(
         rim = (mission.sensing_range - RANGE_MARGIN) ** 2
         outside = np.sum([distance > rim for distance in squared], axis=0)
         value = np.where(outside == np.min(outside), gap, -np.inf)
-    row, column = _best(value)
-    drive = Controls(float(speed[row, 0]), float(omega[column]))
-    return Plan(drive, float(gap[row, column]) if len(candidates) > 1 else None)
+    return Compared(reach, gap, value)
 
 
 def survey(
@@ -192,7 +234,7 @@ def survey(
     For a placement that alone fits, and that the ranges in `sightings` do not determine: both robots and
     their anchors on one line. By the determinant of the information, which takes both robots to raise.
     """
-    speed, omega, x, y = _ends(a if mover == "a" else b, mission, "assured")
+    speed, omega, x, y = reachable(a if mover == "a" else b, mission, "assured")
     (ax, ay), (bx, by) = _placed(mover, a, b, placement, x, y)
     dx, dy = ax - bx, ay - by
     apart = np.maximum(np.hypot(dx, dy), ELSEWHERE)
@@ -202,7 +244,8 @@ def survey(
     value = (pp + by_phi**2 + FAINT) * (qq + by_psi**2 + FAINT) - (pq + by_phi * by_psi) ** 2
     value = np.where(apart <= mission.sensing_range - RANGE_MARGIN, value, -np.inf)
     row, column = _best(value)
-    return Plan(Controls(float(speed[row, 0]), float(omega[column])), None)
+    drive = Controls(float(speed[row, 0]), float(omega[column]))
+    return Plan(drive, None, Question(mover, a, b, (placement,)))
 
 
 def _best(value: Array) -> tuple[int, int]:
@@ -211,8 +254,8 @@ def _best(value: Array) -> tuple[int, int]:
     return int(row), int(column)
 
 
-def _ends(pose: Pose, mission: Mission, variant: Variant) -> tuple[Array, Array, Array, Array]:
-    """v (a column) and omega (a row) of the manoeuvres that are compared, and x and y of where each ends."""
+def reachable(pose: Pose, mission: Mission, variant: Variant) -> Reach:
+    """The manoeuvres that are compared, from `pose`."""
     omega = np.linspace(-mission.max_turn_rate, mission.max_turn_rate, TURN_RATES)
     half = 0.5 * mission.period * omega
     unit = mission.period * np.sinc(half / math.pi)
@@ -221,7 +264,8 @@ def _ends(pose: Pose, mission: Mission, variant: Variant) -> tuple[Array, Array,
     else:
         speed = mission.first_straight / mission.period * np.array(SPEEDS)[:, None]
     course = pose.heading + half
-    return speed, omega, pose.x + speed * unit * np.cos(course), pose.y + speed * unit * np.sin(course)
+    x, y = pose.x + speed * unit * np.cos(course), pose.y + speed * unit * np.sin(course)
+    return Reach(speed, omega, x, y)
 
 
 def _placed(

@@ -58,6 +58,14 @@ class Listening(msgspec.Struct, frozen=True):
     drive: Controls = REST
 
 
+class Retreating(msgspec.Struct, frozen=True):
+    """Has left the peer's range: drives back as it came, and as far again, not to do the same once more."""
+
+    drive: Controls
+    since: int
+    """the tick in which it found itself alone"""
+
+
 def stride(mission: Mission) -> int:
     """Ticks that a manoeuvre lasts: from nearer by, a range tells little more."""
     return max(1, round(STRIDE * mission.sensing_range / mission.first_straight))
