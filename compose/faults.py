@@ -10,7 +10,7 @@ import msgspec
 from msgspec import Meta
 from msgspec.structs import asdict
 
-from world.faults import MAX_DELAY, MAX_FAULTS, Chance, Delay, Fault, Link, Window
+from world.faults import MAX_DELAY, MAX_FAULTS, Delay, Fault, Link
 
 _LINK = re.compile(r"\s*(?P<one>[A-Za-z0-9_-]+)\s*(?P<way><->|->)\s*(?P<other>[A-Za-z0-9_-]+)\s*")
 _NUMBER = re.compile(r"[0-9]*\.?[0-9]+(?:[eE]-?[0-9]+)?")
@@ -21,23 +21,13 @@ class BadFault(ValueError):
     """A fault that cannot be; the text names the field and what is wrong."""
 
 
-class FaultTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """[[fault]]: see `world.faults.Fault`."""
+class FaultTable(Fault, frozen=True, array_like=False, forbid_unknown_fields=True):
+    """[[fault]]: a `Fault` whose link and delay are written as people write them."""
 
-    link: str = EVERYWHERE
+    link: str = EVERYWHERE  # type: ignore[assignment]
     """a->b, a<->b, or * for all"""
-    loss: Chance = 0.0
-    burst_start: Chance = 0.0
-    burst_end: Chance = 1.0
-    burst_loss: Chance = 1.0
-    partition: bool = False
-    delay: Delay | Annotated[list[Delay], Meta(min_length=2, max_length=2)] = 0
-    duplicate: Chance = 0.0
-    reorder: Chance = 0.0
-    corrupt: Chance = 0.0
-    reports_per_tick: Annotated[float, Meta(gt=0.0, le=1e3)] | None = None
-    ticks: Window | None = None
-    contact_ticks: Window | None = None
+    delay: Delay | Annotated[list[Delay], Meta(min_length=2, max_length=2)] = 0  # type: ignore[assignment]
+    """or between two, both included"""
 
 
 def fault(table: FaultTable, pairs: Iterable[tuple[str, str]]) -> Fault:
@@ -106,7 +96,7 @@ def _named(error: str) -> str:
     what, _, where = error.partition(" - at `$")
     unknown = re.fullmatch(r"Object contains unknown field `(.*)`", what, re.DOTALL)
     if unknown is not None:
-        known = ", ".join(FaultTable.__struct_fields__[1:])
+        known = ", ".join([name for name in Fault.__struct_fields__ if name != "link"])
         return f"there is no '{unknown[1]}'; there are {known}"
     return f"{where.strip('.`')}: {what[0].lower()}{what[1:]}".replace("`", "'")
 

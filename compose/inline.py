@@ -53,8 +53,9 @@ def played(scenario: Scenario, sinks: Mapping[str, Sink]) -> Record:
             drives[sense.robot] = robots[sense.robot].decide(heard)
             if robots[sense.robot].journaled:
                 robots[sense.robot].estimate()
-        if len(told) > LATEST * len(ids):
-            told = {key: one for key, one in told.items() if key[1] > course.tick - LATEST}
+        if told:
+            for robot in ids:  # nobody hears it any more
+                told.pop((robot, course.tick - LATEST), None)
         moments.append(Moment(course.world.truth, drives))
         end = course.drive(drives)
     farewells: dict[str, Farewell] = {robot: robots[robot].farewell(end) for robot in ids}

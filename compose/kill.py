@@ -1,14 +1,16 @@
-"""`--kill`: processes of a run that kill themselves where they are told to, to be started again."""
+"""`--kill` and `[[kill]]`: processes that kill themselves where they are told to, to be started again."""
 
 from __future__ import annotations
 
 import os
+import random
 import re
 import signal
 from collections.abc import Callable, Sequence
-from typing import Literal, cast, get_args
+from typing import Annotated, Literal, cast, get_args
 
 import msgspec
+from msgspec import Meta
 
 Point = Literal["sense", "report", "journal", "drive"]
 """How far a tick has come. An agent's: its Sense is there, and nothing on record; its Report is sent; its
@@ -17,6 +19,9 @@ record, and nobody has moved; all Drives are there, and not on record."""
 
 POINTS: tuple[Point, ...] = get_args(Point)
 WORLD = "world"
+DRAWN = "?"
+"""whoever, or wherever in the tick, the seed says"""
+_Tick = Annotated[int, Meta(ge=0, le=999_999_999)]
 _FORM = re.compile(
     r"(?P<who>[A-Za-z0-9_-]{1,32})@(?P<tick>[0-9]{1,9})(?::(?P<point>sense|report|journal|drive))?"
     r"(?:\+(?:(?P<never>never)|(?P<after>[0-9]{1,6}(?:\.[0-9]{1,6})?)s))?"
@@ -48,6 +53,47 @@ class Kill(msgspec.Struct, frozen=True):
     def last_words(self) -> str:
         """What the process says when it takes it."""
         return f"--kill {self.text}: taken"
+
+
+class KillTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """[[kill]]: what `--kill` says, or that it is to be drawn from the seed."""
+
+    who: str | list[str] = DRAWN
+    """a robot, or WORLD; or several, all of them in the one tick"""
+    tick: _Tick | Annotated[list[_Tick], Meta(min_length=2, max_length=2)] = 0
+    """or drawn between two, both included"""
+    point: Literal["sense", "report", "journal", "drive", "?"] = "sense"
+    """of each that is killed, where it is drawn"""
+    after: Annotated[float, Meta(ge=0.0, le=999_999.0)] | Literal["never"] = 0.0
+    """s until each is started again"""
+
+    def kills(self, draw: random.Random, anyone: Sequence[str]) -> list[Kill]:
+        """Those that `draw` makes of it, among `anyone`. Raises BadKill, whose text begins with the field."""
+        named = self.who if isinstance(self.who, list) else [self.who]
+        least, most = self.tick if isinstance(self.tick, list) else (self.tick, self.tick)
+        if least > most:
+            raise BadKill(f"tick: from {least} to {most} is backwards")
+        tick = draw.randint(least, most)
+        after = f"+{self.after:.6f}s" if self.after != "never" else "+never"
+        found = []
+        for name in named:
+            who = draw.choice(anyone) if name == DRAWN else name
+            if who not in anyone:
+                raise BadKill(f"who: there is no '{who}'; there are {', '.join(anyone)}")
+            point = draw.choice(POINTS) if self.point == DRAWN else self.point
+            found.append(parse(f"{who}@{tick}:{point}{after if self.after else ''}"))
+        return found
+
+
+def drawn(tables: Sequence[KillTable], seed: int, robots: Sequence[str]) -> tuple[Kill, ...]:
+    """What the tables of a scenario come to. Raises BadKill, whose text begins with the field."""
+    kills: list[Kill] = []
+    for i, table in enumerate(tables):
+        try:
+            kills += table.kills(random.Random(f"{seed}/kill/{i}"), [*robots, WORLD])
+        except BadKill as error:
+            raise BadKill(f"kill[{i}].{error}") from None
+    return tuple(kills)
 
 
 def parse(text: str) -> Kill:

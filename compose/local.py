@@ -107,6 +107,10 @@ class _Child:
         with suppress(BrokenPipeError):
             self._input.close()
 
+    def forget(self) -> None:
+        """What it said is of no more use."""
+        self._errors.close()
+
 
 def handed() -> Scenario:
     """In a child: the scenario that its launcher has handed it."""
@@ -165,6 +169,8 @@ class _Run:
 
     def start(self, name: str, kills: Sequence[Kill]) -> None:
         """Start it, for the first time or again."""
+        if name in self.children:
+            self.children[name].forget()
         self.children[name] = _Child(name, self._arguments[name], self._inbox, kills)
         if name == WORLD:
             self.children[name].hand(encode(self._scenario))
@@ -214,6 +220,7 @@ class _Run:
         for child in self.children.values():
             if child.status == ENDED and (said := child.said()):
                 print(said, file=sys.stderr)
+            child.forget()
 
 
 def _how(status: int) -> str:

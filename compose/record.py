@@ -16,13 +16,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
+from msgspec.structs import astuple
 
 from compose.claim import Claim, claim, matrix
-from compose.history import history
 from compose.status import UserError
 from protocol import journal
 from protocol.messages import Drive, End, Estimate, Farewell, Localised, Outcome
 from protocol.motion import Pose, wrap
+from world.history import history
 from world.scenario import Scenario
 from world.sensors import anchor_ranges, executed, mutual_ranges
 from world.truth import Truth, asked
@@ -79,6 +80,24 @@ class Record(msgspec.Struct, frozen=True):
     farewells: dict[str, Farewell]
 
 
+class Book(msgspec.Struct, frozen=True):
+    """A journal, as it is found."""
+
+    frames: list[bytes]
+    torn: int
+    """bytes of a torn write behind them"""
+
+
+def books(folder: Path) -> dict[str, Book]:
+    """Every journal of the record in `folder`, by its name; the world's is the first.
+
+    Raises OSError if that is not there or one cannot be read, journal.CorruptJournal where something stands
+    that is no frame.
+    """
+    names = [WORLD_JOURNAL, *sorted([path.name for path in folder.glob(agent_journal("*"))])]
+    return {name: Book(*journal.torn(folder / name)) for name in names}
+
+
 def read(folder: Path) -> Record:
     """The record of the run in `folder`: its world's journal, folded.
 
@@ -122,36 +141,52 @@ def legible(folder: Path) -> Iterator[None]:
         raise UserError(str(error)) from None
 
 
+class Row(msgspec.Struct, frozen=True):
+    """One robot in one tick, as `ticks.csv` has it; what is none is an empty field there."""
+
+    tick: int
+    robot: str
+    x: float
+    y: float
+    heading: float
+    """in (-pi, pi]"""
+    v: float | None
+    """driven until the next tick; none in the last"""
+    omega: float | None
+    anchor_range: float | None
+    mutual_range: float | None
+    phase: int | None
+    state: str | None
+
+
+def rows(record: Record) -> Iterator[Row]:
+    """One per tick and robot, tick 0 included."""
+    scenario = record.scenario
+    last = record.moments[-1].truth.tick if record.moments else 0
+    for moment in record.moments:
+        tick = moment.truth.tick
+        anchor = anchor_ranges(moment.truth, scenario)
+        mutual = _mutual(scenario, moment.truth)
+        for i, (robot, pose) in enumerate(zip(scenario.robots, moment.truth.poses, strict=True)):
+            drive = moment.drives.get(robot.id)
+            v = omega = None
+            if tick != last:
+                done = executed(asked(drive, scenario.mission), scenario, robot.id, tick)
+                v, omega = done.v, done.omega
+            yield Row(
+                *(tick, robot.id, pose.x, pose.y, wrap(pose.heading), v, omega),
+                *(anchor[i], mutual.get(robot.id)),
+                *((drive.phase, drive.state) if drive is not None else (None, None)),
+            )
+
+
 def ticks_csv(record: Record) -> str:
     """One row per tick and robot; floats in their shortest exact form."""
     out = io.StringIO()
-    rows = csv.writer(out, lineterminator="\n")
-    rows.writerow(
-        ["tick", "robot", "x", "y", "heading", "v", "omega"]
-        + ["anchor_range", "mutual_range", "phase", "state"]
-    )
-    last = record.moments[-1].truth.tick if record.moments else 0
-    ids = [robot.id for robot in record.scenario.robots]
-    for moment in record.moments:
-        anchor = anchor_ranges(moment.truth, record.scenario)
-        mutual = _mutual(record.scenario, moment.truth)
-        for i, (robot, pose) in enumerate(zip(ids, moment.truth.poses, strict=True)):
-            drive = moment.drives.get(robot)
-            driven: list[object] = ["", ""]
-            if moment.truth.tick != last:
-                command = asked(drive, record.scenario.mission)
-                done = executed(command, record.scenario, robot, moment.truth.tick)
-                driven = [done.v, done.omega]
-            said = [drive.phase, drive.state] if drive is not None else ["", ""]
-            rows.writerow(
-                [moment.truth.tick, robot, pose.x, pose.y, wrap(pose.heading), *driven]
-                + [_or_empty(anchor[i]), _or_empty(mutual.get(robot)), *said]
-            )
+    written = csv.writer(out, lineterminator="\n")
+    written.writerow(Row.__struct_fields__)
+    written.writerows([["" if one is None else one for one in astuple(row)] for row in rows(record)])
     return out.getvalue()
-
-
-def _or_empty(value: float | None) -> object:
-    return "" if value is None else value
 
 
 def _mutual(scenario: Scenario, truth: Truth) -> dict[str, float]:

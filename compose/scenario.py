@@ -18,6 +18,7 @@ import msgspec
 from msgspec import Meta
 
 from compose.faults import BadFault, FaultTable, added, table_of
+from compose.kill import BadKill, Kill, KillTable, drawn
 from compose.status import UserError
 from protocol.lie import Lie
 from protocol.messages import Briefing
@@ -86,6 +87,8 @@ class ScenarioFile(_Table, frozen=True):
     planner: PlannerTable = PlannerTable()
     fault: list[FaultTable] = []
     """of the radio, one befalling a report after the other"""
+    kill: list[KillTable] = []
+    """of processes: the world knows nothing of it, and no record tells"""
 
 
 class Setting(msgspec.Struct, frozen=True):
@@ -95,8 +98,10 @@ class Setting(msgspec.Struct, frozen=True):
     scenario: Scenario
     """with the seed of the file"""
 
-    def seeded(self, seed: int) -> Scenario:
-        """The same, with what the file leaves open drawn from `seed`."""
+    def seeded(self, seed: int | None) -> Scenario:
+        """The same, with what the file leaves open drawn from `seed`, if there is one."""
+        if seed is None:
+            return self.scenario
         reach = self.file.mission.sensing_range
         return msgspec.structs.replace(
             self.scenario,
@@ -108,6 +113,10 @@ class Setting(msgspec.Struct, frozen=True):
                 ]
             ),
         )
+
+    def kills(self, seed: int) -> tuple[Kill, ...]:
+        """Who is killed, and when; what the file leaves open is drawn from `seed`. Raises BadKill."""
+        return drawn(self.file.kill, seed, [robot.id for robot in self.file.robot])
 
 
 def shipped(folder: str = "scenarios") -> dict[str, Path]:
@@ -140,6 +149,11 @@ def load(source: str, *, seed: int | None = None, faults: Sequence[str] = ()) ->
 
     `faults` are added to its own. Raises BadScenario.
     """
+    return setting(source, faults).seeded(seed)
+
+
+def setting(source: str, faults: Sequence[str] = ()) -> Setting:
+    """That of the scenario of that name, or in the file at that path, with `faults`. Raises BadScenario."""
     path = shipped().get(source, Path(source))
     try:
         text = read_text(path)
@@ -148,7 +162,7 @@ def load(source: str, *, seed: int | None = None, faults: Sequence[str] = ()) ->
         raise BadScenario(f"{source}: neither a file nor a scenario that ships ({names})") from None
     except ValueError as error:
         raise BadScenario(f"{source}: {error}") from None
-    return parse(text, source, seed=seed, faults=faults)
+    return validate(table_in(text, source), source, faults)
 
 
 def read_text(path: Path) -> str:
@@ -165,8 +179,7 @@ def read_text(path: Path) -> str:
 
 def parse(text: str, source: str, *, seed: int | None = None, faults: Sequence[str] = ()) -> Scenario:
     """The scenario in `text`, with `faults`. Raises BadScenario, whose text begins with `source`."""
-    setting = validate(table_in(text, source), source, faults)
-    return setting.scenario if seed is None else setting.seeded(seed)
+    return validate(table_in(text, source), source, faults).seeded(seed)
 
 
 def table_in(text: str, source: str) -> dict[str, Any]:
@@ -186,7 +199,12 @@ def validate(table: Mapping[str, Any], source: str, faults: Sequence[str] = ()) 
         file = msgspec.convert(table, ScenarioFile)
     except msgspec.ValidationError as error:
         raise BadScenario(f"{source}: {field_first(str(error))}") from None
-    return Setting(file, _validated(file, source, faults))
+    found = Setting(file, _validated(file, source, faults))
+    try:
+        found.kills(file.seed)
+    except BadKill as error:
+        raise BadScenario(f"{source}: {error}") from None
+    return found
 
 
 def field_first(error: str) -> str:

@@ -7,10 +7,10 @@ from collections.abc import Iterable, Mapping
 import msgspec
 
 from agent.past import OutOfOrder, Past, past
-from compose.history import History, history
 from compose.record import WORLD_JOURNAL, agent_journal
 from protocol.journal import CorruptJournal
 from protocol.messages import Contact, Drive, Sense
+from world.history import History, history
 from world.tick import senses
 
 

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from msgspec.structs import astuple
+
 from agent.letter import CHECKED as CHECKED_BY_LETTER
-from agent.letter import REDUNDANT
 from agent.past import Past
 from agent.phases.encounter import ELSEWHERE
 from agent.phases.seeking import travelled
 from agent.survey import CHECKED, CHECKED_WITH_OUTLIERS
 from compose.audit.case import Case
-from compose.audit.findings import Checks, Violation
-from protocol.messages import Localised
+from compose.audit.findings import Checks, Violation, between
+from protocol.messages import End, Localised
 from protocol.motion import Pose
 from world.referee import Judgement, mistake
 from world.scenario import Placed
@@ -32,7 +33,7 @@ def claim(case: Case) -> Checks:
         past = case.pasts.get(placed.id)
         if past is not None and tick < len(past.steps) and past.steps[tick].drive is not None:
             yield _redundant(case, placed, past, tick)
-    yield _outcome(case)
+    yield from outcome(case)
 
 
 def _first_claim(case: Case, robot: str) -> tuple[int, Localised | None]:
@@ -54,14 +55,10 @@ def _redundant(case: Case, placed: Placed, past: Past, tick: int) -> Violation |
     if noise.exact:
         places = _places(case, placed, mutual)
         return _too_few(tick, placed, "relative placements with a mutual range", places, PLACES)
-    if scenario.variant == "assured":
-        least = CHECKED_WITH_OUTLIERS if noise.outliers else CHECKED
-        return _too_few(tick, placed, "mutual ranges", len(mutual), least)
-    peer = case.pasts.get(placed.peer)
-    if noise.outliers and peer is not None:
-        ranges = len(mutual) + sum([_anchored(one, through) for one in (past, peer)])
-        return _too_few(tick, placed, "ranges", ranges, REDUNDANT)
-    return _too_few(tick, placed, "mutual ranges", len(mutual), CHECKED_BY_LETTER)
+    least = CHECKED if scenario.variant == "assured" else CHECKED_BY_LETTER
+    if noise.outliers:
+        least = CHECKED_WITH_OUTLIERS
+    return _too_few(tick, placed, "mutual ranges", len(mutual), least)
 
 
 def _too_few(tick: int, placed: Placed, what: str, found: int, expected: int) -> Violation | None:
@@ -81,11 +78,6 @@ def _ranged(past: Past, through: int) -> list[int]:
     ]
 
 
-def _anchored(past: Past, through: int) -> int:
-    """How many ranges to its anchor it had."""
-    return sum([step.sense.anchor_range is not None for step in past.steps[: through + 1]])
-
-
 def _places(case: Case, placed: Placed, ticks: Sequence[int]) -> int:
     """From how many different relative placements of the pair the ranges of those ticks were taken."""
     ids = [robot.id for robot in case.history.scenario.robots]
@@ -101,17 +93,19 @@ def _places(case: Case, placed: Placed, ticks: Sequence[int]) -> int:
     return len(found)
 
 
-def _outcome(case: Case) -> Violation | None:
+def outcome(case: Case) -> Checks:
     """The End is what the referee says, by the truth; a run may have failed before he says anything."""
     end, judgement = case.history.end, case.history.judgement
     if end is None:
-        return None
+        return
     found = Judgement(end.outcome, end.reason)
     if judgement is not None and found != judgement:
-        return Violation("claim", end.tick, None, f"it ends {_told(found)}, expected {_told(judgement)}")
-    if judgement is None and end.outcome != "failed":
-        return Violation("claim", end.tick, None, f"it ends {_told(found)}, expected it to go on")
-    return None
+        what = f"it ends {_told(found)}, expected {_told(judgement)}"
+        yield Violation("claim", end.tick, None, what, between(end, End(end.tick, *astuple(judgement))))
+    elif judgement is None and end.outcome != "failed":
+        yield Violation("claim", end.tick, None, f"it ends {_told(found)}, expected it to go on")
+    else:
+        yield None
 
 
 def _told(judgement: Judgement) -> str:

@@ -8,7 +8,7 @@ from agent import radio
 from agent.past import Step
 from agent.robot import Robot
 from compose.audit.case import Case
-from compose.audit.findings import Checks, Violation, difference, said
+from compose.audit.findings import Checks, Violation, between, difference, said
 from protocol.messages import End, Farewell, Message, Report
 from protocol.mission import Mission
 from protocol.motion import Controls
@@ -56,7 +56,8 @@ def _same(tick: int, robot: str, found: Message, expected: bytes) -> Violation |
     if encode(found) == expected:
         return None
     wanted = decode(expected, type(found))
-    return Violation("decision", tick, robot, f"in its {type(found).__name__}, {difference(found, wanted)}")
+    what = f"in its {type(found).__name__}, {difference(found, wanted)}"
+    return Violation("decision", tick, robot, what, between(found, wanted))
 
 
 def _last_word(again: Robot, robot: str, end: End, found: Farewell) -> Violation | None:

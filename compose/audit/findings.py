@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import msgspec
 
 MAX_VALUE = 60
 """characters of a value that is quoted"""
+
+
+class Difference(msgspec.Struct, frozen=True):
+    """A value on record that is not what follows from the rest of the record, to the bit."""
+
+    kind: str
+    """of message"""
+    field: str
+    """where in the message it stands, such as `contacts[0].range`"""
+    found: str
+    expected: str
 
 
 class Violation(msgspec.Struct, frozen=True):
@@ -21,6 +32,10 @@ class Violation(msgspec.Struct, frozen=True):
     """none of what only the world has on record"""
     what: str
     """was found, and what was expected"""
+    difference: Difference | None = None
+    """where two messages were held against each other: the first in which they differ"""
+    breaks_off: bool = False
+    """there is no more of the journal, and what there is may be sound"""
 
     @property
     def line(self) -> str:
@@ -83,6 +98,29 @@ def difference(found: msgspec.Struct, expected: msgspec.Struct) -> str:
     first = fields[0]
     more = f" (and {', '.join(fields[1:])})" if fields[1:] else ""
     return f"{first} is {said(getattr(found, first))}, expected {said(getattr(expected, first))}{more}"
+
+
+def between(found: msgspec.Struct, expected: msgspec.Struct) -> Difference:
+    """The first value in which they differ, however deep it stands."""
+    field, one, other = _first("", found, expected)
+    return Difference(type(found).__name__, field, said(one), said(other))
+
+
+def _first(path: str, found: Any, expected: Any) -> tuple[str, Any, Any]:
+    parts: Iterable[tuple[str, Any, Any]] = ()
+    match found:
+        case msgspec.Struct() if type(found) is type(expected):
+            names = found.__struct_fields__
+            parts = [(f"{path}.{name}", getattr(found, name), getattr(expected, name)) for name in names]
+        case tuple() if isinstance(expected, tuple) and len(found) == len(expected):
+            parts = [
+                (f"{path}[{i}]", one, other)
+                for i, (one, other) in enumerate(zip(found, expected, strict=True))
+            ]
+    for deeper, one, other in parts:
+        if _bits(one) != _bits(other):
+            return _first(deeper, one, other)
+    return path.removeprefix("."), found, expected
 
 
 def said(value: Any) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from agent.past import Past, Step
 from compose.audit.case import Case, Testimony
-from compose.audit.findings import Checks, Violation, difference
+from compose.audit.findings import Checks, Violation, between, difference
 from protocol.wire import encode
 
 
@@ -33,19 +33,21 @@ def _of_the_world(case: Case) -> Violation | None:
         return Violation("order", told.disorder.tick, None, told.disorder.what)
     if told.end is None:
         last = told.ticks[-1].world.truth.tick if told.ticks else None
-        return Violation("order", last, None, "its journal breaks off here, expected an End")
+        what = "its journal breaks off here, expected an End"
+        return Violation("order", last, None, what, breaks_off=True)
     return None
 
 
 def _of_the_robot(case: Case, robot: str, testimony: Testimony) -> Violation | None:
     past, end = testimony.past, case.history.end
     if testimony.missing:
-        return Violation("order", None, robot, "it has left no journal")
+        return Violation("order", None, robot, "it has left no journal", breaks_off=True)
     if testimony.disorder is not None:
         return Violation("order", testimony.disorder_tick, robot, testimony.disorder)
     if past is None or past.farewell is None:
         last = past.steps[-1].sense.tick if past is not None and past.steps else None
-        return Violation("order", last, robot, "its journal breaks off here, expected End and Farewell")
+        what = "its journal breaks off here, expected End and Farewell"
+        return Violation("order", last, robot, what, breaks_off=True)
     if end is not None and len(past.steps) != end.tick + 1 and not case.forced:
         return Violation(
             "order", end.tick, robot, f"it went through {len(past.steps)} ticks, expected {end.tick + 1}"
@@ -81,7 +83,8 @@ def _same_drive(case: Case, robot: str, past: Past, step: Step) -> Violation | N
         return Violation("order", tick, robot, "the world has a Drive of it, expected none: it gave none")
     if encode(had) == encode(gave):
         return None
-    return Violation("order", tick, robot, f"the world's Drive of it: {difference(had, gave)}")
+    what = f"the world's Drive of it: {difference(had, gave)}"
+    return Violation("order", tick, robot, what, between(had, gave))
 
 
 def _same_end(case: Case, robot: str, past: Past) -> Violation | None:
@@ -91,7 +94,7 @@ def _same_end(case: Case, robot: str, past: Past) -> Violation | None:
     if encode(past.end) == encode(case.history.end):
         return None
     what = f"the End that it was told: {difference(past.end, case.history.end)}"
-    return Violation("order", past.end.tick, robot, what)
+    return Violation("order", past.end.tick, robot, what, between(past.end, case.history.end))
 
 
 def _same_farewell(case: Case, robot: str, past: Past) -> Violation | None:
@@ -101,10 +104,11 @@ def _same_farewell(case: Case, robot: str, past: Past) -> Violation | None:
     if said is None:
         return None
     if heard is None:
-        return Violation("order", past.end.tick, robot, "the world has no Farewell of it")
+        return Violation("order", past.end.tick, robot, "the world has no Farewell of it", breaks_off=True)
     if encode(heard) == encode(said):
         return None
-    return Violation("order", past.end.tick, robot, f"the world's Farewell of it: {difference(heard, said)}")
+    what = f"the world's Farewell of it: {difference(heard, said)}"
+    return Violation("order", past.end.tick, robot, what, between(heard, said))
 
 
 def briefing(case: Case) -> Checks:
@@ -114,4 +118,5 @@ def briefing(case: Case) -> Checks:
         if encode(past.briefing) == encode(expected):
             yield None
         else:
-            yield Violation("briefing", None, robot, difference(past.briefing, expected))
+            what = difference(past.briefing, expected)
+            yield Violation("briefing", None, robot, what, between(past.briefing, expected))

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 from compose.audit.case import Case, case_of
@@ -13,8 +12,7 @@ from compose.audit.findings import Checks, Count, Findings, Violation
 from compose.audit.journals import briefing, order
 from compose.audit.radio import befallen, faults
 from compose.audit.wires import contact, report, sense
-from compose.record import WORLD_JOURNAL
-from protocol import journal
+from compose.record import books
 
 RULES: tuple[Callable[[Case], Checks], ...] = (
     order,
@@ -37,14 +35,14 @@ def audit(folder: Path) -> Findings:
     Raises OSError if there is none, journal.CorruptJournal if a frame in it cannot be understood, or stands
     in the journal of another robot.
     """
-    journals = {WORLD_JOURNAL: journal.read(folder / WORLD_JOURNAL)}
-    for path in folder.glob("agent-*.journal"):
-        with suppress(FileNotFoundError):
-            journals[path.name] = journal.read(path)
-    return judge(journals, folder)
+    return judge({name: book.frames for name, book in books(folder).items()}, folder)
 
 
-def judge(journals: Mapping[str, Iterable[bytes]], folder: object = "the record") -> Findings:
+def judge(
+    journals: Mapping[str, Iterable[bytes]],
+    folder: object = "the record",
+    rules: Sequence[Callable[[Case], Checks]] = RULES,
+) -> Findings:
     """What there is to find in the frames of `journals`, by name; `folder` is where errors say they are.
 
     Raises journal.CorruptJournal like `audit`.
@@ -52,7 +50,7 @@ def judge(journals: Mapping[str, Iterable[bytes]], folder: object = "the record"
     case = case_of(journals, folder)
     counts: list[Count] = []
     violations: list[Violation] = []
-    for rule in RULES:
+    for rule in rules:
         checks = list(rule(case))
         found = [check for check in checks if check is not None]
         counts.append(Count(rule.__name__, len(checks), len(found)))

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from agent.past import Past, Step
 from agent.robot import Told
 from compose.audit.case import Case
-from compose.audit.findings import Checks, Violation, difference, said
+from compose.audit.findings import Checks, Violation, between, difference, said
 from protocol.wire import encode
 
 
@@ -20,7 +20,8 @@ def sense(case: Case) -> Checks:
             if step.frame == encode(expected):
                 yield None
             else:
-                yield Violation("sense", step.sense.tick, robot, difference(step.sense, expected))
+                what = difference(step.sense, expected)
+                yield Violation("sense", step.sense.tick, robot, what, between(step.sense, expected))
 
 
 def contact(case: Case) -> Checks:
@@ -97,4 +98,4 @@ def _as_sent(robot: str, step: Step, told: Told, peer: Past) -> Violation | None
     if told.frame == sent.frame:
         return None
     what = f"in the report of tick {told.report.tick}, {difference(told.report, sent.report)}"
-    return Violation("report", tick, robot, what)
+    return Violation("report", tick, robot, what, between(told.report, sent.report))

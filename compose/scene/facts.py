@@ -1,0 +1,102 @@
+"""What is known of a run, tick by tick, however and in whatever order it comes to be known."""
+
+from __future__ import annotations
+
+import msgspec
+
+from protocol.messages import (
+    Briefing,
+    Drive,
+    End,
+    Estimate,
+    Farewell,
+    Message,
+    Missed,
+    Report,
+    Sense,
+    Truth,
+)
+from protocol.motion import Pose
+
+Link = tuple[str, str]
+"""from a robot to its peer"""
+
+
+class Said(msgspec.Struct, frozen=True):
+    """A report, and how long its frame was."""
+
+    report: Report
+    bytes: int
+
+
+class Facts(msgspec.Struct, frozen=True):
+    """One tick, as far as it is known; whatever is missing may come later."""
+
+    tick: int
+    truth: dict[str, Pose] = msgspec.field(default_factory=dict)
+    senses: dict[str, Sense] = msgspec.field(default_factory=dict)
+    reports: dict[str, Said] = msgspec.field(default_factory=dict)
+    """by who says them"""
+    drives: dict[str, Drive] = msgspec.field(default_factory=dict)
+    estimates: dict[str, Estimate] = msgspec.field(default_factory=dict)
+    late: set[str] = msgspec.field(default_factory=set)
+    """robots whose Drive did not come in time"""
+    without: set[str] = msgspec.field(default_factory=set)
+    """robots that went without their peer's report, which did not come in time"""
+    under_way: dict[Link, tuple[int, ...]] = msgspec.field(default_factory=dict)
+    """the ticks of the reports that are on that link after this tick; known only to the world"""
+
+
+class Gathering:
+    """Facts, as they come in."""
+
+    def __init__(self) -> None:
+        self.ticks: dict[int, Facts] = {}
+        self.briefings: dict[str, Briefing] = {}
+        self.farewells: dict[str, Farewell] = {}
+        self.end: End | None = None
+        self.last = -1
+        """the latest tick of which anything is known"""
+        self.touched: int | None = None
+        """the earliest tick of which something has become known since somebody last set this to none"""
+
+    def at(self, tick: int) -> Facts:
+        """What is known of `tick`, to be added to."""
+        self.last = max(self.last, tick)
+        if self.touched is None or tick < self.touched:
+            self.touched = tick
+        known = self.ticks.get(tick)
+        if known is None:
+            known = self.ticks[tick] = Facts(tick)
+        return known
+
+    def take(self, message: Message, size: int, teller: str | None = None) -> None:
+        """Fold in `message`, of a frame of `size` bytes; what is known already stays.
+
+        `teller` is the robot in whose journal it stands; none of the world's, or on the network.
+        """
+        match message:
+            case Sense(tick, robot):
+                self.at(tick).senses.setdefault(robot, message)
+            case Drive(tick, robot):
+                self.at(tick).drives.setdefault(robot, message)
+            case Estimate(tick, robot):
+                self.at(tick).estimates.setdefault(robot, message)
+            case Report(tick, robot):
+                self.at(tick).reports.setdefault(robot, Said(message, size))
+            case Truth(tick, poses):
+                self.at(tick).truth.update(poses)
+            case Missed(tick, robot):
+                facts = self.at(tick)
+                (facts.late if teller is None else facts.without).add(teller or robot)
+            case _:
+                self._take_once(message)
+
+    def _take_once(self, message: Message) -> None:
+        match message:
+            case Briefing(robot):
+                self.briefings.setdefault(robot, message)
+            case Farewell(robot):
+                self.farewells.setdefault(robot, message)
+            case End():
+                self.end = self.end or message
