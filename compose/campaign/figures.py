@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 
-from compose.campaign import lies
+from compose.campaign import crashes, lies
 from compose.campaign.run import Results
 from compose.campaign.spec import Axis
 from compose.campaign.summary import Counted, column, counted, orbited_over_t_max
@@ -55,6 +55,8 @@ def draw(results: Results, folder: Path) -> None:
             save(lies.outcomes(results, of_lies), folder / "lies")
             if (roc := lies.roc(results, of_lies)) is not None:
                 save(roc, folder / "roc")
+        if (of_ticks := crashes.axis_of_ticks(results)) is not None:
+            save(crashes.costs(results, of_ticks), folder / "crash")
 
 
 def _success(results: Results, place: int) -> Figure:
@@ -173,11 +175,11 @@ def _groups(results: Results) -> list[tuple[str, pa.Table]]:
         return [
             (
                 ", ".join([_named(axis, i) for axis, i in zip(axes, cell.place, strict=True)]),
-                _of(results, {cell.index}),
+                results.of(cell.index),
             )
             for cell in played
         ]
-    groups = [(label, _of(results, chosen)) for label, chosen in _apart(results, None)]
+    groups = [(label, results.of(*chosen)) for label, chosen in _apart(results, None)]
     return [(label, table) for label, table in groups if len(table)]
 
 
@@ -187,7 +189,7 @@ def _lines(results: Results, place: int) -> Iterator[tuple[str, list[pa.Table]]]
         yield (
             label,
             [
-                _of(results, {i for i in chosen if results.cells[i].place[place] == x})
+                results.of(*[i for i in chosen if results.cells[i].place[place] == x])
                 for x in range(len(results.campaign.axes[place].values))
             ],
         )
@@ -218,10 +220,6 @@ def _told_apart(results: Results, place: int | None) -> tuple[int, ...]:
 def _named(axis: Axis, i: int) -> str:
     """A value of the axis, where it stands alone."""
     return axis.label(i) if _numbers(axis) is None else f"{axis.name.rpartition('.')[2]} = {axis.label(i)}"
-
-
-def _of(results: Results, cells: set[int]) -> pa.Table:
-    return results.table.filter(pa.array(np.isin(results.table["cell"].to_numpy(), list(cells))))
 
 
 def _against(axis: Axis) -> tuple[Figure, Axes, list[float]]:

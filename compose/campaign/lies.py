@@ -42,7 +42,7 @@ def outcomes(results: Results, place: int) -> Figure:
     for panel, (name, cells) in zip(panels, groups, strict=True):
         left = np.zeros(len(labels))
         for outcome, colour, hatch in OUTCOMES:
-            share = np.array([_share(_of(results, cell), outcome) for cell in cells])
+            share = np.array([_share(results.of(cell), outcome) for cell in cells])
             panel.barh(labels, share, left=left, color=colour, hatch=hatch, edgecolor="white", label=outcome)
             left += share
         panel.barh(labels, 1.0 - left, left=left, color=WRONG, hatch="//", edgecolor="white", label="wrong")
@@ -66,7 +66,7 @@ def roc(results: Results, place: int) -> Figure | None:
     noisy = [
         (name, cells)
         for name, cells in _settings(results, place)
-        if len(honest := _least(_of(results, cells[truth]))) and np.ptp(honest) > 0.0
+        if len(honest := _least(results.of(cells[truth]))) and np.ptp(honest) > 0.0
     ]
     if not noisy:
         return None
@@ -74,11 +74,11 @@ def roc(results: Results, place: int) -> Figure | None:
     panels = figure.subplots(1, len(noisy), sharey=True, squeeze=False)[0]
     kinds = list(dict.fromkeys([_kind(axis.label(i)) for i in range(len(axis.values))]))
     for panel, (name, cells) in zip(panels, noisy, strict=True):
-        honest = np.sort(_least(_of(results, cells[truth])))
+        honest = np.sort(_least(results.of(cells[truth])))
         false = np.arange(1, len(honest) + 1) / len(honest)
         for k, kind in enumerate([one for one in kinds if one != HONEST]):
             sizes = [cell for i, cell in enumerate(cells) if _kind(axis.label(i)) == kind]
-            lies = np.sort(np.concatenate([_least(_of(results, cell)) for cell in sizes]))
+            lies = np.sort(np.concatenate([_least(results.of(cell)) for cell in sizes]))
             found = np.searchsorted(lies, honest, side="right") / max(1, len(lies))
             colour, line = f"C{k // 4}", ("-", "--", "-.", ":")[k % 4]
             panel.step(false, found, where="post", color=colour, ls=line, lw=1.2, label=kind)
@@ -95,14 +95,9 @@ def roc(results: Results, place: int) -> Figure | None:
 
 def _settings(results: Results, place: int) -> list[tuple[str, list[int]]]:
     """The other axes' choices: what to call each, and the cell of each lie in it."""
-    axes = results.campaign.axes
-    found: dict[tuple[int, ...], list[int]] = {}
-    for cell in results.cells:
-        found.setdefault(cell.place[:place] + cell.place[place + 1 :], []).append(cell.index)
-    others = [axis for i, axis in enumerate(axes) if i != place]
     return [
-        (", ".join([f"{axis.name} {axis.label(i)}" for axis, i in zip(others, choice, strict=True)]), cells)
-        for choice, cells in found.items()
+        (", ".join([f"{name} {label}" for name, label in named]), cells)
+        for named, cells in results.settings(place)
     ]
 
 
@@ -116,10 +111,6 @@ def _kind(label: str) -> str:
     words: Sequence[str] = label.split()
     size = next((i for i, word in enumerate(words) if word[0].isdigit()), len(words))
     return " ".join(words[:size])
-
-
-def _of(results: Results, cell: int) -> pa.Table:
-    return results.table.filter(pa.array(results.table["cell"].to_numpy() == cell))
 
 
 def _share(table: pa.Table, outcome: str) -> float:

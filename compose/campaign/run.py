@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pyarrow as pa
 
 from compose.campaign.cells import Cell, Refused, setting_of
@@ -62,6 +63,21 @@ class Results(msgspec.Struct, frozen=True):
     """because somebody said so"""
     trials: int
     """in all cells that are not refused"""
+
+    def of(self, *cells: int) -> pa.Table:
+        """The trials of these cells."""
+        return self.table.filter(pa.array(np.isin(self.table["cell"].to_numpy(), cells)))
+
+    def settings(self, place: int) -> list[tuple[list[tuple[str, str]], list[int]]]:
+        """Each choice of values of all axes but that at `place`: names and labels; its cells, along that."""
+        others = [(i, axis) for i, axis in enumerate(self.campaign.axes) if i != place]
+        found: dict[tuple[int, ...], list[int]] = {}
+        for cell in self.cells:
+            found.setdefault(tuple([cell.place[i] for i, _ in others]), []).append(cell.index)
+        return [
+            ([(axis.name, axis.label(value)) for (_, axis), value in zip(others, choice, strict=True)], cells)
+            for choice, cells in found.items()
+        ]
 
 
 def sweep(campaign: Campaign, out: Path, means: Means, inbox: Inbox, progress: Progress) -> Results:

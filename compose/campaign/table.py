@@ -25,7 +25,8 @@ _KINDS: dict[str, pa.DataType] = {
     **dict.fromkeys(("t_max_ticks", "candidates", "candidates_left"), pa.int64()),
     **dict.fromkeys(("hypotheses", "claims", "claims_within", "violations"), pa.int64()),
     **dict.fromkeys(("reports_sent", "reports_heard", "reports_refused"), pa.int64()),
-    **dict.fromkeys(("reports_lost", "bytes_sent"), pa.int64()),
+    **dict.fromkeys(("reports_lost", "bytes_sent", "kills"), pa.int64()),
+    "same_record": pa.bool_(),
     **dict.fromkeys(("period_s", "t_max_s", "wall_s", "position_error_m"), pa.float64()),
     **dict.fromkeys(
         ("heading_error_rad", "alpha", "odds", "p_value", "position_sigma_m", "nees", "bound_m"), pa.float64()

@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 import math
-import tempfile
-import time
-from pathlib import Path
 from typing import TypeVar
 
 import msgspec
 from msgspec.structs import replace
 
-from compose import inline
-from compose.audit import judge
 from compose.audit.findings import Findings
+from compose.campaign.played import as_processes, in_process
 from compose.claim import Claim
-from compose.record import Record, first_claim, first_contact, read
-from compose.scenario import run_name
-from protocol.inbox import Inbox
-from protocol.journal import Kept
+from compose.kill import Kill
+from compose.record import Record, first_claim, first_contact
 from protocol.messages import Farewell, Outcome
 from protocol.motion import Covariance
 from world.scenario import Scenario
@@ -28,8 +22,6 @@ WITHIN = 3.0
 """times mission.accuracy"""
 ROUNDING = 1e-6
 """ticks by which a quotient may miss a whole number"""
-PATIENCE_S = 30.0
-"""how long the processes of a trial wait for each other"""
 
 
 class Trial(msgspec.Struct, frozen=True):
@@ -43,6 +35,8 @@ class Trial(msgspec.Struct, frozen=True):
     """over Zenoh, instead of in this process"""
     audit: bool = False
     """whether its journals are judged, as soon as it is over"""
+    kills: tuple[Kill, ...] | None = None
+    """of its processes; none where it is no trial of kills, and no processes are needed for them"""
 
 
 class RobotRow(msgspec.Struct, frozen=True, array_like=True):
@@ -125,6 +119,10 @@ class Row(msgspec.Struct, frozen=True, array_like=True):
     violations: int | None = None
     """that the audit found; none if there was none"""
     first_violation: str | None = None
+    kills: int | None = None
+    """that were taken; none where the scenario asks for none"""
+    same_record: bool | None = None
+    """whether the record is, to the byte, that of the same in one process without kills"""
     wall_s: float | None = None
     robots: dict[str, RobotRow] = {}
 
@@ -136,28 +134,18 @@ def lost(cell: int, trial: int, seed: int, error: str, wall_s: float | None) -> 
 
 def play(trial: Trial) -> Row:
     """Play it. What it raises becomes a row with that error."""
-    began = time.perf_counter()
-    record, findings = (_as_processes if trial.processes else in_process)(trial.scenario, audit=trial.audit)
-    return row(trial, record, time.perf_counter() - began, findings)
-
-
-def in_process(scenario: Scenario, *, audit: bool) -> tuple[Record, Findings | None]:
-    """Its run in this process; its journals are kept only to be judged."""
-    if not audit:
-        return inline.play(scenario), None
-    kept = {name: Kept() for name in inline.journals(scenario)}
-    record = inline.played(scenario, kept)
-    return record, judge.judge({name: journal.frames for name, journal in kept.items()})
-
-
-def _as_processes(scenario: Scenario, *, audit: bool) -> tuple[Record, Findings | None]:
-    from compose import local  # noqa: PLC0415  # in-process trials do without
-
-    with tempfile.TemporaryDirectory(prefix="tandem-") as folder:
-        out = Path(folder)
-        inbox = Inbox("tandem sweep")
-        local.play(scenario, out, inbox, run=run_name(scenario), rate=None, patience=PATIENCE_S)
-        return read(out), judge.audit(out) if audit else None
+    if trial.processes or trial.kills is not None:
+        played = as_processes(trial.scenario, audit=trial.audit, kills=trial.kills)
+    else:
+        played = in_process(trial.scenario, audit=trial.audit)
+    found = row(trial, played.record, played.wall_s, played.findings)
+    if played.kills is None:
+        return found
+    found = replace(found, kills=played.kills, same_record=not played.otherwise)
+    if not played.otherwise:
+        return found
+    why = f"another record than in one process: {', '.join(played.otherwise)}"
+    return replace(found, outcome="failed", reason=why)
 
 
 def row(trial: Trial, record: Record, wall_s: float, findings: Findings | None = None) -> Row:

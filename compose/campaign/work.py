@@ -66,7 +66,8 @@ def chunks_of(
     """All of it, each chunk as large as fits when it is asked for."""
     for source in work:
         while source.given < len(source.trials):
-            size = source.size(threads(), 1 if orders.processes else FIRST_CHUNK)
+            slow = orders.processes or source.setting.file.kill
+            size = source.size(threads(), 1 if slow else FIRST_CHUNK)
             trials = tuple(source.trials[source.given : source.given + size])
             source.given += size
             seeds = tuple([trial_seed(orders.seed, source.key, trial) for trial in trials])

@@ -107,7 +107,8 @@ def _played(chunk: Chunk, number: int, seed: int) -> trial.Row:
     try:
         player = _function(chunk.play)
         scenario = chunk.setting.seeded(seed)
-        return player(trial.Trial(chunk.cell, number, scenario, chunk.processes, chunk.audit))
+        kills = chunk.setting.kills(seed) if chunk.setting.file.kill else None
+        return player(trial.Trial(chunk.cell, number, scenario, chunk.processes, chunk.audit, kills))
     except BaseException as error:  # noqa: BLE001  # a trial that tries to end the process is lost, too
         said = one_line(f"{type(error).__name__}: {error}")[:MAX_ERROR]
         return trial.lost(chunk.cell, number, seed, said, time.perf_counter() - began)
