@@ -35,10 +35,11 @@ def draw(story: Story, folder: Path) -> tuple[Path, Path]:
     """Draw it anew, as SVG and PNG, into `folder`; what has been written. Raises OSError."""
     folder.mkdir(exist_ok=True)
     with look():
-        return save(_figure(story), folder / f"robot-{story.own.id}")
+        svg, png = save(figure_of(story), folder / f"robot-{story.own.id}", ("svg", "png"))
+    return svg, png
 
 
-def _figure(story: Story) -> Figure:
+def figure_of(story: Story) -> Figure:
     """The panels at the left, and at their right what is close, and what the signs mean."""
     left, right, low, high = plane.window(story)
     tall = min(PLANE * (high - low) / (right - left), PLANE)

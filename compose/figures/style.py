@@ -1,9 +1,11 @@
-"""What all pictures share: fonts, colours, and how they are saved."""
+"""What all pictures share: fonts, colours, lines and markers, and how they are saved."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
@@ -11,21 +13,35 @@ from matplotlib.figure import Figure
 from protocol.mission import Role
 
 COLOURS: dict[Role, str] = {"a": "#0b62a4", "b": "#c4451c"}
-"""of a pair's robots; told apart without colour by their lightness"""
+"""of a pair's robots, as in the paper: blue and red; in grey their markers tell them apart"""
+MARKS: dict[Role, dict[str, Any]] = {
+    "a": {"marker": "o", "markerfacecolor": COLOURS["a"], "markeredgecolor": COLOURS["a"]},
+    "b": {"marker": "^", "markerfacecolor": "white", "markeredgecolor": COLOURS["b"]},
+}
+"""filled circles, and open triangles"""
+DASHES: dict[Role, Any] = {"a": (0, (6, 2)), "b": (0, (2, 1.4))}
+"""of what belongs to a robot and is no path"""
+INK, PALE, PALER = "#1a1a1a", "0.45", "0.75"
+"""what belongs to neither robot, by how much it matters"""
+SHADE = "#f3e6bd"
+"""of time in contact"""
 DPI = 160
 
+_DATES: dict[str, dict[str, None]] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {}}
 
-def look() -> AbstractContextManager[None]:
+
+def look(symbols: bool = False) -> AbstractContextManager[None]:
     """Matplotlib's settings, within which pictures are drawn and saved.
 
-    With that salt the same picture is the same bytes; text is as it stands, `$` and `_` included.
+    With that salt the same picture is the same bytes. Text is as it stands, `$` and `_` included; or, with
+    `symbols`, what is between two `$` is set as the paper sets it.
     """
-    return mpl.rc_context({"svg.hashsalt": "tandem", "font.size": 9, "text.parse_math": False})
+    return mpl.rc_context({"svg.hashsalt": "tandem", "font.size": 9, "text.parse_math": symbols})
 
 
-def save(figure: Figure, path: Path) -> tuple[Path, Path]:
-    """As SVG and as PNG, `path` with these endings; both carry no date. Raises OSError."""
-    svg, png = path.with_suffix(".svg"), path.with_suffix(".png")
-    figure.savefig(svg, metadata={"Date": None})
-    figure.savefig(png, dpi=DPI)
-    return svg, png
+def save(figure: Figure, path: Path, formats: Sequence[str] = ("svg", "png")) -> tuple[Path, ...]:
+    """In each of `formats`, `path` with that ending; none carries a date. Raises OSError."""
+    written = [path.with_name(f"{path.name}.{ending}") for ending in formats]
+    for ending, place in zip(formats, written, strict=True):
+        figure.savefig(place, dpi=DPI, metadata=_DATES[ending])
+    return tuple(written)

@@ -1,0 +1,276 @@
+"""A last manoeuvre as it was planned, in the frame of who makes it: Figs. 3(c) and 4(b), and eq. (8)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from agent.geometry import Placement
+from agent.phases.encounter import Array, Compared, LastManoeuvre, Plan, compared
+from compose.figures.pair import ROLES, Pair
+from compose.figures.sheet import NO_ENCOUNTER, ROW, SMALL, Absent, Sheet, circle, ending, equal
+from compose.figures.style import COLOURS, INK, MARKS, PALE, PALER
+from compose.figures.trajectory import heading
+from protocol.mission import Mission, Role
+from protocol.motion import ORIGIN, Pose, compose, step
+
+PLANE, COST = 3.7, 2.4
+"""inches: of the plane, and of eq. (8)'s value beside it"""
+COLUMNS = 3
+SIGNS = 6
+"""in the key, beside one for each candidate"""
+AROUND = 1.14
+"""of what is to be seen about where it stands"""
+FINE = 24
+"""pieces that the arc of the manoeuvre is drawn in"""
+OTHER: dict[Role, Role] = {"a": "b", "b": "a"}
+ANCHOR: dict[Role, str] = {"a": "M_1", "b": "M_2"}
+
+
+class Planned(NamedTuple):
+    """A last manoeuvre, and when it was planned."""
+
+    tick: int
+    plan: Plan
+
+
+def planned(pair: Pair, role: Role) -> Iterator[Planned]:
+    """Every last manoeuvre of one robot, in order."""
+    before = None
+    for mind in pair.minds(role):
+        if mind.findings.plan is not before and isinstance(mind.state, LastManoeuvre):
+            before = mind.findings.plan
+            assert before is not None
+            yield Planned(mind.tick, before)
+
+
+def draw(pair: Pair) -> dict[str, Figure | Absent]:
+    """A picture of each plan, by what tells it from others: who made it, and when."""
+    found: dict[str, Figure | Absent] = {}
+    for role in ROLES:
+        for one in planned(pair, role):
+            found[f"{pair.robot(role).id}-{one.tick}"] = _figure(pair, one)
+    if not found:
+        met = pair.met is not None
+        found[pair.name] = Absent("no last manoeuvre was planned" if met else NO_ENCOUNTER)
+    return found
+
+
+class Scene(NamedTuple):
+    """What was compared, seen from the mover: its frame turned such that it stands on the x-axis."""
+
+    mover: Pose
+    others: tuple[Pose, ...]
+    """where the other robot may be, by each candidate"""
+    spin: float
+    """rad, by which the frame of its anchor is turned"""
+
+    def turned(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """Points of the frame of its anchor, likewise."""
+        c, s = math.cos(self.spin), math.sin(self.spin)
+        return c * x - s * y, s * x + c * y
+
+
+def scene(plan: Plan) -> Scene:
+    """Of `plan`."""
+    mover, a, b, candidates = plan.question
+    own, other = (a, b) if mover == "a" else (b, a)
+    spin = -math.atan2(own.y, own.x)
+    frame = Pose(0.0, 0.0, spin)
+    places = [
+        compose(_inverse(one), other) if mover == "a" else one.place(other) for one in candidates
+    ]  # fmt: skip
+    return Scene(compose(frame, own), tuple([compose(frame, place) for place in places]), spin)
+
+
+def _inverse(placement: Placement) -> Pose:
+    """<b(M2)> in <a(M1)>."""
+    c, s = math.cos(placement.phi), math.sin(placement.phi)
+    return Pose(
+        -c * placement.x - s * placement.y, s * placement.x - c * placement.y, -placement.phi
+    )  # fmt: skip
+
+
+def _figure(pair: Pair, one: Planned) -> Figure:
+    seen, plan, mission = scene(one.plan), one.plan, pair.mission
+    ways = compared(plan.question, mission, pair.record.scenario.variant)
+    below = 0.5 + ROW * math.ceil((SIGNS + len(seen.others)) / COLUMNS) + 0.05
+    sheet = Sheet(0.6 + PLANE + 0.75 + COST + 0.2, below + PLANE + 0.08, [ending(pair), _title(pair, one)])
+    axes = sheet.panel(0.6, below, PLANE, PLANE)
+    half = AROUND * max(
+        mission.max_speed * mission.period,
+        *[math.hypot(p.x - seen.mover.x, p.y - seen.mover.y) for p in seen.others],
+    )
+    _candidates(axes, pair, one, seen, half)
+    _reach(axes, pair, plan, seen, ways)
+    x, y = seen.mover.x, seen.mover.y
+    equal(axes, (x - half, x + half, y - half, y + half))
+    axes.set_xlabel("$x$ [m]")
+    axes.set_ylabel("$y$ [m]")
+    value = sheet.panel(0.6 + PLANE + 0.75, below, COST, PLANE)
+    draw_cost(value, plan, ways, mission)
+    sheet.key(axes, 0.6, below - 0.48, columns=COLUMNS)
+    return sheet.figure
+
+
+def _title(pair: Pair, one: Planned) -> str:
+    mover = one.plan.question.mover
+    robot = pair.robot(mover).id
+    frame = (
+        f"{robot}'s own frame"
+        if _framed_by_itself(one.plan)
+        else rf"$\langle {mover}({ANCHOR[mover]})\rangle$"
+    )
+    v, omega = one.plan.drive.v, one.plan.drive.omega
+    chosen = rf"$v_2$ = {v:g} m/s, $\omega_2$ = {omega:+.4f} rad/s"
+    count = len(one.plan.question.candidates)
+    told = f"{count} candidates" if count > 1 else "one candidate, to be checked"
+    value = f", $J$ = {one.plan.separation_m2:.5g} m$^2$" if one.plan.separation_m2 is not None else ""
+    return f"Plan of {robot} at $k$ = {one.tick}, in {frame}: {told}; {chosen}{value}"
+
+
+def _framed_by_itself(plan: Plan) -> bool:
+    """Whether candidates are placed in the frame of the mover's own pose, as the letter does under noise."""
+    return plan.question.a == ORIGIN == plan.question.b
+
+
+def _candidates(axes: Axes, pair: Pair, one: Planned, seen: Scene, half: float) -> None:
+    """Where the other may be, at the range last measured, and the axes of each two of these places."""
+    mover: Role = one.plan.question.mover
+    other = OTHER[mover]
+    x, y = seen.mover.x, seen.mover.y
+    for i, j in combinations(range(len(seen.others)), 2):
+        _bisector(axes, seen.others[i], seen.others[j], 3.0 * half, f"bisector-{i + 1}-{j + 1}")
+    if len(seen.others) > 1:
+        axes.plot([], [], "-", color=PALE, lw=0.7, label="axes of two candidates")
+    rho = pair.mutual[one.tick][1]
+    if rho is not None:
+        circle(
+            axes, (x, y), rho, ls=(0, (5, 3)), lw=1.0, color="k", gid="rho", label=f"last range, {rho:.4f} m"
+        )
+    after = _after(pair, one)
+    end = _end(seen, one.plan, pair.mission)
+    for i, place in enumerate(seen.others, start=1):
+        away = math.hypot(place.x - x, place.y - y) or 1.0
+        axes.plot(
+            place.x, place.y, MARKS[other]["marker"], ms=7, mfc=COLOURS[other], mec="white", mew=0.6, ls="",
+            gid=f"candidate-{i}", zorder=5,
+            label=f"{i}: would be {math.hypot(place.x - end.x, place.y - end.y):.4f} m away",
+        )  # fmt: skip
+        axes.annotate(
+            str(i), (place.x, place.y), xytext=(-13 * (place.x - x) / away, -13 * (place.y - y) / away),
+            textcoords="offset points", ha="center", va="center", fontsize=9, zorder=6,
+            bbox={"facecolor": "white", "alpha": 0.8, "pad": 0.6, "lw": 0},
+        )  # fmt: skip
+    axes.plot([], [], ls="", label=after)
+
+
+def _after(pair: Pair, one: Planned) -> str:
+    """What the manoeuvre led to."""
+    if one.tick + 1 >= len(pair.mutual):
+        return "the record ends before the next range"
+    near, rho = pair.mutual[one.tick + 1]
+    said = f"{rho:.4f} m" if rho is not None else "a drop-out" if near else "none: out of range"
+    return f"measured at $k$ = {one.tick + 1}: {said}"
+
+
+def _bisector(axes: Axes, one: Pose, other: Pose, length: float, gid: str) -> None:
+    """The axis of the segment between the two."""
+    dx, dy = other.x - one.x, other.y - one.y
+    apart = math.hypot(dx, dy)
+    if apart == 0.0:
+        return
+    x, y, ux, uy = (one.x + other.x) / 2, (one.y + other.y) / 2, -dy / apart, dx / apart
+    axes.plot(
+        [x - length * ux, x + length * ux], [y - length * uy, y + length * uy], "-", lw=0.7, color=PALE,
+        zorder=1, gid=gid,
+    )  # fmt: skip
+
+
+def _end(seen: Scene, plan: Plan, mission: Mission) -> Pose:
+    return step(seen.mover, plan.drive.v, plan.drive.omega, mission.period)
+
+
+def _reach(axes: Axes, pair: Pair, plan: Plan, seen: Scene, ways: Compared) -> None:
+    """The ends of all manoeuvres that were compared, and the one that was chosen."""
+    mover = plan.question.mover
+    colour = COLOURS[mover]
+    chosen = chosen_row(plan, ways)
+    first = True
+    for row in range(len(ways.reach.v)):
+        if row == chosen:
+            continue
+        axes.plot(
+            *seen.turned(ways.reach.x[row], ways.reach.y[row]), "-", lw=0.7, color=PALER, zorder=1.5,
+            gid=f"reach-{row}", label="with another $v_2$" if first else None,
+        )  # fmt: skip
+        first = False
+    v = float(ways.reach.v[chosen, 0])
+    axes.plot(
+        *seen.turned(ways.reach.x[chosen], ways.reach.y[chosen]), "-", lw=2.0, color="k", zorder=2,
+        gid="reach", label=f"within reach with $v_2$ = {v:g} m/s",
+    )  # fmt: skip
+    ends = [
+        step(seen.mover, plan.drive.v, plan.drive.omega, pair.mission.period * i / FINE)
+        for i in range(FINE + 1)
+    ]
+    axes.plot([p.x for p in ends], [p.y for p in ends], "-", lw=2.0, color=colour, zorder=4, gid="chosen")
+    axes.plot(
+        [ends[0].x, ends[-1].x], [ends[0].y, ends[-1].y], "x", ms=9, mew=2.0, color=colour, zorder=5, ls="",
+        gid="chosen-ends", label=f"the choice: {pair.robot(mover).id} drives here",
+    )  # fmt: skip
+    heading(axes, ends[0], 0.42 * max(abs(v) * pair.mission.period, 1e-9), INK)
+
+
+def chosen_row(plan: Plan, ways: Compared) -> int:
+    """Which of the speeds was chosen."""
+    return int(np.argmin(abs(ways.reach.v[:, 0] - plan.drive.v)))
+
+
+def draw_cost(axes: Axes, plan: Plan, ways: Compared, mission: Mission) -> None:
+    """What each turn rate is worth, eq. (8)."""
+    chosen = chosen_row(plan, ways)
+    omega = ways.reach.omega
+    allowed = np.isfinite(ways.value)
+    for row in range(len(ways.reach.v)):
+        if row != chosen:
+            axes.plot(
+                omega, np.where(allowed[row], ways.gap[row], np.nan), "-", lw=0.6, color=PALER, zorder=1,
+                gid=f"cost-{row}",
+            )  # fmt: skip
+    if not allowed[chosen].all():
+        axes.plot(omega, ways.gap[chosen], ":", lw=1.2, color=PALE, label="more candidates out of range")
+    axes.plot(
+        omega,
+        np.where(allowed[chosen], ways.gap[chosen], np.nan),
+        "-",
+        lw=1.5,
+        color="k",
+        gid="cost",
+        zorder=2,
+    )
+    best = float(ways.gap[chosen, int(np.argmin(abs(omega - plan.drive.omega)))])
+    colour = COLOURS[plan.question.mover]
+    axes.plot([plan.drive.omega], [best], "x", ms=9, mew=2.0, color=colour, zorder=4, gid="cost-chosen")
+    axes.axvline(plan.drive.omega, lw=0.8, ls="--", color=colour, zorder=1)
+    axes.set_xlim(-mission.max_turn_rate, mission.max_turn_rate)
+    if math.isclose(mission.max_turn_rate, math.pi):
+        axes.set_xticks(
+            [-math.pi, -math.pi / 2, 0.0, math.pi / 2, math.pi],
+            [r"$-\pi$", r"$-\pi/2$", "0", r"$\pi/2$", r"$\pi$"],
+        )
+    axes.set_xlabel(r"$\omega_2$ [rad/s]")
+    axes.set_ylabel(
+        "$J$ of eq. (8), on squares [m$^2$]" if plan.separation_m2 is not None else "nearer by [m$^2$]"
+    )
+    axes.tick_params(labelsize=SMALL)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(
+            frameon=False, fontsize=SMALL, loc="lower center", bbox_to_anchor=(0.5, 1.0), borderaxespad=0.2
+        )

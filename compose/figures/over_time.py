@@ -1,0 +1,252 @@
+"""Ranges and separation, and errors, over time: all of the mission, and the encounter again beside it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatterMathtext, LogLocator, MaxNLocator, NullLocator
+
+from compose.claim import Claim
+from compose.figures.pair import ROLES, Pair
+from compose.figures.sheet import ROW, SMALL, Absent, Sheet, ending
+from compose.figures.style import COLOURS, INK, MARKS, PALE, SHADE
+from compose.record import first_claim
+from protocol.messages import Estimate
+from protocol.mission import Role
+from protocol.motion import Pose, wrap
+from world.referee import TOLERANCE
+
+WHOLE, NEAR = 4.4, 2.2
+"""inches: of all the mission, and of its encounter"""
+APART = 0.5
+TALL, BETWEEN, LEFT = 2.2, 0.2, 0.75
+BEFORE = 3
+"""ticks before the encounter"""
+MARKED = 90
+"""points, of which each has room for its mark"""
+LEAST = 1e-16
+"""what an error is drawn as that is less"""
+LINES = {"a": "-", "b": (0, (4, 1.5))}
+SIGMAS = 3.0
+ROOM = 4.0
+"""how many times more, and less, than what is drawn the scale of errors goes"""
+KEY_ROWS = 4
+"""of errors, at the most"""
+
+Points = list[tuple[int, float]]
+
+
+def ranges(pair: Pair) -> Figure:
+    """What each sensor measured, and how far apart the two truly were."""
+    tall, key = TALL + 0.4, 2 * ROW + 0.05
+    sheet = Sheet(_width(), 0.53 + tall + key, [ending(pair)])
+    panels = _panels(sheet, pair, key + 0.45, tall)
+    for axes in panels:
+        _shade(axes, pair)
+        _ranges(axes, pair)
+    for axes in panels[1:]:
+        highest = max(pair.separations[max(0, (pair.met or 0) - BEFORE) :])
+        axes.set_ylim(0.0, 1.1 * max(pair.mission.sensing_range, highest))
+    panels[0].set_ylabel("distance [m]")
+    sheet.key(panels[0], LEFT, key, columns=3)
+    return sheet.figure
+
+
+def _width() -> float:
+    return LEFT + WHOLE + APART + NEAR + 0.15
+
+
+def _panels(sheet: Sheet, pair: Pair, bottom: float, tall: float, *, named: bool = True) -> list[Axes]:
+    """Of all ticks; and of those of the encounter, if there was one."""
+    width = WHOLE if pair.met is not None else WHOLE + APART + NEAR
+    panels = [sheet.panel(LEFT, bottom, width, tall)]
+    panels[0].set_xlim(-0.5, pair.last + 0.5)
+    if pair.met is not None:
+        near = sheet.panel(LEFT + WHOLE + APART, bottom, NEAR, tall)
+        near.set_xlim(max(0, pair.met - BEFORE) - 0.4, pair.last + 0.4)
+        panels.append(near)
+    for i, axes in enumerate(panels):
+        axes.tick_params(labelsize=SMALL)
+        axes.xaxis.set_major_locator(MaxNLocator(8 if i == 0 else 5, integer=True, min_n_ticks=1))
+        axes.xaxis.set_minor_locator(NullLocator())
+        if named:
+            period = pair.mission.period
+            unit = "one a second" if period == 1.0 else f"{period:g} s each"
+            axes.set_xlabel(f"tick $k$, {unit}" if i == 0 else "the encounter again")
+        else:
+            axes.tick_params(labelbottom=False)
+    return panels
+
+
+def _shade(axes: Axes, pair: Pair) -> None:
+    """The ticks in contact."""
+    for i, (first, last) in enumerate(pair.contacts):
+        axes.axvspan(
+            first - 0.5, last + 0.5, color=SHADE, lw=0, zorder=-2, gid=f"contact-{first}-{last}",
+            label="in contact" if i == 0 else None,
+        )  # fmt: skip
+
+
+def _ranges(axes: Axes, pair: Pair) -> None:
+    ticks = list(range(len(pair.record.moments)))
+    axes.plot(
+        ticks, pair.separations[: len(ticks)], "-", lw=1.2, color=INK, zorder=2, gid="separation",
+        label="true separation",
+    )  # fmt: skip
+    for role in ROLES:
+        number = "1" if role == "a" else "2"
+        _measured(
+            axes, pair.anchor_ranges(role), f"anchor-range-{role}", COLOURS[role], MARKS[role],
+            rf"$\rho$ of {pair.robot(role).id} to $M_{number}$, measured",
+        )  # fmt: skip
+    diamonds = {"marker": "D", "markerfacecolor": INK, "markeredgecolor": INK}
+    mutual = [rho for _, rho in pair.mutual]
+    _measured(axes, mutual, "mutual-range", INK, diamonds, "mutual range, measured")
+    reach = pair.mission.sensing_range
+    axes.axhline(reach, ls="-.", lw=0.9, color=PALE, gid="reach", label=f"$R$ = {reach:g} m", zorder=1)
+    axes.set_ylim(0.0, 1.05 * max([reach, *pair.separations]))
+
+
+def _measured(
+    axes: Axes, values: Sequence[float | None], gid: str, colour: str, mark: dict[str, Any], label: str
+) -> None:
+    told = [(tick, rho) for tick, rho in enumerate(values) if rho is not None]
+    axes.plot(
+        [tick for tick, _ in told], [rho for _, rho in told], ls="", ms=4, mew=1.0, color=colour, gid=gid,
+        markevery=max(1, math.ceil(len(told) / (2 * MARKED))), label=label, zorder=3, **mark,
+    )  # fmt: skip
+
+
+# --- errors -------------------------------------------------------------------------------------------
+
+
+def errors(pair: Pair) -> Figure | Absent:
+    """How far off each robot's pose was: its position, and its heading."""
+    if not any(_held(pair, role) for role in ROLES):
+        return Absent("neither robot held anything possible of where it is")
+    key = KEY_ROWS * ROW + 0.05
+    sheet = Sheet(_width(), 0.53 + 2 * TALL + BETWEEN + key, [ending(pair)])
+    rows: list[tuple[str, str, Callable[[Pose, Pose], float], Callable[[Claim], float]]] = [
+        ("position", "error of position [m]", _off, lambda claim: claim.position_error),
+        ("heading", "error of heading [rad]", _askew, lambda claim: claim.heading_error),
+    ]
+    for i, (name, label, off, of_claim) in enumerate(rows):
+        bottom = key + 0.45 + (1 - i) * (TALL + BETWEEN)
+        panels = _panels(sheet, pair, bottom, TALL, named=i == 1)
+        for axes in panels:
+            _shade(axes, pair)
+            for role in ROLES:
+                _errors(axes, pair, role, name, off)
+                _claimed(axes, pair, role, of_claim)
+        panels[0].set_ylabel(label)
+        _scale(panels, pair, name)
+        if i == 0:
+            sheet.key(panels[0], LEFT, key, columns=3)
+    return sheet.figure
+
+
+def _off(pose: Pose, truth: Pose) -> float:
+    return math.hypot(pose.x - truth.x, pose.y - truth.y)
+
+
+def _askew(pose: Pose, truth: Pose) -> float:
+    return abs(wrap(pose.heading - truth.heading))
+
+
+def _held(pair: Pair, role: Role) -> list[tuple[Estimate, Pose]]:
+    """Each estimate, and where the robot was then."""
+    account, truth = pair.account(role), pair.truth(role)
+    held = account.held if account is not None else ()
+    return [(one, truth[one.tick]) for one in held if one.tick < len(truth)]
+
+
+def _errors(axes: Axes, pair: Pair, role: Role, name: str, off: Callable[[Pose, Pose], float]) -> None:
+    """Of its likeliest pose, of others that it holds possible; before it has any, of its distance."""
+    held, robot, colour = _held(pair, role), pair.robot(role), COLOURS[role]
+    anchor = robot.anchor
+    alone = [
+        (one.tick, max(_alone(pose, Pose(truth.x - anchor.x, truth.y - anchor.y, truth.heading))[name]
+                       for pose in one.local))
+        for one, truth in held
+        if one.local and not one.world
+    ]  # fmt: skip
+    _line(axes, alone, ls=":" if role == "a" else "-.", lw=1.1, color=colour, gid=f"{name}-alone-{role}",
+          label=f"{robot.id}, seen from its anchor")  # fmt: skip
+    single = [one for one in held if one[0].world and (one[0].odds or len(one[0].world) == 1)]
+    others = [
+        (one.tick, off(pose, truth))
+        for one, truth in held
+        for pose in (one.world[1:] if one.odds or len(one.world) == 1 else one.world)
+    ]
+    _line(axes, others, ls="", marker="x" if role == "a" else "+", ms=5, mew=0.9, color=colour, alpha=0.75,
+          gid=f"{name}-others-{role}", label=f"{robot.id}, others held possible")  # fmt: skip
+    likeliest = [(one.tick, off(one.world[0], truth)) for one, truth in single]
+    _line(axes, likeliest, lw=1.3, ls=LINES[role], ms=4.5, color=colour, gid=f"{name}-{role}",
+          label=f"{robot.id}, of its {'pose' if pair.exact else 'likeliest pose'}",
+          markevery=max(1, math.ceil(len(likeliest) / MARKED)), **MARKS[role])  # fmt: skip
+    sigmas = [
+        (one.tick, SIGMAS * (c.position_sigma if name == "position" else c.heading_sigma))
+        for one, _ in single
+        if (c := one.covariance) is not None
+    ]
+    _line(axes, sigmas, lw=0.9,
+           ls="-." if role == "a" else (0, (1, 1)), color=colour, gid=f"{name}-sigma-{role}",
+          label=rf"{robot.id}, 3 $\sigma$ as claimed")  # fmt: skip
+
+
+def _alone(pose: Pose, truth: Pose) -> dict[str, float]:
+    """All that can be off before the two have met, both in the frame of the anchor: the distance to it, and
+    mu, the heading relative to the line from it."""
+    mu, true = (one.heading - math.atan2(one.y, one.x) for one in (pose, truth))
+    return {
+        "position": abs(math.hypot(pose.x, pose.y) - math.hypot(truth.x, truth.y)),
+        "heading": abs(wrap(mu - true)),
+    }
+
+
+def _line(axes: Axes, points: Points, **looks: Any) -> None:
+    """Nothing, where there are none."""
+    if len(points) == 1:
+        looks = {"marker": ".", **looks}
+    if points:
+        axes.plot([tick for tick, _ in points], [max(value, LEAST) for _, value in points], **looks)
+
+
+def _claimed(axes: Axes, pair: Pair, role: Role, of_claim: Callable[[Claim], float]) -> None:
+    claim = first_claim(pair.record, pair.place(role))
+    if claim is not None:
+        axes.plot(
+            claim.tick, max(of_claim(claim), LEAST), MARKS[role]["marker"], ms=11, mfc="none", mec=INK,
+            mew=1.2,
+            ls="", clip_on=False, gid=f"claim-{role}",
+            label=f"{pair.robot(role).id} claims, $k$ = {claim.tick}",
+        )  # fmt: skip
+
+
+def _scale(panels: Sequence[Axes], pair: Pair, name: str) -> None:
+    """One scale for both; with a line at what would be wrong, where sensors are exact."""
+    for axes in panels:
+        axes.set_yscale("log")
+        if pair.exact:
+            axes.axhline(TOLERANCE, ls="-.", lw=0.9, color=PALE, gid=f"{name}-tolerance", zorder=1,
+                         label="wrong, if more: $10^{-6}$")  # fmt: skip
+        elif name == "position":
+            asked = pair.mission.accuracy
+            axes.axhline(asked, ls="--", lw=0.9, color=PALE, gid="accuracy", zorder=1,
+                         label=rf"$\sigma$ asked for: {asked:g} m")  # fmt: skip
+    values = [float(y) for axes in panels for one in axes.lines for y in np.ravel(one.get_ydata()) if y > 0.0]
+    for axes in panels:
+        if values:
+            axes.set_autoscaley_on(False)
+            axes.set_ylim(min(values) / ROOM, max(values) * ROOM)
+        axes.yaxis.set_major_locator(LogLocator(numticks=8))
+        axes.yaxis.set_major_formatter(LogFormatterMathtext())
+        axes.yaxis.set_minor_locator(NullLocator())
+
+
+__all__ = ["errors", "ranges"]

@@ -1,0 +1,115 @@
+"""A picture's paper: panels placed in inches, a title, keys beside the panels.
+
+Nothing is fitted to the size of a text, so the same picture is the same bytes.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+
+from compose.figures.pair import Pair
+from compose.figures.style import INK
+from compose.record import ended
+
+LINE, ROW = 0.17, 0.175
+"""inches: of a line of the title, and of a row of a key"""
+CHARACTERS = 14.8
+"""of the title, to an inch"""
+SMALL = 8
+NO_ENCOUNTER = "the two did not meet in phase 3"
+
+
+class Absent(NamedTuple):
+    """A picture that does not apply."""
+
+    why: str
+
+
+class Sheet:
+    """A figure of `width` by `height` inches below its title, whose first line is as long as it likes."""
+
+    def __init__(self, width: float, height: float, lines: Sequence[str]) -> None:
+        wrapped = [*textwrap.wrap(lines[0], int(CHARACTERS * width)), *lines[1:]]
+        self.width, self.height = width, height
+        self.tall = height + 0.1 + LINE * len(wrapped)
+        self.figure = Figure(figsize=(width, self.tall))
+        for i, line in enumerate(wrapped):
+            self.figure.text(
+                0.1 / width, 1.0 - (0.13 + LINE * i) / self.tall, line, va="center", ha="left",
+                fontsize=9.5 if i <= len(wrapped) - len(lines) else SMALL, color=INK,
+            )  # fmt: skip
+
+    def panel(self, left: float, bottom: float, width: float, height: float) -> Axes:
+        """In inches from the lower left corner."""
+        return self.figure.add_axes(
+            (left / self.width, bottom / self.tall, width / self.width, height / self.tall)
+        )
+
+    def key(self, panel: Axes, left: float, top: float, columns: int = 1) -> None:
+        """What the signs in `panel` mean; `left` and `top` in inches from the lower left corner."""
+        handles, _ = panel.get_legend_handles_labels()
+        self.figure.legend(
+            handles=handles,
+            loc="upper left",
+            bbox_to_anchor=(left / self.width, top / self.tall),
+            ncols=columns,
+            frameon=False,
+            fontsize=SMALL,
+            handlelength=2.4,
+            labelspacing=0.45,
+            columnspacing=1.2,
+            borderaxespad=0.0,
+        )
+
+
+def circle(axes: Axes, place: tuple[float, float], radius: float, **look: Any) -> None:
+    """Of `radius` about `place`; in a key it is a line."""
+    label, gid = look.pop("label", None), look.pop("gid", None)
+    axes.add_patch(Circle(place, radius, fill=False, gid=gid, **look))
+    if label is not None:
+        axes.plot([], [], label=label, **look)
+
+
+def ending(pair: Pair) -> str:
+    """Which run it is of, and how that ended."""
+    record = pair.record
+    how = (
+        f"the record breaks off after {pair.last} ticks"
+        if record.end is None
+        else ended(record.end.outcome, pair.last, record.end.reason)
+    )
+    return plain(f"{record.scenario.name}, seed {record.scenario.seed}, {record.scenario.variant}: {how}")
+
+
+def plain(text: str) -> str:
+    """`text` as it stands, where what is between two `$` would be set as symbols."""
+    return text.replace("$", r"\$")
+
+
+def equal(axes: Axes, window: Sequence[float]) -> None:
+    """A window (left, right, low, high) on a plane."""
+    left, right, low, high = window
+    axes.set_xlim(left, right)
+    axes.set_ylim(low, high)
+    axes.set_aspect("equal", adjustable="box")
+    axes.tick_params(labelsize=SMALL)
+
+
+def fitted(window: Sequence[float], width: float, tallest: float) -> tuple[float, float]:
+    """Width and height in inches of a panel that shows `window` to one scale."""
+    left, right, low, high = window
+    scale = min(width / (right - left), tallest / (high - low))
+    return scale * (right - left), scale * (high - low)
+
+
+def around(points: Sequence[tuple[float, float]], margin: float) -> tuple[float, float, float, float]:
+    """The window that holds `points`; `margin` is a part of its larger side."""
+    xs, ys = zip(*points, strict=True)
+    more = margin * max(max(xs) - min(xs), max(ys) - min(ys))
+    return min(xs) - more, max(xs) + more, min(ys) - more, max(ys) + more

@@ -1,0 +1,154 @@
+"""The encounter step by step, as Figs. 3(d) and 4(c) show it: a panel for each mutual range."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from compose.figures.pair import ROLES, Pair
+from compose.figures.sheet import NO_ENCOUNTER, SMALL, Absent, Sheet, around, circle, ending, equal, fitted
+from compose.figures.style import COLOURS, DASHES, INK, MARKS, PALE
+from compose.figures.trajectory import heading
+from protocol.mission import Role
+from protocol.motion import Pose
+
+WIDTH, TALLEST = 2.35, 3.2
+"""inches: of a panel, and its height at the most"""
+LEFT, GAP, KEY = 0.68, 0.42, 0.28
+"""inches: left of panels, between panels, and of the key below them"""
+COLUMNS, PANELS = 3, 6
+"""panels in a row, and in all at the most"""
+HEAD = 0.36
+"""inches: above a panel, for what is said of it"""
+BEFORE = 2
+"""ticks before the encounter that are seen"""
+ARROW = 0.12
+"""of the window: how long a heading is drawn"""
+
+
+def draw(pair: Pair) -> Figure | Absent:
+    """The ticks in which the two were ranged from new places."""
+    ticks = steps(pair)
+    if not ticks:
+        return Absent(NO_ENCOUNTER if pair.met is None else "no mutual range was measured in it")
+    shown = _some(ticks)
+    window = _window(pair, ticks[0], shown[-1])
+    width, height = fitted(window, WIDTH, TALLEST)
+    columns, rows = min(COLUMNS, len(shown)), math.ceil(len(shown) / COLUMNS)
+    row = height + HEAD + 0.45
+    wide = LEFT + columns * (width + GAP)
+    sheet = Sheet(max(wide, 5.4), rows * row + KEY, [ending(pair), _title(ticks, shown)])
+    for i, tick in enumerate(shown):
+        left = LEFT + (i % columns) * (width + GAP)
+        bottom = KEY + 0.42 + (rows - 1 - i // columns) * row
+        axes = sheet.panel(left, bottom, width, height)
+        _panel(axes, pair, ticks[0], shown[i - 1] if i else tick, tick)
+        equal(axes, window)
+        axes.set_title(_said(pair, tick, i + 1), fontsize=SMALL, loc="left", pad=3, linespacing=1.15)
+        if i % columns == 0:
+            axes.set_ylabel("$y$ [m]", fontsize=SMALL)
+        axes.set_xlabel("$x$ [m]", fontsize=SMALL)
+    _key(sheet, axes, pair)
+    return sheet.figure
+
+
+def steps(pair: Pair) -> list[int]:
+    """The ticks of phase 3 with a mutual range that is taken from elsewhere than the one before."""
+    if pair.met is None:
+        return []
+    told: list[int] = []
+    for tick in range(pair.met, pair.last + 1):
+        if pair.mutual[tick][1] is None:
+            continue
+        if told and all(pair.truth(role)[told[-1]] == pair.truth(role)[tick] for role in ROLES):
+            continue
+        told.append(tick)
+    return told
+
+
+def _some(ticks: list[int]) -> list[int]:
+    """As many as have room: the first and the last, and others as evenly as can be."""
+    if len(ticks) <= PANELS:
+        return ticks
+    return [ticks[round(i * (len(ticks) - 1) / (PANELS - 1))] for i in range(PANELS)]
+
+
+def _window(pair: Pair, first: int, last: int) -> tuple[float, float, float, float]:
+    ends = [pose for role in ROLES for pose in pair.truth(role)[max(0, first - BEFORE) : last + 1]]
+    left, right, low, high = around([(p.x, p.y) for p in ends], 0.12)
+    half = 0.5 * max(right - left, high - low, 0.2 * pair.mission.sensing_range)
+    x, y = (left + right) / 2, (low + high) / 2
+    return x - half, x + half, y - half, y + half
+
+
+def _title(ticks: list[int], shown: list[int]) -> str:
+    many = (
+        f"{len(shown)} of its {len(ticks)} mutual ranges" if len(shown) < len(ticks) else "its mutual ranges"
+    )
+    return f"The encounter: {many}, $k$ = {ticks[0]} to {ticks[-1]}"
+
+
+def _said(pair: Pair, tick: int, number: int) -> str:
+    """The range, and what each robot then sets out to do."""
+    rho = pair.mutual[tick][1]
+    doing = []
+    for role in ROLES:
+        drive = pair.drive(role, tick)
+        doing.append(f"{pair.robot(role).id}: {drive.state if drive is not None else 'no answer'}")
+    return f"({number}) $k$ = {tick}, " + rf"$\rho$ = {rho:.4f} m" + "\n" + ", ".join(doing)
+
+
+def _panel(axes: Axes, pair: Pair, met: int, before: int, tick: int) -> None:
+    for role in ROLES:
+        one = pair.robot(role)
+        plan = one.rendezvous.a if role == "a" else one.rendezvous.b
+        place = (one.anchor.x, one.anchor.y)
+        circle(axes, place, plan.radius, lw=0.9, ls=DASHES[role], color=COLOURS[role], zorder=1)
+        poses = pair.truth(role)
+        _trail(axes, poses[max(0, met - BEFORE) : before + 1], 1.0, PALE)
+        _trail(axes, poses[before : tick + 1], 2.0, COLOURS[role])
+        for k in range(max(0, met - BEFORE), tick + 1):
+            _place(axes, role, poses[k], ranged=pair.mutual[k][1] is not None, now=k == tick)
+    ends = [pair.truth(role)[tick] for role in ROLES]
+    axes.plot([p.x for p in ends], [p.y for p in ends], ":", color=INK, lw=1.4, zorder=3, gid=f"rho-{tick}")
+    left, right, _, _ = _window(pair, met, tick)
+    for role, pose in zip(ROLES, ends, strict=True):
+        heading(axes, pose, ARROW * (right - left), COLOURS[role], zorder=6)
+
+
+def _trail(axes: Axes, poses: list[Pose], width: float, colour: str) -> None:
+    moved = [pose for before, pose in pairwise(poses) if pose != before]
+    if moved:
+        places = [poses[0], *moved]
+        axes.plot([p.x for p in places], [p.y for p in places], "-", lw=width, color=colour, zorder=2)
+
+
+def _place(axes: Axes, role: Role, pose: Pose, ranged: bool, now: bool) -> None:
+    """Filled, where the two are ranged; the present one large."""
+    colour = COLOURS[role]
+    axes.plot(
+        pose.x, pose.y, MARKS[role]["marker"], ms=7.5 if now else 4, mfc=colour if ranged else "white",
+        mec="white" if now and ranged else colour, mew=0.7 if now else 1.0, ls="", zorder=5 if now else 4,
+    )  # fmt: skip
+
+
+def _key(sheet: Sheet, axes: Axes, pair: Pair) -> None:
+    for role in ROLES:
+        axes.plot(
+            [],
+            [],
+            MARKS[role]["marker"],
+            ls="-",
+            lw=1.6,
+            ms=6,
+            color=COLOURS[role],
+            label=pair.robot(role).id,
+        )
+    axes.plot([], [], "o", ls="", ms=4, mfc="white", mec=INK, label="not ranged")
+    axes.plot([], [], ":", color=INK, lw=1.4, label="mutual range")
+    axes.plot([], [], ls="", marker=r"$\rightarrow$", ms=12, color=PALE, label="heading")
+    axes.plot([], [], ls=DASHES["a"], color=PALE, lw=0.9, label="orbits")
+    sheet.key(axes, LEFT, KEY - 0.05, columns=6)

@@ -1,0 +1,135 @@
+"""The whole mission from above, as Figs. 3(a) and 4(a) show it: paths, anchors, sensing ranges, orbits."""
+
+from __future__ import annotations
+
+import math
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from compose.figures.pair import ROLES, Pair
+from compose.figures.sheet import Sheet, around, circle, ending, equal, fitted
+from compose.figures.style import COLOURS, DASHES, INK, MARKS, PALE
+from protocol.mission import Role
+from protocol.motion import Pose
+
+WIDTH, BESIDE, TALLEST = 4.9, 1.95, 6.0
+"""inches: of the plane, of the key, of the plane at the most"""
+MANY = 160
+"""ticks of a path, too many to mark each"""
+ANCHORS: dict[Role, str] = {"a": "$M_1$", "b": "$M_2$"}
+LABEL = {"facecolor": "white", "alpha": 0.75, "pad": 0.6, "lw": 0}
+
+
+def draw(pair: Pair) -> Figure:
+    """The plane, and what the signs in it mean beside it."""
+    window = around(_extent(pair), 0.03)
+    width, height = fitted(window, WIDTH, TALLEST)
+    tall = max(height, 2.9)
+    sheet = Sheet(0.6 + width + BESIDE, 0.5 + tall, [ending(pair)])
+    axes = sheet.panel(0.55, 0.42 + (tall - height), width, height)
+    for role in ROLES:
+        draw_anchor(axes, pair, role)
+        _orbit(axes, pair, role)
+    for role in ROLES:
+        draw_path(axes, role, pair.truth(role), gid=f"path-{role}", label=f"path of {pair.robot(role).id}")
+    for role in ROLES:
+        released(axes, role, pair.truth(role)[0], _arrow(pair))
+    _marks(axes, pair)
+    equal(axes, window)
+    axes.set_xlabel("$x$ [m]")
+    axes.set_ylabel("$y$ [m]")
+    sheet.key(axes, 0.55 + width + 0.12, 0.42 + tall)
+    return sheet.figure
+
+
+def _extent(pair: Pair) -> list[tuple[float, float]]:
+    points = [(pose.x, pose.y) for role in ROLES for pose in pair.truth(role)]
+    for role in ROLES:
+        one = pair.robot(role)
+        reach = max(pair.mission.sensing_range, _orbit_radius(pair, role))
+        points += [(one.anchor.x + dx, one.anchor.y + dy) for dx in (-reach, reach) for dy in (-reach, reach)]
+    return points
+
+
+def _orbit_radius(pair: Pair, role: Role) -> float:
+    plan = pair.robot(role).rendezvous
+    return (plan.a if role == "a" else plan.b).radius
+
+
+def _arrow(pair: Pair) -> float:
+    """m: how long a heading is drawn."""
+    return 0.35 * pair.mission.sensing_range
+
+
+def draw_anchor(axes: Axes, pair: Pair, role: Role) -> None:
+    """Its place, and how far it is heard."""
+    one, reach = pair.robot(role), pair.mission.sensing_range
+    place, first = (one.anchor.x, one.anchor.y), role == "a"
+    axes.plot(
+        *place, "x", color="k", ms=7, mew=1.6, gid=f"anchor-{role}", zorder=4, ls="",
+        label="anchors $M_1$, $M_2$" if first else None,
+    )  # fmt: skip
+    axes.annotate(
+        ANCHORS[role], place, xytext=(6, 6), textcoords="offset points", fontsize=10, zorder=6, bbox=LABEL
+    )
+    circle(
+        axes, place, reach, ls=(0, (4, 3)), lw=1.0, color="k", gid=f"range-{role}",
+        label=f"sensing range $R$ = {reach:g} m" if first else None,
+    )  # fmt: skip
+
+
+def _orbit(axes: Axes, pair: Pair, role: Role) -> None:
+    one, radius = pair.robot(role), _orbit_radius(pair, role)
+    circle(
+        axes, (one.anchor.x, one.anchor.y), radius, ls=DASHES[role], lw=0.9, color=COLOURS[role],
+        gid=f"orbit-{role}", label=f"orbit of {one.id}, {radius:.4g} m",
+    )  # fmt: skip
+
+
+def draw_path(axes: Axes, role: Role, poses: list[Pose], gid: str, label: str | None) -> None:
+    """Successive positions, joined by lines as in the paper."""
+    axes.plot(
+        [p.x for p in poses], [p.y for p in poses], "-", lw=1.3, ms=3.6, mew=0.8, color=COLOURS[role],
+        markevery=max(1, math.ceil(len(poses) / MANY)), gid=gid, label=label, zorder=3, **MARKS[role],
+    )  # fmt: skip
+
+
+def released(axes: Axes, role: Role, start: Pose, length: float) -> None:
+    """Where it was released, and which way it faced."""
+    axes.plot(
+        start.x, start.y, "s", ms=7, mfc="white", mec=COLOURS[role], mew=1.5, zorder=4,
+        gid=f"released-{role}",
+    )  # fmt: skip
+    heading(axes, start, length, COLOURS[role])
+
+
+def heading(axes: Axes, pose: Pose, length: float, colour: str, zorder: float = 4.5) -> None:
+    """An arrow of `length` m."""
+    axes.annotate(
+        "",
+        (pose.x + length * math.cos(pose.heading), pose.y + length * math.sin(pose.heading)),
+        (pose.x, pose.y),
+        arrowprops={
+            "arrowstyle": "-|>", "color": colour, "lw": 1.3, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 9
+        },
+        zorder=zorder,
+    )  # fmt: skip
+
+
+def _marks(axes: Axes, pair: Pair) -> None:
+    """Where the two met, and where they were last."""
+    axes.plot([], [], "s", ms=7, mfc="white", mec=INK, mew=1.5, label="released, heading")
+    if pair.contacts:
+        tick = pair.contacts[0][0]
+        ends = [pair.truth(role)[tick] for role in ROLES]
+        axes.plot(
+            [p.x for p in ends], [p.y for p in ends], ":", color=INK, lw=1.6, zorder=5, gid="contact",
+            label=f"first in range of each\nother, $k$ = {tick}",
+        )  # fmt: skip
+    for role in ROLES:
+        end = pair.truth(role)[-1]
+        axes.plot(
+            end.x, end.y, "*", ms=11, mfc=COLOURS[role], mec="white", mew=0.7, zorder=6, gid=f"last-{role}"
+        )
+    axes.plot([], [], "*", ms=10, mfc=PALE, mec="white", ls="", label=f"last position, $k$ = {pair.last}")
