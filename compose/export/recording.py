@@ -1,0 +1,167 @@
+"""`run.mcap`: every journaled frame of a record, and what there is to see of it.
+
+Times are of the simulation, from 0 on. The same record gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from heapq import merge
+from operator import itemgetter
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import foxglove
+import msgspec
+from foxglove import Channel, Context, Schema
+from foxglove.mcap import MCAPWriteOptions
+
+from compose.export.frames import Journaled, in_time, kind_of
+from compose.export.schemas import schema
+from compose.export.views import Views, nanoseconds, topics
+from compose.record import Book
+from compose.scene.recorded import Performance
+from compose.scene.scene import Scene
+from compose.scene.stage import Stage
+from protocol.wire import VERSION
+
+CHUNK_BYTES = 1 << 18
+"""trails of ticks in a row are much alike: a chunk of many is a tenth of many chunks"""
+LONGEST_S = 2**32
+"""what Foxglove's timestamps can tell"""
+
+
+class TooLong(ValueError):
+    """A run of more time than the format can tell."""
+
+
+class Channels:
+    """Those of a run in a context, made as something is to be told on them."""
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+        self._frames: dict[tuple[str, type], Channel] = {}
+        self._views: dict[str, Channel] = {}
+
+    def frame(self, one: Journaled, at: int) -> None:
+        """A journaled frame: its body, msgpack, on a channel of its journal and kind."""
+        kind = type(one.message)
+        channel = self._frames.get((one.journal, kind))
+        if channel is None:
+            channel = self._frames[one.journal, kind] = self._of_frames(one.journal, kind)
+        channel.log(one.body, log_time=at)
+
+    def _of_frames(self, journal: str, kind: type[msgspec.Struct]) -> Channel:
+        described = Schema(name=f"tandem.{kind.__name__}", encoding="jsonschema", data=schema(kind))
+        return Channel(
+            f"/journal/{journal.removesuffix('.journal')}/{kind_of(kind)}",
+            message_encoding="msgpack",
+            schema=described,
+            context=self._context,
+            metadata={"version": str(VERSION)},
+        )
+
+    def open_views(self, stage: Stage) -> None:
+        """All that there will be, whether or not anything is told on them."""
+        for topic, kind in topics(stage).items():
+            if topic not in self._views:
+                self._views[topic] = Channel(
+                    topic, message_encoding="protobuf", schema=kind.get_schema(), context=self._context
+                )
+
+    def view(self, topic: str, message: Any, at: int) -> None:
+        """Something to be seen."""
+        self._views[topic].log(message.encode(), log_time=at)
+
+    @property
+    def watched(self) -> bool:
+        """Whether there is anyone to see anything."""
+        return any(channel.has_sinks() for channel in self._views.values())
+
+    def close(self) -> None:
+        """Nothing more is told on them."""
+        for channel in (*self._frames.values(), *self._views.values()):
+            channel.close()
+
+
+def write_mcap(books: Mapping[str, Book], run: Performance, path: Path) -> int:
+    """Write `path` anew; how many frames are in it.
+
+    Raises OSError if it cannot be written, TooLong, CorruptJournal.
+    """
+    last = max([scene.tick for scene in run.scenes], default=0)
+    if nanoseconds(run.stage, last) >= LONGEST_S * 1_000_000_000:
+        raise TooLong(f"the run lasts {last * run.stage.mission.period:g} s; MCAP can tell {LONGEST_S} s")
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    context = Context()
+    channels = Channels(context)
+    try:
+        with draft.open("wb") as file:
+            kept = _Kept(file)
+            options = MCAPWriteOptions(chunk_size=CHUNK_BYTES, compression_threads=0)
+            with foxglove.open_mcap(kept, context=context, writer_options=options):
+                count = _tell(books, run, channels, kept)
+            kept.check()
+        draft.replace(path)
+    finally:
+        channels.close()
+        draft.unlink(missing_ok=True)
+    return count
+
+
+def _tell(books: Mapping[str, Book], run: Performance, channels: Channels, kept: _Kept) -> int:
+    """Everything, tick by tick: first the frames, then what there is to see."""
+    views = Views(run.stage)
+    channels.open_views(run.stage)
+    count = 0
+    for tick, one in _by_tick(books, run):
+        at = nanoseconds(run.stage, tick)
+        if isinstance(one, Journaled):
+            channels.frame(one, at)
+            count += 1
+            continue
+        if tick == 0:
+            channels.view(*views.standing(), at)
+        for shown in views.of(one):
+            channels.view(*shown, at)
+        kept.check()
+    return count
+
+
+def _by_tick(books: Mapping[str, Book], run: Performance) -> Iterator[tuple[int, Journaled | Scene]]:
+    frames: Iterable[tuple[int, int, Journaled | Scene]] = ((one.tick, 0, one) for one in in_time(books))
+    scenes = ((scene.tick, 1, scene) for scene in run.scenes)
+    for tick, _, one in merge(frames, scenes, key=itemgetter(0, 1)):
+        yield tick, one
+
+
+class _Kept:
+    """A file whose first error is kept: the writer would go on, and say every time that it cannot."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._error: OSError | None = None
+
+    def check(self) -> None:
+        """Raises OSError if something could not be written."""
+        if self._error is not None:
+            raise self._error
+
+    def write(self, data: bytes | bytearray) -> int:
+        if self._error is None:
+            try:
+                return self._file.write(data)
+            except OSError as error:
+                self._error = error
+        return len(data)
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        return self._file.seek(offset, whence) if self._error is None else 0
+
+    def flush(self) -> None:
+        if self._error is None:
+            try:
+                self._file.flush()
+            except OSError as error:
+                self._error = error

@@ -1,0 +1,52 @@
+"""What messages look like on the wire, as JSON Schema: arrays of their name and their fields."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+from msgspec import inspect
+
+
+def schema(kind: type[msgspec.Struct]) -> bytes:
+    """Of the messages of that kind. msgspec knows neither field's names in arrays nor ECMA's expressions."""
+    told = msgspec.json.schema(kind)
+    structs = {one.__name__: one for one in _structs(inspect.type_info(kind))}
+    for name, part in told["$defs"].items():
+        struct = structs.get(name)
+        if struct is not None and "prefixItems" in part:
+            tagged = len(part["prefixItems"]) - len(struct.__struct_fields__)
+            titles = ["kind"] * tagged + list(struct.__struct_fields__)
+            part["prefixItems"] = [
+                {"title": title, **item} for title, item in zip(titles, part["prefixItems"], strict=True)
+            ]
+    return msgspec.json.encode(_in_ecma(told), order="sorted")
+
+
+def _structs(info: Any) -> set[type[msgspec.Struct]]:
+    """All that occur in a type, however deep."""
+    found: set[type[msgspec.Struct]] = set()
+    match info:
+        case inspect.Metadata(type=inner) | inspect.VarTupleType(item_type=inner):
+            found |= _structs(inner)
+        case inspect.UnionType(types=types) | inspect.TupleType(item_types=types):
+            found = found.union(*map(_structs, types))
+        case inspect.DictType(value_type=inner):
+            found |= _structs(inner)
+        case inspect.StructType(cls=struct, fields=fields):
+            found = {struct}.union(*[_structs(field.type) for field in fields])
+    return found
+
+
+def _in_ecma(part: Any) -> Any:
+    """The same, its regular expressions with the anchors that JSON Schema has."""
+    match part:
+        case dict():
+            return {
+                key: value.replace(r"\A", "^").replace(r"\Z", "$") if key == "pattern" else _in_ecma(value)
+                for key, value in part.items()
+            }
+        case list():
+            return [_in_ecma(one) for one in part]
+        case _:
+            return part
