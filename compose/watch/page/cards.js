@@ -1,0 +1,164 @@
+// Beside the plane: what each robot does, in words; what came in, what it decides, what it believes and has counted.
+
+import { distance, wrap } from "./geometry.js";
+import { metres, odds, PHASES, place, plural, rad, speed, turning } from "./words.js";
+
+const MOST_ODDS = 5;
+const MANY = 4;
+
+export class Cards {
+  constructor(root, roster, choose) {
+    this.root = root;
+    this.roster = roster;
+    this.choose = choose;
+  }
+
+  stage(store) {
+    this.store = store;
+    this.cards = new Map();
+    this.root.replaceChildren();
+    this.many = store.stage.robots.length > MANY;
+    this.roster.hidden = !this.many;
+    this.roster.replaceChildren();
+    this.entries = new Map();
+    if (!this.many) return;
+    for (const robot of store.stage.robots) {
+      const entry = make("button", { type: "button", className: "entry" });
+      entry.addEventListener("click", () => this.choose(robot.id));
+      this.roster.append(entry);
+      this.entries.set(robot.id, entry);
+    }
+  }
+
+  draw({ tick, focus, truth }) {
+    const { store } = this, robots = store.stage.robots;
+    let shown = robots;
+    if (this.many) {
+      const chosen = robots.find((robot) => robot.id === focus) ?? robots[0];
+      shown = robots.filter((robot) => robot === chosen || robot.id === chosen.peer);
+    }
+    if (!truth && focus) shown = shown.filter((robot) => robot.id === focus);
+    for (const [id, card] of this.cards) if (!shown.some((robot) => robot.id === id)) { card.root.remove(); this.cards.delete(id); }
+    for (const robot of shown) {
+      if (!this.cards.has(robot.id)) this.cards.set(robot.id, new Card(robot, this.choose));
+      const card = this.cards.get(robot.id);
+      if (this.root.children[shown.indexOf(robot)] !== card.root) this.root.append(card.root);
+      card.draw(store, tick, truth, focus === robot.id);
+    }
+    for (const [id, entry] of this.entries ?? []) {
+      const player = store.player(tick, id), phase = player?.drive?.phase ?? 0;
+      const text = `${id} ${player?.drive?.state ?? "–"}`;
+      if (entry.textContent !== text) entry.textContent = text;
+      entry.dataset.phase = phase;
+      entry.setAttribute("aria-pressed", String(id === focus));
+      entry.setAttribute("aria-label", player?.doing ?? id);
+    }
+  }
+}
+
+class Card {
+  constructor(robot, choose) {
+    this.robot = robot;
+    this.root = make("article", { className: "card", tabIndex: -1 });
+    this.root.dataset.robot = robot.id;
+    this.root.setAttribute("aria-label", `Robot ${robot.id}`);
+    this.name = make("button", { type: "button", className: "name", textContent: robot.id });
+    this.name.addEventListener("click", () => choose(robot.id));
+    this.phase = make("span", { className: "phase" });
+    this.error = make("span", { className: "error" });
+    this.doing = make("p", { className: "doing" });
+    this.rows = make("dl", {});
+    this.odds = make("ol", { className: "odds" });
+    this.root.append(make("div", { className: "line" }, this.name, this.phase, this.error), this.doing, this.rows, this.odds);
+    this.fields = new Map();
+  }
+
+  #row(name, text) {
+    if (!this.fields.has(name)) {
+      const value = make("dd", {});
+      this.rows.append(make("dt", { textContent: name }), value);
+      this.fields.set(name, value);
+    }
+    const value = this.fields.get(name);
+    if (value.textContent !== text) value.textContent = text;
+  }
+
+  draw(store, tick, truth, chosen) {
+    const player = store.player(tick, this.robot.id);
+    this.root.classList.toggle("chosen", chosen);
+    this.name.setAttribute("aria-pressed", String(chosen));
+    this.name.title = chosen ? "Show all robots (A)" : `Show what ${this.robot.id} knows`;
+    if (!player) return void (this.doing.textContent = "…");
+    const { drive, held } = player;
+    this.root.dataset.phase = drive?.phase ?? 0;
+    this.phase.textContent = drive ? `phase ${drive.phase}: ${PHASES[drive.phase]}` : "";
+    if (this.doing.textContent !== player.doing) this.doing.textContent = player.doing;
+    this.error.textContent = truth && player.pose && held?.world.length
+      ? `${metres(distance(held.world[0], player.pose))} off` : "";
+    this.#row("senses", inputs(player, this.robot));
+    this.#row("hears", hears(player, this.robot));
+    this.#row("decides", drive ? decides(drive) : "–");
+    this.#row("says", player.sent ? `a report of ${player.sent.bytes} bytes, its log through tick ${player.sent.through}` : "nothing");
+    this.#row("holds", held ? holds(held) : "–");
+    if (truth) this.#row("is at", player.pose ? `${place(player.pose)}, ${rad(player.pose[2])}` : "not known here");
+    else if (this.fields.has("is at")) this.#row("is at", "hidden");
+    const counted = store.counted(this.robot.id, tick);
+    this.#row("so far", counted ? counts(counted) : "…");
+    this.#odds(held);
+  }
+
+  #odds(held) {
+    const bars = held?.odds.length > 1 ? held.odds.slice(0, MOST_ODDS) : [];
+    this.odds.hidden = !bars.length;
+    while (this.odds.children.length > bars.length) this.odds.lastChild.remove();
+    bars.forEach((chance, i) => {
+      const bar = this.odds.children[i] ?? this.odds.appendChild(make("li", {}, make("i", {}), make("span", {})));
+      bar.firstChild.style.width = `${100 * chance}%`;
+      bar.lastChild.textContent = odds(chance);
+    });
+  }
+}
+
+function inputs(player, robot) {
+  if (!player.sensed) return "not known";
+  const drove = player.executed ? `drove ${speed(player.executed[0])}, ${turning(player.executed[1])}; ` : "";
+  const anchor = player.anchor_range === undefined ? "no range to its anchor" : `anchor ${metres(player.anchor_range)}`;
+  const contact = player.contacts?.[0];
+  if (!contact) return `${drove}${anchor}; ${robot.peer} is not in range`;
+  return `${drove}${anchor}; ${contact[0]} ${contact[1] === null ? "in range, not measured" : metres(contact[1])}`;
+}
+
+function hears(player, robot) {
+  const contact = player.contacts?.[0];
+  if (!contact) return "nothing";
+  const ticks = (list) => `${list.length > 1 ? "ticks" : "tick"} ${list.join(", ")}`;
+  const heard = contact[2].length ? `${robot.peer}'s report of ${ticks(contact[2])}` : `nothing of ${robot.peer}`;
+  return contact[3].length ? `${heard}; refuses that of ${ticks(contact[3])}: damaged` : heard;
+}
+
+const decides = ({ v, omega, state }) => `${state}: ${v === 0 && omega === 0 ? "stands" : `${speed(v)}, ${turning(omega)}`}`;
+
+function holds({ local, world, odds: chances, covariance, localised }) {
+  const sigma = covariance && world.length ? `, sigma ${metres(Math.sqrt(Math.max(0, covariance[0] + covariance[3])))}` : "";
+  if (world.length === 1) {
+    const at = `${place(world[0])}, ${rad(wrap(world[0][2]))}${sigma}`;
+    return localised ? `it is at ${at}` : `one placement: ${at}`;
+  }
+  if (world.length) return `${world.length} placements of the two possible${chances.length ? "" : ", equally"}${sigma}`;
+  if (local.length > 1) return `${local.length} branches possible about its anchor`;
+  if (local.length) return `${metres(Math.hypot(local[0][0], local[0][1]))} from its anchor, at no known bearing`;
+  return "nothing but its ranges";
+}
+
+function counts({ anchor, mutual, sent, heard, refused, lost, bytes }) {
+  const fates = [`${plural(sent, "report")} sent`, `${heard} heard`];
+  if (refused) fates.push(`${refused} refused`);
+  if (lost) fates.push(`${lost} of its own lost`);
+  return `${anchor} + ${mutual} ranges; ${fates.join(", ")}; ${bytes} bytes`;
+}
+
+export function make(tag, properties, ...children) {
+  const element = Object.assign(document.createElement(tag), properties);
+  element.append(...children);
+  return element;
+}

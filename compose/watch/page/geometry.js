@@ -1,0 +1,49 @@
+// Poses are [x, y, heading]: m and rad, headings counter-clockwise. As in protocol/motion.py.
+
+export const TAU = 2 * Math.PI;
+
+/** The pose after driving (v, omega) for `s` seconds. */
+export function step([x, y, heading], v, omega, s) {
+  const half = (omega * s) / 2;
+  const length = half === 0 ? v * s : (v * s * Math.sin(half)) / half;
+  return [x + length * Math.cos(heading + half), y + length * Math.sin(heading + half), heading + omega * s];
+}
+
+/** `local`, given in `frame`, in the coordinates in which `frame` itself is given. */
+export function compose(frame, local) {
+  const c = Math.cos(frame[2]), s = Math.sin(frame[2]);
+  return [frame[0] + c * local[0] - s * local[1], frame[1] + s * local[0] + c * local[1], frame[2] + local[2]];
+}
+
+/** The frame in which `pose` is the origin's. */
+export function inverse([x, y, heading]) {
+  const c = Math.cos(heading), s = Math.sin(heading);
+  return [-x * c - y * s, x * s - y * c, -heading];
+}
+
+export const distance = (one, other) => Math.hypot(one[0] - other[0], one[1] - other[1]);
+
+export function wrap(angle) {
+  const turned = angle - TAU * Math.round(angle / TAU);
+  return turned <= -Math.PI ? Math.PI : turned;
+}
+
+/** Half axes and direction of the ellipse of `sigmas` standard deviations, of [xx, xy, xh, yy, yh, hh]. */
+export function ellipse([xx, xy, , yy], sigmas) {
+  const mean = (xx + yy) / 2, spread = Math.hypot((xx - yy) / 2, xy);
+  const root = (value) => sigmas * Math.sqrt(Math.max(0, value));
+  return { major: root(mean + spread), minor: root(mean - spread), turn: Math.atan2(2 * xy, xx - yy) / 2 };
+}
+
+/** The pose between two ticks, a share of the way along what was driven. */
+export function between(from, to, driven, share, period) {
+  if (!to || share <= 0) return from;
+  if (!driven) return share < 1 ? from : to;
+  const [v, omega] = driven;
+  const end = step(from, v, omega, period), now = step(from, v, omega, period * share);
+  return [
+    now[0] + share * (to[0] - end[0]),
+    now[1] + share * (to[1] - end[1]),
+    now[2] + share * wrap(to[2] - end[2]),
+  ];
+}

@@ -1,0 +1,94 @@
+// What happened, a line an event; choosing one goes there. Only what is near the tick is in the page.
+
+import { make } from "./cards.js";
+import { KIND_NAMES, SIGNS } from "./words.js";
+
+const NEAR = 120;
+
+export class Log {
+  constructor(root, states, radio, go) {
+    this.root = root;
+    this.states = states;
+    this.radio = radio;
+    this.go = go;
+    for (const box of [states, radio]) box.addEventListener("change", () => { this.dirty = true; this.onchange?.(); });
+  }
+
+  stage(store) {
+    this.store = store;
+    this.events = [];
+    this.read = 0;
+    this.revision = store.revision;
+    this.dirty = true;
+  }
+
+  #read() {
+    const { store } = this;
+    if (store.revision !== this.revision || store.whole < this.read) {
+      this.revision = store.revision;
+      this.read = Math.min(this.read, store.whole);
+      while (this.events.length && this.events.at(-1).tick >= this.read) this.events.pop();
+      this.dirty = true;
+    }
+    for (; this.read < store.whole; this.read++) {
+      const events = store.scene(this.read)?.events ?? [];
+      if (events.length) { this.events.push(...events); this.dirty = true; }
+    }
+  }
+
+  #wanted(event, focus) {
+    if (!this.states.checked && event.kind === "state") return false;
+    if (!this.radio.checked && event.kind.startsWith("report")) return false;
+    if (!focus || event.robot === null || event.robot === focus) return true;
+    return event.kind.startsWith("contact") && this.store.stage.robots.some((r) => r.id === focus && r.peer === event.robot);
+  }
+
+  /** The nearest wanted event's tick before (-1) or after (+1) `tick`. */
+  next(tick, direction, focus) {
+    this.#read();
+    const ticks = this.events.filter((event) => this.#wanted(event, focus)).map((event) => event.tick);
+    return direction > 0 ? ticks.find((k) => k > tick) : ticks.findLast((k) => k < tick);
+  }
+
+  draw({ tick, focus, truth }) {
+    this.#read();
+    if (!this.dirty && this.tick === tick && this.focus === focus && this.truth === truth) return;
+    const only = truth ? null : focus;
+    const wanted = this.events.filter((event) => this.#wanted(event, only ?? focus));
+    let now = wanted.findIndex((event) => event.tick >= tick);
+    if (now < 0) now = wanted.length;
+    const from = Math.max(0, now - NEAR), shown = wanted.slice(from, now + NEAR);
+    const key = `${from}/${shown.length}/${shown[0]?.tick}/${shown.at(-1)?.tick}/${shown.at(-1)?.text}/${focus}/${truth}`;
+    if (key !== this.key) {
+      this.key = key;
+      this.root.replaceChildren(...shown.map((event) => this.#item(event, truth)));
+    }
+    let current = null;
+    for (const item of this.root.children) {
+      const there = Number(item.dataset.tick);
+      item.classList.toggle("now", there === tick);
+      item.classList.toggle("ahead", there > tick);
+      if (there <= tick) current = item;
+    }
+    if (current && (this.tick !== tick || this.dirty)) {
+      const top = current.offsetTop - this.root.offsetTop;
+      this.root.scrollTop = Math.max(0, top - this.root.clientHeight + current.offsetHeight + 30);
+    }
+    this.dirty = false;
+    this.tick = tick;
+    this.focus = focus;
+    this.truth = truth;
+  }
+
+  #item(event, truth) {
+    const text = truth ? event.text : event.text.replace(/; it is .* off$/, "");
+    const sign = make("span", { className: "sign", textContent: SIGNS[event.kind], title: KIND_NAMES[event.kind] });
+    sign.setAttribute("aria-hidden", "true");
+    const go = make("button", { type: "button" }, make("b", { textContent: event.tick }), sign, make("span", { textContent: text }));
+    go.addEventListener("click", () => this.go(event.tick));
+    const item = make("li", {}, go);
+    item.dataset.tick = event.tick;
+    item.dataset.kind = event.kind;
+    return item;
+  }
+}

@@ -1,0 +1,382 @@
+// What is shown, and how one moves through it. The address says the same: #show=…&tick=46&robot=a&truth=0
+
+import { campaign } from "./campaign.js";
+import { Cards, make } from "./cards.js";
+import { Log } from "./log.js";
+import { Plane } from "./plane.js";
+import { Store } from "./store.js";
+import { Timeline } from "./timeline.js";
+import { KEYS, MEANINGS, place, plural, rad } from "./words.js";
+
+const SPEEDS = [0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000];
+const USUAL = 5;
+const TELL_MS = 900;
+
+const $ = (id) => document.getElementById(id);
+const still = matchMedia("(prefers-reduced-motion: reduce)");
+const view = { tick: 0, share: 0, playing: false, follow: true, focus: null, truth: true, moving: false, speed: USUAL };
+let store = null;
+let listed = null;
+let source = null;
+let due = false;
+let before = null;
+
+const plane = new Plane($("canvas"), () => draw());
+const timeline = new Timeline($("line"), $("bands"), $("scrub"), (tick) => go(tick));
+const cards = new Cards($("robots"), $("roster"), (robot) => focus(view.focus === robot ? null : robot));
+const log = new Log($("log"), $("states"), $("radio"), (tick) => go(tick));
+log.onchange = () => draw();
+
+// --- the address ---
+
+function asked() {
+  const said = new URLSearchParams(location.hash.slice(1));
+  const tick = said.get("tick");
+  return {
+    show: said.get("show"),
+    tick: tick !== null && /^\d+$/.test(tick) ? Number(tick) : null,
+    robot: said.get("robot"),
+    truth: said.get("truth") !== "0",
+  };
+}
+
+function tell_address() {
+  if (!store) return;
+  const said = new URLSearchParams();
+  if (listed && listed.shows.length > 1) said.set("show", store.name);
+  if (!(view.follow && store.live)) said.set("tick", view.tick);
+  if (view.focus) said.set("robot", view.focus);
+  if (!view.truth) said.set("truth", "0");
+  const hash = `#${said}`;
+  if (location.hash !== hash && (location.hash || String(said))) history.replaceState(null, "", hash);
+}
+
+// --- which mission ---
+
+function listen() {
+  source?.close();
+  const query = store ? `?show=${encodeURIComponent(store.name)}&since=${store.version}` : "";
+  source = new EventSource(`/api/news${query}`);
+  source.onmessage = ({ data }) => {
+    const told = JSON.parse(data);
+    document.body.classList.remove("lost");
+    if (told.list) on_list(told.list);
+    if (told.show && store) {
+      const ahead = store.last;
+      store.told(told.show);
+      if (view.follow && store.live && store.last !== ahead) view.tick = Math.max(store.last, 0);
+      else if (view.follow && !store.live && ahead !== store.last) view.tick = Math.max(store.last, 0);
+    }
+    draw();
+  };
+  source.onerror = () => {
+    document.body.classList.add("lost");
+    draw();
+  };
+}
+
+async function on_list(list) {
+  listed = list;
+  if (list.campaign) {
+    if ($("campaign").hidden) {
+      text($("title"), await campaign($("campaign")));
+      document.title = `${$("title").textContent} · Tandem`;
+      text($("status"), "campaign");
+    }
+    return;
+  }
+  const { show } = asked();
+  const chosen = list.shows.find((one) => one.name === show) ?? (list.shows.length === 1 ? list.shows[0] : null);
+  if (chosen && chosen.name !== store?.name) await open(chosen.name);
+  else if (!chosen && !(store && list.shows.some((one) => one.name === store.name) && show)) show_list();
+}
+
+let opening = null;
+async function open(name) {
+  if (opening === name) return;
+  opening = name;
+  try {
+    const answer = await fetch(`/api/shows/${encodeURIComponent(name)}`);
+    if (!answer.ok) return;
+    store?.close();
+    store = new Store(name, await answer.json(), draw);
+    store.onstage = staged;
+    const { tick, robot, truth } = asked();
+    view.follow = tick === null;
+    view.tick = tick ?? (store.live ? Math.max(store.last, 0) : store.first);
+    view.truth = truth;
+    view.playing = false;
+    view.focus = store.places.has(robot) ? robot : null;
+    staged();
+    listen();
+  } finally {
+    opening = null;
+  }
+}
+
+function staged() {
+  $("home").hidden = !listed || listed.shows.length < 2;
+  for (const id of ["mission", "time", "view"]) $(id).hidden = false;
+  for (const id of ["list", "campaign"]) $(id).hidden = true;
+  $("title").textContent = store.stage.name;
+  document.title = `${store.stage.name} · Tandem`;
+  const all = make("option", { value: "", textContent: "all" });
+  $("robot").replaceChildren(all, ...store.stage.robots.map((robot) => make("option", { value: robot.id, textContent: robot.id })));
+  cards.stage(store);
+  timeline.stage(store);
+  log.stage(store);
+  plane.fitted = true;
+  draw();
+}
+
+function show_list() {
+  store?.close();
+  store = null;
+  for (const id of ["mission", "time", "view"]) $(id).hidden = true;
+  const root = $("list");
+  root.hidden = false;
+  $("home").hidden = true;
+  $("title").textContent = "Missions";
+  document.title = "Missions · Tandem";
+  const where = listed.network.map(({ endpoint, reached }) => `${endpoint}${reached ? "" : " (nobody there yet)"}`);
+  $("status").textContent = listed.shows.length ? plural(listed.shows.length, "mission") : listed.waiting ? "waiting for a mission" : "nothing to see";
+  root.replaceChildren(
+    ...(where.length ? [make("p", { className: "note", textContent: `Listening at ${where.join(", ")}.` })] : []),
+    make("ul", {}, ...listed.shows.map((one) => {
+      const link = make("a", { href: `#show=${encodeURIComponent(one.name)}` },
+        make("b", { textContent: one.name }), " ",
+        ...(one.title !== one.name ? [make("span", { textContent: one.title }), " "] : []),
+        make("span", { textContent: plural(one.robots, "robot") }), " ",
+        make("span", { className: "chip", textContent: state_of(one.live, one.last, one.end && { tick: one.end[1], outcome: one.end[2] }) }));
+      return make("li", {}, link);
+    })),
+  );
+}
+
+function state_of(live, last, end) {
+  if (end) return `${end.outcome} after ${end.tick} ticks`;
+  if (live) return `● runs, tick ${Math.max(last, 0)}`;
+  return `breaks off at tick ${last}`;
+}
+
+// --- moving ---
+
+function go(tick, { keep_playing = false } = {}) {
+  if (!store) return;
+  view.tick = Math.min(Math.max(tick, store.first), Math.max(store.last, 0));
+  view.share = 0;
+  if (!keep_playing) view.playing = false;
+  view.follow = store.live && view.tick >= store.last;
+  store.want(view.tick);
+  draw();
+}
+
+function focus(robot) {
+  view.focus = robot;
+  if (store && plane.fitted) plane.fit(store, robot, view.truth);
+  draw();
+}
+
+function play(on = !view.playing) {
+  if (!store) return;
+  if (on && view.tick >= store.last && !store.live) view.tick = store.first;
+  view.playing = on;
+  view.follow = false;
+  view.share = 0;
+  before = null;
+  draw();
+}
+
+function advance(now) {
+  if (!view.playing || !store) return;
+  const s = before === null ? 0 : Math.min((now - before) / 1000, 0.25);
+  before = now;
+  const time = view.tick + view.share + s * view.speed;
+  if (time >= store.last) {
+    view.tick = store.last;
+    view.share = 0;
+    view.playing = false;
+    view.follow = store.live;
+    return;
+  }
+  const tick = Math.floor(time);
+  if (!store.scene(tick)) {
+    store.want(tick);
+    return;
+  }
+  store.wanted = tick;
+  view.tick = tick;
+  view.share = time - tick;
+}
+
+// --- drawing ---
+
+function draw() {
+  if (due) return;
+  due = true;
+  requestAnimationFrame((now) => {
+    due = false;
+    if (!store) return;
+    advance(now);
+    store.want(view.tick);
+    view.moving = view.playing && !still.matches && view.speed <= 60;
+    document.body.dataset.tick = view.tick;
+    document.body.dataset.shown = store.scene(view.tick) ? view.tick : "";
+    plane.draw(store, view);
+    cards.draw(view);
+    log.draw(view);
+    timeline.draw(view, doing());
+    controls();
+    speak(now);
+    if (view.playing) draw();
+    else tell_address();
+  });
+}
+
+function doing() {
+  const players = store.scene(view.tick)?.players ?? [];
+  const chosen = view.focus ? players.filter((player) => player.robot === view.focus) : players.slice(0, 4);
+  return chosen.map((player) => player.doing).join(". ");
+}
+
+function controls() {
+  const lost = document.body.classList.contains("lost");
+  text($("status"), lost ? "the server has gone" : state_of(store.live, store.last, store.end));
+  $("status").dataset.outcome = lost ? "lost" : store.end?.outcome ?? (store.live ? "live" : "torn");
+  $("status").title = store.end?.reason ?? "";
+  text($("tick"), `tick ${view.tick} of ${Math.max(store.last, 0)}`);
+  $("play").classList.toggle("on", view.playing);
+  $("play").setAttribute("aria-label", view.playing ? "Pause" : "Play");
+  $("follow").hidden = !store.live;
+  $("follow").setAttribute("aria-pressed", String(view.follow));
+  $("truth").checked = view.truth;
+  if ($("robot").value !== (view.focus ?? "")) $("robot").value = view.focus ?? "";
+  if ($("speed").value !== String(view.speed)) $("speed").value = String(view.speed);
+  const notes = store.state.notes.join(" · ");
+  text($("notes"), notes);
+  $("notes").hidden = !notes;
+  const who = view.focus ?? "each robot";
+  const seen = view.truth ? (view.focus ? `the truth, and what ${who} believes` : "") :
+    `only what ${who} knows${knows_bearing() ? "" : "; before it is placed, its anchor's frame is turned at will"}`;
+  text($("seen"), seen);
+  $("canvas").setAttribute("aria-label", described());
+}
+
+function knows_bearing() {
+  const players = store.scene(view.tick)?.players ?? [];
+  return players.filter((player) => !view.focus || player.robot === view.focus).every((player) => player.held?.world.length);
+}
+
+function described() {
+  const scene = store.scene(view.tick);
+  if (!scene) return `Tick ${view.tick}, not here yet`;
+  const shown = scene.players.filter((player) => !view.focus || player.robot === view.focus).slice(0, 4);
+  const at = shown.map((player) => {
+    const pose = view.truth ? player.pose : player.held?.world[0];
+    return pose ? `${player.robot} at ${place(pose)}, heading ${rad(pose[2])}` : `${player.robot} nowhere known`;
+  });
+  return `The plane at tick ${view.tick}: ${at.join("; ")}`;
+}
+
+function text(element, said) {
+  if (element.textContent !== said) element.textContent = said;
+}
+
+let spoken = null;
+let spoken_at = 0;
+function speak(now) {
+  const scene = store.scene(view.tick);
+  if (!scene || spoken === view.tick || ((view.playing || view.follow) && now - spoken_at < TELL_MS)) return;
+  spoken = view.tick;
+  spoken_at = now;
+  const events = scene.events.filter((event) => !view.focus || !event.robot || event.robot === view.focus).slice(0, 6);
+  const said = events.map((event) => (view.truth ? event.text : event.text.replace(/; it is .* off$/, "")));
+  if (said.length || !(view.playing || view.follow)) text($("live"), `Tick ${view.tick}. ${said.join(". ") || doing()}`);
+}
+
+// --- keys and buttons ---
+
+function next_robot(direction) {
+  const ids = [null, ...store.stage.robots.map((robot) => robot.id)];
+  focus(ids[(ids.indexOf(view.focus) + direction + ids.length) % ids.length]);
+}
+
+function to_event(direction) {
+  const tick = log.next(view.tick, direction, view.focus);
+  if (tick !== undefined) go(tick);
+}
+
+function pace(direction) {
+  const place = Math.min(Math.max(SPEEDS.indexOf(view.speed) + direction, 0), SPEEDS.length - 1);
+  view.speed = SPEEDS[place];
+  draw();
+}
+
+function show_truth(on) {
+  view.truth = on;
+  draw();
+}
+
+function fit() {
+  plane.fit(store, view.focus, view.truth);
+  draw();
+}
+
+function pressed(event) {
+  if (!store || event.ctrlKey || event.metaKey || event.altKey || $("keys").open) return;
+  const { tagName, type } = event.target, typing = tagName === "SELECT";
+  const on_button = tagName === "BUTTON" || (tagName === "INPUT" && type === "checkbox") || tagName === "A";
+  if (typing || (on_button && [" ", "Enter"].includes(event.key))) return;
+  const far = event.shiftKey ? 10 : 1;
+  const deeds = {
+    " ": () => play(), ArrowLeft: () => go(view.tick - far), ArrowRight: () => go(view.tick + far),
+    PageDown: () => go(view.tick - 10), PageUp: () => go(view.tick + 10),
+    Home: () => go(store.first), End: () => go(store.last), ",": () => to_event(-1), ".": () => to_event(1),
+    "[": () => pace(-1), "]": () => pace(1), l: () => go(store.last), t: () => show_truth(!view.truth),
+    r: () => next_robot(event.shiftKey ? -1 : 1), a: () => focus(null), f: fit, n: () => plane.near(store, view),
+    "+": () => plane.zoom(1.25), "=": () => plane.zoom(1.25), "-": () => plane.zoom(0.8),
+    w: () => plane.shift(event.shiftKey ? 60 : 0, event.shiftKey ? 0 : 60),
+    s: () => plane.shift(event.shiftKey ? -60 : 0, event.shiftKey ? 0 : -60),
+    "?": () => $("keys").showModal(),
+  };
+  const deed = deeds[event.key.length === 1 ? event.key.toLowerCase() : event.key];
+  if (!deed) return;
+  event.preventDefault();
+  deed();
+}
+
+document.addEventListener("keydown", pressed);
+$("play").addEventListener("click", () => play());
+$("back").addEventListener("click", () => go(view.tick - 1));
+$("on").addEventListener("click", () => go(view.tick + 1));
+$("first").addEventListener("click", () => go(store.first));
+$("last").addEventListener("click", () => go(store.last));
+$("follow").addEventListener("click", () => go(store.last));
+$("truth").addEventListener("change", () => show_truth($("truth").checked));
+$("robot").addEventListener("change", () => focus($("robot").value || null));
+$("speed").addEventListener("change", () => { view.speed = Number($("speed").value); draw(); });
+$("fit").addEventListener("click", fit);
+$("near").addEventListener("click", () => plane.near(store, view));
+$("help").addEventListener("click", () => $("keys").showModal());
+$("view").addEventListener("submit", (event) => event.preventDefault());
+$("speed").append(...SPEEDS.map((speed) => make("option", { value: speed, textContent: speed })));
+$("key-list").append(...KEYS.flatMap(([key, deed]) => [make("dt", {}, make("kbd", { textContent: key })), make("dd", { textContent: deed })]));
+$("signs").append(...MEANINGS.map(([sign, meaning]) => make("li", {}, make("b", { textContent: sign }), `: ${meaning}`)));
+for (const phase of [1, 2, 3]) {
+  const item = make("li", { textContent: `phase ${phase}` });
+  item.dataset.phase = phase;
+  $("legend").append(item);
+}
+
+window.addEventListener("hashchange", () => {
+  const { show, tick, robot, truth } = asked();
+  if (!store || (show || store.name) !== store.name || (!show && listed?.shows.length > 1)) return void (listed && on_list(listed));
+  view.focus = store.places.has(robot) ? robot : null;
+  view.truth = truth;
+  if (tick !== null) go(tick);
+  else draw();
+});
+new ResizeObserver(() => draw()).observe($("plane"));
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => draw());
+
+listen();

@@ -1,0 +1,143 @@
+// One mission, as far as it has been fetched: its stage, and its scenes by tick. The newest come by themselves,
+// what was skipped is fetched when there is time.
+
+const COUNTERS = ["anchor", "mutual", "sent", "heard", "refused", "lost", "bytes"];
+
+export class Store {
+  constructor(name, told, changed) {
+    this.name = name;
+    this.stage = told.stage;
+    this.places = new Map(told.stage.robots.map((robot, place) => [robot.id, place]));
+    this.scenes = [];
+    this.state = told;
+    this.version = told.version;
+    this.wanted = 0;
+    this.closed = false;
+    this.revision = 0;
+    this.#changed = changed;
+    this.#counts = told.stage.robots.map(() => []);
+    this.#fill();
+  }
+
+  #changed;
+  #counts;
+  #whole = 0;
+  #wake = null;
+  #failed = 0;
+  #stale = Infinity;
+
+  get last() { return this.state.last; }
+  get first() { return this.state.first; }
+  get live() { return this.state.live; }
+  get end() { return this.state.end && { tick: this.state.end[1], outcome: this.state.end[2], reason: this.state.end[3] }; }
+  /** Every tick before this one is there. */
+  get whole() { return this.#whole; }
+
+  close() {
+    this.closed = true;
+    this.#wake?.();
+  }
+
+  scene(tick) { return this.scenes[tick]; }
+
+  player(tick, robot) { return this.scenes[tick]?.players[this.places.get(robot)]; }
+
+  /** The tick has something to show, or is being fetched. */
+  want(tick) {
+    this.wanted = tick;
+    if (!this.scenes[tick]) this.#wake?.();
+  }
+
+  /** What the server has told of it. */
+  told(news) {
+    const robots = this.stage.robots.length;
+    this.state = news;
+    if (news.from !== null && news.from !== undefined) this.#forget(news.from);
+    for (const scene of news.scenes) this.scenes[scene.tick] = scene;
+    this.#advance();
+    this.#wake?.();
+    if (news.robots !== robots) this.#restage();
+    this.#changed();
+  }
+
+  async #restage() {
+    const told = await (await fetch(`/api/shows/${encodeURIComponent(this.name)}`)).json();
+    this.stage = told.stage;
+    this.places = new Map(told.stage.robots.map((robot, place) => [robot.id, place]));
+    this.#counts = told.stage.robots.map(() => []);
+    this.#forget(0);
+    this.onstage?.();
+  }
+
+  #forget(from) {
+    this.#stale = Math.min(this.#stale, from);
+    if (from < this.scenes.length) {
+      this.scenes.length = from;
+      this.revision += 1;
+    }
+    this.#whole = Math.min(this.#whole, from);
+    for (const counts of this.#counts) counts.length = Math.min(counts.length, from);
+  }
+
+  #advance() {
+    while (this.scenes[this.#whole] || this.#whole < this.first) this.#whole += 1;
+  }
+
+  #missing() {
+    const near = Math.max(this.wanted - 3, this.first);
+    for (let tick = near; tick <= Math.min(this.wanted, this.last); tick++) if (!this.scenes[tick]) return tick;
+    return this.#whole <= this.last ? this.#whole : null;
+  }
+
+  async #fill() {
+    while (!this.closed) {
+      const from = this.#missing();
+      if (from === null) {
+        await new Promise((resolve) => { this.#wake = resolve; });
+        this.#wake = null;
+        continue;
+      }
+      try {
+        this.#stale = Infinity;
+        const path = `/api/shows/${encodeURIComponent(this.name)}/scenes?from=${from}&to=${this.last}`;
+        const answer = await (await fetch(path)).json();
+        for (const scene of answer.scenes) if (scene.tick < this.#stale) this.scenes[scene.tick] = scene;
+        for (let tick = answer.from; tick <= Math.min(answer.to, this.#stale - 1); tick++) {
+          this.scenes[tick] ??= { tick, players: this.stage.robots.map(unknown), passages: [], events: [] };
+        }
+        this.#failed = 0;
+        this.#advance();
+        this.#changed();
+      } catch {
+        this.#failed += 1;
+        await new Promise((resolve) => setTimeout(resolve, Math.min(200 * this.#failed, 3000)));
+      }
+      if (this.live) await new Promise((resolve) => setTimeout(resolve, 50));
+    }
+  }
+
+  /** What `robot` has counted up to `tick`; none while not all before it is there. */
+  counted(robot, tick) {
+    if (tick >= this.#whole) return null;
+    const place = this.places.get(robot), counts = this.#counts[place];
+    for (let k = counts.length; k <= tick; k++) {
+      const before = counts[k - 1] ?? Object.fromEntries(COUNTERS.map((name) => [name, 0]));
+      const scene = this.scenes[k], player = scene?.players[place], now = { ...before };
+      if (player) {
+        now.anchor += player.anchor_range !== undefined ? 1 : 0;
+        now.mutual += player.contacts?.some((contact) => contact[1] !== null) ? 1 : 0;
+        now.sent += player.sent ? 1 : 0;
+        now.bytes += player.sent?.bytes ?? 0;
+        for (const passage of scene.passages) {
+          if (passage.receiver === robot && passage.what === "heard") now.heard += 1;
+          if (passage.receiver === robot && passage.what === "damaged") now.refused += 1;
+          if (passage.sender === robot && passage.what === "lost") now.lost += 1;
+        }
+      }
+      counts[k] = now;
+    }
+    return counts[tick];
+  }
+}
+
+const unknown = (robot) => ({ robot: robot.id, doing: `nothing is known of ${robot.id} in this tick` });

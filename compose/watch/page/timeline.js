@@ -1,0 +1,154 @@
+// The time line: a band a robot, its phases; contact shaded across; faults, claims and the end marked above.
+
+import { unit } from "./plane.js";
+import { FAULTS } from "./words.js";
+
+const MOST_BANDS = 6;
+const MARKS = 15;
+
+export class Timeline {
+  constructor(box, canvas, scrub, go) {
+    this.canvas = canvas;
+    this.scrub = scrub;
+    this.box = box;
+    let held = false;
+    const there = (event) => {
+      const { left, width } = canvas.getBoundingClientRect(), inset = this.inset * unit();
+      const share = (event.clientX - left - inset) / Math.max(width - inset - 6, 1);
+      go(Math.round(Math.min(Math.max(share, 0), 1) * Math.max(this.last, 0)));
+    };
+    box.addEventListener("pointerdown", (event) => {
+      if (event.target === scrub) return;
+      held = true;
+      box.setPointerCapture(event.pointerId);
+      there(event);
+      scrub.focus({ preventScroll: true });
+    });
+    box.addEventListener("pointermove", (event) => { if (held) there(event); });
+    for (const name of ["pointerup", "pointercancel"]) box.addEventListener(name, () => { held = false; });
+    scrub.addEventListener("input", () => go(Number(scrub.value)));
+  }
+
+  inset = 30;
+  last = 0;
+
+  stage(store) {
+    this.store = store;
+    this.read = 0;
+    this.revision = store.revision;
+    this.spans = new Map(store.stage.robots.map((robot) => [robot.id, []]));
+    this.contacts = new Map(store.stage.robots.map((robot) => [robot.id, []]));
+    this.marks = [];
+  }
+
+  /** Fold in the scenes that have come. */
+  #read() {
+    const { store } = this;
+    if (store.revision !== this.revision || store.whole < this.read) this.#back_to(store.whole);
+    this.revision = store.revision;
+    for (; this.read < store.whole; this.read++) {
+      const scene = store.scene(this.read);
+      if (!scene) continue;
+      for (const player of scene.players) {
+        lengthen(this.spans.get(player.robot), this.read, player.drive?.phase ?? 0);
+        if (player.contacts?.length) lengthen(this.contacts.get(player.robot), this.read, 1);
+      }
+      for (const event of scene.events) {
+        if (FAULTS.has(event.kind)) this.marks.push([this.read, "fault", event.robot]);
+        else if (["contact", "claim", "undecided", "alarm"].includes(event.kind)) this.marks.push([this.read, event.kind, event.robot]);
+      }
+    }
+  }
+
+  #back_to(tick) {
+    for (const spans of [...this.spans.values(), ...this.contacts.values()]) {
+      while (spans.length && spans.at(-1).from >= tick) spans.pop();
+      if (spans.length) spans.at(-1).to = Math.min(spans.at(-1).to, tick - 1);
+    }
+    while (this.marks.length && this.marks.at(-1)[0] >= tick) this.marks.pop();
+    this.read = tick;
+  }
+
+  draw({ tick, share, focus, moving }, doing) {
+    const { store, canvas } = this;
+    this.#read();
+    this.last = Math.max(store.last, 0);
+    const robots = store.stage.robots;
+    let shown = robots;
+    if (robots.length > MOST_BANDS) {
+      const chosen = robots.find((robot) => robot.id === focus) ?? robots[0];
+      shown = robots.filter((robot) => robot === chosen || robot.id === chosen.peer);
+    }
+    const style = getComputedStyle(document.documentElement), of = (name) => style.getPropertyValue(`--${name}`).trim();
+    const ratio = (window.devicePixelRatio || 1) * unit(), wide = canvas.clientWidth / unit();
+    const band = shown.length > 3 ? 9 : 14, tall = MARKS + shown.length * (band + 3) + 15;
+    const height = `${Math.round(tall * unit())}px`;
+    if (canvas.style.height !== height) canvas.style.height = height;
+    if (canvas.width !== Math.round(wide * ratio) || canvas.height !== Math.round(tall * ratio)) {
+      canvas.width = Math.round(wide * ratio);
+      canvas.height = Math.round(tall * ratio);
+    }
+    const pen = canvas.getContext("2d");
+    pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+    pen.clearRect(0, 0, wide, tall);
+    pen.font = `11px ${of("font")}`;
+    this.inset = 12 + Math.max(...shown.map((robot) => pen.measureText(robot.id).width));
+    const x = (k) => this.inset + (k / Math.max(this.last, 1)) * (wide - this.inset - 6);
+    const ids = new Set(shown.map((robot) => robot.id));
+    shown.forEach((robot, row) => {
+      const y = MARKS + row * (band + 3);
+      pen.fillStyle = of("faint");
+      pen.textAlign = "left";
+      pen.fillText(robot.id, 4, y + band - (band > 10 ? 3 : 1));
+      pen.fillStyle = of("grid");
+      pen.fillRect(x(0), y, x(this.last) - x(0), band);
+      for (const { from, to, value } of this.spans.get(robot.id)) {
+        if (!value) continue;
+        const left = x(from), width = Math.max(x(Math.min(to + 1, this.last)) - left, 1.5);
+        pen.fillStyle = of(`phase-${value}`);
+        const inner = { 1: 0.4, 2: 0.62, 3: 1 }[value] * band;
+        pen.fillRect(left, y + (band - inner) / 2, width, inner);
+        if (width > 54) {
+          pen.fillStyle = value === 3 ? of("paper") : of("faint");
+          if (value === 3) pen.fillText(`phase ${value}`, left + 5, y + band - 3.5);
+        }
+      }
+      pen.fillStyle = of("shade");
+      for (const { from, to } of this.contacts.get(robot.id)) {
+        pen.fillRect(x(from), y - 2, Math.max(x(Math.min(to + 1, this.last)) - x(from), 2), band + 4);
+      }
+    });
+    for (const [k, kind, robot] of this.marks) {
+      if (!ids.has(robot)) continue;
+      pen.textAlign = "center";
+      pen.fillStyle = kind === "fault" || kind === "alarm" || kind === "undecided" ? of("fault") : of("ink");
+      pen.fillText({ fault: "×", contact: "⇄", claim: "★", alarm: "!", undecided: "…" }[kind], x(k), 11);
+    }
+    this.#ticks(pen, x, MARKS + shown.length * (band + 3) + 11, of("faint"), wide);
+    const now = x(Math.min(tick + (moving ? share : 0), this.last));
+    pen.fillStyle = of("ink");
+    pen.fillRect(now - 1, 2, 2, tall - 15);
+    pen.beginPath();
+    pen.moveTo(now - 5, 0); pen.lineTo(now + 5, 0); pen.lineTo(now, 7); pen.closePath();
+    pen.fill();
+    if (this.scrub.max !== String(this.last)) this.scrub.max = String(this.last);
+    if (this.scrub.value !== String(tick)) this.scrub.value = String(tick);
+    this.scrub.setAttribute("aria-valuetext", `tick ${tick} of ${this.last}. ${doing}`);
+  }
+
+  #ticks(pen, x, y, colour, wide) {
+    const raw = (this.last * 70) / Math.max(wide, 1), power = 10 ** Math.floor(Math.log10(Math.max(raw, 1)));
+    const unit = [1, 2, 5, 10].find((factor) => factor * power >= raw) * power;
+    pen.fillStyle = colour;
+    for (let k = 0; k <= this.last; k += unit) {
+      pen.textAlign = k === 0 ? "left" : x(k) > wide - 20 ? "right" : "center";
+      pen.fillText(String(k), k === 0 ? x(0) : x(k), y);
+    }
+  }
+}
+
+function lengthen(spans, tick, value) {
+  const latest = spans.at(-1);
+  if (latest && latest.value === value && latest.to === tick - 1) latest.to = tick;
+  else spans.push({ from: tick, to: tick, value });
+}

@@ -1,0 +1,44 @@
+"""Somebody who looks at a page without a browser, and takes what one would. `tandem bench` sends one."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import signal
+import sys
+import time
+from contextlib import suppress
+from urllib.parse import quote, urlsplit
+
+TIMEOUT_S = 30.0
+BETWEEN_S = 0.05
+"""how long a page waits between two answers while the mission runs (`page/store.js`)"""
+
+
+def visit(address: str) -> None:
+    """Take the news and all the scenes of the first mission listed, until the server ends."""
+    place = urlsplit(address).netloc
+    news = http.client.HTTPConnection(place, timeout=TIMEOUT_S)
+    scenes = http.client.HTTPConnection(place, timeout=TIMEOUT_S)
+    name, last = "", -1
+    while not name:
+        news.request("GET", "/api/news")
+        for line in news.getresponse():
+            if line.startswith(b"data: ") and (shows := json.loads(line[6:]).get("list", {}).get("shows")):
+                name = quote(shows[0]["name"])
+                break
+        news.close()
+    news.request("GET", f"/api/news?show={name}")
+    for line in news.getresponse():
+        show = json.loads(line[6:]).get("show") if line.startswith(b"data: ") else None
+        if show is None or show["last"] <= last:
+            continue
+        scenes.request("GET", f"/api/shows/{name}/scenes?from={last + 1}&to={show['last']}")
+        last = max(last, json.loads(scenes.getresponse().read())["to"])
+        time.sleep(BETWEEN_S)
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    with suppress(OSError, http.client.HTTPException):  # the server has ended
+        visit(sys.argv[1])
