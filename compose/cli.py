@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NoReturn, TextIO
 
 from compose import kill
+from compose.figures import FORMATS, PICTURES
 from compose.status import BROKEN_PIPE, BUG, FAILED, USER_ERROR, UserError
 from protocol.inbox import one_line
 from protocol.units import NAME
@@ -67,6 +68,9 @@ def _parser() -> argparse.ArgumentParser:
     _add_scenario(run)
     _add_playing(run)
     run.add_argument("--in-process", action="store_true", help="without processes or network")
+    run.add_argument("--export", action="store_true", help="leave run.mcap and tables in --out DIR, too")
+    run.add_argument("--foxglove", type=_port, metavar="PORT", help="serve Foxglove's viewers there, live")
+    run.add_argument("--watch", action="store_true", help="serve a page that shows it, live and afterwards")
     run.add_argument(
         "--kill",
         type=_kill,
@@ -98,11 +102,42 @@ def _parser() -> argparse.ArgumentParser:
 
     _add_sweep(command("sweep", "Play a campaign: many trials of a scenario, over axes of its fields."))
 
-    figures = command("figures", "Draw a record: a picture for each of its robots, into DIR/figures.")
+    figures = command(
+        "figures", "Draw a record, into DIR/figures: the paper's figures, and each robot's mission."
+    )
     figures.add_argument("record", type=_folder, metavar="DIR", help="where `tandem run --out DIR` left it")
+    figures.add_argument(
+        "--only", action="append", choices=PICTURES, metavar="NAME",
+        help=f"draw only these; again for more: {', '.join(PICTURES)}",
+    )  # fmt: skip
+    figures.add_argument(
+        "--format", action="append", choices=FORMATS, help="write only these; again for more (all three)"
+    )
+
+    watch = command("watch", "Serve a page on which a run is watched: a record, or what runs on a network.")
+    watch.add_argument(
+        "record", type=_folder, nargs="?", metavar="DIR", help="a record, a campaign, or a folder of records"
+    )
+    watch.add_argument(
+        "--connect",
+        action="append",
+        default=[],
+        metavar="ENDPOINT",
+        help="without DIR: where missions run (tcp/127.0.0.1:7447); as often as you like",
+    )
+    watch.add_argument("--launched", action="store_true", help=argparse.SUPPRESS)  # by `tandem run --watch`
+    for sub in (run, watch):
+        sub.add_argument("--port", type=_port, default=0, metavar="N", help="of the page (one that is free)")
 
     audit = command("audit", "Judge a record: what its journals say, held against the world and the planner.")
     audit.add_argument("record", type=_folder, metavar="DIR", help="where `tandem run --out DIR` left it")
+
+    replay = command("replay", "Play a record once more, and hold every decision against it, to the bit.")
+    replay.add_argument("record", type=_folder, metavar="DIR", help="where `tandem run --out DIR` left it")
+
+    export = command("export", "Leave a record in other formats: run.mcap, frames.csv, ticks.parquet.")
+    export.add_argument("record", type=_folder, metavar="DIR", help="where `tandem run --out DIR` left it")
+    export.add_argument("--out", type=_folder, metavar="DIR", help="where the files go (where the record is)")
 
     command("scenarios", "List the scenarios and the campaigns that ship.")
 
@@ -179,6 +214,13 @@ def _natural(text: str) -> int:
     if not re.fullmatch(r"[0-9]{1,19}", text) or int(text) >= 2**63:
         raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 0 to 2^63 - 1")
     return int(text)
+
+
+def _port(text: str) -> int:
+    value = _natural(text)
+    if value >= 1 << 16:
+        raise argparse.ArgumentTypeError(f"{value} is not a port, from 0 (one that is free) to 65535")
+    return value
 
 
 def _count(text: str) -> int:

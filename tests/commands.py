@@ -58,6 +58,10 @@ anchor = [60.0, 0.0]
 """
 """1874 ticks: time enough to interfere with it"""
 LONG_TICKS = 1874
+ASSURED = "max_ticks = 1_000_000\n" + PAPER_1.replace('"paper"', '"assured"').replace(
+    "10.0, 0.0", "60.0, 0.0"
+).replace("11.3", "61.3")
+"""of the variant for which standing still is no harm, however long a busy machine makes robots stand"""
 ENDLESS = (
     LONG.replace("60.0", "400.0").replace("max_speed = 1.0", "max_speed = 0.1").replace('"long"', '"endless"')
 )

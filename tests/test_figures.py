@@ -57,7 +57,7 @@ def copied(record: Path, folder: Path) -> Path:
 
 
 def draw(folder: Path) -> Ended:
-    return tandem("figures", folder)
+    return tandem("figures", folder, "--only", "robot", "--format", "svg")
 
 
 def picture(folder: Path, robot: str) -> Path:
@@ -98,15 +98,15 @@ def cut(journal: Path, count: int) -> None:
 
 def test_a_line_a_file_is_printed_and_the_files_are_there(noisy: Path, tmp_path: Path) -> None:
     folder = copied(noisy, tmp_path)
-    ended = draw(folder)
-    names = ["robot-a.svg", "robot-a.png", "robot-b.svg", "robot-b.png"]
+    ended = tandem("figures", folder, "--only", "robot")
+    names = [f"robot-{robot}.{ending}" for robot in "ab" for ending in ("svg", "pdf", "png")]
     assert ended.status == 0
     assert ended.err == ""
     assert ended.out.splitlines() == [str(folder / "figures" / name) for name in names]
     assert {path.name for path in (folder / "figures").iterdir()} == set(names)
     for name in names:
         head = (folder / "figures" / name).read_bytes()[:8]
-        assert head.startswith(b"<?xml" if name.endswith("svg") else b"\x89PNG")
+        assert head.startswith({"svg": b"<?xml", "pdf": b"%PDF", "png": b"\x89PNG"}[name[-3:]])
 
 
 def test_a_run_draws_nothing_by_itself(tmp_path: Path) -> None:
@@ -312,7 +312,7 @@ def test_a_robot_without_a_journal_is_named_and_the_others_are_drawn(noisy: Path
     ended = draw(folder)
     assert ended.status == 3
     assert ended.err == "tandem figures: no picture of a: agent-a.journal is missing\n"
-    assert {path.name for path in (folder / "figures").iterdir()} == {"robot-b.svg", "robot-b.png"}
+    assert {path.name for path in (folder / "figures").iterdir()} == {"robot-b.svg"}
     (folder / "agent-a.journal").write_bytes(b"\xc1")
     ended = draw(folder)
     assert ended.status == 3

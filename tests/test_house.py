@@ -273,6 +273,12 @@ def loaded_by(module: str) -> set[str]:
         ("compose.commands.audit", {"zenoh", "rich", "distributed", "matplotlib", "pyarrow"}),
         ("compose.record", {"zenoh", "numpy", "scipy", "rich", "agent"}),
         ("compose.commands.figures", {"zenoh", "numpy", "rich", "distributed", "matplotlib"}),
+        ("compose.commands.run", {"numpy", "scipy", "rich", "agent", "foxglove", "pyarrow"}),
+        ("compose.commands.replay", {"zenoh", "rich", "foxglove", "pyarrow", "matplotlib"}),
+        ("compose.commands.export", {"zenoh", "numpy", "rich", "agent", "foxglove", "pyarrow"}),
+        ("compose.commands.run", {"numpy", "scipy", "rich", "agent", "starlette", "uvicorn"}),
+        ("compose.commands.watch", {"zenoh", "numpy", "scipy", "rich", "agent", "starlette", "uvicorn"}),
+        ("compose.scene.recorded", {"zenoh", "numpy", "scipy", "rich", "agent", "starlette", "uvicorn"}),
         ("compose.commands.sweep", {"zenoh", "rich", "distributed", "dask", "pyarrow", "matplotlib"}),
     ],
 )

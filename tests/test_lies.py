@@ -117,6 +117,11 @@ def test_under_noise_a_lie_that_is_large_beside_it_is_an_alarm(lie: Lie) -> None
         assert alarm.residual > 3.0
 
 
+@pytest.mark.parametrize("seed", [30, 49, 109])
+def test_who_plans_by_a_lie_and_loses_its_peer_finds_other_places_to_range_from(seed: int) -> None:
+    assert outcome(mission(seed, {"a": Lie("scale", 0.5, "phase-1")}, FINE)) == "alarm"
+
+
 def test_under_noise_the_honest_are_believed() -> None:
     for seed in range(8):
         assert outcome(mission(seed, {}, FINE)) == "localised", seed

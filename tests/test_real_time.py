@@ -12,7 +12,7 @@ import pytest
 from protocol import journal
 from protocol.messages import Drive, End, Farewell, Missed
 from protocol.wire import MAX_FRAME_BYTES, decode
-from tests.commands import ENDLESS, PAPER_1, Command, process_of, tandem
+from tests.commands import ASSURED, ENDLESS, PAPER_1, Command, process_of, tandem
 from world.scenario import Scenario
 
 
@@ -54,7 +54,8 @@ def test_a_rate_beyond_all_sense_is_refused(rate: str, lasts: str) -> None:
 
 def test_a_robot_whose_agent_is_stopped_stands_still_and_the_mission_goes_on(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    with Command("run", "paper-2", "--rate", "20", "--out", out, "-q") as run:
+    (tmp_path / "assured.toml").write_text(ASSURED)
+    with Command("run", tmp_path / "assured.toml", "--rate", "20", "--out", out, "-q") as run:
         run.until_written(out / "world.journal", 3000)
         stopped = process_of(out, "agent", "a")
         os.kill(stopped, SIGSTOP)

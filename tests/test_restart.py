@@ -29,9 +29,9 @@ from protocol.journal import CannotRecord, CorruptJournal, Journal
 from protocol.messages import Contact, Drive, End, Farewell, Missed, Report, Sense
 from protocol.retrace import Retrace
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
-from tests.commands import BOUND_S, PAPER_1, Command, Ended, journals, processes_of, tandem, world
+from tests.commands import ASSURED, BOUND_S, PAPER_1, Command, Ended, journals, processes_of, tandem, world
 from world.course import Course, again
-from world.past import past as world_past
+from world.history import history
 from world.scenario import Scenario
 
 PARTS = ("agent-a", "agent-b", "world")
@@ -126,7 +126,9 @@ def test_a_robot_that_comes_back_too_late_fails_the_run_by_the_patience(tmp_path
 
 def test_in_real_time_whoever_is_away_stands_still_and_is_told_what_it_missed(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    ended = tandem("run", "paper-2", "--rate", "20", "-q", "--out", out, *options("a@20 world@60:report"))
+    (tmp_path / "assured.toml").write_text(ASSURED)
+    kills = options("a@20 world@60:report")
+    ended = tandem("run", tmp_path / "assured.toml", "--rate", "20", "-q", "--out", out, *kills)
     assert ended.status == 0, ended
     with (out / "ticks.csv").open(newline="") as file:
         away = [row for row in csv.DictReader(file) if row["state"] == ""]
@@ -230,7 +232,7 @@ def test_a_worlds_journal_torn_anywhere_is_finished_with_the_same_bytes(
     undisturbed: Path, tmp_path: Path
 ) -> None:
     data = (undisturbed / "world.journal").read_bytes()
-    whole = world_past(list(journal.read(undisturbed / "world.journal")), "world")
+    whole = history(journal.read(undisturbed / "world.journal"), "world")
     torn = tmp_path / "torn.journal"
     for cut in cuts(data):
         torn.write_bytes(data[:cut])
@@ -240,10 +242,10 @@ def test_a_worlds_journal_torn_anywhere_is_finished_with_the_same_bytes(
         book, _ = old.go_on()
         with book:
             course.keep(book)
-            for drives in whole.ticks[course.tick :]:
+            for tick in whole.ticks[course.tick :]:
                 if course.over is None:
-                    course.drive(drives)
-            course.farewells(whole.farewells)
+                    course.drive(tick.drives)
+            course.farewells(whole.farewells.values())
         assert torn.read_bytes() == data, cut
 
 

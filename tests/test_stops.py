@@ -18,9 +18,9 @@ from protocol.inbox import Inbox
 from protocol.messages import Drive, End, Farewell, Missed
 from protocol.wire import MAX_FRAME_BYTES, decode
 from tests.commands import (
+    ASSURED,
     LONG,
     LONG_TICKS,
-    PAPER_1,
     Command,
     process_of,
     processes_of,
@@ -33,7 +33,6 @@ from world.scenario import Scenario
 NAMES = ("agent a", "agent b", "world")
 PATIENCE_S = 6.0
 """longer than Zenoh's lease"""
-ASSURED = PAPER_1.replace('"paper"', '"assured"').replace("10.0, 0.0", "20.0, 0.0").replace("11.3", "21.3")
 LOCALISED = f"localised after {LONG_TICKS} ticks\n"
 
 

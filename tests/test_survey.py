@@ -301,6 +301,13 @@ def test_a_robot_that_turns_out_to_head_off_its_radius_turns_onto_it_again() -> 
         world = onward
 
 
+def test_a_robot_that_left_its_peers_range_does_not_go_there_again() -> None:
+    """Both planned to stay in range, by a belief that an outlier misled; going back is not enough."""
+    record = play(scenario_of("outliers = 0.05", 4253053381025039869, accuracy=0.03))
+    assert "retreating" in states(record, "a")
+    assert_localised(record)
+
+
 def test_nothing_is_claimed_by_a_fit_that_still_moves(monkeypatch: pytest.MonkeyPatch) -> None:
     ticks = len(survey(SIGMA, SHORT).moments)
 

@@ -6,8 +6,9 @@ import argparse
 from pathlib import Path
 
 from agent.joining import NoWorld, Search, Unwelcome, join
+from agent.link import LinkLost
 from agent.memory import Memory, remember
-from agent.process import AgentProcess, LinkLost
+from agent.process import AgentProcess
 from agent.robot import Robot
 from compose import kill
 from compose.record import ended, make

@@ -13,7 +13,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from statistics import median
 
@@ -24,7 +24,9 @@ from rich.table import Table
 
 from agent.robot import Robot
 from compose import barrier, inline, local, record, scenario
-from compose.campaign.trial import in_process
+from compose.beside import beside
+from compose.beside import page as page_on
+from compose.campaign.played import in_process
 from compose.status import LOCALISED
 from protocol import session
 from protocol.inbox import Inbox
@@ -75,16 +77,26 @@ def _ticks(rounds: int, done: Callable[[], None]) -> Table:
     played = scenario.load(MISSION)
     sizes = _frame_sizes(played)
     missions: list[float] = []
+    bare: list[float] = []
+    watched: list[float] = []
     barriers: list[float] = []
     for _ in range(rounds):
         missions.append(_mission_rate(played))
+        bare.append(_mission_rate(played, journals=False))
+        watched.append(_mission_rate(played, watched=True))
         barriers.append(_barrier_rate(played, sizes))
         done()
     table = _table("Ticks/s as processes, two robots")
     _row(table, f"a mission ({MISSION}), with journals", missions, "ticks/s")
+    _row(table, "the same, without journals", bare, "ticks/s")
+    _row(table, "the same, and somebody watches the page", watched, "ticks/s")
     _row(table, f"the bare barrier, frames of {sizes[0]} and {sizes[1]} bytes", barriers, "ticks/s")
-    ratios = [mission / bare for mission, bare in zip(missions, barriers, strict=True)]
+    ratios = [mission / barrier for mission, barrier in zip(missions, barriers, strict=True)]
     _row(table, "mission / barrier (at least 0.5)", ratios, "")
+    ratios = [mission / without for mission, without in zip(missions, bare, strict=True)]
+    _row(table, "with journals / without (at least 0.85)", ratios, "")
+    ratios = [with_page / mission for with_page, mission in zip(watched, missions, strict=True)]
+    _row(table, "watched / mission (at least 0.6)", ratios, "")
     return table
 
 
@@ -101,13 +113,13 @@ def _frame_sizes(played: Scenario) -> tuple[int, int]:
 
 
 @contextmanager
-def _robots(arguments: Sequence[Sequence[str]]) -> Iterator[None]:
-    """Robots as processes, for as long as it takes."""
+def _processes(arguments: Sequence[Sequence[str]], *, until_ended: bool = False) -> Iterator[None]:
+    """Processes, for as long as it takes."""
     command = [sys.executable, "-P", "-m"]
     children = [subprocess.Popen([*command, *one], stdout=subprocess.DEVNULL) for one in arguments]
     try:
         yield
-        for child in children:
+        for child in children if until_ended else ():
             child.wait(local.STOP_S)
     finally:
         for child in children:
@@ -115,16 +127,22 @@ def _robots(arguments: Sequence[Sequence[str]]) -> Iterator[None]:
             child.wait()
 
 
-def _mission_rate(played: Scenario) -> float:
+def _mission_rate(played: Scenario, *, journals: bool = True, watched: bool = False) -> float:
+    """As processes; `watched`: beside a page, and somebody who looks at it."""
     endpoint = local.free_endpoint()
-    with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder)
-        common = ["--connect", endpoint, "--out", folder, "--quiet"]
+    with ExitStack() as stack:
+        folder = stack.enter_context(tempfile.TemporaryDirectory())
+        visitors = []
+        if watched:
+            page = stack.enter_context(beside(*page_on(Path(folder), 0)))
+            visitors.append(["compose.watch.visitor", page.address])
+        common = ["--connect", endpoint, "--quiet", *(["--out", folder] if journals else [])]
         robots = [["compose", "agent", robot.id, *common] for robot in played.robots]
         with (
-            _robots(robots),
+            _processes(visitors),
+            _processes(robots, until_ended=True),
             session.open_router(endpoint) as link,
-            Journal(out / record.WORLD_JOURNAL) as journal,
+            Journal(Path(folder) / record.WORLD_JOURNAL) if journals else nullcontext() as journal,
         ):
             process = WorldProcess(Course(played, journal), link, "bench", Inbox("tandem bench"))
             end = process.play()
@@ -135,7 +153,7 @@ def _barrier_rate(played: Scenario, sizes: tuple[int, int]) -> float:
     endpoint = local.free_endpoint()
     ids = [robot.id for robot in played.robots]
     robots = [["compose.barrier", endpoint, one, str(sizes[1]), str(BARRIER_TICKS)] for one in ids]
-    with session.open_router(endpoint) as link, _robots(robots):
+    with session.open_router(endpoint) as link, _processes(robots, until_ended=True):
         return BARRIER_TICKS / barrier.world(link, ids, sizes[0], BARRIER_TICKS)
 
 

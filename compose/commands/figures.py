@@ -4,33 +4,41 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from compose.figures import FORMATS, PICTURES
 from compose.lab import need
-from compose.record import agent_journal, estimates, legible, read
+from compose.record import agent_journal, legible, read
 from compose.status import ENDED, FAILED, UserError
 from protocol.inbox import one_line
 from protocol.journal import CorruptJournal
-from protocol.messages import Estimate
+
+if TYPE_CHECKING:
+    from compose.figures.pair import Account, Pair
 
 
 def main(options: argparse.Namespace) -> int:
-    """Draw each robot of the record; FAILED if one of them has left no journal that can be read."""
+    """Draw each pair of the record; FAILED if a robot has left no journal that can be followed to its end."""
     need("matplotlib")
     with legible(options.record):
         record = read(options.record)
-    from compose.figures import robot  # noqa: PLC0415  # slow, and there may be no extra
+    from compose.figures.pair import Pair  # noqa: PLC0415  # slow, and there may be no extra
 
-    folder = options.record / "figures"
-    status = ENDED
-    for place, placed in enumerate(record.scenario.robots):
-        held = _estimates(options.record, placed.id)
-        if held is None:
-            status = FAILED
-            continue
+    folder, status = options.record / "figures", ENDED
+    kinds = [kind for kind in PICTURES if kind in (options.only or PICTURES)]
+    formats = [one for one in FORMATS if one in (options.format or FORMATS)]
+    for i, j in record.scenario.pairs():
+        accounts = {}
+        for robot in (record.scenario.robots[i].id, record.scenario.robots[j].id):
+            account = _account(options.record, robot)
+            if account is not None:
+                accounts[robot] = account
+            if account is None or account.broken is not None:
+                status = FAILED
         try:
-            for path in robot.draw(robot.Story(record, place, held), folder):
-                print(path, flush=True)
+            _draw(Pair(record, i, j, accounts), kinds, formats, folder)
         except BrokenPipeError:
             raise
         except OSError as error:
@@ -38,15 +46,41 @@ def main(options: argparse.Namespace) -> int:
     return status
 
 
-def _estimates(folder: Path, robot: str) -> tuple[Estimate, ...] | None:
-    """None, and a line that says why, where they cannot be read."""
+def _draw(pair: Pair, kinds: Sequence[str], formats: Sequence[str], folder: Path) -> None:
+    """A line for each file that is written, and for each picture that does not apply. Raises OSError."""
+    from compose.figures import album, style  # noqa: PLC0415
+    from compose.figures.sheet import Absent  # noqa: PLC0415
+
+    folder.mkdir(exist_ok=True)
+    for kind in kinds:
+        with album.settings(kind):
+            for name, figure in album.pictures(pair, kind):
+                if isinstance(figure, Absent):
+                    _say(f"no {name}: {figure.why}")
+                    continue
+                for path in style.save(figure, folder / name, formats):
+                    print(path, flush=True)
+
+
+def _account(folder: Path, robot: str) -> Account | None:
+    """None, and a line that says why, where its journal cannot be read."""
+    from compose.figures.pair import account  # noqa: PLC0415
+
     try:
-        return estimates(folder, robot)
+        found = account(folder, robot)
     except FileNotFoundError:
         why = f"{agent_journal(robot)} is missing"
     except OSError as error:
         why = f"{agent_journal(robot)} cannot be read: {error.strerror or error}"
     except CorruptJournal as error:
         why = str(error)
-    print(one_line(f"tandem figures: no picture of {robot}: {why}"), file=sys.stderr)
+    else:
+        if found.broken is not None:
+            _say(f"of {robot} only up to where its journal can be followed: {found.broken}")
+        return found
+    _say(f"no picture of {robot}: {why}")
     return None
+
+
+def _say(words: str) -> None:
+    print(one_line(f"tandem figures: {words}"), file=sys.stderr)

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
 
 from compose import local
-from compose.kill import WORLD
+from compose.beside import Beside, beside, page, stay, viewers
+from compose.kill import WORLD, Kill
+from compose.lab import need
 from compose.record import folder_for, read
-from compose.scenario import check_rate, load, run_name
+from compose.scenario import Setting, check_rate, run_name, setting
 from compose.status import FAILED, STOPPED, UserError
 from compose.stop import stop_by_signal
 from compose.telling import break_off, conclude, progress
@@ -19,16 +25,34 @@ from world.scenario import Scenario
 
 def main(options: argparse.Namespace) -> int:
     """Play the mission, as processes or in this one."""
-    scenario = load(options.scenario, seed=options.seed, faults=options.fault)
+    found = setting(options.scenario, options.fault)
+    scenario = found.seeded(options.seed)
     if options.out is not None and any(options.out.glob("*.journal")):
         raise UserError(f"--out: {options.out} holds a record already; choose another folder")
+    if options.foxglove is not None:
+        need("foxglove")
+    if options.export:
+        need("foxglove", "pyarrow")
+        if options.out is None:
+            raise UserError("--export: there is no --out DIR to leave it in")
+    kills = _kills(options, found, scenario)
+    if options.in_process:
+        if kills:
+            where = "--kill" if options.kill else f"{options.scenario}: kill"
+            raise UserError(f"{where}: --in-process has no processes to kill")
+        return _in_process(options, scenario)
+    return _as_processes(options, scenario, kills)
+
+
+def _kills(options: argparse.Namespace, found: Setting, scenario: Scenario) -> tuple[Kill, ...]:
+    """Those of the file, then those of the command line. Raises UserError."""
+    ids = [robot.id for robot in scenario.robots]
     for kill in options.kill:
-        ids = [robot.id for robot in scenario.robots]
         if kill.who not in (*ids, WORLD):
             raise UserError(
                 f"--kill: {kill.text}: there is no '{kill.who}'; there are {', '.join(ids)}, {WORLD}"
             )
-    return _in_process(options, scenario) if options.in_process else _as_processes(options, scenario)
+    return (*found.kills(scenario.seed), *options.kill)
 
 
 def _in_process(options: argparse.Namespace, scenario: Scenario) -> int:
@@ -36,24 +60,31 @@ def _in_process(options: argparse.Namespace, scenario: Scenario) -> int:
 
     if options.rate is not None:
         raise UserError("--rate: --in-process knows no real time")
-    if options.kill:
-        raise UserError("--kill: --in-process has no processes to kill")
+    if options.foxglove is not None:
+        raise UserError("--foxglove: what --in-process plays is over before anyone could look")
     began = time.perf_counter()
-    if options.out is None:
+    if options.out is None and not options.watch:
         return conclude(options, inline.play(scenario), None, "in-process", began)
-    with folder_for(options.out) as folder:
+    with folder_for(options.out) as folder, _shown(options, folder) as shows:
+        began = time.perf_counter()
         try:
             played = inline.play(scenario, folder)
         except CannotRecord as error:
             raise UserError(f"--out: {error}") from None
-        return conclude(options, played, folder, "in-process", began)
+        status = conclude(options, played, folder, "in-process", began)
+        _export(options, folder)
+        if shows:
+            inbox = Inbox("tandem run")
+            stop_by_signal(inbox)
+            stay(shows, inbox)
+        return status
 
 
-def _as_processes(options: argparse.Namespace, scenario: Scenario) -> int:
+def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[Kill, ...]) -> int:
     check_rate(scenario, options.rate)
     inbox = Inbox("tandem run")
     stop_by_signal(inbox)
-    with folder_for(options.out) as folder:
+    with folder_for(options.out) as folder, _shown(options, folder) as shows:
         began = time.perf_counter()
         try:
             with progress(options, scenario, folder):
@@ -64,7 +95,7 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario) -> int:
                     run=run_name(scenario),
                     rate=options.rate,
                     patience=options.patience,
-                    kills=options.kill,
+                    kills=kills,
                 )
         except local.ChildFailed as failure:
             inbox.say(f"failed: {failure}")
@@ -76,4 +107,29 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario) -> int:
             return STOPPED
         for kill in spared:
             inbox.say(f"--kill {kill.text}: never came")
-        return conclude(options, read(folder), folder, "processes", began)
+        status = conclude(options, read(folder), folder, "processes", began)
+        _export(options, folder)
+        stay(shows, inbox)
+        return status
+
+
+@contextmanager
+def _shown(options: argparse.Namespace, folder: Path) -> Iterator[list[Beside]]:
+    """What is to show the mission that is recorded in `folder`: it is there, and where has been said."""
+    wanted = [page(folder, options.port)] if options.watch else []
+    if options.foxglove is not None:
+        wanted.append(viewers(folder, options.foxglove))
+    with ExitStack() as stack:
+        shows = [stack.enter_context(beside(*one)) for one in wanted]
+        for show in shows:
+            show.announce()
+        yield shows
+
+
+def _export(options: argparse.Namespace, folder: Path) -> None:
+    """Once the outcome has been told; it takes as long as a short mission."""
+    if options.export:
+        from compose.export.folder import export  # noqa: PLC0415  # slow, and there may be no extra
+
+        sys.stdout.flush()
+        export(folder, folder)

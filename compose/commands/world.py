@@ -11,7 +11,7 @@ import zenoh
 from compose import kill
 from compose.local import handed
 from compose.record import WORLD_JOURNAL, folder_for, read
-from compose.scenario import check_rate, load, run_name
+from compose.scenario import check_rate, run_name, setting
 from compose.status import ENDED, STOPPED, UserError
 from compose.stop import stop_by_signal, stop_with_launcher
 from compose.telling import break_off, conclude, going_on, progress
@@ -31,7 +31,10 @@ def main(options: argparse.Namespace) -> int:
     if options.launched:
         scenario = handed()
     else:
-        scenario = load(options.scenario, seed=options.seed, faults=options.fault)
+        found = setting(options.scenario, options.fault)
+        if found.file.kill:
+            raise UserError(f"{options.scenario}: kill: a world starts nobody again; `tandem run` does")
+        scenario = found.seeded(options.seed)
     check_rate(scenario, options.rate)
     inbox = Inbox("tandem world")
     if options.launched:

@@ -1,0 +1,67 @@
+"""`tandem watch`: a page on which a run is watched."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import threading
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from compose.beside import OVER
+from compose.lab import need
+from compose.status import ENDED, UserError
+from protocol.inbox import one_line
+
+if TYPE_CHECKING:
+    from compose.watch.site import Site
+
+NICENESS = 10
+"""the mission's processes come first"""
+
+
+def main(options: argparse.Namespace) -> int:
+    """Serve the page until Ctrl-C."""
+    need("starlette", "uvicorn")
+    from compose.watch import server, site  # noqa: PLC0415  # there may be no extra
+
+    if options.record is None:
+        shown = site.of_network(options.connect or [DEFAULT_ENDPOINT])
+    elif options.connect:
+        raise UserError("--connect: a record needs no network; leave out one of the two")
+    else:
+        shown = site.of_record(options.record) if options.launched else site.of_folder(options.record)
+    for note in shown.notes:
+        print(one_line(f"tandem watch: {note}"), file=sys.stderr)
+    try:
+        taken = server.bound(options.port)
+    except server.CannotServe as error:
+        raise UserError(f"--port: {options.port} cannot be had: {error.strerror}") from None
+    if shown.waiting:
+        os.nice(NICENESS)
+
+    def ready(stop: Callable[[], None]) -> None:
+        if options.launched:
+            threading.Thread(target=_follow_launcher, args=(shown, stop), daemon=True).start()
+        print(
+            server.address(taken) if options.launched else f"{server.address(taken)} until Ctrl-C", flush=True
+        )
+
+    shown.start()
+    try:
+        server.serve(shown, taken, ready)
+    finally:
+        shown.stop()
+    return ENDED
+
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+
+
+def _follow_launcher(shown: Site, stop: Callable[[], None]) -> None:
+    """The launcher says when the mission is over, and holds standard input open as long as the page stays."""
+    while said := os.read(0, 64):
+        if OVER in said:
+            shown.concluded()
+    stop()

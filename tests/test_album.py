@@ -1,0 +1,388 @@
+"""The paper's figures of any record: what they show is what the journals say, and any run has them."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from matplotlib.artist import Artist
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle
+from msgspec.structs import replace
+
+from agent.phases.encounter import compared
+from compose.commands.figures import _draw as draw_all
+from compose.figures import PICTURES, album, hypotheses, manoeuvre, over_time, phase_one, steps, trajectory
+from compose.figures.pair import Pair, account
+from compose.figures.sheet import Absent
+from compose.figures.style import look
+from compose.inline import play
+from compose.record import estimates, first_claim, read
+from compose.scenario import load, parse
+from protocol.journal import read as frames
+from protocol.messages import Drive
+from protocol.mission import Role
+from protocol.wire import MalformedFrame, decode, encode
+from tests.commands import PAPER_1, SECTION_IV, several_pairs, tandem
+from tests.reference import REFERENCE
+from world.scenario import Scenario
+
+NOISE = "[mission.noise]\nanchor_sigma = 0.01\nmutual_sigma = 0.01\n"
+FAULT = "[[fault]]\nloss = 0.6\ndelay = [0, 5]\n"
+RANDOM = f"""
+name = "random"
+seed = 3
+{SECTION_IV}
+[[robot]]
+id = "a"
+anchor = [0.0, 0.0]
+[[robot]]
+id = "b"
+anchor = [10.0, 0.0]
+"""
+LETTER = RANDOM.replace("seed = 3", "seed = 5").replace(
+    "[[robot]]", f'{NOISE}[planner]\nvariant = "paper"\n[[robot]]', 1
+)
+BRIEF = PAPER_1.replace("seed = 1", "seed = 1\nmax_ticks = 4")
+
+
+def scenario_of(name: str) -> Scenario:
+    match name:
+        case "paper-1" | "paper-2" | "noisy":
+            return load(name)
+        case "assured":
+            return parse(RANDOM, name)
+        case "faulty":
+            return parse(RANDOM + FAULT, name)
+        case "letter":
+            return parse(LETTER, name)
+        case "undecided":
+            return parse(BRIEF, name)
+        case _:
+            return parse(several_pairs(2), name)
+
+
+@pytest.fixture(scope="session")
+def records(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("records")
+
+
+def recorded(name: str, records: Path) -> Path:
+    folder = records / name
+    if not (folder / "world.journal").exists():
+        folder.mkdir(exist_ok=True)
+        play(scenario_of(name), folder)
+    return folder
+
+
+def pair(folder: Path, number: int = 0) -> Pair:
+    record = read(folder)
+    a, b = record.scenario.pairs()[number]
+    robots = [record.scenario.robots[place].id for place in (a, b)]
+    return Pair(record, a, b, {robot: account(folder, robot) for robot in robots})
+
+
+def found(figure: Figure, gid: str) -> list[Artist]:
+    """What is drawn under names of that form."""
+    return figure.findobj(lambda one: re.fullmatch(gid, one.get_gid() or "") is not None)
+
+
+def line(figure: Figure, gid: str) -> list[tuple[float, float]]:
+    """The points of the first line of that name."""
+    one = found(figure, gid)[0]
+    assert isinstance(one, Line2D)
+    return list(zip(np.asarray(one.get_xdata()).tolist(), np.asarray(one.get_ydata()).tolist(), strict=True))
+
+
+def radii(figure: Figure, gid: str) -> list[float]:
+    return [one.radius for one in found(figure, gid) if isinstance(one, Circle)]
+
+
+def drawn(figure: Figure | Absent) -> Figure:
+    assert isinstance(figure, Figure), figure
+    return figure
+
+
+def cut(journal: Path, count: int) -> None:
+    """Leave the first `count` frames of it, and a torn one."""
+    left = list(frames(journal))[:count]
+    journal.write_bytes(b"".join([msgpack.packb(frame) for frame in left]) + b"\xc4\x10torn")
+
+
+def copied(folder: Path, there: Path) -> Path:
+    for journal in folder.glob("*.journal"):
+        (there / journal.name).write_bytes(journal.read_bytes())
+    return there
+
+
+# --- what they show -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("name", "simulation"), [("paper-1", 0), ("paper-2", 1)])
+def test_a_plan_shows_each_candidate_and_the_axis_of_each_two_and_the_choice(
+    name: str, simulation: int, records: Path
+) -> None:
+    told, computed = pair(recorded(name, records)), REFERENCE.sims[simulation]
+    (figure,) = [drawn(one) for one in manoeuvre.draw(told).values()]
+    farewell = told.record.farewells["b"]
+    assert farewell.candidates is not None
+    count = farewell.candidates[1]
+    assert len(found(figure, r"candidate-\d+")) == count == len(computed.d_i)
+    assert len(found(figure, r"bisector-\d+-\d+")) == count * (count - 1) // 2
+    places = [line(figure, f"candidate-{i + 1}")[0] for i in range(count)]
+    start, end = line(figure, "chosen-ends")
+    rho = told.mutual[computed.k_second][1]
+    assert radii(figure, "rho") == [rho]
+    assert [math.dist(start, place) for place in places] == pytest.approx([rho] * count)
+    assert sorted(math.dist(end, place) for place in places) == pytest.approx(sorted(computed.d_i), abs=1e-6)
+    for i, j in combinations(range(count), 2):
+        for point in line(figure, f"bisector-{i + 1}-{j + 1}"):
+            assert math.dist(point, places[i]) == pytest.approx(math.dist(point, places[j]))
+    ((omega, value),) = line(figure, "cost-chosen")
+    assert omega == farewell.last_turn_rate == pytest.approx(computed.w2, abs=1e-9)
+    assert value == farewell.separation_m2 == pytest.approx(computed.J, abs=1e-9)
+    assert max(value for _, value in line(figure, "cost")) == value
+    assert min(math.dist(end, point) for point in line(figure, "reach")) < 1e-9
+
+
+def test_what_is_compared_is_what_was_chosen_from(records: Path) -> None:
+    told = pair(recorded("assured", records))
+    (one,) = [one for role in ("b", "a") for one in manoeuvre.planned(told, role)][:1]
+    ways = compared(one.plan.question, told.mission, "assured")
+    row, column = np.unravel_index(np.argmax(ways.value), ways.value.shape)
+    assert (ways.reach.v[row, 0], ways.reach.omega[column]) == (one.plan.drive.v, one.plan.drive.omega)
+    drive = told.drive(one.plan.question.mover, one.tick)
+    assert drive is not None
+    assert (drive.v, drive.omega, drive.state) == (one.plan.drive.v, one.plan.drive.omega, "last-manoeuvre")
+    (figure,) = [drawn(one) for one in manoeuvre.draw(told).values()][:1]
+    assert len(found(figure, r"reach-\d+")) == len(ways.reach.v) - 1
+
+
+def test_a_plan_of_a_is_seen_from_a(records: Path) -> None:
+    """A distance is the same from either end: b's candidates about a, and a's about b."""
+    told = pair(recorded("paper-1", records))
+    ((_, plan),) = manoeuvre.planned(told, "b")
+    turned = manoeuvre.scene(plan._replace(question=plan.question._replace(mover="a")))
+    straight = manoeuvre.scene(plan)
+    for one, other in zip(turned.others, straight.others, strict=True):
+        apart = math.dist((one.x, one.y), (turned.mover.x, turned.mover.y))
+        assert apart == pytest.approx(math.dist((other.x, other.y), (straight.mover.x, straight.mover.y)))
+        assert straight.mover.y == pytest.approx(0.0)
+        assert turned.mover.y == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "role", "ranges", "against"),
+    [
+        ("paper-1", "a", [0, 5], "3, 4"),
+        ("paper-1", "b", [0, 1, 2], "2"),
+        ("paper-2", "a", [0, 1], "2"),
+        ("paper-2", "b", [0, 1, 2], "2"),
+    ],
+)
+def test_phase_1_shows_both_branches_the_rings_and_what_rules_one_out(
+    name: str, role: Role, ranges: Sequence[int], against: str, records: Path
+) -> None:
+    told = pair(recorded(name, records))
+    figure = drawn(phase_one.draw(told, role))
+    rho = told.anchor_ranges(role)
+    assert radii(figure, r"rho-\d") == [rho[tick] for tick in ranges]
+    assert radii(figure, "range") == [3.0]
+    assert len(found(figure, "rejected")) == 1
+    assert [one.get_linestyle() for one in found(figure, "rejected") if isinstance(one, Line2D)] == [":"]
+    anchor = told.robot(role).anchor
+    true = [math.hypot(p.x - anchor.x, p.y - anchor.y) for p in told.truth(role)]
+    kept = line(figure, "kept")
+    assert [math.hypot(x, y) for x, y in kept] == pytest.approx(true[: len(kept)])
+    words = [one.get_label() for one in found(figure, "contradicted")]
+    assert words == [f"what rules it out: $k$ = {against}"]
+    assert len(line(figure, "ranged-kept")) == len(ranges)
+    if (name, role) == ("paper-2", "a"):
+        assert radii(figure, "rho-virtual") == pytest.approx([true[2]])
+
+
+@pytest.mark.parametrize(("name", "ticks"), [("paper-1", [46, 47, 48]), ("paper-2", [106, 109, 110])])
+def test_the_encounter_has_a_panel_for_each_mutual_range(name: str, ticks: list[int], records: Path) -> None:
+    told = pair(recorded(name, records))
+    assert steps.steps(told) == ticks
+    figure = drawn(steps.draw(told))
+    assert len(figure.axes) == 3
+    for axes, tick in zip(figure.axes, ticks, strict=True):
+        assert axes.get_title(loc="left").startswith(f"({ticks.index(tick) + 1}) $k$ = {tick}, ")
+        assert axes.get_aspect() == 1.0
+        truth = [told.truth(role)[tick] for role in ("a", "b")]
+        ((x, y), (other_x, other_y)) = line(figure, f"rho-{tick}")
+        assert [(x, y), (other_x, other_y)] == [(p.x, p.y) for p in truth]
+
+
+def test_the_trajectory_has_both_paths_the_ranges_and_the_orbits(records: Path) -> None:
+    told = pair(recorded("paper-1", records))
+    figure = trajectory.draw(told)
+    for role in ("a", "b"):
+        assert line(figure, f"path-{role}") == [(p.x, p.y) for p in told.truth(role)]
+        assert radii(figure, f"range-{role}") == [3.0]
+        assert radii(figure, f"orbit-{role}") == [6.5]
+    assert len(line(figure, "path-a")) == 49
+    (axes,) = figure.axes
+    assert axes.get_aspect() == 1.0
+
+
+def test_ranges_are_those_that_were_measured_and_contact_is_shaded(records: Path) -> None:
+    told = pair(recorded("paper-2", records))
+    figure = over_time.ranges(told)
+    assert line(figure, "mutual-range") == [
+        (k, rho) for k, (_, rho) in enumerate(told.mutual) if rho is not None
+    ]
+    assert [k for k, _ in line(figure, "mutual-range")] == [106, 109, 110]
+    assert [k for k, _ in line(figure, "anchor-range-a")][:2] == [0, 1]
+    assert line(figure, "separation") == list(enumerate(told.separations))
+    names = {one.get_gid() for one in found(figure, r"contact-.*")}
+    assert names == {"contact-106-106", "contact-109-110"}
+
+
+@pytest.mark.parametrize("name", ["paper-1", "noisy"])
+def test_the_last_error_is_that_of_the_claim(name: str, records: Path) -> None:
+    told = pair(recorded(name, records))
+    figure = drawn(over_time.errors(told))
+    for place, role in enumerate("ab"):
+        claim = first_claim(told.record, place)
+        assert claim is not None
+        for what, error in (("position", claim.position_error), ("heading", claim.heading_error)):
+            tick, value = line(figure, f"{what}-{role}")[-1]
+            assert tick == claim.tick
+            assert value == pytest.approx(error, abs=1e-16)
+    assert {axes.get_yscale() for axes in figure.axes} == {"log"}
+    assert bool(found(figure, "position-sigma-a")) == (name == "noisy")
+
+
+def test_under_noise_a_panel_has_each_hypothesis_that_the_journal_tells_of(records: Path) -> None:
+    folder = recorded("noisy", records)
+    told = pair(folder)
+    figure = drawn(hypotheses.draw(told))
+    shown = {int(one.get_gid().split("-")[1]) for one in found(figure, r"truth-.*")}  # type: ignore[union-attr]
+    assert len(shown) == len(figure.axes) > 1
+    for role in ("a", "b"):
+        held = estimates(folder, role)
+        for tick in shown:
+            marks = [
+                line(figure, f"hypothesis-{tick}-{role}-{i + 1}")[0] for i in range(len(held[tick].world))
+            ]
+            assert marks == [(pose.x, pose.y) for pose in held[tick].world]
+            assert not found(figure, f"hypothesis-{tick}-{role}-{len(marks) + 1}")
+
+
+def test_the_letters_plan_under_noise_is_drawn_in_bs_own_frame(records: Path) -> None:
+    told = pair(recorded("letter", records))
+    ((_, plan),) = manoeuvre.planned(told, "b")
+    (figure,) = [drawn(one) for one in manoeuvre.draw(told).values()]
+    assert len(found(figure, r"candidate-\d+")) == len(plan.question.candidates)
+    assert any("in b's own frame" in text.get_text() for text in figure.texts)
+
+
+# --- whatever the run -----------------------------------------------------------------------------------
+
+ABSENT = {"undecided": {"phase-1-a", "plan-a-b", "encounter-a-b"}}
+
+
+@pytest.mark.parametrize("name", ["assured", "faulty", "noisy", "letter", "undecided"])
+def test_each_kind_is_drawn_of_each_run_or_says_why_not(
+    name: str, records: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = pair(recorded(name, records))
+    draw_all(told, [kind for kind in PICTURES if kind != "robot"], ["svg"], tmp_path)
+    out, err = capsys.readouterr()
+    made = {path.stem for path in tmp_path.iterdir()}
+    missing = ABSENT.get(name, set())
+    assert set(re.findall(r"^tandem figures: no (\S+): [^\n]+$", err, re.MULTILINE)) == missing
+    assert len(err.splitlines()) == len(missing)
+    always = {"trajectory-a-b", "phase-1-a", "phase-1-b", "encounter-a-b", "ranges-a-b", "errors-a-b"}
+    assert made >= always - missing
+    assert any(name.startswith("plan-") for name in made) == ("plan-a-b" not in missing)
+    assert sorted(out.splitlines()) == sorted(map(str, tmp_path.iterdir()))
+
+
+def test_every_pair_has_figures_of_its_own(records: Path) -> None:
+    folder = recorded("pairs", records)
+    names = []
+    with look(symbols=True):
+        for number in range(2):
+            names += [name for name, _ in album.pictures(pair(folder, number), "trajectory")]
+            names += [name for name, _ in album.pictures(pair(folder, number), "phase-1")]
+    assert names == ["trajectory-a-b", "phase-1-a", "phase-1-b", "trajectory-c-d", "phase-1-c", "phase-1-d"]
+
+
+@pytest.mark.parametrize("ticks", [0, 1, 30, 47])
+def test_a_torn_record_is_drawn_to_the_tear(ticks: int, records: Path, tmp_path: Path) -> None:
+    folder = copied(recorded("paper-1", records), tmp_path)
+    cut(folder / "world.journal", 1 + 2 * ticks)
+    cut(folder / "agent-b.journal", 1 + 3 * min(ticks, 20))
+    told = pair(folder)
+    figures = {name: one for kind in PICTURES[:-1] for name, one in album.pictures(told, kind)}
+    path = drawn(figures["trajectory-a-b"])
+    assert len(line(path, "path-a")) == max(1, ticks)
+    assert any("the record breaks off" in text.get_text() for text in path.texts)
+    assert isinstance(figures["encounter-a-b"], Absent) == (ticks < 47)
+    assert isinstance(figures["plan-a-b"], Absent)
+    assert isinstance(figures["phase-1-a"], Absent) == (ticks < 30)
+    if ticks == 47:
+        assert len(drawn(figures["encounter-a-b"]).axes) == 1
+
+
+def test_a_journal_of_another_version_is_followed_to_where_it_decides_otherwise(
+    records: Path, tmp_path: Path
+) -> None:
+    folder = copied(recorded("paper-1", records), tmp_path)
+    path = folder / "agent-b.journal"
+    path.write_bytes(b"".join([msgpack.packb(_turned(frame, 20)) for frame in frames(path)]))
+    assert len(pair(folder).minds("b")) == 20
+    ended = tandem("figures", folder, "--only", "plan", "--format", "svg")
+    assert ended.status == 3
+    assert ended.err == (
+        "tandem figures: of b only up to where its journal can be followed: on record it decided otherwise "
+        "at tick 20: the journal is another version's\n"
+        "tandem figures: no plan-a-b: no last manoeuvre was planned\n"
+    )
+
+
+def _turned(frame: bytes, tick: int) -> bytes:
+    """A Drive of that tick with a bit more of a turn."""
+    try:
+        drive = decode(frame, Drive)
+    except MalformedFrame:
+        return frame
+    return encode(replace(drive, omega=drive.omega + 1e-12)) if drive.tick == tick else frame
+
+
+# --- the command ----------------------------------------------------------------------------------------
+
+
+def test_the_same_record_gives_the_same_bytes_in_each_format(records: Path, tmp_path: Path) -> None:
+    folder = copied(recorded("paper-1", records), tmp_path)
+    runs: list[dict[str, bytes]] = []
+    for _ in range(2):
+        ended = tandem("figures", folder, "--only", "plan")
+        assert (ended.status, ended.err) == (0, "")
+        names = [f"plan-b-47.{ending}" for ending in ("svg", "pdf", "png")]
+        assert ended.out.splitlines() == [str(folder / "figures" / name) for name in names]
+        runs.append({path.name: path.read_bytes() for path in (folder / "figures").iterdir()})
+        assert set(runs[-1]) == set(names)
+    assert runs[0] == runs[1]
+    svg = runs[0]["plan-b-47.svg"].decode()
+    assert {f"candidate-{i}" for i in range(1, 5)} <= set(re.findall(r'id="([^"]+)"', svg))
+    assert "<dc:date>" not in svg
+    assert b"CreationDate" not in runs[0]["plan-b-47.pdf"]
+
+
+@pytest.mark.parametrize("words", [("--only", "plans"), ("--format", "jpg")])
+def test_what_is_no_picture_or_format_is_refused(words: Sequence[Any], tmp_path: Path) -> None:
+    ended = tandem("figures", tmp_path, *words)
+    assert ended.status == 2
+    assert re.fullmatch(r"tandem figures: argument [^\n]+\n", ended.err), ended.err

@@ -1,0 +1,445 @@
+"""A record opens in other people's tools: run.mcap in MCAP's readers and viewers, tables in pandas' like."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import csv
+import io
+import json
+import random
+import socket
+import struct
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from signal import Signals
+from typing import Any
+
+import msgpack
+import msgspec
+import pyarrow.parquet as pq
+import pytest
+import websockets
+from mcap.reader import make_reader
+from mcap.records import Schema
+from mcap.writer import Writer
+from mcap_protobuf.decoder import DecoderFactory
+
+from compose import inline
+from compose.audit.replay import replay
+from compose.export.folder import export
+from compose.local import free_endpoint
+from compose.record import WORLD_JOURNAL, agent_journal, estimates, read
+from compose.scenario import load
+from protocol import journal
+from protocol.messages import Estimate, Sense
+from protocol.wire import decode
+from tests.commands import BOUND_S, Command, tandem
+from tests.doctor import complaints
+from tests.replays import journals_of, killed
+from world.referee import errors
+
+FILES = ["frames.csv", "run.mcap", "ticks.csv", "ticks.parquet"]
+A, B = agent_journal("a"), agent_journal("b")
+
+
+@pytest.fixture(scope="module")
+def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The record of paper-1, exported."""
+    folder = tmp_path_factory.mktemp("paper-1")
+    inline.play(load("paper-1"), folder)
+    export(folder, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def noisy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The record of a run under noise, exported."""
+    folder = tmp_path_factory.mktemp("noisy")
+    inline.play(load("noisy"), folder)
+    export(folder, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def faulty(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The record of a run in which reports are lost and late, exported."""
+    folder = tmp_path_factory.mktemp("faulty")
+    inline.play(load("random", faults=["loss=0.3, delay=0..2"]), folder)
+    export(folder, folder)
+    return folder
+
+
+def told(path: Path) -> Iterator[tuple[Any, Any, Any]]:
+    """Schema, channel and message of each message, in the order of the file."""
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        yield from reader.iter_messages(log_time_order=False)
+
+
+def seen(path: Path, topic: str) -> list[Any]:
+    """What viewers see on a topic."""
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        return [one.decoded_message for one in reader.iter_decoded_messages(topics=[topic])]
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(path.read_text())))
+
+
+def on_disk(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.glob("*.journal")}
+
+
+# --- run.mcap -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("record", ["paper_1", "faulty"])
+def test_every_journaled_frame_is_there_and_the_journals_can_be_made_anew(
+    record: str, request: pytest.FixtureRequest
+) -> None:
+    folder: Path = request.getfixturevalue(record)
+    assert journals_of(folder / "run.mcap") == on_disk(folder)
+
+
+@pytest.mark.parametrize("record", ["paper_1", "faulty"])
+def test_the_doctor_has_no_complaint(record: str, request: pytest.FixtureRequest) -> None:
+    assert complaints(request.getfixturevalue(record) / "run.mcap") == []
+
+
+def test_the_doctor_finds_what_is_wrong(tmp_path: Path) -> None:
+    path = tmp_path / "wrong.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="mine")
+        schema = writer.register_schema("x", "jsonschema", b"{}")
+        channel = writer.register_channel("/x", "json", schema)
+        for time in (2, 1):
+            writer.add_message(channel, log_time=time, data=b"{}", publish_time=time)
+        writer.finish()  # type: ignore[no-untyped-call]
+    assert [one.split(":")[0] for one in complaints(path)] == [
+        "header",
+        "a message of 1 ns after one of 2 ns",
+    ]
+
+
+def test_every_viewers_channel_decodes_with_its_own_schema(faulty: Path) -> None:
+    with (faulty / "run.mcap").open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        topics = {
+            channel.topic
+            for _, channel, _ in told(faulty / "run.mcap")
+            if not channel.topic.startswith("/journal/")
+        }
+        decoded = Counter(
+            (
+                one.channel.topic,
+                one.schema and one.schema.name,
+                type(one.decoded_message).DESCRIPTOR.full_name,
+            )
+            for one in reader.iter_decoded_messages(topics=list(topics))
+        )
+    assert {topic for topic, _, _ in decoded} == topics
+    assert all(schema == kind for _, schema, kind in decoded)
+    ticks = len(read(faulty).moments)
+    assert decoded["/a/pose", "foxglove.PoseInFrame", "foxglove.PoseInFrame"] == ticks
+    assert {name for _, name, _ in decoded} == {
+        f"foxglove.{kind}"
+        for kind in ("FrameTransforms", "Log", "PoseInFrame", "PosesInFrame", "SceneUpdate")
+    }
+
+
+def test_every_frame_is_as_its_channels_schema_says(faulty: Path) -> None:
+    """An array of its name and its fields, to which the schema gives titles."""
+    for schema, channel, message in told(faulty / "run.mcap"):
+        if channel.topic.startswith("/journal/"):
+            assert (schema.encoding, schema.name.split(".")[0]) == ("jsonschema", "tandem")
+            whole = json.loads(schema.data)
+            form = whole["$defs"][schema.name.split(".")[1]]
+            said = msgpack.unpackb(message.data)
+            assert form["minItems"] <= len(said) <= form["maxItems"]
+            assert said[0] in form["prefixItems"][0]["enum"]
+    sense = next(one for one, _, _ in told(faulty / "run.mcap") if one.name == "tandem.Sense")
+    titles = [item["title"] for item in json.loads(sense.data)["$defs"]["Sense"]["prefixItems"]]
+    assert titles == ["kind", *Sense.__struct_fields__]
+
+
+def test_times_are_those_of_the_simulation_and_of_when_a_frame_was_journaled(faulty: Path) -> None:
+    period = read(faulty).scenario.mission.period
+    late = 0
+    for _, channel, message in told(faulty / "run.mcap"):
+        tick = round(message.log_time / 1e9 / period)
+        assert message.log_time == message.publish_time == round(tick * period * 1e9)
+        if channel.topic.endswith(("/sense", "/drive", "/estimate")):
+            assert msgpack.unpackb(message.data)[1] == tick
+        if channel.topic.endswith("/report"):
+            late += msgpack.unpackb(message.data)[1] < tick
+    assert late > 0
+
+
+def test_viewers_see_robots_where_they_were_and_their_trails(paper_1: Path) -> None:
+    record = read(paper_1)
+    poses, trails = seen(paper_1 / "run.mcap", "/b/pose"), seen(paper_1 / "run.mcap", "/b/trail")
+    transforms = seen(paper_1 / "run.mcap", "/tf")
+    assert len(poses) == len(trails) == len(transforms) == len(record.moments)
+    for moment, pose, trail, tf in zip(record.moments, poses, trails, transforms, strict=True):
+        truth = moment.truth.poses[1]
+        assert (pose.frame_id, pose.pose.position.x, pose.pose.position.y) == ("world", truth.x, truth.y)
+        assert str(trail.poses[-1]) == str(pose.pose)
+        assert len(trail.poses) == moment.truth.tick + 1
+        frames = {one.child_frame_id: one for one in tf.transforms}
+        assert set(frames) == {"a", "b", "a/anchor", "b/anchor"}
+        assert (frames["b"].translation.x, frames["b"].rotation.z) == (truth.x, pose.pose.orientation.z)
+        assert (frames["b/anchor"].translation.x, frames["b/anchor"].translation.y) == (10.0, 0.0)
+
+
+def test_viewers_see_anchors_with_their_ranges_and_contact_while_there_is_any(paper_1: Path) -> None:
+    (stage,) = seen(paper_1 / "run.mcap", "/stage")
+    assert [entity.id for entity in stage.entities] == ["a/anchor", "b/anchor"]
+    for entity, x in zip(stage.entities, (0.0, 10.0), strict=True):
+        assert entity.cubes[0].pose.position.x == x
+        reach = entity.lines[0].points
+        assert all(abs((point.x - x) ** 2 + point.y**2 - 9.0) < 1e-9 for point in reach)
+    linked = [bool(one.entities[0].lines) for one in seen(paper_1 / "run.mcap", "/contact")]
+    assert linked.index(True) == 46
+    assert linked[46:] == [True] * 3
+
+
+def test_viewers_see_what_a_robot_holds_possible_in_the_frame_that_it_knows(paper_1: Path) -> None:
+    held = estimates(paper_1, "a")
+    shown = seen(paper_1 / "run.mcap", "/a/hypotheses")
+    for one, poses in zip(held, shown, strict=True):
+        expected = one.world or one.local
+        assert poses.frame_id == ("world" if one.world else "a/anchor")
+        assert [(pose.position.x, pose.position.y) for pose in poses.poses] == [(p.x, p.y) for p in expected]
+    assert {poses.frame_id for poses in shown} == {"world", "a/anchor"}
+
+
+def test_viewers_see_an_ellipse_where_there_is_a_covariance(noisy: Path) -> None:
+    held = estimates(noisy, "a")
+    shown = seen(noisy / "run.mcap", "/a/belief")
+    for one, belief in zip(held, shown, strict=True):
+        (entity,) = belief.entities
+        assert len(entity.arrows) == len(one.world or one.local)
+        assert bool(entity.lines) == (one.covariance is not None and bool(one.world))
+    assert any(one.entities[0].lines for one in shown)
+
+
+def test_viewers_read_what_happens(paper_1: Path) -> None:
+    lines = [line.message for line in seen(paper_1 / "run.mcap", "/log")]
+    assert "a and b are in range of each other: 2.95 m" in lines
+    assert lines[-1] == "The mission ends: localised"
+
+
+def test_the_same_record_gives_the_same_bytes(paper_1: Path, tmp_path: Path) -> None:
+    first = {name: (paper_1 / name).read_bytes() for name in FILES}
+    ended = tandem("export", paper_1, "--out", tmp_path / "elsewhere")
+    assert (ended.status, ended.err) == (0, "")
+    assert ended.out.splitlines() == [
+        str(tmp_path / "elsewhere" / name)
+        for name in ("run.mcap", "frames.csv", "ticks.csv", "ticks.parquet")
+    ]
+    assert {name: (tmp_path / "elsewhere" / name).read_bytes() for name in FILES} == first
+    assert sorted(path.name for path in (tmp_path / "elsewhere").iterdir()) == FILES
+
+
+# --- tables ---------------------------------------------------------------------------------------------
+
+
+def test_ticks_as_a_table_are_those_of_ticks_csv_with_what_was_held_possible(noisy: Path) -> None:
+    table = pq.ParquetFile(noisy / "ticks.parquet").read().to_pylist()
+    rows = rows_of(noisy / "ticks.csv")
+    assert len(table) == len(rows) > 0
+    held = {robot: {one.tick: one for one in estimates(noisy, robot)} for robot in "ab"}
+    for row, line in zip(table, rows, strict=True):
+        for name, text in line.items():
+            assert ("" if row[name] is None else str(row[name])) == text
+        one: Estimate = held[row["robot"]][row["tick"]]
+        assert [msgspec.convert(pose, dict) for pose in row["world"]] == [
+            {"x": pose.x, "y": pose.y, "heading": pose.heading} for pose in one.world
+        ]
+        if one.world:
+            truth = type(one.world[0])(row["x"], row["y"], row["heading"])
+            assert (row["position_error_m"], row["heading_error_rad"]) == errors(one.world[0], truth)
+            assert row["estimate_x"] == one.world[0].x
+        assert row["cov_xx"] == (one.covariance.xx if one.covariance and one.world else None)
+        assert (row["nees"] is None) == (row["cov_xx"] is None)
+    assert {row["verdict"] for row in table} == {None, "localised"}
+
+
+def test_frames_are_rows_with_their_fields_by_name(faulty: Path) -> None:
+    frames = {path.name: list(journal.read(path)) for path in faulty.glob("*.journal")}
+    rows = rows_of(faulty / "frames.csv")
+    assert Counter(row["journal"] for row in rows) == {name: len(ones) for name, ones in frames.items()}
+    for row in rows:
+        frame = frames[row["journal"]][int(row["place"])]
+        assert int(row["bytes"]) == len(frame)
+        assert row["kind"] == msgpack.unpackb(frame[5:])[0]
+        if row["kind"] == "sense":
+            said, sense = json.loads(row["message"]), decode(frame, Sense)
+            assert (said["robot"], said["anchor_range"]) == (sense.robot, sense.anchor_range)
+
+
+# --- records that are not whole, or come from several hosts -------------------------------------------
+
+
+def test_journals_gathered_from_several_hosts_export_as_one(paper_1: Path, tmp_path: Path) -> None:
+    gathered = tmp_path / "gathered"
+    gathered.mkdir()
+    for name in (WORLD_JOURNAL, A, B):  # each from a host of its own: nothing else comes along
+        (gathered / name).write_bytes((paper_1 / name).read_bytes())
+    assert tandem("export", gathered).status == 0
+    assert {name: (gathered / name).read_bytes() for name in FILES} == {
+        name: (paper_1 / name).read_bytes() for name in FILES
+    }
+
+
+@pytest.mark.parametrize("name", [WORLD_JOURNAL, A])
+def test_a_torn_journal_is_exported_to_the_tear(name: str, faulty: Path, tmp_path: Path) -> None:
+    torn = tmp_path / "torn"
+    torn.mkdir()
+    for path in faulty.glob("*.journal"):
+        (torn / path.name).write_bytes(path.read_bytes())
+    size = (torn / name).stat().st_size * 2 // 3
+    (torn / name).write_bytes((torn / name).read_bytes()[:size])
+    whole = journal.packed(journal.read(torn / name))
+    ended = tandem("export", torn)
+    assert (ended.status, ended.err) == (0, f"{name} ends with {size - len(whole)} bytes of a torn write\n")
+    assert journals_of(torn / "run.mcap") == on_disk(faulty) | {name: whole}
+    assert complaints(torn / "run.mcap") == []
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_what_a_killed_process_leaves_is_exported_and_replayed(number: int, tmp_path: Path) -> None:
+    what, whole = killed(random.Random(number), tmp_path)
+    assert whole, what
+
+
+def test_a_robot_that_has_left_no_journal_is_named(paper_1: Path, tmp_path: Path) -> None:
+    for name in (WORLD_JOURNAL, A):
+        (tmp_path / name).write_bytes((paper_1 / name).read_bytes())
+    ended = tandem("export", tmp_path)
+    assert (ended.status, ended.err) == (3, "agent-b.journal is missing\n")
+    assert set(journals_of(tmp_path / "run.mcap")) == {WORLD_JOURNAL, A}
+    assert len(seen(tmp_path / "run.mcap", "/b/pose")) == 49
+
+
+def test_what_is_no_record_and_what_cannot_be_written_are_refused(paper_1: Path, tmp_path: Path) -> None:
+    ended = tandem("export", tmp_path)
+    assert (ended.status, ended.out) == (2, "")
+    assert ended.err == f"tandem export: {tmp_path} holds no record: there is no world.journal\n"
+    (tmp_path / "file").touch()
+    ended = tandem("export", paper_1, "--out", tmp_path / "file")
+    assert ended.status == 2
+    assert ended.err.startswith(f"tandem export: --out: {tmp_path / 'file'} cannot be written: ")
+
+
+# --- a run that exports, and one that is served -----------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", [[], ["--in-process"]])
+def test_a_run_exports_at_its_end_if_it_is_told_to(mode: list[str], paper_1: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    ended = tandem("run", "paper-1", "-q", "--out", out, "--export", *mode)
+    assert (ended.status, ended.out, ended.err) == (0, "localised after 48 ticks\n", "")
+    assert {name: (out / name).read_bytes() for name in FILES} == {
+        name: (paper_1 / name).read_bytes() for name in FILES
+    }
+    assert tandem("run", "paper-1", "-q", "--export", *mode).status == 2
+
+
+async def watched(port: int, until: str) -> tuple[dict[str, str], Counter[str], list[str]]:
+    """Topics with their schemas, messages on each, and log lines, until one says `until`."""
+    async with websockets.connect(
+        f"ws://127.0.0.1:{port}", subprotocols=[websockets.Subprotocol("foxglove.sdk.v1")], max_size=None
+    ) as link:
+        assert link.subprotocol == "foxglove.sdk.v1"
+        topics: dict[int, dict[str, Any]] = {}
+        count: Counter[str] = Counter()
+        lines: list[str] = []
+        while until not in lines:
+            frame = await link.recv()
+            if isinstance(frame, str):
+                said = json.loads(frame)
+                if said["op"] == "advertise":
+                    topics |= {channel["id"]: channel for channel in said["channels"]}
+                    wanted = [{"id": one["id"], "channelId": one["id"]} for one in said["channels"]]
+                    await link.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+            elif frame[0] == 1:
+                number, _ = struct.unpack_from("<IQ", frame, 1)
+                channel = topics[number]
+                count[channel["topic"]] += 1
+                if channel["topic"] == "/log":
+                    lines.append(log_message(channel, frame[13:]))
+        return {one["topic"]: one["schemaName"] for one in topics.values()}, count, lines
+
+
+def log_message(channel: dict[str, Any], data: bytes) -> str:
+    schema = Schema(
+        data=base64.b64decode(channel["schema"]), encoding="protobuf", id=1, name=channel["schemaName"]
+    )
+    decoder = DecoderFactory().decoder_for("protobuf", schema)
+    assert decoder is not None
+    return str(decoder(data).message)
+
+
+def test_a_viewer_sees_a_run_while_it_is_played_and_to_its_end(tmp_path: Path) -> None:
+    port = int(free_endpoint().rsplit(":", 1)[1])
+    out = tmp_path / "out"
+    with Command("run", "paper-1", "-q", "--rate", "10", "--foxglove", str(port), "--out", out) as run:
+        run.until_says(f"what Foxglove's viewers show at ws://127.0.0.1:{port}")
+        topics, count, lines = asyncio.run(
+            asyncio.wait_for(watched(port, "The mission ends: localised"), BOUND_S)
+        )
+        run.until_says("until Ctrl-C")
+        assert run.tell(Signals.SIGINT)
+        ended = run.ended()
+    assert ended.status == 0
+    assert "\nlocalised after 48 ticks\n" in ended.out
+    assert topics["/tf"] == "foxglove.FrameTransforms"
+    assert topics["/journal/agent-a/sense"] == "tandem.Sense"
+    assert {"/stage", "/a/pose", "/b/trail", "/contact", "/a/belief", "/journal/world/drive"} <= set(count)
+    assert "a and b are in range of each other: 2.95 m" in lines
+    again, _ = replay(out)
+    assert again.differences == ()
+
+
+def test_who_comes_late_sees_what_stands_and_the_end() -> None:
+    port = int(free_endpoint().rsplit(":", 1)[1])
+    with Command("run", "paper-1", "-q", "--foxglove", str(port)) as run:
+        run.until_says("until Ctrl-C")
+
+        async def look() -> set[str]:
+            async with websockets.connect(
+                f"ws://127.0.0.1:{port}", subprotocols=[websockets.Subprotocol("foxglove.sdk.v1")]
+            ) as link:
+                topics: dict[int, str] = {}
+                came: set[str] = set()
+                while not {"/stage", "/a/pose", "/b/trail", "/contact"} <= came:
+                    frame = await link.recv()
+                    if isinstance(frame, str):
+                        said = json.loads(frame)
+                        if said["op"] == "advertise":
+                            topics |= {one["id"]: one["topic"] for one in said["channels"]}
+                            wanted = [{"id": one, "channelId": one} for one in topics]
+                            await link.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+                    elif frame[0] == 1:
+                        came.add(topics[struct.unpack_from("<I", frame, 1)[0]])
+                return came
+
+        assert asyncio.run(asyncio.wait_for(look(), BOUND_S))
+        run.tell(Signals.SIGINT)
+        assert run.ended().status == 0
+
+
+def test_a_port_that_is_taken_is_said_before_anything_moves(tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        ended = tandem("run", "paper-1", "-q", "--foxglove", str(port), "--out", tmp_path / "out")
+    assert (ended.status, ended.out) == (2, "")
+    assert ended.err.startswith(f"tandem run: --foxglove: port {port} cannot be served: ")
+    assert list((tmp_path / "out").iterdir()) == []

@@ -1,0 +1,209 @@
+"""A record is played once more: what is on it follows to the bit, and one bit that does not is shown."""
+
+from __future__ import annotations
+
+import random
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+
+from compose import inline
+from compose.audit.replay import replayed
+from compose.record import WORLD_JOURNAL, agent_journal
+from compose.scenario import load, parse
+from protocol import journal
+from protocol.messages import Briefing, Drive, End, Estimate, Farewell, Missed, Report, Sense
+from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode, encode
+from tests.commands import journals, tandem
+from tests.same_plans import scenario as random_plan
+from tests.test_audit import kept
+from world.scenario import Scenario
+
+KINDS = Scenario | Briefing | Sense | Report | Drive | Estimate | Missed | End | Farewell
+HEAD = 5
+"""bytes of a frame before its body"""
+TRIES = 100
+A, B = agent_journal("a"), agent_journal("b")
+UNUSED = {"name", "seed", "max_ticks"}
+"""of a scenario whose starts are given and whose sensors are exact: nothing on record follows from them"""
+
+
+@pytest.fixture(scope="module")
+def paper_1() -> dict[str, list[bytes]]:
+    return kept(load("paper-1"))
+
+
+@pytest.mark.parametrize(
+    "played",
+    [
+        *[pytest.param(load(name), id=name) for name in ("paper-1", "paper-2")],
+        *[pytest.param(load("random", seed=seed), id=f"random-{seed}") for seed in range(5)],
+        *[
+            pytest.param(parse(random_plan(random.Random(seed)), "plan"), id=f"plan-{seed}")
+            for seed in range(1, 6)
+        ],
+    ],
+)
+def test_what_was_played_in_one_process_is_replayed_to_the_bit(played: Scenario) -> None:
+    again = replayed(kept(played))
+    assert (again.differences, again.tears) == ((), ())
+    assert again.checks > 2 * len(played.robots) * again.ticks > 0
+
+
+def test_what_was_played_as_processes_is_replayed_to_the_bit(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert tandem("run", "random", "--fault", "loss=0.3, delay=0..2", "-q", "--out", out).status == 0
+    before = journals(out)
+    ended = tandem("replay", out)
+    assert (ended.status, ended.err) == (0, "")
+    assert ended.out.startswith("random: as recorded, to the bit, in ")
+    assert journals(out) == before
+
+
+# --- one bit --------------------------------------------------------------------------------------------
+
+
+def flips(record: dict[str, list[bytes]], tries: int) -> Iterator[tuple[str, int, bytes]]:
+    """Frames with one bit of their message's values flipped and a good CRC, each with where it stands."""
+    draw = random.Random(6)
+    places = [(name, i) for name, frames in record.items() for i in range(len(frames))]
+    while tries:
+        name, place = draw.choice(places)
+        frame = record[name][place]
+        body = bytearray(frame[HEAD:])
+        body[draw.randrange(len(body))] ^= 1 << draw.randrange(8)
+        flipped = frame[:1] + zlib.crc32(body).to_bytes(4, "big") + bytes(body)
+        if _matters(frame, flipped):
+            tries -= 1
+            yield name, place, flipped
+
+
+def _matters(frame: bytes, flipped: bytes) -> bool:
+    """Whether `flipped` says something else, from which something follows, or of which there is a copy."""
+    before = decode(frame, KINDS, MAX_FRAME_BYTES)
+    try:
+        after = decode(flipped, KINDS, MAX_FRAME_BYTES)
+    except MalformedFrame:
+        return False  # it says nothing at all: no journal with it can be read
+    if isinstance(before, Scenario) and isinstance(after, Scenario):
+        unused = {name: getattr(before, name) for name in UNUSED}
+        return encode(replace(after, **unused)) != encode(before)
+    return encode(after) != encode(before)
+
+
+@pytest.mark.parametrize("name", ["paper-1", "paper-2"])
+def test_one_flipped_bit_in_any_value_that_matters_is_found(name: str) -> None:
+    record = kept(load(name))
+    for book, place, flipped in flips(record, TRIES // 2):
+        frames = [*record[book][:place], flipped, *record[book][place + 1 :]]
+        again = replayed(record | {book: frames})
+        was, now = (decode(one, KINDS, MAX_FRAME_BYTES) for one in (record[book][place], flipped))
+        assert again.differences, (book, place, was, now)
+
+
+def planted(folder: Path, name: str, kind: type, tick: int, **fields: Any) -> tuple[Any, Any]:
+    """Change a message in the journal of that name; the message before and after."""
+    frames = list(journal.read(folder / name))
+    told = [decode(frame, KINDS, MAX_FRAME_BYTES) for frame in frames]
+    (place,) = (i for i, one in enumerate(told) if isinstance(one, kind) and getattr(one, "tick", 0) == tick)
+    changed = replace(told[place], **fields)
+    frames[place] = encode(changed)
+    (folder / name).write_bytes(journal.packed(frames))
+    return told[place], changed
+
+
+@pytest.fixture
+def record(tmp_path: Path) -> Path:
+    inline.play(load("paper-1"), tmp_path / "record")
+    return tmp_path / "record"
+
+
+def test_the_first_difference_is_shown_with_tick_robot_field_and_both_values(record: Path) -> None:
+    before, after = planted(record, A, Drive, 12, v=0.125)
+    ended = tandem("replay", record)
+    assert (ended.status, ended.err) == (1, "")
+    lines = ended.out.splitlines()
+    assert lines[:2] == [
+        "paper-1: not as recorded",
+        f"tick 12, a, Drive v: recorded {after.v!r}, recomputed {before.v!r}",
+    ]
+    assert lines[2] == "and 1 more, which `tandem audit` tells"
+
+
+def test_a_value_is_shown_however_deep_it_stands(record: Path) -> None:
+    told = [decode(frame, KINDS, MAX_FRAME_BYTES) for frame in journal.read(record / A)]
+    sense = next(one for one in told if isinstance(one, Sense) and one.contacts)
+    (contact,) = sense.contacts
+    assert contact.range is not None
+    planted(record, A, Sense, sense.tick, contacts=(replace(contact, range=contact.range + 1e-15),))
+    (first, *_) = tandem("replay", record).out.splitlines()[1:]
+    assert first == (
+        f"tick {sense.tick}, a, Sense contacts[0].range: "
+        f"recorded {contact.range + 1e-15!r}, recomputed {contact.range!r}"
+    )
+
+
+def test_a_record_whose_drives_the_world_has_otherwise_is_found_there(record: Path) -> None:
+    frames = list(journal.read(record / WORLD_JOURNAL))
+    drive = decode(frames[1 + 2 * 20 + 1], Drive)
+    assert (drive.robot, drive.tick) == ("b", 20)
+    frames[1 + 2 * 20 + 1] = encode(replace(drive, omega=drive.omega + 1e-9))
+    (record / WORLD_JOURNAL).write_bytes(journal.packed(frames))
+    ended = tandem("replay", record)
+    assert ended.status == 1
+    assert ended.out.splitlines()[1].startswith("tick 20, b, Drive omega: recorded ")
+
+
+# --- what breaks off ------------------------------------------------------------------------------------
+
+
+def cut(path: Path, size: int) -> int:
+    """Leave so many bytes of a journal; how many of them are no whole frame."""
+    path.write_bytes(path.read_bytes()[:size])
+    return size - len(journal.packed(journal.read(path)))
+
+
+@pytest.mark.parametrize("name", [WORLD_JOURNAL, A, B])
+def test_a_record_that_is_torn_anywhere_is_replayed_to_the_tear(
+    name: str, paper_1: dict[str, list[bytes]]
+) -> None:
+    for count in range(1, len(paper_1[name]), 3):
+        again = replayed(paper_1 | {name: paper_1[name][:count]})
+        assert again.differences == ()
+        assert again.tears
+
+
+def test_where_it_tears_is_told(record: Path) -> None:
+    rest = cut(record / A, 4000)
+    last = [decode(frame, KINDS, MAX_FRAME_BYTES) for frame in journal.read(record / A)][-1]
+    (record / B).unlink()
+    ended = tandem("replay", record)
+    assert (ended.status, ended.err) == (0, "")
+    as_recorded, *tears = ended.out.splitlines()
+    assert as_recorded.startswith("paper-1: as recorded, to the bit, in 49 ticks ")
+    assert rest > 0
+    assert tears == [
+        "no tick, b: it has left no journal",
+        f"tick {last.tick}, a: its journal breaks off here, expected End and Farewell",
+        f"agent-a.journal ends with {rest} bytes of a torn write",
+    ]
+
+
+def test_a_frame_of_a_wrong_length_is_no_tear(record: Path) -> None:
+    frames = list(journal.read(record / A))
+    data = bytearray((record / A).read_bytes())
+    data[len(journal.packed(frames[:20])) + 1] = 0xFF
+    (record / A).write_bytes(data)
+    ended = tandem("replay", record)
+    assert (ended.status, ended.out) == (2, "")
+    assert ended.err.startswith(f"tandem replay: {record / A}: damaged at byte ")
+
+
+def test_what_is_no_record_is_refused(tmp_path: Path) -> None:
+    ended = tandem("replay", tmp_path)
+    assert (ended.status, ended.out) == (2, "")
+    assert ended.err == f"tandem replay: {tmp_path} holds no record: there is no world.journal\n"

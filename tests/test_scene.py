@@ -1,0 +1,141 @@
+"""What there is to see of a run, whoever tells of it: whole records, and torn and incomplete ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from agent.mind import WORDS
+from compose import inline
+from compose.record import read as read_record
+from compose.scenario import load
+from compose.scene.fates import fates
+from compose.scene.recorded import Performance, read
+from compose.scene.stage import of_scenario
+from compose.scene.words import DOING, SEEKING, doing
+from protocol import journal
+from protocol.motion import compose, wrap
+from world.history import history
+
+
+@pytest.fixture(scope="module")
+def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("paper-1")
+    inline.play(load("paper-1"), folder)
+    return folder
+
+
+def said(shown: Performance, kind: str) -> list[tuple[int, str]]:
+    return [(event.tick, event.text) for one in shown.scenes for event in one.events if event.kind == kind]
+
+
+def test_a_scene_shows_where_everyone_is_and_what_everyone_does(paper_1: Path) -> None:
+    record, shown = read_record(paper_1), read(paper_1)
+    assert [one.tick for one in shown.scenes] == [moment.truth.tick for moment in record.moments]
+    for moment, one in zip(record.moments, shown.scenes, strict=True):
+        for player, pose in zip(one.players, moment.truth.poses, strict=True):
+            drive = moment.drives[player.robot]
+            assert player.pose == replace(pose, heading=wrap(pose.heading))
+            assert player.drive is not None
+            assert (player.drive.v, player.drive.state) == (drive.v, drive.state)
+
+
+def test_the_first_contact_of_paper_1_is_told_at_tick_46(paper_1: Path) -> None:
+    shown = read(paper_1)
+    assert said(shown, "contact") == [(46, "a and b are in range of each other: 2.95 m")]
+    assert said(shown, "anchor")[0] == (0, "a is in its anchor's range: 2.68 m")
+    assert shown.scenes[46].player("b").doing == "b stands still; waits for a's second range"
+    assert said(shown, "candidates")[-1] == (48, "b's candidates fall from 4 to 1")
+    assert said(shown, "end") == [(48, "The mission ends: localised")]
+
+
+def test_local_poses_stand_where_the_robot_is_in_the_frame_that_the_stage_gives(paper_1: Path) -> None:
+    shown = read(paper_1)
+    for player in shown.scenes[20].players:
+        frame = shown.stage.seat(player.robot).frame
+        assert frame is not None
+        assert player.held is not None
+        assert player.pose is not None
+        place = compose(frame, player.held.local[0])
+        assert (place.x, place.y) == pytest.approx((player.pose.x, player.pose.y), abs=1e-9)
+
+
+def test_without_the_world_s_journal_the_robots_tell_what_they_know(paper_1: Path, tmp_path: Path) -> None:
+    for path in paper_1.glob("agent-*.journal"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    shown, whole = read(tmp_path), read(paper_1)
+    assert [seat.id for seat in shown.stage.robots] == ["a", "b"]
+    assert all(player.pose is None for one in shown.scenes for player in one.players)
+    assert said(shown, "contact") == said(whole, "contact")
+    assert shown.scenes[47].passages == whole.scenes[47].passages
+
+
+def test_without_a_robot_s_journal_what_it_sensed_follows_from_the_world_s(
+    paper_1: Path, tmp_path: Path
+) -> None:
+    for name in ("world.journal", "agent-b.journal"):
+        (tmp_path / name).write_bytes((paper_1 / name).read_bytes())
+    shown, whole = read(tmp_path), read(paper_1)
+    for one, other in zip(shown.scenes, whole.scenes, strict=True):
+        assert one.player("a").anchor_range == other.player("a").anchor_range
+        assert one.player("a").contacts == other.player("a").contacts
+        assert one.player("b") == other.player("b")
+        assert one.passages == other.passages
+
+
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.77])
+def test_a_torn_record_is_shown_up_to_the_tear(paper_1: Path, tmp_path: Path, share: float) -> None:
+    for path in paper_1.glob("*.journal"):
+        data = path.read_bytes()
+        (tmp_path / path.name).write_bytes(data[: 1500 + int(share * (len(data) - 1500))])
+    shown, whole = read(tmp_path), read(paper_1)
+    assert shown.end is None
+    assert shown.notes == ()
+    known = [
+        one
+        for one in shown.scenes
+        if all(player.held and player.pose and player.drive for player in one.players)
+    ]
+    assert known == [one for one in whole.scenes if one.tick in {other.tick for other in known}]
+
+
+def test_a_folder_without_a_journal_holds_nothing_to_see(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="holds no journal"):
+        read(tmp_path)
+
+
+def test_every_report_has_the_fate_that_the_air_gave_it(tmp_path: Path) -> None:
+    faults = ["loss=0.3, delay=0..3, corrupt=0.2, duplicate=0.3, reorder=0.2", "a->b: reports_per_tick=0.7"]
+    scenario = load("random", seed=3, faults=faults)
+    inline.play(scenario, tmp_path)
+    shown = read(tmp_path)
+    flights = fates(shown.scenes, over=True)
+    assert {flight.fate for flight in flights} == {"heard", "late", "damaged", "lost"}
+    told = history(journal.read(tmp_path / "world.journal"), tmp_path)
+    airs = {sender: [tick.world.air[place] for tick in told.ticks] for place, sender in enumerate(("a", "b"))}
+    lost = {
+        (passage.sender, passage.tick)
+        for one in shown.scenes
+        for passage in one.passages
+        if passage.what == "lost"
+    }
+    for flight in flights:
+        air = list(enumerate(airs[flight.sender]))
+        assert list(flight.heard) == [k for k, one in air for sent in one.heard if sent == flight.tick]
+        assert list(flight.damaged) == [k for k, one in air for sent in one.damaged if sent == flight.tick]
+        came = flight.heard or flight.damaged
+        assert (flight.fate == "lost") == (not came)
+        under_way = flight.tick in [one.tick for one in airs[flight.sender][-1].flying]
+        assert came or under_way or (flight.sender, flight.tick) in lost
+
+
+def test_every_state_has_its_sentence() -> None:
+    assert set(WORDS.values()) | {"localised"} == {*DOING, *SEEKING}
+    seat = of_scenario(load("paper-1")).seat("b")
+    for phase in (1, 2, 3):
+        for state in (*DOING, *SEEKING):
+            sentence = doing(seat, phase, state, None)
+            assert sentence.startswith("b ")
+            assert "{" not in sentence

@@ -1,0 +1,445 @@
+"""The page on which a run is watched: what it shows, in a real browser, and whom it asks.
+
+The browser is Debian's: `apt-get install chromium`. Where there is none, its tests skip.
+With TANDEM_SHOTS=DIR, each of them leaves a picture of what it saw there.
+"""
+
+from __future__ import annotations
+
+import http.client
+import os
+import re
+import shutil
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from signal import SIGINT, SIGKILL
+
+import pytest
+from playwright.sync_api import Browser, Page, expect, sync_playwright
+
+from compose import inline
+from compose.scenario import load
+from tests.commands import BOUND_S, PAPER_1, SECTION_IV, Command, journals, processes_of, tandem, until, world
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+browsing = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium: apt-get install chromium")
+BOUND_MS = 1000 * BOUND_S
+expect.set_options(timeout=BOUND_MS)
+SERVER_GONE = "ERR_CONNECTION_REFUSED|ERR_INCOMPLETE_CHUNKED_ENCODING"
+"""what a browser says where a test has stopped the server"""
+PATIENT = ("--patience", "600")
+"""a mission that waits while browsers start"""
+SCRUB = "(scrub, tick) => { scrub.value = tick; scrub.dispatchEvent(new Event('input')); }"
+Open = Callable[..., Page]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with sync_playwright() as playwright:
+        found = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield found
+        found.close()
+
+
+@pytest.fixture
+def opened(browser: Browser) -> Iterator[Open]:
+    """Opens pages; in the end none must have complained, or asked anybody but the server."""
+    complaints: list[str] = []
+    hosts: set[str] = set()
+    pages: list[Page] = []
+
+    def opens(address: str, *, width: int = 1280, height: int = 800, dark: bool = False) -> Page:
+        page = browser.new_page(
+            viewport={"width": width, "height": height}, color_scheme="dark" if dark else "light"
+        )
+        pages.append(page)
+        page.on("console", lambda said: complaints.append(said.text) if said.type == "error" else None)
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.on("request", lambda request: hosts.add(re.sub(r"^(\w+://[^/:]+).*", r"\1", request.url)))
+        page.set_default_timeout(BOUND_MS)
+        page.goto(address)
+        return page
+
+    yield opens
+    for page in pages:
+        page.close()
+    assert [said for said in complaints if not re.search(SERVER_GONE, said)] == []
+    assert hosts <= {"http://127.0.0.1"}
+
+
+@pytest.fixture(scope="module")
+def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("watch") / "paper-1"
+    folder.mkdir()
+    inline.play(load("paper-1"), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def address(paper_1: Path) -> Iterator[str]:
+    """Of the page on the record of paper-1."""
+    with watching(paper_1) as (_, found):
+        yield found
+
+
+@contextmanager
+def watching(*arguments: str | Path) -> Iterator[tuple[Command, str]]:
+    with Command("watch", *arguments) as command:
+        yield command, address_of(command)
+
+
+def address_of(command: Command) -> str:
+    command.until_says("http://127.0.0.1:")
+    found = re.search(r"http://\S+", command.out)
+    assert found is not None
+    return found[0]
+
+
+def until_shown(page: Page, tick: int) -> None:
+    expect(page.locator("body")).to_have_attribute("data-shown", str(tick))
+
+
+def shot(page: Page, name: str) -> None:
+    if folder := os.environ.get("TANDEM_SHOTS"):
+        page.screenshot(path=Path(folder) / f"{name}.png")
+
+
+def picture(page: Page) -> str:
+    """The plane, pixel by pixel."""
+    return str(page.evaluate("document.getElementById('canvas').toDataURL()"))
+
+
+# --- a record ---------------------------------------------------------------------------------------
+
+
+@browsing
+def test_a_record_scrubbed_to_tick_46_shows_the_first_contact(opened: Open, address: str) -> None:
+    page = opened(f"{address}#tick=45")
+    until_shown(page, 45)
+    expect(page.locator(".card[data-robot=a] dd").first).to_contain_text("b is not in range")
+    box = page.locator("#line").bounding_box()
+    assert box is not None
+    for share in range(900, 1000):
+        page.mouse.click(box["x"] + share / 1000 * box["width"], box["y"] + 20)
+        if page.locator("body").get_attribute("data-tick") == "46":
+            break
+    until_shown(page, 46)
+    expect(page.locator(".card[data-robot=a] dd").first).to_contain_text("b 2.95 m")
+    expect(page.locator(".card[data-robot=b] .doing")).to_have_text(
+        "b stands still; waits for a's second range"
+    )
+    expect(page.locator("#log .now").first).to_contain_text("a and b are in range of each other: 2.95 m")
+    expect(page.locator("#live")).to_contain_text("Tick 46. a and b are in range of each other: 2.95 m")
+    expect(page.locator("#scrub")).to_have_attribute("aria-valuetext", re.compile("^tick 46 of 48"))
+    assert "tick=46" in page.url
+    shot(page, "tick-46")
+
+
+@browsing
+def test_with_the_truth_hidden_only_what_a_robot_knows_is_there(opened: Open, address: str) -> None:
+    page = opened(f"{address}#tick=20")
+    until_shown(page, 20)
+    plane, truth = page.locator("#canvas"), picture(page)
+    expect(plane).to_have_attribute("aria-label", re.compile(r"a at 2\.66, 5\.93 m"))
+    page.locator("#truth").uncheck()
+    page.locator("#robot").select_option("b")
+    expect(page.locator("#seen")).to_contain_text("only what b knows")
+    expect(plane).to_have_attribute("aria-label", "The plane at tick 20: b nowhere known")
+    expect(page.locator(".card")).to_have_count(1)
+    expect(page.locator(".card dl")).not_to_contain_text("9.31")
+    assert picture(page) != truth
+    assert "robot=b" in page.url
+    assert "truth=0" in page.url
+    shot(page, "truth-hidden")
+    page.locator("#truth").check()
+    page.locator("#robot").select_option("")
+    expect(page.locator(".card")).to_have_count(2)
+    expect(page.locator("#seen")).to_have_text("")
+    until(lambda: picture(page) == truth, "the truth is back")
+    shot(page, "truth-shown")
+
+
+@browsing
+def test_all_of_it_goes_by_keyboard_alone(opened: Open, address: str) -> None:
+    page = opened(f"{address}#tick=0")
+    until_shown(page, 0)
+    press = page.keyboard.press
+    for key, tick in (
+        ("ArrowRight", 1),
+        ("Shift+ArrowRight", 11),
+        ("ArrowLeft", 10),
+        ("End", 48),
+        (",", 47),
+        (",", 46),
+        (".", 47),
+        ("Home", 0),
+    ):
+        press(key)
+        until_shown(page, tick)
+    expect(page.locator("#live")).to_contain_text("Tick 0. a is in its anchor's range: 2.68 m")
+    press("t")
+    expect(page.locator("#truth")).not_to_be_checked()
+    press("r")
+    expect(page.locator("#robot")).to_have_value("a")
+    expect(page.locator("#seen")).to_contain_text("only what a knows")
+    press("a")
+    press("t")
+    expect(page.locator("#robot")).to_have_value("")
+    before = picture(page)
+    press("+")
+    until(lambda: picture(page) != before, "it is nearer")
+    press("f")
+    until(lambda: picture(page) == before, "all fits in again")
+    press("n")
+    until(lambda: picture(page) != before, "the robots from near")
+    press("?")
+    expect(page.locator("#keys")).to_be_visible()
+    shot(page, "keys")
+    press("Escape")
+    expect(page.locator("#keys")).not_to_be_visible()
+    for _ in range(8):
+        press("]")
+    press("Space")
+    until_shown(page, 48)
+    expect(page.locator("#play")).to_have_attribute("aria-label", "Play")
+    press("Tab")
+    focused = page.evaluate("document.activeElement.tagName")
+    assert focused in {"A", "INPUT", "BUTTON", "SELECT"}
+
+
+@browsing
+def test_it_can_be_read_on_360_pixels(opened: Open, address: str) -> None:
+    page = opened(f"{address}#tick=48", width=360, height=740)
+    until_shown(page, 48)
+    assert page.evaluate("document.documentElement.scrollWidth") <= 360
+    for part in ("#canvas", "#play", "#back", "#on", "#truth", "#robot", "#line"):
+        expect(page.locator(part)).to_be_in_viewport()
+    shot(page, "narrow")
+    page.locator("#log").scroll_into_view_if_needed()
+    expect(page.locator("#log")).to_contain_text("The mission ends: localised")
+
+
+@browsing
+def test_it_is_dark_where_the_system_is(opened: Open, address: str) -> None:
+    page = opened(f"{address}#tick=47", dark=True)
+    until_shown(page, 47)
+    shot(page, "dark")
+    background = page.evaluate("getComputedStyle(document.documentElement).backgroundColor")
+    assert max(map(int, re.findall(r"\d+", background)[:3])) < 64
+    light = opened(f"{address}#tick=47")
+    until_shown(light, 47)
+    assert picture(light) != picture(page)
+
+
+@browsing
+def test_fifty_robots_are_shown(opened: Open, tmp_path: Path) -> None:
+    scenario = tmp_path / "fifty.toml"
+    robots = [
+        f'[[robot]]\nid = "{role}{i}"\npeer = "{peer}{i}"\n'
+        f"anchor = [{40.0 * (i % 5) + offset}, {25.0 * (i // 5)}]\n"
+        for i in range(25)
+        for role, peer, offset in (("a", "b", 0.0), ("b", "a", 10.0))
+    ]
+    scenario.write_text(f'name = "fifty"\nseed = 5\n{SECTION_IV}' + "".join(robots))
+    record = tmp_path / "record"
+    record.mkdir()
+    inline.play(load(str(scenario)), record)
+    with watching(record) as (_, where):
+        page = opened(f"{where}#tick=20")
+        until_shown(page, 20)
+        expect(page.locator(".entry")).to_have_count(50)
+        expect(page.locator(".card .name")).to_have_text(["a0", "b0"])
+        shot(page, "fifty")
+        page.locator(".entry", has_text=re.compile("^b7 ")).click()
+        expect(page.locator(".card .name")).to_have_text(["a7", "b7"])
+        assert "robot=b7" in page.url
+        shot(page, "fifty-b7")
+
+
+@browsing
+def test_lost_late_and_damaged_reports_are_told(opened: Open, tmp_path: Path) -> None:
+    record = tmp_path / "record"
+    record.mkdir()
+    inline.play(load("noisy", faults=["loss=0.3, delay=0..3, corrupt=0.1, duplicate=0.2"]), record)
+    with watching(record) as (_, where):
+        page = opened(f"{where}#tick=26")
+        until_shown(page, 26)
+        expect(page.locator("#log")).to_contain_text("is lost")
+        expect(page.locator("#log")).to_contain_text("ticks late")
+        expect(page.locator(".odds li").first).to_contain_text("%")
+        page.keyboard.press("n")
+        shot(page, "faults")
+        page.locator("#radio").uncheck()
+        expect(page.locator("#log")).not_to_contain_text("is lost")
+
+
+@browsing
+def test_the_records_in_a_folder_are_listed(opened: Open, paper_1: Path, tmp_path: Path) -> None:
+    shutil.copytree(paper_1, tmp_path / "whole")
+    shutil.copytree(paper_1, tmp_path / "torn")
+    for torn in (tmp_path / "torn").glob("*.journal"):
+        torn.write_bytes(torn.read_bytes()[:4000])
+    with watching(tmp_path) as (_, where):
+        page = opened(where)
+        links = page.locator("#list a")
+        expect(links).to_have_count(2)
+        expect(links.first).to_contain_text("breaks off at tick")
+        shot(page, "list")
+        links.last.click()
+        expect(page.locator("#status")).to_have_text("localised after 48 ticks")
+        page.locator("#home").click()
+        expect(links).to_have_count(2)
+
+
+@browsing
+def test_a_campaign_shows_its_cells_and_its_figures(opened: Open, tmp_path: Path) -> None:
+    spec = tmp_path / "speeds.toml"
+    spec.write_text(
+        'name = "speeds"\nscenario = "random"\ntrials = 2\nseed = 1\n'
+        '[[axis]]\nfield = "mission.max_speed"\nvalues = [0.5, 1.0]\n'
+    )
+    folder = tmp_path / "campaign"
+    with Command("sweep", spec, "--out", folder, "--workers", "1", "-q", "--no-audit") as sweep:
+        assert sweep.ended(4 * BOUND_S).status == 0
+    with watching(folder) as (_, where):
+        page = opened(where)
+        expect(page.locator("#title")).to_have_text("speeds")
+        expect(page.locator("tbody tr")).to_have_count(2)
+        expect(page.locator("tbody tr").first).to_contain_text("100.0 %")
+        expect(page.locator("#campaign")).to_contain_text("Trials are not recorded one by one")
+        expect(page.locator("#campaign img").first).to_have_js_property("complete", value=True)
+        shot(page, "campaign")
+
+
+# --- live -------------------------------------------------------------------------------------------
+
+
+@browsing
+def test_a_mission_is_followed_to_its_end_from_its_journals_and_from_the_network(
+    opened: Open, tmp_path: Path
+) -> None:
+    scenario, record = tmp_path / "paper-1.toml", tmp_path / "record"
+    scenario.write_text(PAPER_1)
+    with (
+        world(scenario, "--out", record, *PATIENT) as (_, endpoint),
+        world("paper-2", *PATIENT) as (_, other),
+        Command("agent", "a", "--connect", endpoint, "--out", record, *PATIENT) as a,
+        Command("agent", "b", "--connect", other),
+        watching(record) as (_, of_journals),
+        watching("--connect", endpoint, "--connect", other) as (_, of_network),
+    ):
+        a.until_answered("a", record)
+        files, heard = opened(of_journals), opened(of_network)
+        expect(heard.locator("#list a")).to_have_count(2)
+        heard.locator("#list a", has_text="paper-1").click()
+        for page in (files, heard):
+            until_shown(page, 0)
+            expect(page.locator("#status")).to_have_text("● runs, tick 0")
+            expect(page.locator("#follow")).to_be_visible()
+        with Command("agent", "b", "--connect", endpoint, "--out", record) as b:
+            for page in (files, heard):
+                expect(page.locator("#status")).to_have_text("localised after 48 ticks")
+                until_shown(page, 48)
+                expect(page.locator("#log .now").last).to_have_text(re.compile("The mission ends: localised"))
+            shot(files, "live-journals")
+            shot(heard, "live-network")
+            for page in (files, heard):  # whatever was skipped is there afterwards
+                for tick in (0, 5, 46):
+                    page.locator("#scrub").evaluate(SCRUB, tick)
+                    until_shown(page, tick)
+                    expect(page.locator(".card[data-robot=a] dd").first).to_contain_text("anchor")
+            assert b.ended().status == 0
+
+
+@browsing
+def test_run_watch_stays_until_ctrl_c_and_leaves_the_record_that_it_would_have_left(
+    opened: Open, paper_1: Path, tmp_path: Path
+) -> None:
+    with Command("run", "paper-1", "--watch", "--out", tmp_path / "record", "-q") as run:
+        page = opened(address_of(run))
+        run.until_says("the page stays at")
+        expect(page.locator("#status")).to_have_text("localised after 48 ticks")
+        page.keyboard.press("Home")
+        until_shown(page, 0)
+        page.keyboard.press("End")
+        until_shown(page, 48)
+        shot(page, "run-watch")
+        run.tell(SIGINT)
+        assert run.ended().status == 0
+        assert "localised after 48 ticks" in run.out
+        expect(page.locator("#status")).to_have_text("the server has gone")
+    assert journals(tmp_path / "record") == journals(paper_1)
+
+
+# --- the command ------------------------------------------------------------------------------------
+
+
+def test_the_page_ends_with_whoever_launched_it(tmp_path: Path) -> None:
+    with Command("run", "paper-1", "--watch", "--out", tmp_path / "record", "-q") as run:
+        run.until_says("the page stays at")
+        assert processes_of(tmp_path / "record")
+        run.tell(SIGKILL)
+        run.ended()
+        until(lambda: not processes_of(tmp_path / "record"), "nobody is left")
+
+
+def test_the_server_answers_to_its_own_name_only_and_seals_what_it_sends(address: str) -> None:
+    host = address.removeprefix("http://").rstrip("/")
+    connection = http.client.HTTPConnection(host, timeout=BOUND_S)
+    connection.request("GET", "/", headers={"Host": "elsewhere.example"})
+    assert connection.getresponse().status == 400
+    connection.close()
+    connection.request("GET", "/")
+    answer = connection.getresponse()
+    assert answer.status == 200
+    assert (answer.getheader("content-security-policy") or "").startswith("default-src 'self'")
+    connection.close()
+    for path in ("/page/../server.py", "/page/%2e%2e/server.py", "/api/figures/x.svg", "/api/shows/none"):
+        connection.request("GET", path)
+        assert connection.getresponse().status == 404
+        connection.close()
+
+
+def test_ctrl_c_ends_the_page_with_somebody_watching(paper_1: Path) -> None:
+    with watching(paper_1) as (command, where):
+        host = where.removeprefix("http://").rstrip("/")
+        connection = http.client.HTTPConnection(host, timeout=BOUND_S)
+        connection.request("GET", "/api/news?show=paper-1")
+        assert connection.getresponse().readline().startswith(b"data: ")
+        command.tell(SIGINT)
+        assert command.ended().status == 0
+        assert command.err == ""
+        connection.close()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["nowhere"], "nowhere is no folder"),
+        (["."], ". holds neither a record, nor a campaign, nor folders with records"),
+        (
+            [".", "--connect", "tcp/127.0.0.1:7447"],
+            "--connect: a record needs no network; leave out one of the two",
+        ),
+        (["--connect", "here"], "--connect: 'here' is no endpoint; one looks like tcp/127.0.0.1:7447"),
+        (
+            [".", "--port", "65536"],
+            "argument --port: 65536 is not a port, from 0 (one that is free) to 65535",
+        ),
+    ],
+)
+def test_a_mistake_is_one_line(arguments: list[str], complaint: str, tmp_path: Path) -> None:
+    ended = tandem("watch", *arguments, cwd=tmp_path)
+    assert (ended.status, ended.out, ended.err) == (2, "", f"tandem watch: {complaint}\n")
+
+
+def test_a_port_that_is_taken_is_one_line(paper_1: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        for command in (["watch", str(paper_1)], ["run", "paper-1", "--watch"]):
+            ended = tandem(*command, "--port", port)
+            assert ended.status == 2
+            said = f"tandem {command[0]}: --port: {port} cannot be had: Address already in use\n"
+            assert ended.err == said
