@@ -80,6 +80,7 @@ class Live:
             self._next = ready[-1].tick + 1
         if self.asked:
             self.asked = False
+            self._channels.again()
             for view in (self._views.standing(), *self._views.again()):
                 self._channels.view(*view, nanoseconds(stage, max(0, self._next - 1)))
         return nanoseconds(stage, self._next)

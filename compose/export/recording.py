@@ -42,6 +42,7 @@ class Channels:
     def __init__(self, context: Context) -> None:
         self._context = context
         self._frames: dict[tuple[str, type], Channel] = {}
+        self._latest: dict[Channel, tuple[bytes, int]] = {}
         self._views: dict[str, Channel] = {}
 
     def frame(self, one: Journaled, at: int) -> None:
@@ -51,6 +52,12 @@ class Channels:
         if channel is None:
             channel = self._frames[one.journal, kind] = self._of_frames(one.journal, kind)
         channel.log(one.body, log_time=at)
+        self._latest[channel] = (one.body, at)
+
+    def again(self) -> None:
+        """The latest journaled frame on each channel, for who has come since."""
+        for channel, (body, at) in self._latest.items():
+            channel.log(body, log_time=at)
 
     def _of_frames(self, journal: str, kind: type[msgspec.Struct]) -> Channel:
         described = Schema(name=f"tandem.{kind.__name__}", encoding="jsonschema", data=schema(kind))

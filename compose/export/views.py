@@ -86,28 +86,33 @@ class Views:
     def of(self, scene: Scene) -> Iterator[Shown]:
         """One tick."""
         yield from self.passing(scene)
-        yield from self.again()
+        yield from self._whole(scene)
 
     def again(self) -> Iterator[Shown]:
-        """The latest tick, but for what happened in it."""
-        scene = self._latest
-        if scene is None:
-            return
+        """The latest tick, for who has come since."""
+        if self._latest is not None:
+            yield from self._lines(self._latest)
+            yield from self._whole(self._latest)
+
+    def passing(self, scene: Scene) -> Iterator[Shown]:
+        """One tick, of which nobody is to see more than what happens in it."""
+        self._latest = scene
+        for player in scene.players:
+            if player.pose is not None:
+                self._trails[player.robot].append(player.pose)
+        yield from self._lines(scene)
+
+    def _lines(self, scene: Scene) -> Iterator[Shown]:
+        at = _timestamp(nanoseconds(self.stage, scene.tick))
+        for event in scene.events:
+            yield Shown("/log", _line(event, at))
+
+    def _whole(self, scene: Scene) -> Iterator[Shown]:
         at = _timestamp(nanoseconds(self.stage, scene.tick))
         yield Shown("/tf", fox.FrameTransforms(transforms=list(self._transforms(scene, at))))
         for player in scene.players:
             yield from self._robot(player, at)
         yield Shown("/contact", fox.SceneUpdate(entities=list(self._contacts(scene, at))))
-
-    def passing(self, scene: Scene) -> Iterator[Shown]:
-        """One tick, of which nobody is to see more than what happens in it."""
-        self._latest = scene
-        at = _timestamp(nanoseconds(self.stage, scene.tick))
-        for player in scene.players:
-            if player.pose is not None:
-                self._trails[player.robot].append(player.pose)
-        for event in scene.events:
-            yield Shown("/log", _line(event, at))
 
     # --- where everyone is ---
 
