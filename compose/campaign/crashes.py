@@ -21,10 +21,10 @@ ABOVE = 95.0
 
 
 def axis_of_ticks(results: Results) -> int | None:
-    """Which axis is of the tick of a kill; none if there is none."""
+    """Which axis is of the tick of a kill, the first of its fields; none if there is none."""
     for place, axis in enumerate(results.campaign.axes):
-        whole = all(isinstance(value, int) for values in axis.values for value in values)
-        if len(axis.values) > 1 and whole and all(map(TICK, axis.fields)):
+        whole = all(isinstance(values[0], int) for values in axis.values)
+        if len(axis.values) > 1 and whole and TICK(axis.fields[0]):
             return place
     return None
 
