@@ -26,6 +26,7 @@ from scipy.stats import binomtest  # type: ignore[import-untyped]
 from compose.campaign import figures, report, run, spec
 from compose.campaign.cells import Refused, cells, setting_of, trial_seed
 from compose.campaign.summary import wilson
+from compose.campaign.table import schema_of
 from compose.campaign.worker import PLAY
 from compose.commands.sweep import status_of
 from compose.scenario import load
@@ -533,6 +534,7 @@ def test_a_figure_tells_every_choice_of_the_other_axes_apart_while_they_are_few(
 @pytest.mark.parametrize("name", sorted(spec.shipped()))
 def test_a_campaign_that_ships_can_be_played(name: str) -> None:
     campaign = spec.load(name)
+    run.check_columns(campaign, schema_of(campaign, list(cells(campaign))))
     for cell in cells(campaign):
         setting = setting_of(campaign, cell)
         assert isinstance(setting, Refused) or setting.scenario.name == campaign.base["name"]

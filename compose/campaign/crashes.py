@@ -18,6 +18,10 @@ NOBODY = "nobody"
 TICK = re.compile(r"kill\[[0-9]+\]\.tick").fullmatch
 ABOVE = 95.0
 """percentile from which on a cost has the darkest colour"""
+LEAST_INCHES = 3.2
+"""of height, for what is written beside the colours"""
+MOST_LABELS = 14
+"""of ticks"""
 
 
 def axis_of_ticks(results: Results) -> int | None:
@@ -43,7 +47,7 @@ def costs(results: Results, place: int) -> Figure:
     wall = np.array([[_median(table) for table in row] for row in tables.values()])
     if nobody is not None:
         wall -= _median(pa.concat_tables(nobody))
-    figure = Figure(figsize=(8.2, 1.5 + 0.22 * len(tables)), layout="constrained")
+    figure = Figure(figsize=(8.2, max(LEAST_INCHES, 1.5 + 0.22 * len(tables))), layout="constrained")
     axes = figure.subplots()
     known = wall[~np.isnan(wall)]
     top = float(np.percentile(known, ABOVE)) if len(known) else 1.0
@@ -61,7 +65,8 @@ def costs(results: Results, place: int) -> Figure:
         if found:
             at = np.array(found).T
             axes.scatter(at[0], at[1], marker=marker, c=colour, s=size, label=said)
-    axes.set_xticks(range(0, len(ticks), 4), [str(tick) for tick in ticks[::4]])
+    every = -(-len(ticks) // MOST_LABELS)
+    axes.set_xticks(range(0, len(ticks), every), [str(tick) for tick in ticks[::every]])
     axes.set_yticks(range(len(tables)), list(tables))
     axes.set_xlabel("tick of the kill")
     kind = "more than with no kill" if nobody is not None else "in all"

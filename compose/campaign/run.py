@@ -86,10 +86,7 @@ def sweep(campaign: Campaign, out: Path, means: Means, inbox: Inbox, progress: P
     Raises UserError: of the spec, a cell that is not a scenario, `out` or the scheduler.
     """
     with opened(out, campaign) as folder:
-        for names in (folder.schema.names, header(campaign)):
-            for name, count in Counter(names).items():
-                if count > 1:
-                    raise BadSpec(f"{campaign.source}: axis: {count} columns would be called '{name}'")
+        check_columns(campaign, folder.schema)
         if means.retry:
             folder.forget_lost()
         work = _left(folder, progress)
@@ -102,6 +99,14 @@ def sweep(campaign: Campaign, out: Path, means: Means, inbox: Inbox, progress: P
             except EngineFailed as error:
                 stopped = str(error)
         return _gathered(folder, stopped, interrupted)
+
+
+def check_columns(campaign: Campaign, schema: pa.Schema) -> None:
+    """Raises BadSpec where two columns of a table would be called the same."""
+    for names in (schema.names, header(campaign)):
+        for name, count in Counter(names).items():
+            if count > 1:
+                raise BadSpec(f"{campaign.source}: axis: {count} columns would be called '{name}'")
 
 
 def _left(folder: Folder, progress: Progress) -> list[Work]:
