@@ -56,6 +56,8 @@ def considered(mind: Mind) -> Mind:
         return mind
     placements = [_seen_from_b(held) for held in inference.held_together(weighed, pair)]
     plan = encounter.last_manoeuvre("b", ORIGIN, ORIGIN, placements, mind.briefing.mission, "paper")
+    if plan is None:
+        return mind.undecided("no manoeuvre keeps the safety distance")
     return replace(
         mind,
         state=LastManoeuvre(plan.drive, mind.odometry),

@@ -12,8 +12,9 @@ from agent.mind import WORDS, Done, Mind
 from agent.phases import encounter
 from agent.phases.encounter import LastManoeuvre, Standing, Waiting
 from agent.phases.rendezvous import Orbiting, off_anchor
-from agent.phases.seeking import Straight
+from agent.phases.seeking import Straight, stretch
 from protocol.messages import Alarm, Localised
+from protocol.mission import SHORTEST_STEP
 
 PEER_RESTS = (WORDS[Standing], WORDS[Waiting])
 """what it says then: two that move at once may do so in mirror image, and learn nothing"""
@@ -44,8 +45,16 @@ def met(mind: Mind) -> Mind:
     if mind.briefing.role == "b":
         return replace(mind, state=Standing(), findings=findings)
     rho = mind.mutual[-1].range if mind.mutual else mind.briefing.mission.sensing_range  # a drop-out
+    if mind.briefing.mission.safety_distance and not _may_go(mind):
+        return mind
     straight = Straight("peer", mind.odometry, rho)
     return replace(mind, state=straight, findings=findings)
+
+
+def _may_go(mind: Mind) -> bool:
+    """Whether a knows that b stands, and is far enough from it to go straight on."""
+    now = bool(mind.mutual) and mind.mutual[-1].tick == mind.tick == mind.radio.peer.through
+    return now and stretch("peer", mind.mutual[-1].range, mind.briefing.mission) >= SHORTEST_STEP
 
 
 def considered(mind: Mind) -> Mind:
@@ -96,6 +105,8 @@ def _settled(mind: Mind) -> Mind:
         plan = encounter.survey(mover, a, b, left[0], sightings, mission)
     else:
         plan = encounter.last_manoeuvre(mover, a, b, left, mission, variant)
+    if plan is None:
+        return mind if variant == "assured" else mind.undecided("no manoeuvre keeps the safety distance")
     return replace(
         mind,
         state=LastManoeuvre(plan.drive, mind.odometry),

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from agent import letter, lying, meeting, radio, survey, trust
+from agent import apart, letter, lying, meeting, radio, survey, trust
 from agent.belief import ON_ANCHOR, Branch, branches, weigh_branches
 from agent.mind import Asleep, Done, Mind
 from agent.phases import anchor, encounter, rendezvous, seeking
@@ -268,6 +268,17 @@ def _on_to_orbit(mind: Mind, state: rendezvous.Meeting) -> Mind:
 
 
 def _controls(mind: Mind) -> Controls:
+    """What its state has it do; less, where it is in range of a peer of which it knows no more."""
+    controls, mission = _intended(mind), mind.briefing.mission
+    blind = mind.phase < 3 or isinstance(mind.state, Retreating)
+    if not (mission.safety_distance and mind.in_contact and blind):
+        return controls
+    if not mind.mutual or mind.mutual[-1].tick != mind.tick:  # a drop-out
+        return REST
+    return apart.slowed(controls, apart.BOTH * apart.leeway(mind.mutual[-1].range, mission), mission)
+
+
+def _intended(mind: Mind) -> Controls:
     match mind.state:
         case Aligning() | Radial() | Tangent() | Orbiting() if meeting.lingers(mind):
             return REST

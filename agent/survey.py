@@ -226,7 +226,9 @@ def _considered(mind: Mind) -> Mind:
         return _homeward(judged)
     if not weighed:
         return _blindly(judged)
-    a, b = surveying.together(inference.held_together(weighed, pair), pair.apart, mission)
+    a, b = surveying.together(
+        inference.held_together(weighed, pair), pair.apart, mind.mutual[-1].range, mission
+    )
     return replace(judged, state=Surveying("peer", a if role == "a" else b))
 
 
@@ -251,8 +253,10 @@ def _doubted(mind: Mind) -> Mind:
 def _blindly(mind: Mind) -> Mind:
     """While nothing is known of how the two lie: b stands, a goes straight on (Section III.C.a)."""
     mission = mind.briefing.mission
-    ahead = Controls(mission.first_straight / mission.period, 0.0)
-    return replace(mind, state=Surveying("peer", ahead if mind.briefing.role == "a" else REST))
+    if mind.briefing.role == "b" or not mind.mutual:
+        return replace(mind, state=Surveying("peer"))
+    step = seeking.stretch("peer", mind.mutual[-1].range, mission)
+    return replace(mind, state=Surveying("peer", Controls(step / mission.period, 0.0)))
 
 
 def claimed(mind: Mind) -> Mind:

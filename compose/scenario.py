@@ -22,7 +22,7 @@ from compose.kill import BadKill, Kill, KillTable, drawn
 from compose.status import UserError
 from protocol.lie import Lie
 from protocol.messages import Briefing
-from protocol.mission import Anchor, Mission, Role, Variant, noise_obstacle, obstacle
+from protocol.mission import Anchor, Mission, Role, Variant, noise_obstacle, obstacle, safety_obstacle
 from protocol.motion import TAU, Pose
 from protocol.rendezvous import Rendezvous, rendezvous, tick_budget
 from protocol.units import NAME, RobotId
@@ -287,7 +287,7 @@ def _check_noise(mission: Mission, source: str) -> None:
             f"{source}: mission.noise.outlier_bias: the least, {least:.6g} m, is more than the most, "
             f"{most:.6g} m"
         )
-    why = noise_obstacle(mission)
+    why = noise_obstacle(mission) or safety_obstacle(mission)
     if why is not None:
         raise Unworkable(f"{source}: mission.{why}")
 

@@ -9,7 +9,7 @@ import msgspec
 from msgspec import Meta
 
 from protocol.noise import Noise
-from protocol.units import Coordinate, Duration, Length, Speed, TurnRate
+from protocol.units import Clearance, Coordinate, Duration, Length, Speed, TurnRate
 
 Variant = Literal["assured", "paper"]
 """`paper` plays the paper to the letter; `assured` also cures what fails in it."""
@@ -62,6 +62,8 @@ class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     covariance of their position"""
     confidence: Annotated[float, Meta(ge=0.5, lt=1.0)] = 0.9999
     """how probable the hypothesis must be that they claim"""
+    safety_distance: Clearance = 0.0
+    """m: two robots that range each other come no nearer"""
     noise: Noise = Noise()
 
     @property
@@ -97,6 +99,18 @@ def obstacle(mission: Mission, distance: float) -> str | None:
             "raise max_speed or period"
         )
     return None
+
+
+def safety_obstacle(mission: Mission) -> str | None:
+    """The field, and why `safety_distance` could not be kept; None if it can."""
+    warned = mission.sensing_range - 2.0 * mission.max_speed * mission.period
+    if mission.safety_distance <= max(0.0, warned):
+        return None
+    return (
+        f"safety_distance: {mission.safety_distance:.6g} m, where two robots that come into range of each "
+        f"other at max_speed may be {max(0.0, warned):.6g} m apart before they know "
+        "(sensing_range - 2 max_speed period)"
+    )
 
 
 MOST_OUTLIERS = 0.25

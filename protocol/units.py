@@ -18,6 +18,8 @@ Time = Annotated[float, Meta(ge=0.0, le=1e15)]
 """s"""
 Duration = Annotated[float, Meta(ge=1e-6, le=1e6)]
 """s, positive"""
+Clearance = Annotated[float, Meta(ge=0.0, le=1e6)]
+"""m, or none"""
 Speed = Annotated[float, Meta(ge=1e-6, le=1e6)]
 """m/s, positive"""
 TurnRate = Annotated[float, Meta(ge=1e-6, le=1e6)]

@@ -34,6 +34,7 @@ SHELL = {"protocol.session", "protocol.journal", "protocol.retrace", "protocol.i
 
 PURE = {
     "agent.planner",
+    "agent.apart",
     "agent.mind",
     "agent.meeting",
     "agent.belief",

@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.apart import nearest
 from agent.belief import ON_ANCHOR, Sighting, dilution, information
 from agent.geometry import Placement, placements
 from agent.phases.seeking import travelled
@@ -191,17 +192,19 @@ def advanced(state: LastManoeuvre | Returning, pose: Pose, in_contact: bool, res
 
 def last_manoeuvre(
     mover: Role, a: Pose, b: Pose, candidates: Sequence[Placement], mission: Mission, variant: Variant
-) -> Plan:
+) -> Plan | None:
     """The manoeuvre after which the ranges that `candidates` predict differ most (eq. (8), on squares).
 
     Of `mover`, in the paper always b; `a` is in <a(M1)> and `b` in <b(M2)>. By enumeration. The letter
     drives at v_max; `assured` takes the best of the manoeuvres with the fewest candidates out of range,
     which silence then names. A single candidate is checked by the range that changes most, towards it:
-    silence would check nothing.
+    silence would check nothing. None where every manoeuvre comes nearer than the safety distance.
     """
     question = Question(mover, a, b, tuple(candidates))
     reach, gap, value = compared(question, mission, variant)
     row, column = _best(value)
+    if value[row, column] == -np.inf:
+        return None
     drive = Controls(float(reach.v[row, 0]), float(reach.omega[column]))
     return Plan(drive, float(gap[row, column]) if len(candidates) > 1 else None, question)
 
@@ -218,24 +221,27 @@ def compared(question: Question, mission: Mission, variant: Variant) -> Compared
         gap = travelled(b, candidates[0].place(a)) ** 2 - squared[0]
     else:
         gap = np.min([abs(one - other) for i, one in enumerate(squared) for other in squared[:i]], axis=0)
-    value = gap
+    apart = _keeps_apart(question, reach, mission)
+    value = np.where(apart, gap, -np.inf)
     if variant == "assured":
         rim = (mission.sensing_range - RANGE_MARGIN) ** 2
         outside = np.sum([distance > rim for distance in squared], axis=0)
-        value = np.where(outside == np.min(outside), gap, -np.inf)
+        fewest = np.min(outside, where=apart, initial=len(squared))
+        value = np.where(outside == fewest, value, -np.inf)
     return Compared(reach, gap, value)
 
 
 def survey(
     mover: Role, a: Pose, b: Pose, placement: Placement, sightings: Sequence[Sighting], mission: Mission
-) -> Plan:
-    """The manoeuvre of `mover` after which one more range would pin down `placement` best.
+) -> Plan | None:
+    """The manoeuvre of `mover` after which one more range would pin down `placement` best; none as above.
 
     For a placement that alone fits, and that the ranges in `sightings` do not determine: both robots and
     their anchors on one line. By the determinant of the information, which takes both robots to raise.
     """
-    speed, omega, x, y = reachable(a if mover == "a" else b, mission, "assured")
-    (ax, ay), (bx, by) = _placed(mover, a, b, placement, x, y)
+    question = Question(mover, a, b, (placement,))
+    reach = reachable(a if mover == "a" else b, mission, "assured")
+    (ax, ay), (bx, by) = _placed(mover, a, b, placement, reach.x, reach.y)
     dx, dy = ax - bx, ay - by
     apart = np.maximum(np.hypot(dx, dy), ELSEWHERE)
     by_phi = (dy * (ax - placement.x) - dx * (ay - placement.y)) / apart
@@ -243,9 +249,35 @@ def survey(
     pp, pq, qq = information(placement, sightings)
     value = (pp + by_phi**2 + FAINT) * (qq + by_psi**2 + FAINT) - (pq + by_phi * by_psi) ** 2
     value = np.where(apart <= mission.sensing_range - RANGE_MARGIN, value, -np.inf)
+    value = np.where(_keeps_apart(question, reach, mission), value, -np.inf)
     row, column = _best(value)
-    drive = Controls(float(speed[row, 0]), float(omega[column]))
-    return Plan(drive, None, Question(mover, a, b, (placement,)))
+    if value[row, column] == -np.inf:
+        return None
+    return Plan(Controls(float(reach.v[row, 0]), float(reach.omega[column])), None, question)
+
+
+def _keeps_apart(question: Question, reach: Reach, mission: Mission) -> NDArray[np.bool]:
+    """Which manoeuvres keep the safety distance, whichever of the candidates is true; (S, W)."""
+    mover, a, b, candidates = question
+    v, omega = np.broadcast_arrays(reach.v, reach.omega)
+    if not mission.safety_distance:
+        return np.ones(v.shape, dtype=np.bool)
+    here = a if mover == "a" else b
+    least = [
+        nearest(here, v, omega, _seen(mover, a, b, candidate), mission.period) for candidate in candidates
+    ]
+    kept: NDArray[np.bool] = np.min(least, axis=0) >= mission.safety_distance
+    return kept
+
+
+def _seen(mover: Role, a: Pose, b: Pose, placement: Placement) -> tuple[float, float]:
+    """Where the one that stands is, in the frame of the mover's anchor."""
+    if mover == "b":
+        there = placement.place(a)
+        return there.x, there.y
+    c, s = math.cos(placement.phi), math.sin(placement.phi)
+    dx, dy = b.x - placement.x, b.y - placement.y
+    return c * dx + s * dy, c * dy - s * dx
 
 
 def _best(value: Array) -> tuple[int, int]:

@@ -12,6 +12,7 @@ from typing import Literal
 
 import msgspec
 
+from agent.apart import leeway
 from protocol.mission import Mission, Variant
 from protocol.motion import REST, TAU, Controls, Pose, wrap
 
@@ -67,6 +68,12 @@ class Homing(msgspec.Struct, frozen=True):
 Seeking = Straight | Backing | Turning | Circling
 
 
+def stretch(beacon: Beacon, rho0: float, mission: Mission) -> float:
+    """m: how far a robot goes from where it ranged `beacon` at `rho0` m: A_0; less towards a peer nearby."""
+    step = mission.first_straight
+    return step if beacon == "anchor" else min(step, leeway(rho0, mission))
+
+
 def arrived(mission: Mission) -> tuple[float, float]:
     """m and rad: how near is there."""
     return (ARRIVED, ARRIVED) if mission.noise.exact else (CLOSE * mission.first_straight, CLOSE)
@@ -90,9 +97,10 @@ def ahead(origin: Pose, pose: Pose) -> float:
 def onward(state: Seeking, pose: Pose, measured: bool, mission: Mission, variant: Variant) -> Seeking | None:
     """The state after a tick that led to `pose`; None once there is a second range."""
     there, facing = arrived(mission)
+    step = stretch(state.beacon, state.rho0, mission)
     match state:
         case Straight(beacon, origin, rho0):
-            if travelled(origin, pose) < mission.first_straight - there:
+            if travelled(origin, pose) < step - there:
                 return state
             if measured:
                 return None
@@ -100,7 +108,7 @@ def onward(state: Seeking, pose: Pose, measured: bool, mission: Mission, variant
                 return Backing(beacon, origin, rho0)
             return Turning(beacon, origin, rho0, pose.heading + math.pi / 2)
         case Backing(beacon, origin, rho0):
-            if ahead(origin, pose) > there - mission.first_straight:
+            if ahead(origin, pose) > there - step:
                 return state
             return None if measured else Turning(beacon, origin, rho0, pose.heading - math.pi / 2)
         case Turning(beacon, origin, rho0, heading):
@@ -111,20 +119,21 @@ def onward(state: Seeking, pose: Pose, measured: bool, mission: Mission, variant
 
 def controls(state: Seeking, pose: Pose, mission: Mission) -> Controls:
     """What `state` drives from `pose`."""
+    step = stretch(state.beacon, state.rho0, mission)
     match state:
         case Straight(_, origin):
-            return straight(mission.first_straight - travelled(origin, pose), mission)
+            return straight(step - travelled(origin, pose), mission)
         case Backing(_, origin):
-            return straight(-mission.first_straight - ahead(origin, pose), mission)
+            return straight(-step - ahead(origin, pose), mission)
         case Turning(heading=heading):
             return turn(pose, heading, mission)
         case Circling(_, _, rho0):
             omega = min(
                 mission.max_turn_rate,
-                inside_arc(rho0, mission) / mission.period,
-                mission.max_speed / mission.first_straight,
+                inside_arc(rho0, step, mission.sensing_range) / mission.period,
+                mission.max_speed / step,
             )
-            return Controls(omega * mission.first_straight, omega)
+            return Controls(omega * step, omega)
 
 
 def homeward(state: Homing, pose: Pose, mission: Mission) -> Controls | None:
@@ -141,10 +150,9 @@ def homeward(state: Homing, pose: Pose, mission: Mission) -> Controls | None:
     return straight(distance if forward else -distance, mission)
 
 
-def inside_arc(rho0: float, mission: Mission) -> float:
-    """2 pi - 2 eta in rad (Section III.A.2): how much of the circle, about a point `rho0` m from the
-    beacon, is in its range."""
-    radius, reach = mission.first_straight, mission.sensing_range
+def inside_arc(rho0: float, radius: float, reach: float) -> float:
+    """2 pi - 2 eta in rad (Section III.A.2): how much of the circle of `radius`, about a point `rho0` from
+    the beacon, is within its `reach`; all in m."""
     rho0 = min(rho0, reach)  # an outlier may be longer
     cosine = (reach * reach - rho0 * rho0 - radius * radius) / (2.0 * radius * rho0) if rho0 > 0.0 else 1.0
     return TAU - 2.0 * math.acos(min(1.0, max(-1.0, cosine)))

@@ -13,7 +13,9 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
+from agent import apart
 from agent.estimation.odometry import Array, Places
 from agent.estimation.ranging import SIGMA_FLOOR
 from agent.phases.seeking import Beacon
@@ -31,6 +33,9 @@ TURNS = 17
 
 SPEEDS = (1.0, -1.0, 0.5, -0.5)
 """values of v, over A_0 / T_s"""
+
+SLOW = (0.1, -0.1)
+"""likewise, where there is a distance to keep and little room"""
 
 FINE = 0.03
 """of the accuracy: what is known better than this need not be known better still"""
@@ -80,6 +85,9 @@ class Choice(NamedTuple):
     """m, in the direction of the heading; (C, AHEAD)"""
     across: Array
     """m, to the left of it"""
+    way_along: Array
+    """the same at CHORDS times of the first stride; (C, CHORDS)"""
+    way_across: Array
 
 
 @cache
@@ -87,19 +95,24 @@ def choice(mission: Mission) -> Choice:
     """All of a robot's; the last is to stand."""
     period = stride(mission) * mission.period
     fastest = min(mission.max_turn_rate, math.pi / period)
+    speeds = SPEEDS + SLOW if mission.safety_distance else SPEEDS
     omega, speed = np.meshgrid(
-        np.linspace(-fastest, fastest, TURNS), mission.first_straight / mission.period * np.array(SPEEDS)
+        np.linspace(-fastest, fastest, TURNS), mission.first_straight / mission.period * np.array(speeds)
     )
     v = np.append(speed.ravel(), 0.0)
     turn = np.append(omega.ravel(), 0.0)
     half = 0.5 * period * turn
     chord = period * v * np.sinc(half / math.pi)
     course = half[:, None] * (2.0 * np.arange(AHEAD) + 1.0)
+    share = half[:, None] * np.arange(1, apart.CHORDS + 1) / apart.CHORDS
+    way = period * v[:, None] * np.arange(1, apart.CHORDS + 1) / apart.CHORDS * np.sinc(share / math.pi)
     return Choice(
         v,
         turn,
         np.cumsum(chord[:, None] * np.cos(course), 1),
         np.cumsum(chord[:, None] * np.sin(course), 1),
+        way * np.cos(share),
+        way * np.sin(share),
     )
 
 
@@ -145,17 +158,20 @@ def alone(held: Sequence[Held], mission: Mission, within: float | None = None) -
     return Controls(float(ways.v[i]), float(ways.omega[i]))
 
 
-def together(held: Sequence[Held], m2: tuple[float, float], mission: Mission) -> tuple[Controls, Controls]:
+def together(
+    held: Sequence[Held], m2: tuple[float, float], rho: float, mission: Mission
+) -> tuple[Controls, Controls]:
     """The manoeuvres of a and b after which both know best where they are.
 
     The covariance is that of both poses, (6, 6), relative to M1; M2 is at `m2`. First b's is chosen, as if a
-    stood; then a's, as b will drive.
+    stood; then a's, as b will drive. Neither comes nearer to the other than the safety distance, whichever
+    hypothesis is true; `rho` is the latest range between them. If all would, they stand.
     """
     ways = choice(mission)
     stand = len(ways.v) - 1
     still = np.array([stand])
-    _, b = _best_of(ways, held, m2, mission, still, np.arange(stand + 1))
-    a, _ = _best_of(ways, held, m2, mission, np.arange(stand + 1), np.array([b]))
+    _, b = _best_of(ways, held, m2, rho, mission, still, np.arange(stand + 1))
+    a, _ = _best_of(ways, held, m2, rho, mission, np.arange(stand + 1), np.array([b]))
     return (
         Controls(float(ways.v[a]), float(ways.omega[a])),
         Controls(float(ways.v[b]), float(ways.omega[b])),
@@ -163,7 +179,13 @@ def together(held: Sequence[Held], m2: tuple[float, float], mission: Mission) ->
 
 
 def _best_of(
-    ways: Choice, held: Sequence[Held], m2: tuple[float, float], mission: Mission, of_a: Places, of_b: Places
+    ways: Choice,
+    held: Sequence[Held],
+    m2: tuple[float, float],
+    latest: float,
+    mission: Mission,
+    of_a: Places,
+    of_b: Places,
 ) -> tuple[int, int]:
     """Of the ways `of_a` and `of_b`, one of which is a single one."""
     reach = mission.sensing_range
@@ -212,9 +234,31 @@ def _best_of(
             variance += 2.0 * (dx * left[:, i + 1, i + 2] - dy * left[:, i, i + 2])
             cost += variance / mission.accuracy**2
     cost += _confusion(held, distances, sigma, reach)
+    if mission.safety_distance:
+        cost[~_keep_apart(ways, held, latest, mission, of_a, of_b)] = np.inf
+        cost[-1] = min(cost[-1], STANDING)
     i = int(np.argmin(cost))
     return int(of_a[i if len(of_a) > 1 else 0]), int(of_b[i if len(of_b) > 1 else 0])
 
+
+def _keep_apart(
+    ways: Choice, held: Sequence[Held], rho: float, mission: Mission, of_a: Places, of_b: Places
+) -> NDArray[np.bool]:
+    """Which of the ways keep the safety distance: by all of `held`, or too short for any to matter."""
+    lengths = np.abs(ways.v) * stride(mission) * mission.period
+    together = lengths[of_a] + lengths[of_b]
+    kept = np.ones(len(together), dtype=np.bool)
+    for one in held:
+        (ax, ay), (bx, by) = _way(ways, one.poses[:3], of_a), _way(ways, one.poses[3:], of_b)
+        relative = one.covariance[:2, :2] + one.covariance[3:5, 3:5] - 2.0 * one.covariance[:2, 3:5]
+        unsure = apart.SIGMAS * math.sqrt(max(0.0, float(np.trace(relative))))
+        least = np.min(np.hypot(ax - bx, ay - by), 1) - 0.5 * together / apart.CHORDS - unsure
+        kept &= least >= mission.safety_distance
+    return kept | (together <= apart.leeway(rho, mission))
+
+
+STANDING = 1e300
+"""what it costs to stand where every way, that one too, might lead too near"""
 
 MARGIN = 0.9
 """of R: how far apart two robots may plan to be, and b from its anchor"""
@@ -252,6 +296,13 @@ COARSE = 1.5
 
 SURE = 400.0
 """sigmas, squared: hypotheses that differ by more are told apart; further apart is no better"""
+
+
+def _way(ways: Choice, pose: Array, some: Places) -> tuple[Array, Array]:
+    """m: where the ways lead from `pose` on their first stride, (C, CHORDS)."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    along, across = ways.way_along[some], ways.way_across[some]
+    return pose[0] + c * along - s * across, pose[1] + s * along + c * across
 
 
 def _ends(ways: Choice, pose: Array, some: Places | slice = slice(None)) -> tuple[Array, Array]:
