@@ -293,6 +293,7 @@ def test_the_letters_last_manoeuvre_maximises_eq_8_at_full_speed(
 ) -> None:
     b, a, found = case
     plan = last_manoeuvre("b", a, b, found, SECTION_IV, "paper")
+    assert plan is not None
     best = max(least(predicted(b, a, found, 1.0, omega)) for omega in grid())
     assert plan.drive.v == 1.0
     assert plan.separation_m2 == pytest.approx(best, abs=1e-9)
@@ -309,6 +310,7 @@ def test_the_assured_last_manoeuvre_keeps_as_many_candidates_in_range_as_it_can(
     b, a, found = case
     rim = SECTION_IV.sensing_range - 1e-6
     plan = last_manoeuvre("b", a, b, found, SECTION_IV, "assured")
+    assert plan is not None
 
     def value(v: float, omega: float) -> tuple[int, float]:
         distances = predicted(b, a, found, v, omega)
@@ -325,6 +327,7 @@ def test_a_single_candidate_is_checked_from_where_its_range_changes_most() -> No
     b, a = Pose(0.0, 0.0, 0.0), Pose(6.5, 0.0, 0.0)
     ahead = Placement(0.0, -4.5, 0.0)
     plan = last_manoeuvre("b", a, b, [ahead], SECTION_IV, "assured")
+    assert plan is not None
     assert plan.drive.v == 1.0
     assert plan.drive.omega == pytest.approx(0.0, abs=1e-9)
     assert predicted(b, a, [ahead], 1.0, 0.0) == [pytest.approx(1.0)]

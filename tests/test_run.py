@@ -81,6 +81,7 @@ def test_summary_says_everything_that_is_promised_of_a_run(played: tuple[str, Pa
         "max_turn_rate": math.pi,
         "accuracy": 0.1,
         "confidence": 0.9999,
+        "safety_distance": 0.0,
         "noise": {
             **dict.fromkeys(("anchor_sigma", "mutual_sigma", "outliers", "drop_outs"), 0.0),
             "outlier_bias": [0.3, 2.0],

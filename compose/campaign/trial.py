@@ -13,6 +13,7 @@ from compose.campaign.played import as_processes, in_process
 from compose.claim import Claim
 from compose.kill import Kill
 from compose.record import Record, first_claim, first_contact
+from compose.separation import nearest
 from protocol.messages import Farewell, Outcome
 from protocol.motion import Covariance
 from world.scenario import Scenario
@@ -102,6 +103,8 @@ class Row(msgspec.Struct, frozen=True, array_like=True):
     heading_error_rad: float | None = None
     hypotheses: int | None = None
     """left: the most of any robot"""
+    nearest_m: float | None = None
+    """two peers, from their first mutual range on; where there is a safety distance"""
     claims: int | None = None
     """robots that claimed to be localised"""
     claims_within: int | None = None
@@ -179,6 +182,7 @@ def row(trial: Trial, record: Record, wall_s: float, findings: Findings | None =
         position_error_m=_most([robot.position_error_m for robot in robots.values()]),
         heading_error_rad=_most([robot.heading_error_rad for robot in robots.values()]),
         hypotheses=_most([robot.hypotheses for robot in robots.values()]),
+        nearest_m=nearest(record) if scenario.mission.safety_distance else None,
         claims=len(errors),
         claims_within=sum([error <= WITHIN * scenario.mission.accuracy for error in errors]),
         nees=sum(nees) / len(nees) if nees else None,

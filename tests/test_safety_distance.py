@@ -1,0 +1,146 @@
+"""Two robots that range each other come no nearer than the safety distance, whatever may be true."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from agent import apart
+from compose.inline import play
+from compose.scenario import load, validate
+from compose.separation import nearest
+from protocol.motion import Controls, Pose, step
+from tests.commands import tandem
+from world.scenario import Scenario
+
+SAFE = 1.0
+NEAR = 75
+"""the seed of a random mission in which b's last manoeuvre leads it to 0.75 m from a, if it may"""
+
+
+def safe(seed: int, distance: float = SAFE, **noise: float) -> Scenario:
+    scenario = load("random", seed=seed)
+    mission = scenario.mission
+    return replace(
+        scenario,
+        mission=replace(mission, safety_distance=distance, noise=replace(mission.noise, **noise)),
+    )
+
+
+speeds = st.floats(-1.0, 1.0)
+turns = st.floats(-math.pi, math.pi)
+places = st.floats(-2.0, 2.0)
+
+
+@given(speeds, turns, turns, places, places)
+def test_how_near_an_arc_comes_is_never_told_too_far_and_hardly_too_near(
+    v: float, omega: float, heading: float, x: float, y: float
+) -> None:
+    pose = Pose(0.3, -0.2, heading)
+    told = float(apart.nearest(pose, np.array([v]), np.array([omega]), (x, y), 1.0)[0])
+    way = [step(pose, v, omega, i / 2000) for i in range(2001)]
+    true = min(math.hypot(at.x - x, at.y - y) for at in way)
+    assert told <= true + 1e-12
+    assert told >= true - 0.005
+
+
+@given(speeds, turns, st.floats(0.0, 2.0))
+def test_a_robot_goes_the_same_arc_only_not_so_far(v: float, omega: float, metres: float) -> None:
+    mission = load("random").mission
+    slowed = apart.slowed(Controls(v, omega), metres, mission)
+    assert abs(slowed.v) * mission.period <= max(metres, 0.0) + 1e-12
+    assert slowed.v * omega == pytest.approx(slowed.omega * v, abs=1e-12)
+    if abs(v) * mission.period <= metres:
+        assert slowed == Controls(v, omega)
+
+
+def test_robots_that_may_come_near_do() -> None:
+    record = play(load("random", seed=NEAR))
+    found = nearest(record)
+    assert found is not None
+    assert found < 0.8
+
+
+@pytest.mark.parametrize("seed", [NEAR, *range(1, 40)])
+def test_none_comes_nearer_and_both_localise(seed: int) -> None:
+    record = play(safe(seed))
+    assert record.end is not None
+    assert record.end.outcome == "localised"
+    found = nearest(record)
+    assert found is not None
+    assert found >= SAFE
+
+
+@pytest.mark.parametrize("seed", range(1, 9))
+def test_none_comes_nearer_under_noise(seed: int) -> None:
+    record = play(safe(seed, anchor_sigma=0.05, mutual_sigma=0.05))
+    assert record.end is not None
+    assert record.end.outcome == "localised"
+    found = nearest(record)
+    assert found is not None
+    assert found >= SAFE
+
+
+@settings(max_examples=20)
+@given(st.integers(1, 10**6), st.floats(0.0, 0.9))
+def test_none_comes_nearer_however_many_reports_are_lost(seed: int, loss: float) -> None:
+    scenario = load("random", seed=seed, faults=[f"a<->b: loss={loss:.3f}", "b->a: delay=0..3"])
+    record = play(replace(scenario, mission=replace(scenario.mission, safety_distance=SAFE)))
+    assert record.end is not None
+    assert record.end.outcome == "localised"
+    found = nearest(record)
+    assert found is not None
+    assert found >= SAFE
+
+
+@pytest.mark.parametrize("seed", range(1, 30))
+def test_robots_that_begin_in_range_of_each_other_come_no_nearer_than_that(seed: int) -> None:
+    table = {
+        "name": "near",
+        "mission": {
+            "sensing_range": 3.0,
+            "period": 1.0,
+            "max_speed": 1.0,
+            "max_turn_rate": math.pi,
+            "safety_distance": SAFE,
+        },
+        "robot": [{"id": "a", "anchor": [0.0, 0.0]}, {"id": "b", "anchor": [3.0, 0.0]}],
+        "max_ticks": 60,
+    }
+    record = play(validate(table, "near.toml").seeded(seed))
+    assert record.end is not None
+    assert record.end.outcome in ("localised", "undecided")
+    a, b = record.moments[0].truth.poses
+    found = nearest(record)
+    assert found is not None
+    assert found >= min(SAFE, math.hypot(a.x - b.x, a.y - b.y)) - 1e-9
+
+
+def test_the_letter_keeps_it_too_or_gives_up() -> None:
+    outcomes = set()
+    for seed in range(1, 40):
+        record = play(replace(safe(seed), variant="paper"))
+        assert record.end is not None
+        outcomes.add(record.end.outcome)
+        found = nearest(record)
+        assert found is None or found >= SAFE
+    assert outcomes <= {"localised", "undecided"}
+    assert "localised" in outcomes
+
+
+def test_a_distance_of_which_nobody_would_be_warned_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "safe.toml"
+    text = (Path("compose/scenarios") / "random.toml").read_text()
+    file.write_text(text.replace("[mission]", "[mission]\nsafety_distance = 1.01"))
+    ended = tandem("run", file)
+    assert ended.status == 2
+    assert ended.err == (
+        f"tandem run: {file}: mission.safety_distance: 1.01 m, where two robots that come into range of each "
+        "other at max_speed may be 1 m apart before they know (sensing_range - 2 max_speed period)\n"
+    )
