@@ -122,8 +122,7 @@ class Mind(msgspec.Struct, frozen=True):
     @property
     def orbit(self) -> Orbit:
         """This robot's part of the rendezvous."""
-        plan = self.briefing.rendezvous
-        return plan.a if self.briefing.role == "a" else plan.b
+        return self.briefing.rendezvous.of(self.briefing.role)
 
     @property
     def off_anchor(self) -> bool:

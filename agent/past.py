@@ -10,11 +10,8 @@ from msgspec.structs import replace
 
 from agent.robot import Told
 from protocol.journal import CorruptJournal
-from protocol.messages import Briefing, Drive, End, Estimate, Farewell, Missed, Report, Sense
+from protocol.messages import Briefing, Drive, End, Estimate, Farewell, Missed, OfRobot, Report, Sense
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
-
-KINDS = Briefing | Sense | Report | Drive | Estimate | Missed | End | Farewell
-"""what stands in an agent's journal"""
 
 
 class Step(msgspec.Struct, frozen=True):
@@ -39,6 +36,11 @@ class Past(msgspec.Struct, frozen=True):
     steps: tuple[Step, ...]
     end: End | None = None
     farewell: Farewell | None = None
+
+    @property
+    def estimates(self) -> tuple[Estimate, ...]:
+        """What the robot held possible, tick by tick."""
+        return tuple([step.estimate for step in self.steps if step.estimate is not None])
 
 
 class OutOfOrder(CorruptJournal):
@@ -87,7 +89,7 @@ def past(frames: Iterable[bytes], source: object) -> Past:
 
 def _message(frame: bytes, source: object) -> Any:
     try:
-        return decode(frame, KINDS, MAX_FRAME_BYTES)
+        return decode(frame, OfRobot, MAX_FRAME_BYTES)
     except MalformedFrame as error:
         raise CorruptJournal(f"{source}: {error}") from None
 

@@ -13,7 +13,7 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from itertools import combinations
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
 from msgspec.structs import astuple
@@ -28,13 +28,28 @@ from world.scenario import Scenario
 from world.sensors import anchor_ranges, executed, mutual_ranges
 from world.truth import Truth, asked
 
+if TYPE_CHECKING:
+    from agent.past import Past
+
 Mode = Literal["processes", "in-process"]
 WORLD_JOURNAL = "world.journal"
+SUMMARY = "summary.json"
 
 
 def agent_journal(robot: str) -> str:
     """The name of the file that `robot` keeps its record in."""
     return f"agent-{robot}.journal"
+
+
+def robot_of(path: Path) -> str:
+    """Whose record an agent's journal is, by its name."""
+    return path.stem.removeprefix("agent-")
+
+
+def journals_in(folder: Path) -> list[Path]:
+    """Those of a record that are there, the world's first."""
+    world = folder / WORLD_JOURNAL
+    return [*([world] if world.exists() else []), *sorted(folder.glob(agent_journal("*")))]
 
 
 @contextmanager
@@ -116,16 +131,25 @@ def estimates(folder: Path, robot: str) -> tuple[Estimate, ...]:
 
     Raises OSError if there is none, journal.CorruptJournal if it is damaged before its end, or another's.
     """
+    told = past_of(folder, robot)
+    return told.estimates if told is not None else ()
+
+
+def past_of(folder: Path, robot: str) -> Past | None:
+    """What `robot` journaled in the record in `folder`; None if it was killed before it was briefed.
+
+    Raises like `estimates`.
+    """
     from agent.past import past  # noqa: PLC0415  # whoever launches, and reads how it went, needs no planner
 
     path = folder / agent_journal(robot)
     frames = list(journal.read(path))
     if not frames:
-        return ()  # killed before it was briefed
+        return None
     told = past(frames, path)
     if told.briefing.robot != robot:
         raise journal.CorruptJournal(f"{path} is the journal of {told.briefing.robot}")
-    return tuple([step.estimate for step in told.steps if step.estimate is not None])
+    return told
 
 
 @contextmanager
@@ -292,7 +316,7 @@ def versions() -> dict[str, str | None]:
 def leave(record: Record, summary: Mapping[str, Any], folder: Path) -> None:
     """Write `ticks.csv` and `summary.json` into `folder`."""
     (folder / "ticks.csv").write_text(ticks_csv(record), encoding="utf-8")
-    (folder / "summary.json").write_bytes(msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n")
+    (folder / SUMMARY).write_bytes(msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n")
 
 
 def outcome_line(summary: Mapping[str, Any]) -> str:

@@ -246,3 +246,7 @@ class Farewell(Message, frozen=True):
     """of all kinds"""
     bytes_sent: Count
     """of reports"""
+
+
+OfRobot = Briefing | Sense | Report | Drive | Estimate | Missed | End | Farewell
+"""what stands in an agent's journal"""

@@ -12,7 +12,7 @@ from functools import cache
 
 import msgspec
 
-from protocol.mission import RANGE_MARGIN, Mission, Variant
+from protocol.mission import RANGE_MARGIN, Mission, Role, Variant
 from protocol.motion import TAU
 from protocol.units import AngularVelocity, Range, Time, Velocity
 
@@ -43,6 +43,10 @@ class Rendezvous(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fi
     b: Orbit
     bound: Time
     """s: T_max, the longest that both orbit before they are in range of each other"""
+
+    def of(self, role: Role) -> Orbit:
+        """The part of who plays `role`."""
+        return self.a if role == "a" else self.b
 
 
 @cache

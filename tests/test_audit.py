@@ -20,6 +20,7 @@ from agent.robot import Robot
 from compose import inline
 from compose.audit.findings import Findings, Violation
 from compose.audit.judge import RULES, audit, judge
+from compose.export.frames import KINDS
 from compose.record import WORLD_JOURNAL, agent_journal, read
 from compose.scenario import load, parse, shipped
 from protocol import journal
@@ -45,7 +46,6 @@ from world.course import Course
 from world.referee import Judgement
 from world.scenario import Scenario
 
-KINDS = Scenario | Briefing | Sense | Report | Drive | Estimate | Missed | End | Farewell
 Found = tuple[int | None, str | None, str]
 """tick, robot and rule of a violation"""
 NOISE = f"""

@@ -13,17 +13,17 @@ from msgspec.structs import replace
 
 from compose import inline
 from compose.audit.replay import replayed
+from compose.export.frames import KINDS
 from compose.record import WORLD_JOURNAL, agent_journal
 from compose.scenario import load, parse
 from protocol import journal
-from protocol.messages import Briefing, Drive, End, Estimate, Farewell, Missed, Report, Sense
+from protocol.messages import Drive, Sense
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode, encode
 from tests.commands import journals, tandem
 from tests.same_plans import scenario as random_plan
 from tests.test_audit import kept
 from world.scenario import Scenario
 
-KINDS = Scenario | Briefing | Sense | Report | Drive | Estimate | Missed | End | Farewell
 HEAD = 5
 """bytes of a frame before its body"""
 TRIES = 100

@@ -42,6 +42,11 @@ class History(msgspec.Struct, frozen=True):
     farewells: dict[str, Farewell] = {}
     disorder: Disorder | None = None
 
+    @property
+    def worlds(self) -> tuple[World, ...]:
+        """At every tick of which anything follows."""
+        return (*[tick.world for tick in self.ticks], *([] if self.ahead is None else [self.ahead]))
+
 
 def history(frames: Iterable[bytes], source: object) -> History:
     """What `frames` tell, the world moved by their Drives. Raises CorruptJournal, which names `source`."""

@@ -63,9 +63,6 @@ def case_of(journals: Mapping[str, Iterable[bytes]], folder: object) -> Case:
     Raises CorruptJournal, whose text names the journal.
     """
     told = history(journals[WORLD_JOURNAL], f"{folder}/{WORLD_JOURNAL}")
-    worlds = [tick.world for tick in told.ticks]
-    if told.ahead is not None:
-        worlds.append(told.ahead)
     testimonies = {}
     for robot in told.scenario.robots:
         name = agent_journal(robot.id)
@@ -74,7 +71,7 @@ def case_of(journals: Mapping[str, Iterable[bytes]], folder: object) -> Case:
         if testimony.past is not None and testimony.past.briefing.robot != robot.id:
             raise CorruptJournal(f"{folder}/{name} is the journal of {testimony.past.briefing.robot}")
         testimonies[robot.id] = testimony
-    sensed = tuple([{sense.robot: sense for sense in senses(world)} for world in worlds])
+    sensed = tuple([{sense.robot: sense for sense in senses(world)} for world in told.worlds])
     return Case(told, sensed, testimonies)
 
 

@@ -10,11 +10,11 @@ import msgspec
 
 from compose.record import Book
 from protocol.journal import CorruptJournal
-from protocol.messages import Briefing, Drive, End, Estimate, Farewell, Message, Missed, Report, Sense
+from protocol.messages import Drive, End, Estimate, Message, Missed, OfRobot, Sense
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, body, decode
 from world.scenario import Scenario
 
-KINDS = Scenario | Briefing | Sense | Report | Drive | Estimate | Missed | End | Farewell
+KINDS = Scenario | OfRobot
 """what stands in a journal"""
 
 

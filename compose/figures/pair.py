@@ -9,11 +9,9 @@ from pathlib import Path
 import msgspec
 
 from agent.mind import Mind
-from agent.past import Past, past
+from agent.past import Past
 from agent.robot import Robot
-from compose.record import Record, agent_journal
-from protocol import journal
-from protocol.journal import CorruptJournal
+from compose.record import Record, past_of
 from protocol.messages import Drive, Estimate
 from protocol.mission import Mission, Role
 from protocol.motion import Pose
@@ -147,20 +145,13 @@ def account(folder: Path, robot: str) -> Account:
 
     Raises OSError if there is no journal, CorruptJournal if it is damaged before its end, or another's.
     """
-    path = folder / agent_journal(robot)
-    frames = list(journal.read(path))
-    if not frames:
-        return Account((), ())  # killed before it was briefed
-    told = past(frames, path)
-    if told.briefing.robot != robot:
-        raise CorruptJournal(f"{path} is the journal of {told.briefing.robot}")
-    held = tuple([step.estimate for step in told.steps if step.estimate is not None])
-    return _again(told, held)
+    told = past_of(folder, robot)
+    return _again(told) if told is not None else Account((), ())
 
 
-def _again(told: Past, held: tuple[Estimate, ...]) -> Account:
+def _again(told: Past) -> Account:
     """Every decision once more, which must be the one on record."""
-    robot = Robot(told.briefing)
+    held, robot = told.estimates, Robot(told.briefing)
     minds: list[Mind] = []
     for step in told.steps:
         tick = step.sense.tick

@@ -104,9 +104,16 @@ def _said(pair: Pair, tick: int, number: int) -> str:
 def _panel(axes: Axes, pair: Pair, met: int, before: int, tick: int) -> None:
     for role in ROLES:
         one = pair.robot(role)
-        plan = one.rendezvous.a if role == "a" else one.rendezvous.b
         place = (one.anchor.x, one.anchor.y)
-        circle(axes, place, plan.radius, lw=0.9, ls=DASHES[role], color=COLOURS[role], zorder=1)
+        circle(
+            axes,
+            place,
+            one.rendezvous.of(role).radius,
+            lw=0.9,
+            ls=DASHES[role],
+            color=COLOURS[role],
+            zorder=1,
+        )
         poses = pair.truth(role)
         _trail(axes, poses[max(0, met - BEFORE) : before + 1], 1.0, PALE)
         _trail(axes, poses[before : tick + 1], 2.0, COLOURS[role])

@@ -53,8 +53,7 @@ def _extent(pair: Pair) -> list[tuple[float, float]]:
 
 
 def _orbit_radius(pair: Pair, role: Role) -> float:
-    plan = pair.robot(role).rendezvous
-    return (plan.a if role == "a" else plan.b).radius
+    return pair.robot(role).rendezvous.of(role).radius
 
 
 def _arrow(pair: Pair) -> float:

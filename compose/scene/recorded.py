@@ -6,19 +6,15 @@ from pathlib import Path
 
 import msgspec
 
-from compose.record import WORLD_JOURNAL
+from compose.record import SUMMARY, WORLD_JOURNAL, journals_in, robot_of
 from compose.scene.facts import Gathering
 from compose.scene.scene import Scene, scene
 from compose.scene.stage import Stage, of_briefings, of_scenario
 from protocol.journal import CorruptJournal, Tail
-from protocol.messages import Briefing, Drive, End, Estimate, Farewell, Missed, Report, Sense
+from protocol.messages import End, Farewell, OfRobot
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 from world.history import Reading, scenario_of
 from world.tick import World, senses
-
-AGENT_JOURNALS = "agent-*.journal"
-SUMMARY = "summary.json"
-KINDS = Briefing | Sense | Report | Drive | Estimate | Missed | End | Farewell
 
 
 class Performance(msgspec.Struct, frozen=True):
@@ -76,10 +72,7 @@ class Journals:
 
     def read(self) -> None:
         """Fold in what has come since the last time. Raises OSError."""
-        paths = sorted(self.folder.glob(AGENT_JOURNALS))
-        if (self.folder / WORLD_JOURNAL).exists():
-            paths.insert(0, self.folder / WORLD_JOURNAL)
-        for path in paths:
+        for path in journals_in(self.folder):
             tail = self._tails.setdefault(path.name, Tail(path))
             try:
                 frames = tail.news()
@@ -98,10 +91,7 @@ class Journals:
         """Nothing more will come: what is missing of what robots sensed follows from the world's journal."""
         if self._world is None:
             return
-        worlds = [tick.world for tick in self._world.ticks]
-        if self._world.judgement is None:
-            worlds.append(self._world.world)
-        for world in worlds:
+        for world in self._world.told().worlds:
             facts = self.known.at(world.truth.tick)
             if len(facts.senses) < len(world.scenario.robots):
                 for sense in senses(world):
@@ -112,9 +102,9 @@ class Journals:
             self.notes.append(text)
 
     def _fold_agent(self, frames: list[bytes], path: Path) -> None:
-        robot = path.name.removeprefix("agent-").removesuffix(".journal")
+        robot = robot_of(path)
         for frame in frames:
-            self.known.take(decode(frame, KINDS, MAX_FRAME_BYTES), len(frame), robot)
+            self.known.take(decode(frame, OfRobot, MAX_FRAME_BYTES), len(frame), robot)
 
     def _fold_world(self, frames: list[bytes], path: Path) -> None:
         if self._world is None:

@@ -11,7 +11,7 @@ from protocol.lie import Lie
 from protocol.messages import Briefing
 from protocol.mission import Anchor, Mission, Role, Variant
 from protocol.motion import Pose
-from protocol.rendezvous import Orbit, Rendezvous
+from protocol.rendezvous import Orbit
 from protocol.units import RobotId, Tick
 from world.faults import Fault
 from world.scenario import Scenario
@@ -81,7 +81,7 @@ def of_scenario(scenario: Scenario, mode: str | None = None, tick_s: float | Non
                     robot.peer,
                     robot.role,
                     robot.anchor,
-                    _orbit(robot.rendezvous, robot.role),
+                    robot.rendezvous.of(robot.role),
                     robot.lie,
                     frame(robot.anchor, robot.start),
                 )
@@ -106,7 +106,7 @@ def of_briefings(name: str, briefings: Mapping[str, Briefing]) -> Stage:
         name=name,
         robots=tuple(
             [
-                Seat(one.robot, one.peer, one.role, one.anchor, _orbit(one.rendezvous, one.role), one.lie)
+                Seat(one.robot, one.peer, one.role, one.anchor, one.rendezvous.of(one.role), one.lie)
                 for one in told
             ]
         ),
@@ -120,7 +120,3 @@ def of_briefings(name: str, briefings: Mapping[str, Briefing]) -> Stage:
 def frame(anchor: Anchor, start: Pose) -> Pose:
     """The frame of `anchor` for a robot that is released at `start`, in the world's."""
     return Pose(anchor.x, anchor.y, math.atan2(start.y - anchor.y, start.x - anchor.x))
-
-
-def _orbit(plan: Rendezvous, role: Role) -> Orbit:
-    return plan.a if role == "a" else plan.b

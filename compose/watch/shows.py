@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Iterator
 from pathlib import Path
 
-from compose.record import WORLD_JOURNAL
+from compose.record import journals_in
 from compose.scene.facts import Gathering
-from compose.scene.recorded import AGENT_JOURNALS, Journals
+from compose.scene.recorded import Journals
 from compose.scene.stage import Stage
 
 REVISIONS_KEPT = 1000
@@ -98,13 +97,6 @@ class Recorded(Show):
     def concluded(self) -> None:
         """Nobody writes it any more."""
         self._expected = False
-
-
-def journals_in(folder: Path) -> Iterator[Path]:
-    """Those of a record."""
-    if (folder / WORLD_JOURNAL).exists():
-        yield folder / WORLD_JOURNAL
-    yield from sorted(folder.glob(AGENT_JOURNALS))
 
 
 def is_written(path: Path) -> bool:

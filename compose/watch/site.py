@@ -7,10 +7,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from compose.record import journals_in
 from compose.status import UserError
 from compose.watch import campaign
 from compose.watch.network import Listener
-from compose.watch.shows import Recorded, Show, journals_in
+from compose.watch.shows import Recorded, Show
 from protocol import session
 
 
