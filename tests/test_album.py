@@ -368,9 +368,10 @@ def test_the_same_record_gives_the_same_bytes_in_each_format(records: Path, tmp_
     folder = copied(recorded("paper-1", records), tmp_path)
     runs: list[dict[str, bytes]] = []
     for _ in range(2):
-        ended = tandem("figures", folder, "--only", "plan")
+        ended = tandem("figures", folder, "--only", "plan", "--only", "robot")
         assert (ended.status, ended.err) == (0, "")
-        names = [f"plan-b-47.{ending}" for ending in ("svg", "pdf", "png")]
+        drawn = ("plan-b-47", "robot-a", "robot-b")
+        names = [f"{name}.{ending}" for name in drawn for ending in ("svg", "pdf", "png")]
         assert ended.out.splitlines() == [str(folder / "figures" / name) for name in names]
         runs.append({path.name: path.read_bytes() for path in (folder / "figures").iterdir()})
         assert set(runs[-1]) == set(names)

@@ -11,14 +11,14 @@ from matplotlib.figure import Figure
 from agent.mind import Mind
 from agent.phases.surveying import Surveying, stride
 from compose.figures.pair import ROLES, Pair
-from compose.figures.sheet import NO_ENCOUNTER, SMALL, Absent, Sheet, around, circle, ending, equal, fitted
+from compose.figures.series import Series, some, square
+from compose.figures.sheet import NO_ENCOUNTER, Absent, Window, circle, ending
 from compose.figures.style import COLOURS, INK, MARKS, PALE, PALER
 from protocol.mission import Role
 from protocol.motion import Pose, step
 
-WIDTH, LEFT, GAP, HEAD, KEY = 2.3, 0.68, 0.42, 0.36, 0.28
-"""inches: of a panel, left of panels, between panels, above one, and of the key below them"""
-COLUMNS, PANELS = 3, 6
+WIDTH, NARROWEST = 2.3, 5.6
+"""inches: of a panel at the most, and of the whole at the least"""
 FINE = 12
 """pieces that a manoeuvre is drawn in, a tick"""
 LIKELY = 1e-3
@@ -51,33 +51,21 @@ def draw(pair: Pair) -> Figure | Absent:
     told = decisions(pair)
     if not told:
         return Absent(NO_ENCOUNTER if pair.met is None else "they never weighed how both lie in the plane")
-    if len(told) <= PANELS:
-        shown = told
-    else:
-        shown = [told[round(i * (len(told) - 1) / (PANELS - 1))] for i in range(PANELS)]
-    window = _window(pair, shown)
-    width, height = fitted(window, WIDTH, 1.5 * WIDTH)
-    columns, rows = min(COLUMNS, len(shown)), math.ceil(len(shown) / COLUMNS)
-    row = height + HEAD + 0.45
+    shown = some(told)
     many = (
         f"{len(shown)} of {len(told)} decisions" if len(shown) < len(told) else f"all {len(told)} decisions"
     )
     title = f"Hypotheses of how both lie in the plane, and the manoeuvres chosen: {many}"
-    sheet = Sheet(max(LEFT + columns * (width + GAP), 5.6), rows * row + KEY, [ending(pair), title])
+    series = Series(len(shown), _window(pair, shown), WIDTH, NARROWEST, [ending(pair), title])
     for i, one in enumerate(shown):
-        left, bottom = LEFT + (i % columns) * (width + GAP), KEY + 0.42 + (rows - 1 - i // columns) * row
-        axes = sheet.panel(left, bottom, width, height)
+        axes = series.panel(i, _said(one, i + 1))
         _panel(axes, pair, one)
-        equal(axes, window)
-        axes.set_title(_said(one, i + 1), fontsize=SMALL, loc="left", pad=3, linespacing=1.15)
-        axes.set_xlabel("$x$ [m]", fontsize=SMALL)
-        if i % columns == 0:
-            axes.set_ylabel("$y$ [m]", fontsize=SMALL)
-    _key(sheet, axes, pair)
-    return sheet.figure
+    _signs(axes, pair)
+    series.key(axes)
+    return series.figure
 
 
-def _window(pair: Pair, shown: list[Decision]) -> tuple[float, float, float, float]:
+def _window(pair: Pair, shown: list[Decision]) -> Window:
     points = [
         (pose.x, pose.y)
         for one in shown
@@ -89,10 +77,7 @@ def _window(pair: Pair, shown: list[Decision]) -> tuple[float, float, float, flo
         ends = [pair.truth(role)[one.tick] for role in ROLES]
         ends += [end for mind in one.minds.values() for end in _ends(mind, pair)]
         points += [(end.x, end.y) for end in ends]
-    left, right, low, high = around(points, 0.16)
-    half = 0.5 * max(right - left, high - low, 0.5 * pair.mission.sensing_range)
-    x, y = (left + right) / 2, (low + high) / 2
-    return x - half, x + half, y - half, y + half
+    return square(points, 0.16, 0.5 * pair.mission.sensing_range)
 
 
 def _said(one: Decision, number: int) -> str:
@@ -169,7 +154,7 @@ def _ends(mind: Mind, pair: Pair) -> list[Pose]:
     ]
 
 
-def _key(sheet: Sheet, axes: Axes, pair: Pair) -> None:
+def _signs(axes: Axes, pair: Pair) -> None:
     for role in ROLES:
         axes.plot(
             [], [], MARKS[role]["marker"], ls="", ms=7, color=COLOURS[role],
@@ -179,4 +164,3 @@ def _key(sheet: Sheet, axes: Axes, pair: Pair) -> None:
     axes.plot([], [], "x-", ms=6, mew=1.5, lw=1.6, color=PALE, label="manoeuvre chosen")
     axes.plot([], [], "+", ls="", ms=9, mew=1.2, color=INK, label="true")
     axes.plot([], [], "x", ls="", ms=6, mew=1.4, color="k", label="anchor")
-    sheet.key(axes, LEFT, KEY - 0.05, columns=6)

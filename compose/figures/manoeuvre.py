@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from agent.geometry import Placement
 from agent.phases.encounter import Array, Compared, LastManoeuvre, Plan, compared
 from compose.figures.pair import ROLES, Pair
-from compose.figures.sheet import NO_ENCOUNTER, ROW, SMALL, Absent, Sheet, circle, ending, equal
+from compose.figures.sheet import ANCHORS, NO_ENCOUNTER, ROW, SMALL, Absent, Sheet, circle, ending, equal
 from compose.figures.style import COLOURS, INK, MARKS, PALE, PALER
 from compose.figures.trajectory import heading
 from protocol.mission import Mission, Role
@@ -30,7 +30,6 @@ AROUND = 1.14
 FINE = 24
 """pieces that the arc of the manoeuvre is drawn in"""
 OTHER: dict[Role, Role] = {"a": "b", "b": "a"}
-ANCHOR: dict[Role, str] = {"a": "M_1", "b": "M_2"}
 
 
 class Planned(NamedTuple):
@@ -125,7 +124,7 @@ def _title(pair: Pair, one: Planned) -> str:
     frame = (
         f"{robot}'s own frame"
         if _framed_by_itself(one.plan)
-        else rf"$\langle {mover}({ANCHOR[mover]})\rangle$"
+        else rf"$\langle {mover}({ANCHORS[mover]})\rangle$"
     )
     v, omega = one.plan.drive.v, one.plan.drive.omega
     chosen = rf"$v_2$ = {v:g} m/s, $\omega_2$ = {omega:+.4f} rad/s"

@@ -13,7 +13,7 @@ from matplotlib.ticker import LogFormatterMathtext, LogLocator, MaxNLocator, Nul
 
 from compose.claim import Claim
 from compose.figures.pair import ROLES, Pair
-from compose.figures.sheet import ROW, SMALL, Absent, Sheet, ending
+from compose.figures.sheet import ANCHORS, ROW, SMALL, Absent, Sheet, ending
 from compose.figures.style import COLOURS, INK, MARKS, PALE, SHADE
 from compose.record import first_claim
 from protocol.messages import Estimate
@@ -99,10 +99,9 @@ def _ranges(axes: Axes, pair: Pair) -> None:
         label="true separation",
     )  # fmt: skip
     for role in ROLES:
-        number = "1" if role == "a" else "2"
         _measured(
             axes, pair.anchor_ranges(role), f"anchor-range-{role}", COLOURS[role], MARKS[role],
-            rf"$\rho$ of {pair.robot(role).id} to $M_{number}$, measured",
+            rf"$\rho$ of {pair.robot(role).id} to ${ANCHORS[role]}$, measured",
         )  # fmt: skip
     diamonds = {"marker": "D", "markerfacecolor": INK, "markeredgecolor": INK}
     mutual = [rho for _, rho in pair.mutual]
@@ -247,6 +246,3 @@ def _scale(panels: Sequence[Axes], pair: Pair, name: str) -> None:
         axes.yaxis.set_major_locator(LogLocator(numticks=8))
         axes.yaxis.set_major_formatter(LogFormatterMathtext())
         axes.yaxis.set_minor_locator(NullLocator())
-
-
-__all__ = ["errors", "ranges"]

@@ -13,7 +13,7 @@ from agent.belief import FLOOR, Branch
 from agent.mind import Mind
 from agent.phases.seeking import travelled
 from compose.figures.pair import Pair
-from compose.figures.sheet import Absent, Sheet, around, circle, ending, equal, fitted
+from compose.figures.sheet import ANCHORS, Absent, Sheet, around, circle, ending, equal, fitted
 from compose.figures.style import COLOURS, INK, MARKS, PALE, PALER
 from protocol.messages import BranchKind
 from protocol.mission import Role
@@ -65,7 +65,7 @@ def draw(pair: Pair, role: Role) -> Figure | Absent:
     sheet = Sheet(0.6 + width + BESIDE, 0.5 + height, [ending(pair), _title(pair, role, mind)])
     axes = sheet.panel(0.55, 0.42, width, height)
     circle(axes, (0, 0), reach, lw=1.2, ls="-", color="k", gid="range", label=f"$R$ = {reach:g} m")
-    axes.plot(0, 0, "x", color="k", ms=7, mew=1.6, ls="", gid="anchor", label=_anchor(role))
+    axes.plot(0, 0, "x", color="k", ms=7, mew=1.6, ls="", gid="anchor", label=f"anchor ${ANCHORS[role]}$")
     _rings(axes, seen, told[0].branch, mind.findings.branch_kind)
     for i, one in enumerate(told):
         _draw(axes, role, one, seen, pair.exact, named=i < 2 or pair.exact)
@@ -77,10 +77,6 @@ def draw(pair: Pair, role: Role) -> Figure | Absent:
     axes.set_ylabel("$y$ [m]")
     sheet.key(axes, 0.55 + width + 0.12, 0.42 + height)
     return sheet.figure
-
-
-def _anchor(role: Role) -> str:
-    return "anchor $M_1$" if role == "a" else "anchor $M_2$"
 
 
 def _at_its_end(minds: Sequence[Mind]) -> Mind | None:
@@ -125,7 +121,7 @@ def _name(branch: Branch, held: Sequence[Branch], end: Mind) -> str:
 
 def _title(pair: Pair, role: Role, mind: Mind) -> str:
     robot = pair.robot(role).id
-    frame = rf"$\langle {role}({'M_1' if role == 'a' else 'M_2'})\rangle$"
+    frame = rf"$\langle {role}({ANCHORS[role]})\rangle$"
     if mind.findings.parted is None:
         how = f"not over at $k$ = {mind.tick}"
     else:

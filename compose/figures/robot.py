@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import textwrap
-from pathlib import Path
 from typing import Any, Literal
 
 from matplotlib.axes import Axes
@@ -12,11 +11,9 @@ from matplotlib.legend import Legend
 
 from compose.figures import belief, plane
 from compose.figures.story import Story
-from compose.figures.style import look, save
 from compose.record import ended
 
 Corner = Literal["upper left", "lower left", "upper right"]
-__all__ = ["Story", "draw"]
 WIDTH, PLANE, BESIDE = 8.6, 5.2, 2.4
 """inches: of all, of the plane and what is below it, of what stands beside these"""
 NEAR, KEY, KEYS, ERROR, ODDS, REST = 2.7, 0.9, 2.2, 1.9, 1.9, 0.6
@@ -29,14 +26,6 @@ RIGHT: list[Any] = [["plane", "near"], ["plane", "key"], *OVER_TIME]
 BELOW: list[Any] = [["plane", "near"], ["key", "key"], *OVER_TIME]
 LINE = 100
 """characters of the title"""
-
-
-def draw(story: Story, folder: Path) -> tuple[Path, Path]:
-    """Draw it anew, as SVG and PNG, into `folder`; what has been written. Raises OSError."""
-    folder.mkdir(exist_ok=True)
-    with look():
-        svg, png = save(figure_of(story), folder / f"robot-{story.own.id}", ("svg", "png"))
-    return svg, png
 
 
 def figure_of(story: Story) -> Figure:

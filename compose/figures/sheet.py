@@ -16,6 +16,7 @@ from matplotlib.patches import Circle
 from compose.figures.pair import Pair
 from compose.figures.style import INK
 from compose.record import ended
+from protocol.mission import Role
 
 LINE, ROW = 0.17, 0.175
 """inches: of a line of the title, and of a row of a key"""
@@ -23,6 +24,12 @@ CHARACTERS = 14.8
 """of the title, to an inch"""
 SMALL = 8
 NO_ENCOUNTER = "the two did not meet in phase 3"
+
+
+ANCHORS: dict[Role, str] = {"a": "M_1", "b": "M_2"}
+"""the paper's names, to stand between two `$`"""
+Window = tuple[float, float, float, float]
+"""of the plane, in m: left, right, low, high"""
 
 
 class Absent(NamedTuple):
@@ -92,8 +99,8 @@ def plain(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-def equal(axes: Axes, window: Sequence[float]) -> None:
-    """A window (left, right, low, high) on a plane."""
+def equal(axes: Axes, window: Window) -> None:
+    """To one scale."""
     left, right, low, high = window
     axes.set_xlim(left, right)
     axes.set_ylim(low, high)
@@ -101,14 +108,14 @@ def equal(axes: Axes, window: Sequence[float]) -> None:
     axes.tick_params(labelsize=SMALL)
 
 
-def fitted(window: Sequence[float], width: float, tallest: float) -> tuple[float, float]:
+def fitted(window: Window, width: float, tallest: float) -> tuple[float, float]:
     """Width and height in inches of a panel that shows `window` to one scale."""
     left, right, low, high = window
     scale = min(width / (right - left), tallest / (high - low))
     return scale * (right - left), scale * (high - low)
 
 
-def around(points: Sequence[tuple[float, float]], margin: float) -> tuple[float, float, float, float]:
+def around(points: Sequence[tuple[float, float]], margin: float) -> Window:
     """The window that holds `points`; `margin` is a part of its larger side."""
     xs, ys = zip(*points, strict=True)
     more = margin * max(max(xs) - min(xs), max(ys) - min(ys))

@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from itertools import pairwise
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from compose.figures.pair import ROLES, Pair
-from compose.figures.sheet import NO_ENCOUNTER, SMALL, Absent, Sheet, around, circle, ending, equal, fitted
+from compose.figures.series import Series, some, square
+from compose.figures.sheet import NO_ENCOUNTER, Absent, Window, circle, ending
 from compose.figures.style import COLOURS, DASHES, INK, MARKS, PALE
 from compose.figures.trajectory import heading
 from protocol.mission import Role
 from protocol.motion import Pose
 
-WIDTH, TALLEST = 2.35, 3.2
-"""inches: of a panel, and its height at the most"""
-LEFT, GAP, KEY = 0.68, 0.42, 0.28
-"""inches: left of panels, between panels, and of the key below them"""
-COLUMNS, PANELS = 3, 6
-"""panels in a row, and in all at the most"""
-HEAD = 0.36
-"""inches: above a panel, for what is said of it"""
+WIDTH, NARROWEST = 2.35, 5.4
+"""inches: of a panel at the most, and of the whole at the least"""
 BEFORE = 2
 """ticks before the encounter that are seen"""
 ARROW = 0.12
@@ -34,25 +28,15 @@ def draw(pair: Pair) -> Figure | Absent:
     ticks = steps(pair)
     if not ticks:
         return Absent(NO_ENCOUNTER if pair.met is None else "no mutual range was measured in it")
-    shown = _some(ticks)
+    shown = some(ticks)
     window = _window(pair, ticks[0], shown[-1])
-    width, height = fitted(window, WIDTH, TALLEST)
-    columns, rows = min(COLUMNS, len(shown)), math.ceil(len(shown) / COLUMNS)
-    row = height + HEAD + 0.45
-    wide = LEFT + columns * (width + GAP)
-    sheet = Sheet(max(wide, 5.4), rows * row + KEY, [ending(pair), _title(ticks, shown)])
+    series = Series(len(shown), window, WIDTH, NARROWEST, [ending(pair), _title(ticks, shown)])
     for i, tick in enumerate(shown):
-        left = LEFT + (i % columns) * (width + GAP)
-        bottom = KEY + 0.42 + (rows - 1 - i // columns) * row
-        axes = sheet.panel(left, bottom, width, height)
+        axes = series.panel(i, _said(pair, tick, i + 1))
         _panel(axes, pair, ticks[0], shown[i - 1] if i else tick, tick)
-        equal(axes, window)
-        axes.set_title(_said(pair, tick, i + 1), fontsize=SMALL, loc="left", pad=3, linespacing=1.15)
-        if i % columns == 0:
-            axes.set_ylabel("$y$ [m]", fontsize=SMALL)
-        axes.set_xlabel("$x$ [m]", fontsize=SMALL)
-    _key(sheet, axes, pair)
-    return sheet.figure
+    _signs(axes, pair)
+    series.key(axes)
+    return series.figure
 
 
 def steps(pair: Pair) -> list[int]:
@@ -69,19 +53,9 @@ def steps(pair: Pair) -> list[int]:
     return told
 
 
-def _some(ticks: list[int]) -> list[int]:
-    """As many as have room: the first and the last, and others as evenly as can be."""
-    if len(ticks) <= PANELS:
-        return ticks
-    return [ticks[round(i * (len(ticks) - 1) / (PANELS - 1))] for i in range(PANELS)]
-
-
-def _window(pair: Pair, first: int, last: int) -> tuple[float, float, float, float]:
+def _window(pair: Pair, first: int, last: int) -> Window:
     ends = [pose for role in ROLES for pose in pair.truth(role)[max(0, first - BEFORE) : last + 1]]
-    left, right, low, high = around([(p.x, p.y) for p in ends], 0.12)
-    half = 0.5 * max(right - left, high - low, 0.2 * pair.mission.sensing_range)
-    x, y = (left + right) / 2, (low + high) / 2
-    return x - half, x + half, y - half, y + half
+    return square([(p.x, p.y) for p in ends], 0.12, 0.2 * pair.mission.sensing_range)
 
 
 def _title(ticks: list[int], shown: list[int]) -> str:
@@ -142,7 +116,7 @@ def _place(axes: Axes, role: Role, pose: Pose, ranged: bool, now: bool) -> None:
     )  # fmt: skip
 
 
-def _key(sheet: Sheet, axes: Axes, pair: Pair) -> None:
+def _signs(axes: Axes, pair: Pair) -> None:
     for role in ROLES:
         axes.plot(
             [],
@@ -158,4 +132,3 @@ def _key(sheet: Sheet, axes: Axes, pair: Pair) -> None:
     axes.plot([], [], ":", color=INK, lw=1.4, label="mutual range")
     axes.plot([], [], ls="", marker=r"$\rightarrow$", ms=12, color=PALE, label="heading")
     axes.plot([], [], ls=DASHES["a"], color=PALE, lw=0.9, label="orbits")
-    sheet.key(axes, LEFT, KEY - 0.05, columns=6)

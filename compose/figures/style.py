@@ -9,6 +9,7 @@ from typing import Any
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
 
 from protocol.mission import Role
 
@@ -26,6 +27,8 @@ INK, PALE, PALER = "#1a1a1a", "0.45", "0.75"
 SHADE = "#f3e6bd"
 """of time in contact"""
 DPI = 160
+PLACES = 6
+"""digits of a place on the paper, as a share of its width or height"""
 
 _DATES: dict[str, dict[str, None]] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {}}
 
@@ -41,7 +44,19 @@ def look(symbols: bool = False) -> AbstractContextManager[None]:
 
 def save(figure: Figure, path: Path, formats: Sequence[str] = ("svg", "png")) -> tuple[Path, ...]:
     """In each of `formats`, `path` with that ending; none carries a date. Raises OSError."""
+    _settle(figure)
     written = [path.with_name(f"{path.name}.{ending}") for ending in formats]
     for ending, place in zip(formats, written, strict=True):
         figure.savefig(place, dpi=DPI, metadata=_DATES[ending])
     return tuple(written)
+
+
+def _settle(figure: Figure) -> None:
+    """Panels stay where a constrained layout has them, to PLACES: the last bits depend on where in memory."""
+    if figure.get_layout_engine() is None:
+        return
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    for axes in figure.axes:
+        corners = axes.get_position(original=True).get_points()
+        axes.set_position(Bbox(corners.round(PLACES)), "original")

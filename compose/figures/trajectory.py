@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from compose.figures.pair import ROLES, Pair
-from compose.figures.sheet import Sheet, around, circle, ending, equal, fitted
+from compose.figures.sheet import ANCHORS, Sheet, around, circle, ending, equal, fitted
 from compose.figures.style import COLOURS, DASHES, INK, MARKS, PALE
 from protocol.mission import Role
 from protocol.motion import Pose
@@ -17,7 +17,6 @@ WIDTH, BESIDE, TALLEST = 4.9, 1.95, 6.0
 """inches: of the plane, of the key, of the plane at the most"""
 MANY = 160
 """ticks of a path, too many to mark each"""
-ANCHORS: dict[Role, str] = {"a": "$M_1$", "b": "$M_2$"}
 LABEL = {"facecolor": "white", "alpha": 0.75, "pad": 0.6, "lw": 0}
 
 
@@ -70,7 +69,13 @@ def draw_anchor(axes: Axes, pair: Pair, role: Role) -> None:
         label="anchors $M_1$, $M_2$" if first else None,
     )  # fmt: skip
     axes.annotate(
-        ANCHORS[role], place, xytext=(6, 6), textcoords="offset points", fontsize=10, zorder=6, bbox=LABEL
+        f"${ANCHORS[role]}$",
+        place,
+        xytext=(6, 6),
+        textcoords="offset points",
+        fontsize=10,
+        zorder=6,
+        bbox=LABEL,
     )
     circle(
         axes, place, reach, ls=(0, (4, 3)), lw=1.0, color="k", gid=f"range-{role}",
