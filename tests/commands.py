@@ -14,6 +14,8 @@ from signal import Signals
 from types import TracebackType
 from typing import IO, NamedTuple
 
+import pytest
+
 from compose.local import free_endpoint
 from protocol import journal
 
@@ -231,6 +233,15 @@ def process_of(mark: str | Path, *words: str) -> int:
     found = [pid for pid, said in processes_of(mark).items() if f" {wanted} " in f" {' '.join(said)} "]
     assert len(found) == 1, f"{wanted}: {found}"
     return found[0]
+
+
+def temporary_in(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder there in which all temporary ones are from now on, so that what is left of them is known."""
+    found = folder / "tmp"
+    found.mkdir()
+    monkeypatch.setenv("TMPDIR", str(found))
+    monkeypatch.setattr(tempfile, "tempdir", str(found))
+    return found
 
 
 def size(path: Path) -> int:

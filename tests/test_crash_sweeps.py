@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from itertools import product
@@ -14,6 +13,7 @@ from typing import Any
 import msgspec
 import pyarrow.parquet as pq
 import pytest
+from msgspec.structs import replace
 
 from compose import inline
 from compose.campaign import spec
@@ -21,9 +21,12 @@ from compose.campaign.cells import cells
 from compose.campaign.trial import Trial, play
 from compose.kill import POINTS, WORLD, KillTable, drawn
 from compose.local import ChildFailed
+from compose.record import WORLD_JOURNAL, Record, agent_journal
 from compose.scenario import BadScenario, load, parse, table_in, validate
-from tests.commands import ENDLESS, PAPER_1, Command, tandem, until
+from protocol.journal import Kept
+from tests.commands import ENDLESS, PAPER_1, Command, tandem, temporary_in, until
 from tests.test_bad_input import refused
+from world.scenario import Scenario
 
 SMALL = """
 name = "small"
@@ -45,10 +48,7 @@ HUNG = 'name = "hung"\nscenario = "endless.toml"\ntrials = 2\ntrial_timeout = '
 @pytest.fixture(autouse=True)
 def nothing_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Every temporary folder is in tmp_path, so the processes of a test are known by their arguments."""
-    folder = tmp_path / "tmp"
-    folder.mkdir()
-    monkeypatch.setenv("TMPDIR", str(folder))
-    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    temporary_in(tmp_path, monkeypatch)
     yield
     until(lambda: not left(tmp_path), "no process is left")
 
@@ -80,14 +80,23 @@ def test_whoever_is_killed_the_record_is_that_of_the_same_without_kills(tmp_path
     assert (tmp_path / "out" / "figures" / "crash.svg").exists()
 
 
+@pytest.mark.parametrize("name", [WORLD_JOURNAL, agent_journal("a"), agent_journal("b"), "ticks.csv"])
 def test_a_trial_that_leaves_another_record_has_failed_and_says_where(
-    monkeypatch: pytest.MonkeyPatch,
+    name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real, other = inline.played, load("paper-1", seed=2)
-    monkeypatch.setattr(inline, "played", lambda _, sinks: real(other, sinks))
+    real = inline.played
+
+    def otherwise(scenario: Scenario, sinks: dict[str, Kept]) -> Record:
+        record = real(scenario, sinks)
+        if name == "ticks.csv":
+            return replace(record, moments=record.moments[:-1])
+        sinks[name].frames[-1] += b"!"
+        return record
+
+    monkeypatch.setattr(inline, "played", otherwise)
     found = play(Trial(0, 0, load("paper-1"), processes=False, kills=()))
     assert (found.outcome, found.ticks, found.same_record) == ("failed", 48, False)
-    assert found.reason == "another record than in one process: world.journal"
+    assert found.reason == f"another record than in one process: {name}"
 
 
 def test_a_process_that_is_never_started_again_ends_its_trial() -> None:

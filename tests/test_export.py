@@ -39,36 +39,34 @@ from tests.commands import BOUND_S, Command, tandem
 from tests.doctor import complaints
 from tests.replays import journals_of, killed
 from world.referee import errors
+from world.scenario import Scenario
 
 FILES = ["frames.csv", "run.mcap", "ticks.csv", "ticks.parquet"]
 A, B = agent_journal("a"), agent_journal("b")
 
 
-@pytest.fixture(scope="module")
-def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The record of paper-1, exported."""
-    folder = tmp_path_factory.mktemp("paper-1")
-    inline.play(load("paper-1"), folder)
+def exported(scenario: Scenario, folder: Path) -> Path:
+    """The record of its run, and what is exported of it."""
+    inline.play(scenario, folder)
     export(folder, folder)
     return folder
+
+
+@pytest.fixture(scope="module")
+def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return exported(load("paper-1"), tmp_path_factory.mktemp("paper-1"))
 
 
 @pytest.fixture(scope="module")
 def noisy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The record of a run under noise, exported."""
-    folder = tmp_path_factory.mktemp("noisy")
-    inline.play(load("noisy"), folder)
-    export(folder, folder)
-    return folder
+    """Hypotheses have odds and covariances."""
+    return exported(load("noisy"), tmp_path_factory.mktemp("noisy"))
 
 
 @pytest.fixture(scope="module")
 def faulty(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The record of a run in which reports are lost and late, exported."""
-    folder = tmp_path_factory.mktemp("faulty")
-    inline.play(load("random", faults=["loss=0.3, delay=0..2"]), folder)
-    export(folder, folder)
-    return folder
+    """Reports are lost and late."""
+    return exported(load("random", faults=["loss=0.3, delay=0..2"]), tmp_path_factory.mktemp("faulty"))
 
 
 def told(path: Path) -> Iterator[tuple[Any, Any, Any]]:

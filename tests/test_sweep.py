@@ -10,7 +10,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from itertools import product
@@ -33,7 +32,7 @@ from compose.scenario import load
 from compose.status import UserError
 from protocol.inbox import Inbox
 from protocol.noise import Drift, Noise
-from tests.commands import PAPER_1, Command, Ended, tandem, until
+from tests.commands import PAPER_1, Command, Ended, tandem, temporary_in, until
 
 HOUSE = Path(__file__).parents[1]
 RANDOM = PAPER_1.replace("start", "# start")
@@ -61,10 +60,7 @@ HASTY = ASTRAY + "trial_timeout = 1.5\n"
 @pytest.fixture(autouse=True)
 def nothing_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Every temporary folder is in tmp_path, so the processes of a test are known by their arguments."""
-    folder = tmp_path / "tmp"
-    folder.mkdir()
-    monkeypatch.setenv("TMPDIR", str(folder))
-    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    folder = temporary_in(tmp_path, monkeypatch)
     yield
     until(lambda: not trial_processes(tmp_path), "no process for trials is left")
     assert list(folder.iterdir()) == []
