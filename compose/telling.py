@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -27,6 +27,23 @@ def progress(options: argparse.Namespace, scenario: Scenario, folder: Path) -> I
 
     with show.live(scenario, folder):
         yield
+
+
+@contextmanager
+def counting(what: str, steps: int) -> Iterator[Callable[[], None]]:
+    """A bar of so many steps, where somebody can see it; what is called after each of them."""
+    if not sys.stdout.isatty():
+        yield lambda: None
+        return
+    from rich.console import Console  # noqa: PLC0415  # as above
+    from rich.progress import Progress, TimeElapsedColumn  # noqa: PLC0415
+
+    console = Console(soft_wrap=True)  # what is printed meanwhile is not broken into lines
+    with Progress(
+        *Progress.get_default_columns(), TimeElapsedColumn(), console=console, transient=True
+    ) as bar:
+        task = bar.add_task(what, total=steps)
+        yield lambda: bar.advance(task)
 
 
 def conclude(

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
+import pty
+import struct
 import subprocess
 import sys
 import tempfile
+import termios
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -194,6 +198,22 @@ def tandem(*arguments: str | Path, cwd: Path | None = None) -> Ended:
     """The command, to its end."""
     with Command(*arguments, cwd=cwd) as command:
         return command.ended()
+
+
+def on_a_terminal(*arguments: str | Path) -> tuple[int, str]:
+    """The command, to its end, on a terminal of 80 columns: its status, and all that was written there."""
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))  # the last two are pixels
+    shown = b""
+    with Command(*arguments, terminal=theirs) as command:
+        os.close(theirs)
+        while True:
+            try:
+                shown += os.read(ours, 65536)
+            except OSError:  # the terminal's other end is closed: the command has ended
+                break
+        os.close(ours)
+        return command.ended().status, shown.decode(errors="replace")
 
 
 @contextmanager

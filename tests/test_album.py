@@ -19,7 +19,8 @@ from matplotlib.patches import Circle
 from msgspec.structs import replace
 
 from agent.phases.encounter import compared
-from compose.commands.figures import _draw as draw_all
+from agent.phases.surveying import stride
+from compose.commands.figures import draw as draw_all
 from compose.figures import PICTURES, album, hypotheses, manoeuvre, over_time, phase_one, steps, trajectory
 from compose.figures.pair import Pair, account
 from compose.figures.sheet import Absent
@@ -30,8 +31,9 @@ from compose.scenario import load, parse
 from protocol.journal import read as frames
 from protocol.messages import Drive
 from protocol.mission import Role
+from protocol.motion import step
 from protocol.wire import MalformedFrame, decode, encode
-from tests.commands import PAPER_1, SECTION_IV, several_pairs, tandem
+from tests.commands import PAPER_1, SECTION_IV, on_a_terminal, several_pairs, tandem
 from tests.reference import REFERENCE
 from world.scenario import Scenario
 
@@ -142,7 +144,10 @@ def test_a_plan_shows_each_candidate_and_the_axis_of_each_two_and_the_choice(
     rho = told.mutual[computed.k_second][1]
     assert radii(figure, "rho") == [rho]
     assert [math.dist(start, place) for place in places] == pytest.approx([rho] * count)
-    assert sorted(math.dist(end, place) for place in places) == pytest.approx(sorted(computed.d_i), abs=1e-6)
+    away = [math.dist(end, place) for place in places]
+    assert sorted(away) == pytest.approx(sorted(computed.d_i), abs=1e-6)
+    labels = [one.get_label() for i in range(count) for one in found(figure, f"candidate-{i + 1}")]
+    assert labels == [f"{i}: would be {far:.4f} m away" for i, far in enumerate(away, start=1)]
     for i, j in combinations(range(count), 2):
         for point in line(figure, f"bisector-{i + 1}-{j + 1}"):
             assert math.dist(point, places[i]) == pytest.approx(math.dist(point, places[j]))
@@ -259,6 +264,11 @@ def test_the_last_error_is_that_of_the_claim(name: str, records: Path) -> None:
             tick, value = line(figure, f"{what}-{role}")[-1]
             assert tick == claim.tick
             assert value == pytest.approx(error, abs=1e-16)
+        if claim.covariance is not None:
+            sigmas = claim.covariance.position_sigma, claim.covariance.heading_sigma
+            for what, sigma in zip(("position", "heading"), sigmas, strict=True):
+                tick, value = line(figure, f"{what}-sigma-{role}")[-1]
+                assert (tick, value) == pytest.approx((claim.tick, 3.0 * sigma))
     assert {axes.get_yscale() for axes in figure.axes} == {"log"}
     assert bool(found(figure, "position-sigma-a")) == (name == "noisy")
 
@@ -277,6 +287,13 @@ def test_under_noise_a_panel_has_each_hypothesis_that_the_journal_tells_of(recor
             ]
             assert marks == [(pose.x, pose.y) for pose in held[tick].world]
             assert not found(figure, f"hypothesis-{tick}-{role}-{len(marks) + 1}")
+            drive = told.drive(role, tick)
+            assert drive is not None
+            if drive.verdict is None:
+                goal = step(
+                    held[tick].world[0], drive.v, drive.omega, stride(told.mission) * told.mission.period
+                )
+                assert line(figure, f"chosen-{tick}-{role}") == [(goal.x, goal.y)]
 
 
 def test_the_letters_plan_under_noise_is_drawn_in_bs_own_frame(records: Path) -> None:
@@ -297,7 +314,10 @@ def test_each_kind_is_drawn_of_each_run_or_says_why_not(
     name: str, records: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     told = pair(recorded(name, records))
-    draw_all(told, [kind for kind in PICTURES if kind != "robot"], ["svg"], tmp_path)
+    kinds = [kind for kind in PICTURES if kind != "robot"]
+    done: list[None] = []
+    draw_all(told, kinds, ["svg"], tmp_path, lambda: done.append(None))
+    assert len(done) == len(kinds)
     out, err = capsys.readouterr()
     made = {path.stem for path in tmp_path.iterdir()}
     missing = ABSENT.get(name, set())
@@ -380,6 +400,21 @@ def test_the_same_record_gives_the_same_bytes_in_each_format(records: Path, tmp_
     assert {f"candidate-{i}" for i in range(1, 5)} <= set(re.findall(r'id="([^"]+)"', svg))
     assert "<dc:date>" not in svg
     assert b"CreationDate" not in runs[0]["plan-b-47.pdf"]
+
+
+def test_a_terminal_shows_how_far_it_is_and_each_file_on_a_line_of_its_own(
+    records: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / f"{'long' * 20}"
+    folder.mkdir()
+    copied(recorded("undecided", records), folder)
+    status, shown = on_a_terminal(
+        "figures", folder, "--only", "ranges", "--only", "errors", "--format", "svg"
+    )
+    assert status == 0
+    for name in ("ranges", "errors"):
+        assert f"{folder}/figures/{name}-a-b.svg\r\n" in shown
+    assert {"tandem figures", " 50%", " 75%", "100%"} <= set(re.findall(r"tandem figures| \d+%|100%", shown))
 
 
 @pytest.mark.parametrize("words", [("--only", "plans"), ("--format", "jpg")])

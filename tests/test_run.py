@@ -5,8 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import math
-import os
-import pty
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,7 +12,7 @@ from typing import Any
 import pytest
 
 from compose.local import free_endpoint
-from tests.commands import PAPER_1, Command, journals, processes_of, tandem
+from tests.commands import PAPER_1, Command, journals, on_a_terminal, processes_of, tandem
 
 PAPER_TICKS = {"paper-1": 48, "paper-2": 110}
 COLUMNS = ["tick", "robot", "x", "y", "heading", "v", "omega", "anchor_range", "mutual_range"]
@@ -275,17 +273,8 @@ def test_a_world_whose_output_nobody_takes_does_not_blame_its_record(tmp_path: P
 
 
 def test_a_terminal_shows_each_robots_phase_and_state_while_it_runs() -> None:
-    ours, theirs = pty.openpty()
-    with Command("run", "random", "--seed", "3", "--rate", "20", terminal=theirs) as command:
-        os.close(theirs)
-        shown = ""
-        while True:
-            try:
-                shown += os.read(ours, 65536).decode(errors="replace")
-            except OSError:  # the terminal's other end is closed: the command has ended
-                break
-        os.close(ours)
-        assert command.ended().status == 0
+    status, shown = on_a_terminal("run", "random", "--seed", "3", "--rate", "20")
+    assert status == 0
     for words in ("phase", "state", "orbiting", "tick ", "localised after"):
         assert words in shown, shown
 

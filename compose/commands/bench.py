@@ -19,7 +19,6 @@ from statistics import median
 
 from msgspec.structs import replace
 from rich.console import Console
-from rich.progress import Progress, TimeElapsedColumn
 from rich.table import Table
 
 from agent.robot import Robot
@@ -28,6 +27,7 @@ from compose.beside import beside
 from compose.beside import page as page_on
 from compose.campaign.played import in_process
 from compose.status import LOCALISED
+from compose.telling import counting
 from protocol import session
 from protocol.inbox import Inbox
 from protocol.journal import Journal
@@ -56,16 +56,10 @@ BARE_IMPORTS = "import zenoh, numpy, scipy.optimize, msgspec"
 def main(options: argparse.Namespace) -> int:
     """Measure and print."""
     rounds = options.rounds
-    console = Console()
-    with Progress(*Progress.get_default_columns(), TimeElapsedColumn(), console=console) as progress:
-        task = progress.add_task("tandem bench", total=4 * rounds)
-
-        def done() -> None:
-            progress.advance(task)
-
+    with counting("tandem bench", 4 * rounds) as done:
         tables = [_ticks(rounds, done), _missions(rounds, done), _noisy(rounds, done), _start(rounds, done)]
     for table in tables:
-        console.print(table)
+        Console().print(table)
     return LOCALISED
 
 

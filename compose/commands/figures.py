@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +12,7 @@ from compose.figures import FORMATS, PICTURES
 from compose.lab import need
 from compose.record import agent_journal, legible, read
 from compose.status import ENDED, FAILED, UserError
+from compose.telling import counting
 from protocol.inbox import one_line
 from protocol.journal import CorruptJournal
 
@@ -29,25 +30,33 @@ def main(options: argparse.Namespace) -> int:
     folder, status = options.record / "figures", ENDED
     kinds = [kind for kind in PICTURES if kind in (options.only or PICTURES)]
     formats = [one for one in FORMATS if one in (options.format or FORMATS)]
-    for i, j in record.scenario.pairs():
-        accounts = {}
-        for robot in (record.scenario.robots[i].id, record.scenario.robots[j].id):
-            account = _account(options.record, robot)
-            if account is not None:
-                accounts[robot] = account
-            if account is None or account.broken is not None:
-                status = FAILED
-        try:
-            _draw(Pair(record, i, j, accounts), kinds, formats, folder)
-        except BrokenPipeError:
-            raise
-        except OSError as error:
-            raise UserError(f"{folder} cannot be written: {error.strerror or error}") from None
+    pairs = record.scenario.pairs()
+    with counting("tandem figures", len(pairs) * (2 + len(kinds))) as done:
+        for places in pairs:
+            accounts = {}
+            for robot in [record.scenario.robots[place].id for place in places]:
+                account = _account(options.record, robot)
+                if account is not None:
+                    accounts[robot] = account
+                if account is None or account.broken is not None:
+                    status = FAILED
+                done()
+            try:
+                draw(Pair(record, *places, accounts), kinds, formats, folder, done)
+            except BrokenPipeError:
+                raise
+            except OSError as error:
+                raise UserError(f"{folder} cannot be written: {error.strerror or error}") from None
     return status
 
 
-def _draw(pair: Pair, kinds: Sequence[str], formats: Sequence[str], folder: Path) -> None:
-    """A line for each file that is written, and for each picture that does not apply. Raises OSError."""
+def draw(
+    pair: Pair, kinds: Sequence[str], formats: Sequence[str], folder: Path, done: Callable[[], None]
+) -> None:
+    """A line for each file that is written, and for each picture that does not apply; `done` after a kind.
+
+    Raises OSError.
+    """
     from compose.figures import album, style  # noqa: PLC0415
     from compose.figures.sheet import Absent  # noqa: PLC0415
 
@@ -60,6 +69,7 @@ def _draw(pair: Pair, kinds: Sequence[str], formats: Sequence[str], folder: Path
                     continue
                 for path in style.save(figure, folder / name, formats):
                     print(path, flush=True)
+        done()
 
 
 def _account(folder: Path, robot: str) -> Account | None:
