@@ -6,25 +6,22 @@ stays on a topic is whole in its latest message, so one may look at any time of 
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 from foxglove import messages as fox
 
-from compose.scene.scene import Event, Held, Player, Scene
+from compose.export import shapes
+from compose.scene.events import Event
+from compose.scene.scene import Held, Player, Scene
 from compose.scene.stage import Seat, Stage
 from protocol.mission import Role
-from protocol.motion import Covariance, Pose, compose
+from protocol.motion import Pose
 
 WORLD = "world"
 TRAIL = 200
 """poses, the latest, that a trail shows"""
-CORNERS = 72
-"""of what is drawn for a circle"""
-SIGMAS = 3.0
-"""of an ellipse"""
 BODY = 0.12
 """of R: how long a robot is drawn"""
 LEAST = 0.06
@@ -103,12 +100,12 @@ class Views:
         yield from self._lines(scene)
 
     def _lines(self, scene: Scene) -> Iterator[Shown]:
-        at = _timestamp(nanoseconds(self.stage, scene.tick))
+        at = shapes.timestamp(nanoseconds(self.stage, scene.tick))
         for event in scene.events:
             yield Shown("/log", _line(event, at))
 
     def _whole(self, scene: Scene) -> Iterator[Shown]:
-        at = _timestamp(nanoseconds(self.stage, scene.tick))
+        at = shapes.timestamp(nanoseconds(self.stage, scene.tick))
         yield Shown("/tf", fox.FrameTransforms(transforms=list(self._transforms(scene, at))))
         for player in scene.players:
             yield from self._robot(player, at)
@@ -127,21 +124,21 @@ class Views:
                     parent_frame_id=WORLD,
                     child_frame_id=child,
                     translation=fox.Vector3(x=pose.x, y=pose.y, z=0.0),
-                    rotation=_turned(pose.heading),
+                    rotation=shapes.turned(pose.heading),
                 )
 
     def _robot(self, player: Player, at: fox.Timestamp) -> Iterator[Shown]:
         robot, seat = player.robot, self.stage.seat(player.robot)
         trail = self._trails[robot]
         if player.pose is not None:
-            pose = fox.PoseInFrame(timestamp=at, frame_id=WORLD, pose=_pose(player.pose))
+            pose = fox.PoseInFrame(timestamp=at, frame_id=WORLD, pose=shapes.pose(player.pose))
             yield Shown(f"/{robot}/pose", pose)
-            poses = [_pose(one) for one in trail]
+            poses = [shapes.pose(one) for one in trail]
             yield Shown(f"/{robot}/trail", fox.PosesInFrame(timestamp=at, frame_id=WORLD, poses=poses))
             yield Shown(f"/{robot}/body", fox.SceneUpdate(entities=[self._body(seat, player, at)]))
         if player.held is not None:
             frame, held = _placed(robot, player.held)
-            poses = [_pose(one) for one in held]
+            poses = [shapes.pose(one) for one in held]
             yield Shown(f"/{robot}/hypotheses", fox.PosesInFrame(timestamp=at, frame_id=frame, poses=poses))
             belief = self._belief(seat, frame, held, player.held, at)
             yield Shown(f"/{robot}/belief", fox.SceneUpdate(entities=[belief]))
@@ -149,21 +146,21 @@ class Views:
     def _body(self, seat: Seat, player: Player, at: fox.Timestamp) -> fox.SceneEntity:
         """The robot, what it does in words, and its anchor's range while it has one."""
         assert player.pose is not None
-        colour = _colour(COLOURS[seat.role])
-        lines, texts = [], [self._text(f"{seat.id}: {player.doing}", player.pose, colour)]
+        colour = shapes.colour(COLOURS[seat.role])
+        lines, texts = [], [shapes.words(f"{seat.id}: {player.doing}", player.pose, self._unit, colour)]
         trail = self._trails[seat.id]
         if len(trail) > 1:
-            lines.append(_strip([(one.x, one.y) for one in trail], colour, 2.0))
+            lines.append(shapes.strip([(one.x, one.y) for one in trail], colour, 2.0))
         if player.anchor_range is not None:
             ends = [(player.pose.x, player.pose.y), (seat.anchor.x, seat.anchor.y)]
-            lines.append(_strip(ends, _colour(COLOURS[seat.role], 0.5), 1.5))
+            lines.append(shapes.strip(ends, shapes.colour(COLOURS[seat.role], 0.5), 1.5))
             middle = Pose((ends[0][0] + ends[1][0]) / 2, (ends[0][1] + ends[1][1]) / 2, 0.0)
-            texts.append(self._text(f"{player.anchor_range:.3f} m", middle, colour))
+            texts.append(shapes.words(f"{player.anchor_range:.3f} m", middle, self._unit, colour))
         return fox.SceneEntity(
             timestamp=at,
             frame_id=WORLD,
             id=seat.id,
-            arrows=[self._arrow(player.pose, colour)],
+            arrows=[shapes.arrow(player.pose, self._unit, colour)],
             lines=lines,
             texts=texts,
         )
@@ -176,15 +173,17 @@ class Views:
         here = Pose(*centre, 0.0)
         size = fox.Vector3(x=self._unit, y=self._unit, z=self._unit)
         return fox.SceneEntity(
-            timestamp=_timestamp(0),
+            timestamp=shapes.timestamp(0),
             frame_id=WORLD,
             id=f"{seat.id}/anchor",
-            cubes=[fox.CubePrimitive(pose=_pose(here), size=size, color=_colour(colour))],
+            cubes=[fox.CubePrimitive(pose=shapes.pose(here), size=size, color=shapes.colour(colour))],
             lines=[
-                _strip(_circle(centre, self.stage.mission.sensing_range), _colour(colour, 0.6), 1.5),
-                _strip(_circle(centre, seat.orbit.radius), _colour(GREY, 0.5), 1.0),
+                shapes.strip(
+                    shapes.circle(centre, self.stage.mission.sensing_range), shapes.colour(colour, 0.6), 1.5
+                ),
+                shapes.strip(shapes.circle(centre, seat.orbit.radius), shapes.colour(GREY, 0.5), 1.0),
             ],
-            texts=[self._text(f"{seat.id}'s anchor", here, _colour(colour))],
+            texts=[shapes.words(f"{seat.id}'s anchor", here, self._unit, shapes.colour(colour))],
         )
 
     def _contacts(self, scene: Scene, at: fox.Timestamp) -> Iterator[fox.SceneEntity]:
@@ -195,7 +194,7 @@ class Views:
             lines, texts = [], []
             if contact is not None and a.pose is not None and b.pose is not None:
                 ends = [(a.pose.x, a.pose.y), (b.pose.x, b.pose.y)]
-                lines = [_strip(ends, _colour(GREEN), 3.0)]
+                lines = [shapes.strip(ends, shapes.colour(GREEN), 3.0)]
                 words = [f"{contact.range:.3f} m"] if contact.range is not None else ["no range"]
                 words += [
                     f"{passage.sender}'s report of tick {passage.tick}: {passage.what}"
@@ -203,7 +202,7 @@ class Views:
                     if passage.sender in (one.id, other.id) and passage.what != "sent"
                 ]
                 middle = Pose((a.pose.x + b.pose.x) / 2, (a.pose.y + b.pose.y) / 2, 0.0)
-                texts = [self._text("\n".join(words), middle, _colour(GREEN))]
+                texts = [shapes.words("\n".join(words), middle, self._unit, shapes.colour(GREEN))]
             yield fox.SceneEntity(
                 timestamp=at, frame_id=WORLD, id=f"{one.id}-{other.id}", lines=lines, texts=texts
             )
@@ -218,10 +217,12 @@ class Views:
         odds = held.odds or (1.0 / max(1, len(poses)),) * len(poses)
         lines = []
         if held.covariance is not None and held.world:
-            lines.append(_strip(_ellipse(held.world[0], held.covariance), _colour(colour), 1.5))
-        shades = [_colour(colour, max(LEAST, share)) for share in odds]
+            lines.append(
+                shapes.strip(shapes.ellipse(held.world[0], held.covariance), shapes.colour(colour), 1.5)
+            )
+        shades = [shapes.colour(colour, max(LEAST, share)) for share in odds]
         texts = [
-            self._text(f"{share:.3g}", pose, shade)
+            shapes.words(f"{share:.3g}", pose, self._unit, shade)
             for pose, share, shade in zip(poses, odds, shades, strict=False)
             if len(poses) > 1
         ]
@@ -229,29 +230,11 @@ class Views:
             timestamp=at,
             frame_id=frame,
             id=seat.id,
-            arrows=[self._arrow(pose, shade) for pose, shade in zip(poses, shades, strict=False)],
+            arrows=[
+                shapes.arrow(pose, self._unit, shade) for pose, shade in zip(poses, shades, strict=False)
+            ],
             lines=lines,
             texts=texts,
-        )
-
-    # --- primitives ---
-
-    def _arrow(self, pose: Pose, colour: fox.Color) -> fox.ArrowPrimitive:
-        return fox.ArrowPrimitive(
-            pose=_pose(pose),
-            shaft_length=0.6 * self._unit,
-            shaft_diameter=0.3 * self._unit,
-            head_length=0.4 * self._unit,
-            head_diameter=0.6 * self._unit,
-            color=colour,
-        )
-
-    def _text(self, text: str, at: Pose, colour: fox.Color) -> fox.TextPrimitive:
-        above = fox.Pose(
-            position=fox.Vector3(x=at.x, y=at.y + self._unit, z=self._unit), orientation=_turned(0.0)
-        )
-        return fox.TextPrimitive(
-            pose=above, billboard=True, font_size=14.0, scale_invariant=True, color=colour, text=text
         )
 
 
@@ -270,46 +253,3 @@ def _line(event: Event, at: fox.Timestamp) -> fox.Log:
     return fox.Log(
         timestamp=at, level=level, message=event.text, name=event.robot or "world", file=event.kind
     )
-
-
-def _timestamp(ns: int) -> fox.Timestamp:
-    return fox.Timestamp(*divmod(ns, 1_000_000_000))
-
-
-def _turned(heading: float) -> fox.Quaternion:
-    return fox.Quaternion(x=0.0, y=0.0, z=math.sin(heading / 2.0), w=math.cos(heading / 2.0))
-
-
-def _pose(pose: Pose) -> fox.Pose:
-    return fox.Pose(position=fox.Vector3(x=pose.x, y=pose.y, z=0.0), orientation=_turned(pose.heading))
-
-
-def _colour(rgb: tuple[float, float, float], alpha: float = 1.0) -> fox.Color:
-    return fox.Color(r=rgb[0], g=rgb[1], b=rgb[2], a=alpha)
-
-
-def _strip(points: Sequence[tuple[float, float]], colour: fox.Color, width: float) -> fox.LinePrimitive:
-    """A line through `points`, `width` pixels wide."""
-    return fox.LinePrimitive(
-        type=fox.LinePrimitiveLineType.LineStrip,
-        pose=fox.Pose(position=fox.Vector3(), orientation=fox.Quaternion(w=1.0)),
-        thickness=width,
-        scale_invariant=True,
-        points=[fox.Point3(x=x, y=y, z=0.0) for x, y in points],
-        color=colour,
-    )
-
-
-def _circle(centre: tuple[float, float], radius: float) -> list[tuple[float, float]]:
-    turns = [2.0 * math.pi * i / CORNERS for i in range(CORNERS + 1)]
-    return [(centre[0] + radius * math.cos(turn), centre[1] + radius * math.sin(turn)) for turn in turns]
-
-
-def _ellipse(centre: Pose, covariance: Covariance) -> list[tuple[float, float]]:
-    """Of SIGMAS of the position, by the eigenvalues of its part of the covariance."""
-    mean = (covariance.xx + covariance.yy) / 2.0
-    spread = math.hypot((covariance.xx - covariance.yy) / 2.0, covariance.xy)
-    axis = Pose(centre.x, centre.y, math.atan2(2.0 * covariance.xy, covariance.xx - covariance.yy) / 2.0)
-    long, short = (SIGMAS * math.sqrt(max(0.0, one)) for one in (mean + spread, mean - spread))
-    points = [compose(axis, Pose(long * x, short * y, 0.0)) for x, y in _circle((0.0, 0.0), 1.0)]
-    return [(point.x, point.y) for point in points]
