@@ -16,6 +16,7 @@ from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
+from matplotlib.text import Annotation
 from msgspec.structs import replace
 
 from agent.phases.encounter import compared
@@ -31,7 +32,7 @@ from compose.scenario import load, parse
 from protocol.journal import read as frames
 from protocol.messages import Drive
 from protocol.mission import Role
-from protocol.motion import step
+from protocol.motion import step, wrap
 from protocol.wire import MalformedFrame, decode, encode
 from tests.commands import PAPER_1, SECTION_IV, on_a_terminal, several_pairs, tandem
 from tests.reference import REFERENCE
@@ -231,10 +232,15 @@ def test_the_encounter_has_a_panel_for_each_mutual_range(name: str, ticks: list[
 def test_the_trajectory_has_both_paths_the_ranges_and_the_orbits(records: Path) -> None:
     told = pair(recorded("paper-1", records))
     figure = trajectory.draw(told)
+    arrows = [one for one in figure.findobj(Annotation) if isinstance(one, Annotation)]
     for role in ("a", "b"):
         assert line(figure, f"path-{role}") == [(p.x, p.y) for p in told.truth(role)]
         assert radii(figure, f"range-{role}") == [3.0]
         assert radii(figure, f"orbit-{role}") == [6.5]
+        start = told.truth(role)[0]
+        (arrow,) = [one for one in arrows if one.xyann == (start.x, start.y)]
+        along = math.atan2(arrow.xy[1] - start.y, arrow.xy[0] - start.x)
+        assert wrap(along - start.heading) == pytest.approx(0.0, abs=1e-9)
     assert len(line(figure, "path-a")) == 49
     (axes,) = figure.axes
     assert axes.get_aspect() == 1.0

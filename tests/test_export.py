@@ -7,6 +7,7 @@ import base64
 import csv
 import io
 import json
+import math
 import random
 import socket
 import struct
@@ -18,6 +19,7 @@ from typing import Any
 
 import msgpack
 import msgspec
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import websockets
@@ -29,11 +31,13 @@ from mcap_protobuf.decoder import DecoderFactory
 from compose import inline
 from compose.audit.replay import replay
 from compose.export.folder import export
+from compose.export.views import LEAST
 from compose.local import free_endpoint
 from compose.record import WORLD_JOURNAL, agent_journal, estimates, read
 from compose.scenario import load
 from protocol import journal
 from protocol.messages import Estimate, Sense
+from protocol.motion import wrap
 from protocol.wire import decode
 from tests.commands import BOUND_S, Command, tandem
 from tests.doctor import complaints
@@ -185,6 +189,8 @@ def test_viewers_see_robots_where_they_were_and_their_trails(paper_1: Path) -> N
     for moment, pose, trail, tf in zip(record.moments, poses, trails, transforms, strict=True):
         truth = moment.truth.poses[1]
         assert (pose.frame_id, pose.pose.position.x, pose.pose.position.y) == ("world", truth.x, truth.y)
+        turn = pose.pose.orientation
+        assert wrap(2.0 * math.atan2(turn.z, turn.w) - truth.heading) == pytest.approx(0.0, abs=1e-9)
         assert str(trail.poses[-1]) == str(pose.pose)
         assert len(trail.poses) == moment.truth.tick + 1
         frames = {one.child_frame_id: one for one in tf.transforms}
@@ -221,8 +227,24 @@ def test_viewers_see_an_ellipse_where_there_is_a_covariance(noisy: Path) -> None
     for one, belief in zip(held, shown, strict=True):
         (entity,) = belief.entities
         assert len(entity.arrows) == len(one.world or one.local)
+        assert [arrow.color.a for arrow in entity.arrows] == [max(LEAST, share) for share in one.odds]
         assert bool(entity.lines) == (one.covariance is not None and bool(one.world))
+        for point in entity.lines[0].points if one.covariance is not None and entity.lines else ():
+            assert one.covariance is not None
+            off = np.array([point.x - one.world[0].x, point.y - one.world[0].y])
+            sigma = [[one.covariance.xx, one.covariance.xy], [one.covariance.xy, one.covariance.yy]]
+            assert off @ np.linalg.solve(sigma, off) == pytest.approx(9.0)
     assert any(one.entities[0].lines for one in shown)
+
+
+def test_viewers_see_what_a_robot_does_and_the_range_to_its_anchor_while_there_is_one(paper_1: Path) -> None:
+    shown = seen(paper_1 / "run.mcap", "/a/body")
+    ranges = [row["anchor_range"] for row in rows_of(paper_1 / "ticks.csv") if row["robot"] == "a"]
+    for body, measured in zip(shown, ranges, strict=True):
+        (entity,) = body.entities
+        assert entity.texts[0].text.startswith("a: a ")
+        assert [text.text for text in entity.texts[1:]] == ([f"{float(measured):.3f} m"] if measured else [])
+    assert "" in ranges
 
 
 def test_viewers_read_what_happens(paper_1: Path) -> None:
@@ -264,6 +286,9 @@ def test_ticks_as_a_table_are_those_of_ticks_csv_with_what_was_held_possible(noi
             assert row["estimate_x"] == one.world[0].x
         assert row["cov_xx"] == (one.covariance.xx if one.covariance and one.world else None)
         assert (row["nees"] is None) == (row["cov_xx"] is None)
+        if one.covariance is not None and one.world:
+            sigmas = one.covariance.position_sigma, one.covariance.heading_sigma
+            assert (row["position_sigma_m"], row["heading_sigma_rad"]) == sigmas
     assert {row["verdict"] for row in table} == {None, "localised"}
 
 
