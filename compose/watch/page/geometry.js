@@ -47,3 +47,8 @@ export function between(from, to, driven, share, period) {
     now[2] + share * wrap(to[2] - end[2]),
   ];
 }
+
+/** The frame of its anchor; its bearing is the truth's, or, where only the robot is asked, anything. */
+export function frame_of(robot, truth) {
+  return truth && robot.frame ? robot.frame : [robot.anchor[0], robot.anchor[1], 0];
+}

@@ -1,6 +1,6 @@
 // The time line: a band a robot, its phases; contact shaded across; faults, claims and the end marked above.
 
-import { unit } from "./plane.js";
+import { unit } from "./pen.js";
 import { FAULTS } from "./words.js";
 
 const MOST_BANDS = 6;

@@ -1,0 +1,128 @@
+// What robots hold possible, and what they have just ruled out.
+
+import { compose, distance, ellipse, frame_of, step, TAU } from "./geometry.js";
+import { label, shape } from "./pen.js";
+import { odds } from "./words.js";
+
+const FADING = 3;
+const SIGMAS = 3;
+const LEGIBLE = 2.5;
+
+export class Beliefs {
+  constructor(plane) { this.plane = plane; }
+
+  belief(view, robot) {
+    const { store, scene, truth, look, size, tick } = view;
+    const player = scene.players[store.places.get(robot.id)], held = player?.held;
+    if (!held) return this.#somewhere(view, robot, player);
+    const pen = this.plane.context, frame = frame_of(robot, truth);
+    const poses = held.world.length ? held.world : held.local.map((local) => compose(frame, local));
+    if (!poses.length) return this.#somewhere(view, robot, player);
+    this.#ruled_out(view, robot, poses, tick);
+    if (!held.world.length && !truth) this.#any_bearing(view, robot, held);
+    poses.slice(0, 60).forEach((pose, place) => {
+      const chance = held.odds[place] ?? 1 / poses.length;
+      const [x, y] = this.plane.at(pose);
+      pen.globalAlpha = 0.3 + 0.7 * Math.sqrt(chance);
+      if (place === 0 && held.covariance && held.world.length) this.#ellipse(pose, held.covariance, look);
+      const grown = truth ? size * 1.45 : size * 1.15;
+      shape(pen, robot.role, x, y, pose[2], grown);
+      if (!truth && poses.length === 1) {
+        pen.fillStyle = look.phase[player.drive?.phase ?? 1];
+        pen.fill();
+      }
+      pen.strokeStyle = look.ghost;
+      pen.lineWidth = 2;
+      pen.setLineDash(held.world.length || !truth ? [] : [3, 3]);
+      pen.stroke();
+      pen.setLineDash([]);
+      if (held.odds.length > 1 && place < 6 && chance > 0.01 && size > 6) {
+        label(pen, odds(chance), x - grown - 4, y + grown + 8, look.ghost, "right", look);
+      }
+      if (!truth && place === 0) label(pen, robot.id, x + grown + 3, y - grown, look.ink, "left", look, look.bold);
+    });
+    pen.globalAlpha = 1;
+    return undefined;
+  }
+
+  /** Before anything is known but a range, or nothing: somewhere in the anchor's range. */
+  #somewhere({ look, truth, store }, robot, player) {
+    if (truth || !player) return;
+    const pen = this.plane.context, [x, y] = this.plane.at(robot.anchor);
+    const range = player.anchor_range ?? store.stage.mission.sensing_range;
+    pen.beginPath();
+    pen.arc(x, y, range * this.plane.scale, 0, TAU);
+    pen.strokeStyle = look.ghost;
+    pen.lineWidth = 3;
+    pen.setLineDash([2, 6]);
+    pen.stroke();
+    pen.setLineDash([]);
+    label(pen, `${robot.id} is somewhere here`, x, y - range * this.plane.scale - 6, look.ghost, "center", look);
+  }
+
+  /** Its place relative to its anchor is known, the bearing is not: the frame is turned at will. */
+  #any_bearing({ look }, robot, held) {
+    const pen = this.plane.context, [x, y] = this.plane.at(robot.anchor);
+    const radius = Math.hypot(held.local[0][0], held.local[0][1]) * this.plane.scale;
+    pen.beginPath();
+    pen.arc(x, y, radius, 0, TAU);
+    pen.strokeStyle = look.ghost;
+    pen.globalAlpha = 0.5;
+    pen.lineWidth = 2;
+    pen.setLineDash([2, 6]);
+    pen.stroke();
+    pen.setLineDash([]);
+    pen.globalAlpha = 1;
+    label(pen, `${robot.id}: here, at any bearing`, x, y - radius - 6, look.ghost, "center", look);
+  }
+
+  /** What was held possible up to FADING ticks ago, moved on, and is not any more. */
+  #ruled_out({ store, truth, look, size }, robot, poses, tick) {
+    const pen = this.plane.context, period = store.stage.mission.period;
+    for (let age = 1; age <= FADING && tick - age >= 0; age++) {
+      const held = store.player(tick - age, robot.id)?.held;
+      const later = store.player(tick - age + 1, robot.id)?.held;
+      if (!held || !later || held.world.length + held.local.length < 2) continue;
+      const frame = frame_of(robot, truth), in_world = held.world.length > 0;
+      if (in_world !== later.world.length > 0) continue;
+      const had = in_world ? held.world : held.local.map((local) => compose(frame, local));
+      const has = in_world ? later.world : later.local.map((local) => compose(frame, local));
+      if (has.length >= had.length) continue;
+      for (let pose of had.slice(0, 60)) {
+        for (let k = tick - age + 1; k <= tick; k++) {
+          const driven = store.player(k, robot.id)?.executed;
+          if (driven) pose = step(pose, driven[0], driven[1], period);
+          if (k === tick - age + 1 && has.some((one) => distance(one, pose) < 0.15)) { pose = null; break; }
+        }
+        if (!pose || poses.some((one) => distance(one, pose) < 0.15)) continue;
+        const [x, y] = this.plane.at(pose), r = 0.7 * size;
+        pen.globalAlpha = 0.75 / age;
+        shape(pen, robot.role, x, y, pose[2], size * 1.3);
+        pen.strokeStyle = look.ghost;
+        pen.lineWidth = 1.4;
+        pen.setLineDash([2, 3]);
+        pen.stroke();
+        pen.setLineDash([]);
+        pen.strokeStyle = look.fault;
+        pen.lineWidth = 2;
+        pen.beginPath();
+        pen.moveTo(x - r, y - r); pen.lineTo(x + r, y + r); pen.moveTo(x + r, y - r); pen.lineTo(x - r, y + r);
+        pen.stroke();
+      }
+      pen.globalAlpha = 1;
+    }
+  }
+
+  #ellipse(pose, covariance, look) {
+    const { major, minor, turn } = ellipse(covariance, SIGMAS), pen = this.plane.context;
+    if (major * this.plane.scale < LEGIBLE) return;
+    const [x, y] = this.plane.at(pose);
+    pen.beginPath();
+    pen.ellipse(x, y, major * this.plane.scale, Math.max(minor * this.plane.scale, 0.5), -turn, 0, TAU);
+    pen.fillStyle = look.cloud;
+    pen.fill();
+    pen.lineWidth = 1.5;
+    pen.strokeStyle = look.ghost;
+    pen.stroke();
+  }
+}

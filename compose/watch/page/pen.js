@@ -1,0 +1,45 @@
+// What is drawn with on a canvas: colours and fonts of the page, robots, and words.
+
+import { TAU } from "./geometry.js";
+
+/** CSS pixels that what is drawn takes for one: on a very large screen more. */
+export const unit = () => Math.max(1, window.innerWidth / 2200);
+
+/** a points, b is round with a nose: told apart without colour. */
+export function shape(pen, role, x, y, heading, size) {
+  const c = Math.cos(heading), s = -Math.sin(heading);
+  const to = (ahead, left) => [x + size * (ahead * c + left * s), y + size * (ahead * s - left * c)];
+  pen.beginPath();
+  if (role === "a") {
+    pen.moveTo(...to(1.25, 0)); pen.lineTo(...to(-0.85, 0.85)); pen.lineTo(...to(-0.4, 0)); pen.lineTo(...to(-0.85, -0.85));
+  } else {
+    const angle = Math.atan2(s, c);
+    pen.arc(x, y, 0.82 * size, angle + 0.55, angle + TAU - 0.55);
+    pen.lineTo(...to(1.4, 0));
+  }
+  pen.closePath();
+}
+
+export function label(pen, text, x, y, colour, align, look, font = look.font) {
+  pen.font = font;
+  pen.textAlign = align;
+  pen.lineWidth = 3.5;
+  pen.strokeStyle = look.paper;
+  pen.strokeText(text, x, y);
+  pen.fillStyle = colour;
+  pen.fillText(text, x, y);
+}
+
+export class Look {
+  constructor(style) {
+    const of = (name) => style.getPropertyValue(`--${name}`).trim();
+    for (const name of ["ink", "paper", "faint", "grid", "disc", "ring", "orbit", "ghost", "cloud", "range", "link", "fault"]) {
+      this[name] = of(name);
+    }
+    this.phase = { 1: of("phase-1"), 2: of("phase-2"), 3: of("phase-3") };
+    const family = of("font");
+    const size = 12.5;
+    this.font = `${size}px ${family}`;
+    this.bold = `600 ${size + 2.5}px ${family}`;
+  }
+}

@@ -1,0 +1,138 @@
+// What robots measure, and what they say to each other.
+
+import { compose, distance, frame_of, TAU } from "./geometry.js";
+import { label } from "./pen.js";
+import { metres } from "./words.js";
+
+export class Signals {
+  constructor(plane) { this.plane = plane; }
+
+  #origin({ truth, scene, store, places }, robot) {
+    if (truth) return places.get(robot.id);
+    const held = scene.players[store.places.get(robot.id)]?.held;
+    if (!held) return null;
+    if (held.world.length) return held.world[0];
+    return held.local.length ? compose(frame_of(robot, false), held.local[0]) : null;
+  }
+
+  anchor_range(view, robot) {
+    const { scene, store, look, share, moving } = view;
+    const range = scene.players[store.places.get(robot.id)]?.anchor_range;
+    const pose = view.truth ? scene.players[store.places.get(robot.id)]?.pose : this.#origin(view, robot);
+    if (range === undefined || !pose) return;
+    const pen = this.plane.context, from = this.plane.at(pose), to = this.plane.at(robot.anchor);
+    pen.globalAlpha = moving ? Math.max(0, 1 - 1.6 * share) : 1;
+    pen.beginPath();
+    pen.moveTo(...from); pen.lineTo(...to);
+    pen.strokeStyle = look.range;
+    pen.lineWidth = 1.8;
+    pen.stroke();
+    if (distance(from, to) > 46) {
+      label(pen, metres(range), (from[0] + to[0]) / 2, (from[1] + to[1]) / 2 - 5, look.range, "center", look);
+    }
+    pen.globalAlpha = 1;
+  }
+
+  /** Without the truth, a range to the peer is a ring. */
+  mutual_ring(view, robot) {
+    const { scene, store, look } = view;
+    const contact = scene.players[store.places.get(robot.id)]?.contacts?.[0];
+    const pose = this.#origin(view, robot);
+    if (!contact || contact[1] === null || !pose) return;
+    const pen = this.plane.context, [x, y] = this.plane.at(pose), radius = contact[1] * this.plane.scale;
+    const held = scene.players[store.places.get(robot.id)].held;
+    const poses = held.world.length > 1 && held.world.length <= 6 ? held.world : [pose];
+    pen.strokeStyle = look.link;
+    pen.lineWidth = 1.5;
+    pen.setLineDash([6, 5]);
+    for (const one of poses) {
+      pen.globalAlpha = one === poses[0] ? 1 : 0.45;
+      pen.beginPath();
+      pen.arc(...this.plane.at(one), radius, 0, TAU);
+      pen.stroke();
+    }
+    pen.globalAlpha = 1;
+    pen.setLineDash([]);
+    label(pen, `${contact[0]}: ${metres(contact[1])}`, x, y + radius + 14, look.link, "center", look);
+  }
+
+  contact(view, robot) {
+    const { scene, store, look, places, size, focus } = view;
+    const player = scene.players[store.places.get(robot.id)];
+    const contact = player?.contacts?.find((one) => one[0] === robot.peer);
+    const from = places.get(robot.id), to = places.get(robot.peer);
+    if (!contact || !from || !to) return;
+    const pen = this.plane.context, one = this.plane.at(from), other = this.plane.at(to), length = distance(one, other);
+    if (length < 1) return;
+    const across = [-(other[1] - one[1]) / length, (other[0] - one[0]) / length];
+    pen.globalAlpha = focus && robot.id !== focus && robot.peer !== focus ? 0.4 : 1;
+    for (const side of [-3.5, 3.5]) {
+      pen.beginPath();
+      pen.moveTo(one[0] + side * across[0], one[1] + side * across[1]);
+      pen.lineTo(other[0] + side * across[0], other[1] + side * across[1]);
+      pen.strokeStyle = look.link;
+      pen.lineWidth = 1.4;
+      pen.stroke();
+    }
+    if (contact[1] !== null && length > 60) {
+      const x = (one[0] + other[0]) / 2 + 16 * across[0], y = (one[1] + other[1]) / 2 + 16 * across[1];
+      label(pen, metres(contact[1]), x, y, look.link, across[0] < 0 ? "right" : "left", look);
+    }
+    if (length > 3 * size && size > 6) {
+      this.#reports(view, robot.id, robot.peer, one, other, across, 3.5);
+      this.#reports(view, robot.peer, robot.id, other, one, across, -3.5);
+    }
+    pen.globalAlpha = 1;
+  }
+
+  /** The reports on one lane: from `from` to `to`; those that wait on the way stand in its middle. */
+  #reports({ scene, share, moving, look, store, tick, size }, sender, receiver, from, to, across, side) {
+    const passages = scene.passages.filter((one) => one.sender === sender && one.receiver === receiver);
+    const here = new Map();
+    for (const one of passages) here.set(one.tick, [...(here.get(one.tick) ?? []), one.what]);
+    const progress = moving ? Math.min(1, share / 0.75) : null;
+    const spot = (way) => [
+      from[0] + way * (to[0] - from[0]) + side * across[0],
+      from[1] + way * (to[1] - from[1]) + side * across[1],
+    ];
+    let waiting = 0;
+    for (const [sent, what] of here) {
+      const arrives = what.includes("heard") || what.includes("damaged"), late = sent < tick;
+      const start = late ? 0.5 : 0.12;
+      const goal = arrives ? 0.86 : 0.5;
+      const way = progress === null ? (arrives ? 0.72 : 0.5) : start + progress * (goal - start);
+      const lost = what.includes("lost") && !arrives;
+      const sign = lost ? "lost" : what.includes("damaged") ? "damaged" : arrives ? (late ? "late" : "heard") : "waiting";
+      if (sign === "waiting" && !store.live && progress === null) waiting += 1;
+      const alpha = progress !== null && lost ? Math.max(0.15, 1 - 0.8 * progress) : 1;
+      this.#report(spot(way - 0.05 * waiting), sign, alpha, spot(way - 0.12), look, size);
+    }
+  }
+
+  #report([x, y], sign, alpha, behind, look, size) {
+    const pen = this.plane.context, before = pen.globalAlpha;
+    pen.globalAlpha = before * alpha;
+    if (sign === "late") {
+      pen.beginPath();
+      pen.moveTo(...behind); pen.lineTo(x, y);
+      pen.strokeStyle = look.link;
+      pen.lineWidth = 4;
+      pen.stroke();
+    }
+    pen.beginPath();
+    pen.arc(x, y, Math.min(5, 0.5 * size), 0, TAU);
+    pen.fillStyle = sign === "heard" || sign === "late" ? look.link : look.paper;
+    pen.fill();
+    pen.strokeStyle = sign === "lost" || sign === "damaged" ? look.fault : look.link;
+    pen.lineWidth = 1.8;
+    pen.setLineDash(sign === "lost" ? [2, 2] : []);
+    pen.stroke();
+    pen.setLineDash([]);
+    if (sign === "damaged") {
+      pen.beginPath();
+      pen.moveTo(x - 3.5, y - 3.5); pen.lineTo(x + 3.5, y + 3.5); pen.moveTo(x + 3.5, y - 3.5); pen.lineTo(x - 3.5, y + 3.5);
+      pen.stroke();
+    }
+    pen.globalAlpha = before;
+  }
+}

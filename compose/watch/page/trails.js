@@ -1,0 +1,130 @@
+// Where robots were: truly, or if what they now hold likeliest is true.
+
+import { between, compose, frame_of, inverse } from "./geometry.js";
+import { unit } from "./pen.js";
+
+const TRAIL = { 1: { dash: [1.5, 4.5], width: 2.4 }, 2: { dash: [], width: 1.6 }, 3: { dash: [], width: 4 } };
+const CHUNK = 64;
+const BENDS = 6;
+
+export class Trails {
+  constructor(plane) { this.plane = plane; }
+
+  #chunks = new Map();
+
+  /** What was kept is not so any more. */
+  forget() { this.#chunks.clear(); }
+
+  trail({ store, tick, share, look, focus, moving }, robot) {
+    const pen = this.plane.context, last = Math.min(tick, store.last);
+    const faint = focus && robot.id !== focus;
+    pen.save();
+    pen.globalAlpha = faint ? 0.4 : 0.95;
+    const ratio = (window.devicePixelRatio || 1) * unit(), s = this.plane.scale;
+    const map = () => pen.setTransform(
+      ratio * s, 0, 0, -ratio * s,
+      ratio * (this.plane.width / 2 - this.plane.centre[0] * s), ratio * (this.plane.height / 2 + this.plane.centre[1] * s),
+    );
+    const stroke = (path, phase) => {
+      const { dash, width } = TRAIL[phase] ?? TRAIL[2];
+      pen.lineWidth = (faint ? 0.7 * width : width) / s;
+      pen.setLineDash(dash.map((length) => length / s));
+      pen.strokeStyle = look.phase[phase];
+      pen.stroke(path);
+    };
+    map();
+    for (let from = store.first; from < last; from += CHUNK) {
+      const to = Math.min(from + CHUNK, last);
+      for (const [phase, path] of this.#pieces(store, robot, from, to, to === from + CHUNK)) stroke(path, phase);
+    }
+    if (moving && share > 0) {
+      const player = store.player(tick, robot.id), next = store.player(tick + 1, robot.id);
+      if (player?.pose && next?.pose) {
+        const path = new Path2D(), bends = bends_of(next.executed, store.stage.mission.period);
+        path.moveTo(player.pose[0], player.pose[1]);
+        for (let k = 1; k <= bends; k++) {
+          const way = (share * k) / bends;
+          const pose = between(player.pose, next.pose, next.executed, way, store.stage.mission.period);
+          path.lineTo(pose[0], pose[1]);
+        }
+        stroke(path, player.drive?.phase ?? 1);
+      }
+    }
+    pen.restore();
+    pen.setLineDash([]);
+  }
+
+  /** The trail from tick `from` to `to`, a path a phase; kept once it is whole. */
+  #pieces(store, robot, from, to, whole) {
+    const key = `${robot.id}/${from}`, kept = this.#chunks.get(key);
+    if (kept && whole) return kept;
+    const pieces = [], period = store.stage.mission.period;
+    let path = null, phase = null, complete = true;
+    for (let k = from; k < to; k++) {
+      const here = store.player(k, robot.id), next = store.player(k + 1, robot.id);
+      if (!here?.pose || !next?.pose) {
+        path = null; phase = null;
+        complete = complete && Boolean(here && next);
+        continue;
+      }
+      const now = here.drive?.phase ?? phase ?? 1;
+      if (now !== phase || !path) {
+        path = new Path2D();
+        path.moveTo(here.pose[0], here.pose[1]);
+        pieces.push([now, path]);
+        phase = now;
+      }
+      const bends = bends_of(next.executed, period);
+      for (let bend = 1; bend < bends; bend++) {
+        const pose = between(here.pose, next.pose, next.executed, bend / bends, period);
+        path.lineTo(pose[0], pose[1]);
+      }
+      path.lineTo(next.pose[0], next.pose[1]);
+    }
+    if (whole && complete) this.#chunks.set(key, pieces);
+    return pieces;
+  }
+
+  /** Where the robot was, if what it now holds likeliest is true. */
+  believed_trail({ store, tick, look }, robot) {
+    const now = store.player(tick, robot.id)?.held;
+    if (!now?.local.length) return;
+    const here = now.world.length ? now.world[0] : compose(frame_of(robot, false), now.local[0]);
+    const turn = compose(here, inverse(now.local[0])), pen = this.plane.context;
+    const { period } = store.stage.mission;
+    let phase = null, last = null;
+    pen.save();
+    pen.globalAlpha = 0.8;
+    for (let k = Math.max(store.first, tick - 4000); k <= tick; k++) {
+      const player = store.player(k, robot.id);
+      if (!player?.held?.local.length || (player.held.local.length > 1 && k < tick)) continue;
+      const there = compose(turn, player.held.local[0]), [x, y] = this.plane.at(there);
+      const next = player.drive?.phase ?? 1;
+      if (phase !== null && last) {
+        const bends = bends_of(player.executed, period);
+        for (let bend = 1; bend <= bends; bend++) {
+          pen.lineTo(...this.plane.at(between(last, there, player.executed, bend / bends, period)));
+        }
+      }
+      last = there;
+      if (next !== phase) {
+        if (phase !== null) pen.stroke();
+        phase = next;
+        const { dash, width } = TRAIL[phase];
+        pen.setLineDash(dash);
+        pen.lineWidth = width;
+        pen.strokeStyle = look.phase[phase];
+        pen.beginPath();
+        pen.moveTo(x, y);
+      }
+    }
+    if (phase !== null) pen.stroke();
+    pen.restore();
+    pen.setLineDash([]);
+  }
+}
+
+function bends_of(driven, period) {
+  if (!driven) return 1;
+  return Math.max(1, Math.min(4 * BENDS, Math.ceil(Math.abs(driven[1] * period) * 4 * BENDS)));
+}
