@@ -17,7 +17,7 @@ from compose.export.frames import KINDS
 from compose.record import WORLD_JOURNAL, agent_journal
 from compose.scenario import load, parse
 from protocol import journal
-from protocol.messages import Drive, Sense
+from protocol.messages import Drive, End, Report, Sense
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode, encode
 from tests.commands import journals, tandem
 from tests.same_plans import scenario as random_plan
@@ -156,6 +156,38 @@ def test_a_record_whose_drives_the_world_has_otherwise_is_found_there(record: Pa
     ended = tandem("replay", record)
     assert ended.status == 1
     assert ended.out.splitlines()[1].startswith("tick 20, b, Drive omega: recorded ")
+
+
+def changed(record: dict[str, list[bytes]], name: str, was: Any, **fields: Any) -> dict[str, list[bytes]]:
+    """`record` with that message of a journal otherwise."""
+    frames = [encode(replace(was, **fields)) if one == encode(was) else one for one in record[name]]
+    assert frames != record[name]
+    return record | {name: frames}
+
+
+def test_a_report_that_is_heard_otherwise_than_it_was_told_is_found(paper_1: dict[str, list[bytes]]) -> None:
+    heard = [decode(frame, KINDS, MAX_FRAME_BYTES) for frame in paper_1[B]]
+    told = next(one for one in heard if isinstance(one, Report) and one.robot == "a")
+    first, *_ = replayed(changed(paper_1, B, told, state="listening")).differences
+    assert (first.rule, first.robot) == ("report", "b")
+
+
+def test_a_report_that_is_heard_and_that_no_sense_lists_is_found(paper_1: dict[str, list[bytes]]) -> None:
+    frames = list(paper_1[B])
+    heard = [decode(frame, KINDS, MAX_FRAME_BYTES) for frame in frames]
+    place = next(i for i, one in enumerate(heard) if isinstance(one, Report) and one.robot == "a")
+    frames.insert(place, frames[place])
+    assert "contact" in {one.rule for one in replayed(paper_1 | {B: frames}).differences}
+
+
+def test_an_end_that_does_not_follow_is_found_though_all_say_the_same(
+    paper_1: dict[str, list[bytes]],
+) -> None:
+    end = next(one for frame in paper_1[A] if isinstance(one := decode(frame, KINDS, MAX_FRAME_BYTES), End))
+    record = paper_1
+    for name in paper_1:
+        record = changed(record, name, end, outcome="undecided")
+    assert [(one.rule, one.tick) for one in replayed(record).differences] == [("claim", end.tick)]
 
 
 # --- what breaks off ------------------------------------------------------------------------------------
