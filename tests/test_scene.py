@@ -11,6 +11,7 @@ from agent.mind import WORDS
 from compose import inline
 from compose.record import read as read_record
 from compose.scenario import load
+from compose.scene.fates import fates
 from compose.scene.recorded import Performance, read
 from compose.scene.stage import of_scenario
 from compose.scene.words import DOING, SEEKING, doing
@@ -126,6 +127,31 @@ def test_what_becomes_of_every_report_is_what_the_air_made_of_it(tmp_path: Path)
             ever |= {what for what, ticks in here.items() if ticks} | ({"late"} if flying else set())
             flying = left
     assert ever == {"sent", "heard", "damaged", "lost", "late"}
+
+
+def test_every_report_has_the_fate_that_the_air_gave_it(tmp_path: Path) -> None:
+    faults = ["loss=0.3, delay=0..3, corrupt=0.2, duplicate=0.3, reorder=0.2", "a->b: reports_per_tick=0.7"]
+    scenario = load("random", seed=3, faults=faults)
+    inline.play(scenario, tmp_path)
+    shown = read(tmp_path)
+    flights = fates(shown.scenes, over=True)
+    assert {flight.fate for flight in flights} == {"heard", "late", "damaged", "lost"}
+    told = history(journal.read(tmp_path / "world.journal"), tmp_path)
+    airs = {sender: [tick.world.air[place] for tick in told.ticks] for place, sender in enumerate(("a", "b"))}
+    lost = {
+        (passage.sender, passage.tick)
+        for one in shown.scenes
+        for passage in one.passages
+        if passage.what == "lost"
+    }
+    for flight in flights:
+        air = list(enumerate(airs[flight.sender]))
+        assert list(flight.heard) == [k for k, one in air for sent in one.heard if sent == flight.tick]
+        assert list(flight.damaged) == [k for k, one in air for sent in one.damaged if sent == flight.tick]
+        came = flight.heard or flight.damaged
+        assert (flight.fate == "lost") == (not came)
+        under_way = flight.tick in [one.tick for one in airs[flight.sender][-1].flying]
+        assert came or under_way or (flight.sender, flight.tick) in lost
 
 
 def test_every_state_has_its_sentence() -> None:
