@@ -9,7 +9,18 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from compose.figures.pair import ROLES, Pair
-from compose.figures.sheet import NO_ENCOUNTER, SMALL, Absent, Sheet, around, circle, ending, equal, fitted
+from compose.figures.sheet import (
+    NO_ENCOUNTER,
+    ROW,
+    SMALL,
+    Absent,
+    Sheet,
+    around,
+    circle,
+    ending,
+    equal,
+    fitted,
+)
 from compose.figures.style import COLOURS, DASHES, INK, MARKS, PALE
 from compose.figures.trajectory import heading
 from protocol.mission import Role
@@ -18,9 +29,11 @@ from protocol.motion import Pose
 WIDTH, TALLEST = 2.35, 3.2
 """inches: of a panel, and its height at the most"""
 LEFT, GAP, KEY = 0.68, 0.42, 0.28
-"""inches: left of panels, between panels, and of the key below them"""
+"""inches: left of panels, between panels, and of the key below them on one line"""
 COLUMNS, PANELS = 3, 6
 """panels in a row, and in all at the most"""
+SIGNS = 6
+"""in the key below them: side by side below a whole row of panels, else on two lines"""
 HEAD = 0.36
 """inches: above a panel, for what is said of it"""
 BEFORE = 2
@@ -40,10 +53,12 @@ def draw(pair: Pair) -> Figure | Absent:
     columns, rows = min(COLUMNS, len(shown)), math.ceil(len(shown) / COLUMNS)
     row = height + HEAD + 0.45
     wide = LEFT + columns * (width + GAP)
-    sheet = Sheet(max(wide, 5.4), rows * row + KEY, [ending(pair), _title(ticks, shown)])
+    signs = SIGNS if columns == COLUMNS else SIGNS // 2
+    key = KEY + ROW * (SIGNS / signs - 1)
+    sheet = Sheet(max(wide, 5.4), rows * row + key, [ending(pair), _title(ticks, shown)])
     for i, tick in enumerate(shown):
         left = LEFT + (i % columns) * (width + GAP)
-        bottom = KEY + 0.42 + (rows - 1 - i // columns) * row
+        bottom = key + 0.42 + (rows - 1 - i // columns) * row
         axes = sheet.panel(left, bottom, width, height)
         _panel(axes, pair, ticks[0], shown[i - 1] if i else tick, tick)
         equal(axes, window)
@@ -51,7 +66,7 @@ def draw(pair: Pair) -> Figure | Absent:
         if i % columns == 0:
             axes.set_ylabel("$y$ [m]", fontsize=SMALL)
         axes.set_xlabel("$x$ [m]", fontsize=SMALL)
-    _key(sheet, axes, pair)
+    _key(sheet, axes, pair, key - 0.05, signs)
     return sheet.figure
 
 
@@ -85,6 +100,8 @@ def _window(pair: Pair, first: int, last: int) -> tuple[float, float, float, flo
 
 
 def _title(ticks: list[int], shown: list[int]) -> str:
+    if len(ticks) == 1:
+        return f"The encounter: its mutual range, $k$ = {ticks[0]}"
     many = (
         f"{len(shown)} of its {len(ticks)} mutual ranges" if len(shown) < len(ticks) else "its mutual ranges"
     )
@@ -135,7 +152,7 @@ def _place(axes: Axes, role: Role, pose: Pose, ranged: bool, now: bool) -> None:
     )  # fmt: skip
 
 
-def _key(sheet: Sheet, axes: Axes, pair: Pair) -> None:
+def _key(sheet: Sheet, axes: Axes, pair: Pair, top: float, columns: int) -> None:
     for role in ROLES:
         axes.plot(
             [],
@@ -151,4 +168,4 @@ def _key(sheet: Sheet, axes: Axes, pair: Pair) -> None:
     axes.plot([], [], ":", color=INK, lw=1.4, label="mutual range")
     axes.plot([], [], ls="", marker=r"$\rightarrow$", ms=12, color=PALE, label="heading")
     axes.plot([], [], ls=DASHES["a"], color=PALE, lw=0.9, label="orbits")
-    sheet.key(axes, LEFT, KEY - 0.05, columns=6)
+    sheet.key(axes, LEFT, top, columns)
