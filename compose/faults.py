@@ -13,7 +13,7 @@ from msgspec.structs import asdict
 from world.faults import MAX_DELAY, MAX_FAULTS, Delay, Fault, Link
 
 _LINK = re.compile(r"\s*(?P<one>[A-Za-z0-9_-]+)\s*(?P<way><->|->)\s*(?P<other>[A-Za-z0-9_-]+)\s*")
-_NUMBER = re.compile(r"[0-9]*\.?[0-9]+(?:[eE]-?[0-9]+)?")
+_NUMBER = re.compile(r"-?[0-9]*\.?[0-9]+(?:[eE]-?[0-9]+)?")
 EVERYWHERE = "*"
 
 
@@ -101,7 +101,9 @@ def _named(error: str) -> str:
     return f"{where.strip('.`')}: {what[0].lower()}{what[1:]}".replace("`", "'")
 
 
-def _value(name: str, text: str) -> float | list[float]:
+def _value(name: str, text: str) -> bool | float | list[float]:
+    if text in ("true", "false"):
+        return text == "true"
     numbers = text.split("..")
     if len(numbers) > 2 or not all(_NUMBER.fullmatch(number) for number in numbers):
         raise BadFault(f"{name}: '{text}' is neither a number nor a range such as 0..3")

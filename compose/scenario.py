@@ -12,15 +12,15 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import msgspec
 from msgspec import Meta
 
 from compose.faults import BadFault, FaultTable, added, table_of
-from compose.kill import BadKill, Kill, KillTable, drawn
+from compose.kill import DRAWN, POINTS, BadKill, Kill, KillTable, drawn
 from compose.status import UserError
-from protocol.lie import Lie
+from protocol.lie import Kind, Lie, Part
 from protocol.messages import Briefing
 from protocol.mission import Anchor, Mission, Role, Variant, noise_obstacle, obstacle, safety_obstacle
 from protocol.motion import TAU, Pose
@@ -43,6 +43,15 @@ TICK_S = (5e-4, 3600.0)
 """s of wall time that a tick in real time may last"""
 WITHIN = 1.0 - 1e-9
 """of R: how far out a start is drawn at the most, so that rounding does not carry it outside"""
+
+
+CHOICES: dict[str, tuple[str, ...]] = {
+    "variant": get_args(Variant),
+    "kind": get_args(Kind),
+    "part": get_args(Part),
+    "point": (*POINTS, DRAWN),
+}
+"""of the fields that take one of a few words"""
 
 
 class BadScenario(UserError):
@@ -214,6 +223,11 @@ def field_first(error: str) -> str:
     what = match["what"].replace("`", "'")
     what = what.replace("Object contains ", "").replace("Object missing required field", "missing field")
     what = what[0].lower() + what[1:]
+    field = (match["where"] or "").rpartition(".")[2]
+    if what.startswith("invalid enum value") and field in CHOICES:
+        what = (
+            f"there is no {what.removeprefix('invalid enum value ')}; there are {', '.join(CHOICES[field])}"
+        )
     if "matching regex" in what:
         what = "no name: letters, digits, - and _, a letter or digit first"
     return f"{match['where']}: {what}" if match["where"] else what

@@ -229,6 +229,26 @@ def test_the_encounter_has_a_panel_for_each_mutual_range(name: str, ticks: list[
         assert [(x, y), (other_x, other_y)] == [(p.x, p.y) for p in truth]
 
 
+@pytest.mark.parametrize("ticks", [46, 47, 48])
+def test_the_key_of_an_encounter_is_on_the_paper_however_few_ranges_it_has(
+    ticks: int, tmp_path: Path
+) -> None:
+    play(parse(PAPER_1.replace("seed = 1", f"seed = 1\nmax_ticks = {ticks}"), "mine.toml"), tmp_path)
+    told = pair(tmp_path)
+    assert len(steps.steps(told)) == ticks - 45
+    with look():
+        figure = drawn(steps.draw(told))
+        figure.draw_without_rendering()
+    (key,) = figure.legends
+    paper, signs = figure.bbox, key.get_window_extent()
+    assert paper.x0 <= signs.x0 < signs.x1 <= paper.x1
+    assert paper.y0 <= signs.y0
+    for axes in figure.axes:
+        panel = axes.get_tightbbox()
+        assert panel is not None
+        assert signs.y1 <= panel.y0
+
+
 def test_the_trajectory_has_both_paths_the_ranges_and_the_orbits(records: Path) -> None:
     told = pair(recorded("paper-1", records))
     figure = trajectory.draw(told)

@@ -74,6 +74,29 @@ def test_an_unknown_field_is_named(was: str, typo: str, field: str, tmp_path: Pa
 
 
 @pytest.mark.parametrize(
+    ("was", "new", "says"),
+    [
+        ('"paper"', '"papers"', "planner.variant: there is no 'papers'; there are assured, paper"),
+        ('id = "a"', 'id = "a"\nlie = {kind = "scal", size = 2}', "robot[0].lie.kind: there is no 'scal'; "),
+        (
+            'id = "a"',
+            'id = "a"\nlie = {kind = "scale", size = 2, part = "orbits"}',
+            "robot[0].lie.part: there is no 'orbits'; there are phase-1, orbit, encounter, all",
+        ),
+        (
+            "[planner]",
+            '[[kill]]\npoint = "sens"\n[planner]',
+            "kill[0].point: there is no 'sens'; there are sense, report, journal, drive, ?",
+        ),
+    ],
+)
+def test_a_word_that_is_none_is_told_with_those_that_there_are(was: str, new: str, says: str) -> None:
+    with pytest.raises(BadScenario) as bad:
+        parse(changed(GOOD, was, new), "mine.toml")
+    assert str(bad.value).startswith(f"mine.toml: {says}")
+
+
+@pytest.mark.parametrize(
     ("line", "field"),
     [
         ('name = "paper-1"\n', "missing field 'name'"),

@@ -77,7 +77,8 @@ def test_whoever_is_killed_the_record_is_that_of_the_same_without_kills(tmp_path
     rows = pq.read_table(tmp_path / "out" / "trials.parquet").to_pylist()
     assert [row["kills"] for row in rows] == [0, 3, 0, 0]
     assert all(row["same_record"] is True and row["ticks"] == 48 for row in rows)
-    assert (tmp_path / "out" / "figures" / "crash.svg").exists()
+    picture = (tmp_path / "out" / "figures" / "crash.svg").read_text()
+    assert all(f"<!-- {tick} -->" in picture for tick in (46, 49))
 
 
 @pytest.mark.parametrize("name", [WORLD_JOURNAL, agent_journal("a"), agent_journal("b"), "ticks.csv"])

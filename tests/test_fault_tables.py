@@ -73,6 +73,12 @@ def test_a_file_and_the_command_line_say_the_same(tmp_path: Path) -> None:
     assert journals(tmp_path / "rough") == journals(tmp_path / "plain") != {}
 
 
+@pytest.mark.parametrize("said", ["partition", "partition=true"])
+def test_a_partition_is_said_with_or_without_true(said: str) -> None:
+    assert parse(RANDOM, "mine.toml", faults=[said]).faults == (Fault(partition=True),)
+    assert parse(RANDOM, "mine.toml", faults=["partition=false"]).faults == (Fault(),)
+
+
 def test_the_command_lines_faults_come_after_those_of_the_file() -> None:
     found = parse(RANDOM + "[[fault]]\nloss = 0.1\n", "mine.toml", faults=["loss=0.2", "b->a: loss=0.3"])
     assert [fault.loss for fault in found.faults] == [0.1, 0.2, 0.3]
@@ -162,7 +168,8 @@ SAID_BADLY = [
     ("loss=0.1,", "says nothing"),
     ("loss", "loss: expected 'float', got 'bool'"),
     ("loss=2", "loss: expected 'float' <= 1.0"),
-    ("loss=-1", "loss: '-1' is neither a number nor a range such as 0..3"),
+    ("loss=-1", "loss: expected 'float' >= 0.0"),
+    ("loss=true", "loss: expected 'float', got 'bool'"),
     ("loss=nan", "loss: 'nan' is neither a number nor a range"),
     ("loss=0..1", "loss: expected 'float', got 'array'"),
     ("loss=0.1; delay=3", "loss: '0.1; delay=3' is neither a number nor a range"),
@@ -174,7 +181,7 @@ SAID_BADLY = [
     ("delay=5..2", "delay: from 5 to 2 is backwards"),
     ("delay=0..51", "delay[1]: expected 'int' <= 50"),
     ("ticks=0..1.5", "ticks[1]: expected 'int', got 'float'"),
-    ("partition=true", "partition: 'true' is neither a number nor a range"),
+    ("partition=yes", "partition: 'yes' is neither a number nor a range"),
     ("a-b: loss=1", "link: 'a-b' is none; one looks like a->b, a<->b or *"),
     ("a->b: b->a: loss=1", "link: 'a->b: b->a' is none"),
     ("a->c: loss=1", "link: 'a' and 'c' are no pair of the scenario"),

@@ -272,6 +272,14 @@ def test_an_agent_killed_before_its_briefing_has_a_picture_without_estimates(
     assert "nothing-near" in ids(picture(folder, "a"))
 
 
+def test_a_robot_of_which_nothing_is_on_record_is_drawn_without_a_warning(tmp_path: Path) -> None:
+    play(load("paper-1"), tmp_path)
+    (tmp_path / "agent-a.journal").write_bytes(b"")
+    ended = draw(tmp_path)
+    assert (ended.status, ended.err) == (0, "")
+    assert "tolerance" in ids(tmp_path / "figures" / "robot-a.svg")
+
+
 def test_each_robot_of_several_pairs_has_a_picture_of_its_own_pair(tmp_path: Path) -> None:
     recorded(parse(several_pairs(2), "pairs"), tmp_path)
     assert draw(tmp_path).status == 0
@@ -303,7 +311,7 @@ def test_what_is_no_record_is_refused(tmp_path: Path) -> None:
     (empty / "world.journal").write_bytes(b"\xc1 no journal")
     refused(draw(empty), "world.journal: damaged at byte 0")
     (empty / "world.journal").write_bytes(b"")
-    refused(draw(empty), "world.journal: ")
+    refused(draw(empty), "world.journal: there is no scenario in it")
     assert [path.name for path in empty.iterdir()] == ["world.journal"]
 
 

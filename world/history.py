@@ -125,6 +125,8 @@ class Reading:
 
 def scenario_of(frame: bytes, source: object) -> Scenario:
     """The scenario that a world's journal begins with. Raises CorruptJournal, which names `source`."""
+    if not frame:
+        raise CorruptJournal(f"{source}: there is no scenario in it")
     try:
         scenario = decode(frame, Scenario, MAX_FRAME_BYTES)
     except MalformedFrame as error:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Mapping
+from itertools import takewhile
 from pathlib import Path
 
 from compose.scenario import shipped
@@ -11,7 +13,7 @@ from compose.status import ENDED
 
 
 def main(_options: argparse.Namespace) -> int:
-    """List the scenarios and the campaigns that ship, with the first line of each."""
+    """List the scenarios and the campaigns that ship, with the first sentence of each."""
     _list(shipped())
     print("campaigns, for `tandem sweep`:")
     _list(shipped("sweeps"))
@@ -19,6 +21,14 @@ def main(_options: argparse.Namespace) -> int:
 
 
 def _list(files: Mapping[str, Path]) -> None:
+    width = max(map(len, files))
     for name, path in files.items():
-        first = path.read_text(encoding="utf-8").splitlines()[0]
-        print(f"{name:10} {first.removeprefix('# ')}")
+        print(f"{name:{width}} {_sentence(path.read_text(encoding='utf-8'))}")
+
+
+def _sentence(text: str) -> str:
+    """The first of the comment that the file begins with, on however many lines it stands."""
+    comment = takewhile(lambda line: line.startswith("#"), text.splitlines())
+    return re.split(r"(?<=\.) ", " ".join([line.removeprefix("#").strip() for line in comment]), maxsplit=1)[
+        0
+    ]

@@ -35,9 +35,9 @@ def draw_error(axes: Axes, story: Story) -> None:
     name_phases(axes, story)
     axes.set_yscale("log")
     name = "at first: of its distance\nto its anchor"
-    errors = _distance_errors(story)
-    marked = _marked(story, [tick for tick, _ in errors])
-    _plot(axes, errors, "-o", ms=1.5, markevery=marked, color="0.45", gid="error-of-distance", label=name)
+    distances = _distance_errors(story)
+    marked = _marked(story, [tick for tick, _ in distances])
+    _plot(axes, distances, "-o", ms=1.5, markevery=marked, color="0.45", gid="error-of-distance", label=name)
     others = [(one.tick, error(pose, truth)) for one, truth in story.placed for pose in story.others(one)]
     name = name_of_others(story)
     _plot(axes, others, "x", ms=3.5, mew=0.8, color=GHOST, gid="errors-of-others", label=name)
@@ -54,6 +54,8 @@ def draw_error(axes: Axes, story: Story) -> None:
     else:
         limit = story.record.scenario.mission.accuracy
         gid, name = "accuracy", f"sigma asked for: {limit:g} m"
+    if not distances and not story.placed:  # there is nothing to fit but the limit
+        axes.set_ylim(limit / 10.0, limit * 10.0)
     axes.axhline(limit, color="k", lw=0.9, ls="-.", gid=gid, label=name)
     _envelope(axes, sigmas)
     _in_metres(axes)

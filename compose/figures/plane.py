@@ -198,8 +198,8 @@ def draw_near(axes: Axes, story: Story) -> None:
     if not story.likeliest:
         axes.set_axis_off()
         axes.text(
-            0.5, 0.5, "No pose in the plane\nwas ever the likeliest.", transform=axes.transAxes, ha="center",
-            va="center", color="0.3", gid="nothing-near",
+            0.5, 0.5, "That a pose in the plane was\nthe likeliest is not on record.",
+            transform=axes.transAxes, ha="center", va="center", color="0.3", gid="nothing-near",
         )  # fmt: skip
         return
     axes.set_title("closer: estimates about the truth", fontsize=8, color="0.3")

@@ -9,16 +9,16 @@ from typing import TypeVar
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from compose.figures.sheet import SMALL, Sheet, Window, around, equal, fitted
+from compose.figures.sheet import ROW, SMALL, Sheet, Window, around, equal, fitted
 
 LEFT, GAP, KEY = 0.68, 0.42, 0.28
-"""inches: left of panels, between panels, and of the key below them"""
+"""inches: left of panels, between panels, and of the key below them on one line"""
 HEAD, FOOT, ROOM = 0.36, 0.42, 0.03
 """inches: above a panel, for what is said of it; below it, for its axis; and between rows"""
 COLUMNS, PANELS = 3, 6
 """panels in a row, and in all at the most"""
 SIGNS = 6
-"""in a row of the key"""
+"""in the key: side by side below a whole row of panels, else on two lines"""
 Moment = TypeVar("Moment")
 
 
@@ -45,9 +45,11 @@ class Series:
         self._window = window
         self._width, self._height = fitted(window, width, math.inf)
         self._columns, self._rows = min(COLUMNS, count), math.ceil(count / COLUMNS)
+        self._signs = SIGNS if self._columns == COLUMNS else SIGNS // 2
+        self._key = KEY + ROW * (SIGNS / self._signs - 1)
         self._row = self._height + HEAD + FOOT + ROOM
         wide = LEFT + self._columns * (self._width + GAP)
-        self._sheet = Sheet(max(wide, narrowest), self._rows * self._row + KEY, lines)
+        self._sheet = Sheet(max(wide, narrowest), self._rows * self._row + self._key, lines)
 
     @property
     def figure(self) -> Figure:
@@ -58,7 +60,7 @@ class Series:
         """The panel at `place`, from 0 on."""
         row, column = divmod(place, self._columns)
         left = LEFT + column * (self._width + GAP)
-        bottom = KEY + FOOT + (self._rows - 1 - row) * self._row
+        bottom = self._key + FOOT + (self._rows - 1 - row) * self._row
         axes = self._sheet.panel(left, bottom, self._width, self._height)
         equal(axes, self._window)
         axes.set_title(title, fontsize=SMALL, loc="left", pad=3, linespacing=1.15)
@@ -69,4 +71,4 @@ class Series:
 
     def key(self, panel: Axes) -> None:
         """What the signs in `panel` mean."""
-        self._sheet.key(panel, LEFT, KEY - 0.05, columns=SIGNS)
+        self._sheet.key(panel, LEFT, self._key - 0.05, columns=self._signs)

@@ -59,6 +59,8 @@ def _window(pair: Pair, first: int, last: int) -> Window:
 
 
 def _title(ticks: list[int], shown: list[int]) -> str:
+    if len(ticks) == 1:
+        return f"The encounter: its mutual range, $k$ = {ticks[0]}"
     many = (
         f"{len(shown)} of its {len(ticks)} mutual ranges" if len(shown) < len(ticks) else "its mutual ranges"
     )
