@@ -84,18 +84,21 @@ def _parser() -> argparse.ArgumentParser:
     world = command("world", "Play the world's part; robots join from wherever they reach it.")
     _add_scenario(world)
     _add_playing(world)
-    world.add_argument("--listen", required=True, metavar="ENDPOINT", help="such as tcp/127.0.0.1:7447")
     world.add_argument("--run", type=_name, metavar="NAME", help="what to call the run")
 
     agent = command("agent", "Play one robot's part.")
     agent.add_argument("id", type=_name, metavar="ID", help="which robot of the scenario")
     _add_playing(agent)
-    agent.add_argument("--connect", required=True, metavar="ENDPOINT", help="such as tcp/127.0.0.1:7447")
     agent.add_argument("--run", type=_name, metavar="NAME", help="which run, if several are alive")
     agent.add_argument(
         "--wait", type=_positive, default=60.0, metavar="S", help="how long to look for a world (60)"
     )
     for sub in (world, agent):
+        _add_reaching(sub)
+        sub.add_argument(
+            "--listen", action="append", default=[], metavar="ENDPOINT",
+            help="be a router that listens there, such as tcp/127.0.0.1:7447; as often as you like",
+        )  # fmt: skip
         sub.add_argument("--launched", action="store_true", help=argparse.SUPPRESS)  # by `tandem run`
         sub.add_argument("--kill", type=_kill, action="append", default=[], help=argparse.SUPPRESS)
         sub.add_argument("--fsync", action="store_true", help="the journal survives a power cut")
@@ -118,13 +121,7 @@ def _parser() -> argparse.ArgumentParser:
     watch.add_argument(
         "record", type=_folder, nargs="?", metavar="DIR", help="a record, a campaign, or a folder of records"
     )
-    watch.add_argument(
-        "--connect",
-        action="append",
-        default=[],
-        metavar="ENDPOINT",
-        help="without DIR: where missions run (tcp/127.0.0.1:7447); as often as you like",
-    )
+    _add_reaching(watch)
     watch.add_argument("--launched", action="store_true", help=argparse.SUPPRESS)  # by `tandem run --watch`
     for sub in (run, watch):
         sub.add_argument("--port", type=_port, default=0, metavar="N", help="of the page (one that is free)")
@@ -165,6 +162,21 @@ def _add_playing(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=_folder, metavar="DIR", help="where the record goes")
     parser.add_argument("--patience", type=_positive, default=30.0, metavar="S", help="longest silence (30)")
     parser.add_argument("-q", "--quiet", action="store_true", help="print only the outcome")
+
+
+def _add_reaching(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--connect", action="append", default=[], metavar="ENDPOINT",
+        help="a router, such as tcp/127.0.0.1:7447; as often as you like",
+    )  # fmt: skip
+    secured = parser.add_mutually_exclusive_group()
+    secured.add_argument(
+        "--keys",
+        type=_folder,
+        metavar="DIR",
+        help="encrypt, by the certificates that `tandem keys` left in DIR",
+    )
+    secured.add_argument("--config", type=_folder, metavar="FILE", help="a Zenoh configuration of your own")
 
 
 def _add_sweep(parser: argparse.ArgumentParser) -> None:

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from protocol import journal, session
+from protocol.endpoints import Endpoints
 from protocol.messages import Drive, End, Farewell, Missed
 from protocol.wire import MAX_FRAME_BYTES, decode
 from tests.commands import LONG, PAPER_1, Command, Ended, journals, size, tandem, until
@@ -203,7 +204,7 @@ def local() -> dict[str, bytes]:
 
 def route(listen: str, connect: str) -> None:
     """Be the router, until killed."""
-    with session.open_router(listen, connect=[connect]):
+    with session.open_router(Endpoints((connect,), (listen,))):
         signal.pause()
 
 

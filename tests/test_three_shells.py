@@ -11,6 +11,7 @@ import pytest
 
 from compose.local import free_endpoint
 from protocol import keys, session
+from protocol.endpoints import at
 from tests.commands import Command, journals, processes_of, several_pairs, tandem, world
 
 
@@ -147,7 +148,7 @@ def test_an_agent_that_is_refused_leaves_the_mission_alone(paper_1: Path, tmp_pa
 def test_an_agent_that_meets_several_runs_must_be_told_which() -> None:
     with (
         world("paper-1", "--run", "mine") as (_, endpoint),
-        session.open_client(endpoint, unanswered) as link,
+        session.open_client(at(endpoint), unanswered) as link,
     ):
         _token = session.show_alive(link, keys.world_alive("yours"))  # all that tells a world from afar
         ended = tandem("agent", "a", "--connect", endpoint)

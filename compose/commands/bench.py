@@ -29,6 +29,7 @@ from compose.campaign.played import in_process
 from compose.status import LOCALISED
 from compose.telling import counting
 from protocol import session
+from protocol.endpoints import listening
 from protocol.inbox import Inbox
 from protocol.journal import Journal
 from protocol.noise import Noise
@@ -135,10 +136,11 @@ def _mission_rate(played: Scenario, *, journals: bool = True, watched: bool = Fa
         with (
             _processes(visitors),
             _processes(robots, until_ended=True),
-            session.open_router(endpoint) as link,
+            session.open_router(listening(endpoint)) as link,
             Journal(Path(folder) / record.WORLD_JOURNAL) if journals else nullcontext() as journal,
         ):
-            process = WorldProcess(Course(played, journal), link, "bench", Inbox("tandem bench"))
+            process = WorldProcess(Course(played, journal), "bench", Inbox("tandem bench"))
+            process.attach(link)
             end = process.play()
             return end.tick / process.playing_s
 
@@ -147,7 +149,7 @@ def _barrier_rate(played: Scenario, sizes: tuple[int, int]) -> float:
     endpoint = local.free_endpoint()
     ids = [robot.id for robot in played.robots]
     robots = [["compose.barrier", endpoint, one, str(sizes[1]), str(BARRIER_TICKS)] for one in ids]
-    with session.open_router(endpoint) as link, _processes(robots, until_ended=True):
+    with session.open_router(listening(endpoint)) as link, _processes(robots, until_ended=True):
         return BARRIER_TICKS / barrier.world(link, ids, sizes[0], BARRIER_TICKS)
 
 

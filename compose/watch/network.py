@@ -13,6 +13,7 @@ from compose.scene.facts import Gathering
 from compose.scene.stage import of_briefings
 from compose.watch.shows import Show
 from protocol import keys, session
+from protocol.endpoints import Endpoints
 from protocol.inbox import Inbox, Interrupted
 from protocol.messages import Briefing, Drive, End, Estimate, Farewell, Message, Report, Sense, Truth
 from protocol.wire import MalformedFrame, decode
@@ -72,8 +73,9 @@ class Heard(Show):
 class Listener:
     """Somebody who listens at an endpoint, in a thread of its own; says nothing but questions."""
 
-    def __init__(self, endpoint: str) -> None:
-        self.endpoint = endpoint
+    def __init__(self, endpoints: Endpoints) -> None:
+        self.endpoint = str(endpoints)
+        self._endpoints = endpoints
         self.shows: dict[str, Heard] = {}
         """by run, in the order in which they were found"""
         self.reached = False
@@ -120,7 +122,7 @@ class Listener:
     def _listen(self) -> None:
         while not self._stop.is_set():
             try:
-                with session.open_client(self.endpoint, self._unanswered) as link:
+                with session.open_client(self._endpoints, self._unanswered) as link:
                     self.reached = True
                     self._attend(link)
             except Interrupted:
