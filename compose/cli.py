@@ -68,6 +68,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_scenario(run)
     _add_playing(run)
     run.add_argument("--in-process", action="store_true", help="without processes or network")
+    run.add_argument("--secure", action="store_true", help="encrypted, with keys made for this run alone")
     run.add_argument("--export", action="store_true", help="leave run.mcap and tables in --out DIR, too")
     run.add_argument("--foxglove", type=_port, metavar="PORT", help="serve Foxglove's viewers there, live")
     run.add_argument("--watch", action="store_true", help="serve a page that shows it, live and afterwards")
@@ -136,6 +137,8 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("record", type=_folder, metavar="DIR", help="where `tandem run --out DIR` left it")
     export.add_argument("--out", type=_folder, metavar="DIR", help="where the files go (where the record is)")
 
+    _add_keys(command("keys", "Make certificates and access rules, for networks that are not trusted."))
+
     command("scenarios", "List the scenarios and the campaigns that ship.")
 
     bench = command("bench", "Measure speed, against the bare thing in the same run.")
@@ -177,6 +180,16 @@ def _add_reaching(parser: argparse.ArgumentParser) -> None:
         help="encrypt, by the certificates that `tandem keys` left in DIR",
     )
     secured.add_argument("--config", type=_folder, metavar="FILE", help="a Zenoh configuration of your own")
+
+
+def _add_keys(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("folder", type=_folder, metavar="DIR", help="where they go; what is there is kept")
+    parser.add_argument("--robots", type=_names, required=True, metavar="A,B", help="who takes part")
+    parser.add_argument(
+        "--host", action="append", default=[], metavar="NAME",
+        help="a name or address of the world or a router; as often as you like (localhost, 127.0.0.1, ::1)",
+    )  # fmt: skip
+    parser.add_argument("--days", type=_days, default=365, metavar="N", help="how long they last (365)")
 
 
 def _add_sweep(parser: argparse.ArgumentParser) -> None:
@@ -253,6 +266,22 @@ def _name(text: str) -> str:
     if not re.search(NAME, text):
         raise argparse.ArgumentTypeError(f"'{text}' is no name: letters, digits, - and _ only")
     return text
+
+
+def _names(text: str) -> tuple[str, ...]:
+    names = tuple(_name(name) for name in text.split(","))
+    if len(set(names)) < len(names):
+        raise argparse.ArgumentTypeError(f"'{text}' names a robot twice")
+    if any(len(name) > 32 for name in names):
+        raise argparse.ArgumentTypeError(f"'{text}' has a name of more than 32 letters")
+    return names
+
+
+def _days(text: str) -> int:
+    value = _natural(text)
+    if not 0 < value <= 36_500:
+        raise argparse.ArgumentTypeError(f"{value} is not from 1 to 36500")
+    return value
 
 
 def _kill(text: str) -> kill.Kill:

@@ -173,6 +173,7 @@ def zenoh_config(endpoints: Endpoints, first: int = 0) -> zenoh.Config:
         "scouting/delay": 0,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
+        "transport/link/tls/close_link_on_expiration": False,  # it panics where a low-latency link closes
         "transport/link/tx/lease": int(LEASE_S * 1000),
         "transport/unicast/lowlatency": True,
         "transport/unicast/qos/enabled": False,

@@ -124,6 +124,11 @@ def alive(session: zenoh.Session, key: str, timeout: float) -> list[str]:
     return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok is not None)
 
 
+def linked(session: zenoh.Session) -> bool:
+    """Whether there is a link to a router."""
+    return bool(session.info.routers_zid())
+
+
 def ask(session: zenoh.Session, key: str, timeout: float) -> bytes | str | None:
     """What the queryable at `key` answers: a frame, or its refusal in words, or None if nobody is there."""
     for reply in session.get(key, timeout=timeout):

@@ -14,6 +14,8 @@ from protocol import keys, session
 from protocol.endpoints import at
 from tests.commands import Command, journals, processes_of, several_pairs, tandem, world
 
+NOBODY = "nobody listens there; check the address, and that the router runs"
+
 
 def unanswered() -> None:
     raise AssertionError("nobody listens there")
@@ -96,8 +98,8 @@ def test_an_agent_without_a_world_says_so_and_gives_up(tmp_path: Path) -> None:
     ended = tandem("agent", "a", "--connect", endpoint, "--wait", "6", "--out", tmp_path / "out")
     assert ended.status == 3
     assert ended.err.splitlines() == [
-        f"tandem agent a: no world at {endpoint} yet; looking for one for 6 s",
-        f"tandem agent a: no world at {endpoint}; gave up after 6 s",
+        f"tandem agent a: no world at {endpoint} yet; looking for one for 6 s: {NOBODY}",
+        f"tandem agent a: no world at {endpoint}; gave up after 6 s: {NOBODY}",
     ]
     assert not (tmp_path / "out").exists()
 

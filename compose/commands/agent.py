@@ -63,7 +63,7 @@ def _play(options: argparse.Namespace, inbox: Inbox) -> End:
     end = memory.end if memory is not None else None
     which = f"world of run '{options.run}'" if options.run else "world"
     wait = options.wait if end is None else min(options.wait, STILL_THERE_S)
-    search = Search(f"{which} at {endpoints}", wait, inbox)
+    search = Search(which, endpoints, wait, inbox)
     warning = beyond(endpoints)
     process: AgentProcess | None = None
     while True:

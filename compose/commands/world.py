@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import threading
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -15,7 +16,7 @@ from compose.scenario import check_rate, run_name, setting
 from compose.status import ENDED, FAILED, STOPPED, UserError
 from compose.stop import stop_by_signal, stop_with_launcher
 from compose.telling import break_off, conclude, going_on, progress
-from protocol import session
+from protocol import refusal, session
 from protocol.endpoints import Endpoints
 from protocol.inbox import Inbox, Interrupted
 from protocol.journal import CannotRecord, CorruptJournal, Journal
@@ -97,6 +98,7 @@ class _Way:
         self._inbox = inbox
         self._wait = wait
         self._open = ExitStack()
+        self._later: threading.Timer | None = None
 
     def open(self) -> None:
         """Close the session there is, and open another. Raises CannotListen, NoRouter or Interrupted."""
@@ -105,11 +107,21 @@ class _Way:
 
         def unanswered() -> None:
             if time.monotonic() >= give_up:
-                raise NoRouter(f"no router at {self.endpoints}; gave up after {self._patience:g} s")
+                why = refusal.why(self.endpoints)
+                raise NoRouter(f"no router at {self.endpoints}; gave up after {self._patience:g} s: {why}")
             self._inbox.next(LOOK_AGAIN_S)
 
         opened = session.open_session(self.endpoints, unanswered, self._wait)
         self.session = self._open.enter_context(opened)
+        if self.endpoints.listen and self.endpoints.connect:
+            self._later = threading.Timer(refusal.FIRST_WORD_S, self._tell_if_alone)
+            self._later.daemon = True
+            self._later.start()
+
+    def _tell_if_alone(self) -> None:
+        """A router goes on without those that it connects to; they may come."""
+        if not session.linked(self.session):
+            self._inbox.say(f"no router at {self.endpoints} yet: {refusal.why(self.endpoints)}")
 
     def play(self, process: WorldProcess) -> None:
         """The run to its End, over as many sessions as it takes. Raises NoRouter or Interrupted."""
@@ -127,6 +139,8 @@ class _Way:
         return self
 
     def __exit__(self, *_: object) -> None:
+        if self._later is not None:
+            self._later.cancel()
         self._open.close()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -12,7 +13,7 @@ import zenoh
 from compose.scene.facts import Gathering
 from compose.scene.stage import of_briefings
 from compose.watch.shows import Show
-from protocol import keys, session
+from protocol import keys, refusal, session
 from protocol.endpoints import Endpoints
 from protocol.inbox import Inbox, Interrupted
 from protocol.messages import Briefing, Drive, End, Estimate, Farewell, Message, Report, Sense, Truth
@@ -83,6 +84,8 @@ class Listener:
         self._inbox = Inbox("tandem watch")
         self._answers: SimpleQueue[tuple[str, bytes]] = SimpleQueue()
         self._stop = threading.Event()
+        self._looking_since: float | None = None
+        self._told = False
         self._thread = threading.Thread(target=self._listen, daemon=True)
 
     def start(self) -> None:
@@ -124,12 +127,18 @@ class Listener:
             try:
                 with session.open_client(self._endpoints, self._unanswered) as link:
                     self.reached = True
+                    self._looking_since = None
                     self._attend(link)
             except Interrupted:
                 return
             self.reached = False
 
     def _unanswered(self) -> None:
+        if self._looking_since is None:
+            self._looking_since = time.monotonic()
+        elif not self._told and time.monotonic() >= self._looking_since + refusal.FIRST_WORD_S:
+            self._told = True
+            self._inbox.say(f"no router at {self.endpoint} yet: {refusal.why(self._endpoints)}")
         if self._stop.wait(LOOK_AGAIN_S):
             raise Interrupted("stop")
 
