@@ -32,9 +32,8 @@ def reach(options: argparse.Namespace, who: str) -> Endpoints:
         found = configured(file, connect, listen)
     except BadConfiguration as error:
         raise UserError(f"{'--config' if options.keys is None else '--keys'}: {error}") from None
-    owner = (found.setting("metadata") or {}).get("participant")
-    if options.keys is not None and owner != who:
-        raise UserError(f"--keys: {options.keys} is the folder of {owner}, not of {who}")
+    if options.keys is not None and found.participant != who:
+        raise UserError(f"--keys: {options.keys} is the folder of {found.participant}, not of {who}")
     return found
 
 
