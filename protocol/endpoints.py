@@ -212,9 +212,7 @@ def _read(file: Path) -> str:
 
 def _what(complaint: str) -> str:
     """Zenoh's complaint about a configuration, without the place in its own source."""
-    said = re.search(r'msg: "(?P<what>.*)", location: Some\(Location { line: (?P<line>\d+)', complaint)
-    if said is None:
-        said = re.search(r"--> (?P<line>\d+):.*= (?P<what>[^\n]*)", complaint, re.DOTALL)
+    said = re.search(r"--> (?P<line>\d+):.*= (?P<what>[^\n]*)", complaint, re.DOTALL)
     if said is None:
         return complaint.partition(" at /")[0]
     return f"line {said['line']}: {said['what'].partition(' at /')[0]}"
