@@ -19,32 +19,40 @@ VIEWER = "viewer"
 CARRIERS = (ROUTER, WORLD)
 """who passes on what others say"""
 
-MESSAGES = {
-    "put": ("put", "declare_subscriber"),
-    "answer": ("reply", "declare_queryable", "query"),
-    "show": ("liveliness_token", "declare_liveliness_subscriber", "liveliness_query"),
+
+class Passing(NamedTuple):
+    """A message that passes a router: "ingress" from a participant, "egress" to one."""
+
+    flow: str
+    message: str
+    every: bool = False
+    """under any key of the kind, not one's own alone: it tells who listens or answers"""
+
+
+BY = {
+    "put": (Passing("ingress", "put"), Passing("egress", "declare_subscriber", every=True)),
+    "answer": (
+        Passing("ingress", "declare_queryable"),
+        Passing("egress", "query"),
+        Passing("ingress", "reply"),
+    ),
+    "show": (Passing("ingress", "liveliness_token"),),
 }
-"""Zenoh's, of each way of a rule"""
-SAID = {
-    "put": (("ingress", "put"),),
-    "answer": (("ingress", "declare_queryable"), ("ingress", "reply"), ("egress", "query")),
-    "show": (("ingress", "liveliness_token"),),
-}
-"""what passes the router where one does it, under a key of its own: in from it, and out to it"""
-HEARD = {
-    "put": (("ingress", "declare_subscriber"), ("egress", "put")),
-    "answer": (("ingress", "query"), ("egress", "reply")),
+"""what passes for whoever does it, by the way of a rule"""
+TO = {
+    "put": (Passing("ingress", "declare_subscriber"), Passing("egress", "put")),
+    "answer": (
+        Passing("egress", "declare_queryable", every=True),
+        Passing("ingress", "query"),
+        Passing("egress", "reply"),
+    ),
     "show": (
-        ("ingress", "declare_liveliness_subscriber"),
-        ("ingress", "liveliness_query"),
-        ("egress", "liveliness_token"),
+        Passing("ingress", "declare_liveliness_subscriber"),
+        Passing("ingress", "liveliness_query"),
+        Passing("egress", "liveliness_token"),
     ),
 }
-"""the same where one hears it, asks, or looks for it"""
-TOLD_BY = {"put": (("egress", "declare_subscriber"),), "answer": (), "show": ()}
-"""what is told to who does it, under any key of the kind: who listens"""
-TOLD_TO = {"put": (), "answer": (("egress", "declare_queryable"),), "show": ()}
-"""and to who asks: who answers"""
+"""what passes for whoever hears it, asks, or looks for it"""
 
 
 class Permit(NamedTuple):
@@ -62,18 +70,13 @@ def agent(robot: str) -> str:
 
 def permits(participant: str) -> set[Permit]:
     """All that a robot ("agent-ID") or a viewer may say and be told."""
-    found = set()
-    for key, rule in keys.RULES.items():
-        every = _key(key, {})
-        for own in _own(key, (rule.by,), participant):
-            found |= {Permit(*one, own) for one in SAID[rule.way]} | {
-                Permit(*one, every) for one in TOLD_BY[rule.way]
-            }
-        for own in _own(key, rule.to, participant):
-            found |= {Permit(*one, own) for one in HEARD[rule.way]} | {
-                Permit(*one, every) for one in TOLD_TO[rule.way]
-            }
-    return found
+    return {
+        Permit(one.flow, one.message, _key(key, {}) if one.every else own)
+        for key, rule in keys.RULES.items()
+        for roles, passing in (((rule.by,), BY), (rule.to, TO))
+        for own in _own(key, roles, participant)
+        for one in passing[rule.way]
+    }
 
 
 def _own(key: Callable[..., str], roles: Iterable[str], participant: str) -> Iterator[str]:
@@ -93,7 +96,7 @@ def _key(key: Callable[..., str], named: dict[str, str]) -> str:
 
 def access_control(robots: Iterable[str]) -> dict[str, Any]:
     """The part `access_control` of a Zenoh configuration, for a router that these robots may reach."""
-    messages = sorted({message for way in MESSAGES.values() for message in way})
+    messages = sorted({one.message for ways in (BY, TO) for passing in ways.values() for one in passing})
     rules = [_rule("carried", ["ingress", "egress"], messages, [f"{keys.ROOT}/**"])]
     policies = [{"subjects": list(CARRIERS), "rules": ["carried"]}]
     names = [VIEWER, *(agent(robot) for robot in robots)]
