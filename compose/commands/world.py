@@ -8,6 +8,8 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 
+import zenoh
+
 from compose import kill
 from compose.local import handed
 from compose.reach import beyond, reach
@@ -98,12 +100,12 @@ class _Way:
         self._inbox = inbox
         self._wait = wait
         self._open = ExitStack()
-        self._later: threading.Timer | None = None
 
     def open(self) -> None:
         """Close the session there is, and open another. Raises CannotListen, NoRouter or Interrupted."""
         self._open.close()
         give_up = time.monotonic() + self._patience
+        self.session: zenoh.Session | None = None
 
         def unanswered() -> None:
             if time.monotonic() >= give_up:
@@ -111,21 +113,23 @@ class _Way:
                 raise NoRouter(f"no router at {self.endpoints}; gave up after {self._patience:g} s: {why}")
             self._inbox.next(LOOK_AGAIN_S)
 
+        if self.endpoints.connect:
+            later = threading.Timer(refusal.FIRST_WORD_S, self._tell_if_alone)
+            later.daemon = True
+            later.start()
+            self._open.callback(later.cancel)
         opened = session.open_session(self.endpoints, unanswered, self._wait)
         self.session = self._open.enter_context(opened)
-        if self.endpoints.listen and self.endpoints.connect:
-            self._later = threading.Timer(refusal.FIRST_WORD_S, self._tell_if_alone)
-            self._later.daemon = True
-            self._later.start()
 
     def _tell_if_alone(self) -> None:
-        """A router goes on without those that it connects to; they may come."""
-        if not session.linked(self.session):
+        """A router goes on without those that it connects to, and a client waits for one; they may come."""
+        if self.session is None or not session.linked(self.session):
             self._inbox.say(f"no router at {self.endpoints} yet: {refusal.why(self.endpoints)}")
 
     def play(self, process: WorldProcess) -> None:
         """The run to its End, over as many sessions as it takes. Raises NoRouter or Interrupted."""
         while True:
+            assert self.session is not None
             process.attach(self.session, replaceable=self.endpoints.mode == "client")
             try:
                 process.play()
@@ -139,8 +143,6 @@ class _Way:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._later is not None:
-            self._later.cancel()
         self._open.close()
 
 
