@@ -14,6 +14,8 @@ import pytest
 
 from compose.local import free_endpoint
 from compose.reach import KEYED
+from protocol import session
+from protocol.endpoints import listening
 from tests.commands import BOUND_S, LONG, LONG_JOURNAL_BYTES, PAPER_1, Command, journals, tandem
 
 ROUTER = [sys.executable, "-m", "tests.router"]
@@ -176,6 +178,13 @@ def test_a_router_may_come_last(tmp_path: Path) -> None:
             part.until_says("nobody listens there; check the address, and that the router runs")
         stack.enter_context(routing(Router(x), tmp_path))
         same(mission, out, expected)
+
+
+def test_an_agent_that_is_a_router_says_where_it_cannot_listen() -> None:
+    x = free_endpoint()
+    with session.open_router(listening(x)):
+        ended = tandem("agent", "a", *listen(x), *connect(free_endpoint()))
+    assert ended == (2, "", f"tandem agent: --listen: {x}: already in use\n")
 
 
 def test_a_world_whose_router_is_not_there_says_what_to_check_and_gives_up(tmp_path: Path) -> None:
