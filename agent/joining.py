@@ -6,9 +6,11 @@ import time
 
 import zenoh
 
-from protocol import keys, session
+from protocol import keys, refusal, session
+from protocol.endpoints import Endpoints
 from protocol.inbox import Inbox
 from protocol.messages import Briefing
+from protocol.refusal import FIRST_WORD_S
 from protocol.wire import MalformedFrame, decode
 
 QUERY_S = 2.0
@@ -17,8 +19,6 @@ SESSION_S = 3.0
 """how long to look for a world through one session, or to wait for a robot's former process to be gone"""
 ASK_AGAIN_S = 0.05
 """how long to wait before looking for a world again"""
-FIRST_WORD_S = 5.0
-"""how long an agent looks for its world before it says so"""
 
 
 class Unwelcome(Exception):
@@ -32,22 +32,31 @@ class NoWorld(TimeoutError):
 class Search:
     """Looking for a world, for `wait` seconds at the most, and saying so after FIRST_WORD_S."""
 
-    def __init__(self, what: str, wait: float, inbox: Inbox) -> None:
-        self._what = what
+    def __init__(self, what: str, endpoints: Endpoints, wait: float, inbox: Inbox) -> None:
+        self._what = f"{what} at {endpoints}"
+        self._endpoints = endpoints
         self._wait = wait
         self._inbox = inbox
         self._began = time.monotonic()
         self._told = False
 
-    def go_on(self) -> None:
-        """Wait a moment. Raises NoWorld when that has been too long, Interrupted when told to stop."""
+    def go_on(self, *, linked: bool = False) -> None:
+        """Wait a moment. Raises NoWorld when that has been too long, Interrupted when told to stop.
+
+        `linked`: there is a link to a router, and nothing of a world to be seen over it.
+        """
         waited = time.monotonic() - self._began
         if waited >= self._wait:
-            raise NoWorld(f"no {self._what}; gave up after {self._wait:g} s")
+            raise NoWorld(f"no {self._what}; gave up after {self._wait:g} s: {self._why(linked)}")
         if waited >= FIRST_WORD_S and not self._told:
             self._told = True
-            self._inbox.say(f"no {self._what} yet; looking for one for {self._wait:g} s")
+            self._inbox.say(f"no {self._what} yet; looking for one for {self._wait:g} s: {self._why(linked)}")
         self.pause()
+
+    def _why(self, linked: bool) -> str:
+        if linked:
+            return "a router answers; check that the world runs, and that its access rules name this robot"
+        return refusal.why(self._endpoints) or "nobody has linked with it; check who connects to it"
 
     def pause(self) -> None:
         """Wait a moment, with a world in sight. Raises Interrupted when told to stop."""
@@ -81,7 +90,7 @@ def join(link: zenoh.Session, run: str | None, robot: str, search: Search) -> tu
                 except MalformedFrame as error:
                     raise Unwelcome(f"the world's briefing is not understood: {error}") from None
         if played is None:
-            search.go_on()
+            search.go_on(linked=session.linked(link))
         else:
             search.pause()
     if played is not None:

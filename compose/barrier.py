@@ -15,6 +15,7 @@ from queue import SimpleQueue
 import zenoh
 
 from protocol import keys, session
+from protocol.endpoints import at
 from protocol.inbox import Inbox
 
 PATIENCE_S = 30.0
@@ -57,7 +58,7 @@ def robot(endpoint: str, name: str, size: int, ticks: int) -> None:
         if time.monotonic() > give_up:
             sys.exit(1)
 
-    with session.open_client(endpoint, unanswered) as link:
+    with session.open_client(at(endpoint), unanswered) as link:
         link.declare_subscriber(keys.sense(RUN, name), lambda sample: drop(frames, sample))
         publisher = session.publisher(link, keys.drive(RUN, name))
         _token = session.show_alive(link, keys.robot_alive(RUN, name))

@@ -68,6 +68,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_scenario(run)
     _add_playing(run)
     run.add_argument("--in-process", action="store_true", help="without processes or network")
+    run.add_argument("--secure", action="store_true", help="encrypted, with keys made for this run alone")
     run.add_argument("--export", action="store_true", help="leave run.mcap and tables in --out DIR, too")
     run.add_argument("--foxglove", type=_port, metavar="PORT", help="serve Foxglove's viewers there, live")
     run.add_argument("--watch", action="store_true", help="serve a page that shows it, live and afterwards")
@@ -84,18 +85,21 @@ def _parser() -> argparse.ArgumentParser:
     world = command("world", "Play the world's part; robots join from wherever they reach it.")
     _add_scenario(world)
     _add_playing(world)
-    world.add_argument("--listen", required=True, metavar="ENDPOINT", help="such as tcp/127.0.0.1:7447")
     world.add_argument("--run", type=_name, metavar="NAME", help="what to call the run")
 
     agent = command("agent", "Play one robot's part.")
     agent.add_argument("id", type=_name, metavar="ID", help="which robot of the scenario")
     _add_playing(agent)
-    agent.add_argument("--connect", required=True, metavar="ENDPOINT", help="such as tcp/127.0.0.1:7447")
     agent.add_argument("--run", type=_name, metavar="NAME", help="which run, if several are alive")
     agent.add_argument(
         "--wait", type=_positive, default=60.0, metavar="S", help="how long to look for a world (60)"
     )
     for sub in (world, agent):
+        _add_reaching(sub)
+        sub.add_argument(
+            "--listen", action="append", default=[], metavar="ENDPOINT",
+            help="be a router that listens there, such as tcp/127.0.0.1:7447; as often as you like",
+        )  # fmt: skip
         sub.add_argument("--launched", action="store_true", help=argparse.SUPPRESS)  # by `tandem run`
         sub.add_argument("--kill", type=_kill, action="append", default=[], help=argparse.SUPPRESS)
         sub.add_argument("--fsync", action="store_true", help="the journal survives a power cut")
@@ -118,13 +122,7 @@ def _parser() -> argparse.ArgumentParser:
     watch.add_argument(
         "record", type=_folder, nargs="?", metavar="DIR", help="a record, a campaign, or a folder of records"
     )
-    watch.add_argument(
-        "--connect",
-        action="append",
-        default=[],
-        metavar="ENDPOINT",
-        help="without DIR: where missions run (tcp/127.0.0.1:7447); as often as you like",
-    )
+    _add_reaching(watch)
     watch.add_argument("--launched", action="store_true", help=argparse.SUPPRESS)  # by `tandem run --watch`
     for sub in (run, watch):
         sub.add_argument("--port", type=_port, metavar="N", help="of the page (one that is free)")
@@ -138,6 +136,8 @@ def _parser() -> argparse.ArgumentParser:
     export = command("export", "Leave a record in other formats: run.mcap, frames.csv, ticks.parquet.")
     export.add_argument("record", type=_folder, metavar="DIR", help="where `tandem run --out DIR` left it")
     export.add_argument("--out", type=_folder, metavar="DIR", help="where the files go (where the record is)")
+
+    _add_keys(command("keys", "Make certificates and access rules, for networks that are not trusted."))
 
     command("scenarios", "List the scenarios and the campaigns that ship.")
 
@@ -165,6 +165,31 @@ def _add_playing(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=_folder, metavar="DIR", help="where the record goes")
     parser.add_argument("--patience", type=_positive, default=30.0, metavar="S", help="longest silence (30)")
     parser.add_argument("-q", "--quiet", action="store_true", help="print only the outcome")
+
+
+def _add_reaching(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--connect", action="append", default=[], metavar="ENDPOINT",
+        help="a router, such as tcp/127.0.0.1:7447; as often as you like",
+    )  # fmt: skip
+    secured = parser.add_mutually_exclusive_group()
+    secured.add_argument(
+        "--keys",
+        type=_folder,
+        metavar="DIR",
+        help="encrypt, by the certificates that `tandem keys` left in DIR",
+    )
+    secured.add_argument("--config", type=_folder, metavar="FILE", help="a Zenoh configuration of your own")
+
+
+def _add_keys(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("folder", type=_folder, metavar="DIR", help="where they go; what is there is kept")
+    parser.add_argument("--robots", type=_names, required=True, metavar="A,B", help="who takes part")
+    parser.add_argument(
+        "--host", action="append", default=[], metavar="NAME",
+        help="a name or address of the world or a router; as often as you like (localhost, 127.0.0.1, ::1)",
+    )  # fmt: skip
+    parser.add_argument("--days", type=_days, default=365, metavar="N", help="how long they last (365)")
 
 
 def _add_sweep(parser: argparse.ArgumentParser) -> None:
@@ -241,6 +266,22 @@ def _name(text: str) -> str:
     if not re.search(NAME, text):
         raise argparse.ArgumentTypeError(f"'{text}' is no name: letters, digits, - and _ only")
     return text
+
+
+def _names(text: str) -> tuple[str, ...]:
+    names = tuple(_name(name) for name in text.split(","))
+    if len(set(names)) < len(names):
+        raise argparse.ArgumentTypeError(f"'{text}' names a robot twice")
+    if any(len(name) > 32 for name in names):
+        raise argparse.ArgumentTypeError(f"'{text}' has a name of more than 32 letters")
+    return names
+
+
+def _days(text: str) -> int:
+    value = _natural(text)
+    if not 0 < value <= 36_500:
+        raise argparse.ArgumentTypeError(f"{value} is not from 1 to 36500")
+    return value
 
 
 def _kill(text: str) -> kill.Kill:

@@ -32,8 +32,8 @@ class ChildFailed(RuntimeError):
     """A process of the run ended before the run did; says which, and how."""
 
 
-def free_endpoint() -> str:
-    """A TCP endpoint on loopback on which nobody listens."""
+def free_endpoint(protocol: str = "tcp") -> str:
+    """An endpoint on loopback on which nobody listens."""
     ports = random.SystemRandom()
     while True:
         port = ports.choice(LISTENING_PORTS)
@@ -42,7 +42,7 @@ def free_endpoint() -> str:
                 probe.bind(("127.0.0.1", port))
             except OSError:
                 continue
-        return f"tcp/127.0.0.1:{port}"
+        return f"{protocol}/127.0.0.1:{port}"
 
 
 class _Child:
@@ -127,13 +127,16 @@ def play(
     rate: float | None,
     patience: float,
     kills: Sequence[Kill] = (),
+    keys: Path | None = None,
 ) -> list[Kill]:
     """Play `scenario`; journals go to `out`. A process takes its `kills` and is started again.
+
+    With `keys`, the folder that `tandem keys` makes, links are encrypted, and access rules enforced.
 
     Returns those that never came. Raises ChildFailed, or Interrupted when `inbox` says so; no process is left
     then, either.
     """
-    launched = _Run(scenario, out, inbox, run=run, rate=rate, patience=patience)
+    launched = _Run(scenario, out, inbox, run=run, rate=rate, patience=patience, keys=keys)
     try:
         for name in launched.names:
             launched.start(name, [kill for kill in kills if kill.process == name])
@@ -147,24 +150,42 @@ class _Run:
     """The processes of one run, by name, and those that are to be started again."""
 
     def __init__(
-        self, scenario: Scenario, out: Path, inbox: Inbox, *, run: str, rate: float | None, patience: float
+        self,
+        scenario: Scenario,
+        out: Path,
+        inbox: Inbox,
+        *,
+        run: str,
+        rate: float | None,
+        patience: float,
+        keys: Path | None,
     ) -> None:
         self._scenario = scenario
         self._inbox = inbox
-        self._arguments = self._named(out, run, rate, patience)
+        self._arguments = self._named(out, run, rate, patience, keys)
         self.names = list(self._arguments)
         self.children: dict[str, _Child] = {}
         self._due: dict[str, float] = {}
         """when to start again who has been killed"""
 
-    def _named(self, out: Path, run: str, rate: float | None, patience: float) -> dict[str, list[str]]:
-        endpoint = free_endpoint()
+    def _named(
+        self, out: Path, run: str, rate: float | None, patience: float, keys: Path | None
+    ) -> dict[str, list[str]]:
+        endpoint = free_endpoint("tcp" if keys is None else "tls")
         shared = ["--launched", "--run", run, "--out", str(out), "--patience", str(patience)]
         real_time = ["--rate", str(rate)] if rate is not None else []
-        world = ["world", self._scenario.name, "--listen", endpoint, *shared, *real_time]
-        robots = [robot.id for robot in self._scenario.robots]
+
+        def keyed(who: str) -> list[str]:
+            return ["--keys", str(keys / who)] if keys is not None else []
+
+        world = ["world", self._scenario.name, "--listen", endpoint, *keyed("world"), *shared, *real_time]
         return {WORLD: world} | {
-            f"agent {robot}": ["agent", robot, "--connect", endpoint, *shared] for robot in robots
+            f"agent {robot.id}": [
+                *("agent", robot.id, "--connect", endpoint),
+                *keyed(f"agent-{robot.id}"),
+                *shared,
+            ]
+            for robot in self._scenario.robots
         }
 
     def start(self, name: str, kills: Sequence[Kill]) -> None:

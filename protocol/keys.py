@@ -1,6 +1,10 @@
-"""The key-expression tree, one function a key. `run` and robot ids are single chunks."""
+"""The key-expression tree, one function a key, and who may do what. `run` and robot ids are single chunks."""
 
 from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Literal, NamedTuple
 
 ROOT = "tandem"
 
@@ -43,6 +47,35 @@ def world_alive(run: str) -> str:
 def robot_alive(run: str, robot: str) -> str:
     """Liveliness token of a robot; "*" for those of all robots of the run."""
     return f"{ROOT}/{run}/alive/robot/{robot}"
+
+
+class Rule(NamedTuple):
+    """Who may do what under a key.
+
+    They are "world", "viewer", "robots" (any), or a parameter of the key's function: the robot that it names.
+    """
+
+    way: Literal["put", "answer", "show"]
+    """what is done: frames are put, questions answered, a liveliness token is shown"""
+    by: str
+    """who does it"""
+    to: tuple[str, ...]
+    """who hears it, asks, or looks for it"""
+
+
+RULES: Mapping[Callable[..., str], Rule] = MappingProxyType(
+    {
+        truth: Rule("put", "world", ("viewer",)),
+        briefing: Rule("answer", "world", ("robot", "viewer")),
+        sense: Rule("put", "world", ("robot", "viewer")),
+        drive: Rule("put", "robot", ("world", "viewer")),
+        report: Rule("put", "robot", ("peer", "viewer")),
+        estimate: Rule("put", "robot", ("viewer",)),
+        world_alive: Rule("show", "world", ("robots", "viewer")),
+        robot_alive: Rule("show", "robot", ("robot", "world", "viewer")),
+    }
+)
+"""of every key; what no rule allows a robot or a viewer, no router lets pass"""
 
 
 def run_of(key: str) -> str:

@@ -1,42 +1,35 @@
 """Zenoh sessions that open, become ready and close without hanging.
 
-The world is the router and robots are its clients, over TCP, so nothing else has to be installed. What
-arrives goes into one queue per process: `recv()` of Zenoh has no time-out, and a queue has. Whoever
-subscribes first declares, then shows its liveliness token: a put before the match would be lost.
+The world is the router and robots are its clients, so nothing else has to be installed; other routers may
+stand between (protocol/endpoints.py). What arrives goes into one queue per process: `recv()` of Zenoh has no
+time-out, and a queue has. Whoever subscribes first declares, then shows its liveliness token: a put before
+the match would be lost.
 """
 
 from __future__ import annotations
 
-import json
 import os
-import re
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from itertools import count
 from typing import Any, NoReturn
 
 import zenoh
 
+from protocol.endpoints import Endpoints, zenoh_config
 from protocol.inbox import Inbox, Topic
 from protocol.messages import Message
 from protocol.wire import encode
 
-CONNECT_TIMEOUT_S = 1.0
-"""one attempt; `open_client` makes as many as fit its patience"""
 CLOSE_TIMEOUT_S = 2.0
 """Zenoh's own close can take ten seconds under loss; the process ends without it"""
-RETRY_MS = 50
-"""a client looks for a world that went away as often"""
-LEASE_S = 2.0
-"""a link on which nothing has come for so long is given up, and made anew: its peer is stopped, or cut off"""
 LISTEN_AGAIN_S = 0.1
 """how long to wait before trying once more to have a port"""
 
 MSGPACK = zenoh.Encoding("application/msgpack")
-
-_ENDPOINT = re.compile(r"(tcp|tls|quic|ws)/(?P<host>\[[0-9A-Fa-f:.%\w]+\]|[^\s/:\[\]]+):(?P<port>\d{1,5})")
 
 zenoh.init_log_from_env_or("off")
 
@@ -45,39 +38,8 @@ _left_open: list[zenoh.Session] = []
 """sessions that did not close in time"""
 
 
-class BadEndpoint(ValueError):
-    """An endpoint that Zenoh could not use; its text says what one looks like."""
-
-
 class CannotListen(OSError):
     """The endpoint to listen on cannot be had; its text says why."""
-
-
-def check_endpoint(endpoint: str) -> None:
-    """Raises BadEndpoint if `endpoint` is not of the form protocol/host:port."""
-    match = _ENDPOINT.fullmatch(endpoint)
-    if match is None or not 0 < int(match["port"]) < 65536:
-        raise BadEndpoint(f"'{endpoint}' is no endpoint; one looks like tcp/127.0.0.1:7447")
-
-
-def _config(mode: str, listen: Sequence[str], connect: Sequence[str]) -> zenoh.Config:
-    config = zenoh.Config()
-    for key, value in {
-        "mode": mode,
-        "listen/endpoints": list(listen),
-        "connect/endpoints": list(connect),
-        "connect/timeout_ms": int(CONNECT_TIMEOUT_S * 1000),
-        "connect/exit_on_failure": True,
-        "connect/retry": {"period_init_ms": RETRY_MS, "period_max_ms": 1000, "period_increase_factor": 2.0},
-        "scouting/delay": 0,
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "transport/link/tx/lease": int(LEASE_S * 1000),
-        "transport/unicast/lowlatency": True,
-        "transport/unicast/qos/enabled": False,
-    }.items():
-        config.insert_json5(key, json.dumps(value))
-    return config
 
 
 @contextmanager
@@ -94,46 +56,47 @@ def _closing(session: zenoh.Session) -> Iterator[zenoh.Session]:
 
 
 @contextmanager
-def open_router(listen: str, wait: float = 0.0, connect: Sequence[str] = ()) -> Iterator[zenoh.Session]:
-    """The world's session, listening on `listen`; waits `wait` seconds for it to be free.
+def open_router(endpoints: Endpoints, wait: float = 0.0) -> Iterator[zenoh.Session]:
+    """The session of a router; waits `wait` seconds for where it listens to be free.
 
-    A router between it and its robots is one that also connects to it.
-
-    Raises BadEndpoint or CannotListen.
+    Routers that it connects to may come later, and go. Raises CannotListen.
     """
-    check_endpoint(listen)
     give_up = time.monotonic() + wait
     while True:
         try:
-            session = zenoh.open(_config("router", [listen], connect))
+            session = zenoh.open(zenoh_config(endpoints))
             break
         except zenoh.ZError as error:
             taken = "in use" in str(error)
             if not taken or time.monotonic() >= give_up:
                 why = "already in use" if taken else "cannot listen there"
-                raise CannotListen(f"{listen}: {why}") from None
+                raise CannotListen(f"{' and '.join(endpoints.listen)}: {why}") from None
         time.sleep(LISTEN_AGAIN_S)
     with _closing(session):
         yield session
 
 
 @contextmanager
-def open_client(connect: str, unanswered: Callable[[], None]) -> Iterator[zenoh.Session]:
-    """A robot's session to the router at `connect`.
+def open_client(endpoints: Endpoints, unanswered: Callable[[], None]) -> Iterator[zenoh.Session]:
+    """A session to a router that answers.
 
-    Calls `unanswered` after each attempt of CONNECT_TIMEOUT_S in vain; it may raise to give up. Raises
-    BadEndpoint.
+    Calls `unanswered` after each attempt of CONNECT_TIMEOUT_S in vain; it may raise to give up.
     """
-    check_endpoint(connect)
-    while True:
-        config = _config("client", [], [connect])
+    for attempt in count():
         try:
-            session = zenoh.open(config)
+            session = zenoh.open(zenoh_config(endpoints, first=attempt))
             break
         except zenoh.ZError:
             unanswered()
     with _closing(session):
         yield session
+
+
+def open_session(
+    endpoints: Endpoints, unanswered: Callable[[], None], wait: float = 0.0
+) -> AbstractContextManager[zenoh.Session]:
+    """That of a router, or of a client, as `endpoints` say. Raises CannotListen, if it listens."""
+    return open_router(endpoints, wait) if endpoints.listen else open_client(endpoints, unanswered)
 
 
 def subscribe(session: zenoh.Session, key: str, inbox: Inbox, topic: Topic) -> None:
@@ -159,6 +122,11 @@ def alive(session: zenoh.Session, key: str, timeout: float) -> list[str]:
     """The keys of the liveliness tokens under `key`, now; waits `timeout` seconds at the most."""
     replies = session.liveliness().get(key, timeout=timeout)
     return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok is not None)
+
+
+def linked(session: zenoh.Session) -> bool:
+    """Whether there is a link to a router."""
+    return bool(session.info.routers_zid())
 
 
 def ask(session: zenoh.Session, key: str, timeout: float) -> bytes | str | None:

@@ -21,7 +21,9 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
+from compose.reach import KEYED
 from protocol import journal, session
+from protocol.endpoints import Endpoints, configured
 from protocol.messages import Drive, End, Farewell, Missed
 from protocol.wire import MAX_FRAME_BYTES, decode
 from tests.commands import LONG, PAPER_1, Command, Ended, journals, size, tandem, until
@@ -47,9 +49,14 @@ class Case(NamedTuple):
     happens: Callable[[Network, Run], None]
     """returns when all is well again"""
 
+    secured: bool = False
+    """over TLS, with access rules; the world and the agents are clients of a router that enforces them"""
+
     @property
     def by(self) -> str:
         """What else its name says."""
+        if self.secured:
+            return ", through a router, secured"
         return ", through a router" if self.routed and self.what.startswith("link") else ""
 
 
@@ -94,24 +101,36 @@ class Run:
         self._stack = stack
         self.scenario = folder / "scenario.toml"
         self.scenario.write_text(ASSURED if case.real_time else LONG)
-        clock = f"tcp/{HOSTS['world']}:{PORT}"
+        self._keys = folder / "keys" if case.secured else None
+        if self._keys is not None:
+            made = tandem("keys", self._keys, "--robots", "a,b", "--host", HOSTS["router"])
+            assert made.status == 0, made
+        protocol = "tls" if case.secured else "tcp"
+        clock, router = (f"{protocol}/{HOSTS[host]}:{PORT}" for host in ("world", "router"))
         rate = ["--rate", RATE] if case.real_time else []
-        self.parts = {"world": self._part("world", "world", str(self.scenario), "--listen", clock, *rate)}
+        self._route = ["--router", router, *([] if case.secured else [clock])]
+        if self._keys is not None:
+            self._route += ["--keys", str(self._keys / "router")]
+            self.start_router()
+        reach = ["--connect", router] if case.secured else ["--listen", clock]
+        self.parts = {"world": self._part("world", "world", str(self.scenario), *reach, *rate)}
         self.parts["world"].until_written(self.out / "world.journal", 1)  # which it does when it listens
-        endpoint = f"tcp/{HOSTS['router']}:{PORT}" if case.routed else clock
-        if case.routed:
+        if case.routed and not case.secured:
             self.start_router()
         for robot in ("a", "b"):
-            self.parts[robot] = self._part(robot, "agent", robot, "--connect", endpoint)
+            self.parts[robot] = self._part(
+                robot, "agent", robot, "--connect", router if case.routed else clock
+            )
 
     def _part(self, host: str, *arguments: str) -> Command:
         through = self._network.on(host)
-        return self._stack.enter_context(Command(*arguments, "--out", self.out, "-q", through=through))
+        name = host if host == "world" else f"agent-{host}"
+        keys = ["--keys", str(self._keys / name)] if self._keys is not None else []
+        return self._stack.enter_context(Command(*arguments, *keys, "--out", self.out, "-q", through=through))
 
     def start_router(self) -> None:
         """The router between the world and the agents."""
-        endpoints = [f"tcp/{HOSTS[host]}:{PORT}" for host in ("router", "world")]
-        arguments = [sys.executable, "-m", "tests.namespaces", "--router", *endpoints]
+        arguments = [sys.executable, "-m", "tests.namespaces", *self._route]
         self.router = subprocess.Popen([*self._network.on("router"), *arguments])
         self._stack.callback(_end, self.router)
 
@@ -175,6 +194,14 @@ CASES = [
 ]
 
 
+CASES += [
+    Case("link of a down for 3 s", False, True, down(3.0), True),
+    Case("link of a down for 3 s", True, True, down(3.0), True),
+    Case("router killed for 0 s", False, True, killed(0.0), True),
+    Case("router killed for 3 s", False, True, killed(3.0), True),
+]
+
+
 def play(case: Case, network: Network, expected: dict[str, bytes]) -> tuple[dict[str, Ended], float, str]:
     """How everyone ended, the time until both robots answered again, and whether the bytes are the same."""
     with tempfile.TemporaryDirectory(prefix="tandem-hosts-") as folder, ExitStack() as stack:
@@ -201,9 +228,12 @@ def local() -> dict[str, bytes]:
         return journals(out) | {"ticks.csv": (out / "ticks.csv").read_bytes()}
 
 
-def route(listen: str, connect: str) -> None:
+def route(listen: str, connect: list[str], keys: Path | None) -> None:
     """Be the router, until killed."""
-    with session.open_router(listen, connect=[connect]):
+    endpoints = Endpoints(tuple(connect), (listen,))
+    if keys is not None:
+        endpoints = configured(keys / KEYED, connect, [listen])
+    with session.open_router(endpoints):
         signal.pause()
 
 
@@ -262,8 +292,9 @@ def main(wanted: str) -> int:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
     parser.add_argument("wanted", nargs="?", default="", help="only cases whose names have this")
-    parser.add_argument("--router", nargs=2, metavar=("LISTEN", "CONNECT"), help=argparse.SUPPRESS)
+    parser.add_argument("--router", nargs="+", metavar="LISTEN CONNECT", help=argparse.SUPPRESS)
+    parser.add_argument("--keys", type=Path, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.router is not None:
-        route(*arguments.router)
+        route(arguments.router[0], arguments.router[1:], arguments.keys)
     sys.exit(main(arguments.wanted))

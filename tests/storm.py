@@ -32,6 +32,7 @@ from compose import inline
 from compose.record import leave, summary
 from compose.scenario import load
 from protocol import keys, session
+from protocol.endpoints import at
 from protocol.inbox import Inbox
 from protocol.journal import read
 from protocol.messages import Briefing, Drive, End, Estimate, Farewell, Report, Sense
@@ -367,7 +368,7 @@ def _ticks(endpoint: str, genuine: Genuine) -> Iterator[Iterator[int]]:
         raise AssertionError("no world")
 
     inbox = Inbox("storm")
-    with session.open_client(endpoint, nobody) as link:
+    with session.open_client(at(endpoint), nobody) as link:
         drives = {robot: session.publisher(link, keys.drive(RUN, robot)) for robot in PUPPETS}
         for robot in PUPPETS:
             session.subscribe(link, keys.sense(RUN, robot), inbox, "sense")

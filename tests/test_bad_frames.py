@@ -21,6 +21,7 @@ from msgspec.structs import replace
 from compose.local import free_endpoint
 from compose.scenario import load
 from protocol import inbox, keys, session
+from protocol.endpoints import listening
 from protocol.inbox import Arrival, Inbox, Interrupted, Topic
 from protocol.journal import read
 from protocol.messages import Contact, Drive, End, Farewell, Message, Report, Sense
@@ -262,7 +263,7 @@ def test_a_robot_refuses_what_is_out_of_step_and_hears_a_repeated_report_once(tm
     def sense(tick: int) -> Sense:
         return Sense(tick, "a", REST if tick else None, 2.5, (Contact("b", 2.0, (tick,)),))
 
-    with session.open_router(endpoint) as link:
+    with session.open_router(listening(endpoint)) as link:
         session.answer(link, keys.briefing(RUN, "*"), lambda _: scenario.briefing("a"))
         session.subscribe(link, keys.drive(RUN, "a"), said, "drive")
         session.watch_liveliness(link, keys.robot_alive(RUN, "*"), said)

@@ -16,6 +16,7 @@ from signal import SIGINT, SIGKILL, SIGSTOP, SIGTERM
 import pytest
 
 from compose.local import free_endpoint
+from protocol.refusal import MUTE
 from tests.commands import (
     ENDLESS,
     LONG,
@@ -237,7 +238,7 @@ def test_an_agent_at_a_port_that_does_not_speak_zenoh_gives_up() -> None:
     with socket.create_server(("127.0.0.1", 0)) as mute:
         endpoint = f"tcp/127.0.0.1:{mute.getsockname()[1]}"
         ended = tandem("agent", "a", "--connect", endpoint, "--wait", "2")
-    assert ended == (3, "", f"tandem agent a: no world at {endpoint}; gave up after 2 s\n")
+    assert ended == (3, "", f"tandem agent a: no world at {endpoint}; gave up after 2 s: {MUTE}\n")
 
 
 def test_processes_end_when_their_launcher_is_killed(endless: Path, tmp_path: Path) -> None:

@@ -280,6 +280,9 @@ def loaded_by(module: str) -> set[str]:
         ("compose.commands.run", {"numpy", "scipy", "rich", "agent", "starlette", "uvicorn"}),
         ("compose.commands.watch", {"zenoh", "numpy", "scipy", "rich", "agent", "starlette", "uvicorn"}),
         ("compose.scene.recorded", {"zenoh", "numpy", "scipy", "rich", "agent", "starlette", "uvicorn"}),
+        ("compose.commands.keys", {"zenoh", "numpy", "rich", "agent", "world", "cryptography"}),
+        ("compose.commands.agent", {"rich", "cryptography"}),
+        ("compose.commands.world", {"numpy", "scipy", "rich", "cryptography"}),
         ("compose.commands.sweep", {"zenoh", "rich", "distributed", "dask", "pyarrow", "matplotlib"}),
     ],
 )

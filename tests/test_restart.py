@@ -24,6 +24,7 @@ from compose.kill import BadKill, parse
 from compose.local import free_endpoint
 from compose.scenario import load
 from protocol import journal, keys, session
+from protocol.endpoints import listening
 from protocol.inbox import Inbox
 from protocol.journal import CannotRecord, CorruptJournal, Journal
 from protocol.messages import Contact, Drive, End, Farewell, Missed, Report, Sense
@@ -354,14 +355,14 @@ def test_an_agent_says_farewell_until_a_world_has_it_on_record(tmp_path: Path) -
             publisher.put(encode(End(0, "undecided", "for a test")))
 
     with ExitStack() as folder:
-        with session.open_router(endpoint) as link:
+        with session.open_router(listening(endpoint)) as link:
             session.answer(link, keys.briefing(run, "*"), lambda _: scenario.briefing("a"))
             _token = session.show_alive(link, keys.world_alive(run))
             agent = folder.enter_context(Command("agent", "a", "--connect", endpoint, "--out", tmp_path))
             first = farewell_of(link)
         agent.until_says("the world has gone after its End; waiting 30 s for it")
         there = Inbox("test")
-        with session.open_router(endpoint, BOUND_S) as link:
+        with session.open_router(listening(endpoint), BOUND_S) as link:
             assert farewell_of(link) == first
             assert agent.running
             session.publisher(link, keys.sense(run, "a")).put(first)
@@ -382,7 +383,7 @@ def test_a_repeated_sense_makes_an_agent_say_all_its_latest_reports_again(tmp_pa
     def heard(ticks: list[int]) -> None:
         assert [next_of(reports) for _ in ticks] == ticks
 
-    with session.open_router(endpoint) as link:
+    with session.open_router(listening(endpoint)) as link:
         session.answer(link, keys.briefing(run, "*"), lambda _: scenario.briefing("a"))
         session.watch_liveliness(link, keys.robot_alive(run, "*"), there)
         link.declare_subscriber(

@@ -14,6 +14,7 @@ import pytest
 from compose.local import free_endpoint
 from compose.scenario import load
 from protocol import journal, keys, session
+from protocol.endpoints import at, listening
 from protocol.inbox import Inbox
 from protocol.messages import Drive, End, Farewell, Missed
 from protocol.wire import MAX_FRAME_BYTES, decode
@@ -83,7 +84,7 @@ def watched(out: Path, name: str) -> Iterator[Inbox]:
     option = {word: words[place + 1] for place, word in enumerate(words) if word in ("--listen", "--run")}
     run = option["--run"]
     inbox = Inbox("a bystander")
-    with session.open_client(option["--listen"], lambda: None) as link:
+    with session.open_client(at(option["--listen"]), lambda: None) as link:
         robot = name.removeprefix("agent ")
         key = keys.world_alive(run) if name == "world" else keys.robot_alive(run, robot)
         session.watch_liveliness(link, key, inbox)
@@ -154,7 +155,7 @@ def test_stopped_for_longer_than_the_patience_a_process_fails_the_run(
 
 def test_a_link_over_which_nothing_comes_is_replaced_by_another() -> None:
     endpoint, briefing, inbox = free_endpoint(), load("paper-1").briefing("a", None), Inbox("a mute world")
-    with session.open_router(endpoint) as link:
+    with session.open_router(listening(endpoint)) as link:
         session.watch_liveliness(link, keys.robot_alive("mute", "a"), inbox)
         session.answer(link, keys.briefing("mute", "*"), lambda _key: briefing)
         _token = session.show_alive(link, keys.world_alive("mute"))

@@ -11,7 +11,10 @@ import pytest
 
 from compose.local import free_endpoint
 from protocol import keys, session
+from protocol.endpoints import at
 from tests.commands import Command, journals, processes_of, several_pairs, tandem, world
+
+NOBODY = "nobody listens there; check the address, and that the router runs"
 
 
 def unanswered() -> None:
@@ -95,8 +98,8 @@ def test_an_agent_without_a_world_says_so_and_gives_up(tmp_path: Path) -> None:
     ended = tandem("agent", "a", "--connect", endpoint, "--wait", "6", "--out", tmp_path / "out")
     assert ended.status == 3
     assert ended.err.splitlines() == [
-        f"tandem agent a: no world at {endpoint} yet; looking for one for 6 s",
-        f"tandem agent a: no world at {endpoint}; gave up after 6 s",
+        f"tandem agent a: no world at {endpoint} yet; looking for one for 6 s: {NOBODY}",
+        f"tandem agent a: no world at {endpoint}; gave up after 6 s: {NOBODY}",
     ]
     assert not (tmp_path / "out").exists()
 
@@ -147,7 +150,7 @@ def test_an_agent_that_is_refused_leaves_the_mission_alone(paper_1: Path, tmp_pa
 def test_an_agent_that_meets_several_runs_must_be_told_which() -> None:
     with (
         world("paper-1", "--run", "mine") as (_, endpoint),
-        session.open_client(endpoint, unanswered) as link,
+        session.open_client(at(endpoint), unanswered) as link,
     ):
         _token = session.show_alive(link, keys.world_alive("yours"))  # all that tells a world from afar
         ended = tandem("agent", "a", "--connect", endpoint)

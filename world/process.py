@@ -9,6 +9,7 @@ not come stands still.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
@@ -22,6 +23,8 @@ from protocol.wire import MalformedFrame, decode, encode
 from world.course import Course
 from world.referee import Judgement
 
+SILENCE_S = 3.0
+"""a replaceable link over which no robot has said anything for so long is replaced, as an agent's is"""
 REPEAT_S = 0.25
 """how often what is unanswered is said again"""
 FAREWELL_S = 2.0
@@ -32,13 +35,16 @@ class NoAnswer(TimeoutError):
     """Somebody did not answer within the patience; says who."""
 
 
+class LinkLost(Exception):
+    """Nothing comes over this link any more; over another the robots may be there."""
+
+
 class WorldProcess:
-    """One run over one session."""
+    """One run, over one session after the other. Nothing is heard or said before one is attached."""
 
     def __init__(
         self,
         course: Course,
-        link: zenoh.Session,
         run: str,
         inbox: Inbox,
         *,
@@ -50,6 +56,7 @@ class WorldProcess:
 
         `patience` (s) bounds every wait for an answer; `reached` is told how far each tick has come.
         """
+        self._run = run
         scenario = course.world.scenario
         self._scenario = scenario
         self._course = course
@@ -65,9 +72,22 @@ class WorldProcess:
         self._late = 0
         """Drives of ticks that are over"""
         self._truth_wanted = False
+        self._mute = math.inf
+        """when its link counts as lost, if nothing comes until then"""
+        self._silence = math.inf
+        self._began: float | None = None
+        """when everyone had answered the first Sense"""
         self.playing_s = 0.0
-        """wall time since everyone had answered the first Sense"""
+        """wall time since then, to the End"""
+        self._parting: float | None = None
+        """when the End was first said"""
+        self._last_words: dict[str, Farewell] = {}
 
+    def attach(self, link: zenoh.Session, *, replaceable: bool = False) -> None:
+        """From now on, this is the session over which it hears and is heard; `replaceable` by silence."""
+        run, inbox = self._run, self._inbox
+        self._silence = SILENCE_S + self._tick_s if replaceable else math.inf
+        self._mute = time.monotonic() + self._silence
         self._sense = {robot: session.publisher(link, keys.sense(run, robot)) for robot in self._robots}
         self._truth = session.publisher(link, keys.truth(run))
         session.on_matching(self._truth, self._want_truth)
@@ -77,10 +97,12 @@ class WorldProcess:
         self._token = session.show_alive(link, keys.world_alive(run))
 
     def play(self) -> End:
-        """The whole run, to its End. Raises Interrupted when told to stop."""
+        """The run, to its End.
+
+        Raises LinkLost, to be played on over another; or Interrupted when told to stop.
+        """
         course = self._course
         due: float | None = None
-        began: float | None = None
         end = course.over
         expected = self._robots if end is not None else []
         if course.tick > 0 and self._period is not None:  # its clock goes on; not everyone is back yet
@@ -94,12 +116,13 @@ class WorldProcess:
                 if self._reached is not None:
                     self._reached("journal", course.tick)
                 end = course.advance(drives)
-                began = time.monotonic() if began is None else began
+                self._began = time.monotonic() if self._began is None else self._began
                 if self._period is not None:
-                    due = max((due or began) + self._period, time.monotonic())
+                    due = max((due or self._began) + self._period, time.monotonic())
         except NoAnswer as silence:
             end = course.end(Judgement("failed", str(silence)))
-        self.playing_s = time.monotonic() - began if began is not None else 0.0
+        self._parting = time.monotonic() if self._parting is None else self._parting
+        self.playing_s = self._parting - self._began if self._began is not None else 0.0
         course.farewells(self._farewells(end, expected))
         self._put({robot: encode(farewell) for robot, farewell in course.parted.items()})
         if refused := self._inbox.refused.total():
@@ -151,10 +174,17 @@ class WorldProcess:
             self._sense[robot].put(encode(sense))
 
     def _next(self, timeout: float) -> Arrival:
-        arrival = self._inbox.next(timeout)
+        now = time.monotonic()
+        arrival = self._inbox.next(min(timeout, self._mute - now))
+        if arrival is not NOTHING:
+            self._mute = now + self._silence
+        elif time.monotonic() >= self._mute:
+            raise LinkLost
         if arrival.topic == "alive":
-            self._alive.add(keys.robot_of(arrival.key))
-            self._answered = time.monotonic()
+            robot = keys.robot_of(arrival.key)
+            if robot not in self._alive:
+                self._answered = time.monotonic()
+            self._alive.add(robot)
         elif arrival.topic == "gone":
             self._alive.discard(keys.robot_of(arrival.key))
         return arrival
@@ -213,8 +243,9 @@ class WorldProcess:
         whoever else is there, for FAREWELL_S.
         """
         frames = dict.fromkeys(self._robots, encode(end))
-        said = dict(self._course.parted)
-        now = repeat = began = time.monotonic()
+        said = self._last_words = {**self._course.parted, **self._last_words}
+        now = repeat = time.monotonic()
+        began = self._parting or now
         told = False
         while True:
             last_words = set(self._course.witnesses) - said.keys()

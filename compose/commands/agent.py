@@ -11,11 +11,13 @@ from agent.memory import Memory, remember
 from agent.process import AgentProcess
 from agent.robot import Robot
 from compose import kill
+from compose.reach import beyond, reach
 from compose.record import ended, make
 from compose.status import ENDED, FAILED, STOPPED, UserError, status_of
 from compose.stop import stop_by_signal, stop_with_launcher
 from compose.telling import going_on
 from protocol import session
+from protocol.endpoints import Endpoints
 from protocol.inbox import Inbox, Interrupted
 from protocol.journal import CannotRecord, CorruptJournal, Journal
 from protocol.messages import Briefing, End
@@ -33,8 +35,8 @@ def main(options: argparse.Namespace) -> int:
     stop_by_signal(inbox)
     try:
         end = _play(options, inbox)
-    except session.BadEndpoint as error:
-        raise UserError(f"--connect: {error}") from None
+    except session.CannotListen as error:
+        raise UserError(f"--listen: {error}") from None
     except CannotRecord as error:
         raise UserError(f"--out: {error}") from None
     except CorruptJournal as error:
@@ -54,21 +56,25 @@ def main(options: argparse.Namespace) -> int:
 
 
 def _play(options: argparse.Namespace, inbox: Inbox) -> End:
-    session.check_endpoint(options.connect)
+    endpoints = _endpoints(options)
     path: Path | None = options.out / f"agent-{options.id}.journal" if options.out is not None else None
     old = Retrace(path, fsync=options.fsync) if path is not None and path.exists() else None
     memory = remember(old) if old is not None else None
     end = memory.end if memory is not None else None
     which = f"world of run '{options.run}'" if options.run else "world"
     wait = options.wait if end is None else min(options.wait, STILL_THERE_S)
-    search = Search(f"{which} at {options.connect}", wait, inbox)
+    search = Search(which, endpoints, wait, inbox)
+    warning = beyond(endpoints)
     process: AgentProcess | None = None
     while True:
         try:
-            with session.open_client(
-                options.connect, search.go_on if process is None else process.unanswered
+            with session.open_session(
+                endpoints, search.go_on if process is None else process.unanswered, session.CLOSE_TIMEOUT_S
             ) as link:
                 if process is None:
+                    if warning is not None:
+                        inbox.say(warning)
+                        warning = None
                     joined = join(link, options.run, options.id, search)
                     if joined is None:  # a session that has lost its link finds nothing; a new one may
                         continue
@@ -94,6 +100,13 @@ def _play(options: argparse.Namespace, inbox: Inbox) -> End:
             if end is None:
                 raise
             return end
+
+
+def _endpoints(options: argparse.Namespace) -> Endpoints:
+    found = reach(options, f"agent-{options.id}")
+    if not found.connect and not found.listen:
+        raise UserError("--connect ENDPOINT is needed, such as tcp/127.0.0.1:7447")
+    return found
 
 
 def _ready(

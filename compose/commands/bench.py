@@ -26,9 +26,12 @@ from compose import barrier, inline, local, record, scenario
 from compose.beside import beside
 from compose.beside import page as page_on
 from compose.campaign.played import in_process
+from compose.lab import need
+from compose.reach import KEYED
 from compose.status import LOCALISED
 from compose.telling import counting
-from protocol import session
+from protocol import access, session
+from protocol.endpoints import Endpoints, configured, listening
 from protocol.inbox import Inbox
 from protocol.journal import Journal
 from protocol.noise import Noise
@@ -55,6 +58,7 @@ BARE_IMPORTS = "import zenoh, numpy, scipy.optimize, msgspec"
 
 def main(options: argparse.Namespace) -> int:
     """Measure and print."""
+    need("cryptography", extra="deploy")
     rounds = options.rounds
     with counting("tandem bench", 4 * rounds) as done:
         tables = [_ticks(rounds, done), _missions(rounds, done), _noisy(rounds, done), _start(rounds, done)]
@@ -73,17 +77,20 @@ def _ticks(rounds: int, done: Callable[[], None]) -> Table:
     missions: list[float] = []
     bare: list[float] = []
     watched: list[float] = []
+    secured: list[float] = []
     barriers: list[float] = []
     for _ in range(rounds):
         missions.append(_mission_rate(played))
         bare.append(_mission_rate(played, journals=False))
         watched.append(_mission_rate(played, watched=True))
+        secured.append(_mission_rate(played, secured=True))
         barriers.append(_barrier_rate(played, sizes))
         done()
     table = _table("Ticks/s as processes, two robots")
     _row(table, f"a mission ({MISSION}), with journals", missions, "ticks/s")
     _row(table, "the same, without journals", bare, "ticks/s")
     _row(table, "the same, and somebody watches the page", watched, "ticks/s")
+    _row(table, "the same, over TLS with access control", secured, "ticks/s")
     _row(table, f"the bare barrier, frames of {sizes[0]} and {sizes[1]} bytes", barriers, "ticks/s")
     ratios = [mission / barrier for mission, barrier in zip(missions, barriers, strict=True)]
     _row(table, "mission / barrier (at least 0.5)", ratios, "")
@@ -91,6 +98,8 @@ def _ticks(rounds: int, done: Callable[[], None]) -> Table:
     _row(table, "with journals / without (at least 0.85)", ratios, "")
     ratios = [with_page / mission for with_page, mission in zip(watched, missions, strict=True)]
     _row(table, "watched / mission (at least 0.6)", ratios, "")
+    ratios = [with_keys / mission for with_keys, mission in zip(secured, missions, strict=True)]
+    _row(table, "secured / mission (at least 0.75)", ratios, "")
     return table
 
 
@@ -121,33 +130,50 @@ def _processes(arguments: Sequence[Sequence[str]], *, until_ended: bool = False)
             child.wait()
 
 
-def _mission_rate(played: Scenario, *, journals: bool = True, watched: bool = False) -> float:
+def _mission_rate(
+    played: Scenario, *, journals: bool = True, watched: bool = False, secured: bool = False
+) -> float:
     """As processes; `watched`: beside a page, and somebody who looks at it."""
-    endpoint = local.free_endpoint()
     with ExitStack() as stack:
+        endpoints, keyed = _endpoints(played, secured, stack)
         folder = stack.enter_context(tempfile.TemporaryDirectory())
         visitors = []
         if watched:
             page = stack.enter_context(beside(*page_on(Path(folder), 0)))
             visitors.append(["compose.watch.visitor", page.address])
-        common = ["--connect", endpoint, "--quiet", *(["--out", folder] if journals else [])]
-        robots = [["compose", "agent", robot.id, *common] for robot in played.robots]
+        common = ["--connect", str(endpoints), "--quiet", *(["--out", folder] if journals else [])]
+        robots = [["compose", "agent", robot.id, *keyed(robot.id), *common] for robot in played.robots]
         with (
             _processes(visitors),
             _processes(robots, until_ended=True),
-            session.open_router(endpoint) as link,
+            session.open_router(endpoints) as link,
             Journal(Path(folder) / record.WORLD_JOURNAL) if journals else nullcontext() as journal,
         ):
-            process = WorldProcess(Course(played, journal), link, "bench", Inbox("tandem bench"))
+            process = WorldProcess(Course(played, journal), "bench", Inbox("tandem bench"))
+            process.attach(link)
             end = process.play()
             return end.tick / process.playing_s
+
+
+def _endpoints(
+    played: Scenario, secured: bool, stack: ExitStack
+) -> tuple[Endpoints, Callable[[str], list[str]]]:
+    """Where the world listens, and by which flags a robot reaches it."""
+    if not secured:
+        return listening(local.free_endpoint()), lambda _: []
+    from compose import certificates  # noqa: PLC0415  # there may be no such library
+
+    folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tandem-keys-")))
+    certificates.make(folder, [robot.id for robot in played.robots], (), 1)
+    endpoints = configured(folder / "world" / KEYED, listen=[local.free_endpoint("tls")])
+    return endpoints, lambda robot: ["--keys", str(folder / access.agent(robot))]
 
 
 def _barrier_rate(played: Scenario, sizes: tuple[int, int]) -> float:
     endpoint = local.free_endpoint()
     ids = [robot.id for robot in played.robots]
     robots = [["compose.barrier", endpoint, one, str(sizes[1]), str(BARRIER_TICKS)] for one in ids]
-    with session.open_router(endpoint) as link, _processes(robots, until_ended=True):
+    with session.open_router(listening(endpoint)) as link, _processes(robots, until_ended=True):
         return BARRIER_TICKS / barrier.world(link, ids, sizes[0], BARRIER_TICKS)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -38,7 +39,11 @@ def main(options: argparse.Namespace) -> int:
         if options.out is None:
             raise UserError("--export: there is no --out DIR to leave it in")
     kills = _kills(options, found, scenario)
+    if options.secure:
+        need("cryptography", extra="deploy")
     if options.in_process:
+        if options.secure:
+            raise UserError("--secure: --in-process has no network")
         if kills:
             where = "--kill" if options.kill else f"{options.scenario}: kill"
             raise UserError(f"{where}: --in-process has no processes to kill")
@@ -86,7 +91,11 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[
     check_rate(scenario, options.rate)
     inbox = Inbox("tandem run")
     stop_by_signal(inbox)
-    with folder_for(options.out) as folder, _shown(options, folder) as shows:
+    with (
+        folder_for(options.out) as folder,
+        _keys(options, scenario) as keys,
+        _shown(options, folder) as shows,
+    ):
         began = time.perf_counter()
         try:
             with progress(options, scenario, folder):
@@ -98,6 +107,7 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[
                     rate=options.rate,
                     patience=options.patience,
                     kills=kills,
+                    keys=keys,
                 )
         except local.ChildFailed as failure:
             inbox.say(f"failed: {failure}")
@@ -113,6 +123,19 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[
         _export(options, folder)
         stay(shows, inbox)
         return status
+
+
+@contextmanager
+def _keys(options: argparse.Namespace, scenario: Scenario) -> Iterator[Path | None]:
+    """Keys for this run alone, if it is to be secured."""
+    if not options.secure:
+        yield None
+        return
+    from compose import certificates  # noqa: PLC0415  # there may be no such library
+
+    with tempfile.TemporaryDirectory(prefix="tandem-keys-") as folder:
+        certificates.make(Path(folder), [robot.id for robot in scenario.robots], (), 1)
+        yield Path(folder)
 
 
 @contextmanager

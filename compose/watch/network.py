@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -12,7 +13,8 @@ import zenoh
 from compose.scene.facts import Gathering
 from compose.scene.stage import of_briefings
 from compose.watch.shows import Show
-from protocol import keys, session
+from protocol import keys, refusal, session
+from protocol.endpoints import Endpoints
 from protocol.inbox import Inbox, Interrupted
 from protocol.messages import Briefing, Drive, End, Estimate, Farewell, Message, Report, Sense, Truth
 from protocol.wire import MalformedFrame, decode
@@ -72,8 +74,9 @@ class Heard(Show):
 class Listener:
     """Somebody who listens at an endpoint, in a thread of its own; says nothing but questions."""
 
-    def __init__(self, endpoint: str) -> None:
-        self.endpoint = endpoint
+    def __init__(self, endpoints: Endpoints) -> None:
+        self.endpoint = str(endpoints)
+        self._endpoints = endpoints
         self.shows: dict[str, Heard] = {}
         """by run, in the order in which they were found"""
         self.reached = False
@@ -81,6 +84,8 @@ class Listener:
         self._inbox = Inbox("tandem watch")
         self._answers: SimpleQueue[tuple[str, bytes]] = SimpleQueue()
         self._stop = threading.Event()
+        self._looking_since: float | None = None
+        self._told = False
         self._thread = threading.Thread(target=self._listen, daemon=True)
 
     def start(self) -> None:
@@ -120,14 +125,20 @@ class Listener:
     def _listen(self) -> None:
         while not self._stop.is_set():
             try:
-                with session.open_client(self.endpoint, self._unanswered) as link:
+                with session.open_client(self._endpoints, self._unanswered) as link:
                     self.reached = True
+                    self._looking_since = None
                     self._attend(link)
             except Interrupted:
                 return
             self.reached = False
 
     def _unanswered(self) -> None:
+        if self._looking_since is None:
+            self._looking_since = time.monotonic()
+        elif not self._told and time.monotonic() >= self._looking_since + refusal.FIRST_WORD_S:
+            self._told = True
+            self._inbox.say(f"no router at {self.endpoint} yet: {refusal.why(self._endpoints)}")
         if self._stop.wait(LOOK_AGAIN_S):
             raise Interrupted("stop")
 

@@ -12,7 +12,7 @@ from compose.status import UserError
 from compose.watch import campaign
 from compose.watch.network import Listener
 from compose.watch.shows import Recorded, Show
-from protocol import session
+from protocol.endpoints import Endpoints
 
 
 class Site:
@@ -98,14 +98,9 @@ def of_record(folder: Path) -> Site:
     return Site([Recorded(folder.name, folder, expected=True)])
 
 
-def of_network(endpoints: Sequence[str]) -> Site:
-    """Of the missions that are heard there. Raises UserError."""
-    try:
-        for endpoint in endpoints:
-            session.check_endpoint(endpoint)
-    except session.BadEndpoint as error:
-        raise UserError(f"--connect: {error}") from None
-    return Site(listeners=[Listener(endpoint) for endpoint in endpoints])
+def of_network(places: Sequence[Endpoints]) -> Site:
+    """Of the missions that are heard there."""
+    return Site(listeners=[Listener(endpoints) for endpoints in places])
 
 
 def of_folder(folder: Path) -> Site:

@@ -1,0 +1,247 @@
+"""Who may do what: each of it tried with sessions of its own, through a router that carries the rules."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from functools import partial
+from typing import Any, NamedTuple
+
+import pytest
+import zenoh
+
+from compose.local import free_endpoint
+from compose.reach import KEYED
+from protocol import keys, session
+from protocol.endpoints import configured
+from tests.commands import BOUND_S, tandem, until
+
+KEYS = {
+    "truth": keys.truth("r"),
+    "briefing of a": keys.briefing("r", "a"),
+    "sense of a": keys.sense("r", "a"),
+    "drive of a": keys.drive("r", "a"),
+    "report of a to b": keys.report("r", "a", "b"),
+    "estimate of a": keys.estimate("r", "a"),
+    "world alive": keys.world_alive("r"),
+    "a alive": keys.robot_alive("r", "a"),
+}
+MAY = {
+    "agent-a": {
+        ("ask", "briefing of a"),
+        ("hear", "sense of a"),
+        ("put", "drive of a"),
+        ("put", "report of a to b"),
+        ("put", "estimate of a"),
+        ("see", "world alive"),
+        ("show", "a alive"),
+        ("see", "a alive"),
+    },
+    "agent-b": {
+        ("hear", "report of a to b"),
+        ("see", "world alive"),
+    },
+    "viewer": {
+        ("hear", "truth"),
+        ("ask", "briefing of a"),
+        ("hear", "sense of a"),
+        ("hear", "drive of a"),
+        ("hear", "report of a to b"),
+        ("hear", "estimate of a"),
+        ("see", "world alive"),
+        ("see", "a alive"),
+    },
+}
+"""the whole matrix, written out; what is not here must not be possible"""
+
+
+def key_functions() -> set[Callable[..., str]]:
+    public = {name: one for name, one in vars(keys).items() if inspect.isfunction(one) and name[0] != "_"}
+    return {one for one in public.values() if next(iter(inspect.signature(one).parameters)) == "run"}
+
+
+def test_every_key_has_a_rule_and_is_tried() -> None:
+    assert key_functions() == set(keys.RULES)
+    whose = {"run": "r", "robot": "a", "peer": "b"}
+    made = {one(*(whose[name] for name in inspect.signature(one).parameters)) for one in key_functions()}
+    assert made == set(KEYS.values())
+
+
+def test_every_role_of_a_rule_is_one_that_there_is() -> None:
+    for key, rule in keys.RULES.items():
+        there = {"world", "viewer", "robots", *inspect.signature(key).parameters} - {"run"}
+        assert {rule.by, *rule.to} <= there
+
+
+# --- tried for real -------------------------------------------------------------------------------------
+
+
+class Network(NamedTuple):
+    """A router, and sessions of others at it."""
+
+    open: Callable[[str], zenoh.Session]
+    world: zenoh.Session
+    """which may say and hear anything of a mission; it answers, and is alive, under every key"""
+
+
+@pytest.fixture(scope="module", params=["a router between", "the world is the router"])
+def network(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Network]:
+    folder = tmp_path_factory.mktemp("access") / "keys"
+    assert tandem("keys", folder, "--robots", "a,b").status == 0
+    endpoint = free_endpoint("tls")
+    with ExitStack() as stack:
+
+        def opened(name: str) -> zenoh.Session:
+            endpoints = configured(folder / name / KEYED, connect=[endpoint])
+            return stack.enter_context(session.open_client(endpoints, unreachable))
+
+        routes = "router" if request.param == "a router between" else "world"
+        router = session.open_router(configured(folder / routes / KEYED, listen=[endpoint]))
+        world = stack.enter_context(router)
+        if routes == "router":
+            world = opened("world")
+        for key in {*KEYS.values(), keys.briefing("r", "b")}:
+            world.declare_queryable(key, partial(answer, "world"))
+            stack.callback(undeclare, session.show_alive(world, key))
+        yield Network(opened, world)
+
+
+def unreachable() -> None:
+    raise AssertionError("the router does not let it in")
+
+
+def answer(who: str, query: zenoh.Query) -> None:
+    query.reply(query.key_expr, who)
+
+
+def undeclare(declared: Any) -> None:
+    declared.undeclare()
+
+
+def heard(declared: Any) -> set[str]:
+    """The keys of what has come. A channel holds it as soon as it has; a callback would be called later."""
+    found = set()
+    while (sample := declared.try_recv()) is not None:
+        found.add(str(sample.key_expr))
+    return found
+
+
+def answers(who: zenoh.Session, key: str) -> list[str]:
+    replies = who.get(
+        key, target=zenoh.QueryTarget.ALL, consolidation=zenoh.ConsolidationMode.NONE, timeout=BOUND_S
+    )
+    return [reply.ok.payload.to_string() for reply in replies if reply.ok is not None]
+
+
+class Participant:
+    """Somebody at the router, and what becomes of what they try."""
+
+    def __init__(self, network: Network, name: str) -> None:
+        self.session = network.open(name)
+        self._world = network.world
+        self._own = keys.briefing("r", name.removeprefix("agent-") if name != "viewer" else "a")
+        until(lambda: answers(self.session, self._own), f"{name} is answered")
+
+    def _settled(self) -> None:
+        """What either has said has passed the router: a question and its answer have, on the same links."""
+        assert "world" in answers(self.session, self._own)  # its own answer, if any, never leaves it
+
+    def put(self, key: str) -> bool:
+        """Whether what they put comes to the world."""
+        return self._passes(self._world, key, self.session)
+
+    def hear(self, key: str) -> bool:
+        """Whether what the world puts comes to them."""
+        return self._passes(self.session, key, self._world)
+
+    def _passes(self, hearer: zenoh.Session, key: str, speaker: zenoh.Session) -> bool:
+        declared = hearer.declare_subscriber(key)
+        self._settled()
+        self._settled()  # the world's declaration passes when its first answer has
+        speaker.put(key, b"?")
+        self._settled()
+        came = heard(declared)
+        undeclare(declared)
+        return bool(came)
+
+    def answer(self, key: str) -> bool:
+        """Whether the world's question is answered by them."""
+        declared: Any = self.session.declare_queryable(key, partial(answer, "it"))
+        self._settled()
+        found = answers(self._world, key)
+        undeclare(declared)
+        return "it" in found
+
+    def ask(self, key: str) -> bool:
+        """Whether they are answered by the world."""
+        return answers(self.session, key) == ["world"]
+
+    def show(self, key: str) -> bool:
+        """Whether the world takes them for alive there."""
+        elsewhere = key.replace("tandem/r/", "tandem/s/")  # where the world itself is not
+        token = session.show_alive(self.session, elsewhere)
+        self._settled()
+        found = session.alive(self._world, elsewhere, BOUND_S)
+        undeclare(token)
+        return found == [elsewhere]
+
+    def see(self, key: str) -> bool:
+        """Whether they are told that somebody is alive there, asking or listening."""
+        asked = session.alive(self.session, key, BOUND_S)
+        looking: Any = self.session.liveliness()
+        declared = looking.declare_subscriber(key, history=True)
+        came: set[str] = set()
+
+        def told() -> bool:
+            came.update(heard(declared))
+            return bool(came)
+
+        if asked:
+            until(told, "who asks and is told is told unasked, too")
+        self._settled()
+        told()
+        undeclare(declared)
+        assert came == set(asked)
+        return bool(came)
+
+
+@pytest.mark.parametrize("name", MAY)
+def test_the_router_lets_pass_what_the_matrix_says_and_nothing_else(name: str, network: Network) -> None:
+    participant = Participant(network, name)
+    deeds = {deed: getattr(participant, deed) for deed in ("put", "hear", "answer", "ask", "show", "see")}
+    found = {(deed, what) for what, key in KEYS.items() for deed, does in deeds.items() if does(key)}
+    assert found == MAY[name]
+
+
+@pytest.mark.parametrize("key", ["tandem/**", "**", "tandem/*/world/truth", "tandem/*/robot/*/sense"])
+def test_a_robot_that_listens_to_everything_hears_nothing_of_it(key: str, network: Network) -> None:
+    robot = Participant(network, "agent-b")
+    declared = robot.session.declare_subscriber(key)
+    robot._settled()
+    for one in KEYS.values():
+        network.world.put(one, b"?")
+    robot._settled()
+    assert heard(declared) == set()
+
+
+@pytest.mark.parametrize("key", ["tandem/r/robot/*/drive", "tandem/r/robot/**", "tandem/**"])
+def test_a_robot_that_speaks_for_everybody_speaks_for_nobody(key: str, network: Network) -> None:
+    robot = Participant(network, "agent-b")
+    declared = network.world.declare_subscriber("tandem/r/**")
+    robot._settled()
+    robot._settled()
+    robot.session.put(key, b"?")
+    robot._settled()
+    came = heard(declared)
+    undeclare(declared)
+    assert came == set()
+
+
+def test_the_answer_of_a_robot_that_may_not_answer_is_not_asked_for(network: Network) -> None:
+    robot = Participant(network, "agent-b")
+    declared: Any = robot.session.declare_queryable("tandem/r/world/briefing/**", partial(answer, "agent-b"))
+    robot._settled()
+    a = Participant(network, "agent-a")
+    assert answers(a.session, keys.briefing("r", "a")) == ["world"]
+    undeclare(declared)

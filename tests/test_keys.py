@@ -1,0 +1,467 @@
+"""Keys: what `tandem keys` makes, who is refused without, and what is said of it."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import ssl
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import timedelta
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import Encoding, load_pem_private_key
+
+from compose import certificates
+from compose.local import free_endpoint
+from compose.reach import KEYED
+from protocol import keys as tree
+from protocol import session
+from protocol.endpoints import BadConfiguration, Endpoints, configured, listening
+from protocol.refusal import MUTE
+from tests.commands import Command, Ended, journals, tandem
+
+EVERYBODY = ("agent-a", "agent-b", "router", "viewer", "world")
+
+
+@pytest.fixture(scope="module")
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Those of a mission of a and b; nobody changes anything in it."""
+    folder = tmp_path_factory.mktemp("keys") / "keys"
+    assert tandem("keys", folder, "--robots", "a,b").status == 0
+    return folder
+
+
+@pytest.fixture
+def mine(keys: Path, tmp_path: Path) -> Path:
+    """Those of a, to be spoilt."""
+    shutil.copytree(keys / "agent-a", tmp_path / "mine")
+    return tmp_path / "mine"
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def mistaken(ended: Ended, *words: str) -> None:
+    """A mistake of the user's: one line, that has these words."""
+    assert ended.status == 2, ended
+    assert ended.out == ""
+    assert re.fullmatch(r"tandem[^\n]*: [^\n]+\n", ended.err), ended.err
+    for word in words:
+        assert word in ended.err
+
+
+# --- what is made ---------------------------------------------------------------------------------------
+
+
+def test_everybody_has_a_folder_with_all_that_one_machine_needs(keys: Path) -> None:
+    assert sorted(path.name for path in keys.iterdir() if path.is_dir()) == list(EVERYBODY)
+    for name in EVERYBODY:
+        own = keys / name
+        assert sorted(path.name for path in own.iterdir()) == ["ca.pem", "cert.pem", "key.pem", KEYED]
+        assert own.joinpath("ca.pem").read_bytes() == keys.joinpath("ca.pem").read_bytes()
+        context = ssl.create_default_context(cafile=own / "ca.pem")
+        context.load_cert_chain(own / "cert.pem", own / "key.pem")  # raises if they do not go together
+        certificate = x509.load_pem_x509_certificate((own / "cert.pem").read_bytes())
+        certificate.verify_directly_issued_by(x509.load_pem_x509_certificate((own / "ca.pem").read_bytes()))
+        assert certificate.subject.rfc4514_string() == f"CN={name}"
+
+
+def test_only_its_owner_reads_a_private_key(keys: Path) -> None:
+    private = [path for path in keys.rglob("*") if path.is_file() and b"PRIVATE" in path.read_bytes()]
+    assert {path.name for path in private} == {"key.pem", "ca-key.pem"}
+    assert len(private) == len(EVERYBODY) + 1
+    assert {path.stat().st_mode & 0o777 for path in private} == {0o600}
+
+
+def test_who_is_there_keeps_the_keys_and_learns_of_who_comes_later(tmp_path: Path) -> None:
+    folder = tmp_path / "keys"
+    assert tandem("keys", folder, "--robots", "a,b", "--days", "3").status == 0
+    before = contents(folder)
+    ended = tandem("keys", folder, "--robots", "c")
+    assert ended.status == 0
+    assert "made, for 365 days: agent-c\n" in ended.out
+    assert "kept, with their keys and names: router, world, viewer, agent-a, agent-b\n" in ended.out
+    after = contents(folder)
+    changed = {name for name in before if after[name] != before[name]}
+    assert changed == {f"{name}/{KEYED}" for name in EVERYBODY}
+    named = {
+        subject["id"] for subject in configured(folder / "router" / KEYED).setting("access_control/subjects")
+    }
+    assert named == {*EVERYBODY, "agent-c"}
+
+
+def test_a_folder_that_is_removed_is_made_anew_by_the_same_authority(tmp_path: Path) -> None:
+    folder = tmp_path / "keys"
+    assert tandem("keys", folder, "--robots", "a", "--host", "robot.example").status == 0
+    before = contents(folder)
+    shutil.rmtree(folder / "world")
+    assert tandem("keys", folder, "--robots", "a", "--host", "10.1.2.3").status == 0
+    after = contents(folder)
+    assert {name for name in before if before[name] != after[name]} == {"world/cert.pem", "world/key.pem"}
+    names = {"world": "<IPAddress(value=10.1.2.3)>", "router": "<DNSName(value='robot.example')>"}
+    for name, host in names.items():
+        certificate = x509.load_pem_x509_certificate(after[f"{name}/cert.pem"])
+        known = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        assert host in [str(one) for one in known]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--robots", "a,"), "'' is no name"),
+        (("--robots", "a,b,a"), "names a robot twice"),
+        (("--robots", "../a"), "is no name"),
+        (("--robots", "a" * 33), "more than 32 letters"),
+        (("--robots", "a", "--host", "not a host"), "--host: 'not a host' is neither a name nor an address"),
+        (("--robots", "a", "--days", "0"), "0 is not from 1 to 36500"),
+        ((), "--robots"),
+    ],
+)
+def test_what_no_keys_can_be_made_of_is_told(arguments: tuple[str, ...], words: str, tmp_path: Path) -> None:
+    mistaken(tandem("keys", tmp_path / "keys", *arguments), words)
+    assert not (tmp_path / "keys").exists()
+
+
+def spoil_authority(folder: Path) -> None:
+    (folder / "ca-key.pem").write_text("nonsense")
+
+
+def lose_authority(folder: Path) -> None:
+    (folder / "ca-key.pem").unlink()
+
+
+def lose_key(folder: Path) -> None:
+    (folder / "agent-a" / "key.pem").unlink()
+
+
+def mix(folder: Path) -> None:
+    for name in ("ca.pem", "ca-key.pem"):
+        (folder / name).unlink()
+    shutil.move(folder / "agent-a", folder.parent / "agent-a")
+    shutil.rmtree(folder)
+    assert tandem("keys", folder, "--robots", "b").status == 0
+    shutil.move(folder.parent / "agent-a", folder / "agent-a")
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (spoil_authority, "its authority cannot be read"),
+        (lose_authority, "is not empty, and holds no ca.pem with ca-key.pem"),
+        (lose_key, "has no key.pem; remove the folder, and it is made anew"),
+        (mix, "is of another authority"),
+    ],
+)
+def test_a_folder_that_is_damaged_is_left_as_it_is(
+    damage: Callable[[Path], None], words: str, keys: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(keys, tmp_path / "keys")
+    damage(tmp_path / "keys")
+    before = contents(tmp_path / "keys")
+    mistaken(tandem("keys", tmp_path / "keys", "--robots", "a"), words)
+    after = contents(tmp_path / "keys")
+    assert {name: after[name] for name in before if not name.endswith(KEYED)} == {
+        name: before[name] for name in before if not name.endswith(KEYED)
+    }
+
+
+# --- a mission over TLS ---------------------------------------------------------------------------------
+
+
+def test_a_secured_mission_leaves_the_record_of_an_open_one(tmp_path: Path) -> None:
+    assert tandem("run", "paper-1", "-q", "--out", tmp_path / "open").status == 0
+    ended = tandem("run", "paper-1", "-q", "--secure", "--out", tmp_path / "secured")
+    assert ended == (0, "localised after 48 ticks\n", "")
+    assert journals(tmp_path / "secured") == journals(tmp_path / "open")
+    ticks = [(tmp_path / name / "ticks.csv").read_bytes() for name in ("open", "secured")]
+    assert ticks[0] == ticks[1]
+
+
+def test_a_mission_in_one_process_has_nothing_to_secure() -> None:
+    mistaken(tandem("run", "paper-1", "--in-process", "--secure"), "--secure: --in-process has no network")
+
+
+def test_a_folder_of_keys_may_lie_anywhere(keys: Path, mine: Path, tmp_path: Path) -> None:
+    endpoint = free_endpoint("tls")
+    with (
+        Command("world", "paper-1", "--listen", endpoint, "--keys", keys / "world") as world,
+        Command("agent", "a", "--connect", endpoint, "--keys", mine.name, cwd=tmp_path) as a,
+        Command("agent", "b", "--connect", endpoint, "--keys", keys / "agent-b") as b,
+    ):
+        for part in (a, b, world):
+            assert part.ended().status == 0
+
+
+# --- who is refused -------------------------------------------------------------------------------------
+
+
+@contextmanager
+def world_of(keys: Path, name: str = "world") -> Iterator[str]:
+    """The endpoint of somebody who shows that a world is there."""
+    endpoint = free_endpoint("tls")
+    with session.open_router(configured(keys / name / KEYED, listen=[endpoint])) as link:
+        _token = session.show_alive(link, tree.world_alive("mine"))
+        yield endpoint
+
+
+def authority_of(keys: Path) -> certificates.Authority:
+    key = load_pem_private_key((keys / "ca-key.pem").read_bytes(), None)
+    assert isinstance(key, ec.EllipticCurvePrivateKey)
+    return certificates.Authority(x509.load_pem_x509_certificate((keys / "ca.pem").read_bytes()), key)
+
+
+def expire(own: Path, keys: Path) -> None:
+    """Its certificate is one that has ended an hour ago."""
+    key = load_pem_private_key((own / "key.pem").read_bytes(), None)
+    assert isinstance(key, ec.EllipticCurvePrivateKey)
+    name = "world" if own.name == "world" else "agent-a"
+    lasted = timedelta(hours=-1)
+    old = certificates.issue(authority_of(keys), name, key.public_key(), certificates.LOOPBACK, lasted)
+    (own / "cert.pem").write_bytes(old.public_bytes(Encoding.PEM))
+
+
+def give_foreign(own: Path, _keys: Path) -> None:
+    """Its certificate is of another authority, though it knows the right one."""
+    other = own.parent / "others"
+    assert tandem("keys", other, "--robots", "a").status == 0
+    for name in ("cert.pem", "key.pem"):
+        shutil.copy(other / "agent-a" / name, own / name)
+
+
+def take_away(own: Path, _keys: Path) -> None:
+    """It has no certificate."""
+    settings = json.loads((own / KEYED).read_text().partition("\n")[2])
+    tls = settings["transport"]["link"]["tls"]
+    for name in [name for name in tls if name.startswith(("connect_", "listen_"))]:
+        del tls[name]
+    (own / KEYED).write_text(json.dumps(settings))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (expire, "this certificate has expired; check the certificate"),
+        (give_foreign, "this certificate is not of an authority that it trusts; check the certificate"),
+        (take_away, "it asks for a certificate, and there is none; check the certificate"),
+    ],
+)
+def test_who_has_no_good_certificate_is_not_let_in_and_told_why(
+    spoil: Callable[[Path, Path], None], words: str, keys: Path, mine: Path
+) -> None:
+    spoil(mine, keys)
+    with world_of(keys) as endpoint:
+        ended = tandem("agent", "a", "--connect", endpoint, "--keys", mine, "--wait", "2")
+    assert ended == (3, "", f"tandem agent a: no world at {endpoint}; gave up after 2 s: {words}\n")
+
+
+def test_a_world_of_another_authority_is_not_believed(mine: Path, tmp_path: Path) -> None:
+    other = tmp_path / "others"
+    assert tandem("keys", other, "--robots", "a,b").status == 0
+    with world_of(other) as endpoint:
+        ended = tandem("agent", "a", "--connect", endpoint, "--keys", mine, "--wait", "2")
+    assert ended.status == 3
+    assert "its certificate is refused here: unable to get local issuer certificate" in ended.err
+
+
+def test_a_world_whose_certificate_has_expired_is_not_believed(
+    keys: Path, mine: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(keys / "world", tmp_path / "old" / "world")
+    expire(tmp_path / "old" / "world", keys)
+    with world_of(tmp_path / "old") as endpoint:
+        ended = tandem("agent", "a", "--connect", endpoint, "--keys", mine, "--wait", "2")
+    assert ended.status == 3
+    assert "its certificate is refused here: certificate has expired" in ended.err
+
+
+def test_a_world_by_another_name_than_its_certificates_is_not_believed(keys: Path, mine: Path) -> None:
+    with world_of(keys) as endpoint:
+        elsewhere = endpoint.replace("127.0.0.1", "127.0.0.2")
+        with session.open_router(configured(keys / "world" / KEYED, listen=[elsewhere])):
+            ended = tandem("agent", "a", "--connect", elsewhere, "--keys", mine, "--wait", "2")
+    assert ended.status == 3
+    assert "its certificate is refused here: IP address mismatch" in ended.err
+
+
+def test_a_robot_that_the_rules_do_not_name_is_told_to_check_them(keys: Path, tmp_path: Path) -> None:
+    shutil.copytree(keys, tmp_path / "keys")
+    assert tandem("keys", tmp_path / "keys", "--robots", "c").status == 0
+    with world_of(keys) as endpoint:
+        own = tmp_path / "keys" / "agent-c"
+        ended = tandem("agent", "c", "--connect", endpoint, "--keys", own, "--wait", "2")
+    assert ended.status == 3
+    assert (
+        "a router answers; check that the world runs, and that its access rules name this robot" in ended.err
+    )
+
+
+def test_who_speaks_without_tls_is_told_to(keys: Path) -> None:
+    with world_of(keys) as endpoint:
+        plain = endpoint.replace("tls/", "tcp/")
+        ended = tandem("agent", "a", "--connect", plain, "--wait", "2")
+    assert ended.status == 3
+    assert "check that it is a Zenoh router, user and password, and tls/" in ended.err
+
+
+def test_who_speaks_tls_where_nobody_does_is_told_so(mine: Path) -> None:
+    endpoint = free_endpoint()
+    with session.open_router(listening(endpoint)):
+        secured = endpoint.replace("tcp/", "tls/")
+        ended = tandem("agent", "a", "--connect", secured, "--keys", mine, "--wait", "2")
+    assert ended.status == 3
+    assert "check that it listens at tls/" in ended.err
+
+
+def test_a_wrong_password_is_told_to_be_checked(tmp_path: Path) -> None:
+    (tmp_path / "users").write_text("a:secret\n")
+    accounts = {"auth": {"usrpwd": {"user": "r", "password": "r", "dictionary_file": "users"}}}
+    (tmp_path / "router.json5").write_text(json.dumps({"transport": accounts}))
+    for name, password in (("right", "secret"), ("wrong", "guess")):
+        account = {"auth": {"usrpwd": {"user": "a", "password": password}}}
+        (tmp_path / name).write_text(json.dumps({"transport": account}))
+    endpoint = free_endpoint()
+    with session.open_router(configured(tmp_path / "router.json5", listen=[endpoint])):
+        part = ("agent", "a", "--connect", endpoint, "--wait", "2", "--config")
+        right, wrong = (tandem(*part, tmp_path / name) for name in ("right", "wrong"))
+    assert (right.status, wrong.status) == (3, 3)
+    assert "a router answers; check that the world runs" in right.err
+    assert wrong.err == f"tandem agent a: no world at {endpoint}; gave up after 2 s: {MUTE}\n"
+
+
+def test_a_page_whose_certificate_is_refused_says_so(keys: Path, tmp_path: Path) -> None:
+    own = shutil.copytree(keys / "viewer", tmp_path / "viewer")
+    take_away(own, keys)
+    with world_of(keys) as endpoint, Command("watch", "--connect", endpoint, "--keys", own) as page:
+        page.until_says(f"no router at {endpoint} yet: it asks for a certificate, and there is none")
+
+
+# --- what is no way to the network ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "expected array, boolean"),
+        ("{mode: 'client', ", "line 1: expected identifier or string"),
+        ("{\n nonsense: 1}", "unknown field `nonsense`, expected one of"),
+        ("{transport: {unicast: {lowlatency: 'yes'}}}", "expected a boolean"),
+        ("{mode: 'peer'}", "mode: 'peer', but who only connects is a client here; leave it out"),
+        ("{connect: {endpoints: ['somewhere']}}", "Endpoints must be of the form"),
+        (
+            "{transport: {link: {tls: {root_ca_certificate: 'nowhere.pem'}}}}",
+            "transport/link/tls/root_ca_certificate: ",
+        ),
+        (b"\xff\xfe", "is not UTF-8"),
+        (None, "cannot be read: No such file or directory"),
+    ],
+)
+def test_a_wrong_configuration_is_a_line_that_names_it(
+    text: str | bytes | None, words: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "mine.json5"
+    if text is not None:
+        file.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(BadConfiguration) as bad:
+        configured(file, connect=["tcp/127.0.0.1:7447"])
+    assert re.fullmatch(rf"{re.escape(str(file))}: .*{re.escape(words)}.*", str(bad.value))
+
+
+@pytest.mark.parametrize("part", [("world", "paper-1"), ("agent", "a"), ("watch",)])
+def test_a_command_refuses_a_wrong_configuration(part: tuple[str, ...], tmp_path: Path) -> None:
+    file = tmp_path / "mine.json5"
+    file.write_text("{mode: 'peer'}")
+    ended = tandem(*part, "--connect", free_endpoint(), "--config", file)
+    mistaken(ended, f"--config: {file}: mode: 'peer', but who only connects is a client here")
+
+
+def test_a_configuration_may_say_where_to_connect(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    (tmp_path / "world.json5").write_text(
+        f"{{mode: 'router', listen: {{endpoints: ['{endpoint}']}}}} // mine"
+    )
+    (tmp_path / "agent.json5").write_text(f"{{connect: {{endpoints: {{client: ['{endpoint}']}}}}}}")
+    with (
+        Command("world", "paper-1", "--config", tmp_path / "world.json5") as world,
+        Command("agent", "a", "--config", tmp_path / "agent.json5") as a,
+        Command("agent", "b", "--config", tmp_path / "agent.json5") as b,
+    ):
+        for part in (a, b, world):
+            assert part.ended().status == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("agent", "a"), "--connect ENDPOINT is needed"),
+        (("world", "paper-1"), "--listen ENDPOINT is needed"),
+        (("agent", "a", "--keys", "{keys}/agent-a"), "--connect ENDPOINT is needed"),
+        (
+            ("agent", "a", "--connect", "tls/127.0.0.1:7447"),
+            "takes certificates: --keys DIR, or --config FILE",
+        ),
+        (
+            ("agent", "a", "--connect", "tcp/127.0.0.1:7447", "--keys", "{keys}/agent-a"),
+            "tcp/127.0.0.1:7447 is not encrypted; with --keys it is tls/127.0.0.1:7447",
+        ),
+        (
+            ("agent", "b", "--connect", "tls/127.0.0.1:7447", "--keys", "{keys}/agent-a"),
+            "agent-a is the folder of agent-a, not of agent-b",
+        ),
+        (("watch", "--keys", "{keys}/world"), "world is the folder of world, not of viewer"),
+        (
+            ("world", "paper-1", "--listen", "tls/127.0.0.1:7447", "--keys", "{keys}"),
+            "name one of those in it: agent-a, agent-b, router, viewer, world",
+        ),
+        (
+            ("watch", "--keys", "nowhere"),
+            "nowhere is no participant's folder of keys; `tandem keys` makes such",
+        ),
+        (("watch", "--keys", "{keys}/viewer", "--config", "x"), "not allowed with argument"),
+        (("watch", ".", "--keys", "{keys}/viewer"), "--keys: a record needs no network"),
+    ],
+)
+def test_flags_that_do_not_go_together_are_told(arguments: tuple[str, ...], words: str, keys: Path) -> None:
+    mistaken(tandem(*(one.format(keys=keys) for one in arguments)), words)
+
+
+# --- who is warned --------------------------------------------------------------------------------------
+
+
+def test_who_listens_beyond_this_machine_without_keys_is_warned(keys: Path) -> None:
+    where = free_endpoint().replace("127.0.0.1", "0.0.0.0")
+    warning = f"listening beyond this machine without --keys, at {where}: whoever reaches it"
+    with Command("world", "paper-1", "--listen", where) as world:
+        world.until_says("waiting for")
+        assert world.err.startswith(f"tandem world: {warning}")
+        assert world.err.count("\n") == 1
+    with Command("world", "paper-1", "--listen", free_endpoint()) as world:
+        world.until_says("waiting for")
+        assert world.err == ""
+    where = free_endpoint("tls").replace("127.0.0.1", "0.0.0.0")
+    with Command("world", "paper-1", "--listen", where, "--keys", keys / "world") as world:
+        world.until_says("waiting for")
+        assert world.err == ""
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "exposed"),
+    [
+        ("tcp/127.0.0.1:1", False),
+        ("tcp/127.9.9.9:1", False),
+        ("tcp/localhost:1", False),
+        ("tcp/[::1]:1", False),
+        ("tcp/[::]:1", True),
+        ("tcp/0.0.0.0:1", True),
+        ("tcp/10.0.0.1:1", True),
+        ("tcp/robot:1", True),
+        ("tls/10.0.0.1:1", True),
+    ],
+)
+def test_loopback_is_what_no_other_machine_reaches(endpoint: str, exposed: bool) -> None:
+    assert (endpoint in Endpoints(listen=(endpoint,)).exposed) is exposed
