@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import ipaddress
 import os
 import re
 import sys
@@ -123,6 +124,10 @@ def _parser() -> argparse.ArgumentParser:
         "record", type=_folder, nargs="?", metavar="DIR", help="a record, a campaign, or a folder of records"
     )
     _add_reaching(watch)
+    watch.add_argument(
+        "--address", type=_address, default="127.0.0.1", metavar="IP",
+        help="of the page (127.0.0.1); 0.0.0.0 in a container, whose port is published on loopback",
+    )  # fmt: skip
     watch.add_argument("--launched", action="store_true", help=argparse.SUPPRESS)  # by `tandem run --watch`
     for sub in (run, watch):
         sub.add_argument("--port", type=_port, metavar="N", help="of the page (one that is free)")
@@ -246,6 +251,13 @@ def _port(text: str) -> int:
     if value >= 1 << 16:
         raise argparse.ArgumentTypeError(f"{value} is not a port, from 0 (one that is free) to 65535")
     return value
+
+
+def _address(text: str) -> str:
+    try:
+        return str(ipaddress.ip_address(text))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is no address, such as 127.0.0.1 or 0.0.0.0") from None
 
 
 def _count(text: str) -> int:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import errno
+import ipaddress
 import os
 import sys
 import threading
@@ -39,9 +41,14 @@ def main(options: argparse.Namespace) -> int:
     for note in shown.notes:
         print(one_line(f"tandem watch: {note}"), file=sys.stderr)
     try:
-        taken = server.bound(options.port or 0)
+        taken = server.bound(options.port or 0, options.address)
     except server.CannotServe as error:
-        raise UserError(f"--port: {options.port} cannot be had: {error.strerror}") from None
+        what = f"--address: {options.address}"
+        if error.errno != errno.EADDRNOTAVAIL:
+            what = f"--port: {options.port}"
+        raise UserError(f"{what} cannot be had: {error.strerror}") from None
+    if not ipaddress.ip_address(options.address).is_loopback:
+        print(f"tandem watch: --address: whoever reaches {options.address} can watch", file=sys.stderr)
     if shown.waiting:
         os.nice(NICENESS)
 

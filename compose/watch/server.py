@@ -1,8 +1,12 @@
-"""Who serves the page: on loopback, to whoever asks for it by that name. It reads, and writes nothing."""
+"""Who serves the page: on loopback if not told otherwise, to whoever asks for it by that name.
+
+It reads, and writes nothing.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import ipaddress
 import signal
 import socket
 from collections.abc import AsyncIterator, Callable
@@ -95,8 +99,8 @@ class _Answers:
         return StreamingResponse(told, media_type="text/event-stream")
 
 
-def application(site: Site) -> Starlette:
-    """The pages of `site`."""
+def application(site: Site, address: str = LOOPBACK) -> Starlette:
+    """The pages of `site`, for whoever asks for them by a name of loopback, or by `address`."""
     answers = _Answers(site)
     return Starlette(
         routes=[
@@ -109,7 +113,7 @@ def application(site: Site) -> Starlette:
             Mount("/page", StaticFiles(directory=PAGE)),
         ],
         middleware=[
-            Middleware(TrustedHostMiddleware, allowed_hosts=[LOOPBACK, "localhost"]),
+            Middleware(TrustedHostMiddleware, allowed_hosts=[*{LOOPBACK, "localhost", host(address)}]),
             Middleware(_Sealed),
         ],
     )
@@ -181,12 +185,13 @@ async def _news(site: Site, name: str | None, version: int) -> AsyncIterator[byt
 # --- serving ----------------------------------------------------------------------------------------
 
 
-def bound(port: int) -> socket.socket:
-    """A socket on loopback at `port`, or, if that is 0, at one that is free. Raises CannotServe."""
-    taken = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+def bound(port: int, address: str = LOOPBACK) -> socket.socket:
+    """A socket on `address` at `port`, or, if that is 0, at one that is free. Raises CannotServe."""
+    family = socket.AF_INET6 if ":" in address else socket.AF_INET
+    taken = socket.socket(family, socket.SOCK_STREAM)
     taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        taken.bind((LOOPBACK, port))
+        taken.bind((address, port))
         taken.listen(64)
     except OSError as error:
         taken.close()
@@ -194,9 +199,17 @@ def bound(port: int) -> socket.socket:
     return taken
 
 
+def host(address: str) -> str:
+    """What a browser on this machine calls a server on `address`."""
+    if ipaddress.ip_address(address).is_unspecified:
+        return LOOPBACK
+    return f"[{address}]" if ":" in address else address
+
+
 def address(taken: socket.socket) -> str:
     """What to open in a browser."""
-    return f"http://{LOOPBACK}:{taken.getsockname()[1]}/"
+    where, port, *_ = taken.getsockname()
+    return f"http://{host(where)}:{port}/"
 
 
 Ready = Callable[[Callable[[], None]], None]
@@ -211,7 +224,11 @@ def serve(site: Site, taken: socket.socket, ready: Ready) -> None:
 async def _serve(site: Site, taken: socket.socket, ready: Ready) -> None:
     server = _Server(
         uvicorn.Config(
-            application(site), log_config=None, lifespan="off", timeout_graceful_shutdown=1, ws="none"
+            application(site, taken.getsockname()[0]),
+            log_config=None,
+            lifespan="off",
+            timeout_graceful_shutdown=1,
+            ws="none",
         )
     )
     loop = asyncio.get_running_loop()
