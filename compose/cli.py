@@ -30,7 +30,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     """Parse, and do as told; ends the process."""
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115  # closed by whoever started this
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
-    options = _parser().parse_args(arguments)
+    options = parser().parse_args(arguments)
     try:
         status = import_module(f"compose.commands.{options.command}").main(options)
         sys.stdout.flush()
@@ -58,9 +58,10 @@ def _leave_stream(stream: TextIO) -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="tandem", description="Two robots find out together where they are.")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
+def parser() -> argparse.ArgumentParser:
+    """Of the whole command line."""
+    tandem = _Parser(prog="tandem", description="Two robots find out together where they are.")
+    commands = tandem.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
 
     def command(name: str, what: str) -> argparse.ArgumentParser:
         return commands.add_parser(name, help=what, description=what)
@@ -148,7 +149,7 @@ def _parser() -> argparse.ArgumentParser:
 
     bench = command("bench", "Measure speed, against the bare thing in the same run.")
     bench.add_argument("--rounds", type=_count, default=5, metavar="N", help="repetitions (5)")
-    return parser
+    return tandem
 
 
 def _add_scenario(parser: argparse.ArgumentParser) -> None:

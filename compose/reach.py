@@ -55,7 +55,11 @@ def _check(flag: str, endpoint: str, *, keyed: bool, configured: bool) -> None:
 
 def _keyed(folder: Path) -> Path:
     """The configuration in the folder of one participant. Raises UserError."""
-    if not (folder / KEYED).is_file():
+    try:
+        there = (folder / KEYED).is_file()
+    except OSError as error:
+        raise UserError(f"--keys: {folder}: cannot be read: {error.strerror or error}") from None
+    if not there:
         within = sorted(path.parent.name for path in folder.glob(f"*/{KEYED}"))
         why = (
             f"name one of those in it: {', '.join(within)}" if within else "`tandem keys` makes such folders"

@@ -1,0 +1,217 @@
+"""The compose file, the container file and the systemd unit fit the commands, and play missions."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tomllib
+from contextlib import ExitStack
+from pathlib import Path
+from signal import SIGKILL, SIGTERM
+from typing import Any
+
+import pytest
+from ruamel.yaml import YAML
+
+from compose.cli import parser
+from compose.local import free_endpoint
+from protocol import journal
+from tests.commands import Command, tandem
+
+HOUSE = Path(__file__).parents[1]
+DEPLOY = HOUSE / "compose" / "deploy"
+COMPOSE = DEPLOY / "compose.yaml"
+CONTAINER = DEPLOY / "Containerfile"
+UNIT = DEPLOY / "tandem-agent@.service"
+
+
+def services(**environment: str) -> dict[str, dict[str, Any]]:
+    """Those of the compose file, with its variables replaced as a compose command does."""
+    text = re.sub(
+        r"\$\{(\w+):-([^}]*)\}", lambda found: environment.get(found[1], found[2]), COMPOSE.read_text()
+    )
+    assert "${" not in text
+    found: dict[str, dict[str, Any]] = YAML(typ="safe", pure=True).load(text)["services"]
+    return found
+
+
+def ours() -> dict[str, dict[str, Any]]:
+    """The services that run a command of `tandem`."""
+    return {name: one for name, one in services().items() if "build" in one}
+
+
+def unit() -> dict[str, list[str]]:
+    """What the unit says, by field; of a field that comes more than once, all."""
+    found: dict[str, list[str]] = {}
+    for line in UNIT.read_text().splitlines():
+        if line and line[0] not in "#[":
+            name, _, value = line.partition("=")
+            found.setdefault(name, []).append(value)
+    return found
+
+
+def valid(file: Path) -> bool:
+    """Whether `file` is valid by the compose specification."""
+    check = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.compose-spec"]
+    return subprocess.run([*check, file], check=False, capture_output=True).returncode == 0
+
+
+def test_the_compose_file_is_valid_by_the_compose_specification(tmp_path: Path) -> None:
+    assert valid(COMPOSE)
+    broken = tmp_path / "compose.yaml"
+    broken.write_text(COMPOSE.read_text().replace("read_only: true", "readonly: true"))
+    assert not valid(broken)
+
+
+def test_every_service_has_a_command_that_there_is_and_a_record_of_its_own() -> None:
+    records = []
+    for name, service in ours().items():
+        options = parser().parse_args(service["command"])
+        if options.command == "watch":
+            continue
+        assert options.out == Path("/journal")
+        assert service["volumes"] == [f"{name}:/journal"]
+        records.append(name)
+    assert records == ["world", "agent-a", "agent-b"]
+
+
+def test_who_connects_does_so_to_a_service_that_listens_on_that_port_in_the_same_network() -> None:
+    listening = {"zenoh": "7447"}
+    for name, service in ours().items():
+        for endpoint in getattr(parser().parse_args(service["command"]), "listen", ()):
+            listening[name] = endpoint.rpartition(":")[2]
+    for service in ours().values():
+        for endpoint in parser().parse_args(service["command"]).connect:
+            host, _, port = endpoint.removeprefix("tcp/").partition(":")
+            assert listening[host] == port
+            assert set(service["networks"]) & set(services()[host]["networks"])
+    zenoh = services()["zenoh"]["command"]
+    assert zenoh[zenoh.index("--connect") + 1] == f"tcp/world:{listening['world']}"
+
+
+def test_only_the_page_is_published_and_on_loopback_only() -> None:
+    published = {name: service["ports"] for name, service in services().items() if "ports" in service}
+    assert published == {"page": ["127.0.0.1:8080:8080"]}
+    options = parser().parse_args(services()["page"]["command"])
+    assert (options.address, options.port) == ("0.0.0.0", 8080)
+    assert [name for name, service in services().items() if service["networks"] != ["mission"]] == ["page"]
+
+
+def test_every_service_is_confined_watched_over_and_started_again() -> None:
+    for service in services().values():
+        assert service["read_only"] is True
+        assert service["cap_drop"] == ["ALL"]
+        assert service["security_opt"] == ["no-new-privileges:true"]
+        assert service["restart"].startswith("on-failure")
+        assert service["healthcheck"]["test"]
+
+
+def test_the_image_takes_the_arguments_that_the_compose_file_gives_and_runs_as_nobody() -> None:
+    lines = CONTAINER.read_text().splitlines()
+    known = {line.split()[1].partition("=")[0] for line in lines if line.startswith("ARG ")}
+    given = set().union(*(service["build"]["args"] for service in ours().values()))
+    assert given == {"BASE", "EXTRAS"}
+    assert given <= known
+    default = next(line for line in lines if line.startswith("ARG BASE=")).partition("=")[2]
+    assert {service["build"]["args"]["BASE"] for service in ours().values()} == {default}
+    assert next(line for line in reversed(lines) if line.startswith("USER ")) == "USER 10001:10001"
+    assert 'ENTRYPOINT ["tandem"]' in lines
+    for service in ours().values():
+        assert (DEPLOY / service["build"]["context"]).resolve() == HOUSE
+        assert (HOUSE / service["build"]["dockerfile"]) == CONTAINER
+
+
+def test_what_the_wheel_is_made_of_goes_into_the_image() -> None:
+    project = tomllib.loads((HOUSE / "pyproject.toml").read_text())
+    needed = {
+        "pyproject.toml",
+        project["project"]["readme"],
+        *project["project"]["license-files"],
+        *project["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"],
+    }
+    let_in = {line[1:] for line in (HOUSE / ".dockerignore").read_text().splitlines() if line.startswith("!")}
+    assert let_in == needed
+
+
+@pytest.mark.parametrize("killed", ["agent-a", "world"])
+def test_the_services_commands_play_a_mission_though_one_is_killed_and_started_again(
+    killed: str, tmp_path: Path
+) -> None:
+    world, router = free_endpoint(), free_endpoint()
+    places = {"tcp/world:7447": world, "tcp/0.0.0.0:7447": world, "tcp/zenoh:7447": router}
+    commands = {}
+    for name, service in services(TANDEM_RATE="20").items():
+        if name in ("page", "zenoh"):
+            continue
+        line = "\n".join(service["command"]).replace("/journal", str(tmp_path / name))
+        for said, place in places.items():
+            line = line.replace(said, place)
+        commands[name] = line.split("\n")
+    with ExitStack() as stack:
+        playing = {name: stack.enter_context(Command(*line)) for name, line in commands.items()}
+        for robot in ("a", "b"):
+            playing[f"agent-{robot}"].until_answered(robot, tmp_path / f"agent-{robot}")
+        record = tmp_path / "world" / "world.journal"
+        playing["world"].until(lambda: len(list(journal.read(record))) >= 4, "three ticks are on record")
+        playing[killed].tell(SIGKILL)
+        playing[killed] = stack.enter_context(Command(*commands[killed]))
+        ended = {name: command.ended() for name, command in playing.items()}
+    assert {name: end.status for name, end in ended.items()} == dict.fromkeys(commands, 0), ended
+    assert "again, " in ended[killed].out
+
+
+# --- without containers -----------------------------------------------------------------------------
+
+
+def test_systemd_finds_nothing_wrong_with_the_unit(tmp_path: Path) -> None:
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("no systemd-analyze; Debian's package is systemd")
+    copy = tmp_path / UNIT.name
+    copy.write_text(UNIT.read_text().replace("/opt/tandem/bin/tandem", sys.executable))
+    for options in (["verify"], ["security", "--offline=yes", "--threshold=20"]):
+        checked = subprocess.run(
+            ["systemd-analyze", "--no-pager", *options, copy], check=False, capture_output=True, text=True
+        )
+        assert checked.returncode == 0, checked.stdout + checked.stderr
+        if options == ["verify"]:
+            assert checked.stdout + checked.stderr == ""
+
+
+def test_the_unit_hands_over_every_file_of_the_robots_keys(tmp_path: Path) -> None:
+    assert tandem("keys", tmp_path / "keys", "--robots", "a").status == 0
+    given = dict(line.split(":") for line in unit()["LoadCredential"])
+    assert given == {
+        path.name: f"/etc/tandem/agent-%i/{path.name}" for path in (tmp_path / "keys" / "agent-a").iterdir()
+    }
+
+
+def test_the_units_command_plays_a_robot_with_its_keys(tmp_path: Path) -> None:
+    keys, endpoint = tmp_path / "keys", free_endpoint("tls")
+    assert tandem("keys", keys, "--robots", "a,b").status == 0
+    (start,) = unit()["ExecStart"]
+    with ExitStack() as stack:
+        listens = ("--listen", endpoint, "--keys", keys / "world", "-q")
+        playing = [stack.enter_context(Command("world", "paper-1", *listens))]
+        for robot in ("a", "b"):
+            line = start.replace("%i", robot).replace("%d", str(keys / f"agent-{robot}"))
+            line = line.replace("%S", str(tmp_path / "state"))
+            line = line.replace("$TANDEM_OPTIONS", f"--connect {endpoint} --wait 60")
+            program, *arguments = shlex.split(line)
+            assert program == "/opt/tandem/bin/tandem"
+            playing.append(stack.enter_context(Command(*arguments)))
+        assert [one.ended().status for one in playing] == [0, 0, 0]
+    assert (tmp_path / "state" / "tandem" / "a" / "agent-a.journal").exists()
+
+
+def test_a_stop_is_none_of_the_failures_after_which_the_unit_starts_again(tmp_path: Path) -> None:
+    service = unit()
+    assert service["Restart"] == ["on-failure"]
+    with Command("agent", "a", "--connect", free_endpoint(), "--out", tmp_path) as waiting:
+        waiting.until_says("looking for one")
+        waiting.tell(SIGTERM)
+        assert [str(waiting.ended().status)] == service["SuccessExitStatus"]
+    mistaken = tandem("agent", "a", "--keys", tmp_path)
+    assert str(mistaken.status) in service["RestartPreventExitStatus"][0].split()
