@@ -465,3 +465,9 @@ def test_who_listens_beyond_this_machine_without_keys_is_warned(keys: Path) -> N
 )
 def test_loopback_is_what_no_other_machine_reaches(endpoint: str, exposed: bool) -> None:
     assert (endpoint in Endpoints(listen=(endpoint,)).exposed) is exposed
+
+
+def test_a_folder_that_cannot_be_looked_into_is_told() -> None:
+    folder = "k" * 300
+    ended = tandem("agent", "a", "--connect", "tls/127.0.0.1:7447", "--keys", folder)
+    mistaken(ended, f"--keys: {folder}: cannot be read: File name too long")

@@ -15,6 +15,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from signal import SIGINT, SIGKILL
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
 
 import pytest
 from playwright.sync_api import Browser, Page, expect, sync_playwright
@@ -443,3 +445,34 @@ def test_a_port_that_is_taken_is_one_line(paper_1: Path) -> None:
             assert ended.status == 2
             said = f"tandem {command[0]}: --port: {port} cannot be had: Address already in use\n"
             assert ended.err == said
+
+
+def test_a_page_on_every_address_is_told_of_and_answers_to_the_names_of_this_machine(paper_1: Path) -> None:
+    with Command("watch", paper_1, "--address", "0.0.0.0") as command:
+        command.until_says("until Ctrl-C")
+        assert "tandem watch: --address: whoever reaches 0.0.0.0 can watch\n" in command.err
+        address = command.out.split()[0]
+        assert address.startswith("http://127.0.0.1:")
+        with urlopen(address, timeout=BOUND_S) as answer:
+            assert answer.status == 200
+        with pytest.raises(HTTPError, match="400"):
+            urlopen(Request(address, headers={"Host": "robot.example"}), timeout=BOUND_S)
+
+
+def test_a_page_on_an_address_of_this_machine_answers_to_it(paper_1: Path) -> None:
+    with Command("watch", paper_1, "--address", "127.0.0.2") as command:
+        command.until_says("until Ctrl-C")
+        assert command.err == ""
+        address = command.out.split()[0]
+        assert address.startswith("http://127.0.0.2:")
+        with urlopen(address, timeout=BOUND_S) as answer:
+            assert answer.status == 200
+
+
+def test_an_address_that_cannot_be_had_is_one_line(paper_1: Path) -> None:
+    for address, said in {
+        "192.0.2.1": "--address: 192.0.2.1 cannot be had: Cannot assign requested address",
+        "robot": "argument --address: 'robot' is no address, such as 127.0.0.1 or 0.0.0.0",
+    }.items():
+        ended = tandem("watch", str(paper_1), "--address", address)
+        assert (ended.status, ended.out, ended.err) == (2, "", f"tandem watch: {said}\n")

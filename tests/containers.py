@@ -1,0 +1,356 @@
+"""A measurement: a mission in containers, by the compose file; one of them is killed, and comes back.
+
+    uv run python -m tests.containers [--base FILE]
+
+No test: it needs root, podman, and without `--base` mmdebstrap (Debian's packages), and says so where it
+has not. No registry is asked: the base is made of Debian's packages, and the rest comes from PyPI. All that
+podman keeps is in a folder of this run's own, and nothing is left.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from urllib.error import URLError
+from urllib.request import urlopen
+
+from compose.local import free_endpoint
+from tests.commands import Command, tandem, until
+
+HOUSE = Path(__file__).parents[1]
+DEPLOY = HOUSE / "compose" / "deploy"
+BASE, LEAN, LAB = (f"localhost/tandem-check{part}" for part in ("-base", "", "-lab"))
+EPOCH = "1700000000"
+"""s; the date of every file in an image"""
+RATE = 4.0
+"""times real time: a mission takes some 7 s"""
+MIDDLE = 8
+"""the tick from which on somebody is killed"""
+AWAY_S = 1.0
+"""how long who is killed stays away, at the least"""
+RUNTIMES: tuple[dict[str, str], ...] = (
+    {},
+    {"runtime": "crun", "cgroup_manager": "cgroupfs"},
+    {"runtime": "runc", "cgroup_manager": "cgroupfs"},
+)
+"""tried in this order: podman's own choice, and what runs without systemd, or with old cgroups"""
+ROUTER = """
+import signal, zenoh
+config = zenoh.Config()
+for path, value in {
+    "mode": '"router"',
+    "listen/endpoints": '["tcp/0.0.0.0:7447"]',
+    "connect/endpoints": '["tcp/world:7447"]',
+    "connect/timeout_ms": "-1",
+    "connect/exit_on_failure": "false",
+    "scouting/multicast/enabled": "false",
+}.items():
+    config.insert_json5(path, value)
+with zenoh.open(config):
+    signal.pause()
+"""
+"""for the router's official image, which only a registry has: Zenoh's library, told the same"""
+
+
+class Unable(Exception):
+    """There can be no containers here; says why."""
+
+
+class Podman:
+    """Podman, with storage and networks of this run's own."""
+
+    def __init__(self, folder: Path, stack: ExitStack) -> None:
+        self._folder = folder
+        self._environment = os.environ | {
+            "CONTAINERS_STORAGE_CONF": str(folder / "storage.conf"),
+            "CONTAINERS_CONF": str(folder / "containers.conf"),
+        }
+        (folder / "storage.conf").write_text(
+            f'[storage]\ndriver = "overlay"\ngraphroot = "{folder}/graph"\nrunroot = "{folder}/run"\n'
+        )
+        stack.callback(self._leave)
+
+    def configure(self, engine: dict[str, str]) -> None:
+        """Use these from now on."""
+        said = "".join(f'{name} = "{value}"\n' for name, value in engine.items())
+        (self._folder / "networks").mkdir(exist_ok=True)
+        (self._folder / "containers.conf").write_text(
+            '[containers]\ndefault_ulimits = ["nofile=1024:1024", "nproc=1024:1024"]\n'
+            f'[network]\nnetwork_backend = "netavark"\nnetwork_config_dir = "{self._folder}/networks"\n'
+            f'[engine]\ntmp_dir = "{self._folder}/tmp"\n{said}'
+        )
+
+    def __call__(self, *arguments: str | Path, check: bool = True) -> str:
+        """What the command prints. Raises CalledProcessError."""
+        return self._run(["podman", *map(str, arguments)], check)
+
+    def compose(self, project: str, *arguments: str, files: tuple[Path, ...] = (), **said: str) -> None:
+        """podman-compose. Raises CalledProcessError."""
+        named = [part for file in (DEPLOY / "compose.yaml", *files) for part in ("-f", str(file))]
+        command = [sys.executable, "-m", "podman_compose", "-p", project, *named, *arguments]
+        self._run(command, check=True, environment=said)
+
+    def _run(self, command: list[str], check: bool, environment: dict[str, str] | None = None) -> str:
+        done = subprocess.run(
+            command,
+            check=False,
+            capture_output=True,
+            text=True,
+            env=self._environment | (environment or {}),
+            timeout=900.0,
+        )
+        if check and done.returncode:
+            raise subprocess.CalledProcessError(done.returncode, command, done.stdout, done.stderr)
+        return done.stdout.strip()
+
+    def _leave(self) -> None:
+        self("rm", "--force", "--all", "--time", "0", check=False)
+        self("network", "prune", "--force", check=False)
+        self("umount", "--all", "--force", check=False)
+        subprocess.run(["umount", self._folder / "graph" / "overlay"], check=False, capture_output=True)
+
+
+class Mission:
+    """The compose file, up."""
+
+    def __init__(self, podman: Podman, port: int, what: str) -> None:
+        self._podman = podman
+        self._project = f"tandem-{os.getpid()}-{what}"
+        self._port = port
+        self._files: tuple[Path, ...] = ()
+
+    def compose(self, *arguments: str) -> None:
+        """podman-compose, of this mission."""
+        self._podman.compose(
+            self._project,
+            *arguments,
+            files=self._files,
+            TANDEM_IMAGE=LEAN,
+            TANDEM_LAB_IMAGE=LAB,
+            TANDEM_PORT=str(self._port),
+            TANDEM_RATE=str(RATE),
+        )
+
+    def routed(self, folder: Path) -> None:
+        """With a router beside the world."""
+        stand_in = folder / "stand-in.json"
+        service = {"image": LEAN, "entrypoint": ["python3", "-c", ROUTER], "command": []}
+        stand_in.write_text(json.dumps({"services": {"zenoh": service}}))
+        self._files = (stand_in,)
+
+    def container(self, service: str) -> str:
+        """Its name."""
+        return f"{self._project}_{service}_1"
+
+    def tick(self) -> int:
+        """How far the page has seen the mission come; -1 if it has seen none."""
+        try:
+            with urlopen(f"http://127.0.0.1:{self._port}/api/news", timeout=5.0) as news:
+                shows = json.loads(news.readline().removeprefix(b"data: "))["list"]["shows"]
+        except (URLError, ConnectionError, TimeoutError):
+            return -1
+        return max((show["last"] for show in shows), default=-1)
+
+    def ended(self, service: str) -> int | None:
+        """Its exit status; none if it runs."""
+        state = self._podman(
+            "inspect", "--format", "{{.State.Running}} {{.State.ExitCode}}", self.container(service)
+        )
+        running, status = state.split()
+        return None if running == "true" else int(status)
+
+    def healthy(self, service: str) -> bool:
+        """Whether its health check passes."""
+        try:
+            self._podman("healthcheck", "run", self.container(service))
+        except subprocess.CalledProcessError:
+            return False
+        return True
+
+    def logs(self, service: str) -> str:
+        """What it said."""
+        return self._podman("logs", self.container(service))
+
+    def record(self, folder: Path) -> Path:
+        """All journals, in one folder."""
+        for name in ("world", "agent-a", "agent-b"):
+            self._podman("cp", f"{self.container(name)}:/journal/{name}.journal", folder)
+        return folder
+
+
+def base(podman: Podman, given: Path | None, folder: Path) -> str:
+    """Import the base image; how it was had. Raises Unable."""
+    file, how = given, f"of {given}"
+    if file is None:
+        if shutil.which("mmdebstrap") is None:
+            raise Unable("no command `mmdebstrap`; it is Debian's package of that name, or --base FILE")
+        began = time.monotonic()
+        file = folder / "base.tar"
+        leave_out = [f"--dpkgopt=path-exclude=/usr/share/{one}/*" for one in ("doc", "man", "locale", "info")]
+        _checked(
+            ["mmdebstrap", "--variant=minbase", "--include=python3,python3-venv", *leave_out]
+            + ["bookworm", str(file)]
+        )
+        how = f"made with mmdebstrap in {time.monotonic() - began:.0f} s"
+    for engine in RUNTIMES:
+        podman.configure(engine)
+        podman("import", file, BASE)
+        try:
+            podman("run", "--rm", "--network=none", BASE, "true")
+        except subprocess.CalledProcessError as error:
+            why = error.stderr.strip().splitlines()[-1:]
+            print(f"podman with {engine or 'its defaults'}: {''.join(why)}", flush=True)
+            continue
+        print(f"{podman('--version')}, with {engine or 'its defaults'}", flush=True)
+        return how
+    raise Unable("podman starts no container here")
+
+
+def build(podman: Podman, folder: Path) -> None:
+    """Both images. A line each. Raises CalledProcessError."""
+    python = podman("run", "--rm", "--network=none", BASE, "python3", "-V").split()[1].rpartition(".")[0]
+    project = tomllib.loads((HOUSE / "pyproject.toml").read_text())
+    wanted = project["build-system"]["requires"] + project["project"]["dependencies"]
+    wanted += project["project"]["optional-dependencies"]["lab"]
+    wheels = folder / "wheels"
+    options = ["-q", "-d", str(wheels), "--python-version", python, "--only-binary=:all:"]
+    _checked(["uv", "tool", "run", "pip", "download", *options, *wanted])
+    for image, extras in ((LEAN, ""), (LAB, "lab")):
+        arguments = {
+            "BASE": BASE, "EXTRAS": extras, "SOURCE_DATE_EPOCH": EPOCH,
+            "PIP_NO_INDEX": "1", "PIP_FIND_LINKS": "/wheels", "PIP_INDEX_URL": "",
+        }  # fmt: skip
+        given = [part for name, value in arguments.items() for part in ("--build-arg", f"{name}={value}")]
+        began = time.monotonic()
+
+        def once(image: str = image, given: list[str] = given) -> str:
+            flags = ["--no-cache", "--network=none", "--timestamp", EPOCH, "-v", f"{wheels}:/wheels:ro"]
+            podman("build", *flags, "-t", image, "-f", DEPLOY / "Containerfile", *given, HOUSE)
+            return podman("inspect", "--format", "{{json .RootFS.Layers}}", image)
+
+        layers, took = once(), time.monotonic() - began
+        size = int(podman("inspect", "--format", "{{.Size}}", image)) / 1e6
+        own = size - int(podman("inspect", "--format", "{{.Size}}", BASE)) / 1e6
+        again = "" if extras else f"; built again it is the same: {'yes' if once() == layers else 'NO'}"
+        sizes = f"{size:.0f} MB, {own:.0f} without its base"
+        print(f"image {extras or 'lean'}: {sizes}; built in {took:.0f} s{again}", flush=True)
+    began = time.monotonic()
+    podman("run", "--rm", "--network=none", "--read-only", LEAN, "scenarios")
+    print(f"start: `scenarios`, container included, {time.monotonic() - began:.2f} s", flush=True)
+
+
+def play(podman: Podman, killed: str, folder: Path) -> bool:
+    """A mission in which `killed` is killed in the middle, and comes back. Whether all is well; says so."""
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    mission = Mission(podman, port, killed)
+    services = ["world", "agent-a", "agent-b"]
+    up = ["up", "-d", "--no-build"]
+    if killed == "zenoh":
+        mission.routed(folder)
+        up = ["--profile", "router", *up]
+    try:
+        began = time.monotonic()
+        mission.compose(*up)
+        until(lambda: mission.tick() >= 0, "the page sees the mission")
+        seen = time.monotonic() - began
+        until(lambda: mission.tick() >= MIDDLE, "the mission is in its middle")
+        sick = [one for one in (*services, "page") if not mission.healthy(one)]
+        mission.compose("kill", killed)
+        at, since = mission.tick(), time.monotonic()
+        until(lambda: time.monotonic() >= since + AWAY_S, "it was away")
+        mission.compose(*up, killed)
+        until(lambda: all(mission.ended(one) is not None for one in services), "all have ended", 120.0)
+        statuses = {one: mission.ended(one) for one in services}
+        outcome = next((line for line in mission.logs("agent-b").splitlines() if " after " in line), "?")
+        audit = tandem("audit", mission.record(Path(tempfile.mkdtemp(dir=folder))))
+        page = mission.tick()
+        mission.compose(*up)
+        until(lambda: all(mission.ended(one) is not None for one in services), "all have ended again", 120.0)
+        folded = {one: mission.ended(one) for one in services}
+        well = not sick and {*statuses.values(), *folded.values(), audit.status} == {0} and page > MIDDLE
+        print(
+            f"{killed:8} killed at tick {at:2}, up again: {outcome}; on the page {seen:.1f} s after `up`; "
+            f"unhealthy: {', '.join(sick) or 'none'}; audit: {audit.status}; "
+            f"`up` when it was over: {', '.join(map(str, folded.values()))}",
+            flush=True,
+        )
+        if not well:
+            print("\n".join(f"    {one}: {statuses[one]}, {mission.logs(one)}" for one in services))
+            print(audit.out)
+        return well
+    finally:
+        mission.compose("down", "-v", "-t", "0")
+
+
+def on_a_robot(podman: Podman, folder: Path) -> bool:
+    """The image alone, as an agent with keys; the world and the peer are processes. Whether all is well."""
+    keys, journal, endpoint = folder / "keys", folder / "robot", free_endpoint("tls")
+    assert tandem("keys", keys, "--robots", "a,b").status == 0
+    journal.mkdir()
+    for path in (keys / "agent-a", *(keys / "agent-a").iterdir(), journal):
+        os.chown(path, 10001, 10001)
+    with ExitStack() as stack:
+        with_keys = ("--listen", endpoint, "--keys", keys / "world", "-q")
+        world = stack.enter_context(Command("world", "random", *with_keys))
+        peer = ("--connect", endpoint, "--keys", keys / "agent-b", "-q")
+        stack.enter_context(Command("agent", "b", *peer))
+        said = podman(
+            *("run", "--rm", "--network=host", "--read-only", "--cap-drop=all"),
+            *("-v", f"{keys}/agent-a:/keys:ro", "-v", f"{journal}:/journal"),
+            *(LEAN, "agent", "a", "--connect", endpoint, "--keys", "/keys", "--out", "/journal", "--fsync"),
+        )
+        ended = world.ended()
+    print(f"the image as a robot's agent, over TLS: {said.splitlines()[-1]}", flush=True)
+    return ended.status == 0
+
+
+@contextmanager
+def containers() -> Iterator[tuple[Podman, Path]]:
+    """Raises Unable."""
+    if os.geteuid() != 0:
+        raise Unable("not root")
+    for command in ("podman", "uv"):
+        if shutil.which(command) is None:
+            raise Unable(f"no command `{command}`")
+    with tempfile.TemporaryDirectory(prefix="tandem-containers-") as folder, ExitStack() as stack:
+        yield Podman(Path(folder), stack), Path(folder)
+
+
+def _checked(command: list[str]) -> None:
+    subprocess.run(command, check=True, capture_output=True, text=True)
+
+
+def main(given: Path | None) -> int:
+    """Build, and play every case, a line for each; 0 if all is as it should be."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(130))  # clean up, then too
+    try:
+        with containers() as (podman, folder):
+            print(f"base: {base(podman, given, folder)}", flush=True)
+            build(podman, folder)
+            well = [play(podman, one, folder) for one in ("agent-a", "world", "zenoh")]
+            return int(not all([*well, on_a_robot(podman, folder)]))
+    except Unable as why:
+        print(f"skipped: {why}")
+        return 0
+    except subprocess.CalledProcessError as error:
+        print(f"failed: {' '.join(map(str, error.cmd))}\n{error.stderr}")
+        return 1
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--base", type=Path, metavar="FILE", help="a root file system with Python, as a tar")
+    sys.exit(main(parser.parse_args().base))
