@@ -28,9 +28,8 @@ from urllib.request import urlopen
 
 from compose.local import free_endpoint
 from tests.commands import Command, tandem, until
+from tests.podman import DEPLOY, HOUSE, Podman, Unable
 
-HOUSE = Path(__file__).parents[1]
-DEPLOY = HOUSE / "compose" / "deploy"
 BASE, LEAN, LAB = (f"localhost/tandem-check{part}" for part in ("-base", "", "-lab"))
 EPOCH = "1700000000"
 """s; the date of every file in an image"""
@@ -38,14 +37,13 @@ RATE = 4.0
 """times real time: a mission takes some 7 s"""
 MIDDLE = 8
 """the tick from which on somebody is killed"""
+PORT = 7447
+LINKS = 3
+"""of the router in the middle of a mission: both agents, and the world"""
+ESTABLISHED = "01"
+"""in Linux's tables of connections"""
 AWAY_S = 1.0
 """how long who is killed stays away, at the least"""
-RUNTIMES: tuple[dict[str, str], ...] = (
-    {},
-    {"runtime": "crun", "cgroup_manager": "cgroupfs"},
-    {"runtime": "runc", "cgroup_manager": "cgroupfs"},
-)
-"""tried in this order: podman's own choice, and what runs without systemd, or with old cgroups"""
 ROUTER = """
 import signal, zenoh
 config = zenoh.Config()
@@ -64,64 +62,6 @@ with zenoh.open(config):
 """for the router's official image, which only a registry has: Zenoh's library, told the same"""
 
 
-class Unable(Exception):
-    """There can be no containers here; says why."""
-
-
-class Podman:
-    """Podman, with storage and networks of this run's own."""
-
-    def __init__(self, folder: Path, stack: ExitStack) -> None:
-        self._folder = folder
-        self._environment = os.environ | {
-            "CONTAINERS_STORAGE_CONF": str(folder / "storage.conf"),
-            "CONTAINERS_CONF": str(folder / "containers.conf"),
-        }
-        (folder / "storage.conf").write_text(
-            f'[storage]\ndriver = "overlay"\ngraphroot = "{folder}/graph"\nrunroot = "{folder}/run"\n'
-        )
-        stack.callback(self._leave)
-
-    def configure(self, engine: dict[str, str]) -> None:
-        """Use these from now on."""
-        said = "".join(f'{name} = "{value}"\n' for name, value in engine.items())
-        (self._folder / "networks").mkdir(exist_ok=True)
-        (self._folder / "containers.conf").write_text(
-            '[containers]\ndefault_ulimits = ["nofile=1024:1024", "nproc=1024:1024"]\n'
-            f'[network]\nnetwork_backend = "netavark"\nnetwork_config_dir = "{self._folder}/networks"\n'
-            f'[engine]\ntmp_dir = "{self._folder}/tmp"\n{said}'
-        )
-
-    def __call__(self, *arguments: str | Path, check: bool = True) -> str:
-        """What the command prints. Raises CalledProcessError."""
-        return self._run(["podman", *map(str, arguments)], check)
-
-    def compose(self, project: str, *arguments: str, files: tuple[Path, ...] = (), **said: str) -> None:
-        """podman-compose. Raises CalledProcessError."""
-        named = [part for file in (DEPLOY / "compose.yaml", *files) for part in ("-f", str(file))]
-        command = [sys.executable, "-m", "podman_compose", "-p", project, *named, *arguments]
-        self._run(command, check=True, environment=said)
-
-    def _run(self, command: list[str], check: bool, environment: dict[str, str] | None = None) -> str:
-        done = subprocess.run(
-            command,
-            check=False,
-            capture_output=True,
-            text=True,
-            env=self._environment | (environment or {}),
-            timeout=900.0,
-        )
-        if check and done.returncode:
-            raise subprocess.CalledProcessError(done.returncode, command, done.stdout, done.stderr)
-        return done.stdout.strip()
-
-    def _leave(self) -> None:
-        self("rm", "--force", "--all", "--time", "0", check=False)
-        self("network", "prune", "--force", check=False)
-        self("umount", "--all", "--force", check=False)
-        subprocess.run(["umount", self._folder / "graph" / "overlay"], check=False, capture_output=True)
-
-
 class Mission:
     """The compose file, up."""
 
@@ -129,14 +69,12 @@ class Mission:
         self._podman = podman
         self._project = f"tandem-{os.getpid()}-{what}"
         self._port = port
-        self._files: tuple[Path, ...] = ()
+        self._options: tuple[str, ...] = ()
 
     def compose(self, *arguments: str) -> None:
         """podman-compose, of this mission."""
         self._podman.compose(
-            self._project,
-            *arguments,
-            files=self._files,
+            *("-p", self._project, *self._options, *arguments),
             TANDEM_IMAGE=LEAN,
             TANDEM_LAB_IMAGE=LAB,
             TANDEM_PORT=str(self._port),
@@ -144,11 +82,11 @@ class Mission:
         )
 
     def routed(self, folder: Path) -> None:
-        """With a router beside the world."""
+        """With a router beside the world, which is there first."""
         stand_in = folder / "stand-in.json"
         service = {"image": LEAN, "entrypoint": ["python3", "-c", ROUTER], "command": []}
         stand_in.write_text(json.dumps({"services": {"zenoh": service}}))
-        self._files = (stand_in,)
+        self._options = ("-f", str(stand_in), "--profile", "router")
 
     def container(self, service: str) -> str:
         """Its name."""
@@ -179,6 +117,13 @@ class Mission:
             return False
         return True
 
+    def links(self, service: str) -> int:
+        """How many there are to a router in it, or from one to the world."""
+        tables = self._podman("exec", self.container(service), "cat", "/proc/net/tcp", "/proc/net/tcp6")
+        rows = [line.split() for line in tables.splitlines() if ":" in line.split()[0]]
+        port = f":{PORT:04X}"
+        return sum(row[3] == ESTABLISHED and (row[1].endswith(port) or row[2].endswith(port)) for row in rows)
+
     def logs(self, service: str) -> str:
         """What it said."""
         return self._podman("logs", self.container(service))
@@ -204,18 +149,8 @@ def base(podman: Podman, given: Path | None, folder: Path) -> str:
             + ["bookworm", str(file)]
         )
         how = f"made with mmdebstrap in {time.monotonic() - began:.0f} s"
-    for engine in RUNTIMES:
-        podman.configure(engine)
-        podman("import", file, BASE)
-        try:
-            podman("run", "--rm", "--network=none", BASE, "true")
-        except subprocess.CalledProcessError as error:
-            why = error.stderr.strip().splitlines()[-1:]
-            print(f"podman with {engine or 'its defaults'}: {''.join(why)}", flush=True)
-            continue
-        print(f"{podman('--version')}, with {engine or 'its defaults'}", flush=True)
-        return how
-    raise Unable("podman starts no container here")
+    podman.load(file, BASE)
+    return how
 
 
 def build(podman: Podman, folder: Path) -> None:
@@ -260,14 +195,17 @@ def play(podman: Podman, killed: str, folder: Path) -> bool:
     up = ["up", "-d", "--no-build"]
     if killed == "zenoh":
         mission.routed(folder)
-        up = ["--profile", "router", *up]
     try:
+        if killed == "zenoh":
+            mission.compose(*up, "zenoh")
         began = time.monotonic()
         mission.compose(*up)
         until(lambda: mission.tick() >= 0, "the page sees the mission")
         seen = time.monotonic() - began
         until(lambda: mission.tick() >= MIDDLE, "the mission is in its middle")
         sick = [one for one in (*services, "page") if not mission.healthy(one)]
+        if killed == "zenoh":
+            sick += [] if mission.links("zenoh") == LINKS else ["links of the router"]
         mission.compose("kill", killed)
         at, since = mission.tick(), time.monotonic()
         until(lambda: time.monotonic() >= since + AWAY_S, "it was away")
