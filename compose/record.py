@@ -295,6 +295,7 @@ def _robot_summary(record: Record, place: int) -> dict[str, Any]:
         "heading_sigma_rad": covariance.heading_sigma if covariance is not None else None,
         "nees": claimed.nees if claimed is not None else None,
         **{field: getattr(farewell, field, None) for field in _SAID},
+        "deadlines_missed": sum([robot not in moment.drives for moment in record.moments[:-1]]),
     }
 
 

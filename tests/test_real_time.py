@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import os
 from pathlib import Path
 from signal import SIGCONT, SIGINT, SIGSTOP
@@ -61,8 +62,11 @@ def test_a_robot_whose_agent_is_stopped_stands_still_and_the_mission_goes_on(tmp
         os.kill(stopped, SIGSTOP)
         run.until(lambda: missed(out / "world.journal", "a") >= 10, "ten of a's Drives are missed")
         os.kill(stopped, SIGCONT)
-        assert run.ended().status == 0
+        ended = run.ended()
+    assert ended.status == 0
     with (out / "ticks.csv").open(newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["robot"] == "a" and row["state"] == ""]
     assert len(rows) >= 10
+    told = json.loads((out / "summary.json").read_text())["robots"]
+    assert told["a"]["deadlines_missed"] == len(rows)
     assert {(row["v"], row["omega"]) for row in rows} == {("0.0", "0.0")}
