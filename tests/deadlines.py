@@ -2,8 +2,8 @@
 
     uv run python -m tests.deadlines
 
-Each mission lasts 10 s; then one more, in which a's agent is stopped for 3 s. A line for each; exit status 0 if
-all were played to the end, and who was late stood still.
+Each mission lasts 10 s; then one more, in which a's agent is stopped for 3 s. A line for each; exit status 0
+if all were played to the end, and who was late stood still.
 """
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ def test_a_rate_beyond_all_sense_is_refused(rate: str, lasts: str) -> None:
 def test_a_robot_whose_agent_is_stopped_stands_still_and_the_mission_goes_on(tmp_path: Path) -> None:
     out = tmp_path / "out"
     (tmp_path / "assured.toml").write_text(ASSURED)
-    with Command("run", tmp_path / "assured.toml", "--rate", "20", "--out", out, "-q") as run:
+    with Command("run", tmp_path / "assured.toml", "--rate", "20", "--out", out) as run:
         run.until_written(out / "world.journal", 3000)
         stopped = process_of(out, "agent", "a")
         os.kill(stopped, SIGSTOP)
@@ -64,6 +64,7 @@ def test_a_robot_whose_agent_is_stopped_stands_still_and_the_mission_goes_on(tmp
         os.kill(stopped, SIGCONT)
         ended = run.ended()
     assert ended.status == 0
+    assert "late: ticks in which it stood still" in ended.out
     with (out / "ticks.csv").open(newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["robot"] == "a" and row["state"] == ""]
     assert len(rows) >= 10
