@@ -43,7 +43,7 @@ def _sent(case: Case, robot: str, step: Step) -> Violation | None:
 
 
 def _listed(robot: str, step: Step) -> Violation | None:
-    listed = [tick for contact in step.sense.contacts for tick in contact.heard]
+    listed = [tick for contact in step.sense.contacts for tick in contact.heard or ()]
     heard = [told.report.tick for told in step.heard]
     if len(heard) + len(step.missed) == len(listed) and _in_order(heard, listed):
         return None
