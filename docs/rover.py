@@ -31,26 +31,35 @@ GIVE_UP_S = 10.0
 class Rover:
     """Wheels, odometry, an anchor's range and the peer's, all without error."""
 
-    def __init__(self, briefing: Briefing, manoeuvre_s: float, *, start: str, beacon: str) -> None:
-        """`start` is x,y,heading in <W>, which no agent is told; `beacon` is HOST:PORT."""
+    def __init__(self, briefing: Briefing, manoeuvre_s: float, *, start: str = "", beacon: str = "") -> None:
+        """`start` is x,y,heading in <W>, which no agent is told; `beacon` HOST:PORT, or there is no peer."""
         self._briefing = briefing
         self._manoeuvre_s = manoeuvre_s
-        self.pose = Pose(*[float(word) for word in start.split(",")])
+        anchor = briefing.anchor
+        self.pose = (
+            Pose(*[float(word) for word in start.split(",")])
+            if start
+            else Pose(anchor.x + 0.1, anchor.y - 0.2, 0.7)
+        )
         """where it truly was at the last reading"""
         self._controls = REST
         self._began = 0.0
         self._done = 1.0
         """how much of the manoeuvre is in `pose`"""
+        self._driven = REST
+        """since the last reading"""
         self._tick = 0
         host, _, port = beacon.rpartition(":")
-        self._radio = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._radio.settimeout(ASK_AGAIN_S)
-        self._radio.connect((host, int(port)))
+        self._radio = socket.socket(socket.AF_INET, socket.SOCK_DGRAM) if beacon else None
+        if self._radio is not None:
+            self._radio.settimeout(ASK_AGAIN_S)
+            self._radio.connect((host, int(port)))
 
     def sense(self, tick: int) -> Reading:
         """Where it has come to, and what is in range there."""
         self._tick = tick
-        executed = self._settle()
+        self._settle()
+        executed, self._driven = self._driven, REST
         anchor, reach = self._briefing.anchor, self._briefing.mission.sensing_range
         rho = math.hypot(self.pose.x - anchor.x, self.pose.y - anchor.y)
         return Reading(executed, rho if rho <= reach else None, self._mutual_range(tick))
@@ -69,18 +78,18 @@ class Rover:
         x, y, heading = self.pose.x, self.pose.y, wrap(self.pose.heading)
         print(f"{self._briefing.robot}: truly at {x:.9f} {y:.9f} {heading:+.9f}", flush=True)
 
-    def _settle(self) -> Controls:
-        """Move `pose` to where the wheels have come by now; what took it there, as if held for T_s."""
+    def _settle(self) -> None:
+        """Move `pose` to where the wheels have come by now, and count what took it there."""
         share = min(1.0, (time.monotonic() - self._began) / self._manoeuvre_s) - self._done
         self._done += share
-        driven = Controls(self._controls.v * share, self._controls.omega * share)
-        self.pose = step(self.pose, driven.v, driven.omega, self._briefing.mission.period)
-        return driven
+        v, omega = self._controls.v * share, self._controls.omega * share
+        self.pose = step(self.pose, v, omega, self._briefing.mission.period)
+        self._driven = Controls(self._driven.v + v, self._driven.omega + omega)
 
     def _mutual_range(self, tick: int) -> float | None:
         """m; none if the peer, standing in the same tick, is out of range. Raises TimeoutError."""
         give_up = time.monotonic() + GIVE_UP_S
-        while time.monotonic() < give_up:
+        while self._radio is not None and time.monotonic() < give_up:
             self._tell(tick)
             try:
                 said = json.loads(self._radio.recv(1024))
@@ -88,11 +97,14 @@ class Rover:
                 continue
             if said["tick"] == tick:
                 return said["range"] if said["range"] is None else float(said["range"])
+        if self._radio is None:
+            return None
         raise TimeoutError(f"no answer of the beacon for {GIVE_UP_S:g} s")
 
     def _tell(self, tick: int, *, parked: bool = False) -> None:
         where = {"robot": self._briefing.robot, "peer": self._briefing.peer, "tick": tick, "parked": parked}
-        self._radio.send(json.dumps(where | {"x": self.pose.x, "y": self.pose.y}).encode())
+        if self._radio is not None:
+            self._radio.send(json.dumps(where | {"x": self.pose.x, "y": self.pose.y}).encode())
 
 
 def main() -> None:
@@ -116,8 +128,8 @@ def main() -> None:
         if other is not None and not one["parked"]:
             rho = math.dist(place, other)
             answer = json.dumps({"tick": tick, "range": rho if rho <= options.reach else None}).encode()
-            for address in {senders[robot], senders.get(peer, sender)}:
-                air.sendto(answer, address)
+            for name in {robot, peer} & senders.keys():
+                air.sendto(answer, senders[name])
 
 
 if __name__ == "__main__":
