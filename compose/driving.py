@@ -13,7 +13,7 @@ from protocol.messages import Briefing
 from world.driver import THINKING, Driver
 from world.scenario import Scenario
 
-METHODS = ("sense", "drive", "stop")
+METHODS = ("sense", "drive", "stop", "close")
 
 Maker = Callable[..., Driver]
 

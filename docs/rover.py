@@ -75,6 +75,11 @@ class Rover:
         if self._done < 1.0:
             self._controls, self._done = REST, 1.0
         self._tell(self._tick, parked=True)
+
+    def close(self) -> None:
+        """Nobody else will say where it was."""
+        if self._radio is not None:
+            self._radio.close()
         x, y, heading = self.pose.x, self.pose.y, wrap(self.pose.heading)
         print(f"{self._briefing.robot}: truly at {x:.9f} {y:.9f} {heading:+.9f}", flush=True)
 

@@ -50,7 +50,7 @@ def test_a_broken_driver_is_told_what_it_breaks(broken: str, said: str) -> None:
         ("docs.rover", "'docs.rover' is no driver; one looks like MODULE:CLASS"),
         ("docs.nothing:Rover", "docs.nothing:Rover: there is no module 'docs.nothing'"),
         ("docs.rover:Nobody", "docs.rover:Nobody: there is no 'Nobody' in docs.rover"),
-        ("tests.broken_drivers:NoDriver", "is no driver: it has no drive, stop"),
+        ("tests.broken_drivers:NoDriver", "is no driver: it has no drive, stop, close"),
     ],
 )
 def test_what_is_no_driver_is_one_line(name: str, said: str) -> None:

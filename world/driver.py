@@ -52,4 +52,7 @@ class Driver(Protocol):
         """Begin a manoeuvre: hold `v` m/s and `omega` rad/s from now, then stand. Returns at once."""
 
     def stop(self) -> None:
-        """Stand still now. Called at the end, too, whatever it was; it may come again, or alone."""
+        """Stand still now. It comes at the end, too, whatever that was; and it may come twice."""
+
+    def close(self) -> None:
+        """Let go of the hardware; nothing comes after that."""

@@ -54,18 +54,17 @@ class Field:
         max_ticks: int,
         manoeuvre_s: float,
         patience: float = 30.0,
-        ended: Callable[[], None],
     ) -> None:
-        """`ended` is called when the agent's process has ended; it may start it again, or raise."""
+        """`manoeuvre_s` (s) is T_s by the clock; `patience` (s) bounds every wait for an answer."""
         self._driver = driver
         self._briefing = briefing
         self._id, self._peer = briefing.robot, briefing.peer
-        self._run = run
+        self.run = run
         self._inbox = inbox
         self._manoeuvre_s = manoeuvre_s
         self._tick_s = (1.0 + THINKING) * manoeuvre_s
         self._patience = patience + self._tick_s
-        self._ended = ended
+        self._ended: Callable[[], None] = lambda: None
         self._ending = Ending(briefing, max_ticks, self._patience)
         self._alive: set[str] = set()
         self._unanswered: deque[tuple[int, bytes]] = deque()
@@ -85,7 +84,7 @@ class Field:
 
     def attach(self, link: zenoh.Session) -> None:
         """This is the session over which the agent and the peer are reached."""
-        me, run, inbox = self._id, self._run, self._inbox
+        me, run, inbox = self._id, self.run, self._inbox
         self._sense = session.publisher(link, keys.sense(run, me))
         self._beat = session.publisher(link, keys.beat(run, me))
         session.subscribe(link, keys.drive(run, me), inbox, "drive")
@@ -95,11 +94,13 @@ class Field:
         session.answer(link, keys.briefing(run, me), lambda _: self._briefing)
         self._token = session.show_alive(link, keys.world_alive(run))
 
-    def play(self, wait: float) -> End:
+    def play(self, wait: float, ended: Callable[[], None]) -> End:
         """The whole mission; looks for agent and peer for `wait` seconds. The robot stands when this is over.
 
-        Raises NoStart; whatever `ended` raises; Interrupted when told to stop.
+        `ended` is called when the agent's process has ended; it may start it again, or raise. Raises NoStart;
+        whatever `ended` raises; Interrupted when told to stop.
         """
+        self._ended = ended
         end: End | None = None
         try:
             self._gather(time.monotonic() + wait)
@@ -108,7 +109,7 @@ class Field:
         except DriverFailed as failure:
             end = End(max(self._tick, 0), "failed", f"{self._id}'s driver: {failure}"[:300])
         finally:
-            self._driver.stop()
+            self._stop()
         self._part(end)
         return end
 
@@ -147,9 +148,18 @@ class Field:
 
     def _reading(self, tick: int) -> Reading:
         try:
-            return self._driver.sense(tick)
+            reading = self._driver.sense(tick)
         except Exception as error:  # it is the user's own, and may raise anything
             raise DriverFailed(f"sense({tick}): {type(error).__name__}: {error}") from error
+        if not isinstance(reading, Reading):
+            raise DriverFailed(f"sense({tick}): gives {type(reading).__name__}, expected a Reading")
+        return reading
+
+    def _stop(self) -> None:
+        try:
+            self._driver.stop()
+        except Exception as error:  # noqa: BLE001  # as above; and there is an End to be told
+            self._inbox.say(f"the driver does not stop: {type(error).__name__}: {error}")
 
     def _set_off(self, drive: Drive) -> None:
         """At v_max and omega_max at the most."""

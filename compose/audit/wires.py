@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from agent.past import Past, Step
 from agent.robot import Told
-from compose.audit.case import Case
+from compose.audit.case import Case, Testified
 from compose.audit.findings import Checks, Violation, between, difference, said
 from protocol.wire import encode
 
@@ -69,7 +69,7 @@ def _heard(case: Case, robot: str, step: Step, told: Told) -> Violation | None:
     return None
 
 
-def report(case: Case) -> Checks:
+def report(case: Testified) -> Checks:
     """Every report that was heard is, to the byte, what the peer has on record as sent."""
     for robot, past in case.pasts.items():
         peer = case.pasts.get(past.briefing.peer)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from pathlib import Path
+from contextlib import closing
 
 from compose.driving import briefed, driver_class, made, mission, options_of
 from compose.local import STOP_S, Child, ChildFailed, free_endpoint
@@ -16,7 +16,7 @@ from compose.stop import stop_by_signal
 from protocol import session
 from protocol.endpoints import Endpoints
 from protocol.inbox import Inbox, Interrupted
-from protocol.messages import Localised
+from protocol.messages import End, Localised
 from protocol.motion import wrap
 from world.field import Field, NoStart
 
@@ -71,51 +71,53 @@ def main(options: argparse.Namespace) -> int:
     stop_by_signal(inbox)
     if (warning := beyond(reached)) is not None:
         inbox.say(warning)
-    driver = made(maker, options.driver, briefing, manoeuvre_s, given)
-    own = free_endpoint()
-    endpoints = Endpoints(reached.connect, (own, *reached.listen), reached.settings, reached.folder)
-    run = options.run or scenario.name
-    try:
-        with session.open_router(endpoints) as link, folder_for(options.out) as folder:
-            agent = Agent(_agent(options, run, own, folder), inbox)
-            field = Field(
-                driver,
-                briefing,
-                run,
-                inbox,
-                max_ticks=scenario.max_ticks,
-                manoeuvre_s=manoeuvre_s,
-                patience=options.patience,
-                ended=agent.again,
-            )
-            try:
-                field.attach(link)
-                if not options.quiet:
-                    print(f"{options.id}: in run {run}, waiting for {briefing.peer}", flush=True)
-                end = field.play(options.wait)
-                agent.end(STOP_S)
-            finally:
-                agent.end()
-    except session.CannotListen as error:
-        raise UserError(f"--listen: {error}") from None
-    except (NoStart, ChildFailed) as error:
-        inbox.say(str(error))
-        return FAILED
-    except Interrupted as signal_name:
-        inbox.say(f"stopped by {signal_name}")
-        return STOPPED
-    print(f"{options.id}: {ended(end.outcome, end.tick, end.reason)}")
-    if isinstance(field.verdict, Localised) and not options.quiet:
+    with closing(made(maker, options.driver, briefing, manoeuvre_s, given)) as driver:
+        field = Field(
+            driver,
+            briefing,
+            options.run or scenario.name,
+            inbox,
+            max_ticks=scenario.max_ticks,
+            manoeuvre_s=manoeuvre_s,
+            patience=options.patience,
+        )
+        try:
+            end = _play(options, field, reached, inbox)
+        except session.CannotListen as error:
+            raise UserError(f"--listen: {error}") from None
+        except (NoStart, ChildFailed) as error:
+            inbox.say(str(error))
+            return FAILED
+        except Interrupted as signal_name:
+            inbox.say(f"stopped by {signal_name}")
+            return STOPPED
+    if not options.quiet and isinstance(field.verdict, Localised):
         pose = field.verdict.pose
-        print(f"{options.id}: claimed {pose.x:.9f} {pose.y:.9f} {wrap(pose.heading):+.9f} (m, m, rad)")
+        print(f"{options.id}: claims {pose.x:.9f} {pose.y:.9f} {wrap(pose.heading):+.9f} (m, m, rad)")
     if not options.quiet:
         print(f"{options.id}: stood {field.missed} of {end.tick + 1} ticks for want of a Drive in time")
+    print(f"{options.id}: {ended(end.outcome, end.tick, end.reason)}")
     return status_of(end.outcome)
 
 
-def _agent(options: argparse.Namespace, run: str, endpoint: str, folder: Path) -> list[str]:
-    """Its command line."""
-    return [
-        *("agent", options.id, "--connect", endpoint, "--launched", "--run", run),
-        *("--out", str(folder.resolve()), "--patience", str(options.patience)),
-    ]
+def _play(options: argparse.Namespace, field: Field, reached: Endpoints, inbox: Inbox) -> End:
+    """The mission, and an agent for it, which leaves with it."""
+    own = free_endpoint()
+    endpoints = Endpoints(reached.connect, (own, *reached.listen), reached.settings, reached.folder)
+    with session.open_router(endpoints) as link, folder_for(options.out) as folder:
+        agent = Agent(
+            [
+                *("agent", options.id, "--connect", own, "--launched", "--run", field.run),
+                *("--out", str(folder.resolve()), "--patience", str(options.patience)),
+            ],
+            inbox,
+        )
+        try:
+            field.attach(link)
+            if not options.quiet:
+                print(f"{options.id}: in run {field.run}, waiting for its peer", flush=True)
+            end = field.play(options.wait, agent.again)
+            agent.end(STOP_S)
+        finally:
+            agent.end()
+        return end
