@@ -114,15 +114,17 @@ class Ros2:
 
     def sense(self, tick: int) -> Reading:
         """What came since it stands. Raises TimeoutError, if nothing came that must."""
-        give_up = time.monotonic() + (SENSING * self._manoeuvre_s if tick else CONNECT_S)
+        now = time.monotonic()
+        since = min(self._rest_since, now)
+        give_up = now + (SENSING * self._manoeuvre_s if tick else CONNECT_S)
         with self._changed:
-            self._changed.wait_for(self._is_all_here, max(0.0, give_up - time.monotonic()))
-            if self._pose is None or self._pose[1] < self._rest_since:
+            self._changed.wait_for(lambda: self._is_all_here(since), give_up - now)
+            if self._pose is None or self._pose[1] < since:
                 raise TimeoutError("no odometry since the robot stands")
             pose, _ = self._pose
             driven = executed(self._last or pose, pose, self._mission.period)
             self._last = pose
-            return Reading(driven, self._fresh(self._anchor), self._fresh(self._peer))
+            return Reading(driven, self._fresh(self._anchor, since), self._fresh(self._peer, since))
 
     def drive(self, v: float, omega: float) -> None:
         """Say it over and over, for the time of a manoeuvre; then to rest."""
@@ -184,15 +186,15 @@ class Ros2:
 
     # --- what is fresh ---
 
-    def _is_all_here(self) -> bool:
+    def _is_all_here(self, since: float) -> bool:
         came = [self._pose[1] if self._pose else 0.0]
         came += [self._ranges[topic][1] for topic in (self._anchor, self._peer) if topic in self._ranges]
-        return len(came) == 3 and min(came) >= self._rest_since
+        return len(came) == 3 and min(came) >= since
 
-    def _fresh(self, topic: str) -> float | None:
-        """m: what came on `topic` since the robot stands. Raises TimeoutError, unless ranges may drop out."""
+    def _fresh(self, topic: str, since: float) -> float | None:
+        """m: what came on `topic` since then. Raises TimeoutError, unless ranges may drop out."""
         rho, came = self._ranges.get(topic, (None, -math.inf))
-        if came >= self._rest_since:
+        if came >= since:
             return rho
         if not self._mission.noise.drop_outs:
             raise TimeoutError(f"nothing on {topic} since the robot stands, and the mission has no drop-outs")

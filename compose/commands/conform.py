@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import closing
 
 from compose.conformance import judged
 from compose.driving import briefed, driver_class, made, mission, options_of
@@ -19,16 +20,15 @@ def main(options: argparse.Namespace) -> int:
     check_rate(scenario, rate)
     manoeuvre_s = scenario.mission.period / rate
     briefing = briefed(scenario, options.robot, manoeuvre_s)
-    driver = made(
-        driver_class(options.driver), options.driver, briefing, manoeuvre_s, options_of(options.option)
-    )
-    trial = Trial(driver, briefing, manoeuvre_s)
-    try:
-        trial.go_through()
-    except Broken as broken:
-        where = trial.tries[-1].what if trial.tries else "the start"
-        print(one_line(f"wrong  the exercise can be gone through: after '{where}': {broken}"))
-        return VIOLATED
+    maker, given = driver_class(options.driver), options_of(options.option)
+    with closing(made(maker, options.driver, briefing, manoeuvre_s, given)) as driver:
+        trial = Trial(driver, briefing, manoeuvre_s)
+        try:
+            trial.go_through()
+        except Broken as broken:
+            where = trial.tries[-1].what if trial.tries else "the start"
+            print(one_line(f"wrong  the exercise can be gone through: after '{where}': {broken}"))
+            return VIOLATED
     found = judged(trial)
     for one in found:
         print(one_line(f"wrong  {one.check}: {one.wrong}" if one.wrong else f"ok     {one.check}"))
