@@ -13,7 +13,7 @@ from compose.record import agent_journal, ended, folder_for
 from compose.scenario import check_rate
 from compose.status import ENDED, FAILED, STOPPED, UserError, status_of
 from compose.stop import stop_by_signal
-from protocol import session
+from protocol import access, session
 from protocol.endpoints import Endpoints
 from protocol.inbox import Inbox, Interrupted
 from protocol.messages import End, Localised
@@ -102,12 +102,13 @@ def main(options: argparse.Namespace) -> int:
 
 def _play(options: argparse.Namespace, field: Field, reached: Endpoints, inbox: Inbox) -> End:
     """The mission, and an agent for it, which leaves with it."""
-    own = free_endpoint()
+    keys = ["--keys", str(options.keys.resolve().parent / access.agent(options.id))] if options.keys else []
+    own = free_endpoint("tls" if keys else "tcp")
     endpoints = Endpoints(reached.connect, (own, *reached.listen), reached.settings, reached.folder)
     with session.open_router(endpoints) as link, folder_for(options.out) as folder:
         agent = Agent(
             [
-                *("agent", options.id, "--connect", own, "--launched", "--run", field.run),
+                *("agent", options.id, "--connect", own, "--launched", "--run", field.run, *keys),
                 *("--out", str(folder.resolve()), "--patience", str(options.patience)),
             ],
             inbox,
