@@ -14,10 +14,10 @@ from signal import SIGCONT, SIGINT, SIGKILL, SIGSTOP
 import pytest
 from msgspec.structs import replace
 
-from agent.past import KINDS, Past, past
+from agent.past import Past, past
 from compose.local import free_endpoint
 from protocol import journal
-from protocol.messages import Drive
+from protocol.messages import Drive, OfRobot
 from protocol.motion import REST
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from tests.commands import PAPER_1, Command, Ended, process_of, processes_of, tandem
@@ -42,16 +42,16 @@ def beacon() -> Iterator[str]:
 
 
 @contextmanager
-def pair(out: Path, rate: float = 6.0) -> Iterator[dict[str, Command]]:
+def pair(out: Path, *more: str | Path, protocol: str = "tcp") -> Iterator[dict[str, Command]]:
     """Both robots of paper-1's geometry, on their way."""
     (out / "field.toml").write_text(ASSURED)
-    endpoint = free_endpoint()
+    endpoint = free_endpoint(protocol)
     with beacon() as air:
 
         def robot(name: str, flag: str) -> Command:
             return Command(
                 *("robot", name, "--mission", out / "field.toml", "--driver", "docs.rover:Rover"),
-                *("--rate", f"{rate:g}", flag, endpoint, "--out", out / name, "--patience", "20"),
+                *("--rate", "6", flag, endpoint, *more, "--out", out / name, "--patience", "20"),
                 *("--option", f"start={STARTS[name]}", "--option", f"beacon={air}"),
             )
 
@@ -65,7 +65,7 @@ def told(out: Path, robot: str) -> Past:
 
 
 def messages(frames: list[bytes]) -> list[object]:
-    return [decode(frame, KINDS, MAX_FRAME_BYTES) for frame in frames]
+    return [decode(frame, OfRobot, MAX_FRAME_BYTES) for frame in frames]
 
 
 def pose(ended: Ended, robot: str, word: str) -> tuple[float, ...]:
@@ -104,6 +104,12 @@ def test_two_robots_find_out_where_they_are_without_a_world(tmp_path: Path) -> N
     both = tandem("replay", tmp_path / "a")
     assert both.status == 0
     assert "a and b, without a world: as recorded, to the bit" in both.out
+
+
+def test_they_do_so_over_links_that_are_encrypted(tmp_path: Path) -> None:
+    assert tandem("keys", tmp_path / "keys", "--robots", "a,b").status == 0
+    with pair(tmp_path, "--keys", tmp_path / "keys" / "world", protocol="tls") as robots:
+        both_localised(tmp_path, robots)
 
 
 def test_a_decision_that_does_not_follow_is_found_without_a_world(tmp_path: Path) -> None:
