@@ -252,7 +252,8 @@ def test_b_begins_when_a_does_and_counts_a_s_ticks() -> None:
     """Late by seven ticks, it goes through those at once, standing; then it drives in a's."""
     driver, endpoint = Recorded(), free_endpoint()
     briefing = briefed(parse(ASSURED, "assured"), "b", MANOEUVRE_S)
-    field = Field(driver, briefing, "r", Inbox("field"), max_ticks=12, manoeuvre_s=MANOEUVRE_S)
+    inbox = Inbox("field")
+    field = Field(driver, briefing, "r", inbox, max_ticks=12, manoeuvre_s=MANOEUVRE_S)
     with (
         session.open_router(listening(endpoint)) as link,
         session.open_client(at(endpoint), lambda: None) as other,
@@ -272,10 +273,12 @@ def test_b_begins_when_a_does_and_counts_a_s_ticks() -> None:
         beat = session.publisher(other, keys.beat("r", "a"))
         assert token is not None
 
-        def begin() -> None:
-            beat.put(encode(Beat(7, "a")))
+        def say(tick: int) -> None:
+            beat.put(encode(Beat(tick, "a")))
 
-        threading.Timer(0.5, begin).start()
+        threading.Timer(0.5, say, [7]).start()
+        threading.Timer(0.5 + 2.5 * MANOEUVRE_S, say, [0]).start()  # of an a that has lost its past
+        threading.Timer(0.5 + 2.5 * MANOEUVRE_S, say, [500]).start()
         before = time.monotonic()
         end = field.play(10.0, lambda: None)
     assert end.tick == 12
@@ -283,4 +286,5 @@ def test_b_begins_when_a_does_and_counts_a_s_ticks() -> None:
     assert [tick for tick, _ in driver.ticks] == list(range(13))
     assert driver.ticks[7][1] - driver.ticks[0][1] < 2 * MANOEUVRE_S
     assert field.missed == 7
+    assert inbox.refused["beat"] == 2
     assert len(driver.drives) == 6

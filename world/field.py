@@ -28,7 +28,7 @@ REPEAT_S = 0.25
 FAREWELL_S = 2.0
 """how long to wait for the agent's last word"""
 ASTRAY = 64
-"""ticks: a beat farther off than this is no beat of this mission"""
+"""ticks that a's beat may be ahead of b; a beat of long ago is of an a that was started again, and lost"""
 
 M = TypeVar("M", Drive, Beat, Report)
 
@@ -228,15 +228,15 @@ class Field:
         return drive
 
     def _on_beat(self, arrival: Arrival) -> None:
-        """b's next tick begins as many ticks after that of a's as it is farther on."""
+        """b's next tick begins as many ticks after that of a's as it is farther on: at once, if it is not."""
         beat = self._accepted(arrival, Beat)
         if beat is None or self._briefing.role == "a":
             return
-        ahead = self._tick + 1 - beat.tick
-        if abs(ahead) > ASTRAY:
-            self._inbox.refuse(arrival, f"it is of tick {beat.tick}, this is tick {max(self._tick, 0)}")
+        left = self._tick + 1 - beat.tick
+        if -ASTRAY <= left <= 2:
+            self._next = time.monotonic() + left * self._tick_s
         else:
-            self._next = time.monotonic() + ahead * self._tick_s
+            self._inbox.refuse(arrival, f"it is of tick {beat.tick}, this is tick {max(self._tick, 0)}")
 
     def _on_report(self, arrival: Arrival) -> None:
         report = self._accepted(arrival, Report)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from contextlib import closing
 
@@ -33,7 +34,7 @@ class Agent:
         self._child = self._start()
 
     def _start(self) -> Child:
-        self._started = time.monotonic()
+        self._started, self._told = time.monotonic(), False
         return Child(f"agent {self._arguments[1]}", self._arguments, self._inbox, ())
 
     def again(self) -> None:
@@ -53,6 +54,9 @@ class Agent:
         if self._child.running and not within:
             self._child.stop()
         self._child.end(within or STOP_S)
+        if not self._told and self._child.status == ENDED and (said := self._child.said()):
+            print(said, file=sys.stderr)
+        self._told = True
         self._child.forget()
 
 
