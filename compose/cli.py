@@ -124,15 +124,7 @@ def parser() -> argparse.ArgumentParser:
     )
 
     watch = command("watch", "Serve a page on which a run is watched: a record, or what runs on a network.")
-    watch.add_argument(
-        "record", type=_folder, nargs="?", metavar="DIR", help="a record, a campaign, or a folder of records"
-    )
-    _add_reaching(watch)
-    watch.add_argument(
-        "--address", type=_address, default="127.0.0.1", metavar="IP",
-        help="of the page (127.0.0.1); 0.0.0.0 in a container, whose port is published on loopback",
-    )  # fmt: skip
-    watch.add_argument("--launched", action="store_true", help=argparse.SUPPRESS)  # by `tandem run --watch`
+    _add_watch(watch)
     for sub in (run, watch):
         sub.add_argument("--port", type=_port, metavar="N", help="of the page (one that is free)")
 
@@ -189,6 +181,18 @@ def _add_reaching(parser: argparse.ArgumentParser) -> None:
         help="encrypt, by the certificates that `tandem keys` left in DIR",
     )
     secured.add_argument("--config", type=_folder, metavar="FILE", help="a Zenoh configuration of your own")
+
+
+def _add_watch(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "record", type=_folder, nargs="?", metavar="DIR", help="a record, a campaign, or a folder of records"
+    )
+    _add_reaching(parser)
+    parser.add_argument(
+        "--address", type=_address, default="127.0.0.1", metavar="IP",
+        help="of the page (127.0.0.1); 0.0.0.0 in a container, whose port is published on loopback",
+    )  # fmt: skip
+    parser.add_argument("--launched", action="store_true", help=argparse.SUPPRESS)  # by `tandem run --watch`
 
 
 def _add_keys(parser: argparse.ArgumentParser) -> None:

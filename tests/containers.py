@@ -277,15 +277,16 @@ def main(given: Path | None) -> int:
     try:
         with containers() as (podman, folder):
             print(f"base: {base(podman, given, folder)}", flush=True)
-            build(podman, folder)
-            well = [play(podman, one, folder) for one in ("agent-a", "world", "zenoh")]
-            return int(not all([*well, on_a_robot(podman, folder)]))
+            try:
+                build(podman, folder)
+                well = [play(podman, one, folder) for one in ("agent-a", "world", "zenoh")]
+                return int(not all([*well, on_a_robot(podman, folder)]))
+            except subprocess.CalledProcessError as error:
+                print(f"failed: {' '.join(map(str, error.cmd))}\n{error.stderr}", flush=True)
+                return 1
     except Unable as why:
         print(f"skipped: {why}")
         return 0
-    except subprocess.CalledProcessError as error:
-        print(f"failed: {' '.join(map(str, error.cmd))}\n{error.stderr}")
-        return 1
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import os
 import re
+import shutil
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -573,3 +574,17 @@ def test_a_mission_under_noise_is_folded_to_the_bit(tmp_path: Path) -> None:
             assert memory.farewell is not None
     with closing(Retrace(tmp_path / "world.journal")) as old:
         assert again(scenario, old).parted.keys() == {"a", "b"}
+
+
+def test_who_has_ended_waits_for_no_world_that_has_gone_however_patient(
+    undisturbed: Path, tmp_path: Path
+) -> None:
+    shutil.copy(undisturbed / "agent-a.journal", tmp_path)
+    with ExitStack() as stack:
+        playing, endpoint = stack.enter_context(world("paper-1"))
+        reach = ("--connect", endpoint, "--out", tmp_path, "--patience", "600")
+        agent = stack.enter_context(Command("agent", "a", *reach))
+        agent.until_says("again, from tick 48 on")
+        playing.tell(SIGKILL)
+        ended = agent.ended()
+    assert (ended.status, ended.out.splitlines()[-1]) == (0, f"a: {LOCALISED.strip()}")

@@ -25,6 +25,8 @@ from protocol.retrace import Retrace
 
 STILL_THERE_S = 3.0
 """how long an agent whose mission has ended looks for a world that may not know its last word"""
+LAST_WORD_S = 10.0
+"""how long it then waits for what such a world says"""
 
 
 def main(options: argparse.Namespace) -> int:
@@ -63,6 +65,7 @@ def _play(options: argparse.Namespace, inbox: Inbox) -> End:
     end = memory.end if memory is not None else None
     which = f"world of run '{options.run}'" if options.run else "world"
     wait = options.wait if end is None else min(options.wait, STILL_THERE_S)
+    patience = options.patience if end is None else min(options.patience, LAST_WORD_S)
     search = Search(which, endpoints, wait, inbox)
     warning = beyond(endpoints)
     process: AgentProcess | None = None
@@ -83,7 +86,7 @@ def _play(options: argparse.Namespace, inbox: Inbox) -> End:
                         raise CorruptJournal(f"{old.path}: another run's: its briefing is not this world's")
                     memory = _ready(options, briefing, old, memory, inbox)
                     process = AgentProcess(
-                        memory, run, inbox, patience=options.patience, reached=kill.taker(options.kill)
+                        memory, run, inbox, patience=patience, reached=kill.taker(options.kill)
                     )
                     process.attach(link)
                     if not (options.quiet or options.launched):
