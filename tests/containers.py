@@ -216,7 +216,7 @@ def play(podman: Podman, killed: str, folder: Path) -> bool:
         audit = tandem("audit", mission.record(Path(tempfile.mkdtemp(dir=folder))))
         page = mission.tick()
         mission.compose(*up)
-        until(lambda: all(mission.ended(one) is not None for one in services), "all have ended again", 120.0)
+        until(lambda: all(mission.ended(one) is not None for one in services), "all have ended again", 300.0)
         folded = {one: mission.ended(one) for one in services}
         well = not sick and {*statuses.values(), *folded.values(), audit.status} == {0} and page > MIDDLE
         print(
