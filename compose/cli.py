@@ -137,7 +137,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_reaching(watch)
     watch.add_argument("--launched", action="store_true", help=argparse.SUPPRESS)  # by `tandem run --watch`
     for sub in (run, watch):
-        sub.add_argument("--port", type=_port, default=0, metavar="N", help="of the page (one that is free)")
+        sub.add_argument("--port", type=_port, metavar="N", help="of the page (one that is free)")
 
     audit = command("audit", "Judge a record: what its journals say, held against the world and the planner.")
     audit.add_argument("record", type=_folder, metavar="DIR", help="where `tandem run --out DIR` left it")

@@ -23,7 +23,7 @@ from compose.status import UserError
 from protocol import journal
 from protocol.messages import Drive, End, Estimate, Farewell, Localised, Outcome
 from protocol.motion import Pose, wrap
-from world.history import history
+from world.history import history, scenario_of
 from world.scenario import Scenario
 from world.sensors import anchor_ranges, executed, mutual_ranges
 from world.truth import Truth, asked
@@ -149,6 +149,10 @@ def past_of(folder: Path, robot: str) -> Past | None:
     told = past(frames, path)
     if told.briefing.robot != robot:
         raise journal.CorruptJournal(f"{path} is the journal of {told.briefing.robot}")
+    world = folder / WORLD_JOURNAL
+    first = next(iter(journal.read(world)), None) if world.exists() else None
+    if first is not None and not scenario_of(first, world).is_of(told.briefing):
+        raise journal.CorruptJournal(f"{path}: another run's: its briefing is not this world's")
     return told
 
 
@@ -291,6 +295,7 @@ def _robot_summary(record: Record, place: int) -> dict[str, Any]:
         "heading_sigma_rad": covariance.heading_sigma if covariance is not None else None,
         "nees": claimed.nees if claimed is not None else None,
         **{field: getattr(farewell, field, None) for field in _SAID},
+        "deadlines_missed": sum([robot not in moment.drives for moment in record.moments[:-1]]),
     }
 
 

@@ -20,7 +20,7 @@ from msgspec import Meta
 from compose.faults import BadFault, FaultTable, added, table_of
 from compose.kill import DRAWN, POINTS, BadKill, Kill, KillTable, drawn
 from compose.status import UserError
-from protocol.lie import Kind, Lie, Part
+from protocol.lie import OF_THE_START, Kind, Lie, Part
 from protocol.messages import Briefing
 from protocol.mission import Anchor, Mission, Role, Variant, noise_obstacle, obstacle, safety_obstacle
 from protocol.motion import TAU, Pose
@@ -250,6 +250,11 @@ def _validated(file: ScenarioFile, source: str, told: Sequence[str]) -> Scenario
             raise BadScenario(
                 f"{source}: robot[{i}].start: '{robot.id}' is {rho0:.9g} m from its anchor, "
                 f"outside mission.sensing_range = {file.mission.sensing_range:.9g} m"
+            )
+        if robot.lie is not None and robot.lie.kind in OF_THE_START and robot.lie.part != "all":
+            raise BadScenario(
+                f"{source}: robot[{i}].lie.part: a lie of the {robot.lie.kind} is of the beginning, "
+                "and so of all"
             )
         placed.append(Placed(robot.id, peer, role, Anchor(*robot.anchor), start, plans[robot.id], robot.lie))
     faults = _faults(file, told, list(peers.items()), source)

@@ -23,7 +23,10 @@ from world.scenario import Scenario
 
 SIGMA = "sigma m"
 """a column only where sensors are not exact"""
+LATE = "late"
+"""a column only where a drive came too late, in real time"""
 LEGEND = "m and rad; ranges to the anchor + to the peer; reports sent / heard"
+LATE_LEGEND = "late: ticks in which it stood still, as its drive had not come in time; "
 SIGMA_LEGEND = "sigma: of the position, as claimed; "
 UNLIMITED = 1000
 """columns, of what is not a terminal"""
@@ -64,7 +67,8 @@ def live(scenario: Scenario, folder: Path) -> Iterator[None]:
 def result(summary: Mapping[str, Any]) -> None:
     """The table at the end of a run: a line each robot, or a few where the terminal is narrow."""
     exact = all(robot["covariance"] is None for robot in summary["robots"].values())
-    robots = {name: _cells(robot, exact) for name, robot in summary["robots"].items()}
+    late = any(robot["deadlines_missed"] for robot in summary["robots"].values())
+    robots = {name: _cells(robot, exact, late) for name, robot in summary["robots"].items()}
     rows = Table("robot", box=SIMPLE_HEAD, pad_edge=False)
     for heading in next(iter(robots.values())):
         rows.add_column(heading, justify="right")
@@ -81,10 +85,11 @@ def result(summary: Mapping[str, Any]) -> None:
             for line in (name, *(f"  {heading}: {cell}" for heading, cell in cells.items()))
         ]
     title = f"{summary['scenario']}: {outcome_line(summary)}"
-    print(title, "", *lines, "", LEGEND if exact else SIGMA_LEGEND + LEGEND, sep="\n")
+    legend = ("" if exact else SIGMA_LEGEND) + (LATE_LEGEND if late else "") + LEGEND
+    print(title, "", *lines, "", legend, sep="\n")
 
 
-def _cells(robot: Mapping[str, Any], exact: bool) -> dict[str, str]:
+def _cells(robot: Mapping[str, Any], exact: bool, late: bool) -> dict[str, str]:
     """What stands in its line, by column."""
     sigma = {} if exact else {SIGMA: _number(robot["position_sigma_m"], ".1e")}
     return {
@@ -94,6 +99,7 @@ def _cells(robot: Mapping[str, Any], exact: bool) -> dict[str, str]:
         **sigma,
         "ranges": f"{_number(robot['anchor_ranges'])} + {_number(robot['mutual_ranges'])}",
         "reports": f"{_number(robot['reports_sent'])} / {_number(robot['reports_heard'])}",
+        **({LATE: _number(robot["deadlines_missed"])} if late else {}),
     }
 
 

@@ -11,6 +11,8 @@ Kind = Literal["scale", "rotate", "shift", "radius", "heading", "reframe"]
 """`scale`, `rotate`, `shift`: of what it drove. `radius`, `heading`: of where it says it began, relative to
 its anchor; the ranges that it tells go with the radius. `reframe`: of all, about its anchor."""
 
+OF_THE_START: frozenset[Kind] = frozenset(("radius", "heading", "reframe"))
+
 Part = Literal["phase-1", "orbit", "encounter", "all"]
 """of its log, by phase; the last three kinds are of the beginning, and so of all"""
 

@@ -80,6 +80,11 @@ def test_an_unknown_field_is_named(was: str, typo: str, field: str, tmp_path: Pa
         ('id = "a"', 'id = "a"\nlie = {kind = "scal", size = 2}', "robot[0].lie.kind: there is no 'scal'; "),
         (
             'id = "a"',
+            'id = "a"\nlie = {kind = "radius", size = 0.1, part = "orbit"}',
+            "robot[0].lie.part: a lie of the radius is of the beginning, and so of all",
+        ),
+        (
+            'id = "a"',
             'id = "a"\nlie = {kind = "scale", size = 2, part = "orbits"}',
             "robot[0].lie.part: there is no 'orbits'; there are phase-1, orbit, encounter, all",
         ),
@@ -356,6 +361,7 @@ def test_an_unknown_scenario_is_refused(
         (["run", "paper-1", "--in-process", "--foxglove", "8765"], "--foxglove: "),
         *((["run", "paper-1", "--foxglove", v], "--foxglove: ") for v in ("-1", "65536", "http")),
         (["run", "paper-1", "--export"], "--export: there is no --out DIR"),
+        (["run", "paper-1", "--port", "8080"], "--port: of the page, and there is none without --watch"),
         (["replay", ""], "'' is no folder"),
         *((["run", "paper-1", "--rate", v], "--rate: ") for v in ("0", "-1", "nan", "inf", "fast", "1e400")),
         *((["run", "paper-1", "--patience", v], "--patience: ") for v in ("0", "-1", "nan", "inf", "x")),

@@ -22,6 +22,7 @@ from compose.figures.style import PLACES, look, save
 from compose.inline import play
 from compose.record import estimates, first_claim, read
 from compose.scenario import load, parse
+from compose.scene.recorded import read as performed
 from protocol.journal import CorruptJournal
 from protocol.journal import read as frames
 from protocol.messages import Estimate
@@ -360,3 +361,17 @@ def test_the_journal_of_another_robot_is_not_taken_for_its_own(noisy: Path, tmp_
         estimates(folder, "a")
     with pytest.raises(FileNotFoundError):
         estimates(folder, "z")
+
+
+def test_a_journal_of_another_run_is_no_record_of_this_one(noisy: Path, tmp_path: Path) -> None:
+    folder, other = copied(noisy, tmp_path), tmp_path / "other"
+    play(load("paper-1"), other)
+    shutil.copyfile(other / "agent-a.journal", folder / "agent-a.journal")
+    with pytest.raises(CorruptJournal, match=r"agent-a\.journal: another run's: its briefing"):
+        estimates(folder, "a")
+    assert [note.split("/")[-1] for note in performed(folder).notes] == [
+        "agent-a.journal: another run's: its briefing is not this world's"
+    ]
+    ended = tandem("export", folder)
+    assert ended.status == 2
+    assert "agent-a.journal: another run's" in ended.err

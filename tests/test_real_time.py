@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import os
 from pathlib import Path
 from signal import SIGCONT, SIGINT, SIGSTOP
@@ -55,14 +56,18 @@ def test_a_rate_beyond_all_sense_is_refused(rate: str, lasts: str) -> None:
 def test_a_robot_whose_agent_is_stopped_stands_still_and_the_mission_goes_on(tmp_path: Path) -> None:
     out = tmp_path / "out"
     (tmp_path / "assured.toml").write_text(ASSURED)
-    with Command("run", tmp_path / "assured.toml", "--rate", "20", "--out", out, "-q") as run:
+    with Command("run", tmp_path / "assured.toml", "--rate", "20", "--out", out) as run:
         run.until_written(out / "world.journal", 3000)
         stopped = process_of(out, "agent", "a")
         os.kill(stopped, SIGSTOP)
         run.until(lambda: missed(out / "world.journal", "a") >= 10, "ten of a's Drives are missed")
         os.kill(stopped, SIGCONT)
-        assert run.ended().status == 0
+        ended = run.ended()
+    assert ended.status == 0
+    assert "late: ticks in which it stood still" in ended.out
     with (out / "ticks.csv").open(newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["robot"] == "a" and row["state"] == ""]
     assert len(rows) >= 10
+    told = json.loads((out / "summary.json").read_text())["robots"]
+    assert told["a"]["deadlines_missed"] == len(rows)
     assert {(row["v"], row["omega"]) for row in rows} == {("0.0", "0.0")}

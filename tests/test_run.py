@@ -132,6 +132,7 @@ def test_summary_says_everything_that_is_promised_of_a_robot(played: tuple[str, 
     assert told["localised_tick"] == PAPER_TICKS[name]
     assert told["mutual_ranges"] == 3
     assert told["reports_refused"] == 0
+    assert told["deadlines_missed"] == 0
     assert told["reports_sent"] == told["reports_heard"] >= 3
     assert 0 < told["bytes_sent"] <= 4096 * told["reports_sent"]
     last = [row for row in ticks(out) if row["robot"] == robot][-1]

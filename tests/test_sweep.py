@@ -416,6 +416,24 @@ def test_the_command_that_the_table_prints_plays_the_trial_again(folder: Path) -
     assert row["bytes_sent"] == sum(robot["bytes_sent"] for robot in summary["robots"].values())
 
 
+def test_of_more_cells_than_fit_a_screen_those_in_which_all_is_well_are_counted(folder: Path) -> None:
+    starts = ", ".join([f"[{0.3 + 0.01 * i:.2f}, 0.1, 1.0]" for i in range(101)])
+    axis = f'[[axis]]\nfield = "robot.a.start"\nvalues = [{starts}]\n'
+    variant = '[[axis]]\nfield = "planner.variant"\nvalues = ["assured", "paper"]\n'
+    (folder / "many.toml").write_text(
+        f'name = "many"\nscenario = "random"\ntrials = 1\nseed = 1\n{axis}{variant}'
+    )
+    ended = sweep(folder, "many.toml", "out")
+    total = {row["cell"]: row["localised"] for row in summary_rows(folder / "out")}
+    assert len(total) == 202
+    poor = [cell for cell, localised in total.items() if localised == "0"]
+    lines = ended.out.splitlines()
+    listed = [line.split()[0] for line in lines if line[1:2].isdigit()]
+    assert listed == poor
+    assert f"all is well in {202 - len(poor)} cells, not listed: out/summary.csv" in lines
+    assert 0 < len(poor) < 202
+
+
 # --- every trial is judged ------------------------------------------------------------------------------
 
 

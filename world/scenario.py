@@ -49,6 +49,11 @@ class Scenario(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fiel
                 return placed
         raise KeyError(robot)
 
+    def is_of(self, briefing: Briefing) -> bool:
+        """Whether that is what one of its robots is told, be it in real time or in lockstep."""
+        known = any(placed.id == briefing.robot for placed in self.robots)
+        return known and self.briefing(briefing.robot, briefing.tick_s) == briefing
+
     def briefing(self, robot: str, tick_s: float | None = None) -> Briefing:
         """What `robot` is told; nothing of where it is. `tick_s` is set in real time only."""
         own = self.robot(robot)

@@ -18,7 +18,7 @@ from rich.text import Text
 
 from compose.campaign.cells import Cell
 from compose.campaign.folder import CELLS
-from compose.campaign.run import Progress, Results
+from compose.campaign.run import SUMMARY, Progress, Results
 from compose.campaign.summary import Counted, noted
 from compose.show import UNLIMITED
 
@@ -38,6 +38,10 @@ CHOICES = (
 OF_NOISE = ("within", "nees", "nees low", "nees high")
 """more of them, where covariances are claimed"""
 NOISE_LEGEND = "within: claims within 3 x accuracy; nees: in the mean, and the 99 % band of true covariances"
+
+
+MOST_ROWS = 100
+"""cells that are listed whether or not all was well"""
 
 
 class _Rate(bars.ProgressColumn):
@@ -80,7 +84,11 @@ def show(results: Results, out: Path, *, quiet: bool) -> None:
     if quiet:
         return
     legend = [LEGEND, NOISE_LEGEND] if _noisy(results) else [LEGEND]
-    print("", *_lines(results), "", *legend, sep="\n")
+    shown = len(_shown(results))
+    if shown:
+        print("", *_lines(results), "", *legend, sep="\n")
+    if shown < len(results.cells):
+        print(f"all is well in {len(results.cells) - shown} cells, not listed: {out / SUMMARY}")
     for index, figures in results.figures.items():
         if figures.refused is not None:
             print(f"cell {index} cannot be played: {figures.refused}")
@@ -114,6 +122,20 @@ def _lines(results: Results) -> list[str]:
     return lines
 
 
+def _shown(results: Results) -> list[Cell]:
+    """All of them; of more than fit a screen or two, those in which something was not well."""
+    if len(results.cells) <= MOST_ROWS:
+        return list(results.cells)
+    return [cell for cell in results.cells if not _well(results.figures[cell.index])]
+
+
+def _well(figures: Counted) -> bool:
+    """All were played and localised, and nothing was found in those that were judged."""
+    return (
+        figures.refused is None and figures.trials == figures.localised and figures.audited == figures.clean
+    )
+
+
 def _noisy(results: Results) -> bool:
     return any(one.nees_mean is not None for one in results.figures.values())
 
@@ -132,7 +154,7 @@ def _table(results: Results, columns: Sequence[str]) -> list[str]:
         table.add_column(axis.name.rpartition(".")[2])
     for heading in columns:
         table.add_column(heading, justify="right")
-    for cell in results.cells:
+    for cell in _shown(results):
         figures = results.figures[cell.index]
         said = _figures(figures)
         table.add_row(*_axes(results, cell), *[said[column] for column in columns])

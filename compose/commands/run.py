@@ -30,6 +30,8 @@ def main(options: argparse.Namespace) -> int:
     scenario = found.seeded(options.seed)
     if options.out is not None and any(options.out.glob("*.journal")):
         raise UserError(f"--out: {options.out} holds a record already; choose another folder")
+    if options.port is not None and not options.watch:
+        raise UserError("--port: of the page, and there is none without --watch")
     if options.foxglove is not None:
         need("foxglove")
     if options.export:
@@ -139,7 +141,7 @@ def _keys(options: argparse.Namespace, scenario: Scenario) -> Iterator[Path | No
 @contextmanager
 def _shown(options: argparse.Namespace, folder: Path) -> Iterator[list[Beside]]:
     """What is to show the mission that is recorded in `folder`: it is there, and where has been said."""
-    wanted = [page(folder, options.port)] if options.watch else []
+    wanted = [page(folder, options.port or 0)] if options.watch else []
     if options.foxglove is not None:
         wanted.append(viewers(folder, options.foxglove))
     with ExitStack() as stack:

@@ -38,7 +38,7 @@ def main(options: argparse.Namespace) -> int:
     for note in shown.notes:
         print(one_line(f"tandem watch: {note}"), file=sys.stderr)
     try:
-        taken = server.bound(options.port)
+        taken = server.bound(options.port or 0)
     except server.CannotServe as error:
         raise UserError(f"--port: {options.port} cannot be had: {error.strerror}") from None
     if shown.waiting:

@@ -35,6 +35,8 @@ LOOK_S = 0.05
 """how often the journals are looked at"""
 WAIT_S = 0.5
 """for what is missing of a tick, once the next is there"""
+SETTLED_S = 1.0
+"""after which who has asked for a channel surely listens"""
 BACKLOG = 8
 """ticks that are shown one by one; of more, the latest"""
 MESSAGES = 1 << 14
@@ -56,6 +58,8 @@ class Live:
         self._views: Views | None = None
         self._next = 0
         """the tick that is to be shown next"""
+        self._once_more: float | None = None
+        """when what stands is to be told again: whoever has just asked may not have listened yet"""
         self._since: dict[int, float] = {}
         """when those from there on were first there to be shown"""
 
@@ -78,7 +82,9 @@ class Live:
                 self._channels.view(*view, nanoseconds(stage, scene.tick))
         if ready:
             self._next = ready[-1].tick + 1
-        if self.asked:
+        due = self._once_more is not None and now >= self._once_more
+        if self.asked or due:
+            self._once_more = now + SETTLED_S if self.asked else None
             self.asked = False
             self._channels.again()
             for view in (self._views.standing(), *self._views.again()):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import msgspec
 
-from compose.record import SUMMARY, WORLD_JOURNAL, journals_in, robot_of
+from compose.record import SUMMARY, WORLD_JOURNAL, agent_journal, journals_in, robot_of
 from compose.scene.facts import Gathering
 from compose.scene.scene import Scene, scene
 from compose.scene.stage import Stage, of_briefings, of_scenario
@@ -84,6 +84,10 @@ class Journals:
                 text = str(error)
                 self._note(text if text.startswith(str(path)) else f"{path}: {text}")
         told = self.known.briefings
+        if self._world is not None:
+            for robot in [robot for robot, one in told.items() if not self._world.world.scenario.is_of(one)]:
+                path = self.folder / agent_journal(robot)
+                self._note(f"{path}: another run's: its briefing is not this world's")
         if self._world is None and len(told) > (len(self.stage.robots) if self.stage is not None else 0):
             self.stage = of_briefings(self.folder.name, told)
 

@@ -1,0 +1,78 @@
+"""A measurement: two agents in real time at 1, 10 and 100 Hz; how many deadlines are missed on this machine?
+
+    uv run python -m tests.deadlines
+
+Each mission lasts 10 s; then one more, in which a's agent is stopped for 3 s. A line for each; exit status 0
+if all were played to the end, and who was late stood still.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from compose.record import Record, read
+from tests.commands import ENDLESS, Command, process_of
+
+RATES = (1, 10, 100)
+"""Hz"""
+LASTS_S = 10
+STOPPED_S = 3.0
+
+
+def main() -> int:
+    """Play them all."""
+    shown = Table("rate Hz", "stopped s", "ticks", "a missed", "b missed", "a moved on", "wall s")
+    well = True
+    for rate in RATES:
+        for stopped in (0.0, STOPPED_S):
+            with tempfile.TemporaryDirectory(prefix="tandem-") as folder:
+                began = time.monotonic()
+                record = played(Path(folder), rate, stopped)
+                wall = time.monotonic() - began
+            ticks = record.moments[-1].truth.tick
+            missed = {robot: late(record, robot) for robot in "ab"}
+            moved = max([drifted(record, tick) for tick in missed["a"]], default=0.0)
+            well &= ticks == rate * LASTS_S and moved == 0.0
+            well &= not stopped or len(missed["a"]) >= (STOPPED_S - 1.0) * rate
+            share = [f"{len(ticks_)} ({len(ticks_) / ticks:.2%})" for ticks_ in missed.values()]
+            shown.add_row(str(rate), f"{stopped:g}", str(ticks), *share, f"{moved:g} m", f"{wall:.1f}")
+    Console().print(shown)
+    return 0 if well else 1
+
+
+def played(folder: Path, rate: int, stopped: float) -> Record:
+    """The record of 10 s at that rate, with a's agent stopped in the middle."""
+    scenario, out = folder / "mission.toml", folder / "out"
+    scenario.write_text(f"max_ticks = {rate * LASTS_S}\n" + ENDLESS.replace("max_ticks", "# max_ticks"))
+    with Command("run", scenario, "--rate", str(rate), "--out", out, "-q") as run:
+        if stopped:
+            run.until_answered("a", out)
+            agent = process_of(out, "agent", "a")
+            os.kill(agent, signal.SIGSTOP)
+            time.sleep(stopped)  # what is measured
+            os.kill(agent, signal.SIGCONT)
+        run.ended()
+    return read(out)
+
+
+def late(record: Record, robot: str) -> list[int]:
+    """The ticks for which its drive did not come."""
+    return [moment.truth.tick for moment in record.moments[:-1] if robot not in moment.drives]
+
+
+def drifted(record: Record, tick: int) -> float:
+    """m: how far a moved in that tick."""
+    before, after = record.moments[tick].truth.poses[0], record.moments[tick + 1].truth.poses[0]
+    return abs(after.x - before.x) + abs(after.y - before.y)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
