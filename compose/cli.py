@@ -32,9 +32,8 @@ class _Version(argparse.Action):
         from compose import installed  # noqa: PLC0415  # it takes time
         from protocol.wire import VERSION  # noqa: PLC0415
 
-        parser.exit(
-            0, f"tandem {installed.version() or 'that is not installed'}, protocol version {VERSION}\n"
-        )
+        print(f"tandem {installed.version() or 'that is not installed'}, protocol version {VERSION}")
+        parser.exit()
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:

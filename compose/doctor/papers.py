@@ -24,6 +24,8 @@ SOON_DAYS = 30
 DAY_S = 86_400.0
 NO_CHECK_TIME = 0x200000
 """OpenSSL's X509_V_FLAG_NO_CHECK_TIME, for which the module ssl has no name"""
+UNASKED = ""
+"""the password of a key that has one, instead of a question on the terminal; Zenoh knows none either"""
 FLIGHTS = 4
 """a handshake in memory is over after as many, either way"""
 
@@ -74,9 +76,7 @@ def _findings(paper: Paper, endpoints: Endpoints, now: float) -> Iterator[Findin
         except ssl.SSLError:
             return
     except ssl.SSLError as error:
-        mixed = error.reason == "KEY_VALUES_MISMATCH"
-        why = f"{paper.key} is not its key" if mixed else f"cannot be used: {error.reason or error}"
-        yield fix(f"certificate: {at}: {why}; copy the folder once more")
+        yield fix(f"certificate: {at}: {_unusable(paper, error)}; copy the folder once more")
         return
     name = dict(pair for part in shown["subject"] for pair in part).get("commonName", "nobody")
     if signed:
@@ -89,6 +89,12 @@ def _findings(paper: Paper, endpoints: Endpoints, now: float) -> Iterator[Findin
     yield from _named(paper, name, endpoints)
     if not paper.connects:
         yield from _known(at, shown, endpoints)
+
+
+def _unusable(paper: Paper, error: ssl.SSLError) -> str:
+    if error.reason == "KEY_VALUES_MISMATCH":
+        return f"{paper.key} is not its key"
+    return f"with {paper.key.name} and {paper.authority.name} it cannot be read: {error.reason or error}"
 
 
 def _named(paper: Paper, name: str, endpoints: Endpoints) -> Iterator[Finding]:
@@ -155,10 +161,10 @@ def _shown(paper: Paper, trusted: Path) -> Mapping[str, Any]:
     """What an end of a handshake sees of who shows this certificate. Raises ssl.SSLError."""
     client = _context(ssl.PROTOCOL_TLS_CLIENT, trusted)
     server = _context(ssl.PROTOCOL_TLS_SERVER, trusted)
-    server.load_cert_chain(paper.certificate, paper.key)
+    server.load_cert_chain(paper.certificate, paper.key, UNASKED)
     if paper.connects:
         client.verify_mode = ssl.CERT_NONE
-        client.load_cert_chain(paper.certificate, paper.key)
+        client.load_cert_chain(paper.certificate, paper.key, UNASKED)
         server.verify_mode = ssl.CERT_REQUIRED
     there, back = ssl.MemoryBIO(), ssl.MemoryBIO()
     ends = (client.wrap_bio(back, there), server.wrap_bio(there, back, server_side=True))
