@@ -50,6 +50,14 @@ class Post:
         """What was told in `tick`, once it has come."""
         return self._reports.get(tick)
 
+    def waiting(self, known: int) -> list[Told]:
+        """What has come and was never heard, of ticks up to `known`, the oldest first."""
+        return [
+            self._reports[tick]
+            for tick in sorted(self._reports)
+            if tick <= known and tick not in self._listed
+        ]
+
     def list(self, ticks: Iterable[int]) -> None:
         """A Sense has listed those of these `ticks`."""
         self._listed.update(ticks)

@@ -26,6 +26,8 @@ from protocol.wire import MalformedFrame, decode, encode
 
 REPORT_SHARE = 0.5
 """of a tick in real time: how long to wait for the peer's report"""
+FIELD_SHARE = 0.1
+"""the same without a world, where the rest of the tick is for the manoeuvre"""
 LAST_WORD_S = 0.5
 """how long what the world has said may outlast its sign of life"""
 ENDED_S = 1.0
@@ -171,8 +173,9 @@ class AgentProcess:
         return False
 
     def _set_due(self) -> None:
-        if self._tick_s is not None:
-            self._due = time.monotonic() + REPORT_SHARE * self._tick_s
+        if self._tick_s is not None and self._sense is not None:
+            in_field = any(contact.heard is None for contact in self._sense.contacts)
+            self._due = time.monotonic() + (FIELD_SHARE if in_field else REPORT_SHARE) * self._tick_s
 
     # --- what is done about it ---
 
@@ -182,7 +185,11 @@ class AgentProcess:
         heard: list[Told] = []
         missed: list[str] = []
         for contact in self._sense.contacts:
-            for tick in contact.heard:
+            listed = contact.heard
+            if listed is None:
+                heard += self._post.waiting(self._sense.tick)
+                listed = () if self._post.of(self._sense.tick) else (self._sense.tick,)
+            for tick in listed:
                 told = self._post.of(tick)
                 if told is not None:
                     heard.append(told)

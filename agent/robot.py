@@ -68,7 +68,7 @@ class Robot:
         self.told = self.drive = self._frame = None
         for contact in sense.contacts:
             self.unheard.add(sense.tick)
-            self.unheard.difference_update(contact.heard, contact.damaged)
+            self.unheard.difference_update(contact.heard or (), contact.damaged)
             self.damaged += len(contact.damaged)
         if sense.contacts:
             report = planner.report(self.mind)
@@ -84,6 +84,7 @@ class Robot:
     def decide(self, heard: Sequence[Told] = (), missed: Sequence[str] = ()) -> Drive:
         """Fold in what was heard; the drive for the tick. `missed` are peers whose report did not come."""
         self.mind = planner.decide(self.mind, [told.report for told in heard])
+        self.unheard.difference_update([told.report.tick for told in heard])
         self.drive = planner.drive(self.mind)
         if self._journal is not None:
             frames = [told.frame for told in heard]

@@ -115,6 +115,9 @@ def _parser() -> argparse.ArgumentParser:
         sub.add_argument("--kill", type=_kill, action="append", default=[], help=argparse.SUPPRESS)
         sub.add_argument("--fsync", action="store_true", help="the journal survives a power cut")
 
+    _add_robot(command("robot", "Play one robot's part without a world: its own driver, and its agent."))
+    _add_conform(command("conform", "Try a driver against the contract of docs/driver.md."))
+
     _add_sweep(command("sweep", "Play a campaign: many trials of a scenario, over axes of its fields."))
 
     figures = command(
@@ -220,6 +223,39 @@ def _add_keys(parser: argparse.ArgumentParser) -> None:
         help="a name or address of the world or a router; as often as you like (localhost, 127.0.0.1, ::1)",
     )  # fmt: skip
     parser.add_argument("--days", type=_days, default=365, metavar="N", help="how long they last (365)")
+
+
+def _add_robot(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("id", type=_name, metavar="ID", help="which robot of the mission")
+    parser.add_argument("--driver", required=True, metavar="MODULE:CLASS", help="of its wheels and sensors")
+    parser.add_argument("--mission", required=True, metavar="FILE", help="a scenario; starts are not needed")
+    _add_driver(parser)
+    _add_playing(parser)
+    _add_reaching(parser)
+    parser.add_argument(
+        "--listen", action="append", default=[], metavar="ENDPOINT",
+        help="where the peer reaches it, such as tcp/127.0.0.1:7447; as often as you like",
+    )  # fmt: skip
+    parser.add_argument("--run", type=_name, metavar="NAME", help="what the mission is called (its name)")
+    parser.add_argument(
+        "--wait", type=_positive, default=60.0, metavar="S", help="how long to look for the peer (60)"
+    )
+
+
+def _add_driver(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--option", action="append", default=[], metavar="NAME=VALUE", help="for the driver; again for more"
+    )
+    parser.add_argument(
+        "--rate", type=_positive, metavar="X", help="X times as fast, for a driver that can (1)"
+    )
+
+
+def _add_conform(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("driver", metavar="MODULE:CLASS", help="of one robot's wheels and sensors")
+    parser.add_argument("--mission", default="paper-1", metavar="FILE", help="a scenario (paper-1)")
+    parser.add_argument("--robot", type=_name, default="a", metavar="ID", help="which of its robots (a)")
+    _add_driver(parser)
 
 
 def _add_sweep(parser: argparse.ArgumentParser) -> None:

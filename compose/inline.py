@@ -49,7 +49,7 @@ def played(scenario: Scenario, sinks: Mapping[str, Sink]) -> Record:
                 told[sense.robot, sense.tick] = report
         drives: dict[str, Drive] = {}
         for sense in senses:
-            heard = [told[contact.peer, tick] for contact in sense.contacts for tick in contact.heard]
+            heard = [told[contact.peer, tick] for contact in sense.contacts for tick in contact.heard or ()]
             drives[sense.robot] = robots[sense.robot].decide(heard)
             if robots[sense.robot].journaled:
                 robots[sense.robot].estimate()

@@ -45,7 +45,7 @@ def free_endpoint(protocol: str = "tcp") -> str:
         return f"{protocol}/127.0.0.1:{port}"
 
 
-class _Child:
+class Child:
     """A process of the run. It is in a session of its own: Ctrl-C reaches it only through the launcher."""
 
     def __init__(self, name: str, arguments: list[str], inbox: Inbox, kills: Sequence[Kill]) -> None:
@@ -164,7 +164,7 @@ class _Run:
         self._inbox = inbox
         self._arguments = self._named(out, run, rate, patience, keys)
         self.names = list(self._arguments)
-        self.children: dict[str, _Child] = {}
+        self.children: dict[str, Child] = {}
         self._due: dict[str, float] = {}
         """when to start again who has been killed"""
 
@@ -192,7 +192,7 @@ class _Run:
         """Start it, for the first time or again."""
         if name in self.children:
             self.children[name].forget()
-        self.children[name] = _Child(name, self._arguments[name], self._inbox, kills)
+        self.children[name] = Child(name, self._arguments[name], self._inbox, kills)
         if name == WORLD:
             self.children[name].hand(encode(self._scenario))
 
@@ -221,7 +221,7 @@ class _Run:
             return min(self._due.values()) - time.monotonic()
         return None if world_runs else FOLLOW_S
 
-    def _bury(self, child: _Child) -> None:
+    def _bury(self, child: Child) -> None:
         """It is to be started again if it took a kill. Raises ChildFailed if not, or if it is never to be."""
         said = child.said()
         kill = taken(child.kills, said) if child.status == -signal.SIGKILL else None
@@ -248,7 +248,7 @@ def _how(status: int) -> str:
     return f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
 
 
-def _stop(children: Iterable[_Child]) -> None:
+def _stop(children: Iterable[Child]) -> None:
     for child in children:
         if child.running:
             child.stop()

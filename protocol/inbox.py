@@ -8,7 +8,7 @@ from collections import Counter
 from queue import Empty, SimpleQueue
 from typing import Literal, NamedTuple
 
-Topic = Literal["sense", "drive", "report", "alive", "gone", "ended", "stop", "nothing"]
+Topic = Literal["sense", "drive", "report", "beat", "alive", "gone", "ended", "stop", "nothing"]
 
 COMPLAINTS = 100
 """kinds of malformed frames that are told, each once; the rest is only counted"""

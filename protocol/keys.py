@@ -34,6 +34,11 @@ def report(run: str, robot: str, peer: str) -> str:
     return f"{ROOT}/{run}/robot/{robot}/to/{peer}"
 
 
+def beat(run: str, robot: str) -> str:
+    """Without a world, from that robot's driver to its peer's: a tick has begun."""
+    return f"{ROOT}/{run}/robot/{robot}/beat"
+
+
 def estimate(run: str, robot: str) -> str:
     """That robot to viewers: what it holds possible."""
     return f"{ROOT}/{run}/robot/{robot}/estimate"
@@ -70,6 +75,7 @@ RULES: Mapping[Callable[..., str], Rule] = MappingProxyType(
         sense: Rule("put", "world", ("robot", "viewer")),
         drive: Rule("put", "robot", ("world", "viewer")),
         report: Rule("put", "robot", ("peer", "viewer")),
+        beat: Rule("put", "world", ("world",)),
         estimate: Rule("put", "robot", ("viewer",)),
         world_alive: Rule("show", "world", ("robots", "viewer")),
         robot_alive: Rule("show", "robot", ("robot", "world", "viewer")),

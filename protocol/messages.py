@@ -62,8 +62,9 @@ class Contact(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_field
 
     peer: RobotId
     range: Range | None
-    heard: tuple[Tick, ...]
-    """the ticks of those of the peer's reports that reach this robot now, in order"""
+    heard: tuple[Tick, ...] | None
+    """the ticks of those of the peer's reports that reach this robot now, in order; none without a world:
+    what arrives within the tick counts"""
     damaged: tuple[Tick, ...] = ()
     """of those that reach it damaged, and are refused"""
 
@@ -201,6 +202,13 @@ class Missed(Message, frozen=True):
     tick: Tick
     robot: RobotId
     """whose Drive (in the world's journal) or Report (in an agent's)"""
+
+
+class Beat(Message, frozen=True):
+    """Without a world, one robot's driver to its peer's: tick k has begun."""
+
+    tick: Tick
+    robot: RobotId
 
 
 class End(Message, frozen=True):

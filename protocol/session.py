@@ -121,7 +121,7 @@ def watch_liveliness(session: zenoh.Session, key: str, inbox: Inbox) -> None:
 def alive(session: zenoh.Session, key: str, timeout: float) -> list[str]:
     """The keys of the liveliness tokens under `key`, now; waits `timeout` seconds at the most."""
     replies = session.liveliness().get(key, timeout=timeout)
-    return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok is not None)
+    return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})
 
 
 def linked(session: zenoh.Session) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from compose.scenario import load
 from protocol.messages import (
+    Beat,
     Contact,
     Drive,
     End,
@@ -55,4 +56,6 @@ EXAMPLES: tuple[Message, ...] = (
         "b", 5, 3, "circle", -2.5, (4, 2), 0.5, 1.5, 2, 0.75, "8 mutual ranges", 0.25, 3, 4, 1, 2, 5, 3, 600
     ),
     Farewell("b", 0, 0, None, None, None, None, None, None, None, None, None, 0, 0, 0, 0, 0, 0, 0),
+    Sense(8, "a", Controls(1.0, -0.5), None, (Contact("b", 1.25, None),)),
+    Beat(7, "a"),
 )

@@ -23,6 +23,7 @@ KEYS = {
     "sense of a": keys.sense("r", "a"),
     "drive of a": keys.drive("r", "a"),
     "report of a to b": keys.report("r", "a", "b"),
+    "beat of a": keys.beat("r", "a"),
     "estimate of a": keys.estimate("r", "a"),
     "world alive": keys.world_alive("r"),
     "a alive": keys.robot_alive("r", "a"),

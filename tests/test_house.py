@@ -53,6 +53,7 @@ PURE = {
     ),
     "world.tick",
     "world.truth",
+    "world.driver",
     "world.sensors",
     "world.draws",
     "world.faults",
@@ -267,6 +268,8 @@ def loaded_by(module: str) -> set[str]:
     [
         ("compose.cli", {"zenoh", "numpy", "scipy", "rich"}),
         ("agent.process", {"world", "compose", "scipy", "rich"}),
+        ("world.field", {"numpy", "scipy", "rich", "agent", "compose", "rosbags"}),
+        ("compose.commands.robot", {"numpy", "scipy", "rich", "agent", "rosbags"}),
         ("world.process", {"numpy", "scipy", "rich", "agent", "compose"}),
         ("agent.planner", {"zenoh", "scipy", "rich", "world", "compose"}),
         ("compose.inline", {"zenoh", "rich"}),

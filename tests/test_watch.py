@@ -20,8 +20,20 @@ import pytest
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 from compose import inline
+from compose.record import read
 from compose.scenario import load
-from tests.commands import BOUND_S, PAPER_1, SECTION_IV, Command, journals, processes_of, tandem, until, world
+from tests.commands import (
+    BOUND_S,
+    ENDLESS,
+    PAPER_1,
+    SECTION_IV,
+    Command,
+    journals,
+    processes_of,
+    tandem,
+    until,
+    world,
+)
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 browsing = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium: apt-get install chromium")
@@ -29,6 +41,8 @@ BOUND_MS = 1000 * BOUND_S
 expect.set_options(timeout=BOUND_MS)
 SERVER_GONE = "ERR_CONNECTION_REFUSED|ERR_INCOMPLETE_CHUNKED_ENCODING"
 """what a browser says where a test has stopped the server"""
+FAST_TICKS = 1000
+"""about a second of a mission that nobody slows"""
 PATIENT = ("--patience", "600")
 """a mission that waits while browsers start"""
 SCRUB = "(scrub, tick) => { scrub.value = tick; scrub.dispatchEvent(new Event('input')); }"
@@ -354,6 +368,24 @@ def test_a_mission_is_followed_to_its_end_from_its_journals_and_from_the_network
 
 
 @browsing
+@browsing
+def test_a_page_keeps_up_with_a_mission_as_fast_as_it_goes(opened: Open, tmp_path: Path) -> None:
+    """By leaving out frames: thousands of ticks are past, and it is never far behind for long."""
+    scenario, out = tmp_path / "endless.toml", tmp_path / "out"
+    scenario.write_text(ENDLESS)
+    with Command("run", scenario, "--watch", "--out", out, "-q") as run:
+        page = opened(address_of(run))
+
+        def shown() -> int:
+            return int(page.evaluate("document.body.dataset.shown || -1"))
+
+        for tick in (FAST_TICKS, 2 * FAST_TICKS):
+            until(lambda tick=tick: shown() >= tick, f"tick {tick} is shown")  # type: ignore[misc]
+            until(lambda: len(read(out).moments) - shown() < FAST_TICKS // 2, "the page is nearly there")
+        assert run.tell(SIGINT)
+        assert run.ended().status == 130
+
+
 def test_run_watch_stays_until_ctrl_c_and_leaves_the_record_that_it_would_have_left(
     opened: Open, paper_1: Path, tmp_path: Path
 ) -> None:

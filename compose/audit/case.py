@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from typing import Protocol
 
 import msgspec
 
@@ -24,6 +25,14 @@ class Testimony(msgspec.Struct, frozen=True):
     disorder_tick: int | None = None
     missing: bool = False
     """there is no such journal"""
+
+
+class Testified(Protocol):
+    """What robots' journals tell, whoever else tells something."""
+
+    @property
+    def pasts(self) -> dict[str, Past]:
+        """Of the robots that tell one."""
 
 
 class Case(msgspec.Struct, frozen=True):
@@ -67,7 +76,7 @@ def case_of(journals: Mapping[str, Iterable[bytes]], folder: object) -> Case:
     for robot in told.scenario.robots:
         name = agent_journal(robot.id)
         frames = list(journals.get(name, ()))
-        testimony = _testimony(frames, f"{folder}/{name}") if name in journals else _NONE
+        testimony = testimony_of(frames, f"{folder}/{name}") if name in journals else _NONE
         if testimony.past is not None and testimony.past.briefing.robot != robot.id:
             raise CorruptJournal(f"{folder}/{name} is the journal of {testimony.past.briefing.robot}")
         testimonies[robot.id] = testimony
@@ -78,7 +87,8 @@ def case_of(journals: Mapping[str, Iterable[bytes]], folder: object) -> Case:
 _NONE = Testimony(None, missing=True)
 
 
-def _testimony(frames: list[bytes], source: object) -> Testimony:
+def testimony_of(frames: list[bytes], source: object) -> Testimony:
+    """What `frames` tell, as far as that can be followed. Raises CorruptJournal."""
     if not frames:
         return Testimony(None)
     try:

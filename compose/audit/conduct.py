@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from agent import radio
 from agent.past import Step
 from agent.robot import Robot
-from compose.audit.case import Case
+from compose.audit.case import Case, Testified
 from compose.audit.findings import Checks, Violation, between, difference, said
 from protocol.messages import End, Farewell, Message, Report
 from protocol.mission import Mission
@@ -18,7 +18,7 @@ ROUNDING = 1e-12
 """of a limit: how far rounding may put a quotient of lengths and periods beyond it"""
 
 
-def decision(case: Case) -> Checks:
+def decision(case: Testified) -> Checks:
     """Every Report, Drive, Estimate and Farewell is, to the bit, what the planner makes of what came in."""
     for robot, past in case.pasts.items():
         tick = None

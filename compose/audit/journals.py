@@ -20,7 +20,7 @@ def order(case: Case) -> Checks:
         if past is None:
             continue
         for step in past.steps:
-            yield _whole(robot, past, step, excused=case.forced)
+            yield whole(robot, past, step, excused=case.forced)
             yield _same_drive(case, robot, past, step)
         if past.end is not None and case.history.end is not None:
             yield _same_end(case, robot, past)
@@ -42,12 +42,9 @@ def _of_the_robot(case: Case, robot: str, testimony: Testimony) -> Violation | N
     past, end = testimony.past, case.history.end
     if testimony.missing:
         return Violation("order", None, robot, "it has left no journal", breaks_off=True)
-    if testimony.disorder is not None:
-        return Violation("order", testimony.disorder_tick, robot, testimony.disorder)
-    if past is None or past.farewell is None:
-        last = past.steps[-1].sense.tick if past is not None and past.steps else None
-        what = "its journal breaks off here, expected End and Farewell"
-        return Violation("order", last, robot, what, breaks_off=True)
+    off = broken_off(robot, testimony)
+    if past is None or off is not None:
+        return off
     if end is not None and len(past.steps) != end.tick + 1 and not case.forced:
         return Violation(
             "order", end.tick, robot, f"it went through {len(past.steps)} ticks, expected {end.tick + 1}"
@@ -55,7 +52,19 @@ def _of_the_robot(case: Case, robot: str, testimony: Testimony) -> Violation | N
     return None
 
 
-def _whole(robot: str, past: Past, step: Step, *, excused: bool) -> Violation | None:
+def broken_off(robot: str, testimony: Testimony) -> Violation | None:
+    """Where its journal is out of order, or breaks off."""
+    past = testimony.past
+    if testimony.disorder is not None:
+        return Violation("order", testimony.disorder_tick, robot, testimony.disorder)
+    if past is None or past.farewell is None:
+        last = past.steps[-1].sense.tick if past is not None and past.steps else None
+        what = "its journal breaks off here, expected End and Farewell"
+        return Violation("order", last, robot, what, breaks_off=True)
+    return None
+
+
+def whole(robot: str, past: Past, step: Step, *, excused: bool) -> Violation | None:
     """Every Sense was answered, but for the last: that may have come too late, or been the last of all."""
     tick, last = step.sense.tick, step is past.steps[-1]
     if last and (past.end is None or (excused and step.drive is None)):

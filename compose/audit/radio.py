@@ -35,7 +35,7 @@ def befallen(case: Case) -> tuple[Befallen, ...]:
 def _befallen(past: Past) -> Befallen:
     """Of the link to this robot."""
     contacts = [(step.sense.tick, contact) for step in past.steps for contact in step.sense.contacts]
-    heard = [(now, tick) for now, contact in contacts for tick in contact.heard]
+    heard = [(now, tick) for now, contact in contacts for tick in contact.heard or ()]
     damaged = [tick for _, contact in contacts for tick in contact.damaged]
     ticks = [tick for _, tick in heard]
     return Befallen(

@@ -2,6 +2,7 @@
 
 The world is moved by the Drives on record, and senses anew; every robot's planner is run on the Senses and
 Reports that came to its process. This is the judge's own doing: of his rules those that recompute something.
+Where there was no world, the robots' journals are held against themselves.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import msgspec
 
+from compose.audit.alone import judge_alone
 from compose.audit.case import Case
 from compose.audit.claims import outcome
 from compose.audit.conduct import decision
@@ -18,7 +20,7 @@ from compose.audit.findings import Checks, Violation
 from compose.audit.journals import briefing, order
 from compose.audit.judge import judge
 from compose.audit.wires import contact, report, sense
-from compose.record import books
+from compose.record import WORLD_JOURNAL, books
 
 RULES: tuple[Callable[[Case], Checks], ...] = (briefing, sense, contact, report, decision, order, outcome)
 """in the order of a tick: what differs first has caused what differs later"""
@@ -43,7 +45,7 @@ def replay(folder: Path) -> tuple[Replay, dict[str, int]]:
     Raises OSError if there is none, journal.CorruptJournal if a frame in it cannot be understood, or stands
     in the journal of another robot.
     """
-    found = books(folder)
+    found = books(folder, alone=True)
     told = replayed({name: book.frames for name, book in found.items()}, folder)
     return told, {name: book.torn for name, book in found.items()}
 
@@ -53,7 +55,8 @@ def replayed(journals: Mapping[str, Iterable[bytes]], folder: object = "the reco
 
     Raises journal.CorruptJournal like `replay`.
     """
-    findings = judge(journals, folder, RULES)
+    alone = WORLD_JOURNAL not in journals
+    findings = judge_alone(journals, folder) if alone else judge(journals, folder, RULES)
     return Replay(
         findings.scenario,
         findings.ticks,

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from agent.past import Past, Step
 from agent.robot import Told
-from compose.audit.case import Case
+from compose.audit.case import Case, Testified
 from compose.audit.findings import Checks, Violation, between, difference, said
 from protocol.wire import encode
 
@@ -43,7 +43,7 @@ def _sent(case: Case, robot: str, step: Step) -> Violation | None:
 
 
 def _listed(robot: str, step: Step) -> Violation | None:
-    listed = [tick for contact in step.sense.contacts for tick in contact.heard]
+    listed = [tick for contact in step.sense.contacts for tick in contact.heard or ()]
     heard = [told.report.tick for told in step.heard]
     if len(heard) + len(step.missed) == len(listed) and _in_order(heard, listed):
         return None
@@ -69,7 +69,7 @@ def _heard(case: Case, robot: str, step: Step, told: Told) -> Violation | None:
     return None
 
 
-def report(case: Case) -> Checks:
+def report(case: Testified) -> Checks:
     """Every report that was heard is, to the byte, what the peer has on record as sent."""
     for robot, past in case.pasts.items():
         peer = case.pasts.get(past.briefing.peer)

@@ -259,7 +259,7 @@ def _parts(scenarios: Sequence[Scenario]) -> tuple[float, float, float]:
             heard = time.perf_counter()
             drives = {}
             for sense in senses:
-                reports = [told[contact.peer] for contact in sense.contacts for _ in contact.heard]
+                reports = [told[contact.peer] for contact in sense.contacts for _ in contact.heard or ()]
                 drives[sense.robot] = robots[sense.robot].decide([one for one in reports if one is not None])
             decided = time.perf_counter()
             end = course.drive(drives)

@@ -33,7 +33,7 @@ def passages(stage: Stage, before: Facts | None, now: Facts) -> Iterator[Passage
         if sent:
             yield Passage(*link, now.tick, "sent")
         contact = contact_of(now, seat.peer, seat.id)
-        heard, damaged = (contact.heard, contact.damaged) if contact is not None else ((), ())
+        heard, damaged = (contact.heard or (), contact.damaged) if contact is not None else ((), ())
         yield from [Passage(*link, tick, "heard") for tick in heard]
         yield from [Passage(*link, tick, "damaged") for tick in damaged]
         if link in now.under_way and (before is None or link in before.under_way):

@@ -1,0 +1,64 @@
+"""A record without a world: what robots with drivers of their own have left, judged by what it tells itself.
+
+Nobody knows where they were; but what each decided must follow from what came in, and what it heard must be
+what its peer sent, where that is on record, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import msgspec
+
+from agent.past import Past
+from compose.audit.case import Testimony, testimony_of
+from compose.audit.conduct import decision
+from compose.audit.findings import Checks, Count, Findings, Violation
+from compose.audit.journals import broken_off, whole
+from compose.audit.wires import report
+from protocol.journal import CorruptJournal
+
+
+class Alone(msgspec.Struct, frozen=True):
+    """The robots' journals, and nothing else."""
+
+    testimonies: dict[str, Testimony]
+
+    @property
+    def pasts(self) -> dict[str, Past]:
+        """Of the robots that tell one."""
+        return {robot: one.past for robot, one in self.testimonies.items() if one.past is not None}
+
+
+def order(alone: Alone) -> Checks:
+    """Every journal is whole and in its order."""
+    for robot, testimony in alone.testimonies.items():
+        yield broken_off(robot, testimony)
+        past = testimony.past
+        for step in past.steps if past is not None else ():
+            assert past is not None
+            yield whole(robot, past, step, excused=True)
+
+
+def judge_alone(journals: Mapping[str, Iterable[bytes]], folder: object) -> Findings:
+    """What there is to find in the frames of `journals`, by name; `folder` is where errors say they are.
+
+    Raises CorruptJournal, whose text names the journal.
+    """
+    testimonies: dict[str, Testimony] = {}
+    for name, frames in journals.items():
+        testimony = testimony_of(list(frames), f"{folder}/{name}")
+        robot = name.removeprefix("agent-").removesuffix(".journal")
+        if testimony.past is not None and testimony.past.briefing.robot != robot:
+            raise CorruptJournal(f"{folder}/{name} is the journal of {testimony.past.briefing.robot}")
+        testimonies[robot] = testimony
+    alone = Alone(testimonies)
+    found = {"report": list(report(alone)), "decision": list(decision(alone)), "order": list(order(alone))}
+    violations: list[Violation] = [one for checks in found.values() for one in checks if one is not None]
+    violations.sort(key=lambda one: -1 if one.tick is None else one.tick)
+    return Findings(
+        f"{' and '.join(testimonies)}, without a world",
+        max([len(past.steps) for past in alone.pasts.values()], default=0),
+        tuple([Count(rule, len(checks), sum(1 for one in checks if one)) for rule, checks in found.items()]),
+        tuple(violations),
+    )

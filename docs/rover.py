@@ -1,0 +1,141 @@
+"""A robot that is nowhere but in its own process: a driver to copy from, and the ranging between two of them.
+
+    uv run docs/rover.py --port 4747 --reach 3                # the beacon: ranges one robot from the other
+    uv run tandem robot a --mission paper-1 --driver docs.rover:Rover --rate 4 --listen tcp/127.0.0.1:7447 \
+        --option start=2.4,-1.2,4.8 --option beacon=127.0.0.1:4747
+    uv run tandem robot b --mission paper-1 --driver docs.rover:Rover --rate 4 --connect tcp/127.0.0.1:7447 \
+        --option start=11.3,-0.4,3.6 --option beacon=127.0.0.1:4747
+
+There is no world: each robot moves by its own kinematics, and only the beacon, which stands for an
+ultra-wideband exchange between the two, hears from both where they are. Nobody tells the agents.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import socket
+import time
+
+from protocol.messages import Briefing
+from protocol.motion import REST, Controls, Pose, step, wrap
+from world.driver import Reading
+
+ASK_AGAIN_S = 0.05
+"""a datagram may be lost"""
+GIVE_UP_S = 10.0
+"""this robot has no drop-outs: rather than call silence what is none, it gives up"""
+
+
+class Rover:
+    """Wheels, odometry, an anchor's range and the peer's, all without error."""
+
+    def __init__(self, briefing: Briefing, manoeuvre_s: float, *, start: str = "", beacon: str = "") -> None:
+        """`start` is x,y,heading in <W>, which no agent is told; `beacon` HOST:PORT, or there is no peer."""
+        self._briefing = briefing
+        self._manoeuvre_s = manoeuvre_s
+        anchor = briefing.anchor
+        self.pose = (
+            Pose(*[float(word) for word in start.split(",")])
+            if start
+            else Pose(anchor.x + 0.1, anchor.y - 0.2, 0.7)
+        )
+        """where it truly was at the last reading"""
+        self._controls = REST
+        self._began = 0.0
+        self._done = 1.0
+        """how much of the manoeuvre is in `pose`"""
+        self._driven = REST
+        """since the last reading"""
+        self._tick = 0
+        host, _, port = beacon.rpartition(":")
+        self._radio = socket.socket(socket.AF_INET, socket.SOCK_DGRAM) if beacon else None
+        if self._radio is not None:
+            self._radio.settimeout(ASK_AGAIN_S)
+            self._radio.connect((host, int(port)))
+
+    def sense(self, tick: int) -> Reading:
+        """Where it has come to, and what is in range there."""
+        self._tick = tick
+        self._settle()
+        executed, self._driven = self._driven, REST
+        anchor, reach = self._briefing.anchor, self._briefing.mission.sensing_range
+        rho = math.hypot(self.pose.x - anchor.x, self.pose.y - anchor.y)
+        return Reading(executed, rho if rho <= reach else None, self._mutual_range(tick))
+
+    def drive(self, v: float, omega: float) -> None:
+        """Hold them for a manoeuvre; what was left of the one before is not driven any more."""
+        self._settle()
+        self._controls, self._began, self._done = Controls(v, omega), time.monotonic(), 0.0
+
+    def stop(self) -> None:
+        """Stand, and stay in range of whoever ranges it."""
+        self._settle()
+        if self._done < 1.0:
+            self._controls, self._done = REST, 1.0
+        self._tell(self._tick, parked=True)
+
+    def close(self) -> None:
+        """Nobody else will say where it was."""
+        if self._radio is not None:
+            self._radio.close()
+        x, y, heading = self.pose.x, self.pose.y, wrap(self.pose.heading)
+        print(f"{self._briefing.robot}: truly at {x:.9f} {y:.9f} {heading:+.9f}", flush=True)
+
+    def _settle(self) -> None:
+        """Move `pose` to where the wheels have come by now, and count what took it there."""
+        share = min(1.0, (time.monotonic() - self._began) / self._manoeuvre_s) - self._done
+        self._done += share
+        v, omega = self._controls.v * share, self._controls.omega * share
+        self.pose = step(self.pose, v, omega, self._briefing.mission.period)
+        self._driven = Controls(self._driven.v + v, self._driven.omega + omega)
+
+    def _mutual_range(self, tick: int) -> float | None:
+        """m; none if the peer, standing in the same tick, is out of range. Raises TimeoutError."""
+        give_up = time.monotonic() + GIVE_UP_S
+        while self._radio is not None and time.monotonic() < give_up:
+            self._tell(tick)
+            try:
+                said = json.loads(self._radio.recv(1024))
+            except (TimeoutError, ConnectionRefusedError):
+                continue
+            if said["tick"] == tick:
+                return said["range"] if said["range"] is None else float(said["range"])
+        if self._radio is None:
+            return None
+        raise TimeoutError(f"no answer of the beacon for {GIVE_UP_S:g} s")
+
+    def _tell(self, tick: int, *, parked: bool = False) -> None:
+        where = {"robot": self._briefing.robot, "peer": self._briefing.peer, "tick": tick, "parked": parked}
+        if self._radio is not None:
+            self._radio.send(json.dumps(where | {"x": self.pose.x, "y": self.pose.y}).encode())
+
+
+def main() -> None:
+    """The beacon: answers a robot once its peer stands in the same tick, or is parked."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("--port", type=int, default=0)
+    parser.add_argument("--reach", type=float, required=True, help="R, in m")
+    options = parser.parse_args()
+    air = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    air.bind(("127.0.0.1", options.port))
+    print(f"ranging at 127.0.0.1:{air.getsockname()[1]}", flush=True)
+    told: dict[tuple[str, str], tuple[float, float]] = {}
+    senders: dict[str, tuple[str, int]] = {}
+    while True:
+        message, sender = air.recvfrom(1024)
+        one = json.loads(message)
+        robot, peer, tick = one["robot"], one["peer"], one["tick"]
+        senders[robot] = sender
+        place = told.setdefault((robot, "parked" if one["parked"] else str(tick)), (one["x"], one["y"]))
+        other = told.get((peer, str(tick)), told.get((peer, "parked")))
+        if other is not None and not one["parked"]:
+            rho = math.dist(place, other)
+            answer = json.dumps({"tick": tick, "range": rho if rho <= options.reach else None}).encode()
+            for name in {robot, peer} & senders.keys():
+                air.sendto(answer, senders[name])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,135 @@
+"""Drivers that break the contract, each in one way."""
+
+from __future__ import annotations
+
+import math
+import time
+
+from msgspec.structs import replace
+
+from docs.rover import Rover
+from protocol.messages import Briefing
+from protocol.motion import REST, Controls
+from world.driver import Reading
+
+
+class TellsWhatWasAsked(Rover):
+    _asked = REST
+
+    def drive(self, v: float, omega: float) -> None:
+        self._asked = Controls(v, omega)
+        super().drive(v, omega)
+
+    def sense(self, tick: int) -> Reading:
+        asked, self._asked = self._asked, REST
+        return replace(super().sense(tick), executed=asked)
+
+
+class TurnsInDegrees(Rover):
+    def sense(self, tick: int) -> Reading:
+        reading = super().sense(tick)
+        executed = Controls(reading.executed.v, math.degrees(reading.executed.omega))
+        return replace(reading, executed=executed)
+
+
+class RangesInFeet(Rover):
+    def sense(self, tick: int) -> Reading:
+        reading = super().sense(tick)
+        rho = reading.anchor_range
+        return replace(reading, anchor_range=rho / 0.3048 if rho is not None else None)
+
+
+class RangesBeyondReach(Rover):
+    def sense(self, tick: int) -> Reading:
+        anchor = self._briefing.anchor
+        reading = super().sense(tick)
+        rho = math.hypot(self.pose.x - anchor.x, self.pose.y - anchor.y)
+        return replace(reading, anchor_range=rho)
+
+
+class RepeatsStaleRanges(Rover):
+    _stale: float | None = None
+
+    def sense(self, tick: int) -> Reading:
+        reading = super().sense(tick)
+        if tick % 2 == 0 or reading.anchor_range is None:
+            self._stale = reading.anchor_range
+        return replace(reading, anchor_range=self._stale)
+
+
+class MissesRanges(Rover):
+    def sense(self, tick: int) -> Reading:
+        reading = super().sense(tick)
+        return replace(reading, anchor_range=None) if tick == 4 else reading
+
+
+class TellsTheTickBefore(Rover):
+    _before = REST
+
+    def sense(self, tick: int) -> Reading:
+        reading = super().sense(tick)
+        late, self._before = self._before, reading.executed
+        return replace(reading, executed=late)
+
+
+class SkipsEverySecondTick(Rover):
+    _first: Reading | None = None
+
+    def sense(self, tick: int) -> Reading:
+        if tick % 2 == 1 and self._first is not None:
+            return self._first
+        self._first = super().sense(tick)
+        return self._first
+
+
+class DrivesWithoutEnd(Rover):
+    """Holds the last drive until another comes."""
+
+    def _settle(self) -> None:
+        super()._settle()
+        if self._done >= 1.0 and self._controls != REST:
+            self._began, self._done = self._began + self._manoeuvre_s, 0.0
+            if time.monotonic() > self._began:
+                self._settle()
+
+
+class DrivesOnAfterStop(Rover):
+    def stop(self) -> None:
+        pass
+
+
+class DrivesForTwiceAsLong(Rover):
+    def __init__(self, briefing: Briefing, manoeuvre_s: float) -> None:
+        super().__init__(briefing, manoeuvre_s)
+        self._manoeuvre_s = 2.0 * manoeuvre_s
+
+
+class DrivesInHalfTheTime(Rover):
+    """All of it, twice as fast."""
+
+    def __init__(self, briefing: Briefing, manoeuvre_s: float) -> None:
+        super().__init__(briefing, manoeuvre_s)
+        self._manoeuvre_s = 0.5 * manoeuvre_s
+
+
+class WaitsForItsWheels(Rover):
+    def drive(self, v: float, omega: float) -> None:
+        super().drive(v, omega)
+        time.sleep(0.5 * self._manoeuvre_s)
+
+
+class SensesNonsense(Rover):
+    def sense(self, tick: int) -> Reading:
+        reading = super().sense(tick)
+        return replace(reading, anchor_range=math.nan) if tick == 5 else reading
+
+
+class LosesItsSensors(Rover):
+    def sense(self, tick: int) -> Reading:
+        if tick == 3:
+            raise OSError("no such device")
+        return super().sense(tick)
+
+
+class NoDriver:
+    def sense(self, tick: int) -> None: ...

@@ -1,0 +1,164 @@
+"""A robot base as zenoh-bridge-ros2dds shows one: Twists in, Odometry and Ranges out, in CDR by pycdr2.
+
+Nothing of it is the driver's: its messages are declared here from ROS 2's own definitions (common_interfaces
+of humble). Annotations are looked at while the program runs, so they are no strings.
+"""
+
+import math
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import zenoh
+from pycdr2 import IdlStruct
+from pycdr2.types import array, float32, float64, int32, uint8, uint32
+
+from protocol import session
+from protocol.endpoints import listening
+from protocol.motion import Pose, step
+
+Covariance: Any = array[float64, 36]  # type: ignore[misc]
+PERIOD_S = 0.01
+"""of odometry and ranges"""
+WATCHDOG_S = 0.05
+"""without a Twist for so long, the base stands"""
+
+
+@dataclass
+class Time(IdlStruct, typename="builtin_interfaces/msg/Time"):
+    sec: int32 = 7
+    nanosec: uint32 = 8
+
+
+@dataclass
+class Header(IdlStruct, typename="std_msgs/msg/Header"):
+    stamp: Time = field(default_factory=Time)
+    frame_id: str = "odom"
+
+
+@dataclass
+class Vector3(IdlStruct, typename="geometry_msgs/msg/Vector3"):
+    x: float64 = 0.0
+    y: float64 = 0.0
+    z: float64 = 0.0
+
+
+@dataclass
+class Quaternion(IdlStruct, typename="geometry_msgs/msg/Quaternion"):
+    x: float64
+    y: float64
+    z: float64
+    w: float64
+
+
+@dataclass
+class Twist(IdlStruct, typename="geometry_msgs/msg/Twist"):
+    linear: Vector3 = field(default_factory=Vector3)
+    angular: Vector3 = field(default_factory=Vector3)
+
+
+@dataclass
+class RosPose(IdlStruct, typename="geometry_msgs/msg/Pose"):
+    position: Vector3
+    orientation: Quaternion
+
+
+@dataclass
+class PoseWithCovariance(IdlStruct, typename="geometry_msgs/msg/PoseWithCovariance"):
+    pose: RosPose
+    covariance: Covariance
+
+
+@dataclass
+class TwistWithCovariance(IdlStruct, typename="geometry_msgs/msg/TwistWithCovariance"):
+    twist: Twist
+    covariance: Covariance
+
+
+@dataclass
+class Odometry(IdlStruct, typename="nav_msgs/msg/Odometry"):
+    header: Header
+    child_frame_id: str
+    pose: PoseWithCovariance
+    twist: TwistWithCovariance
+
+
+@dataclass
+class Range(IdlStruct, typename="sensor_msgs/msg/Range"):
+    header: Header
+    radiation_type: uint8
+    field_of_view: float32
+    min_range: float32
+    max_range: float32
+    range: float32
+
+
+def odometry(pose: Pose) -> bytes:
+    at = RosPose(
+        Vector3(pose.x, pose.y, 0.0),
+        Quaternion(0.0, 0.0, math.sin(0.5 * pose.heading), math.cos(0.5 * pose.heading)),
+    )
+    zeros = [0.0] * 36
+    message = Odometry(
+        Header(), "base_link", PoseWithCovariance(at, zeros), TwistWithCovariance(Twist(), zeros)
+    )
+    return bytes(message.serialize())
+
+
+def ranged(rho: float, most: float = 100.0) -> bytes:
+    return bytes(Range(Header(frame_id="uwb"), 0, 0.1, 0.0, most, rho).serialize())
+
+
+def twist(payload: bytes) -> tuple[float, float]:
+    message: Any = Twist.deserialize(payload)
+    return message.linear.x, message.angular.z
+
+
+class Base:
+    """It moves as it is told, measures where it is, and stands when nobody tells it anything."""
+
+    def __init__(self, link: zenoh.Session, anchor: tuple[float, float], reach: float) -> None:
+        self.pose = Pose(0.3, -0.4, 3.0)
+        self._anchor = anchor
+        self._reach = reach
+        self._told = (0.0, 0.0)
+        self._at = 0.0
+        self._over = threading.Event()
+        self._odom = session.publisher(link, "bot/odom")
+        self._anchor_range = session.publisher(link, "bot/uwb")
+        self._peer_range = session.publisher(link, "bot/peer")
+        link.declare_subscriber("bot/cmd_vel", self._on_twist)
+
+    def _on_twist(self, sample: zenoh.Sample) -> None:
+        self._told, self._at = twist(sample.payload.to_bytes()), time.monotonic()
+
+    def run(self) -> None:
+        before = time.monotonic()
+        while not self._over.wait(PERIOD_S):
+            now = time.monotonic()
+            v, omega = self._told if now - self._at < WATCHDOG_S else (0.0, 0.0)
+            self.pose, before = step(self.pose, v, omega, now - before), now
+            rho = math.dist((self.pose.x, self.pose.y), self._anchor)
+            self._odom.put(odometry(self.pose))
+            self._anchor_range.put(ranged(rho if rho <= self._reach else math.inf))
+            self._peer_range.put(ranged(math.inf))
+
+    def end(self) -> None:
+        self._over.set()
+
+
+@contextmanager
+def base(endpoint: str, anchor: tuple[float, float], reach: float) -> Iterator[Base]:
+    """One that is there, behind its bridge at `endpoint`."""
+    with session.open_router(listening(endpoint)) as link:
+        found = Base(link, anchor, reach)
+        thread = threading.Thread(target=found.run)
+        thread.start()
+        try:
+            yield found
+        finally:
+            found.end()
+            thread.join()

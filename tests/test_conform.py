@@ -1,0 +1,91 @@
+"""`tandem conform`: the example keeps the contract, and each broken driver is told what it breaks."""
+
+from __future__ import annotations
+
+import pytest
+
+from compose.conformance import judged
+from compose.driving import briefed
+from compose.exercise import Trial
+from compose.scenario import load
+from tests import broken_drivers
+from tests.commands import tandem
+
+MANOEUVRE_S = 0.1
+BRIEFING = briefed(load("paper-1"), "a", MANOEUVRE_S)
+
+
+def test_the_example_keeps_the_contract() -> None:
+    ended = tandem("conform", "docs.rover:Rover", "--rate", "8")
+    assert ended.status == 0, ended.out
+    lines = [line for line in ended.out.splitlines() if "truly at" not in line]
+    assert len(lines) == 8
+    assert all(line.startswith("ok     ") for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("broken", "said"),
+    [
+        ("TellsWhatWasAsked", "it tells 1.00 of a manoeuvre that was stopped after 0.5"),
+        ("TurnsInDegrees", "asked was (0 m/s, 1 rad/s): degrees?"),
+        ("RangesInFeet", "ranges are 3.281 times as long as the path that the odometry tells of"),
+        ("RangesBeyondReach", "m to the anchor, beyond R = 3 m"),
+        ("RepeatsStaleRanges", "is the range of tick 4, to the bit"),
+        ("MissesRanges", "tick 4: no range, "),
+        ("TellsTheTickBefore", "it tells what was driven in tick 2"),
+        ("SkipsEverySecondTick", "it drove"),
+        ("DrivesWithoutEnd", "stands, as no drive comes: it drove"),
+        ("DrivesOnAfterStop", "it tells 1.00 of a manoeuvre that was stopped after 0.5"),
+        ("DrivesForTwiceAsLong", "m/s, 0 rad/s), asked was (0.5 m/s, 0 rad/s)"),
+        ("DrivesInHalfTheTime", "1.00 of the manoeuvre was driven in 0.5"),
+        ("WaitsForItsWheels", "of a manoeuvre, expected 0.05 at the most: it must not wait"),
+    ],
+)
+def test_a_broken_driver_is_told_what_it_breaks(broken: str, said: str) -> None:
+    driver = getattr(broken_drivers, broken)(BRIEFING, MANOEUVRE_S)
+    trial = Trial(driver, BRIEFING, MANOEUVRE_S)
+    trial.go_through()
+    assert said in "; ".join([one.wrong for one in judged(trial) if one.wrong is not None])
+
+
+@pytest.mark.parametrize(
+    ("broken", "said"),
+    [
+        (
+            "RangesInFeet",
+            "wrong  ranges to the anchor are in metres, and of the path that the odometry tells of: ",
+        ),
+        ("SensesNonsense", "the exercise can be gone through: after 'arc': sense(5): Expected"),
+        ("LosesItsSensors", "the exercise can be gone through: after 'straight': OSError: no such device"),
+    ],
+)
+def test_what_is_wrong_is_a_line_and_a_status(broken: str, said: str) -> None:
+    ended = tandem("conform", f"tests.broken_drivers:{broken}", "--rate", "10")
+    assert ended.status == 1
+    assert said in ended.out
+    assert ended.err == ""
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("docs.rover", "'docs.rover' is no driver; one looks like MODULE:CLASS"),
+        ("docs.nothing:Rover", "docs.nothing:Rover: there is no module 'docs.nothing'"),
+        ("docs.rover:Nobody", "docs.rover:Nobody: there is no 'Nobody' in docs.rover"),
+        ("tests.broken_drivers:NoDriver", "is no driver: it has no drive, stop, close"),
+    ],
+)
+def test_what_is_no_driver_is_one_line(name: str, said: str) -> None:
+    ended = tandem("conform", name)
+    assert ended.status == 2
+    assert ended.err.startswith("tandem conform: ")
+    assert said in ended.err
+    assert ended.err.count("\n") == 1
+
+
+def test_an_option_that_a_driver_does_not_know_is_one_line() -> None:
+    ended = tandem("conform", "docs.rover:Rover", "--option", "colour=red")
+    assert ended.status == 2
+    assert "docs.rover:Rover: cannot be made: TypeError: " in ended.err
+    assert "colour" in ended.err
+    assert ended.err.count("\n") == 1

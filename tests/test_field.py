@@ -1,0 +1,215 @@
+"""Without a world: robots with drivers of their own, each in its process, agree on where they are."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from signal import SIGCONT, SIGINT, SIGKILL, SIGSTOP
+
+import pytest
+from msgspec.structs import replace
+
+from agent.past import Past, past
+from compose.local import free_endpoint
+from protocol import journal
+from protocol.messages import Drive, OfRobot
+from protocol.motion import REST
+from protocol.wire import MAX_FRAME_BYTES, decode, encode
+from tests.commands import PAPER_1, Command, Ended, process_of, processes_of, tandem
+
+STARTS = {"a": "2.4,-1.2,4.8", "b": "11.3,-0.4,3.6"}
+ASSURED = PAPER_1.replace('"paper"', '"assured"').replace('name = "paper-1"', 'name = "field"')
+"""of the variant for which standing still is no harm"""
+
+
+@contextmanager
+def beacon() -> Iterator[str]:
+    """The third process, and where it is."""
+    command = [sys.executable, "-P", "docs/rover.py", "--reach", "3"]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": "."}
+    ) as process:
+        assert process.stdout is not None
+        try:
+            yield process.stdout.readline().split()[-1]
+        finally:
+            process.kill()
+
+
+@contextmanager
+def pair(out: Path, *more: str | Path, protocol: str = "tcp") -> Iterator[dict[str, Command]]:
+    """Both robots of paper-1's geometry, on their way."""
+    (out / "field.toml").write_text(ASSURED)
+    endpoint = free_endpoint(protocol)
+    with beacon() as air:
+
+        def robot(name: str, flag: str) -> Command:
+            return Command(
+                *("robot", name, "--mission", out / "field.toml", "--driver", "docs.rover:Rover"),
+                *("--rate", "6", flag, endpoint, *more, "--out", out / name, "--patience", "20"),
+                *("--option", f"start={STARTS[name]}", "--option", f"beacon={air}"),
+            )
+
+        with robot("b", "--connect") as b, robot("a", "--listen") as a:  # in any order
+            yield {"a": a, "b": b}
+
+
+def told(out: Path, robot: str) -> Past:
+    path = out / robot / f"agent-{robot}.journal"
+    return past(journal.read(path), path)
+
+
+def messages(frames: list[bytes]) -> list[object]:
+    return [decode(frame, OfRobot, MAX_FRAME_BYTES) for frame in frames]
+
+
+def pose(ended: Ended, robot: str, word: str) -> tuple[float, ...]:
+    (line,) = [line for line in ended.out.splitlines() if line.startswith(f"{robot}: {word}")]
+    return tuple(float(number) for number in line.removeprefix(f"{robot}: {word}").split()[:3])
+
+
+def both_localised(out: Path, robots: dict[str, Command]) -> None:
+    """Each is where it says, by its own kinematics, and its record follows from what came in."""
+    for name, robot in robots.items():
+        ended = robot.ended()
+        assert ended.status == 0, ended.out + ended.err
+        assert f"{name}: localised after" in ended.out
+        claimed, truly = pose(ended, name, "claims"), pose(ended, name, "truly at")
+        assert claimed == pytest.approx(truly, abs=1e-6)
+        assert not (out / name / "world.journal").exists()
+        replayed = tandem("replay", out / name)
+        assert replayed.status == 0, replayed.out
+        assert f"{name}, without a world: as recorded, to the bit" in replayed.out
+
+
+def test_two_robots_find_out_where_they_are_without_a_world(tmp_path: Path) -> None:
+    with pair(tmp_path) as robots:
+        both_localised(tmp_path, robots)
+    a, b = told(tmp_path, "a"), told(tmp_path, "b")
+    for one, other in ((a, b), (b, a)):
+        sent = {step.sense.tick for step in other.steps if step.report is not None}
+        heard = [report.report.tick for step in one.steps for report in step.heard]
+        assert heard
+        assert len(heard) == len(set(heard))
+        assert set(heard) <= sent
+        assert all(report.report.tick <= step.sense.tick for step in one.steps for report in step.heard)
+        assert all(step.sense.contacts for step in one.steps if step.heard)
+        assert one.farewell is not None
+        assert one.farewell.reports_heard == len(heard)
+        near = {step.sense.tick for step in one.steps if step.sense.contacts}
+        assert one.farewell.reports_lost == len(near - set(heard)) < len(near)
+        assert all(contact.heard is None for step in one.steps for contact in step.sense.contacts)
+    shutil.copy(tmp_path / "b" / "agent-b.journal", tmp_path / "a")
+    both = tandem("replay", tmp_path / "a")
+    assert both.status == 0
+    assert "a and b, without a world: as recorded, to the bit" in both.out
+
+
+def test_they_do_so_over_links_that_are_encrypted(tmp_path: Path) -> None:
+    assert tandem("keys", tmp_path / "keys", "--robots", "a,b").status == 0
+    with pair(tmp_path, "--keys", tmp_path / "keys" / "world", protocol="tls") as robots:
+        both_localised(tmp_path, robots)
+
+
+def test_a_decision_that_does_not_follow_is_found_without_a_world(tmp_path: Path) -> None:
+    with pair(tmp_path) as robots:
+        both_localised(tmp_path, robots)
+    path = tmp_path / "a" / "agent-a.journal"
+    frames = list(journal.read(path))
+    place, drive = next(
+        (i, one) for i, one in enumerate(messages(frames)) if isinstance(one, Drive) and one.v
+    )
+    frames[place] = encode(replace(drive, v=0.5 * drive.v))
+    path.unlink()
+    with journal.Journal(path) as changed:
+        changed.write(*frames)
+    replayed = tandem("replay", tmp_path / "a")
+    assert replayed.status == 1
+    assert f"tick {drive.tick}, a, Drive v: recorded {0.5 * drive.v}, recomputed {drive.v}" in replayed.out
+
+
+@pytest.mark.parametrize("killed", ["a", "b"])
+def test_a_robot_whose_agent_is_killed_stands_still_and_goes_on_from_its_record(
+    tmp_path: Path, killed: str
+) -> None:
+    with pair(tmp_path) as robots:
+        path = tmp_path / killed / f"agent-{killed}.journal"
+        robots[killed].until_written(path, 2500)
+        os.kill(process_of(tmp_path / killed, "agent", killed), SIGKILL)
+        robots[killed].until_says("was killed by signal 9, and is started again")
+        both_localised(tmp_path, robots)
+    stood = [step for step in told(tmp_path, killed).steps if step.sense.executed == REST and step.sense.tick]
+    assert stood
+    assert [step.sense.tick for step in told(tmp_path, killed).steps] == list(
+        range(len(told(tmp_path, killed).steps))
+    )
+
+
+def test_a_robot_whose_agent_is_stopped_stands_still_within_a_period_and_the_mission_goes_on(
+    tmp_path: Path,
+) -> None:
+    with pair(tmp_path) as robots:
+        path = tmp_path / "a" / "agent-a.journal"
+        robots["a"].until_written(path, 2500)
+        agent = process_of(tmp_path / "a", "agent", "a")
+        os.kill(agent, SIGSTOP)
+        before = len(told(tmp_path, "a").steps)
+        other = tmp_path / "b" / "agent-b.journal"
+        robots["b"].until(lambda: len(told(tmp_path, "b").steps) > before + 6, "b's mission goes on")
+        assert other.exists()
+        os.kill(agent, SIGCONT)
+        both_localised(tmp_path, robots)
+    steps = told(tmp_path, "a").steps
+    assert all(step.sense.executed == REST for step in steps[before + 2 : before + 6])
+
+
+def test_ctrl_c_ends_a_robot_and_leaves_nobody_behind(tmp_path: Path) -> None:
+    with pair(tmp_path) as robots:
+        robots["a"].until_written(tmp_path / "a" / "agent-a.journal", 1500)
+        for robot in robots.values():
+            robot.tell(SIGINT)
+        for name, robot in robots.items():
+            ended = robot.ended(20.0)
+            assert ended.status == 130
+            assert "stopped by SIGINT" in ended.err
+            assert "Traceback" not in ended.err
+            assert processes_of((tmp_path / name).resolve()) == {}
+
+
+def test_a_robot_whose_peer_does_not_come_has_not_moved(tmp_path: Path) -> None:
+    ended = tandem(
+        *("robot", "a", "--mission", "paper-1", "--driver", "docs.rover:Rover", "--rate", "10"),
+        *("--wait", "2", "--out", tmp_path / "out"),
+    )
+    assert ended.status == 3
+    assert ended.err.endswith("b: not there; nobody has moved\n")
+    assert ended.err.count("\n") == 1
+    assert processes_of(tmp_path / "out") == {}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("c", "--mission", "paper-1"), "paper-1: there is no robot 'c'; there are a, b"),
+        (("a", "--mission", "nowhere.toml"), "nowhere.toml: neither a file nor a scenario that ships"),
+        (("a", "--mission", "{faults}"), "fault: without a world, the radio is as it is"),
+        (("a", "--mission", "paper-1", "--option", "colour"), "--option: 'colour' is no option"),
+        (("a", "--mission", "paper-1", "--rate", "1e8"), "--rate: 1e+08 makes a tick of 1 s last"),
+        (("a", "--mission", "paper-1", "--listen", "7447"), "--listen: '7447' is no endpoint"),
+        (("a", "--mission", "paper-1", "--out", "{record}"), "holds a record of a already"),
+    ],
+)
+def test_a_mistake_is_one_line(tmp_path: Path, arguments: tuple[str, ...], said: str) -> None:
+    (tmp_path / "faults.toml").write_text(f"{PAPER_1}\n[[fault]]\nloss = 0.5\n")
+    (tmp_path / "agent-a.journal").touch()
+    words = [word.format(faults=tmp_path / "faults.toml", record=tmp_path) for word in arguments]
+    ended = tandem("robot", *words, "--driver", "docs.rover:Rover")
+    assert ended.status == 2
+    assert said in ended.err
+    assert ended.err.startswith("tandem robot: ")
+    assert ended.err.count("\n") == 1

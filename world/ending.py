@@ -1,0 +1,72 @@
+"""When a mission without a world is over for one robot, by what it says itself and by what it was told.
+
+Nobody there knows the truth, so nobody can call a claim wrong. A robot stays until it knows that its peer
+knows: reports go on a little after that, for the peer to learn the same.
+"""
+
+from __future__ import annotations
+
+import time
+
+from protocol.messages import Alarm, Briefing, Drive, End, Localised, Report, Undecided, Verdict
+
+LAST_WORDS = 4
+"""ticks in which a robot goes on telling, once it knows all that it must"""
+
+
+class Ending:
+    """What is known of both verdicts."""
+
+    def __init__(self, briefing: Briefing, max_ticks: int, patience: float) -> None:
+        self._peer = briefing.peer
+        self._me = briefing.robot
+        self._max_ticks = max_ticks
+        self._patience = patience
+        self.verdict: Verdict | None = None
+        """the robot's own"""
+        self._at = 0
+        """the tick of that"""
+        self._since = 0.0
+        """when it was, by the clock"""
+        self._peers: Verdict | None = None
+        self._acknowledged = -1
+        """the peer knows this robot's manoeuvres through this tick, and what it said then"""
+        self._known: int | None = None
+        """in which tick all was known"""
+
+    def told(self, report: Report) -> None:
+        """The peer has said `report`."""
+        self._acknowledged = max(self._acknowledged, report.heard)
+        self._peers = self._peers or report.verdict
+
+    def after(self, tick: int, drive: Drive | None, *, peer_there: bool) -> End | None:
+        """The End, if `tick` was the last, in which the robot gave `drive`; else none."""
+        if self.verdict is None and drive is not None and drive.verdict is not None:
+            self.verdict, self._at, self._since = drive.verdict, tick, time.monotonic()
+        if self.verdict is None:
+            if tick >= self._max_ticks:
+                return End(tick, "undecided", f"max_ticks: {self._me} not localised by then")
+            return None
+        acknowledged = self._acknowledged >= self._at
+        gone = not peer_there and self._peers is not None
+        if self._known is None and self._peers is not None and (acknowledged or gone):
+            self._known = tick
+        if self._known is not None and tick >= self._known + LAST_WORDS:
+            return self._end(tick)
+        if tick >= self._max_ticks or time.monotonic() - self._since > self._patience:
+            return self._end(tick)
+        return None
+
+    def _end(self, tick: int) -> End:
+        for who, other, verdict in (
+            (self._me, self._peer, self.verdict),
+            (self._peer, self._me, self._peers),
+        ):
+            match verdict:
+                case Alarm(claim):
+                    return End(tick, "alarm", f"{who}: {other} tells {claim}"[:300])
+                case Undecided(reason):
+                    return End(tick, "undecided", f"{who}: {reason}"[:300])
+        if isinstance(self._peers, Localised):
+            return End(tick, "localised", None)
+        return End(tick, "undecided", f"{self._me} is localised; {self._peer} was not heard to be")
