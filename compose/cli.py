@@ -120,16 +120,8 @@ def _parser() -> argparse.ArgumentParser:
 
     _add_sweep(command("sweep", "Play a campaign: many trials of a scenario, over axes of its fields."))
 
-    figures = command(
-        "figures", "Draw a record, into DIR/figures: the paper's figures, and each robot's mission."
-    )
-    figures.add_argument("record", type=_folder, metavar="DIR", help="where `tandem run --out DIR` left it")
-    figures.add_argument(
-        "--only", action="append", choices=PICTURES, metavar="NAME",
-        help=f"draw only these; again for more: {', '.join(PICTURES)}",
-    )  # fmt: skip
-    figures.add_argument(
-        "--format", action="append", choices=FORMATS, help="write only these; again for more (all three)"
+    _add_figures(
+        command("figures", "Draw a record, into DIR/figures: the paper's figures, and each robot's mission.")
     )
 
     watch = command("watch", "Serve a page on which a run is watched: a record, or what runs on a network.")
@@ -213,6 +205,17 @@ def _add_looking(doctor: argparse.ArgumentParser, ps: argparse.ArgumentParser) -
 
 def _add_listening(parser: argparse.ArgumentParser, what: str) -> None:
     parser.add_argument("--listen", action="append", default=[], metavar="ENDPOINT", help=what)
+
+
+def _add_figures(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("record", type=_folder, metavar="DIR", help="where `tandem run --out DIR` left it")
+    parser.add_argument(
+        "--only", action="append", choices=PICTURES, metavar="NAME",
+        help=f"draw only these; again for more: {', '.join(PICTURES)}",
+    )  # fmt: skip
+    parser.add_argument(
+        "--format", action="append", choices=FORMATS, help="write only these; again for more (all three)"
+    )
 
 
 def _add_keys(parser: argparse.ArgumentParser) -> None:

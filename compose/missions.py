@@ -126,18 +126,14 @@ class _Ear:
 
 
 def _mission(link: zenoh.Session, ear: _Ear, run: str, there: frozenset[str]) -> Mission:
-    named = ear.named(run, keys.sense) | ear.named(run, keys.drive)
     frames = [
         ear.latest[key(run, robot)] for key in (keys.sense, keys.drive) for robot in ear.named(run, key)
     ]
-    for robot in (
-        sorted(there - {""} - named) if "" in there else ()
-    ):  # in slow time nothing may have been said
-        answer = session.ask(link, keys.briefing(run, robot), ASK_S)
-        if not isinstance(answer, bytes):
-            break
-        frames.append(answer)
-        named |= _paired(answer)
+    answers = _briefings(link, run, ear.named(run, keys.sense) | there - {""}) if "" in there else {}
+    frames += answers.values()
+    briefed = [one for frame in answers.values() if (one := _said(frame, Briefing)) is not None]
+    named = there - {""} | ear.named(run, keys.sense) | ear.named(run, keys.drive)
+    named |= {one.peer for one in briefed}
     said = [_said(ear.latest.get(keys.sense(run, robot)), Sense | End | Farewell) for robot in named]
     ends = [one for one in said if isinstance(one, End)]
     return Mission(
@@ -148,9 +144,24 @@ def _mission(link: zenoh.Session, ear: _Ear, run: str, there: frozenset[str]) ->
         tuple(sorted({version for frame in frames if (version := version_of(frame)) is not None})),
         tuple(
             _participant(robot, robot in there, ear.latest.get(keys.drive(run, robot)))
-            for robot in sorted(named | there - {""})
+            for robot in sorted(named)
         ),
     )
+
+
+def _briefings(link: zenoh.Session, run: str, robots: set[str]) -> dict[str, bytes]:
+    """One of each pair, which names the other: where drivers stand in the world's place, nobody else does."""
+    found: dict[str, bytes] = {}
+    paired: set[str] = set()
+    until = time.monotonic() + ASK_S
+    for robot in sorted(robots):
+        if robot not in paired and time.monotonic() < until:
+            answer = session.ask(link, keys.briefing(run, robot), ASK_S)
+            if isinstance(answer, bytes):
+                found[robot] = answer
+                briefing = _said(answer, Briefing)
+                paired |= {briefing.peer} if briefing is not None else set()
+    return found
 
 
 def _participant(robot: str, there: bool, frame: bytes | None) -> Participant:
@@ -158,11 +169,6 @@ def _participant(robot: str, there: bool, frame: bytes | None) -> Participant:
     if not isinstance(drive, Drive):
         return Participant(robot, there)
     return Participant(robot, there, drive.tick, drive.phase, drive.state)
-
-
-def _paired(answer: bytes) -> set[str]:
-    briefing = _said(answer, Briefing)
-    return {briefing.robot, briefing.peer} if isinstance(briefing, Briefing) else set()
 
 
 def _said(frame: bytes | None, kind: Any) -> Any:

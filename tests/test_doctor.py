@@ -362,15 +362,17 @@ def start(
     return stack.enter_context(Command(*arguments, *where))
 
 
-FORGED = "Drives of b, Estimates of b, Reports of b, Senses of a, truth"
+FORGED = "robot/a/beat, robot/a/sense, robot/b/drive, robot/b/estimate, robot/b/to/a, world/truth"
+FORGED_BY_VIEWER = "robot/a/beat, robot/a/drive, robot/a/estimate, robot/a/sense, robot/a/to/a, world/truth"
+READ = "robot/b/drive, robot/b/sense, world/truth"
 
 
 @pytest.mark.parametrize(
     ("change", "fixes"),
     [
         (enforce, []),
-        (enforce_nothing, [f"can put {FORGED};", "can read Drives of b, Senses of b, the truth in mine;"]),
-        (let_read_truth, ["can put truth;", "can read the truth in mine;"]),
+        (enforce_nothing, [f"can put {FORGED};", f"can read {READ} in mine;"]),
+        (let_read_truth, ["can put world/truth;", "can read world/truth in mine;"]),
     ],
 )
 def test_rules_are_tried_while_a_mission_runs(
@@ -390,9 +392,7 @@ def test_rules_are_tried_while_a_mission_runs(
         assert line.startswith(f"rules: agent-a {words}")
     said = findings(ended, "ok")
     assert "rules: what agent-a puts as Reports of a passes" in said
-    assert ("rules: the truth, Drives of b, Senses of b in mine are not to be heard by agent-a" in said) is (
-        not fixes
-    )
+    assert (f"rules: agent-a hears nothing of {READ} in mine" in said) is (not fixes)
     assert said[-1] == "alive: mine: its world, by this protocol version; a's agent, too"
 
 
@@ -403,12 +403,10 @@ def test_a_page_that_could_speak_is_told(
     with router_by(keys, change, tmp_path) as endpoint:
         ended = tandem("doctor", "--connect", endpoint, "--keys", keys / "viewer")
     if passes:
-        only_fix(
-            ended, "rules: viewer can put Drives of a, Estimates of a, Reports of a, Senses of a, truth;"
-        )
+        only_fix(ended, f"rules: viewer can put {FORGED_BY_VIEWER};")
     else:
         assert findings(ended, "fix") == []
-        assert any("Drives of a" in one and "does not pass" in one for one in findings(ended, "ok"))
+        assert any("robot/a/drive" in one and "does not pass" in one for one in findings(ended, "ok"))
 
 
 def test_rules_that_do_not_name_the_robot_are_told(keys: Path, tmp_path: Path) -> None:
@@ -435,9 +433,7 @@ def test_what_cannot_be_tried_without_a_mission_that_moves_is_not_said_to_be_wel
         ended = tandem("doctor", *flags)
     assert findings(ended, "fix") == []
     (untried,) = findings(ended, "--")
-    assert untried.startswith(
-        "rules: reading the truth, Drives of b, Senses of b: mine did not move within 0.2 s"
-    )
+    assert untried.startswith(f"rules: reading {READ}: mine did not move within 0.2 s")
 
 
 # --- nobody is disturbed --------------------------------------------------------------------------------
@@ -472,4 +468,4 @@ def test_a_mission_beside_which_all_is_tried_leaves_the_record_of_one_alone(
             assert ended.status == 1
             assert ended.err == ""
         for doctor in doctors[:2]:
-            assert "the truth in mine" in doctor.out
+            assert "world/truth in mine" in doctor.out

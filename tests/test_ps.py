@@ -14,6 +14,7 @@ import pytest
 import zenoh
 
 from compose.local import free_endpoint
+from compose.scenario import load
 from protocol import keys, session
 from protocol.endpoints import at, listening
 from protocol.messages import Drive, End, Sense
@@ -194,6 +195,12 @@ def over(mission: Played) -> None:
     }
 
 
+def driven(mission: Played) -> None:
+    """As where a driver stands in the world's place for a: of b only the briefing tells."""
+    running(mission)
+    session.answer(mission.link, keys.briefing("r", "a"), lambda _: load("paper-1").briefing("a"))
+
+
 def foreign(mission: Played) -> None:
     running(mission)
     mission.frames = {key: bytes([VERSION + 1]) + frame[1:] for key, frame in mission.frames.items()}
@@ -219,6 +226,15 @@ def test_what_is_said_is_told_and_what_is_not_is_said_so(
 ) -> None:
     with played(start) as (_, endpoint):
         assert listed(endpoint, "--wait", "0.5") == [f"r at {endpoint}, {lines[0]}", f"  a  {lines[1]}"]
+
+
+def test_a_peer_of_whom_nothing_is_heard_is_missing() -> None:
+    with played(driven) as (_, endpoint):
+        assert listed(endpoint) == [
+            f"r at {endpoint}, tick 7, missing: b",
+            "  a  tick 7, phase 2, orbiting",
+            "  b  not there",
+        ]
 
 
 def test_nobody_is_made_to_tell_the_truth_or_an_estimate() -> None:

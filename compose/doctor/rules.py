@@ -13,6 +13,7 @@ from __future__ import annotations
 import random
 import time
 from collections.abc import Iterator, Mapping
+from inspect import signature
 from typing import Any, NamedTuple
 
 import zenoh
@@ -87,23 +88,26 @@ def _another(endpoints: Endpoints, me: str | None) -> str:
     return others[0] if others else "somebody-else"
 
 
+def _others(run: str, me: str, other: str) -> Iterator[tuple[str, str]]:
+    """A key of each kind under which `me` puts nothing, such as robot/b/drive, and the whole of it."""
+    for key, rule in keys.RULES.items():
+        if rule.way == "put":
+            named = {"run": run, "robot": other if rule.by == "robot" else me, "peer": me}
+            yield _short(whole := key(*(named[name] for name in signature(key).parameters))), whole
+
+
+def _short(key: str) -> str:
+    return key.split("/", 2)[2]
+
+
 def _forged(pair: Pair, who: str, me: str | None, other: str) -> Iterator[Finding]:
-    run = probe_run()
-    mine = me or other
-    said = {
-        "truth": keys.truth(run),
-        f"Senses of {mine}": keys.sense(run, mine),
-        f"Drives of {other}": keys.drive(run, other),
-        f"Reports of {other}": keys.report(run, other, mine),
-        f"Estimates of {other}": keys.estimate(run, other),
-    }
-    passed = sorted(pair.passed(said))
-    if passed:
+    said = dict(_others(probe_run(), me or other, other))
+    if passed := sorted(pair.passed(said)):
         yield fix(f"rules: {who} can put {', '.join(passed)}; {RENEW}")
     else:
-        yield ok(f"rules: what {who} puts as {', '.join(said)} does not pass")
+        yield ok(f"rules: what {who} puts as {', '.join(sorted(said))} does not pass")
     if me is not None:
-        if pair.passed({"Report": keys.report(run, me, me)}):
+        if pair.passed({"Report": keys.report(probe_run(), me, me)}):
             yield ok(f"rules: what {who} puts as Reports of {me} passes")
         else:
             yield fix(f"rules: what {who} puts as Reports of {me} does not pass; {RENEW}, with {me} in it")
@@ -121,11 +125,7 @@ def _overheard(pair: Pair, run: str, me: str, wait: float) -> Iterator[Finding]:
             f"rules: reading the truth of {run}: {me} has no part in it; try by a robot's keys that has"
         )
         return
-    forbidden = {
-        "the truth": keys.truth(run),
-        f"Drives of {peer}": keys.drive(run, peer),
-        f"Senses of {peer}": keys.sense(run, peer),
-    }
+    forbidden = {_short(key): key for key in (keys.truth(run), keys.drive(run, peer), keys.sense(run, peer))}
     latest: Any = zenoh.handlers.RingChannel(1)
     ears: dict[str, Any] = {
         name: pair.hearer.declare_subscriber(key, latest) for name, key in forbidden.items()
@@ -143,11 +143,11 @@ def _overheard(pair: Pair, run: str, me: str, wait: float) -> Iterator[Finding]:
         came |= {name for name, ear in ears.items() if ear.try_recv() is not None}
     for one in (own, *ears.values()):
         one.undeclare()
-    what = ", ".join(forbidden)
+    what = ", ".join(sorted(forbidden))
     if came:
         yield fix(f"rules: {access.agent(me)} can read {', '.join(sorted(came))} in {run}; {RENEW}")
     elif len(ticks) >= TICKS:
-        yield ok(f"rules: {what} in {run} are not to be heard by {access.agent(me)}")
+        yield ok(f"rules: {access.agent(me)} hears nothing of {what} in {run}")
     else:
         yield untried(
             f"rules: reading {what}: {run} did not move within {wait:g} s; try while it does (--wait)"
