@@ -11,6 +11,7 @@ from contextlib import ExitStack, contextmanager
 from datetime import timedelta
 from functools import partial
 from pathlib import Path
+from signal import Signals
 from typing import Any
 
 import pytest
@@ -30,6 +31,7 @@ from compose.reach import KEYED
 from protocol import keys as tree
 from protocol import session
 from protocol.endpoints import configured, listening
+from protocol.refusal import MUTE
 from protocol.wire import VERSION
 from tests.commands import ENDLESS, LONG, Command, Ended, tandem, world
 from tests.test_keys import expire, give_foreign, last, world_of
@@ -252,6 +254,21 @@ def test_who_is_refused_by_the_router_is_told_why_here_and_there(keys: Path, min
     assert link == f"router: no router at {endpoint}: this certificate has expired; check the certificate"
 
 
+@pytest.mark.parametrize("command", ["doctor", "ps"])
+def test_who_listens_and_never_says_a_word_is_waited_for_within_bounds_and_until_the_user_says_stop(
+    command: str,
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        endpoint = f"tcp/127.0.0.1:{mute.getsockname()[1]}"
+        with Command(command, *connect(endpoint)) as stopped:
+            mute.accept()[0].close()  # it has come as far as that
+            stopped.tell(Signals.SIGINT)
+            assert stopped.ended(within=5.0).status == -Signals.SIGINT
+        ended = tandem(command, *connect(endpoint))
+    assert ended.status == (1 if command == "doctor" else 3)
+    assert f"no router at {endpoint}: {MUTE}" in ended.out + ended.err
+
+
 def test_a_network_without_missions_is_said_to_be_one() -> None:
     endpoint = free_endpoint()
     with session.open_router(listening(endpoint)):
@@ -391,6 +408,7 @@ def test_rules_are_tried_while_a_mission_runs(
     for line, words in zip(found, fixes, strict=True):
         assert line.startswith(f"rules: agent-a {words}")
     said = findings(ended, "ok")
+    assert f"router: {endpoint} answers, over TLS" in said
     assert "rules: what agent-a puts as Reports of a passes" in said
     assert (f"rules: agent-a hears nothing of {READ} in mine" in said) is (not fixes)
     assert said[-1] == "alive: mine: its world, by this protocol version; a's agent, too"

@@ -15,7 +15,7 @@ from compose.doctor.finding import Finding, fix, ok, untried
 from compose.doctor.rules import ASK_S, Pair, probe_run
 from compose.linking import Unreached, linked
 from protocol import access, keys, session
-from protocol.endpoints import Endpoints
+from protocol.endpoints import Endpoints, is_encrypted
 from protocol.wire import VERSION, version_of
 
 APART_S = 60.0
@@ -37,8 +37,8 @@ def _at(endpoints: Endpoints, wait: float) -> Iterator[Finding]:
         except Unreached as error:
             yield fix(f"router: {error}")
             return
-        secured = "over TLS, by certificate" if endpoints.secured else "in the clear"
-        yield ok(f"router: {endpoints} answers, {secured}")
+        way = "over TLS" if all(map(is_encrypted, endpoints.connect)) else "in the clear"
+        yield ok(f"router: {endpoints} answers, {way}")
         yield from rules.tried(pair, endpoints, wait)
         yield _clock(pair, endpoints)
         yield from _missions(pair.hearer, endpoints, wait)
