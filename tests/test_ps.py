@@ -242,8 +242,9 @@ def test_nobody_is_made_to_tell_the_truth_or_an_estimate() -> None:
         assert "tick 7" in listed(endpoint)[0]
         assert not mission.wanted.is_set()
         with session.open_client(at(endpoint), unreachable) as page:  # which does
-            page.declare_subscriber(keys.truth("r"))
+            listens = page.declare_subscriber(keys.truth("r"))  # until it is forgotten
             assert mission.wanted.wait(BOUND_S)
+            del listens
 
 
 def unreachable() -> None:
