@@ -26,6 +26,17 @@ class _Parser(argparse.ArgumentParser):
         self.exit(USER_ERROR, one_line(f"{self.prog}: {message}") + "\n")
 
 
+class _Version(argparse.Action):
+    """Tells it, and ends."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
+        from compose import installed  # noqa: PLC0415  # it takes time
+        from protocol.wire import VERSION  # noqa: PLC0415
+
+        print(f"tandem {installed.version() or 'that is not installed'}, protocol version {VERSION}")
+        parser.exit()
+
+
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Parse, and do as told; ends the process."""
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115  # closed by whoever started this
@@ -61,6 +72,7 @@ def _leave_stream(stream: TextIO) -> None:
 def parser() -> argparse.ArgumentParser:
     """Of the whole command line."""
     tandem = _Parser(prog="tandem", description="Two robots find out together where they are.")
+    tandem.add_argument("--version", action=_Version, nargs=0, help="tell which version this is, and end")
     commands = tandem.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
 
     def command(name: str, what: str) -> argparse.ArgumentParser:
@@ -98,10 +110,9 @@ def parser() -> argparse.ArgumentParser:
     )
     for sub in (world, agent):
         _add_reaching(sub)
-        sub.add_argument(
-            "--listen", action="append", default=[], metavar="ENDPOINT",
-            help="be a router that listens there, such as tcp/127.0.0.1:7447; as often as you like",
-        )  # fmt: skip
+        _add_listening(
+            sub, "be a router that listens there, such as tcp/127.0.0.1:7447; as often as you like"
+        )
         sub.add_argument("--launched", action="store_true", help=argparse.SUPPRESS)  # by `tandem run`
         sub.add_argument("--kill", type=_kill, action="append", default=[], help=argparse.SUPPRESS)
         sub.add_argument("--fsync", action="store_true", help="the journal survives a power cut")
@@ -111,16 +122,8 @@ def parser() -> argparse.ArgumentParser:
 
     _add_sweep(command("sweep", "Play a campaign: many trials of a scenario, over axes of its fields."))
 
-    figures = command(
-        "figures", "Draw a record, into DIR/figures: the paper's figures, and each robot's mission."
-    )
-    figures.add_argument("record", type=_folder, metavar="DIR", help="where `tandem run --out DIR` left it")
-    figures.add_argument(
-        "--only", action="append", choices=PICTURES, metavar="NAME",
-        help=f"draw only these; again for more: {', '.join(PICTURES)}",
-    )  # fmt: skip
-    figures.add_argument(
-        "--format", action="append", choices=FORMATS, help="write only these; again for more (all three)"
+    _add_figures(
+        command("figures", "Draw a record, into DIR/figures: the paper's figures, and each robot's mission.")
     )
 
     watch = command("watch", "Serve a page on which a run is watched: a record, or what runs on a network.")
@@ -139,6 +142,11 @@ def parser() -> argparse.ArgumentParser:
     export.add_argument("--out", type=_folder, metavar="DIR", help="where the files go (where the record is)")
 
     _add_keys(command("keys", "Make certificates and access rules, for networks that are not trusted."))
+
+    _add_looking(
+        command("doctor", "Check what a mission needs of this machine, its keys and its network."),
+        command("ps", "List the missions on a network, and who takes part in them."),
+    )
 
     command("scenarios", "List the scenarios and the campaigns that ship.")
 
@@ -193,6 +201,31 @@ def _add_watch(parser: argparse.ArgumentParser) -> None:
         help="of the page (127.0.0.1); 0.0.0.0 in a container, whose port is published on loopback",
     )  # fmt: skip
     parser.add_argument("--launched", action="store_true", help=argparse.SUPPRESS)  # by `tandem run --watch`
+
+
+def _add_looking(doctor: argparse.ArgumentParser, ps: argparse.ArgumentParser) -> None:
+    for sub in (doctor, ps):
+        _add_reaching(sub)
+        sub.add_argument(
+            "--wait", type=_positive, default=2.0, metavar="S", help="how long to listen to missions (2)"
+        )
+    _add_listening(doctor, "where a world, an agent or a router is to listen; as often as you like")
+    ps.add_argument("--json", action="store_true", help="as JSON")
+
+
+def _add_listening(parser: argparse.ArgumentParser, what: str) -> None:
+    parser.add_argument("--listen", action="append", default=[], metavar="ENDPOINT", help=what)
+
+
+def _add_figures(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("record", type=_folder, metavar="DIR", help="where `tandem run --out DIR` left it")
+    parser.add_argument(
+        "--only", action="append", choices=PICTURES, metavar="NAME",
+        help=f"draw only these; again for more: {', '.join(PICTURES)}",
+    )  # fmt: skip
+    parser.add_argument(
+        "--format", action="append", choices=FORMATS, help="write only these; again for more (all three)"
+    )
 
 
 def _add_keys(parser: argparse.ArgumentParser) -> None:

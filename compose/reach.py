@@ -5,7 +5,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from msgspec.structs import replace
+
 from compose.status import UserError
+from protocol import access
 from protocol.endpoints import (
     BadConfiguration,
     BadEndpoint,
@@ -19,8 +22,12 @@ KEYED = "zenoh.json5"
 """the configuration in a participant's folder, which `tandem keys` makes"""
 
 
-def reach(options: argparse.Namespace, who: str) -> Endpoints:
-    """The endpoints of `who`: "world", "viewer", or a robot's "agent-ID". Raises UserError."""
+DEFAULT_ADDRESS = "127.0.0.1:7447"
+"""where viewers look for missions"""
+
+
+def reach(options: argparse.Namespace, who: str | None) -> Endpoints:
+    """The endpoints of `who`: "world", "viewer", a robot's "agent-ID", or anybody's. Raises UserError."""
     connect, listen = tuple(options.connect), tuple(getattr(options, "listen", ()))
     file = _keyed(options.keys) if options.keys is not None else options.config
     for flag, endpoints in (("--connect", connect), ("--listen", listen)):
@@ -32,9 +39,17 @@ def reach(options: argparse.Namespace, who: str) -> Endpoints:
         found = configured(file, connect, listen)
     except BadConfiguration as error:
         raise UserError(f"{'--config' if options.keys is None else '--keys'}: {error}") from None
-    if options.keys is not None and found.participant != who:
+    if options.keys is not None and who is not None and found.participant != who:
         raise UserError(f"--keys: {options.keys} is the folder of {found.participant}, not of {who}")
     return found
+
+
+def places(options: argparse.Namespace) -> list[Endpoints]:
+    """Where a viewer looks for missions, each of which may be anywhere else. Raises UserError."""
+    found = reach(options, access.VIEWER)
+    if not found.connect:
+        return [replace(found, connect=(f"{'tls' if options.keys else 'tcp'}/{DEFAULT_ADDRESS}",))]
+    return [replace(found, connect=(one,)) for one in found.connect] if options.connect else [found]
 
 
 def _check(flag: str, endpoint: str, *, keyed: bool, configured: bool) -> None:

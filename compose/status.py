@@ -11,6 +11,8 @@ CLEAN = 0
 """of an audit: nothing was found"""
 VIOLATED = 1
 """something was"""
+AMISS = 1
+"""a check of `tandem doctor` failed"""
 USER_ERROR = 2
 FAILED = 3
 """the run itself was lost"""

@@ -67,7 +67,8 @@ def _refused(endpoints: Endpoints, link: socket.socket, host: str) -> str:
         context.check_hostname = endpoints.setting("transport/link/tls/verify_name_on_connect") is not False
         certificate = endpoints.file("transport/link/tls/connect_certificate")
         if certificate is not None:
-            context.load_cert_chain(certificate, endpoints.file("transport/link/tls/connect_private_key"))
+            key = endpoints.file("transport/link/tls/connect_private_key")
+            context.load_cert_chain(certificate, key, password="")  # or it would ask the terminal
     except (OSError, ValueError) as error:
         return f"the certificates here cannot be used: {error}"
     try:

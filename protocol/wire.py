@@ -42,6 +42,11 @@ def is_sound(frame: bytes) -> bool:
     return len(frame) > _HEAD.size and _HEAD.unpack_from(frame) == (VERSION, zlib.crc32(frame[_HEAD.size :]))
 
 
+def version_of(frame: bytes) -> int | None:
+    """The version of the protocol that `frame` is of, if it is long enough to be a frame."""
+    return frame[0] if len(frame) > _HEAD.size else None
+
+
 @overload
 def decode(frame: bytes, kind: type[M], limit: int = ...) -> M: ...
 @overload

@@ -216,14 +216,18 @@ def authority_of(keys: Path) -> certificates.Authority:
     return certificates.Authority(x509.load_pem_x509_certificate((keys / "ca.pem").read_bytes()), key)
 
 
-def expire(own: Path, keys: Path) -> None:
-    """Its certificate is one that has ended an hour ago."""
+def last(own: Path, keys: Path, lasts: timedelta) -> None:
+    """Its certificate is one that ends so long from now."""
     key = load_pem_private_key((own / "key.pem").read_bytes(), None)
     assert isinstance(key, ec.EllipticCurvePrivateKey)
     name = "world" if own.name == "world" else "agent-a"
-    lasted = timedelta(hours=-1)
-    old = certificates.issue(authority_of(keys), name, key.public_key(), certificates.LOOPBACK, lasted)
-    (own / "cert.pem").write_bytes(old.public_bytes(Encoding.PEM))
+    issued = certificates.issue(authority_of(keys), name, key.public_key(), certificates.LOOPBACK, lasts)
+    (own / "cert.pem").write_bytes(issued.public_bytes(Encoding.PEM))
+
+
+def expire(own: Path, keys: Path) -> None:
+    """Its certificate is one that has ended an hour ago."""
+    last(own, keys, timedelta(hours=-1))
 
 
 def give_foreign(own: Path, _keys: Path) -> None:

@@ -11,8 +11,6 @@ import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from msgspec.structs import replace
-
 from compose.beside import OVER
 from compose.lab import need
 from compose.status import ENDED, UserError
@@ -20,7 +18,6 @@ from protocol.inbox import one_line
 
 if TYPE_CHECKING:
     from compose.watch.site import Site
-    from protocol.endpoints import Endpoints
 
 NICENESS = 10
 """the mission's processes come first"""
@@ -32,7 +29,9 @@ def main(options: argparse.Namespace) -> int:
     from compose.watch import server, site  # noqa: PLC0415  # there may be no extra
 
     if options.record is None:
-        shown = site.of_network(_places(options))
+        from compose.reach import places  # noqa: PLC0415  # a record needs no network
+
+        shown = site.of_network(places(options))
     elif options.connect or options.config or options.keys:
         flag = "--connect" if options.connect else "--config" if options.config else "--keys"
         raise UserError(f"{flag}: a record needs no network; leave out one of the two")
@@ -65,19 +64,6 @@ def main(options: argparse.Namespace) -> int:
     finally:
         shown.stop()
     return ENDED
-
-
-def _places(options: argparse.Namespace) -> list[Endpoints]:
-    """Where missions run, each of which may be anywhere else. Raises UserError."""
-    from compose.reach import reach  # noqa: PLC0415  # a record needs no network
-
-    found = reach(options, "viewer")
-    if not found.connect:
-        return [replace(found, connect=(f"{'tls' if options.keys else 'tcp'}/{DEFAULT_ADDRESS}",))]
-    return [replace(found, connect=(one,)) for one in found.connect] if options.connect else [found]
-
-
-DEFAULT_ADDRESS = "127.0.0.1:7447"
 
 
 def _follow_launcher(shown: Site, stop: Callable[[], None]) -> None:

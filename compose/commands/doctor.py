@@ -1,0 +1,25 @@
+"""`tandem doctor`: what a mission needs of this machine, its keys and its network, a line each."""
+
+from __future__ import annotations
+
+import argparse
+from itertools import chain
+
+from compose.doctor.finding import FIX
+from compose.doctor.machine import ports, versions
+from compose.doctor.network import network
+from compose.doctor.papers import papers
+from compose.reach import reach
+from compose.status import AMISS, CLEAN
+from protocol.inbox import one_line
+
+
+def main(options: argparse.Namespace) -> int:
+    """Check everything, whatever of it fails."""
+    endpoints = reach(options, None)
+    status = CLEAN
+    checks = (versions(), ports(endpoints), papers(endpoints), network(endpoints, options.wait))
+    for finding in chain.from_iterable(checks):
+        print(one_line(str(finding)), flush=True)
+        status = AMISS if finding.mark == FIX else status
+    return status

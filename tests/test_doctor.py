@@ -1,0 +1,489 @@
+"""`tandem doctor`: each check passes where all is well, and is provoked to fail; no mission is disturbed."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from datetime import timedelta
+from functools import partial
+from pathlib import Path
+from signal import Signals
+from typing import Any
+
+import pytest
+from cryptography.hazmat.primitives.serialization import (
+    BestAvailableEncryption,
+    Encoding,
+    PrivateFormat,
+    load_pem_private_key,
+)
+
+from compose import installed
+from compose.doctor.network import APART_S, compared
+from compose.doctor.papers import papers
+from compose.installed import Library
+from compose.local import free_endpoint
+from compose.reach import KEYED
+from protocol import keys as tree
+from protocol import session
+from protocol.endpoints import configured, listening
+from protocol.refusal import MUTE
+from protocol.wire import VERSION
+from tests.commands import ENDLESS, LONG, Command, Ended, tandem, world
+from tests.test_keys import expire, give_foreign, last, world_of
+from tests.test_topologies import Router, connect, listen, record_of, routing, same
+
+
+@pytest.fixture(scope="module")
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Those of a mission of a and b; nobody changes anything in it."""
+    folder = tmp_path_factory.mktemp("keys") / "keys"
+    assert tandem("keys", folder, "--robots", "a,b").status == 0
+    return folder
+
+
+@pytest.fixture
+def mine(keys: Path, tmp_path: Path) -> Path:
+    """Those of a, to be spoilt."""
+    shutil.copytree(keys / "agent-a", tmp_path / "mine")
+    return tmp_path / "mine"
+
+
+def findings(ended: Ended, mark: str) -> list[str]:
+    """What the lines of that mark say; all lines have one, and the status goes with them."""
+    assert ended.err == ""
+    lines = ended.out.splitlines()
+    assert all(re.match(r"(ok |fix|--) ", line) for line in lines), ended.out
+    assert ended.status == any(line.startswith("fix") for line in lines)
+    return [line[4:] for line in lines if line.startswith(mark)]
+
+
+def only_fix(ended: Ended, *words: str) -> None:
+    """One thing is to be done, and it is said in these words."""
+    (found,) = findings(ended, "fix")
+    for word in words:
+        assert word in found
+
+
+# --- this machine ---------------------------------------------------------------------------------------
+
+
+def test_versions_are_told(tmp_path: Path) -> None:
+    ended = tandem("doctor")
+    (said,) = findings(ended, "ok")
+    for name in ("python 3.", "eclipse-zenoh 1.", "numpy ", "scipy ", "msgpack ", "msgspec "):
+        assert name in said
+    assert f"tandem-ranging {installed.version()}" in said
+    assert said.endswith(f"protocol version {VERSION}")
+    assert findings(ended, "--") == ["network: there is no --connect"]
+    assert tandem("--version", cwd=tmp_path) == (
+        0,
+        f"tandem {installed.version()}, protocol version {VERSION}\n",
+        "",
+    )
+
+
+def test_a_library_that_is_too_old_is_to_be_installed_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "numpy-1.26.4.dist-info").mkdir()
+    (tmp_path / "numpy-1.26.4.dist-info" / "METADATA").write_text("Name: numpy\nVersion: 1.26.4\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    only_fix(tandem("doctor"), "versions: numpy 1.26.4; tandem-ranging", "needs <3,>=2.2: install it anew")
+
+
+@pytest.mark.parametrize(
+    ("version", "fits"),
+    [
+        ("1.9.9", False),
+        ("1.10", True),
+        ("1.10.0", True),
+        ("1.10.2rc1", True),
+        ("2.0.0", False),
+        ("2", False),
+        (None, False),
+    ],
+)
+def test_a_library_fits_within_its_bounds(version: str | None, fits: bool) -> None:
+    assert Library("eclipse-zenoh", version, "<2,>=1.10").fits is fits
+
+
+def test_a_port_that_is_free_is_told_and_one_that_is_taken_is_to_be_freed() -> None:
+    free, taken = free_endpoint(), free_endpoint()
+    with session.open_router(listening(taken)):
+        ended = tandem("doctor", *listen(free, taken))
+    assert f"port: {free} is free" in findings(ended, "ok")
+    only_fix(ended, f"port: {taken}: taken; end the process that has it")
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "words"),
+    [
+        ("tcp/192.0.2.1:7447", "no address of this machine; `ip address` lists those"),
+        ("tcp/nowhere.invalid:7447", "there is no host 'nowhere.invalid'"),
+    ],
+)
+def test_a_place_that_is_not_of_this_machine_is_none_to_listen_at(endpoint: str, words: str) -> None:
+    first, exposed = findings(tandem("doctor", "--listen", endpoint), "fix")
+    assert first.startswith(f"port: {endpoint}: {words}")
+    assert exposed.startswith("port: listening beyond this machine without --keys")
+
+
+def test_a_port_with_the_remains_of_an_old_link_is_free() -> None:
+    endpoint = free_endpoint()
+    port = int(endpoint.rpartition(":")[2])
+    with socket.socket() as server:
+        server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        server.bind(("127.0.0.1", port))
+        server.listen()
+        with socket.create_connection(("127.0.0.1", port)) as client:
+            accepted, _ = server.accept()
+            accepted.close()  # who closes first keeps the port for a minute
+            client.recv(1)
+    assert findings(tandem("doctor", "--listen", endpoint), "fix") == []
+
+
+# --- keys -----------------------------------------------------------------------------------------------
+
+
+def test_keys_that_were_made_just_now_are_well(keys: Path) -> None:
+    for name in ("agent-a", "world", "router", "viewer"):
+        ended = tandem("doctor", "--keys", keys / name)
+        assert findings(ended, "fix") == []
+        said = findings(ended, "ok")
+        own = keys / name
+        assert f"key: only its owner reads {own / 'key.pem'}" in said
+        assert f"certificate: ca.pem signs {own / 'cert.pem'}, which is of {name}" in said
+        assert f"names: certificate and configuration are of {name}" in said
+        assert any(one.startswith(f"certificate: {own / 'cert.pem'} is valid until") for one in said)
+
+
+def let_read(own: Path, _keys: Path) -> None:
+    (own / "key.pem").chmod(0o640)
+
+
+def soon(own: Path, keys: Path) -> None:
+    last(own, keys, timedelta(days=20, hours=1))
+
+
+def mix_keys(own: Path, keys: Path) -> None:
+    shutil.copy(keys / "agent-b" / "key.pem", own / "key.pem")
+
+
+def mix_names(own: Path, keys: Path) -> None:
+    for name in ("cert.pem", "key.pem"):
+        shutil.copy(keys / "agent-b" / name, own / name)
+
+
+def lock(own: Path, _keys: Path) -> None:
+    key = load_pem_private_key((own / "key.pem").read_bytes(), None)
+    locked = BestAvailableEncryption(b"secret")
+    (own / "key.pem").write_bytes(key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, locked))
+
+
+def spoil(own: Path, _keys: Path) -> None:
+    (own / "cert.pem").write_text("nonsense")
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (expire, ("cert.pem has expired on 20", "make it anew by `tandem keys`")),
+        (soon, ("cert.pem expires on 20", "in 20 days")),
+        (give_foreign, ("cert.pem is refused by", "ca.pem: unable to get local issuer certificate")),
+        (let_read, ("others than its owner can read", "chmod 600")),
+        (mix_keys, ("key.pem is not its key",)),
+        (mix_names, ("cert.pem is of agent-b, and", f"{KEYED} of agent-a; copy the folder of agent-a")),
+        (lock, ("certificate: ", "cert.pem: with key.pem and ca.pem it cannot be read")),
+        (spoil, ("certificate: ", "cert.pem: with key.pem and ca.pem it cannot be read")),
+    ],
+)
+def test_a_key_that_is_not_well_is_told(
+    damage: Callable[[Path, Path], None], words: tuple[str, ...], keys: Path, mine: Path
+) -> None:
+    assert findings(tandem("doctor", "--keys", mine), "fix") == []
+    damage(mine, keys)
+    only_fix(tandem("doctor", "--keys", mine), *words)
+
+
+def test_the_folder_of_another_robot_is_told(keys: Path, tmp_path: Path) -> None:
+    wrong = shutil.copytree(keys / "agent-b", tmp_path / "agent-a")
+    words = f"names: the folder {wrong} holds the keys of agent-b; copy the one of agent-a"
+    only_fix(tandem("doctor", "--keys", wrong), words)
+
+
+def test_a_certificate_that_does_not_name_where_its_owner_listens_is_told(keys: Path) -> None:
+    where = free_endpoint("tls")
+    assert findings(tandem("doctor", "--keys", keys / "world", "--listen", where), "fix") == []
+    where = where.replace("127.0.0.1", "127.0.0.2")
+    words = ("cert.pem does not name 127.0.0.2", "with --host 127.0.0.2")
+    only_fix(tandem("doctor", "--keys", keys / "world", "--listen", where), *words)
+
+
+def test_a_certificate_is_not_valid_before_its_time(mine: Path) -> None:
+    found = list(papers(configured(mine / KEYED), now=0.0))
+    assert [one.mark for one in found if "is not valid before" in one.text] == [
+        "fix",
+        "fix",
+    ]  # its own, the CA's
+
+
+# --- the network ----------------------------------------------------------------------------------------
+
+
+def test_an_endpoint_where_nobody_is_is_told_with_what_to_check() -> None:
+    nowhere = free_endpoint()
+    with world("paper-1", "--run", "mine") as (_, endpoint):
+        ended = tandem("doctor", *connect(nowhere, endpoint))
+    only_fix(ended, f"router: no router at {nowhere}: nobody listens there; check the address")
+    said = findings(ended, "ok")
+    assert f"router: {endpoint} answers, in the clear" in said
+    assert any(re.fullmatch(r"clock: the router's is this host's, to 0\.\d+ s", one) for one in said)
+    assert said[-1] == "alive: mine: its world, all by this protocol version; not there: a, b"
+
+
+def test_who_is_refused_by_the_router_is_told_why_here_and_there(keys: Path, mine: Path) -> None:
+    expire(mine, keys)
+    with world_of(keys) as endpoint:
+        own, link = findings(tandem("doctor", "--keys", mine, "--connect", endpoint), "fix")
+    assert "cert.pem has expired" in own
+    assert link == f"router: no router at {endpoint}: this certificate has expired; check the certificate"
+
+
+@pytest.mark.parametrize("command", ["doctor", "ps"])
+def test_who_listens_and_never_says_a_word_is_waited_for_within_bounds_and_until_the_user_says_stop(
+    command: str,
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        endpoint = f"tcp/127.0.0.1:{mute.getsockname()[1]}"
+        with Command(command, *connect(endpoint)) as stopped:
+            mute.accept()[0].close()  # it has come as far as that
+            stopped.tell(Signals.SIGINT)
+            assert stopped.ended(within=5.0).status == -Signals.SIGINT
+        ended = tandem(command, *connect(endpoint))
+    assert ended.status == (1 if command == "doctor" else 3)
+    assert f"no router at {endpoint}: {MUTE}" in ended.out + ended.err
+
+
+def test_a_network_without_missions_is_said_to_be_one() -> None:
+    endpoint = free_endpoint()
+    with session.open_router(listening(endpoint)):
+        ended = tandem("doctor", *connect(endpoint))
+    assert findings(ended, "ok")[-1] == "alive: nobody; no mission is on this network"
+    assert findings(ended, "--") == ["rules: there are none to try without --keys"]
+
+
+@contextmanager
+def of_another_version(keys: Path) -> Iterator[str]:
+    """The endpoint of a world that answers by a later version of the protocol."""
+    endpoint = free_endpoint("tls")
+    with session.open_router(configured(keys / "world" / KEYED, listen=[endpoint])) as link:
+
+        def brief(query: Any) -> None:
+            query.reply(query.key_expr, bytes([VERSION + 1]) + b"whatever it says")
+
+        link.declare_queryable(tree.briefing("r", "*"), brief)
+        tokens = [
+            session.show_alive(link, key) for key in (tree.world_alive("r"), tree.robot_alive("r", "b"))
+        ]
+        yield endpoint
+        del tokens
+
+
+@pytest.mark.parametrize("who", ["agent-a", "viewer"])
+def test_a_world_of_another_protocol_version_is_told(who: str, keys: Path) -> None:
+    with of_another_version(keys) as endpoint:
+        flags = ("--connect", endpoint, "--keys", keys / who, "--wait", "0.2")
+        only_fix(
+            tandem("doctor", *flags),
+            f"versions: r speaks protocol version {VERSION + 1}, and this machine {VERSION}; install",
+        )
+
+
+def test_a_robot_that_the_world_does_not_know_is_told(keys: Path, tmp_path: Path) -> None:
+    everybody = shutil.copytree(keys, tmp_path / "keys")
+    assert tandem("keys", everybody, "--robots", "c").status == 0
+    endpoint = free_endpoint("tls")
+    arguments = ("world", "paper-1", "--run", "mine", "--listen", endpoint, "--keys", everybody / "world")
+    with Command(*arguments) as part:
+        part.until_says("waiting for")
+        ended = tandem("doctor", "--connect", endpoint, "--keys", everybody / "agent-c")
+    only_fix(ended, "alive: mine: this world has no robot 'c'; it has a, b")
+
+
+@pytest.mark.parametrize(
+    ("ahead", "took", "mark", "words"),
+    [
+        (0.001, 0.002, "ok", "this host's, to 0.002 s"),
+        (5.0, 0.5, "ok", "between 4.500 and 5.000 s ahead"),
+        (-3.0, 0.5, "ok", "between 3.000 and 3.500 s behind"),
+        (APART_S + 2.0, 1.0, "fix", "ahead; set one of the two (`timedatectl`)"),
+        (-APART_S - 0.1, 1.0, "fix", "behind; set one of the two (`timedatectl`)"),
+        (APART_S + 0.5, 1.0, "ok", "which no decision depends on"),
+    ],
+)
+def test_clocks_are_compared_as_far_as_can_be_told(ahead: float, took: float, mark: str, words: str) -> None:
+    found = compared(ahead, took)
+    assert found.mark == mark
+    assert words in found.text
+
+
+# --- access rules ---------------------------------------------------------------------------------------
+
+
+def let_read_truth(settings: dict[str, Any]) -> None:
+    """A rule that somebody has added, who wanted to see something."""
+    rules = settings["access_control"]
+    rules["rules"].append(
+        {
+            "id": "curious",
+            "permission": "allow",
+            "flows": ["ingress", "egress"],
+            "messages": ["put", "declare_subscriber"],
+            "key_exprs": ["tandem/*/world/truth"],
+        }
+    )
+    subject = next(one for one in rules["subjects"] if one["id"] == "agent-a")
+    rules["policies"].append({"subjects": [subject["id"]], "rules": ["curious"]})
+
+
+def enforce_nothing(settings: dict[str, Any]) -> None:
+    settings["access_control"]["enabled"] = False
+
+
+def enforce(_settings: dict[str, Any]) -> None:
+    """As it is."""
+
+
+@contextmanager
+def router_by(keys: Path, change: Callable[[dict[str, Any]], None], folder: Path) -> Iterator[str]:
+    """The endpoint of a router, whose configuration somebody has had a hand in."""
+    own = shutil.copytree(keys / "router", folder / "router")
+    settings = json.loads((own / KEYED).read_text().partition("\n")[2])
+    change(settings)
+    (own / KEYED).write_text(f"//\n{json.dumps(settings)}")
+    endpoint = free_endpoint("tls")
+    with routing(Router(endpoint, (), own), folder):
+        yield endpoint
+
+
+def start(
+    keys: Path, endpoint: str, out: Path, stack: ExitStack, who: str, *arguments: str | Path
+) -> Command:
+    """A part of a mission, by the keys of `who`."""
+    where = ("--connect", endpoint, "--keys", keys / who, "--out", out, "-q")
+    return stack.enter_context(Command(*arguments, *where))
+
+
+FORGED = "robot/a/beat, robot/a/sense, robot/b/drive, robot/b/estimate, robot/b/to/a, world/truth"
+FORGED_BY_VIEWER = "robot/a/beat, robot/a/drive, robot/a/estimate, robot/a/sense, robot/a/to/a, world/truth"
+READ = "robot/b/drive, robot/b/sense, world/truth"
+
+
+@pytest.mark.parametrize(
+    ("change", "fixes"),
+    [
+        (enforce, []),
+        (enforce_nothing, [f"can put {FORGED};", f"can read {READ} in mine;"]),
+        (let_read_truth, ["can put world/truth;", "can read world/truth in mine;"]),
+    ],
+)
+def test_rules_are_tried_while_a_mission_runs(
+    change: Callable[[dict[str, Any]], None], fixes: list[str], keys: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "endless.toml").write_text(ENDLESS)
+    with router_by(keys, change, tmp_path) as endpoint, ExitStack() as stack:
+        part = partial(start, keys, endpoint, tmp_path / "out", stack)
+        part("world", "world", tmp_path / "endless.toml", "--run", "mine")
+        for robot in [part(f"agent-{robot}", "agent", robot) for robot in "ab"]:
+            robot.until((tmp_path / "out" / "agent-b.journal").exists, "b plays")
+        ended = tandem("doctor", "--connect", endpoint, "--keys", keys / "agent-a", "--wait", "20")
+    assert findings(ended, "--") == []
+    found = findings(ended, "fix")
+    assert len(found) == len(fixes)
+    for line, words in zip(found, fixes, strict=True):
+        assert line.startswith(f"rules: agent-a {words}")
+    said = findings(ended, "ok")
+    assert f"router: {endpoint} answers, over TLS" in said
+    assert "rules: what agent-a puts as Reports of a passes" in said
+    assert (f"rules: agent-a hears nothing of {READ} in mine" in said) is (not fixes)
+    assert said[-1] == "alive: mine: its world, by this protocol version; a's agent, too"
+
+
+@pytest.mark.parametrize(("change", "passes"), [(enforce, False), (enforce_nothing, True)])
+def test_a_page_that_could_speak_is_told(
+    change: Callable[[dict[str, Any]], None], passes: bool, keys: Path, tmp_path: Path
+) -> None:
+    with router_by(keys, change, tmp_path) as endpoint:
+        ended = tandem("doctor", "--connect", endpoint, "--keys", keys / "viewer")
+    if passes:
+        only_fix(ended, f"rules: viewer can put {FORGED_BY_VIEWER};")
+    else:
+        assert findings(ended, "fix") == []
+        assert any("robot/a/drive" in one and "does not pass" in one for one in findings(ended, "ok"))
+
+
+def test_rules_that_do_not_name_the_robot_are_told(keys: Path, tmp_path: Path) -> None:
+    everybody = shutil.copytree(keys, tmp_path / "keys")
+    assert tandem("keys", everybody, "--robots", "c").status == 0
+    with router_by(keys, enforce, tmp_path) as endpoint:
+        ended = tandem("doctor", "--connect", endpoint, "--keys", everybody / "agent-c")
+    only_fix(
+        ended, "rules: what agent-c puts as Reports of c does not pass; the router must enforce the rules"
+    )
+
+
+def test_what_cannot_be_tried_without_a_mission_that_moves_is_not_said_to_be_well(
+    keys: Path, tmp_path: Path
+) -> None:
+    with router_by(keys, enforce, tmp_path) as endpoint, ExitStack() as stack:
+        flags = ("--connect", endpoint, "--keys", keys / "agent-a", "--wait", "0.2")
+        assert not any(
+            "read" in line for line in tandem("doctor", *flags).out.splitlines() if "rules:" in line
+        )
+        part = partial(start, keys, endpoint, tmp_path / "out", stack)
+        part("world", "world", "paper-1", "--run", "mine")
+        part("agent-a", "agent", "a").until_answered("a", tmp_path / "out")
+        ended = tandem("doctor", *flags)
+    assert findings(ended, "fix") == []
+    (untried,) = findings(ended, "--")
+    assert untried.startswith(f"rules: reading {READ}: mine did not move within 0.2 s")
+
+
+# --- nobody is disturbed --------------------------------------------------------------------------------
+
+
+def test_a_mission_beside_which_all_is_tried_leaves_the_record_of_one_alone(
+    keys: Path, tmp_path: Path
+) -> None:
+    """Where no rule keeps the doctor from doing harm: before b comes, while all move, and by several."""
+    expected, out = record_of(LONG, tmp_path), tmp_path / "out"
+    with router_by(keys, enforce_nothing, tmp_path) as endpoint, ExitStack() as stack:
+        part = partial(start, keys, endpoint, out, stack)
+        started = {
+            "world": part("world", "world", tmp_path / "scenario.toml", "--run", "mine"),
+            "a": part("agent-a", "agent", "a"),
+        }
+        started["a"].until_answered("a", out)
+        doctors = [
+            stack.enter_context(
+                Command("doctor", "--connect", endpoint, "--keys", keys / who, "--wait", "20")
+            )
+            for who in ("agent-a", "agent-b", "viewer")
+        ]
+        for doctor in doctors[:2]:
+            doctor.until_says("puts as Reports of")
+        started["b"] = part("agent-b", "agent", "b")
+        listing = tandem("ps", "--connect", endpoint, "--keys", keys / "viewer")
+        assert listing.status == 0
+        same(started, out, expected)
+        for doctor in doctors:
+            ended = doctor.ended()
+            assert ended.status == 1
+            assert ended.err == ""
+        for doctor in doctors[:2]:
+            assert "world/truth in mine" in doctor.out

@@ -1,0 +1,251 @@
+"""`tandem ps`: what it tells of missions that run, wait, or are over; and that it disturbs none."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from signal import Signals
+from typing import Any
+
+import pytest
+import zenoh
+
+from compose.local import free_endpoint
+from compose.scenario import load
+from protocol import keys, session
+from protocol.endpoints import at, listening
+from protocol.messages import Drive, End, Sense
+from protocol.wire import VERSION, encode
+from tests.commands import BOUND_S, ENDLESS, Command, several_pairs, tandem, until, world
+from tests.test_topologies import Router, routing
+
+
+def listed(endpoint: str, *flags: str | Path) -> list[str]:
+    """The lines of a listing, which goes well."""
+    ended = tandem("ps", "--connect", endpoint, *flags)
+    assert (ended.status, ended.err) == (0, "")
+    return ended.out.splitlines()
+
+
+def told(endpoint: str, *flags: str | Path) -> list[dict[str, Any]]:
+    """The same, as a program reads it."""
+    found: list[dict[str, Any]] = json.loads("\n".join(listed(endpoint, "--json", *flags)))["missions"]
+    return found
+
+
+def test_a_mission_is_a_line_and_so_is_each_robot_there_or_not(tmp_path: Path) -> None:
+    with world("paper-1", "--run", "mine") as (_, endpoint), ExitStack() as stack:
+        assert listed(endpoint) == [
+            f"mine at {endpoint}, tick 0, missing: a, b",
+            "  a  not there",
+            "  b  not there",
+        ]
+        a = stack.enter_context(Command("agent", "a", "--connect", endpoint, "--out", tmp_path))
+        a.until_answered("a", tmp_path)
+        assert listed(endpoint) == [
+            f"mine at {endpoint}, tick 0, missing: b",
+            "  a  tick 0, phase 1, straight",
+            "  b  not there",
+        ]
+
+
+def test_a_mission_that_runs_is_told_to_a_program_with_all_that_is_known(tmp_path: Path) -> None:
+    (tmp_path / "endless.toml").write_text(ENDLESS)
+    with world(tmp_path / "endless.toml", "--run", "mine") as (_, endpoint), ExitStack() as stack:
+        for robot in "ab":
+            stack.enter_context(Command("agent", robot, "--connect", endpoint, "--out", tmp_path))
+        until(lambda: all(one["tick"] for one in told(endpoint)), "it runs")
+        (mission,) = told(endpoint)
+    assert {name: mission[name] for name in ("run", "at", "world", "outcome", "versions", "missing")} == {
+        "run": "mine",
+        "at": endpoint,
+        "world": True,
+        "outcome": None,
+        "versions": [VERSION],
+        "missing": [],
+    }
+    assert [one["robot"] for one in mission["robots"]] == ["a", "b"]
+    for one in mission["robots"]:
+        assert one["there"] is True
+        assert 0 < one["tick"] <= mission["tick"] + 1
+        assert one["phase"] in (1, 2, 3)
+        assert one["state"]
+
+
+def test_robots_of_all_pairs_are_named_though_none_is_there(tmp_path: Path) -> None:
+    (tmp_path / "pairs.toml").write_text(several_pairs(3))
+    with world(tmp_path / "pairs.toml") as (_, endpoint):
+        (mission,) = told(endpoint)
+    assert [one["robot"] for one in mission["robots"]] == list("abcdef")
+    assert mission["missing"] == list("abcdef")
+
+
+def test_missions_of_several_endpoints_are_listed() -> None:
+    with world("paper-1", "--run", "one") as (_, here), world("paper-1", "--run", "other") as (_, there):
+        missions = told(here, "--connect", there)
+    assert [(mission["run"], mission["at"]) for mission in missions] == [("one", here), ("other", there)]
+
+
+def test_robots_whose_world_has_gone_are_listed_and_it_is_missing(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    with routing(Router(endpoint), tmp_path), ExitStack() as stack:
+        part = stack.enter_context(Command("world", "paper-1", "--connect", endpoint, "--run", "mine"))
+        a = stack.enter_context(Command("agent", "a", "--connect", endpoint, "--out", tmp_path))
+        a.until_answered("a", tmp_path)
+        part.tell(Signals.SIGKILL)
+        a.until_says("the world has gone")
+        assert listed(endpoint) == [
+            f"mine at {endpoint}, no tick within 2 s, missing: its world",
+            "  a  there, nothing said within 2 s",
+        ]
+
+
+def test_where_there_is_no_mission_that_is_said() -> None:
+    endpoint = free_endpoint()
+    with session.open_router(listening(endpoint)):
+        assert listed(endpoint) == [f"no mission at {endpoint}"]
+        assert told(endpoint) == []
+
+
+def test_an_endpoint_that_does_not_answer_is_told_beside_one_that_does() -> None:
+    nowhere = free_endpoint()
+    with world("paper-1", "--run", "mine") as (_, endpoint):
+        ended = tandem("ps", "--connect", nowhere, "--connect", endpoint)
+    assert ended.status == 3
+    why = "nobody listens there; check the address, and that the router runs"
+    assert ended.err == f"tandem ps: no router at {nowhere}: {why}\n"
+    assert ended.out.startswith(f"mine at {endpoint}, tick 0")
+
+
+def test_a_viewer_lists_over_tls_what_there_is(tmp_path: Path) -> None:
+    folder, endpoint = tmp_path / "keys", free_endpoint("tls")
+    assert tandem("keys", folder, "--robots", "a,b").status == 0
+    arguments = ("world", "paper-1", "--run", "mine", "--listen", endpoint, "--keys", folder / "world")
+    with Command(*arguments) as part:
+        part.until_says("waiting for")
+        assert listed(endpoint, "--keys", folder / "viewer")[0] == (
+            f"mine at {endpoint}, tick 0, missing: a, b"
+        )
+        ended = tandem("ps", "--connect", endpoint, "--keys", folder / "agent-a")
+    assert ended.status == 2
+    assert ended.err.endswith("is the folder of agent-a, not of viewer\n")
+
+
+# --- worlds that a test plays ---------------------------------------------------------------------------
+
+
+class Played:
+    """A world of robot a, and its agent, both of this process."""
+
+    def __init__(self, link: zenoh.Session) -> None:
+        self.link = link
+        self.frames: dict[str, bytes] = {}
+        """by key, said over and over"""
+        self.tokens: list[zenoh.LivelinessToken] = []
+        self.wanted = threading.Event()
+        """somebody listens to the truth, or to an estimate"""
+
+
+@contextmanager
+def played(start: Callable[[Played], None]) -> Iterator[tuple[Played, str]]:
+    """A mission as a stranger's program may play it, and where."""
+    endpoint = free_endpoint()
+    with session.open_router(listening(endpoint)) as link:
+        mission, over = Played(link), threading.Event()
+        start(mission)
+        costly = [session.publisher(link, key) for key in (keys.truth("r"), keys.estimate("r", "a"))]
+        for one in costly:
+            session.on_matching(one, lambda wanted: mission.wanted.set() if wanted else None)
+
+        def say() -> None:
+            while not over.wait(0.02):
+                for key, frame in mission.frames.items():
+                    link.put(key, frame)
+
+        saying = threading.Thread(target=say)
+        saying.start()
+        try:
+            yield mission, endpoint
+        finally:
+            over.set()
+            saying.join()
+
+
+def alive(mission: Played) -> None:
+    for key in (keys.world_alive("r"), keys.robot_alive("r", "a")):
+        mission.tokens.append(session.show_alive(mission.link, key))
+
+
+def running(mission: Played) -> None:
+    alive(mission)
+    mission.frames = {
+        keys.sense("r", "a"): encode(Sense(7, "a", None, None)),
+        keys.drive("r", "a"): encode(Drive(7, "a", 0.0, 0.0, 2, "orbiting")),
+    }
+
+
+def over(mission: Played) -> None:
+    alive(mission)
+    mission.frames = {
+        keys.sense("r", "a"): encode(End(9, "undecided", "it was dark")),
+        keys.drive("r", "a"): encode(Drive(9, "a", 0.0, 0.0, 3, "undecided")),
+    }
+
+
+def driven(mission: Played) -> None:
+    """As where a driver stands in the world's place for a: of b only the briefing tells."""
+    running(mission)
+    session.answer(mission.link, keys.briefing("r", "a"), lambda _: load("paper-1").briefing("a"))
+
+
+def foreign(mission: Played) -> None:
+    running(mission)
+    mission.frames = {key: bytes([VERSION + 1]) + frame[1:] for key, frame in mission.frames.items()}
+
+
+@pytest.mark.parametrize(
+    ("start", "lines"),
+    [
+        (running, ["tick 7", "tick 7, phase 2, orbiting"]),
+        (over, ["tick 9, over: undecided", "tick 9, phase 3, undecided"]),
+        (alive, ["no tick within 0.5 s", "there, nothing said within 0.5 s"]),
+        (
+            foreign,
+            [
+                f"no tick within 0.5 s, speaks protocol version {VERSION + 1}, this is {VERSION}",
+                "there, nothing said within 0.5 s",
+            ],
+        ),
+    ],
+)
+def test_what_is_said_is_told_and_what_is_not_is_said_so(
+    start: Callable[[Played], None], lines: list[str]
+) -> None:
+    with played(start) as (_, endpoint):
+        assert listed(endpoint, "--wait", "0.5") == [f"r at {endpoint}, {lines[0]}", f"  a  {lines[1]}"]
+
+
+def test_a_peer_of_whom_nothing_is_heard_is_missing() -> None:
+    with played(driven) as (_, endpoint):
+        assert listed(endpoint) == [
+            f"r at {endpoint}, tick 7, missing: b",
+            "  a  tick 7, phase 2, orbiting",
+            "  b  not there",
+        ]
+
+
+def test_nobody_is_made_to_tell_the_truth_or_an_estimate() -> None:
+    with played(running) as (mission, endpoint):
+        assert "tick 7" in listed(endpoint)[0]
+        assert not mission.wanted.is_set()
+        with session.open_client(at(endpoint), unreachable) as page:  # which does
+            listens = page.declare_subscriber(keys.truth("r"))  # until it is forgotten
+            assert mission.wanted.wait(BOUND_S)
+            del listens
+
+
+def unreachable() -> None:
+    raise AssertionError("the router does not answer")
