@@ -65,7 +65,10 @@ def claimed(text: str, covariance: Covariance | None, *, by: float = 0.03) -> Re
     """Robot a claims at once, `by` so many metres off; b never does, and time is up a tick later."""
     scenario = parse("max_ticks = 1\n" + text, "noisy")
     world = release(scenario)
-    first = {"a": claims(0, "a", off(world.truth.poses[0], by), covariance)}
+    first = {
+        "a": claims(0, "a", off(world.truth.poses[0], by), covariance),
+        "b": Drive(0, "b", 0.0, 0.0, 1, "straight", None),
+    }
     onward = advance(world, first)
     assert isinstance(onward, World)
     judgement = advance(onward, {})
