@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from itertools import count
 from typing import Any, NoReturn
 
@@ -34,10 +34,6 @@ MSGPACK = zenoh.Encoding("application/msgpack")
 zenoh.init_log_from_env_or("off")
 
 
-_left_open: list[zenoh.Session] = []
-"""sessions that did not close in time"""
-
-
 class CannotListen(OSError):
     """The endpoint to listen on cannot be had; its text says why."""
 
@@ -51,8 +47,6 @@ def _closing(session: zenoh.Session) -> Iterator[zenoh.Session]:
         closer = threading.Thread(target=session.close, daemon=True)
         closer.start()
         closer.join(CLOSE_TIMEOUT_S)
-        if closer.is_alive():
-            _left_open.append(session)
 
 
 @contextmanager
@@ -175,9 +169,12 @@ def publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
 
 
 def leave(status: int) -> NoReturn:
-    """End the process. An unclosed session would hang the interpreter's exit, so it is not asked."""
-    if _left_open:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(status)
-    sys.exit(status)
+    """End the process, without the interpreter's own end.
+
+    A session that did not close would hang it; and a thread of Zenoh's that is just then in a callback, as it
+    may be for a moment after its session has closed, would abort the process.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError):  # nobody reads it any more
+            stream.flush()
+    os._exit(status)

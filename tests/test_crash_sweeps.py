@@ -121,7 +121,9 @@ def test_however_a_trial_ends_its_processes_end_with_it(how: str, tmp_path: Path
     until(lambda: not left(tmp_path), "no process is left")
     if "hung" in how:
         rows = pq.read_table(tmp_path / "out" / "trials.parquet").to_pylist()
-        assert [row["error"] for row in rows] == ["died: killed by SIGKILL", "hung: no answer within 10 s"]
+        killed, hung = [row["error"] for row in rows]
+        assert killed.startswith("died: killed by SIGKILL")  # and what it said last, if it came to that
+        assert hung == "hung: no answer within 10 s"
 
 
 # --- what a scenario says -----------------------------------------------------------------------------
