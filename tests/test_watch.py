@@ -123,7 +123,8 @@ def shot(page: Page, name: str) -> None:
 
 
 def picture(page: Page) -> str:
-    """The plane, pixel by pixel."""
+    """The plane, pixel by pixel, once all that was asked for is drawn."""
+    page.evaluate("() => new Promise(drawn => requestAnimationFrame(() => requestAnimationFrame(drawn)))")
     return str(page.evaluate("document.getElementById('canvas').toDataURL()"))
 
 
