@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import argparse
-import ipaddress
 import os
-import re
 import sys
 import traceback
 from importlib import import_module
-from pathlib import Path
 from typing import NoReturn, TextIO
 
-from compose import kill
+from compose.arguments import (
+    address,
+    count,
+    days,
+    folder,
+    kill,
+    name,
+    names,
+    natural,
+    port,
+    positive,
+    trials,
+)
 from compose.figures import FORMATS, PICTURES
 from compose.status import BROKEN_PIPE, BUG, FAILED, USER_ERROR, UserError
 from protocol.inbox import one_line
-from protocol.units import NAME
 
 
 class _Parser(argparse.ArgumentParser):
@@ -84,11 +92,11 @@ def parser() -> argparse.ArgumentParser:
     run.add_argument("--in-process", action="store_true", help="without processes or network")
     run.add_argument("--secure", action="store_true", help="encrypted, with keys made for this run alone")
     run.add_argument("--export", action="store_true", help="leave run.mcap and tables in --out DIR, too")
-    run.add_argument("--foxglove", type=_port, metavar="PORT", help="serve Foxglove's viewers there, live")
+    run.add_argument("--foxglove", type=port, metavar="PORT", help="serve Foxglove's viewers there, live")
     run.add_argument("--watch", action="store_true", help="serve a page that shows it, live and afterwards")
     run.add_argument(
         "--kill",
-        type=_kill,
+        type=kill,
         action="append",
         default=[],
         metavar="WHO@TICK",
@@ -99,14 +107,14 @@ def parser() -> argparse.ArgumentParser:
     world = command("world", "Play the world's part; robots join from wherever they reach it.")
     _add_scenario(world)
     _add_playing(world)
-    world.add_argument("--run", type=_name, metavar="NAME", help="what to call the run")
+    world.add_argument("--run", type=name, metavar="NAME", help="what to call the run")
 
     agent = command("agent", "Play one robot's part.")
-    agent.add_argument("id", type=_name, metavar="ID", help="which robot of the scenario")
+    agent.add_argument("id", type=name, metavar="ID", help="which robot of the scenario")
     _add_playing(agent)
-    agent.add_argument("--run", type=_name, metavar="NAME", help="which run, if several are alive")
+    agent.add_argument("--run", type=name, metavar="NAME", help="which run, if several are alive")
     agent.add_argument(
-        "--wait", type=_positive, default=60.0, metavar="S", help="how long to look for a world (60)"
+        "--wait", type=positive, default=60.0, metavar="S", help="how long to look for a world (60)"
     )
     for sub in (world, agent):
         _add_reaching(sub)
@@ -114,7 +122,7 @@ def parser() -> argparse.ArgumentParser:
             sub, "be a router that listens there, such as tcp/127.0.0.1:7447; as often as you like"
         )
         sub.add_argument("--launched", action="store_true", help=argparse.SUPPRESS)  # by `tandem run`
-        sub.add_argument("--kill", type=_kill, action="append", default=[], help=argparse.SUPPRESS)
+        sub.add_argument("--kill", type=kill, action="append", default=[], help=argparse.SUPPRESS)
         sub.add_argument("--fsync", action="store_true", help="the journal survives a power cut")
 
     _add_robot(command("robot", "Play one robot's part without a world: its own driver, and its agent."))
@@ -129,17 +137,17 @@ def parser() -> argparse.ArgumentParser:
     watch = command("watch", "Serve a page on which a run is watched: a record, or what runs on a network.")
     _add_watch(watch)
     for sub in (run, watch):
-        sub.add_argument("--port", type=_port, metavar="N", help="of the page (one that is free)")
+        sub.add_argument("--port", type=port, metavar="N", help="of the page (one that is free)")
 
     audit = command("audit", "Judge a record: what its journals say, held against the world and the planner.")
-    audit.add_argument("record", type=_folder, metavar="DIR", help="where `tandem run --out DIR` left it")
+    audit.add_argument("record", type=folder, metavar="DIR", help="where `tandem run --out DIR` left it")
 
     replay = command("replay", "Play a record once more, and hold every decision against it, to the bit.")
-    replay.add_argument("record", type=_folder, metavar="DIR", help="where `tandem run --out DIR` left it")
+    replay.add_argument("record", type=folder, metavar="DIR", help="where `tandem run --out DIR` left it")
 
     export = command("export", "Leave a record in other formats: run.mcap, frames.csv, ticks.parquet.")
-    export.add_argument("record", type=_folder, metavar="DIR", help="where `tandem run --out DIR` left it")
-    export.add_argument("--out", type=_folder, metavar="DIR", help="where the files go (where the record is)")
+    export.add_argument("record", type=folder, metavar="DIR", help="where `tandem run --out DIR` left it")
+    export.add_argument("--out", type=folder, metavar="DIR", help="where the files go (where the record is)")
 
     _add_keys(command("keys", "Make certificates and access rules, for networks that are not trusted."))
 
@@ -151,13 +159,13 @@ def parser() -> argparse.ArgumentParser:
     command("scenarios", "List the scenarios and the campaigns that ship.")
 
     bench = command("bench", "Measure speed, against the bare thing in the same run.")
-    bench.add_argument("--rounds", type=_count, default=5, metavar="N", help="repetitions (5)")
+    bench.add_argument("--rounds", type=count, default=5, metavar="N", help="repetitions (5)")
     return tandem
 
 
 def _add_scenario(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scenario", metavar="SCENARIO", help="a name that ships, or a TOML file")
-    parser.add_argument("--seed", type=_natural, metavar="N", help="instead of the scenario's")
+    parser.add_argument("--seed", type=natural, metavar="N", help="instead of the scenario's")
     parser.add_argument(
         "--fault",
         action="append",
@@ -166,13 +174,13 @@ def _add_scenario(parser: argparse.ArgumentParser) -> None:
         help="of the radio, such as 'a->b: loss=0.3, delay=0..3'",
     )
     parser.add_argument(
-        "--rate", type=_positive, metavar="X", help="in real time, X times as fast; else in lockstep"
+        "--rate", type=positive, metavar="X", help="in real time, X times as fast; else in lockstep"
     )
 
 
 def _add_playing(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", type=_folder, metavar="DIR", help="where the record goes")
-    parser.add_argument("--patience", type=_positive, default=30.0, metavar="S", help="longest silence (30)")
+    parser.add_argument("--out", type=folder, metavar="DIR", help="where the record goes")
+    parser.add_argument("--patience", type=positive, default=30.0, metavar="S", help="longest silence (30)")
     parser.add_argument("-q", "--quiet", action="store_true", help="print only the outcome")
 
 
@@ -184,20 +192,24 @@ def _add_reaching(parser: argparse.ArgumentParser) -> None:
     secured = parser.add_mutually_exclusive_group()
     secured.add_argument(
         "--keys",
-        type=_folder,
+        type=folder,
         metavar="DIR",
         help="encrypt, by the certificates that `tandem keys` left in DIR",
     )
-    secured.add_argument("--config", type=_folder, metavar="FILE", help="a Zenoh configuration of your own")
+    secured.add_argument("--config", type=folder, metavar="FILE", help="a Zenoh configuration of your own")
 
 
 def _add_watch(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "record", type=_folder, nargs="?", metavar="DIR", help="a record, a campaign, or a folder of records"
+        "record",
+        type=folder,
+        nargs="?",
+        metavar="DIR",
+        help="a record, a campaign, or a folder of records",
     )
     _add_reaching(parser)
     parser.add_argument(
-        "--address", type=_address, default="127.0.0.1", metavar="IP",
+        "--address", type=address, default="127.0.0.1", metavar="IP",
         help="of the page (127.0.0.1); 0.0.0.0 in a container, whose port is published on loopback",
     )  # fmt: skip
     parser.add_argument("--launched", action="store_true", help=argparse.SUPPRESS)  # by `tandem run --watch`
@@ -207,7 +219,7 @@ def _add_looking(doctor: argparse.ArgumentParser, ps: argparse.ArgumentParser) -
     for sub in (doctor, ps):
         _add_reaching(sub)
         sub.add_argument(
-            "--wait", type=_positive, default=2.0, metavar="S", help="how long to listen to missions (2)"
+            "--wait", type=positive, default=2.0, metavar="S", help="how long to listen to missions (2)"
         )
     _add_listening(doctor, "where a world, an agent or a router is to listen; as often as you like")
     ps.add_argument("--json", action="store_true", help="as JSON")
@@ -218,7 +230,7 @@ def _add_listening(parser: argparse.ArgumentParser, what: str) -> None:
 
 
 def _add_figures(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("record", type=_folder, metavar="DIR", help="where `tandem run --out DIR` left it")
+    parser.add_argument("record", type=folder, metavar="DIR", help="where `tandem run --out DIR` left it")
     parser.add_argument(
         "--only", action="append", choices=PICTURES, metavar="NAME",
         help=f"draw only these; again for more: {', '.join(PICTURES)}",
@@ -229,29 +241,26 @@ def _add_figures(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_keys(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("folder", type=_folder, metavar="DIR", help="where they go; what is there is kept")
-    parser.add_argument("--robots", type=_names, required=True, metavar="A,B", help="who takes part")
+    parser.add_argument("folder", type=folder, metavar="DIR", help="where they go; what is there is kept")
+    parser.add_argument("--robots", type=names, required=True, metavar="A,B", help="who takes part")
     parser.add_argument(
         "--host", action="append", default=[], metavar="NAME",
         help="a name or address of the world or a router; as often as you like (localhost, 127.0.0.1, ::1)",
     )  # fmt: skip
-    parser.add_argument("--days", type=_days, default=365, metavar="N", help="how long they last (365)")
+    parser.add_argument("--days", type=days, default=365, metavar="N", help="how long they last (365)")
 
 
 def _add_robot(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("id", type=_name, metavar="ID", help="which robot of the mission")
+    parser.add_argument("id", type=name, metavar="ID", help="which robot of the mission")
     parser.add_argument("--driver", required=True, metavar="MODULE:CLASS", help="of its wheels and sensors")
     parser.add_argument("--mission", required=True, metavar="FILE", help="a scenario; starts are not needed")
     _add_driver(parser)
     _add_playing(parser)
     _add_reaching(parser)
+    _add_listening(parser, "where the peer reaches it, such as tcp/127.0.0.1:7447; as often as you like")
+    parser.add_argument("--run", type=name, metavar="NAME", help="what the mission is called (its name)")
     parser.add_argument(
-        "--listen", action="append", default=[], metavar="ENDPOINT",
-        help="where the peer reaches it, such as tcp/127.0.0.1:7447; as often as you like",
-    )  # fmt: skip
-    parser.add_argument("--run", type=_name, metavar="NAME", help="what the mission is called (its name)")
-    parser.add_argument(
-        "--wait", type=_positive, default=60.0, metavar="S", help="how long to look for the peer (60)"
+        "--wait", type=positive, default=60.0, metavar="S", help="how long to look for the peer (60)"
     )
 
 
@@ -260,28 +269,26 @@ def _add_driver(parser: argparse.ArgumentParser) -> None:
         "--option", action="append", default=[], metavar="NAME=VALUE", help="for the driver; again for more"
     )
     parser.add_argument(
-        "--rate", type=_positive, metavar="X", help="X times as fast, for a driver that can (1)"
+        "--rate", type=positive, metavar="X", help="X times as fast, for a driver that can (1)"
     )
 
 
 def _add_conform(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("driver", metavar="MODULE:CLASS", help="of one robot's wheels and sensors")
     parser.add_argument("--mission", default="paper-1", metavar="FILE", help="a scenario (paper-1)")
-    parser.add_argument("--robot", type=_name, default="a", metavar="ID", help="which of its robots (a)")
+    parser.add_argument("--robot", type=name, default="a", metavar="ID", help="which of its robots (a)")
     _add_driver(parser)
 
 
 def _add_sweep(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("spec", metavar="SPEC", help="a name that ships, or a TOML file")
     parser.add_argument(
-        "--out", type=_folder, metavar="DIR", help="where the results go, and go on (sweep-NAME)"
+        "--out", type=folder, metavar="DIR", help="where the results go, and go on (sweep-NAME)"
     )
-    parser.add_argument("--trials", type=_trials, metavar="N", help="per cell, instead of the spec's")
-    parser.add_argument("--seed", type=_natural, metavar="S", help="instead of the spec's")
+    parser.add_argument("--trials", type=trials, metavar="N", help="per cell, instead of the spec's")
+    parser.add_argument("--seed", type=natural, metavar="S", help="instead of the spec's")
     where = parser.add_mutually_exclusive_group()
-    where.add_argument(
-        "--workers", type=_count, metavar="N", help="on this machine (as many as it has cores)"
-    )
+    where.add_argument("--workers", type=count, metavar="N", help="on this machine (as many as it has cores)")
     where.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask scheduler that runs already")
     parser.add_argument("--processes", action="store_true", help="trials as processes, over Zenoh")
     parser.add_argument(
@@ -292,86 +299,3 @@ def _add_sweep(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--retry", action="store_true", help="play again what was lost before")
     parser.add_argument("-q", "--quiet", action="store_true", help="print only the counts")
-
-
-def _folder(text: str) -> Path:
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        raise argparse.ArgumentTypeError(f"{text!a} is no folder: it is not UTF-8") from None
-    if not text:
-        raise argparse.ArgumentTypeError("'' is no folder")
-    return Path(text).expanduser()
-
-
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0.0 < value < 1e9:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a positive number")
-    return value
-
-
-def _natural(text: str) -> int:
-    if not re.fullmatch(r"[0-9]{1,19}", text) or int(text) >= 2**63:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 0 to 2^63 - 1")
-    return int(text)
-
-
-def _port(text: str) -> int:
-    value = _natural(text)
-    if value >= 1 << 16:
-        raise argparse.ArgumentTypeError(f"{value} is not a port, from 0 (one that is free) to 65535")
-    return value
-
-
-def _address(text: str) -> str:
-    try:
-        return str(ipaddress.ip_address(text))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"'{text}' is no address, such as 127.0.0.1 or 0.0.0.0") from None
-
-
-def _count(text: str) -> int:
-    value = _natural(text)
-    if not 0 < value <= 1000:
-        raise argparse.ArgumentTypeError(f"{value} is not from 1 to 1000")
-    return value
-
-
-def _trials(text: str) -> int:
-    value = _natural(text)
-    if not 0 < value <= 10**7:
-        raise argparse.ArgumentTypeError(f"{value} is not from 1 to 10000000")
-    return value
-
-
-def _name(text: str) -> str:
-    if not re.search(NAME, text):
-        raise argparse.ArgumentTypeError(f"'{text}' is no name: letters, digits, - and _ only")
-    return text
-
-
-def _names(text: str) -> tuple[str, ...]:
-    names = tuple(_name(name) for name in text.split(","))
-    if len(set(names)) < len(names):
-        raise argparse.ArgumentTypeError(f"'{text}' names a robot twice")
-    if any(len(name) > 32 for name in names):
-        raise argparse.ArgumentTypeError(f"'{text}' has a name of more than 32 letters")
-    return names
-
-
-def _days(text: str) -> int:
-    value = _natural(text)
-    if not 0 < value <= 36_500:
-        raise argparse.ArgumentTypeError(f"{value} is not from 1 to 36500")
-    return value
-
-
-def _kill(text: str) -> kill.Kill:
-    try:
-        return kill.parse(text)
-    except kill.BadKill as error:
-        raise argparse.ArgumentTypeError(str(error)) from None

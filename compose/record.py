@@ -10,7 +10,6 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -19,6 +18,7 @@ import msgspec
 from msgspec.structs import astuple
 
 from compose.claim import Claim, claim, matrix
+from compose.installed import version
 from compose.status import UserError
 from protocol import journal
 from protocol.messages import Drive, End, Estimate, Farewell, Localised, Outcome
@@ -315,10 +315,7 @@ def versions() -> dict[str, str | None]:
     """Of everything that a run's figures may depend on."""
     found: dict[str, str | None] = {"python": platform.python_version()}
     for package in ("tandem-ranging", "eclipse-zenoh", "numpy", "scipy", "msgspec", "msgpack"):
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = None
+        found[package] = version(package)
     return found
 
 

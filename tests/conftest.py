@@ -1,6 +1,27 @@
 from __future__ import annotations
 
+import shutil
+from pathlib import Path
+
+import pytest
 from hypothesis import settings
+
+from tests.commands import tandem
 
 settings.register_profile("tandem", derandomize=True, deadline=None, database=None)
 settings.load_profile("tandem")
+
+
+@pytest.fixture(scope="module")
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Those of a mission of a and b; nobody changes anything in it."""
+    folder = tmp_path_factory.mktemp("keys") / "keys"
+    assert tandem("keys", folder, "--robots", "a,b").status == 0
+    return folder
+
+
+@pytest.fixture
+def mine(keys: Path, tmp_path: Path) -> Path:
+    """Those of a, to be spoilt."""
+    shutil.copytree(keys / "agent-a", tmp_path / "mine")
+    return tmp_path / "mine"

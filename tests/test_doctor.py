@@ -38,21 +38,6 @@ from tests.test_keys import expire, give_foreign, last, world_of
 from tests.test_topologies import Router, connect, listen, record_of, routing, same
 
 
-@pytest.fixture(scope="module")
-def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Those of a mission of a and b; nobody changes anything in it."""
-    folder = tmp_path_factory.mktemp("keys") / "keys"
-    assert tandem("keys", folder, "--robots", "a,b").status == 0
-    return folder
-
-
-@pytest.fixture
-def mine(keys: Path, tmp_path: Path) -> Path:
-    """Those of a, to be spoilt."""
-    shutil.copytree(keys / "agent-a", tmp_path / "mine")
-    return tmp_path / "mine"
-
-
 def findings(ended: Ended, mark: str) -> list[str]:
     """What the lines of that mark say; all lines have one, and the status goes with them."""
     assert ended.err == ""

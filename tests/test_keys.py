@@ -28,21 +28,6 @@ from tests.commands import Command, Ended, journals, tandem
 EVERYBODY = ("agent-a", "agent-b", "router", "viewer", "world")
 
 
-@pytest.fixture(scope="module")
-def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Those of a mission of a and b; nobody changes anything in it."""
-    folder = tmp_path_factory.mktemp("keys") / "keys"
-    assert tandem("keys", folder, "--robots", "a,b").status == 0
-    return folder
-
-
-@pytest.fixture
-def mine(keys: Path, tmp_path: Path) -> Path:
-    """Those of a, to be spoilt."""
-    shutil.copytree(keys / "agent-a", tmp_path / "mine")
-    return tmp_path / "mine"
-
-
 def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 

@@ -1,0 +1,105 @@
+"""What one word on the command line may be: from its text to a value, or a line that says why not."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+from argparse import ArgumentTypeError
+from pathlib import Path
+
+from compose.kill import BadKill, Kill, parse
+from protocol.units import NAME
+
+
+def folder(text: str) -> Path:
+    """A folder, there or not."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        raise ArgumentTypeError(f"{text!a} is no folder: it is not UTF-8") from None
+    if not text:
+        raise ArgumentTypeError("'' is no folder")
+    return Path(text).expanduser()
+
+
+def positive(text: str) -> float:
+    """A number above 0."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0.0 < value < 1e9:
+        raise ArgumentTypeError(f"'{text}' is not a positive number")
+    return value
+
+
+def natural(text: str) -> int:
+    """A whole number that fits 63 bits."""
+    if not re.fullmatch(r"[0-9]{1,19}", text) or int(text) >= 2**63:
+        raise ArgumentTypeError(f"'{text}' is not a whole number from 0 to 2^63 - 1")
+    return int(text)
+
+
+def port(text: str) -> int:
+    """Of TCP; 0 is any that is free."""
+    value = natural(text)
+    if value >= 1 << 16:
+        raise ArgumentTypeError(f"{value} is not a port, from 0 (one that is free) to 65535")
+    return value
+
+
+def address(text: str) -> str:
+    """Of IP."""
+    try:
+        return str(ipaddress.ip_address(text))
+    except ValueError:
+        raise ArgumentTypeError(f"'{text}' is no address, such as 127.0.0.1 or 0.0.0.0") from None
+
+
+def count(text: str) -> int:
+    """Of what there can be a thousand of."""
+    value = natural(text)
+    if not 0 < value <= 1000:
+        raise ArgumentTypeError(f"{value} is not from 1 to 1000")
+    return value
+
+
+def trials(text: str) -> int:
+    """Of a cell."""
+    value = natural(text)
+    if not 0 < value <= 10**7:
+        raise ArgumentTypeError(f"{value} is not from 1 to 10000000")
+    return value
+
+
+def name(text: str) -> str:
+    """Of a robot or a run."""
+    if not re.search(NAME, text):
+        raise ArgumentTypeError(f"'{text}' is no name: letters, digits, - and _ only")
+    return text
+
+
+def names(text: str) -> tuple[str, ...]:
+    """Of robots, with commas between."""
+    found = tuple(name(one) for one in text.split(","))
+    if len(set(found)) < len(found):
+        raise ArgumentTypeError(f"'{text}' names a robot twice")
+    if any(len(one) > 32 for one in found):
+        raise ArgumentTypeError(f"'{text}' has a name of more than 32 letters")
+    return found
+
+
+def days(text: str) -> int:
+    """Up to a hundred years."""
+    value = natural(text)
+    if not 0 < value <= 36_500:
+        raise ArgumentTypeError(f"{value} is not from 1 to 36500")
+    return value
+
+
+def kill(text: str) -> Kill:
+    """Who is killed, and when."""
+    try:
+        return parse(text)
+    except BadKill as error:
+        raise ArgumentTypeError(str(error)) from None
