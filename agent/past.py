@@ -9,8 +9,21 @@ import msgspec
 from msgspec.structs import replace
 
 from agent.robot import Told
+from protocol import motion
 from protocol.journal import CorruptJournal
-from protocol.messages import Briefing, Drive, End, Estimate, Farewell, Missed, OfRobot, Report, Sense
+from protocol.messages import (
+    Briefing,
+    Drive,
+    End,
+    Estimate,
+    Farewell,
+    Localised,
+    Missed,
+    OfRobot,
+    Report,
+    Sense,
+)
+from protocol.motion import ORIGIN, REST, Pose
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 
 
@@ -41,6 +54,23 @@ class Past(msgspec.Struct, frozen=True):
     def estimates(self) -> tuple[Estimate, ...]:
         """What the robot held possible, tick by tick."""
         return tuple([step.estimate for step in self.steps if step.estimate is not None])
+
+    @property
+    def claim(self) -> tuple[int, Localised] | None:
+        """The first that it made, and in which tick."""
+        for step in self.steps:
+            if step.drive is not None and isinstance(step.drive.verdict, Localised):
+                return step.sense.tick, step.drive.verdict
+        return None
+
+    @property
+    def odometry(self) -> tuple[Pose, ...]:
+        """Its poses in the frame of tick 0, dead-reckoned from what it measured itself to have driven."""
+        poses, period = [ORIGIN], self.briefing.mission.period
+        for step in self.steps[1:]:
+            done = step.sense.executed or REST
+            poses.append(motion.step(poses[-1], done.v, done.omega, period))
+        return tuple(poses[: len(self.steps)])
 
 
 class OutOfOrder(CorruptJournal):

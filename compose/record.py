@@ -7,7 +7,7 @@ import io
 import math
 import platform
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from itertools import combinations
@@ -178,9 +178,10 @@ class Row(msgspec.Struct, frozen=True):
 
     tick: int
     robot: str
-    x: float
-    y: float
-    heading: float
+    x: float | None
+    """true; none where there was no world to know it"""
+    y: float | None
+    heading: float | None
     """in (-pi, pi]"""
     v: float | None
     """driven until the next tick; none in the last"""
@@ -189,6 +190,13 @@ class Row(msgspec.Struct, frozen=True):
     mutual_range: float | None
     phase: int | None
     state: str | None
+
+    @property
+    def pose(self) -> Pose | None:
+        """The true one."""
+        if self.x is None or self.y is None or self.heading is None:
+            return None
+        return Pose(self.x, self.y, self.heading)
 
 
 def rows(record: Record) -> Iterator[Row]:
@@ -213,11 +221,16 @@ def rows(record: Record) -> Iterator[Row]:
 
 
 def ticks_csv(record: Record) -> str:
-    """One row per tick and robot; floats in their shortest exact form."""
+    """One row per tick and robot."""
+    return table(rows(record))
+
+
+def table(rows: Iterable[Row]) -> str:
+    """`rows` as `ticks.csv` has them: floats in their shortest exact form."""
     out = io.StringIO()
     written = csv.writer(out, lineterminator="\n")
     written.writerow(Row.__struct_fields__)
-    written.writerows([["" if one is None else one for one in astuple(row)] for row in rows(record)])
+    written.writerows([["" if one is None else one for one in astuple(row)] for row in rows])
     return out.getvalue()
 
 

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from compose import inline, scenario
 from compose.figures import PICTURES, album
-from compose.figures.pair import Pair, account
+from compose.figures.account import account
+from compose.figures.pair import of_record
 from compose.figures.sheet import Absent
 from compose.figures.style import save
 
@@ -43,7 +44,7 @@ def draw(name: str, shown: Mapping[str, str], folder: Path) -> None:
     """Play the scenario, and take those pictures of it that are `shown`."""
     record = inline.play(scenario.load(name), folder)
     robots = [robot.id for robot in record.scenario.robots]
-    pair = Pair(record, 0, 1, {robot: account(folder, robot) for robot in robots})
+    pair = of_record(record, (0, 1), {robot: account(folder, robot) for robot in robots})
     for kind in PICTURES:
         with album.settings(kind):
             for title, figure in album.pictures(pair, kind):

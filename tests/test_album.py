@@ -23,7 +23,8 @@ from agent.phases.encounter import compared
 from agent.phases.surveying import stride
 from compose.commands.figures import draw as draw_all
 from compose.figures import PICTURES, album, hypotheses, manoeuvre, over_time, phase_one, steps, trajectory
-from compose.figures.pair import Pair, account
+from compose.figures.account import account
+from compose.figures.pair import Pair, of_record
 from compose.figures.sheet import Absent
 from compose.figures.style import look
 from compose.inline import play
@@ -88,9 +89,9 @@ def recorded(name: str, records: Path) -> Path:
 
 def pair(folder: Path, number: int = 0) -> Pair:
     record = read(folder)
-    a, b = record.scenario.pairs()[number]
-    robots = [record.scenario.robots[place].id for place in (a, b)]
-    return Pair(record, a, b, {robot: account(folder, robot) for robot in robots})
+    places = record.scenario.pairs()[number]
+    robots = [record.scenario.robots[place].id for place in places]
+    return of_record(record, places, {robot: account(folder, robot) for robot in robots})
 
 
 def found(figure: Figure, gid: str) -> list[Artist]:
@@ -135,6 +136,7 @@ def test_a_plan_shows_each_candidate_and_the_axis_of_each_two_and_the_choice(
 ) -> None:
     told, computed = pair(recorded(name, records)), REFERENCE.sims[simulation]
     (figure,) = [drawn(one) for one in manoeuvre.draw(told).values()]
+    assert told.record is not None
     farewell = told.record.farewells["b"]
     assert farewell.candidates is not None
     count = farewell.candidates[1]
@@ -199,13 +201,13 @@ def test_phase_1_shows_both_branches_the_rings_and_what_rules_one_out(
 ) -> None:
     told = pair(recorded(name, records))
     figure = drawn(phase_one.draw(told, role))
-    rho = told.anchor_ranges(role)
+    rho = told.robot(role).anchor_ranges
     assert radii(figure, r"rho-\d") == [rho[tick] for tick in ranges]
     assert radii(figure, "range") == [3.0]
     assert len(found(figure, "rejected")) == 1
     assert [one.get_linestyle() for one in found(figure, "rejected") if isinstance(one, Line2D)] == [":"]
     anchor = told.robot(role).anchor
-    true = [math.hypot(p.x - anchor.x, p.y - anchor.y) for p in told.truth(role)]
+    true = [math.hypot(p.x - anchor.x, p.y - anchor.y) for p in told.robot(role).path]
     kept = line(figure, "kept")
     assert [math.hypot(x, y) for x, y in kept] == pytest.approx(true[: len(kept)])
     words = [one.get_label() for one in found(figure, "contradicted")]
@@ -224,7 +226,7 @@ def test_the_encounter_has_a_panel_for_each_mutual_range(name: str, ticks: list[
     for axes, tick in zip(figure.axes, ticks, strict=True):
         assert axes.get_title(loc="left").startswith(f"({ticks.index(tick) + 1}) $k$ = {tick}, ")
         assert axes.get_aspect() == 1.0
-        truth = [told.truth(role)[tick] for role in ("a", "b")]
+        truth = [told.robot(role).path[tick] for role in ("a", "b")]
         ((x, y), (other_x, other_y)) = line(figure, f"rho-{tick}")
         assert [(x, y), (other_x, other_y)] == [(p.x, p.y) for p in truth]
 
@@ -251,13 +253,13 @@ def test_the_key_of_an_encounter_is_on_the_paper_however_few_ranges_it_has(
 
 def test_the_trajectory_has_both_paths_the_ranges_and_the_orbits(records: Path) -> None:
     told = pair(recorded("paper-1", records))
-    figure = trajectory.draw(told)
+    figure = drawn(trajectory.draw(told))
     arrows = [one for one in figure.findobj(Annotation) if isinstance(one, Annotation)]
     for role in ("a", "b"):
-        assert line(figure, f"path-{role}") == [(p.x, p.y) for p in told.truth(role)]
+        assert line(figure, f"path-{role}") == [(p.x, p.y) for p in told.robot(role).path]
         assert radii(figure, f"range-{role}") == [3.0]
         assert radii(figure, f"orbit-{role}") == [6.5]
-        start = told.truth(role)[0]
+        start = told.robot(role).path[0]
         (arrow,) = [one for one in arrows if one.xyann == (start.x, start.y)]
         along = math.atan2(arrow.xy[1] - start.y, arrow.xy[0] - start.x)
         assert wrap(along - start.heading) == pytest.approx(0.0, abs=1e-9)
@@ -282,6 +284,7 @@ def test_ranges_are_those_that_were_measured_and_contact_is_shaded(records: Path
 @pytest.mark.parametrize("name", ["paper-1", "noisy"])
 def test_the_last_error_is_that_of_the_claim(name: str, records: Path) -> None:
     told = pair(recorded(name, records))
+    assert told.record is not None
     figure = drawn(over_time.errors(told))
     for place, role in enumerate("ab"):
         claim = first_claim(told.record, place)

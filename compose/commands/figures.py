@@ -4,50 +4,73 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from compose.figures import FORMATS, PICTURES
 from compose.lab import need
-from compose.record import agent_journal, legible, read
+from compose.record import Record, agent_journal, legible, read
 from compose.status import ENDED, FAILED, UserError
 from compose.telling import counting
+from compose.worldless import casts, is_worldless
 from protocol.inbox import one_line
 from protocol.journal import CorruptJournal
 
 if TYPE_CHECKING:
-    from compose.figures.pair import Account, Pair
+    from compose.figures.account import Account
+    from compose.figures.pair import Pair
 
 
 def main(options: argparse.Namespace) -> int:
     """Draw each pair of the record; FAILED if a robot has left no journal that can be followed to its end."""
     need("matplotlib")
     with legible(options.record):
-        record = read(options.record)
-    from compose.figures.pair import Pair  # noqa: PLC0415  # slow, and there may be no extra
-
+        record = None if is_worldless(options.record) else read(options.record)
+        pairs = _casts(options.record, record)
     folder, status = options.record / "figures", ENDED
     kinds = [kind for kind in PICTURES if kind in (options.only or PICTURES)]
     formats = [one for one in FORMATS if one in (options.format or FORMATS)]
-    pairs = record.scenario.pairs()
-    with counting("tandem figures", len(pairs) * (2 + len(kinds))) as done:
-        for places in pairs:
+    with counting("tandem figures", sum([len(robots) + len(kinds) for robots in pairs])) as done:
+        for robots in pairs:
             accounts = {}
-            for robot in [record.scenario.robots[place].id for place in places]:
+            for robot in robots:
                 account = _account(options.record, robot)
                 if account is not None:
                     accounts[robot] = account
                 if account is None or account.broken is not None:
                     status = FAILED
                 done()
+            pair = _pair(record, robots, accounts)
+            if pair is None:
+                _say(f"no picture of {' and '.join(robots)}: nothing is on record")
+                continue
             try:
-                draw(Pair(record, *places, accounts), kinds, formats, folder, done)
+                draw(pair, kinds, formats, folder, done)
             except BrokenPipeError:
                 raise
             except OSError as error:
                 raise UserError(f"{folder} cannot be written: {error.strerror or error}") from None
     return status
+
+
+def _casts(folder: Path, record: Record | None) -> list[tuple[str, ...]]:
+    """The robots of each pair, a first; of one that has left a journal, where there was no world."""
+    if record is None:
+        return casts(folder)
+    robots = record.scenario.robots
+    return [(robots[a].id, robots[b].id) for a, b in record.scenario.pairs()]
+
+
+def _pair(record: Record | None, robots: Sequence[str], accounts: Mapping[str, Account]) -> Pair | None:
+    """None of those of whom nothing is known."""
+    from compose.figures.pair import of_record, of_robots  # noqa: PLC0415
+
+    if record is not None:
+        places = {robot.id: place for place, robot in enumerate(record.scenario.robots)}
+        return of_record(record, (places[robots[0]], places[robots[1]]), accounts)
+    told = {robot: account for robot, account in accounts.items() if account.past is not None}
+    return of_robots(told) if told else None
 
 
 def draw(
@@ -74,7 +97,7 @@ def draw(
 
 def _account(folder: Path, robot: str) -> Account | None:
     """None, and a line that says why, where its journal cannot be read."""
-    from compose.figures.pair import account  # noqa: PLC0415
+    from compose.figures.account import account  # noqa: PLC0415
 
     try:
         found = account(folder, robot)

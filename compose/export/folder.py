@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 
-from compose import record
+from compose import record, worldless
 from compose.export.frames import in_time
 from compose.export.recording import TooLong, write_mcap
-from compose.export.tables import frames_csv, write_ticks
+from compose.export.tables import At, frames_csv, write_ticks
+from compose.record import Row
 from compose.scene import recorded
 from compose.status import UserError
+from protocol.messages import Drive, Estimate
 
 
 class Exported(msgspec.Struct, frozen=True):
@@ -24,16 +28,25 @@ class Exported(msgspec.Struct, frozen=True):
     """journals of robots that are not there"""
 
 
+class _Ticks(NamedTuple):
+    """What goes into the tables of ticks."""
+
+    rows: list[Row]
+    drives: dict[At, Drive]
+    held: dict[At, Estimate]
+    period: float
+    missing: tuple[str, ...]
+    """robots of which there is no journal"""
+
+
 def export(folder: Path, out: Path) -> Exported:
     """Write those of the record in `folder` into `out`.
 
     Raises OSError if there is no record, journal.CorruptJournal if it is damaged before its end,
     UserError if it is too long for a format, or `out` cannot be written.
     """
-    books = record.books(folder)
-    told = record.read(folder)
-    there = [one.id for one in told.scenario.robots if record.agent_journal(one.id) in books]
-    held = {robot: record.estimates(folder, robot) for robot in there}
+    books = record.books(folder, alone=True)
+    told = _of_robots(folder) if worldless.is_worldless(folder) else _of_world(folder, books)
     run = recorded.read(folder)
     record.make(out)
     mcap, frames, ticks, parquet = (
@@ -42,8 +55,8 @@ def export(folder: Path, out: Path) -> Exported:
     try:
         write_mcap(books, run, mcap)
         frames.write_text(frames_csv(in_time(books)), encoding="utf-8")
-        ticks.write_text(record.ticks_csv(told), encoding="utf-8")
-        write_ticks(told, held, parquet)
+        ticks.write_text(record.table(told.rows), encoding="utf-8")
+        write_ticks(told.rows, told.drives, told.held, told.period, parquet)
     except OSError as error:
         raise UserError(record.cannot_write(out, error)) from None
     except TooLong as error:
@@ -51,5 +64,37 @@ def export(folder: Path, out: Path) -> Exported:
     return Exported(
         files=(mcap, frames, ticks, parquet),
         torn={name: book.torn for name, book in books.items() if book.torn},
-        missing=tuple([record.agent_journal(one.id) for one in told.scenario.robots if one.id not in there]),
+        missing=tuple([record.agent_journal(robot) for robot in told.missing]),
+    )
+
+
+def _of_world(folder: Path, books: Collection[str]) -> _Ticks:
+    told = record.read(folder)
+    ids = [robot.id for robot in told.scenario.robots]
+    there = [robot for robot in ids if record.agent_journal(robot) in books]
+    return _Ticks(
+        list(record.rows(told)),
+        {(robot, at.truth.tick): drive for at in told.moments for robot, drive in at.drives.items()},
+        {(robot, one.tick): one for robot in there for one in record.estimates(folder, robot)},
+        told.scenario.mission.period,
+        tuple([robot for robot in ids if robot not in there]),
+    )
+
+
+def _of_robots(folder: Path) -> _Ticks:
+    told = worldless.pasts(folder)
+    if not told:
+        raise FileNotFoundError(folder)
+    briefings = [past.briefing for past in told.values()]
+    return _Ticks(
+        list(worldless.rows(told)),
+        {
+            (robot, step.sense.tick): step.drive
+            for robot, past in told.items()
+            for step in past.steps
+            if step.drive is not None
+        },
+        {(robot, one.tick): one for robot, past in told.items() for one in past.estimates},
+        briefings[0].mission.period,
+        tuple([one.peer for one in briefings if one.peer not in told]),
     )

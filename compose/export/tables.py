@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,8 @@ from msgspec.structs import asdict
 
 from compose.claim import nees
 from compose.export.frames import Journaled
-from compose.record import Record, Row, rows
-from protocol.messages import Estimate, Localised
+from compose.record import Row
+from protocol.messages import Drive, Estimate, Localised
 from protocol.motion import Covariance, Pose
 from world.referee import errors
 
@@ -41,23 +41,27 @@ COLUMNS = [
     *_MEASURES,
 ]
 """of `ticks.parquet`"""
+At = tuple[str, int]
+"""a robot, and a tick"""
 
 
-def write_ticks(record: Record, held: Mapping[str, Sequence[Estimate]], path: Path) -> None:
-    """`ticks.parquet`: what `ticks.csv` has, and what each robot held possible, against the truth."""
-    said = {(robot, one.tick): one for robot, estimates in held.items() for one in estimates}
-    verdicts = {
-        (robot, moment.truth.tick): drive.verdict
-        for moment in record.moments
-        for robot, drive in moment.drives.items()
-    }
-    period = record.scenario.mission.period
-    lines = [
-        asdict(row)
-        | {"time_s": row.tick * period, "verdict": _tag(verdicts.get((row.robot, row.tick)))}
-        | _estimate(said.get((row.robot, row.tick)), Pose(row.x, row.y, row.heading))
-        for row in rows(record)
-    ]
+def write_ticks(
+    rows: Iterable[Row],
+    drives: Mapping[At, Drive],
+    held: Mapping[At, Estimate],
+    period: float,
+    path: Path,
+) -> None:
+    """`ticks.parquet`: `rows`, and what each robot held possible, against the truth where there is one.
+
+    `period` is T_s.
+    """
+    lines = []
+    for row in rows:
+        at = row.robot, row.tick
+        verdict = drives[at].verdict if at in drives else None
+        said = {"time_s": row.tick * period, "verdict": _tag(verdict)}
+        lines.append(asdict(row) | said | _estimate(held.get(at), row.pose))
     schema = pa.schema([pa.field(name, _KINDS.get(name, pa.float64())) for name in COLUMNS])
     pq.write_table(pa.Table.from_pylist(lines, schema=schema), path)
 
@@ -66,8 +70,8 @@ def _tag(verdict: msgspec.Struct | None) -> str | None:
     return str(verdict.__struct_config__.tag) if verdict is not None else None
 
 
-def _estimate(held: Estimate | None, truth: Pose) -> dict[str, Any]:
-    """All of it, and of the first in the world how far off it is."""
+def _estimate(held: Estimate | None, truth: Pose | None) -> dict[str, Any]:
+    """All of it, and of the first in the world how far off it is, where that is known."""
     if held is None:
         return {}
     told: dict[str, Any] = {
@@ -79,12 +83,14 @@ def _estimate(held: Estimate | None, truth: Pose) -> dict[str, Any]:
         return told
     first = held.world[0]
     told |= {f"estimate_{name}": value for name, value in asdict(first).items()}
-    told["position_error_m"], told["heading_error_rad"] = errors(first, truth)
+    if truth is not None:
+        told["position_error_m"], told["heading_error_rad"] = errors(first, truth)
     if held.covariance is not None:
         told |= {f"cov_{name}": value for name, value in asdict(held.covariance).items()}
         told["position_sigma_m"] = held.covariance.position_sigma
         told["heading_sigma_rad"] = held.covariance.heading_sigma
-        told["nees"] = nees(first, truth, held.covariance)
+        if truth is not None:
+            told["nees"] = nees(first, truth, held.covariance)
     return told
 
 

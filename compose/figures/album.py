@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from compose.figures import hypotheses, manoeuvre, over_time, phase_one, robot, steps, trajectory
 from compose.figures.pair import Pair
-from compose.figures.sheet import Absent
+from compose.figures.sheet import NO_TRUTH, Absent
 from compose.figures.story import Story
 from compose.figures.style import look
 
@@ -54,15 +54,18 @@ def _ranges(pair: Pair) -> Iterator[Picture]:
 
 def _errors(pair: Pair) -> Iterator[Picture]:
     if pair.told:
-        yield f"errors-{pair.name}", over_time.errors(pair)
+        yield f"errors-{pair.name}", over_time.errors(pair) if pair.record is not None else Absent(NO_TRUTH)
 
 
 def _robot(pair: Pair) -> Iterator[Picture]:
     for role in pair.told:
-        account = pair.account(role)
+        name, account = pair.robot(role).id, pair.robot(role).account
         assert account is not None
-        story = Story(pair.record, pair.place(role), account.held)
-        yield f"robot-{pair.robot(role).id}", robot.figure_of(story)
+        if pair.record is None:
+            yield f"robot-{name}", Absent(NO_TRUTH)
+            continue
+        ids = [one.id for one in pair.record.scenario.robots]
+        yield f"robot-{name}", robot.figure_of(Story(pair.record, ids.index(name), account.held))
 
 
 _DRAWN: dict[str, Callable[[Pair], Iterator[Picture]]] = {

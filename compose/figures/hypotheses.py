@@ -74,7 +74,7 @@ def _window(pair: Pair, shown: list[Decision]) -> Window:
         if held.odds >= LIKELY
     ]
     for one in shown:
-        ends = [pair.truth(role)[one.tick] for role in ROLES]
+        ends = list(_places(pair, one.tick).values())
         ends += [end for mind in one.minds.values() for end in _ends(mind, pair)]
         points += [(end.x, end.y) for end in ends]
     return square(points, 0.16, 0.5 * pair.mission.sensing_range)
@@ -111,9 +111,14 @@ def _panel(axes: Axes, pair: Pair, one: Decision) -> None:
                 gid=f"hypothesis-{one.tick}-{role}-{i + 1}",
             )  # fmt: skip
         _drive(axes, pair, role, mind)
-    for role in ROLES:
-        truth = pair.truth(role)[one.tick]
+    for role, truth in _places(pair, one.tick).items():
         axes.plot(truth.x, truth.y, "+", ms=9, mew=1.2, color=INK, zorder=6, gid=f"truth-{one.tick}-{role}")
+
+
+def _places(pair: Pair, tick: int) -> dict[Role, Pose]:
+    """Where each was; without a world, of those that have claimed to know."""
+    paths = {role: pair.robot(role).path for role in ROLES}
+    return {role: path[tick] for role, path in paths.items() if tick < len(path)}
 
 
 def _ties(axes: Axes, one: Decision) -> None:
@@ -162,5 +167,6 @@ def _signs(axes: Axes, pair: Pair) -> None:
         )  # fmt: skip
     axes.plot([], [], "o", ls="", ms=4, mfc="white", mec=PALE, label="less likely")
     axes.plot([], [], "x-", ms=6, mew=1.5, lw=1.6, color=PALE, label="manoeuvre chosen")
-    axes.plot([], [], "+", ls="", ms=9, mew=1.2, color=INK, label="true")
+    known = "true" if pair.record is not None else "by the claim"
+    axes.plot([], [], "+", ls="", ms=9, mew=1.2, color=INK, label=known)
     axes.plot([], [], "x", ls="", ms=6, mew=1.4, color="k", label="anchor")

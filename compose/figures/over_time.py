@@ -15,7 +15,6 @@ from compose.claim import Claim
 from compose.figures.pair import ROLES, Pair
 from compose.figures.sheet import ANCHORS, ROW, SMALL, Absent, Sheet, ending
 from compose.figures.style import COLOURS, INK, MARKS, PALE, SHADE
-from compose.record import first_claim
 from protocol.messages import Estimate
 from protocol.mission import Role
 from protocol.motion import Pose, wrap
@@ -50,7 +49,7 @@ def ranges(pair: Pair) -> Figure:
         _shade(axes, pair)
         _ranges(axes, pair)
     for axes in panels[1:]:
-        highest = max(pair.separations[max(0, (pair.met or 0) - BEFORE) :])
+        highest = max(pair.separations[max(0, (pair.met or 0) - BEFORE) :], default=0.0)
         axes.set_ylim(0.0, 1.1 * max(pair.mission.sensing_range, highest))
     panels[0].set_ylabel("distance [m]")
     sheet.key(panels[0], LEFT, key, columns=3)
@@ -93,14 +92,15 @@ def _shade(axes: Axes, pair: Pair) -> None:
 
 
 def _ranges(axes: Axes, pair: Pair) -> None:
-    ticks = list(range(len(pair.record.moments)))
-    axes.plot(
-        ticks, pair.separations[: len(ticks)], "-", lw=1.2, color=INK, zorder=2, gid="separation",
-        label="true separation",
-    )  # fmt: skip
+    apart = pair.separations[: len(pair.mutual)]
+    if apart:
+        axes.plot(
+            range(len(apart)), apart, "-", lw=1.2, color=INK, zorder=2, gid="separation",
+            label="true separation" if pair.record is not None else "separation, as claimed",
+        )  # fmt: skip
     for role in ROLES:
         _measured(
-            axes, pair.anchor_ranges(role), f"anchor-range-{role}", COLOURS[role], MARKS[role],
+            axes, pair.robot(role).anchor_ranges, f"anchor-range-{role}", COLOURS[role], MARKS[role],
             rf"$\rho$ of {pair.robot(role).id} to ${ANCHORS[role]}$, measured",
         )  # fmt: skip
     diamonds = {"marker": "D", "markerfacecolor": INK, "markeredgecolor": INK}
@@ -159,7 +159,7 @@ def _askew(pose: Pose, truth: Pose) -> float:
 
 def _held(pair: Pair, role: Role) -> list[tuple[Estimate, Pose]]:
     """Each estimate, and where the robot was then."""
-    account, truth = pair.account(role), pair.truth(role)
+    account, truth = pair.robot(role).account, pair.robot(role).path
     held = account.held if account is not None else ()
     return [(one, truth[one.tick]) for one in held if one.tick < len(truth)]
 
@@ -217,7 +217,7 @@ def _line(axes: Axes, points: Points, **looks: Any) -> None:
 
 
 def _claimed(axes: Axes, pair: Pair, role: Role, of_claim: Callable[[Claim], float]) -> None:
-    claim = first_claim(pair.record, pair.place(role))
+    claim = pair.robot(role).claim
     if claim is not None:
         axes.plot(
             claim.tick, max(of_claim(claim), LEAST), MARKS[role]["marker"], ms=11, mfc="none", mec=INK,

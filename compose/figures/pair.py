@@ -1,55 +1,64 @@
-"""What there is to tell of a pair: the truth, what each robot held possible, and each robot's mind."""
+"""What there is to tell of a pair: where both were, what each measured, and each robot's own account."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from functools import cached_property
-from pathlib import Path
 
 import msgspec
 
 from agent.mind import Mind
-from agent.past import Past
-from agent.robot import Robot
-from compose.record import Record, past_of
-from protocol.messages import Drive, Estimate
-from protocol.mission import Mission, Role
+from compose import worldless
+from compose.claim import Claim
+from compose.figures.account import Account
+from compose.record import Record, ended, first_claim
+from protocol.messages import Drive
+from protocol.mission import Anchor, Mission, Role, Variant
 from protocol.motion import Pose
-from protocol.wire import encode
-from world.scenario import Placed
+from protocol.rendezvous import Orbit
 from world.sensors import anchor_ranges, mutual_ranges
 
+ROLES: tuple[Role, Role] = ("a", "b")
 
-class Account(msgspec.Struct, frozen=True):
-    """One robot's own record."""
 
-    held: tuple[Estimate, ...]
-    """what it held possible, as it journaled"""
-    minds: tuple[Mind, ...]
-    """after each tick, from 0 on, as far as it decided in it"""
-    broken: str | None = None
-    """why minds end before the record does, if they do"""
+class Side(msgspec.Struct, frozen=True):
+    """One of the two, tick by tick."""
+
+    id: str
+    anchor: Anchor
+    orbit: Orbit
+    path: tuple[Pose, ...]
+    """where it was; without a world, as it claims, and empty if it never did"""
+    drives: tuple[Drive | None, ...]
+    """what it set out to do; none, where that did not come"""
+    anchor_ranges: tuple[float | None, ...]
+    """m, as measured"""
+    account: Account | None
+    """none where its journal cannot be read"""
+    claim: Claim | None = None
+    """the first that it made, against the truth"""
 
 
 class Pair(msgspec.Struct, frozen=True, dict=True):
-    """Two robots of a record that are each other's peers."""
+    """Two robots that are each other's peers."""
 
-    record: Record
-    a: int
-    """where it stands in the scenario"""
-    b: int
-    accounts: dict[str, Account]
-    """of those robots whose journal can be read"""
+    title: str
+    """which run it is of, and how that ended"""
+    mission: Mission
+    """what is known of the mission by all"""
+    variant: Variant
+    a: Side
+    b: Side
+    mutual: tuple[tuple[bool, float | None], ...]
+    """whether the two were in contact, and the range that was measured, tick by tick"""
+    record: Record | None
+    """of the truth; none without a world"""
 
     @property
     def name(self) -> str:
         """Of the pair, in names of files."""
-        return f"{self.robot('a').id}-{self.robot('b').id}"
-
-    @property
-    def mission(self) -> Mission:
-        """What is known of the mission by all."""
-        return self.record.scenario.mission
+        return f"{self.a.id}-{self.b.id}"
 
     @property
     def exact(self) -> bool:
@@ -57,64 +66,38 @@ class Pair(msgspec.Struct, frozen=True, dict=True):
         return self.mission.noise.exact
 
     @property
-    def variant(self) -> str:
-        """Of the planner."""
-        return self.record.scenario.variant
-
-    @property
     def last(self) -> int:
         """The last tick on record."""
-        return max(0, len(self.record.moments) - 1)
+        return max(0, len(self.mutual) - 1)
 
-    def place(self, role: Role) -> int:
-        """In the scenario."""
-        return self.a if role == "a" else self.b
+    @property
+    def placed(self) -> bool:
+        """Whether it is known, or claimed, where both were."""
+        return bool(self.a.path and self.b.path)
 
-    def robot(self, role: Role) -> Placed:
+    def robot(self, role: Role) -> Side:
         """Who plays it."""
-        return self.record.scenario.robots[self.place(role)]
-
-    def truth(self, role: Role) -> list[Pose]:
-        """Where it was in every tick; at least where it was released."""
-        place = self.place(role)
-        return [moment.truth.poses[place] for moment in self.record.moments] or [self.robot(role).start]
+        return self.a if role == "a" else self.b
 
     def drive(self, role: Role, tick: int) -> Drive | None:
         """What it set out to do then; none, if that did not come."""
-        return self.record.moments[tick].drives.get(self.robot(role).id)
-
-    def account(self, role: Role) -> Account | None:
-        """None where its journal cannot be read."""
-        return self.accounts.get(self.robot(role).id)
+        drives = self.robot(role).drives
+        return drives[tick] if tick < len(drives) else None
 
     @property
     def told(self) -> list[Role]:
         """Those whose journal can be read."""
-        return [role for role in ROLES if self.account(role) is not None]
+        return [role for role in ROLES if self.robot(role).account is not None]
 
     def minds(self, role: Role) -> tuple[Mind, ...]:
-        """After each tick, as far as both its own record and the world's go."""
-        account = self.account(role)
-        return account.minds[: max(1, len(self.record.moments))] if account is not None else ()
+        """After each tick, as far as there is anything else on record."""
+        account = self.robot(role).account
+        return account.minds[: max(1, len(self.mutual))] if account is not None else ()
 
     @cached_property
     def separations(self) -> list[float]:
-        """m: how far apart the two truly were, tick by tick."""
-        return [
-            math.hypot(p.x - q.x, p.y - q.y) for p, q in zip(self.truth("a"), self.truth("b"), strict=True)
-        ]
-
-    @cached_property
-    def mutual(self) -> list[tuple[bool, float | None]]:
-        """Whether the two were in contact, and the range that was measured, tick by tick."""
-        scenario = self.record.scenario
-        told = [mutual_ranges(one.truth, scenario, [(self.a, self.b)])[0] for one in self.record.moments]
-        return [(one is not None, one.range if one is not None else None) for one in told]
-
-    def anchor_ranges(self, role: Role) -> list[float | None]:
-        """m, as measured, tick by tick."""
-        place, scenario = self.place(role), self.record.scenario
-        return [anchor_ranges(one.truth, scenario)[place] for one in self.record.moments]
+        """m: how far apart the two were, tick by tick, as far as it is known."""
+        return [math.hypot(p.x - q.x, p.y - q.y) for p, q in zip(self.a.path, self.b.path, strict=False)]
 
     @cached_property
     def contacts(self) -> list[tuple[int, int]]:
@@ -130,41 +113,81 @@ class Pair(msgspec.Struct, frozen=True, dict=True):
     @cached_property
     def met(self) -> int | None:
         """The first tick in which one of them is in phase 3."""
-        for tick in range(len(self.record.moments)):
+        for tick in range(len(self.mutual)):
             drives = [self.drive(role, tick) for role in ROLES]
             if any(drive is not None and drive.phase == 3 for drive in drives):
                 return tick
         return None
 
 
-ROLES: tuple[Role, Role] = ("a", "b")
+def of_record(record: Record, places: tuple[int, int], accounts: Mapping[str, Account]) -> Pair:
+    """The robots at those places of the scenario, a first; `accounts` are those that can be read."""
+    scenario, moments = record.scenario, record.moments
+    last = max(0, len(moments) - 1)
+    how = (
+        f"the record breaks off after {last} ticks"
+        if record.end is None
+        else ended(record.end.outcome, last, record.end.reason)
+    )
+    ranges = [anchor_ranges(one.truth, scenario) for one in moments]
+    mutual = [mutual_ranges(one.truth, scenario, [places])[0] for one in moments]
+
+    def side(role: Role, place: int) -> Side:
+        robot = scenario.robots[place]
+        return Side(
+            robot.id,
+            robot.anchor,
+            robot.rendezvous.of(role),
+            tuple([one.truth.poses[place] for one in moments] or [robot.start]),
+            tuple([one.drives.get(robot.id) for one in moments]),
+            tuple([each[place] for each in ranges]),
+            accounts.get(robot.id),
+            first_claim(record, place),
+        )
+
+    return Pair(
+        f"{scenario.name}, seed {scenario.seed}, {scenario.variant}: {how}",
+        scenario.mission,
+        scenario.variant,
+        side("a", places[0]),
+        side("b", places[1]),
+        tuple([(one is not None, one.range if one is not None else None) for one in mutual]),
+        record,
+    )
 
 
-def account(folder: Path, robot: str) -> Account:
-    """What `robot` journaled, and its planner run again on it.
+def of_robots(accounts: Mapping[str, Account]) -> Pair:
+    """Without a world: of one or both of a pair, each of whom was briefed."""
+    told = {robot: one.past for robot, one in accounts.items() if one.past is not None}
+    briefing = next(iter(told.values())).briefing
+    ticks = min([len(past.steps) for past in told.values()])
+    mutual: list[tuple[bool, float | None]] = []
+    for tick in range(ticks):
+        met = [one for past in told.values() if (one := worldless.contact(past, tick)) is not None]
+        mutual.append((bool(met), next((one.range for one in met if one.range is not None), None)))
 
-    Raises OSError if there is no journal, CorruptJournal if it is damaged before its end, or another's.
-    """
-    told = past_of(folder, robot)
-    return _again(told) if told is not None else Account((), ())
+    def side(role: Role) -> Side:
+        own = briefing.role == role
+        robot = briefing.robot if own else briefing.peer
+        past = told.get(robot)
+        steps = past.steps[:ticks] if past is not None else ()
+        return Side(
+            robot,
+            briefing.anchor if own else briefing.peer_anchor,
+            briefing.rendezvous.of(role),
+            worldless.path(past)[:ticks] if past is not None else (),
+            tuple([step.drive for step in steps]),
+            tuple([step.sense.anchor_range for step in steps]),
+            accounts.get(robot),
+        )
 
-
-def _again(told: Past) -> Account:
-    """Every decision once more, which must be the one on record."""
-    held, robot = told.estimates, Robot(told.briefing)
-    minds: list[Mind] = []
-    for step in told.steps:
-        tick = step.sense.tick
-        try:
-            robot.sense(step.sense, step.frame)
-            if step.drive is None:
-                break
-            robot.decide(step.heard, step.missed)
-        except Exception as error:  # noqa: BLE001  # whatever the inputs on record do to it
-            why = f"the planner cannot go on from its inputs of tick {tick}: {type(error).__name__}: {error}"
-            return Account(held, tuple(minds), why)
-        if robot.drive_frame != encode(step.drive):
-            why = f"on record it decided otherwise at tick {tick}: the journal is another version's"
-            return Account(held, tuple(minds), why)
-        minds.append(robot.mind)
-    return Account(held, tuple(minds))
+    places = "; places by their claims" if all(past.claim is not None for past in told.values()) else ""
+    return Pair(
+        f"{' and '.join(told)} without a world, {briefing.variant}: {worldless.outcome(told)}{places}",
+        briefing.mission,
+        briefing.variant,
+        side("a"),
+        side("b"),
+        tuple(mutual),
+        None,
+    )

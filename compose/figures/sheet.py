@@ -15,7 +15,6 @@ from matplotlib.patches import Circle
 
 from compose.figures.pair import Pair
 from compose.figures.style import INK
-from compose.record import ended
 from protocol.mission import Role
 
 LINE, ROW = 0.17, 0.175
@@ -24,6 +23,8 @@ CHARACTERS = 14.8
 """of the title, to an inch"""
 SMALL = 8
 NO_ENCOUNTER = "the two did not meet in phase 3"
+NO_TRUTH = "without a world nobody knows where the two truly were"
+NO_PLACES = "without a world there are only claims of where the two were, and not both have made one"
 
 
 ANCHORS: dict[Role, str] = {"a": "M_1", "b": "M_2"}
@@ -85,13 +86,7 @@ def circle(axes: Axes, place: tuple[float, float], radius: float, **look: Any) -
 
 def ending(pair: Pair) -> str:
     """Which run it is of, and how that ended."""
-    record = pair.record
-    how = (
-        f"the record breaks off after {pair.last} ticks"
-        if record.end is None
-        else ended(record.end.outcome, pair.last, record.end.reason)
-    )
-    return plain(f"{record.scenario.name}, seed {record.scenario.seed}, {record.scenario.variant}: {how}")
+    return plain(pair.title)
 
 
 def plain(text: str) -> str:

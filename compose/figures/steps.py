@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 from matplotlib.axes import Axes
@@ -9,7 +10,7 @@ from matplotlib.figure import Figure
 
 from compose.figures.pair import ROLES, Pair
 from compose.figures.series import Series, some, square
-from compose.figures.sheet import NO_ENCOUNTER, Absent, Window, circle, ending
+from compose.figures.sheet import NO_ENCOUNTER, NO_PLACES, Absent, Window, circle, ending
 from compose.figures.style import COLOURS, DASHES, INK, MARKS, PALE
 from compose.figures.trajectory import heading
 from protocol.mission import Role
@@ -25,6 +26,8 @@ ARROW = 0.12
 
 def draw(pair: Pair) -> Figure | Absent:
     """The ticks in which the two were ranged from new places."""
+    if not pair.placed:
+        return Absent(NO_PLACES)
     ticks = steps(pair)
     if not ticks:
         return Absent(NO_ENCOUNTER if pair.met is None else "no mutual range was measured in it")
@@ -47,14 +50,14 @@ def steps(pair: Pair) -> list[int]:
     for tick in range(pair.met, pair.last + 1):
         if pair.mutual[tick][1] is None:
             continue
-        if told and all(pair.truth(role)[told[-1]] == pair.truth(role)[tick] for role in ROLES):
+        if told and all(pair.robot(role).path[told[-1]] == pair.robot(role).path[tick] for role in ROLES):
             continue
         told.append(tick)
     return told
 
 
 def _window(pair: Pair, first: int, last: int) -> Window:
-    ends = [pose for role in ROLES for pose in pair.truth(role)[max(0, first - BEFORE) : last + 1]]
+    ends = [pose for role in ROLES for pose in pair.robot(role).path[max(0, first - BEFORE) : last + 1]]
     return square([(p.x, p.y) for p in ends], 0.12, 0.2 * pair.mission.sensing_range)
 
 
@@ -84,25 +87,25 @@ def _panel(axes: Axes, pair: Pair, met: int, before: int, tick: int) -> None:
         circle(
             axes,
             place,
-            one.rendezvous.of(role).radius,
+            one.orbit.radius,
             lw=0.9,
             ls=DASHES[role],
             color=COLOURS[role],
             zorder=1,
         )
-        poses = pair.truth(role)
+        poses = pair.robot(role).path
         _trail(axes, poses[max(0, met - BEFORE) : before + 1], 1.0, PALE)
         _trail(axes, poses[before : tick + 1], 2.0, COLOURS[role])
         for k in range(max(0, met - BEFORE), tick + 1):
             _place(axes, role, poses[k], ranged=pair.mutual[k][1] is not None, now=k == tick)
-    ends = [pair.truth(role)[tick] for role in ROLES]
+    ends = [pair.robot(role).path[tick] for role in ROLES]
     axes.plot([p.x for p in ends], [p.y for p in ends], ":", color=INK, lw=1.4, zorder=3, gid=f"rho-{tick}")
     left, right, _, _ = _window(pair, met, tick)
     for role, pose in zip(ROLES, ends, strict=True):
         heading(axes, pose, ARROW * (right - left), COLOURS[role], zorder=6)
 
 
-def _trail(axes: Axes, poses: list[Pose], width: float, colour: str) -> None:
+def _trail(axes: Axes, poses: Sequence[Pose], width: float, colour: str) -> None:
     moved = [pose for before, pose in pairwise(poses) if pose != before]
     if moved:
         places = [poses[0], *moved]

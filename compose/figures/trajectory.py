@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from compose.figures.pair import ROLES, Pair
-from compose.figures.sheet import ANCHORS, Sheet, around, circle, ending, equal, fitted
+from compose.figures.sheet import ANCHORS, NO_PLACES, Absent, Sheet, around, circle, ending, equal, fitted
 from compose.figures.style import COLOURS, DASHES, INK, MARKS, PALE
 from protocol.mission import Role
 from protocol.motion import Pose
@@ -20,8 +21,10 @@ MANY = 160
 LABEL = {"facecolor": "white", "alpha": 0.75, "pad": 0.6, "lw": 0}
 
 
-def draw(pair: Pair) -> Figure:
+def draw(pair: Pair) -> Figure | Absent:
     """The plane, and what the signs in it mean beside it."""
+    if not pair.placed:
+        return Absent(NO_PLACES)
     window = around(_extent(pair), 0.03)
     width, height = fitted(window, WIDTH, TALLEST)
     tall = max(height, 2.9)
@@ -31,9 +34,11 @@ def draw(pair: Pair) -> Figure:
         draw_anchor(axes, pair, role)
         _orbit(axes, pair, role)
     for role in ROLES:
-        draw_path(axes, role, pair.truth(role), gid=f"path-{role}", label=f"path of {pair.robot(role).id}")
+        draw_path(
+            axes, role, pair.robot(role).path, gid=f"path-{role}", label=f"path of {pair.robot(role).id}"
+        )
     for role in ROLES:
-        released(axes, role, pair.truth(role)[0], _arrow(pair))
+        released(axes, role, pair.robot(role).path[0], _arrow(pair))
     _marks(axes, pair)
     equal(axes, window)
     axes.set_xlabel("$x$ [m]")
@@ -43,7 +48,7 @@ def draw(pair: Pair) -> Figure:
 
 
 def _extent(pair: Pair) -> list[tuple[float, float]]:
-    points = [(pose.x, pose.y) for role in ROLES for pose in pair.truth(role)]
+    points = [(pose.x, pose.y) for role in ROLES for pose in pair.robot(role).path]
     for role in ROLES:
         one = pair.robot(role)
         reach = max(pair.mission.sensing_range, _orbit_radius(pair, role))
@@ -52,7 +57,7 @@ def _extent(pair: Pair) -> list[tuple[float, float]]:
 
 
 def _orbit_radius(pair: Pair, role: Role) -> float:
-    return pair.robot(role).rendezvous.of(role).radius
+    return pair.robot(role).orbit.radius
 
 
 def _arrow(pair: Pair) -> float:
@@ -91,7 +96,7 @@ def _orbit(axes: Axes, pair: Pair, role: Role) -> None:
     )  # fmt: skip
 
 
-def draw_path(axes: Axes, role: Role, poses: list[Pose], gid: str, label: str | None) -> None:
+def draw_path(axes: Axes, role: Role, poses: Sequence[Pose], gid: str, label: str | None) -> None:
     """Successive positions, joined by lines as in the paper."""
     axes.plot(
         [p.x for p in poses], [p.y for p in poses], "-", lw=1.3, ms=3.6, mew=0.8, color=COLOURS[role],
@@ -126,13 +131,13 @@ def _marks(axes: Axes, pair: Pair) -> None:
     axes.plot([], [], "s", ms=7, mfc="white", mec=INK, mew=1.5, label="released, heading")
     if pair.contacts:
         tick = pair.contacts[0][0]
-        ends = [pair.truth(role)[tick] for role in ROLES]
+        ends = [pair.robot(role).path[tick] for role in ROLES]
         axes.plot(
             [p.x for p in ends], [p.y for p in ends], ":", color=INK, lw=1.6, zorder=5, gid="contact",
             label=f"first in range of each\nother, $k$ = {tick}",
         )  # fmt: skip
     for role in ROLES:
-        end = pair.truth(role)[-1]
+        end = pair.robot(role).path[-1]
         axes.plot(
             end.x, end.y, "*", ms=11, mfc=COLOURS[role], mec="white", mew=0.7, zorder=6, gid=f"last-{role}"
         )

@@ -1,0 +1,60 @@
+"""What a robot's own journal tells of its mind: its planner, run again on what came in."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+
+from agent.mind import Mind
+from agent.past import Past
+from agent.robot import Robot
+from compose.record import past_of
+from protocol.messages import Estimate
+from protocol.wire import encode
+
+
+class Account(msgspec.Struct, frozen=True):
+    """One robot's own record."""
+
+    past: Past | None
+    """none if it was killed before it was briefed"""
+    minds: tuple[Mind, ...] = ()
+    """after each tick, from 0 on, as far as it decided in it"""
+    broken: str | None = None
+    """why minds end before the record does, if they do"""
+
+    @property
+    def held(self) -> tuple[Estimate, ...]:
+        """What it held possible, as it journaled."""
+        return self.past.estimates if self.past is not None else ()
+
+
+def account(folder: Path, robot: str) -> Account:
+    """What `robot` journaled, and its planner run again on it.
+
+    Raises OSError if there is no journal, CorruptJournal if it is damaged before its end, or another's.
+    """
+    told = past_of(folder, robot)
+    return _again(told) if told is not None else Account(None)
+
+
+def _again(told: Past) -> Account:
+    """Every decision once more, which must be the one on record."""
+    robot = Robot(told.briefing)
+    minds: list[Mind] = []
+    for step in told.steps:
+        tick = step.sense.tick
+        try:
+            robot.sense(step.sense, step.frame)
+            if step.drive is None:
+                break
+            robot.decide(step.heard, step.missed)
+        except Exception as error:  # noqa: BLE001  # whatever the inputs on record do to it
+            why = f"the planner cannot go on from its inputs of tick {tick}: {type(error).__name__}: {error}"
+            return Account(told, tuple(minds), why)
+        if robot.drive_frame != encode(step.drive):
+            why = f"on record it decided otherwise at tick {tick}: the journal is another version's"
+            return Account(told, tuple(minds), why)
+        minds.append(robot.mind)
+    return Account(told, tuple(minds))

@@ -1,0 +1,146 @@
+"""A record of robots alone: what their own journals tell is shown, and nothing of what only a world knows."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from compose.figures import over_time, phase_one, trajectory
+from compose.figures.account import account
+from compose.figures.pair import Pair, of_record, of_robots
+from compose.figures.sheet import NO_PLACES, Absent
+from compose.inline import play
+from compose.record import read
+from compose.scenario import load
+from protocol.mission import Role
+from tests.commands import tandem
+from tests.doctor import complaints
+from tests.replays import journals_of
+from tests.test_album import drawn, line
+
+KNOWN_TO_A_WORLD = ("x", "y", "heading")
+MEASURED = ("tick", "robot", "v", "omega", "anchor_range", "mutual_range", "phase", "state")
+
+
+@pytest.fixture(scope="module", params=["paper-1", "noisy"])
+def folders(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A record, and what the robots have of it."""
+    whole, alone = tmp_path_factory.mktemp("whole"), tmp_path_factory.mktemp("alone")
+    play(load(request.param), whole)
+    for robot in "ab":
+        name = f"agent-{robot}.journal"
+        (alone / name).write_bytes((whole / name).read_bytes())
+    return whole, alone
+
+
+def pair_of(whole: Path) -> Pair:
+    return of_record(read(whole), (0, 1), {robot: account(whole, robot) for robot in "ab"})
+
+
+def alone_of(alone: Path, robots: str = "ab") -> Pair:
+    return of_robots({robot: account(alone, robot) for robot in robots})
+
+
+def table(folder: Path) -> list[dict[str, str]]:
+    with (folder / "ticks.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_an_export_has_what_was_measured_and_believed_and_no_truth(folders: tuple[Path, Path]) -> None:
+    whole, alone = folders
+    for folder in folders:
+        ended = tandem("export", folder)
+        assert (ended.status, ended.err) == (0, "")
+    exact = read(whole).scenario.mission.noise.exact
+    for told, known in zip(table(alone), table(whole), strict=True):
+        assert {told[name] for name in KNOWN_TO_A_WORLD} == {""}
+        same = MEASURED if exact else tuple(name for name in MEASURED if name not in ("v", "omega"))
+        assert [told[name] for name in same] == [known[name] for name in same]
+        assert (told["v"] == "") == (known["v"] == "")  # as measured, where the world knows what was driven
+    rows, truly = (pq.read_table(folder / "ticks.parquet").to_pylist() for folder in (alone, whole))
+    for name in ("world", "local", "odds", "estimate_x", "cov_xx", "verdict", "time_s"):
+        assert [row[name] for row in rows] == [row[name] for row in truly]
+    assert {row["position_error_m"] for row in rows} == {None}
+    assert any(row["position_error_m"] is not None for row in truly)
+    assert set(journals_of(alone / "run.mcap")) == {"agent-a.journal", "agent-b.journal"}
+    assert complaints(alone / "run.mcap") == []
+
+
+def test_paths_are_the_odometry_laid_through_the_claim(folders: tuple[Path, Path]) -> None:
+    whole, alone = folders
+    known, told = pair_of(whole), alone_of(alone)
+    for role in ("a", "b"):
+        claim = known.robot(role).claim
+        assert claim is not None
+        there = told.robot(role).path[claim.tick]
+        assert (there.x, there.y) == pytest.approx((claim.pose.x, claim.pose.y), abs=1e-9)
+        if known.exact:
+            for claimed, true in zip(told.robot(role).path, known.robot(role).path, strict=True):
+                assert (claimed.x, claimed.y) == pytest.approx((true.x, true.y), abs=1e-9)
+                assert claimed.heading == pytest.approx(true.heading, abs=1e-9)
+    figure = drawn(trajectory.draw(told))
+    assert line(figure, "path-a") == [(p.x, p.y) for p in told.a.path]
+
+
+def test_what_needs_no_truth_is_drawn_as_with_a_world(folders: tuple[Path, Path]) -> None:
+    whole, alone = folders
+    known, told = pair_of(whole), alone_of(alone)
+    assert told.mutual == known.mutual
+    assert told.contacts == known.contacts
+    assert told.met == known.met
+    roles: tuple[Role, Role] = ("a", "b")
+    for role in roles:
+        assert told.robot(role).anchor_ranges == known.robot(role).anchor_ranges
+        assert told.robot(role).drives == known.robot(role).drives
+        assert told.minds(role) == known.minds(role)
+        assert type(phase_one.draw(told, role)) is type(phase_one.draw(known, role))
+    figure = drawn(over_time.ranges(told))
+    assert line(figure, "mutual-range") == line(drawn(over_time.ranges(known)), "mutual-range")
+    labels = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+    assert "separation, as claimed" in labels
+    assert "true separation" not in labels
+
+
+def test_the_command_draws_what_can_be_known_and_says_what_cannot(folders: tuple[Path, Path]) -> None:
+    _, alone = folders
+    ended = tandem("figures", alone, "--format", "png")
+    assert ended.status == 0, ended.err
+    there = {path.stem for path in (alone / "figures").iterdir()}
+    assert {"trajectory-a-b", "encounter-a-b", "ranges-a-b"} <= there
+    assert not {name for name in there if name.startswith(("errors", "robot"))}
+    lines = ended.err.splitlines()
+    assert [text for text in lines if "no errors-a-b: without a world nobody knows" in text]
+    assert [text for text in lines if "no robot-b: without a world nobody knows" in text]
+
+
+def test_of_one_robot_there_is_what_it_alone_knows(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    _, alone = folders
+    (tmp_path / "agent-b.journal").write_bytes((alone / "agent-b.journal").read_bytes())
+    told = alone_of(tmp_path, "b")
+    assert trajectory.draw(told) == Absent(NO_PLACES)
+    assert told.a.id == "a"
+    assert told.told == ["b"]
+    ended = tandem("figures", tmp_path, "--format", "png")
+    assert ended.status == 0, ended.err
+    assert (tmp_path / "figures" / "ranges-a-b.png").exists()
+    assert not (tmp_path / "figures" / "trajectory-a-b.png").exists()
+    ended = tandem("export", tmp_path)
+    assert (ended.status, ended.err) == (3, "agent-a.journal is missing\n")
+    assert {row["robot"] for row in table(tmp_path)} == {"b"}
+
+
+def test_a_robot_that_was_never_briefed_is_passed_over(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    _, alone = folders
+    (tmp_path / "agent-a.journal").write_bytes((alone / "agent-a.journal").read_bytes())
+    (tmp_path / "agent-b.journal").touch()
+    ended = tandem("figures", tmp_path, "--only", "ranges", "--format", "png")
+    assert ended.status == 0, ended.err
+    assert (tmp_path / "figures" / "ranges-a-b.png").exists()
+    (tmp_path / "agent-a.journal").write_bytes(b"")
+    ended = tandem("figures", tmp_path, "--only", "ranges", "--format", "png")
+    assert ended.err.splitlines()[-1].endswith("no picture of b: nothing is on record")
+    ended = tandem("export", tmp_path)
+    assert (ended.status, ended.out) == (2, "")
