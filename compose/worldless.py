@@ -7,13 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from agent.past import Past
 from compose.record import WORLD_JOURNAL, Row, agent_journal, ended, journals_in, past_of, robot_of
 from protocol import journal
 from protocol.messages import Briefing, Contact
 from protocol.motion import Pose, compose
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
+
+if TYPE_CHECKING:
+    from agent.past import Past
 
 
 def is_worldless(folder: Path) -> bool:
