@@ -91,7 +91,11 @@ def parser() -> argparse.ArgumentParser:
     _add_playing(run)
     run.add_argument("--in-process", action="store_true", help="without processes or network")
     run.add_argument("--secure", action="store_true", help="encrypted, with keys made for this run alone")
-    run.add_argument("--export", action="store_true", help="leave run.mcap and tables in --out DIR, too")
+    run.add_argument(
+        "--export",
+        action=argparse.BooleanOptionalAction,
+        help="leave run.mcap and tables in --out DIR, too (default: where the extra lab is installed)",
+    )
     run.add_argument("--foxglove", type=port, metavar="PORT", help="serve Foxglove's viewers there, live")
     run.add_argument("--watch", action="store_true", help="serve a page that shows it, live and afterwards")
     run.add_argument(

@@ -104,11 +104,17 @@ class Command:
         terminal: int | None = None,
         through: Sequence[str] = (),
     ) -> None:
-        """`terminal` takes its standard output, if given; `through` is a command that becomes it."""
+        """`terminal` takes its standard output, if given; `through` is a command that becomes it.
+
+        A run leaves its record without an export of it, where nothing is said of that: it takes longer.
+        """
+        words = list(map(str, arguments))
+        if words[:1] == ["run"] and "--out" in words and not {"--export", "--no-export"} & {*words}:
+            words.append("--no-export")
         self._out = tempfile.TemporaryFile()  # noqa: SIM115  # closed with the command
         self._err = tempfile.TemporaryFile()  # noqa: SIM115
         self._process = subprocess.Popen(
-            [*through, sys.executable, "-P", "-m", "compose", *map(str, arguments)],
+            [*through, sys.executable, "-P", "-m", "compose", *words],
             stdin=subprocess.DEVNULL,
             stdout=self._out if terminal is None else terminal,
             stderr=self._err,

@@ -11,6 +11,8 @@ import math
 import random
 import socket
 import struct
+import subprocess
+import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,8 +30,10 @@ from mcap.records import Schema
 from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 
-from compose import inline
+from compose import exporting, inline
 from compose.audit.replay import replay
+from compose.cli import parser
+from compose.commands import run
 from compose.export.folder import export
 from compose.export.views import LEAST
 from compose.local import free_endpoint
@@ -363,14 +367,52 @@ def test_what_is_no_record_and_what_cannot_be_written_are_refused(paper_1: Path,
 
 
 @pytest.mark.parametrize("mode", [[], ["--in-process"]])
-def test_a_run_exports_at_its_end_if_it_is_told_to(mode: list[str], paper_1: Path, tmp_path: Path) -> None:
+def test_a_run_exports_its_record_at_its_end(mode: list[str], paper_1: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    ended = tandem("run", "paper-1", "-q", "--out", out, "--export", *mode)
-    assert (ended.status, ended.out, ended.err) == (0, "localised after 48 ticks\n", "")
+    ended = subprocess.run(
+        [sys.executable, "-P", "-m", "compose", "run", "paper-1", "-q", "--out", out, *mode],
+        capture_output=True,
+        text=True,
+        timeout=BOUND_S,
+        check=False,
+    )
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "localised after 48 ticks\n", "")
     assert {name: (out / name).read_bytes() for name in FILES} == {
         name: (paper_1 / name).read_bytes() for name in FILES
     }
+    ended_without = tandem("run", "paper-1", "-q", "--out", tmp_path / "bare", "--no-export", *mode)
+    assert ended_without.status == 0
+    assert {path.name for path in out.iterdir()} - {path.name for path in (tmp_path / "bare").iterdir()} == {
+        *("run.mcap", "frames.csv", "ticks.parquet")
+    }
     assert tandem("run", "paper-1", "-q", "--export", *mode).status == 2
+
+
+def test_a_run_tells_its_outcome_though_it_cannot_export(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(exporting, "MODULES", ("no_such_module",))
+    monkeypatch.setattr(run, "stop_by_signal", lambda _: None)  # of the tests' own process
+    for quiet, said in ((True, ""), (False, "tandem run: not exported: needs no_such_module")):
+        words = ["run", "paper-1", "--in-process", "--out", str(tmp_path / str(quiet)), *["-q"] * quiet]
+        assert run.main(parser().parse_args(words)) == 0
+        told = capsys.readouterr()
+        assert "localised after 48 ticks" in told.out
+        assert told.err.startswith(said)
+        assert bool(told.err) == bool(said)
+
+
+def test_ctrl_c_ends_an_export_and_leaves_nothing_half_written(paper_1: Path, tmp_path: Path) -> None:
+    with Command("export", paper_1, "--out", tmp_path / "out") as command:
+        command.until(lambda: command.catches(Signals.SIGTERM), "it catches signals")
+        command.tell(Signals.SIGINT)
+        ended = command.ended()
+    assert (ended.status, ended.out, ended.err) == (130, "", "tandem export: stopped by SIGINT\n")
+    assert list((tmp_path / "out").iterdir()) == []
+    ticks = iter(range(10))
+    with pytest.raises(StopIteration):
+        export(paper_1, tmp_path / "out", check=lambda: next(ticks))
+    assert list((tmp_path / "out").iterdir()) == []
 
 
 STANDING = {"/stage", "/a/pose", "/b/trail", "/contact", "/a/belief", "/journal/world/drive"}
@@ -420,12 +462,12 @@ def test_a_viewer_sees_a_run_while_it_is_played_and_to_its_end(tmp_path: Path) -
     out = tmp_path / "out"
     (tmp_path / "assured.toml").write_text(ASSURED)
     scenario = tmp_path / "assured.toml"
-    with Command("run", scenario, "-q", "--rate", "40", "--foxglove", str(port), "--out", out) as run:
-        run.until_says(f"what Foxglove's viewers show at ws://127.0.0.1:{port}")
+    with Command("run", scenario, "-q", "--rate", "40", "--foxglove", str(port), "--out", out) as played:
+        played.until_says(f"what Foxglove's viewers show at ws://127.0.0.1:{port}")
         topics = asyncio.run(asyncio.wait_for(watched(port, "The mission ends: localised"), BOUND_S))
-        run.until_says("until Ctrl-C")
-        assert run.tell(Signals.SIGINT)
-        ended = run.ended()
+        played.until_says("until Ctrl-C")
+        assert played.tell(Signals.SIGINT)
+        ended = played.ended()
     assert ended.status == 0
     assert "\nlocalised after " in ended.out
     assert topics["/tf"] == "foxglove.FrameTransforms"
@@ -436,11 +478,11 @@ def test_a_viewer_sees_a_run_while_it_is_played_and_to_its_end(tmp_path: Path) -
 
 def test_who_comes_late_sees_what_stands_and_the_end() -> None:
     port = int(free_endpoint().rsplit(":", 1)[1])
-    with Command("run", "paper-1", "-q", "--foxglove", str(port)) as run:
-        run.until_says("until Ctrl-C")
+    with Command("run", "paper-1", "-q", "--foxglove", str(port)) as played:
+        played.until_says("until Ctrl-C")
         assert asyncio.run(asyncio.wait_for(watched(port, "The mission ends: localised"), BOUND_S))
-        run.tell(Signals.SIGINT)
-        assert run.ended().status == 0
+        played.tell(Signals.SIGINT)
+        assert played.ended().status == 0
 
 
 def test_a_port_that_is_taken_is_said_before_anything_moves(tmp_path: Path) -> None:

@@ -6,19 +6,22 @@ import argparse
 import sys
 from pathlib import Path
 
-from compose.lab import need
-from compose.record import legible
-from compose.status import ENDED, FAILED
+from compose.exporting import exported
+from compose.status import ENDED, FAILED, STOPPED
+from compose.stop import stop_by_signal
+from protocol.inbox import Inbox, Interrupted
 
 
 def main(options: argparse.Namespace) -> int:
     """Write the files; FAILED if a robot's journal is missing, of whom there is only what the world knows."""
-    need("foxglove", "pyarrow")
-    from compose.export.folder import export  # noqa: PLC0415  # slow, and there may be no extra
-
     out: Path = options.out or options.record
-    with legible(options.record):
-        done = export(options.record, out)
+    inbox = Inbox("tandem export")
+    stop_by_signal(inbox)
+    try:
+        done = exported(options.record, out, inbox)
+    except Interrupted as signal_name:
+        inbox.say(f"stopped by {signal_name}")
+        return STOPPED
     for path in done.files:
         print(path)
     for name, size in done.torn.items():

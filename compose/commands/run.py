@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from compose import local
+from compose import exporting, local
 from compose.beside import Beside, beside, page, stay, viewers
 from compose.kill import WORLD, Kill
 from compose.lab import need
@@ -35,7 +35,7 @@ def main(options: argparse.Namespace) -> int:
     if options.foxglove is not None:
         need("foxglove")
     if options.export:
-        need("foxglove", "pyarrow")
+        need(*exporting.MODULES)
         if options.out is None:
             raise UserError("--export: there is no --out DIR to leave it in")
     kills = _kills(options, found, scenario)
@@ -79,11 +79,11 @@ def _in_process(options: argparse.Namespace, scenario: Scenario) -> int:
         except CannotRecord as error:
             raise UserError(f"--out: {error}") from None
         status = conclude(options, played, folder, "in-process", began)
-        _export(options, folder)
-        if shows:
-            inbox = Inbox("tandem run")
-            stop_by_signal(inbox)
-            stay(shows, inbox)
+        inbox = Inbox("tandem run")
+        stop_by_signal(inbox)
+        if not _exported(options, folder, inbox):
+            return STOPPED
+        stay(shows, inbox)
         return status
 
 
@@ -120,7 +120,8 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[
         for kill in spared:
             inbox.say(f"--kill {kill.text}: never came")
         status = conclude(options, read(folder), folder, "processes", began)
-        _export(options, folder)
+        if not _exported(options, folder, inbox):
+            return STOPPED
         stay(shows, inbox)
         return status
 
@@ -151,10 +152,17 @@ def _shown(options: argparse.Namespace, folder: Path) -> Iterator[list[Beside]]:
         yield shows
 
 
-def _export(options: argparse.Namespace, folder: Path) -> None:
-    """Once the outcome has been told; it takes as long as a short mission."""
-    if options.export:
-        from compose.export.folder import export  # noqa: PLC0415  # slow, and there may be no extra
-
-        sys.stdout.flush()
-        export(folder, folder)
+def _exported(options: argparse.Namespace, folder: Path, inbox: Inbox) -> bool:
+    """Once the outcome has been told, which stands whatever becomes of this. False, if told to stop."""
+    if options.out is None or options.export is False:
+        return True
+    sys.stdout.flush()
+    try:
+        exporting.exported(folder, folder, inbox)
+    except UserError as error:
+        if options.export or not options.quiet:
+            inbox.say(f"not exported: {error}")
+    except Interrupted as signal_name:
+        inbox.say(f"stopped by {signal_name} before all was exported")
+        return False
+    return True

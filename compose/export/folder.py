@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import NamedTuple
 
@@ -39,9 +39,19 @@ class _Ticks(NamedTuple):
     """robots of which there is no journal"""
 
 
-def export(folder: Path, out: Path) -> Exported:
+FILES = ("run.mcap", "frames.csv", "ticks.csv", "ticks.parquet")
+
+
+def export(
+    folder: Path,
+    out: Path,
+    *,
+    done: Callable[[], object] = lambda: None,
+    check: Callable[[], object] = lambda: None,
+) -> Exported:
     """Write those of the record in `folder` into `out`.
 
+    Calls `done` after each file, and `check` now and then, which may raise.
     Raises OSError if there is no record, journal.CorruptJournal if it is damaged before its end,
     UserError if it is too long for a format, or `out` cannot be written.
     """
@@ -49,20 +59,23 @@ def export(folder: Path, out: Path) -> Exported:
     told = _of_robots(folder) if worldless.is_worldless(folder) else _of_world(folder, books)
     run = recorded.read(folder)
     record.make(out)
-    mcap, frames, ticks, parquet = (
-        out / name for name in ("run.mcap", "frames.csv", "ticks.csv", "ticks.parquet")
-    )
+    mcap, frames, ticks, parquet = files = tuple([out / name for name in FILES])
+    writers: dict[Path, Callable[[], object]] = {
+        mcap: lambda: write_mcap(books, run, mcap, check),
+        frames: lambda: frames.write_text(frames_csv(in_time(books), check), encoding="utf-8"),
+        ticks: lambda: ticks.write_text(record.table(told.rows), encoding="utf-8"),
+        parquet: lambda: write_ticks(told.rows, told.drives, told.held, told.period, parquet),
+    }
     try:
-        write_mcap(books, run, mcap)
-        frames.write_text(frames_csv(in_time(books)), encoding="utf-8")
-        ticks.write_text(record.table(told.rows), encoding="utf-8")
-        write_ticks(told.rows, told.drives, told.held, told.period, parquet)
+        for write in writers.values():
+            write()
+            done()
     except OSError as error:
         raise UserError(record.cannot_write(out, error)) from None
     except TooLong as error:
         raise UserError(str(error)) from None
     return Exported(
-        files=(mcap, frames, ticks, parquet),
+        files=files,
         torn={name: book.torn for name, book in books.items() if book.torn},
         missing=tuple([record.agent_journal(robot) for robot in told.missing]),
     )

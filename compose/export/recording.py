@@ -6,7 +6,7 @@ Times are of the simulation, from 0 on. The same record gives the same bytes.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from heapq import merge
 from operator import itemgetter
 from pathlib import Path
@@ -92,8 +92,10 @@ class Channels:
             channel.close()
 
 
-def write_mcap(books: Mapping[str, Book], run: Performance, path: Path) -> int:
-    """Write `path` anew; how many frames are in it.
+def write_mcap(
+    books: Mapping[str, Book], run: Performance, path: Path, check: Callable[[], object] = lambda: None
+) -> int:
+    """Write `path` anew; how many frames are in it. Calls `check` in each tick, which may raise.
 
     Raises OSError if it cannot be written, TooLong, CorruptJournal.
     """
@@ -108,7 +110,7 @@ def write_mcap(books: Mapping[str, Book], run: Performance, path: Path) -> int:
             kept = _Kept(file)
             options = MCAPWriteOptions(chunk_size=CHUNK_BYTES, compression_threads=0)
             with foxglove.open_mcap(kept, context=context, writer_options=options):
-                count = _tell(books, run, channels, kept)
+                count = _tell(books, run, channels, [kept.check, check])
             kept.check()
         draft.replace(path)
     finally:
@@ -117,7 +119,9 @@ def write_mcap(books: Mapping[str, Book], run: Performance, path: Path) -> int:
     return count
 
 
-def _tell(books: Mapping[str, Book], run: Performance, channels: Channels, kept: _Kept) -> int:
+def _tell(
+    books: Mapping[str, Book], run: Performance, channels: Channels, checks: Sequence[Callable[[], object]]
+) -> int:
     """Everything, tick by tick: first the frames, then what there is to see."""
     views = Views(run.stage)
     channels.open_views(run.stage)
@@ -132,7 +136,8 @@ def _tell(books: Mapping[str, Book], run: Performance, channels: Channels, kept:
             channels.view(*views.standing(), at)
         for shown in views.of(one):
             channels.view(*shown, at)
-        kept.check()
+        for check in checks:
+            check()
     return count
 
 

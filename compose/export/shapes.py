@@ -35,14 +35,24 @@ def colour(rgb: tuple[float, float, float], alpha: float = 1.0) -> fox.Color:
     return fox.Color(r=rgb[0], g=rgb[1], b=rgb[2], a=alpha)
 
 
+def point(x: float, y: float) -> fox.Point3:
+    """On the ground."""
+    return fox.Point3(x=x, y=y, z=0.0)
+
+
 def strip(points: Sequence[tuple[float, float]], tint: fox.Color, width: float) -> fox.LinePrimitive:
     """A line through `points`, `width` pixels wide."""
+    return line([point(x, y) for x, y in points], tint, width)
+
+
+def line(points: Sequence[fox.Point3], tint: fox.Color, width: float) -> fox.LinePrimitive:
+    """As `strip`, through points that are made already."""
     return fox.LinePrimitive(
         type=fox.LinePrimitiveLineType.LineStrip,
         pose=fox.Pose(position=fox.Vector3(), orientation=fox.Quaternion(w=1.0)),
         thickness=width,
         scale_invariant=True,
-        points=[fox.Point3(x=x, y=y, z=0.0) for x, y in points],
+        points=list(points),
         color=tint,
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -94,12 +94,16 @@ def _estimate(held: Estimate | None, truth: Pose | None) -> dict[str, Any]:
     return told
 
 
-def frames_csv(frames: Iterable[Journaled]) -> str:
-    """One row per frame: where it stands, when it was journaled, and what it says, as JSON."""
+def frames_csv(frames: Iterable[Journaled], check: Callable[[], object] = lambda: None) -> str:
+    """One row per frame: where it stands, when it was journaled, and what it says, as JSON.
+
+    Calls `check` before each, which may raise.
+    """
     out = io.StringIO()
     written = csv.writer(out, lineterminator="\n")
     written.writerow(["journal", "place", "tick", "kind", "bytes", "message"])
     for one in frames:
+        check()
         text = msgspec.json.encode(_named(one.message)).decode()
         written.writerow([one.journal, one.place, one.tick, one.kind, len(one.frame), text])
     return out.getvalue()

@@ -66,13 +66,26 @@ def nanoseconds(stage: Stage, tick: int) -> int:
     return round(tick * stage.mission.period * 1e9)
 
 
+class Trail:
+    """Where a robot was, the latest TRAIL poses; each is made once for all the messages that it is in."""
+
+    def __init__(self) -> None:
+        self.poses: deque[fox.Pose] = deque(maxlen=TRAIL)
+        self.points: deque[fox.Point3] = deque(maxlen=TRAIL)
+
+    def add(self, pose: Pose) -> None:
+        """The next."""
+        self.poses.append(shapes.pose(pose))
+        self.points.append(shapes.point(pose.x, pose.y))
+
+
 class Views:
     """A run, to be shown tick by tick, in the order of the ticks."""
 
     def __init__(self, stage: Stage) -> None:
         self.stage = stage
         self._unit = BODY * stage.mission.sensing_range
-        self._trails: dict[str, deque[Pose]] = {robot: deque(maxlen=TRAIL) for robot in stage.ids}
+        self._trails = {robot: Trail() for robot in stage.ids}
         self._latest: Scene | None = None
 
     def standing(self) -> Shown:
@@ -96,7 +109,7 @@ class Views:
         self._latest = scene
         for player in scene.players:
             if player.pose is not None:
-                self._trails[player.robot].append(player.pose)
+                self._trails[player.robot].add(player.pose)
         yield from self._lines(scene)
 
     def _lines(self, scene: Scene) -> Iterator[Shown]:
@@ -129,11 +142,10 @@ class Views:
 
     def _robot(self, player: Player, at: fox.Timestamp) -> Iterator[Shown]:
         robot, seat = player.robot, self.stage.seat(player.robot)
-        trail = self._trails[robot]
         if player.pose is not None:
             pose = fox.PoseInFrame(timestamp=at, frame_id=WORLD, pose=shapes.pose(player.pose))
             yield Shown(f"/{robot}/pose", pose)
-            poses = [shapes.pose(one) for one in trail]
+            poses = list(self._trails[robot].poses)
             yield Shown(f"/{robot}/trail", fox.PosesInFrame(timestamp=at, frame_id=WORLD, poses=poses))
             yield Shown(f"/{robot}/body", fox.SceneUpdate(entities=[self._body(seat, player, at)]))
         if player.held is not None:
@@ -148,9 +160,9 @@ class Views:
         assert player.pose is not None
         colour = shapes.colour(COLOURS[seat.role])
         lines, texts = [], [shapes.words(f"{seat.id}: {player.doing}", player.pose, self._unit, colour)]
-        trail = self._trails[seat.id]
+        trail = self._trails[seat.id].points
         if len(trail) > 1:
-            lines.append(shapes.strip([(one.x, one.y) for one in trail], colour, 2.0))
+            lines.append(shapes.line(trail, colour, 2.0))
         if player.anchor_range is not None:
             ends = [(player.pose.x, player.pose.y), (seat.anchor.x, seat.anchor.y)]
             lines.append(shapes.strip(ends, shapes.colour(COLOURS[seat.role], 0.5), 1.5))

@@ -1,0 +1,26 @@
+"""An export as commands make it: with a bar, and no longer than until they are told to stop."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from compose.lab import need
+from compose.record import legible
+from compose.telling import counting
+from protocol.inbox import Inbox
+
+if TYPE_CHECKING:
+    from compose.export.folder import Exported
+
+MODULES = ("foxglove", "pyarrow")
+"""that it needs"""
+
+
+def exported(folder: Path, out: Path, inbox: Inbox) -> Exported:
+    """What `compose.export.folder.export` does. Raises UserError; Interrupted when `inbox` says so."""
+    need(*MODULES)
+    from compose.export.folder import FILES, export  # noqa: PLC0415  # slow, and there may be no extra
+
+    with legible(folder), counting("tandem export", len(FILES)) as done:
+        return export(folder, out, done=done, check=lambda: inbox.next(0.0))
