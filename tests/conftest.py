@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 
@@ -10,6 +11,11 @@ from tests.commands import tandem
 
 settings.register_profile("tandem", derandomize=True, deadline=None, database=None)
 settings.load_profile("tandem")
+
+
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:  # noqa: ARG001  # the hook's own name
+    """One more than there are cores: a test that starts processes waits for a good part of its time."""
+    return (os.cpu_count() or 1) + 1
 
 
 @pytest.fixture(scope="module")
