@@ -1,4 +1,4 @@
-"""Draws the README's pictures of single missions: `uv run docs/picture.py`."""
+"""Draws the pictures of single missions in README and on the pages: `uv run docs/picture.py`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SHOWN: dict[str, dict[str, str]] = {
     },
     "noisy": {"plan-a-b": "noisy-plan", "robot-a": "noisy-a"},
 }
-"""by scenario: of the pictures that `tandem figures` makes, those that README shows, and their names there"""
+"""by scenario: of the pictures that `tandem figures` makes, those that are shown, and their names here"""
 
 
 def main() -> None:
