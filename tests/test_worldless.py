@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Callable
 from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
+from msgspec.structs import replace
 
+from compose.audit.alone import RULES, judge_alone
 from compose.figures import over_time, phase_one, trajectory
 from compose.figures.account import account
 from compose.figures.pair import Pair, of_record, of_robots
@@ -15,7 +18,10 @@ from compose.figures.sheet import NO_PLACES, Absent
 from compose.inline import play
 from compose.record import read
 from compose.scenario import load
+from protocol import journal
+from protocol.messages import Drive, Message, OfRobot, Report
 from protocol.mission import Role
+from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from tests.commands import tandem
 from tests.doctor import complaints
 from tests.replays import journals_of
@@ -144,3 +150,41 @@ def test_a_robot_that_was_never_briefed_is_passed_over(folders: tuple[Path, Path
     assert ended.err.splitlines()[-1].endswith("no picture of b: nothing is on record")
     ended = tandem("export", tmp_path)
     assert (ended.status, ended.out) == (2, "")
+
+
+def test_the_audit_holds_robots_to_their_limits_and_to_what_they_sensed(folders: tuple[Path, Path]) -> None:
+    _, alone = folders
+    ended = tandem("audit", alone)
+    assert ended.status == 0, ended.out
+    assert "a and b, without a world: no violations" in ended.out
+    assert [line.split()[0] for line in ended.out.splitlines()[3:]] == [rule.__name__ for rule in RULES]
+
+
+def too_fast(message: Message) -> Message:
+    return replace(message, v=2.0) if isinstance(message, Drive) else message
+
+
+def another_range(message: Message) -> Message:
+    if isinstance(message, Report) and message.robot == "a" and message.ranges:
+        first, *rest = message.ranges
+        return replace(message, ranges=(replace(first, range=first.range + 1.0), *rest))
+    return message
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "rules"), [(too_fast, {"limits", "decision"}), (another_range, {"log", "report", "decision"})]
+)
+def test_without_a_world_the_audit_finds_what_breaks_a_rule(
+    spoilt: Callable[[Message], Message], rules: set[str], folders: tuple[Path, Path]
+) -> None:
+    _, alone = folders
+    found = {path.name: list(journal.read(path)) for path in sorted(alone.glob("*.journal"))}
+    frames = found["agent-a.journal"]
+    for place, frame in enumerate(frames):
+        message = decode(frame, OfRobot, MAX_FRAME_BYTES)
+        other = spoilt(message)
+        if other is not message:
+            frames[place] = encode(other)
+            break
+    findings = judge_alone(found, alone)
+    assert {one.rule for one in findings.violations} == rules

@@ -6,14 +6,14 @@ what its peer sent, where that is on record, too.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import msgspec
 
 from agent.past import Past
 from compose.audit.case import Testimony, testimony_of
-from compose.audit.conduct import decision
-from compose.audit.findings import Checks, Count, Findings, Violation
+from compose.audit.conduct import decision, limits, log
+from compose.audit.findings import Checks, Findings, counted
 from compose.audit.journals import broken_off, whole
 from compose.audit.wires import report
 from protocol.journal import CorruptJournal
@@ -40,7 +40,15 @@ def order(alone: Alone) -> Checks:
             yield whole(robot, past, step, excused=True)
 
 
-def judge_alone(journals: Mapping[str, Iterable[bytes]], folder: object) -> Findings:
+RULES: tuple[Callable[[Alone], Checks], ...] = (order, report, decision, limits, log)
+"""each by its name; where one violation follows from another, it comes later"""
+
+
+def judge_alone(
+    journals: Mapping[str, Iterable[bytes]],
+    folder: object,
+    rules: Sequence[Callable[[Alone], Checks]] = RULES,
+) -> Findings:
     """What there is to find in the frames of `journals`, by name; `folder` is where errors say they are.
 
     Raises CorruptJournal, whose text names the journal.
@@ -53,12 +61,10 @@ def judge_alone(journals: Mapping[str, Iterable[bytes]], folder: object) -> Find
             raise CorruptJournal(f"{folder}/{name} is the journal of {testimony.past.briefing.robot}")
         testimonies[robot] = testimony
     alone = Alone(testimonies)
-    found = {"report": list(report(alone)), "decision": list(decision(alone)), "order": list(order(alone))}
-    violations: list[Violation] = [one for checks in found.values() for one in checks if one is not None]
-    violations.sort(key=lambda one: -1 if one.tick is None else one.tick)
+    counts, violations = counted(rules, alone)
     return Findings(
         f"{' and '.join(testimonies)}, without a world",
         max([len(past.steps) for past in alone.pasts.values()], default=0),
-        tuple([Count(rule, len(checks), sum(1 for one in checks if one)) for rule, checks in found.items()]),
-        tuple(violations),
+        counts,
+        violations,
     )

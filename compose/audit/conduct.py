@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from agent import radio
 from agent.past import Step
 from agent.robot import Robot
-from compose.audit.case import Case, Testified
+from compose.audit.case import Testified
 from compose.audit.findings import Checks, Violation, between, difference, said
 from protocol.messages import End, Farewell, Message, Report
 from protocol.mission import Mission
@@ -71,13 +71,13 @@ def _last_word(again: Robot, robot: str, end: End, found: Farewell) -> Violation
     return _same(end.tick, robot, found, encode(expected))
 
 
-def limits(case: Case) -> Checks:
+def limits(case: Testified) -> Checks:
     """Nobody drove, or asked for, more than v_max and omega_max.
 
     With noise nobody knows what was driven but the world, whose wheels add it to what was asked.
     """
-    mission = case.history.scenario.mission
     for robot, past in case.pasts.items():
+        mission = past.briefing.mission
         for step in past.steps:
             tick, drive, driven = step.sense.tick, step.drive, step.sense.executed
             if drive is not None:
@@ -97,7 +97,7 @@ def _within(tick: int, robot: str, how: str, controls: Controls, mission: Missio
     return None
 
 
-def log(case: Case) -> Checks:
+def log(case: Testified) -> Checks:
     """What a robot told of its manoeuvres and ranges is what its own Senses say.
 
     Who was told to lie tells, to the bit, what its lie makes of that; to which `decision` holds it.

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -84,6 +84,20 @@ class Findings(msgspec.Struct, frozen=True):
     """the earliest first"""
     radio: tuple[Befallen, ...] = ()
     """of each link, under a fault plan"""
+
+
+T = TypeVar("T")
+
+
+def counted(
+    rules: Sequence[Callable[[T], Checks]], case: T
+) -> tuple[tuple[Count, ...], tuple[Violation, ...]]:
+    """What each of `rules`, which goes by its name, finds in `case`; the earliest violations first."""
+    found = {rule.__name__: list(rule(case)) for rule in rules}
+    violations = [one for checks in found.values() for one in checks if one is not None]
+    violations.sort(key=lambda one: -1 if one.tick is None else one.tick)
+    counts = [Count(rule, len(checks), len(checks) - checks.count(None)) for rule, checks in found.items()]
+    return tuple(counts), tuple(violations)
 
 
 def difference(found: msgspec.Struct, expected: msgspec.Struct) -> str:

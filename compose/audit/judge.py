@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
+from compose.audit.alone import judge_alone
 from compose.audit.case import Case, case_of
 from compose.audit.claims import claim
 from compose.audit.conduct import decision, limits, log
-from compose.audit.findings import Checks, Count, Findings, Violation
+from compose.audit.findings import Checks, Findings, counted
 from compose.audit.journals import briefing, order
 from compose.audit.radio import befallen, faults
 from compose.audit.wires import contact, report, sense
-from compose.record import books
+from compose.record import WORLD_JOURNAL, books
 
 RULES: tuple[Callable[[Case], Checks], ...] = (
     order,
@@ -30,12 +31,13 @@ RULES: tuple[Callable[[Case], Checks], ...] = (
 
 
 def audit(folder: Path) -> Findings:
-    """What there is to find in the record in `folder`.
+    """What there is to find in the record in `folder`; without a world, in what its robots have left.
 
     Raises OSError if there is none, journal.CorruptJournal if a frame in it cannot be understood, or stands
     in the journal of another robot.
     """
-    return judge({name: book.frames for name, book in books(folder).items()}, folder)
+    journals = {name: book.frames for name, book in books(folder, alone=True).items()}
+    return judge(journals, folder) if WORLD_JOURNAL in journals else judge_alone(journals, folder)
 
 
 def judge(
@@ -48,13 +50,6 @@ def judge(
     Raises journal.CorruptJournal like `audit`.
     """
     case = case_of(journals, folder)
-    counts: list[Count] = []
-    violations: list[Violation] = []
-    for rule in rules:
-        checks = list(rule(case))
-        found = [check for check in checks if check is not None]
-        counts.append(Count(rule.__name__, len(checks), len(found)))
-        violations += found
-    violations.sort(key=lambda one: -1 if one.tick is None else one.tick)
+    counts, violations = counted(rules, case)
     name, ticks = case.history.scenario.name, len(case.history.ticks)
-    return Findings(name, ticks, tuple(counts), tuple(violations), befallen(case))
+    return Findings(name, ticks, counts, violations, befallen(case))

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import msgspec
 
-from compose.audit.alone import judge_alone
+from compose.audit import alone
+from compose.audit.alone import Alone, judge_alone
 from compose.audit.case import Case
 from compose.audit.claims import outcome
 from compose.audit.conduct import decision
@@ -24,6 +25,8 @@ from compose.record import WORLD_JOURNAL, books
 
 RULES: tuple[Callable[[Case], Checks], ...] = (briefing, sense, contact, report, decision, order, outcome)
 """in the order of a tick: what differs first has caused what differs later"""
+ALONE: tuple[Callable[[Alone], Checks], ...] = (report, decision, alone.order)
+"""the same without a world"""
 
 
 class Replay(msgspec.Struct, frozen=True):
@@ -55,8 +58,10 @@ def replayed(journals: Mapping[str, Iterable[bytes]], folder: object = "the reco
 
     Raises journal.CorruptJournal like `replay`.
     """
-    alone = WORLD_JOURNAL not in journals
-    findings = judge_alone(journals, folder) if alone else judge(journals, folder, RULES)
+    if WORLD_JOURNAL in journals:
+        findings = judge(journals, folder, RULES)
+    else:
+        findings = judge_alone(journals, folder, ALONE)
     return Replay(
         findings.scenario,
         findings.ticks,
