@@ -6,21 +6,21 @@ import hashlib
 import math
 import platform
 import random
-import re
 import secrets
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta
 
 from compose.faults import BadFault, FaultTable, added, table_of
-from compose.kill import DRAWN, POINTS, BadKill, Kill, KillTable, drawn
+from compose.kill import BadKill, Kill, KillTable, drawn
 from compose.status import UserError
-from protocol.lie import OF_THE_START, Kind, Lie, Part
+from compose.toml import field_first, read_text, table_in
+from protocol.lie import OF_THE_START, Lie
 from protocol.messages import Briefing
 from protocol.mission import Anchor, Mission, Role, Variant, noise_obstacle, obstacle, safety_obstacle
 from protocol.motion import TAU, Pose
@@ -43,15 +43,6 @@ TICK_S = (5e-4, 3600.0)
 """s of wall time that a tick in real time may last"""
 WITHIN = 1.0 - 1e-9
 """of R: how far out a start is drawn at the most, so that rounding does not carry it outside"""
-
-
-CHOICES: dict[str, tuple[str, ...]] = {
-    "variant": get_args(Variant),
-    "kind": get_args(Kind),
-    "part": get_args(Part),
-    "point": (*POINTS, DRAWN),
-}
-"""of the fields that take one of a few words"""
 
 
 class BadScenario(UserError):
@@ -156,13 +147,16 @@ def check_rate(scenario: Scenario, rate: float | None) -> None:
 def load(source: str, *, seed: int | None = None, faults: Sequence[str] = ()) -> Scenario:
     """The scenario of that name, or in the file at that path; `seed` overrides its own.
 
-    `faults` are added to its own. Raises BadScenario.
+    `faults` are added to its own. Raises UserError: BadFile or BadScenario.
     """
     return setting(source, faults).seeded(seed)
 
 
 def setting(source: str, faults: Sequence[str] = ()) -> Setting:
-    """That of the scenario of that name, or in the file at that path, with `faults`. Raises BadScenario."""
+    """That of the scenario of that name, or in the file at that path, with `faults`.
+
+    Raises BadFile and BadScenario.
+    """
     path = shipped().get(source, Path(source))
     try:
         text = read_text(path)
@@ -174,29 +168,12 @@ def setting(source: str, faults: Sequence[str] = ()) -> Setting:
     return validate(table_in(text, source), source, faults)
 
 
-def read_text(path: Path) -> str:
-    """What the file says. Raises FileNotFoundError, and ValueError, whose text says why it cannot be read."""
-    try:
-        return path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise
-    except OSError as error:
-        raise ValueError(f"cannot be read: {error.strerror or error}") from None
-    except ValueError:
-        raise ValueError("cannot be read: it is not UTF-8 text") from None
-
-
 def parse(text: str, source: str, *, seed: int | None = None, faults: Sequence[str] = ()) -> Scenario:
-    """The scenario in `text`, with `faults`. Raises BadScenario, whose text begins with `source`."""
+    """The scenario in `text`, with `faults`.
+
+    Raises BadFile and BadScenario, whose texts begin with `source`.
+    """
     return validate(table_in(text, source), source, faults).seeded(seed)
-
-
-def table_in(text: str, source: str) -> dict[str, Any]:
-    """The TOML in `text`, whatever it says. Raises BadScenario."""
-    try:
-        return msgspec.toml.decode(text, type=dict[str, Any])
-    except (ValueError, RecursionError) as error:  # of msgspec, or of the TOML library beneath it
-        raise BadScenario(f"{source}: not TOML: {error}") from None
 
 
 def validate(table: Mapping[str, Any], source: str, faults: Sequence[str] = ()) -> Setting:
@@ -214,23 +191,6 @@ def validate(table: Mapping[str, Any], source: str, faults: Sequence[str] = ()) 
     except BadKill as error:
         raise BadScenario(f"{source}: {error}") from None
     return found
-
-
-def field_first(error: str) -> str:
-    """msgspec's "Expected `float`, got `str` - at `$.mission.period`", with the field in front."""
-    match = re.fullmatch(r"(?P<what>.*?)(?: - at `\$\.?(?P<where>.*)`)?", error, re.DOTALL)
-    assert match is not None
-    what = match["what"].replace("`", "'")
-    what = what.replace("Object contains ", "").replace("Object missing required field", "missing field")
-    what = what[0].lower() + what[1:]
-    field = (match["where"] or "").rpartition(".")[2]
-    if what.startswith("invalid enum value") and field in CHOICES:
-        what = (
-            f"there is no {what.removeprefix('invalid enum value ')}; there are {', '.join(CHOICES[field])}"
-        )
-    if "matching regex" in what:
-        what = "no name: letters, digits, - and _, a letter or digit first"
-    return f"{match['where']}: {what}" if match["where"] else what
 
 
 def _validated(file: ScenarioFile, source: str, told: Sequence[str]) -> Scenario:

@@ -22,7 +22,8 @@ from compose.campaign.trial import Trial, play
 from compose.kill import POINTS, WORLD, KillTable, drawn
 from compose.local import ChildFailed
 from compose.record import WORLD_JOURNAL, Record, agent_journal
-from compose.scenario import BadScenario, load, parse, table_in, validate
+from compose.scenario import BadScenario, load, parse, validate
+from compose.toml import table_in
 from protocol.journal import Kept
 from tests.commands import ENDLESS, PAPER_1, Command, tandem, temporary_in, until
 from tests.test_bad_input import refused

@@ -13,8 +13,8 @@ from msgspec import Meta
 
 from compose import scenario
 from compose.campaign.fields import NoSuchField, Steps, canonical, jsonable, steps
-from compose.scenario import BadScenario, field_first, read_text, table_in
 from compose.status import UserError
+from compose.toml import BadFile, field_first, read_text, table_in
 from protocol.units import NAME
 
 MAX_TRIALS = 10**7
@@ -102,7 +102,7 @@ def shipped() -> dict[str, Path]:
 def load(source: str, *, trials: int | None = None, seed: int | None = None) -> Campaign:
     """The campaign of that name, or in the file at that path; `trials` and `seed` override its own.
 
-    Raises BadSpec, and BadScenario if it is the base scenario that cannot be read.
+    Raises BadSpec, and BadFile where it is not TOML.
     """
     path = shipped().get(source, Path(source))
     try:
@@ -140,7 +140,7 @@ def _base(spec: SpecFile, path: Path, source: str) -> dict[str, Any]:
             f"{source}: scenario: '{spec.scenario}' is neither a file beside it nor a scenario that ships "
             f"({names})"
         ) from None
-    except (ValueError, BadScenario) as error:
+    except (ValueError, BadFile) as error:
         raise BadSpec(f"{source}: scenario: {error}") from None
 
 
