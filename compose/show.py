@@ -15,7 +15,8 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from compose.record import WORLD_JOURNAL, outcome_line
+from compose.record import WORLD_JOURNAL
+from compose.summary import outcome_line
 from protocol.journal import Tail
 from protocol.messages import Drive, End, Farewell, Missed
 from protocol.wire import MAX_FRAME_BYTES, decode

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from compose import record
 from compose.status import UserError, status_of
+from compose.summary import Mode, leave, outcome_line, summary
 from protocol.inbox import Inbox
 from protocol.journal import Journal
 from protocol.retrace import Retrace
@@ -50,23 +51,23 @@ def conclude(
     options: argparse.Namespace,
     played: record.Record,
     folder: Path | None,
-    mode: record.Mode,
+    mode: Mode,
     began: float,
 ) -> int:
     """Leave the views of the record in `folder`, if it is to stay, and say how it went; the status."""
-    summary = record.summary(played, mode, round(time.perf_counter() - began, 6))
+    told = summary(played, mode, round(time.perf_counter() - began, 6))
     if folder is not None and options.out is not None:
         try:
-            record.leave(played, summary, folder)
+            leave(played, told, folder)
         except OSError as error:
             raise UserError(record.cannot_write(folder, error)) from None
     if options.quiet:
-        print(record.outcome_line(summary))
+        print(outcome_line(told))
     else:
         from compose import show  # noqa: PLC0415  # as above
 
-        show.result(summary)
-    return status_of(summary["outcome"])
+        show.result(told)
+    return status_of(told["outcome"])
 
 
 def break_off(options: argparse.Namespace, folder: Path, reason: str, began: float) -> None:
@@ -75,8 +76,8 @@ def break_off(options: argparse.Namespace, folder: Path, reason: str, began: flo
         return
     with suppress(OSError, ValueError):
         played = record.read(folder)
-        summary = record.summary(played, "processes", round(time.perf_counter() - began, 6))
-        record.leave(played, summary | {"reason": reason}, folder)
+        told = summary(played, "processes", round(time.perf_counter() - began, 6))
+        leave(played, told | {"reason": reason}, folder)
 
 
 def going_on(old: Retrace, inbox: Inbox) -> Journal:

@@ -9,7 +9,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from compose.record import WORLD_JOURNAL, Row, agent_journal, ended, journals_in, past_of, robot_of
+from compose.record import WORLD_JOURNAL, agent_journal, journals_in, past_of, robot_of
+from compose.summary import ended
+from compose.ticks import Row
 from protocol import journal
 from protocol.messages import Briefing, Contact
 from protocol.motion import Pose, compose

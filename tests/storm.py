@@ -29,8 +29,8 @@ from rich.progress import Progress
 from rich.table import Table
 
 from compose import inline
-from compose.record import leave, summary
 from compose.scenario import load
+from compose.summary import leave, summary
 from protocol import keys, session
 from protocol.endpoints import at
 from protocol.inbox import Inbox

@@ -6,8 +6,9 @@ import math
 from functools import cache
 
 from compose.inline import play
-from compose.record import Record, summary
+from compose.record import Record
 from compose.scenario import parse
+from compose.summary import summary
 from world.scenario import Scenario
 
 SIGMA = "anchor_sigma = 0.1\nmutual_sigma = 0.1"

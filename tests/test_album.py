@@ -28,8 +28,9 @@ from compose.figures.pair import Pair, of_record
 from compose.figures.sheet import Absent
 from compose.figures.style import look
 from compose.inline import play
-from compose.record import estimates, first_claim, read
+from compose.record import estimates, read
 from compose.scenario import load, parse
+from compose.summary import first_claim
 from protocol.journal import read as frames
 from protocol.messages import Drive
 from protocol.mission import Role

@@ -11,7 +11,8 @@ from msgspec.structs import replace
 
 from agent.estimation.odometry import Array
 from compose.bound import position_bounds
-from compose.record import Record, summary
+from compose.record import Record
+from compose.summary import summary
 from protocol.motion import Controls, Pose, step
 from protocol.noise import Noise
 from tests.surveys import ODOMETRY, SIGMA, WHEELS, survey

@@ -19,9 +19,10 @@ from compose.campaign.cells import cells
 from compose.campaign.summary import Counted, counted
 from compose.campaign.table import of_rows, schema_of
 from compose.claim import matrix, nees
-from compose.record import Moment, Record, leave, summary
+from compose.record import Moment, Record
 from compose.scenario import parse
 from compose.show import result
+from compose.summary import leave, summary
 from protocol.messages import Drive, End, Farewell, Localised
 from protocol.motion import Covariance, Pose
 from tests.commands import SECTION_IV, tandem

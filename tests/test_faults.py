@@ -10,8 +10,9 @@ import pytest
 from msgspec.structs import replace
 
 from compose import inline
-from compose.record import Record, summary
+from compose.record import Record
 from compose.scenario import load
+from compose.summary import summary
 from protocol import journal
 from protocol.messages import Briefing, Drive, End, Estimate, Farewell, Report, Sense
 from protocol.wire import decode

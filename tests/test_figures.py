@@ -20,9 +20,10 @@ from compose.figures.robot import figure_of
 from compose.figures.story import Story
 from compose.figures.style import PLACES, look, save
 from compose.inline import play
-from compose.record import estimates, first_claim, read
+from compose.record import estimates, read
 from compose.scenario import load, parse
 from compose.scene.recorded import read as performed
+from compose.summary import first_claim
 from protocol.journal import CorruptJournal
 from protocol.journal import read as frames
 from protocol.messages import Estimate

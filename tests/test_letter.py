@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from compose.inline import play
-from compose.record import summary
+from compose.summary import summary
 from tests.surveys import SIGMA, scenario_of, states, survey
 
 FINE = "anchor_sigma = 0.001\nmutual_sigma = 0.001"

@@ -12,8 +12,9 @@ from msgspec.structs import replace
 from agent import lying, planner, radio, trust
 from agent.logbook import Logbook
 from compose.inline import play
-from compose.record import Record, summary
+from compose.record import Record
 from compose.scenario import BadScenario, parse, shipped
+from compose.summary import summary
 from protocol.lie import Kind, Lie, Part
 from protocol.messages import Alarm, Ranged, Report, Undecided
 from protocol.motion import ORIGIN, Pose, Run, follow

@@ -16,8 +16,9 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from compose import inline
-from compose.record import WORLD_JOURNAL, Moment, Record, read, ticks_csv
+from compose.record import WORLD_JOURNAL, Moment, Record, read
 from compose.scenario import load, parse
+from compose.ticks import ticks_csv
 from protocol import journal
 from protocol.messages import Drive, Localised, Sense, Undecided
 from protocol.motion import REST, Controls, Covariance, Pose, step

@@ -13,8 +13,10 @@ import pytest
 
 from agent.geometry import Placement, placements
 from compose.inline import play
-from compose.record import Record, summary, ticks_csv
+from compose.record import Record
 from compose.scenario import load
+from compose.summary import summary
+from compose.ticks import ticks_csv
 from protocol import journal
 from protocol.messages import Briefing, Drive, End, Estimate, Farewell, Report, Sense
 from protocol.mission import Mission

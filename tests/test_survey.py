@@ -18,7 +18,8 @@ from agent.mind import Mind
 from agent.phases.rendezvous import Aligning, Radial, orientation
 from agent.survey import OFF_RADIUS
 from compose.inline import play
-from compose.record import Record, summary
+from compose.record import Record
+from compose.summary import summary
 from protocol.messages import Undecided
 from protocol.motion import Pose
 from protocol.noise import Noise

@@ -13,8 +13,9 @@ from compose import inline
 from compose.audit import judge
 from compose.audit.findings import Findings
 from compose.kill import Kill
-from compose.record import Record, read, ticks_csv
+from compose.record import Record, read
 from compose.scenario import run_name
+from compose.ticks import ticks_csv
 from protocol.inbox import Inbox
 from protocol.journal import Kept, packed
 from world.scenario import Scenario

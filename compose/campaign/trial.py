@@ -12,8 +12,9 @@ from compose.audit.findings import Findings
 from compose.campaign.played import as_processes, in_process
 from compose.claim import Claim
 from compose.kill import Kill
-from compose.record import Record, first_claim, first_contact
+from compose.record import Record
 from compose.separation import nearest
+from compose.summary import first_claim, first_contact
 from protocol.messages import Farewell, Outcome
 from protocol.motion import Covariance
 from world.scenario import Scenario

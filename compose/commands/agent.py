@@ -12,9 +12,10 @@ from agent.process import AgentProcess
 from agent.robot import Robot
 from compose import kill
 from compose.reach import beyond, reach
-from compose.record import ended, make
+from compose.record import make
 from compose.status import ENDED, FAILED, STOPPED, UserError, status_of
 from compose.stop import stop_by_signal, stop_with_launcher
+from compose.summary import ended
 from compose.telling import going_on
 from protocol import session
 from protocol.endpoints import Endpoints

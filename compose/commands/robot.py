@@ -10,10 +10,11 @@ from contextlib import closing
 from compose.driving import briefed, driver_class, made, mission, options_of
 from compose.local import STOP_S, Child, ChildFailed, free_endpoint
 from compose.reach import beyond, reach
-from compose.record import agent_journal, ended, folder_for
+from compose.record import agent_journal, folder_for
 from compose.scenario import check_rate
 from compose.status import ENDED, FAILED, STOPPED, UserError, status_of
 from compose.stop import stop_by_signal
+from compose.summary import ended
 from protocol import access, session
 from protocol.endpoints import Endpoints
 from protocol.inbox import Inbox, Interrupted

@@ -12,9 +12,9 @@ from compose import record, worldless
 from compose.export.frames import in_time
 from compose.export.recording import TooLong, write_mcap
 from compose.export.tables import At, frames_csv, write_ticks
-from compose.record import Row
 from compose.scene import recorded
 from compose.status import UserError
+from compose.ticks import Row, rows, table
 from protocol.messages import Drive, Estimate
 
 
@@ -63,7 +63,7 @@ def export(
     writers: dict[Path, Callable[[], object]] = {
         mcap: lambda: write_mcap(books, run, mcap, check),
         frames: lambda: frames.write_text(frames_csv(in_time(books), check), encoding="utf-8"),
-        ticks: lambda: ticks.write_text(record.table(told.rows), encoding="utf-8"),
+        ticks: lambda: ticks.write_text(table(told.rows), encoding="utf-8"),
         parquet: lambda: write_ticks(told.rows, told.drives, told.held, told.period, parquet),
     }
     try:
@@ -86,7 +86,7 @@ def _of_world(folder: Path, books: Collection[str]) -> _Ticks:
     ids = [robot.id for robot in told.scenario.robots]
     there = [robot for robot in ids if record.agent_journal(robot) in books]
     return _Ticks(
-        list(record.rows(told)),
+        list(rows(told)),
         {(robot, at.truth.tick): drive for at in told.moments for robot, drive in at.drives.items()},
         {(robot, one.tick): one for robot in there for one in record.estimates(folder, robot)},
         told.scenario.mission.period,

@@ -15,7 +15,7 @@ from msgspec.structs import asdict
 
 from compose.claim import nees
 from compose.export.frames import Journaled
-from compose.record import Row
+from compose.ticks import Row
 from protocol.messages import Drive, Estimate, Localised
 from protocol.motion import Covariance, Pose
 from world.referee import errors

@@ -12,7 +12,8 @@ from agent.mind import Mind
 from compose import worldless
 from compose.claim import Claim
 from compose.figures.account import Account
-from compose.record import Record, ended, first_claim
+from compose.record import Record
+from compose.summary import ended, first_claim
 from protocol.messages import Drive
 from protocol.mission import Anchor, Mission, Role, Variant
 from protocol.motion import Pose

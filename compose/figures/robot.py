@@ -11,7 +11,7 @@ from matplotlib.legend import Legend
 
 from compose.figures import belief, plane
 from compose.figures.story import Story
-from compose.record import ended
+from compose.summary import ended
 
 Corner = Literal["upper left", "lower left", "upper right"]
 WIDTH, PLANE, BESIDE = 8.6, 5.2, 2.4

@@ -9,7 +9,8 @@ from itertools import groupby
 import msgspec
 
 from compose.claim import Claim
-from compose.record import Record, first_claim
+from compose.record import Record
+from compose.summary import first_claim
 from protocol.messages import Estimate
 from protocol.motion import Pose
 from world.scenario import Placed

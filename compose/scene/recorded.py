@@ -6,10 +6,11 @@ from pathlib import Path
 
 import msgspec
 
-from compose.record import SUMMARY, WORLD_JOURNAL, agent_journal, journals_in, robot_of
+from compose.record import WORLD_JOURNAL, agent_journal, journals_in, robot_of
 from compose.scene.facts import Gathering
 from compose.scene.scene import Scene, scene
 from compose.scene.stage import Stage, of_briefings, of_scenario
+from compose.summary import SUMMARY
 from protocol.journal import CorruptJournal, Tail
 from protocol.messages import End, Farewell, OfRobot
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
