@@ -435,7 +435,9 @@ async def watched(port: int, until: str) -> dict[str, str]:
             frame = await link.recv()
             if isinstance(frame, str):
                 said = json.loads(frame)
+                assert said["op"] != "status", said  # such as: there is no such channel
                 if said["op"] == "advertise":
+                    assert not told, "a channel is added while somebody looks"
                     topics |= {channel["id"]: channel for channel in said["channels"]}
                     wanted = [{"id": one["id"], "channelId": one["id"]} for one in said["channels"]]
                     await link.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))

@@ -72,7 +72,7 @@ def _in_process(options: argparse.Namespace, scenario: Scenario) -> int:
     began = time.perf_counter()
     if options.out is None and not options.watch:
         return conclude(options, inline.play(scenario), None, "in-process", began)
-    with folder_for(options.out) as folder, _shown(options, folder) as shows:
+    with folder_for(options.out) as folder, _shown(options, scenario, folder) as shows:
         began = time.perf_counter()
         try:
             played = inline.play(scenario, folder)
@@ -94,7 +94,7 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[
     with (
         folder_for(options.out) as folder,
         _keys(options, scenario) as keys,
-        _shown(options, folder) as shows,
+        _shown(options, scenario, folder) as shows,
     ):
         began = time.perf_counter()
         try:
@@ -140,11 +140,11 @@ def _keys(options: argparse.Namespace, scenario: Scenario) -> Iterator[Path | No
 
 
 @contextmanager
-def _shown(options: argparse.Namespace, folder: Path) -> Iterator[list[Beside]]:
+def _shown(options: argparse.Namespace, scenario: Scenario, folder: Path) -> Iterator[list[Beside]]:
     """What is to show the mission that is recorded in `folder`: it is there, and where has been said."""
     wanted = [page(folder, options.port or 0)] if options.watch else []
     if options.foxglove is not None:
-        wanted.append(viewers(folder, options.foxglove))
+        wanted.append(viewers(folder, options.foxglove, [robot.id for robot in scenario.robots]))
     with ExitStack() as stack:
         shows = [stack.enter_context(beside(*one)) for one in wanted]
         for show in shows:

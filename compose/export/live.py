@@ -1,6 +1,6 @@
 """A run served to Foxglove's viewers while it is played, by a process of its own that reads its journals.
 
-    python -m compose.export.live PORT FOLDER
+    python -m compose.export.live PORT FOLDER ROBOT ...
 
 The mission knows nothing of it. What cannot be shown as fast as it happens is left out: the frames of every
 tick are told, but of a backlog only the latest tick is seen. It ends when its standard input does.
@@ -12,6 +12,7 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -72,7 +73,6 @@ class Live:
             return None
         if self._views is None:
             self._views = Views(stage)
-            self._channels.open_views(stage)
         self._tell_frames(stage)
         ready = self._ready(stage, now)
         seen = ready[0 if len(ready) <= BACKLOG else -1].tick if ready else 0
@@ -126,14 +126,19 @@ class _Door(ServerListener):
         self._live.asked = True
 
 
-def main(port: int, folder: Path) -> int:
-    """Serve until standard input ends. 1 if the port cannot be had."""
+def main(port: int, folder: Path, robots: Sequence[str]) -> int:
+    """Serve until standard input ends. 1 if the port cannot be had.
+
+    Channels are there before anyone can come: under load the SDK refuses who asks for one that is new.
+    """
     os.nice(NICE)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the launcher's to handle
     inbox = Inbox("tandem run --foxglove")
     stop_with_launcher(inbox)
     context = Context()
-    live = Live(folder, Channels(context))
+    channels = Channels(context)
+    channels.open(robots)
+    live = Live(folder, channels)
     try:
         server = foxglove.start_server(
             name="tandem",
@@ -168,4 +173,4 @@ def _serve(live: Live, server: WebSocketServer, inbox: Inbox) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(int(sys.argv[1]), Path(sys.argv[2])))
+    sys.exit(main(int(sys.argv[1]), Path(sys.argv[2]), sys.argv[3:]))

@@ -10,20 +10,20 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from heapq import merge
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, get_args
 
 import foxglove
 import msgspec
 from foxglove import Channel, Context, Schema
 from foxglove.mcap import MCAPWriteOptions
 
-from compose.export.frames import Journaled, in_time, kind_of
+from compose.export.frames import Journaled, OfWorld, in_time, kind_of
 from compose.export.schemas import schema
 from compose.export.views import Views, nanoseconds, topics
-from compose.record import Book
+from compose.record import WORLD_JOURNAL, Book, agent_journal
 from compose.scene.recorded import Performance
 from compose.scene.scene import Scene
-from compose.scene.stage import Stage
+from protocol.messages import OfRobot
 from protocol.wire import VERSION
 
 CHUNK_BYTES = 1 << 18
@@ -45,12 +45,19 @@ class Channels:
         self._latest: dict[Channel, tuple[bytes, int]] = {}
         self._views: dict[str, Channel] = {}
 
+    def open(self, robots: Sequence[str]) -> None:
+        """All that there can be in a run of these, so that none is added once somebody looks."""
+        for name, kinds in {
+            WORLD_JOURNAL: OfWorld,
+            **{agent_journal(one): OfRobot for one in robots},
+        }.items():
+            for kind in get_args(kinds):
+                self._of_frames(name, kind)
+        self.open_views(robots)
+
     def frame(self, one: Journaled, at: int) -> None:
         """A journaled frame: its body, msgpack, on a channel of its journal and kind."""
-        kind = type(one.message)
-        channel = self._frames.get((one.journal, kind))
-        if channel is None:
-            channel = self._frames[one.journal, kind] = self._of_frames(one.journal, kind)
+        channel = self._of_frames(one.journal, type(one.message))
         channel.log(one.body, log_time=at)
         self._latest[channel] = (one.body, at)
 
@@ -60,18 +67,22 @@ class Channels:
             channel.log(body, log_time=at)
 
     def _of_frames(self, journal: str, kind: type[msgspec.Struct]) -> Channel:
-        described = Schema(name=f"tandem.{kind.__name__}", encoding="jsonschema", data=schema(kind))
-        return Channel(
-            f"/journal/{journal.removesuffix('.journal')}/{kind_of(kind)}",
-            message_encoding="msgpack",
-            schema=described,
-            context=self._context,
-            metadata={"version": str(VERSION)},
-        )
+        """That one, made if there is none yet."""
+        channel = self._frames.get((journal, kind))
+        if channel is None:
+            described = Schema(name=f"tandem.{kind.__name__}", encoding="jsonschema", data=schema(kind))
+            channel = self._frames[journal, kind] = Channel(
+                f"/journal/{journal.removesuffix('.journal')}/{kind_of(kind)}",
+                message_encoding="msgpack",
+                schema=described,
+                context=self._context,
+                metadata={"version": str(VERSION)},
+            )
+        return channel
 
-    def open_views(self, stage: Stage) -> None:
-        """All that there will be, whether or not anything is told on them."""
-        for topic, kind in topics(stage).items():
+    def open_views(self, robots: Iterable[str]) -> None:
+        """All that there will be to see, whether or not anything is told of it."""
+        for topic, kind in topics(robots).items():
             if topic not in self._views:
                 self._views[topic] = Channel(
                     topic, message_encoding="protobuf", schema=kind.get_schema(), context=self._context
@@ -124,7 +135,7 @@ def _tell(
 ) -> int:
     """Everything, tick by tick: first the frames, then what there is to see."""
     views = Views(run.stage)
-    channels.open_views(run.stage)
+    channels.open_views(run.stage.ids)
     count = 0
     for tick, one in _by_tick(books, run):
         at = nanoseconds(run.stage, tick)

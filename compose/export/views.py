@@ -7,7 +7,7 @@ stays on a topic is whole in its latest message, so one may look at any time of 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from foxglove import messages as fox
@@ -44,7 +44,7 @@ class Shown(NamedTuple):
     """of Foxglove's"""
 
 
-def topics(stage: Stage) -> dict[str, Any]:
+def topics(robots: Iterable[str]) -> dict[str, Any]:
     """The kind of message on each."""
     found = {
         "/tf": fox.FrameTransforms,
@@ -52,7 +52,7 @@ def topics(stage: Stage) -> dict[str, Any]:
         "/contact": fox.SceneUpdate,
         "/log": fox.Log,
     }
-    for robot in stage.ids:
+    for robot in robots:
         found[f"/{robot}/pose"] = fox.PoseInFrame
         found[f"/{robot}/trail"] = fox.PosesInFrame
         found[f"/{robot}/body"] = fox.SceneUpdate
