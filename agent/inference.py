@@ -18,7 +18,7 @@ from agent.logbook import Logbook
 from agent.mind import Mind
 from agent.phases.surveying import Held
 from protocol.mission import Mission
-from protocol.motion import Covariance, Pose, compose, wrap
+from protocol.motion import Covariance, Pose, compose, inverse, wrap
 
 
 def path_of(log: Logbook, through: int, period: float) -> Track:
@@ -61,13 +61,8 @@ def branch_of(mind: Mind, weighed: Weighed) -> Branch:
     c, s = math.cos(frame), math.sin(frame)
     x, y = float(path.x[-1]) - mx, float(path.y[-1]) - my
     now = Pose(c * x + s * y, c * y - s * x, float(path.heading[-1]) - frame)
-    start = compose(now, _inverse(mind.odometry))
+    start = compose(now, inverse(mind.odometry))
     return Branch(wrap(-frame), start)
-
-
-def _inverse(pose: Pose) -> Pose:
-    c, s = math.cos(pose.heading), math.sin(pose.heading)
-    return Pose(-c * pose.x - s * pose.y, s * pose.x - c * pose.y, -pose.heading)
 
 
 def held_alone(weighed: Sequence[Weighed]) -> list[Held]:

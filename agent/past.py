@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import msgspec
@@ -13,6 +13,7 @@ from protocol import motion
 from protocol.journal import CorruptJournal
 from protocol.messages import (
     Briefing,
+    Contact,
     Drive,
     End,
     Estimate,
@@ -23,7 +24,7 @@ from protocol.messages import (
     Report,
     Sense,
 )
-from protocol.motion import ORIGIN, REST, Pose
+from protocol.motion import ORIGIN, REST, Pose, compose, inverse
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 
 
@@ -72,6 +73,20 @@ class Past(msgspec.Struct, frozen=True):
             poses.append(motion.step(poses[-1], done.v, done.omega, period))
         return tuple(poses[: len(self.steps)])
 
+    @property
+    def path(self) -> tuple[Pose, ...]:
+        """Where it was in the plane, by its claim: its odometry, laid through it. Empty, if it made none."""
+        if self.claim is None:
+            return ()
+        (tick, said), odometry = self.claim, self.odometry
+        frame = compose(said.pose, inverse(odometry[tick]))
+        return tuple([compose(frame, pose) for pose in odometry])
+
+    def contact(self, tick: int) -> Contact | None:
+        """With its peer, as it sensed it at `tick`; none, too, where that is not on record."""
+        contacts = self.steps[tick].sense.contacts if tick < len(self.steps) else ()
+        return contacts[0] if contacts else None
+
 
 class OutOfOrder(CorruptJournal):
     """A frame that is sound, and stands where none of its kind can."""
@@ -102,7 +117,7 @@ def past(frames: Iterable[bytes], source: object) -> Past:
                 end = message
             case Farewell() if end is not None and farewell is None:
                 farewell = message
-            case Sense() if end is None and (not steps or steps[-1].drive is not None):
+            case Sense(tick) if end is None and tick == len(steps) and _answered(steps):
                 steps.append(Step(message, frame))
             case Report() | Missed() | Drive() | Estimate() if steps and end is None:
                 assert briefing is not None
@@ -115,6 +130,11 @@ def past(frames: Iterable[bytes], source: object) -> Past:
     if briefing is None:
         raise CorruptJournal(f"{source}: there is no Briefing in it")
     return Past(briefing, tuple(steps), end, farewell)
+
+
+def _answered(steps: Sequence[Step]) -> bool:
+    """Whether the latest of them has come to its Drive, so that the next may come."""
+    return not steps or steps[-1].drive is not None
 
 
 def _message(frame: bytes, source: object) -> Any:

@@ -17,10 +17,10 @@ MODULES = ("foxglove", "pyarrow")
 """that it needs"""
 
 
-def exported(folder: Path, out: Path, inbox: Inbox) -> Exported:
+def exported(folder: Path, out: Path, inbox: Inbox, *, quiet: bool = False) -> Exported:
     """What `compose.export.folder.export` does. Raises UserError; Interrupted when `inbox` says so."""
     need(*MODULES)
     from compose.export.folder import FILES, export  # noqa: PLC0415  # slow, and there may be no extra
 
-    with legible(folder), counting("tandem export", len(FILES)) as done:
+    with legible(folder), counting("tandem export", 0 if quiet else len(FILES)) as done:
         return export(folder, out, done=done, check=lambda: inbox.next(0.0))

@@ -11,16 +11,16 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import msgspec
 from msgspec import Meta
 
 from compose.faults import BadFault, FaultTable, added, table_of
-from compose.kill import BadKill, Kill, KillTable, drawn
+from compose.kill import DRAWN, POINTS, BadKill, Kill, KillTable, drawn
 from compose.status import UserError
 from compose.toml import field_first, read_text, table_in
-from protocol.lie import OF_THE_START, Lie
+from protocol.lie import OF_THE_START, Kind, Lie, Part
 from protocol.messages import Briefing
 from protocol.mission import Anchor, Mission, Role, Variant, noise_obstacle, obstacle, safety_obstacle
 from protocol.motion import TAU, Pose
@@ -43,6 +43,15 @@ TICK_S = (5e-4, 3600.0)
 """s of wall time that a tick in real time may last"""
 WITHIN = 1.0 - 1e-9
 """of R: how far out a start is drawn at the most, so that rounding does not carry it outside"""
+
+
+CHOICES: dict[str, tuple[str, ...]] = {
+    "variant": get_args(Variant),
+    "kind": get_args(Kind),
+    "part": get_args(Part),
+    "point": (*POINTS, DRAWN),
+}
+"""of the fields that take one of a few words"""
 
 
 class BadScenario(UserError):
@@ -147,7 +156,7 @@ def check_rate(scenario: Scenario, rate: float | None) -> None:
 def load(source: str, *, seed: int | None = None, faults: Sequence[str] = ()) -> Scenario:
     """The scenario of that name, or in the file at that path; `seed` overrides its own.
 
-    `faults` are added to its own. Raises UserError: BadFile or BadScenario.
+    `faults` are added to its own. Raises UserError: NotToml or BadScenario.
     """
     return setting(source, faults).seeded(seed)
 
@@ -155,7 +164,7 @@ def load(source: str, *, seed: int | None = None, faults: Sequence[str] = ()) ->
 def setting(source: str, faults: Sequence[str] = ()) -> Setting:
     """That of the scenario of that name, or in the file at that path, with `faults`.
 
-    Raises BadFile and BadScenario.
+    Raises NotToml and BadScenario.
     """
     path = shipped().get(source, Path(source))
     try:
@@ -171,7 +180,7 @@ def setting(source: str, faults: Sequence[str] = ()) -> Setting:
 def parse(text: str, source: str, *, seed: int | None = None, faults: Sequence[str] = ()) -> Scenario:
     """The scenario in `text`, with `faults`.
 
-    Raises BadFile and BadScenario, whose texts begin with `source`.
+    Raises NotToml and BadScenario, whose texts begin with `source`.
     """
     return validate(table_in(text, source), source, faults).seeded(seed)
 
@@ -184,7 +193,7 @@ def validate(table: Mapping[str, Any], source: str, faults: Sequence[str] = ()) 
     try:
         file = msgspec.convert(table, ScenarioFile)
     except msgspec.ValidationError as error:
-        raise BadScenario(f"{source}: {field_first(str(error))}") from None
+        raise BadScenario(f"{source}: {field_first(str(error), CHOICES)}") from None
     found = Setting(file, _validated(file, source, faults))
     try:
         found.kills(file.seed)

@@ -122,6 +122,11 @@ def outcome_line(summary: Mapping[str, Any]) -> str:
     return ended(summary["outcome"], summary["ticks"], summary["reason"])
 
 
+def broken_off(ticks: int) -> str:
+    """That it did not end, in one line."""
+    return f"the record breaks off after {max(0, ticks)} ticks"
+
+
 def ended(outcome: Outcome, ticks: int, reason: str | None) -> str:
     """How a run ended, in one line."""
     return f"{outcome} after {ticks} ticks{f' ({reason})' if reason else ''}"

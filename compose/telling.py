@@ -32,8 +32,8 @@ def progress(options: argparse.Namespace, scenario: Scenario, folder: Path) -> I
 
 @contextmanager
 def counting(what: str, steps: int) -> Iterator[Callable[[], None]]:
-    """A bar of so many steps, where somebody can see it; what is called after each of them."""
-    if not sys.stdout.isatty():
+    """A bar of so many steps, if any, where somebody can see it; what is called after each of them."""
+    if not steps or not sys.stdout.isatty():
         yield lambda: None
         return
     from rich.console import Console  # noqa: PLC0415  # as above

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING
 
 import msgspec
 from msgspec.structs import astuple
@@ -14,6 +15,9 @@ from protocol.motion import Pose, wrap
 from world.scenario import Scenario
 from world.sensors import anchor_ranges, executed, mutual_ranges
 from world.truth import Truth, asked
+
+if TYPE_CHECKING:
+    from agent.past import Past
 
 
 class Row(msgspec.Struct, frozen=True):
@@ -27,7 +31,7 @@ class Row(msgspec.Struct, frozen=True):
     heading: float | None
     """in (-pi, pi]"""
     v: float | None
-    """driven until the next tick; none in the last"""
+    """driven until the next tick, without a world as measured; none in the last"""
     omega: float | None
     anchor_range: float | None
     mutual_range: float | None
@@ -36,7 +40,7 @@ class Row(msgspec.Struct, frozen=True):
 
     @property
     def pose(self) -> Pose | None:
-        """The true one."""
+        """The true one, where it is known."""
         if self.x is None or self.y is None or self.heading is None:
             return None
         return Pose(self.x, self.y, self.heading)
@@ -60,6 +64,30 @@ def rows(record: Record) -> Iterator[Row]:
                 *(tick, robot.id, pose.x, pose.y, wrap(pose.heading), v, omega),
                 *(anchor[i], mutual.get(robot.id)),
                 *((drive.phase, drive.state) if drive is not None else (None, None)),
+            )
+
+
+def rows_of(told: Mapping[str, Past]) -> Iterator[Row]:
+    """The same of robots without a world: speeds as measured, and nothing of their true poses."""
+    for tick in range(max([len(past.steps) for past in told.values()], default=0)):
+        for robot, past in told.items():
+            if tick >= len(past.steps):
+                continue
+            sense, drive = past.steps[tick].sense, past.steps[tick].drive
+            after = past.steps[tick + 1].sense.executed if tick + 1 < len(past.steps) else None
+            contact = past.contact(tick)
+            yield Row(
+                tick,
+                robot,
+                x=None,
+                y=None,
+                heading=None,
+                v=after.v if after is not None else None,
+                omega=after.omega if after is not None else None,
+                anchor_range=sense.anchor_range,
+                mutual_range=contact.range if contact is not None else None,
+                phase=drive.phase if drive is not None else None,
+                state=drive.state if drive is not None else None,
             )
 
 

@@ -3,27 +3,17 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import msgspec
 
-from compose.kill import DRAWN, POINTS
 from compose.status import UserError
-from protocol.lie import Kind, Part
-from protocol.mission import Variant
-
-CHOICES: dict[str, tuple[str, ...]] = {
-    "variant": get_args(Variant),
-    "kind": get_args(Kind),
-    "part": get_args(Part),
-    "point": (*POINTS, DRAWN),
-}
-"""of the fields that take one of a few words"""
 
 
-class BadFile(UserError):
-    """The file is not TOML; the text names it, and where."""
+class NotToml(UserError):
+    """The text names the file, and where it is not TOML."""
 
 
 def read_text(path: Path) -> str:
@@ -39,24 +29,27 @@ def read_text(path: Path) -> str:
 
 
 def table_in(text: str, source: str) -> dict[str, Any]:
-    """The TOML in `text`, whatever it says. Raises BadFile, whose text begins with `source`."""
+    """The TOML in `text`, whatever it says. Raises NotToml, whose text begins with `source`."""
     try:
         return msgspec.toml.decode(text, type=dict[str, Any])
     except (ValueError, RecursionError) as error:  # of msgspec, or of the TOML library beneath it
-        raise BadFile(f"{source}: not TOML: {error}") from None
+        raise NotToml(f"{source}: not TOML: {error}") from None
 
 
-def field_first(error: str) -> str:
-    """msgspec's "Expected `float`, got `str` - at `$.mission.period`", with the field in front."""
+def field_first(error: str, choices: Mapping[str, Sequence[str]]) -> str:
+    """msgspec's "Expected `float`, got `str` - at `$.mission.period`", with the field in front.
+
+    `choices` are of the fields that take one of a few words.
+    """
     match = re.fullmatch(r"(?P<what>.*?)(?: - at `\$\.?(?P<where>.*)`)?", error, re.DOTALL)
     assert match is not None
     what = match["what"].replace("`", "'")
     what = what.replace("Object contains ", "").replace("Object missing required field", "missing field")
     what = what[0].lower() + what[1:]
     field = (match["where"] or "").rpartition(".")[2]
-    if what.startswith("invalid enum value") and field in CHOICES:
+    if what.startswith("invalid enum value") and field in choices:
         what = (
-            f"there is no {what.removeprefix('invalid enum value ')}; there are {', '.join(CHOICES[field])}"
+            f"there is no {what.removeprefix('invalid enum value ')}; there are {', '.join(choices[field])}"
         )
     if "matching regex" in what:
         what = "no name: letters, digits, - and _, a letter or digit first"

@@ -101,6 +101,12 @@ def compose(frame: Pose, local: Pose) -> Pose:
     )
 
 
+def inverse(pose: Pose) -> Pose:
+    """The frame that `pose` is given in, as a pose in the frame that `pose` is."""
+    c, s = math.cos(pose.heading), math.sin(pose.heading)
+    return Pose(-c * pose.x - s * pose.y, s * pose.x - c * pose.y, -pose.heading)
+
+
 def wrap(angle: float) -> float:
     """The same direction in (-pi, pi]."""
     wrapped = math.remainder(angle, TAU)

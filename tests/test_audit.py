@@ -299,7 +299,7 @@ def test_a_tick_that_an_agent_has_left_out_is_missed(folder: Path) -> None:
     told = [one for one in messages(folder / A) if getattr(one, "tick", None) != 12]
     written(folder / A, told)
     assert [one.line for one in audit(folder).violations] == [
-        "tick 12, a, order: a Sense of tick 13 stands where that of tick 12 should"
+        "tick 13, a, order: a Sense of tick 13 is out of order"
     ]
 
 

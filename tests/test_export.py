@@ -5,10 +5,13 @@ from __future__ import annotations
 import asyncio
 import base64
 import csv
+import functools
 import io
+import itertools
 import json
 import math
 import random
+import shutil
 import socket
 import struct
 import subprocess
@@ -402,17 +405,33 @@ def test_a_run_tells_its_outcome_though_it_cannot_export(
         assert bool(told.err) == bool(said)
 
 
+def test_a_run_that_was_told_to_export_and_could_not_has_failed(tmp_path: Path) -> None:
+    (tmp_path / "out" / "run.mcap").mkdir(parents=True)  # which nothing can be written in place of
+    for told, status in (("--export", 3), ("--no-export", 0)):
+        out = shutil.copytree(tmp_path / "out", tmp_path / told)
+        ended = tandem("run", "paper-1", "-q", "--in-process", "--out", out, told)
+        assert (ended.status, ended.out) == (status, "localised after 48 ticks\n")
+        assert ended.err.startswith("tandem run: not exported: ") == (status == 3)
+
+
 def test_ctrl_c_ends_an_export_and_leaves_nothing_half_written(paper_1: Path, tmp_path: Path) -> None:
     with Command("export", paper_1, "--out", tmp_path / "out") as command:
         command.until(lambda: command.catches(Signals.SIGTERM), "it catches signals")
         command.tell(Signals.SIGINT)
         ended = command.ended()
     assert (ended.status, ended.out, ended.err) == (130, "", "tandem export: stopped by SIGINT\n")
-    assert list((tmp_path / "out").iterdir()) == []
-    ticks = iter(range(10))
-    with pytest.raises(StopIteration):
-        export(paper_1, tmp_path / "out", check=lambda: next(ticks))
-    assert list((tmp_path / "out").iterdir()) == []
+    assert not (tmp_path / "out").exists()
+    all_checks = itertools.count()
+    export(paper_1, tmp_path / "whole", check=lambda: next(all_checks))
+    for checks, left in (
+        (10, set()),
+        (60, {"run.mcap"}),
+        (next(all_checks) - 1, {"run.mcap", "frames.csv", "ticks.csv"}),
+    ):
+        some = iter(range(checks))
+        with pytest.raises(StopIteration):
+            export(paper_1, tmp_path / "out", check=functools.partial(next, some))
+        assert {path.name for path in (tmp_path / "out").iterdir()} == left
 
 
 STANDING = {"/stage", "/a/pose", "/b/trail", "/contact", "/a/belief", "/journal/world/drive"}

@@ -6,29 +6,31 @@ import csv
 from collections.abc import Callable
 from pathlib import Path
 
+import msgpack
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from msgspec.structs import replace
 
 from compose.audit.alone import RULES, judge_alone
-from compose.figures import over_time, phase_one, trajectory
+from compose.figures import over_time, phase_one, steps, trajectory
 from compose.figures.account import account
 from compose.figures.pair import Pair, of_record, of_robots
 from compose.figures.sheet import NO_PLACES, Absent
 from compose.inline import play
-from compose.record import read
-from compose.scenario import load
+from compose.record import past_of, read
+from compose.scenario import load, parse
 from protocol import journal
 from protocol.messages import Drive, Message, OfRobot, Report
 from protocol.mission import Role
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
-from tests.commands import tandem
+from tests.commands import several_pairs, tandem
 from tests.doctor import complaints
 from tests.replays import journals_of
 from tests.test_album import drawn, line
 
 KNOWN_TO_A_WORLD = ("x", "y", "heading")
-MEASURED = ("tick", "robot", "v", "omega", "anchor_range", "mutual_range", "phase", "state")
+MEASURED = ("tick", "robot", "anchor_range", "mutual_range", "phase", "state")
 
 
 @pytest.fixture(scope="module", params=["paper-1", "noisy"])
@@ -60,12 +62,17 @@ def test_an_export_has_what_was_measured_and_believed_and_no_truth(folders: tupl
     for folder in folders:
         ended = tandem("export", folder)
         assert (ended.status, ended.err) == (0, "")
-    exact = read(whole).scenario.mission.noise.exact
+    pasts = {robot: past_of(alone, robot) for robot in "ab"}
     for told, known in zip(table(alone), table(whole), strict=True):
         assert {told[name] for name in KNOWN_TO_A_WORLD} == {""}
-        same = MEASURED if exact else tuple(name for name in MEASURED if name not in ("v", "omega"))
-        assert [told[name] for name in same] == [known[name] for name in same]
-        assert (told["v"] == "") == (known["v"] == "")  # as measured, where the world knows what was driven
+        assert [told[name] for name in MEASURED] == [known[name] for name in MEASURED]
+        past, after = pasts[told["robot"]], int(told["tick"]) + 1
+        assert past is not None
+        driven = past.steps[after].sense.executed if after < len(past.steps) else None
+        assert told["v"] == (
+            "" if driven is None else repr(driven.v)
+        )  # where the world knows what was driven
+        assert told["omega"] == ("" if driven is None else repr(driven.omega))
     rows, truly = (pq.read_table(folder / "ticks.parquet").to_pylist() for folder in (alone, whole))
     for name in ("world", "local", "odds", "estimate_x", "cov_xx", "verdict", "time_s"):
         assert [row[name] for row in rows] == [row[name] for row in truly]
@@ -102,7 +109,12 @@ def test_what_needs_no_truth_is_drawn_as_with_a_world(folders: tuple[Path, Path]
         assert told.robot(role).anchor_ranges == known.robot(role).anchor_ranges
         assert told.robot(role).drives == known.robot(role).drives
         assert told.minds(role) == known.minds(role)
-        assert type(phase_one.draw(told, role)) is type(phase_one.draw(known, role))
+        drawn_alone, drawn_whole = drawn(phase_one.draw(told, role)), drawn(phase_one.draw(known, role))
+        lines = [
+            [np.asarray(one.get_xydata()).tolist() for one in f.axes[0].lines]
+            for f in (drawn_alone, drawn_whole)
+        ]
+        assert lines[0] == lines[1] != []
     figure = drawn(over_time.ranges(told))
     assert line(figure, "mutual-range") == line(drawn(over_time.ranges(known)), "mutual-range")
     labels = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
@@ -129,10 +141,13 @@ def test_of_one_robot_there_is_what_it_alone_knows(folders: tuple[Path, Path], t
     assert trajectory.draw(told) == Absent(NO_PLACES)
     assert told.a.id == "a"
     assert told.told == ["b"]
-    ended = tandem("figures", tmp_path, "--format", "png")
-    assert ended.status == 0, ended.err
-    assert (tmp_path / "figures" / "ranges-a-b.png").exists()
-    assert not (tmp_path / "figures" / "trajectory-a-b.png").exists()
+    ended = tandem("figures", tmp_path, "--only", "ranges", "--only", "trajectory", "--format", "png")
+    assert ended.status == 3
+    assert ended.err.splitlines() == [
+        "tandem figures: no picture of a: agent-a.journal is missing",
+        f"tandem figures: no trajectory-a-b: {NO_PLACES}",
+    ]
+    assert [path.name for path in (tmp_path / "figures").iterdir()] == ["ranges-a-b.png"]
     ended = tandem("export", tmp_path)
     assert (ended.status, ended.err) == (3, "agent-a.journal is missing\n")
     assert {row["robot"] for row in table(tmp_path)} == {"b"}
@@ -143,13 +158,77 @@ def test_a_robot_that_was_never_briefed_is_passed_over(folders: tuple[Path, Path
     (tmp_path / "agent-a.journal").write_bytes((alone / "agent-a.journal").read_bytes())
     (tmp_path / "agent-b.journal").touch()
     ended = tandem("figures", tmp_path, "--only", "ranges", "--format", "png")
-    assert ended.status == 0, ended.err
+    assert (ended.status, ended.err) == (0, "")
     assert (tmp_path / "figures" / "ranges-a-b.png").exists()
+    assert tandem("export", tmp_path).status == 0
     (tmp_path / "agent-a.journal").write_bytes(b"")
     ended = tandem("figures", tmp_path, "--only", "ranges", "--format", "png")
-    assert ended.err.splitlines()[-1].endswith("no picture of b: nothing is on record")
+    nothing = [f"tandem figures: no picture of {robot}: nothing is on record" for robot in "ab"]
+    assert ended.err.splitlines() == nothing
     ended = tandem("export", tmp_path)
     assert (ended.status, ended.out) == (2, "")
+    assert ended.err.endswith("there is no world.journal, and no robot in it was briefed\n")
+
+
+def test_whose_journal_is_shorter_takes_nothing_from_its_peer(
+    folders: tuple[Path, Path], tmp_path: Path
+) -> None:
+    whole, alone = folders
+    (tmp_path / "agent-a.journal").write_bytes((alone / "agent-a.journal").read_bytes())
+    frames = list(journal.read(alone / "agent-b.journal"))[:20]
+    (tmp_path / "agent-b.journal").write_bytes(b"".join([msgpack.packb(frame) for frame in frames]))
+    known, told = pair_of(whole), alone_of(tmp_path)
+    assert told.a.anchor_ranges == known.a.anchor_ranges
+    assert told.minds("a") == known.minds("a")
+    assert len(told.a.path) == len(known.a.path)
+    assert len(told.b.drives) < len(known.b.drives)
+    assert trajectory.draw(told) == steps.draw(told) == Absent(NO_PLACES)
+    mutual = line(drawn(over_time.ranges(told)), "mutual-range")
+    assert mutual == line(drawn(over_time.ranges(known)), "mutual-range")
+    assert "; b: the record breaks off after" in told.title
+
+
+def test_paths_of_two_lengths_are_drawn(folders: tuple[Path, Path]) -> None:
+    _, alone = folders
+    told = alone_of(alone)
+    shorter = replace(told, b=replace(told.b, path=told.b.path[: told.contacts[0][0]]))
+    figure = drawn(trajectory.draw(shorter))
+    assert line(figure, "path-b") == [(p.x, p.y) for p in shorter.b.path]
+    assert isinstance(steps.draw(shorter), Absent)  # there is no tick in which both places are known
+    drawn(over_time.ranges(shorter))
+
+
+def test_each_pair_has_pictures_of_its_own(tmp_path: Path) -> None:
+    play(parse(several_pairs(2), "two pairs"), tmp_path)
+    (tmp_path / "world.journal").unlink()
+    ended = tandem("figures", tmp_path, "--only", "trajectory", "--format", "png")
+    assert (ended.status, ended.err) == (0, "")
+    assert {path.stem for path in (tmp_path / "figures").iterdir()} == {"trajectory-a-b", "trajectory-c-d"}
+
+
+@pytest.mark.parametrize("command", ["figures", "export", "audit", "replay"])
+def test_journals_of_two_runs_are_no_record(command: str, folders: tuple[Path, Path], tmp_path: Path) -> None:
+    _, alone = folders
+    (tmp_path / "agent-b.journal").write_bytes((alone / "agent-b.journal").read_bytes())
+    (tmp_path / "other").mkdir()
+    play(parse(several_pairs(1), "another"), tmp_path / "other")
+    (tmp_path / "agent-a.journal").write_bytes((tmp_path / "other" / "agent-a.journal").read_bytes())
+    ended = tandem(command, tmp_path)
+    assert (ended.status, ended.out) == (2, "")
+    assert ended.err.endswith("agent-b.journal: another run's: its briefing is not of a's peer\n")
+
+
+def test_a_tick_that_is_left_out_is_no_record(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    _, alone = folders
+    frames = [
+        frame
+        for frame in journal.read(alone / "agent-a.journal")
+        if getattr(decode(frame, OfRobot, MAX_FRAME_BYTES), "tick", None) != 5
+    ]
+    (tmp_path / "agent-a.journal").write_bytes(b"".join([msgpack.packb(frame) for frame in frames]))
+    ended = tandem("export", tmp_path)
+    assert (ended.status, ended.out) == (2, "")
+    assert ended.err.endswith("agent-a.journal: a Sense of tick 6 is out of order\n")
 
 
 def test_the_audit_holds_robots_to_their_limits_and_to_what_they_sensed(folders: tuple[Path, Path]) -> None:

@@ -92,13 +92,6 @@ def testimony_of(frames: list[bytes], source: object) -> Testimony:
     if not frames:
         return Testimony(None)
     try:
-        told = past(frames, source)
-        disorder, tick = None, None
+        return Testimony(past(frames, source))
     except OutOfOrder as error:
-        told = past(frames[: error.place], source)
-        disorder, tick = error.what, error.tick
-    for expected, step in enumerate(told.steps):
-        if step.sense.tick != expected:
-            what = f"a Sense of tick {step.sense.tick} stands where that of tick {expected} should"
-            return Testimony(Past(told.briefing, told.steps[:expected]), what, expected)
-    return Testimony(told, disorder, tick)
+        return Testimony(past(frames[: error.place], source), error.what, error.tick)

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
-from compose.audit.alone import judge_alone
+from compose.audit import alone
+from compose.audit.alone import Alone, judge_alone
 from compose.audit.case import Case, case_of
 from compose.audit.claims import claim
 from compose.audit.conduct import decision, limits, log
@@ -34,10 +35,24 @@ def audit(folder: Path) -> Findings:
     """What there is to find in the record in `folder`; without a world, in what its robots have left.
 
     Raises OSError if there is none, journal.CorruptJournal if a frame in it cannot be understood, or stands
-    in the journal of another robot.
+    in the journal of another robot, or of another run than its peer's.
     """
-    journals = {name: book.frames for name, book in books(folder, alone=True).items()}
-    return judge(journals, folder) if WORLD_JOURNAL in journals else judge_alone(journals, folder)
+    return judged({name: book.frames for name, book in books(folder, alone=True).items()}, folder)
+
+
+def judged(
+    journals: Mapping[str, Iterable[bytes]],
+    folder: object,
+    rules: Sequence[Callable[[Case], Checks]] = RULES,
+    without: Sequence[Callable[[Alone], Checks]] = alone.RULES,
+) -> Findings:
+    """What there is to find by `rules`, or `without` a world, in the frames of `journals`, by name.
+
+    `folder` is where errors say they are. Raises journal.CorruptJournal like `audit`.
+    """
+    if WORLD_JOURNAL in journals:
+        return judge(journals, folder, rules)
+    return judge_alone(journals, folder, without)
 
 
 def judge(

@@ -12,20 +12,20 @@ from pathlib import Path
 
 import msgspec
 
-from compose.audit import alone
-from compose.audit.alone import Alone, judge_alone
+from compose.audit.alone import Alone
+from compose.audit.alone import order as order_alone
 from compose.audit.case import Case
 from compose.audit.claims import outcome
 from compose.audit.conduct import decision
 from compose.audit.findings import Checks, Violation
 from compose.audit.journals import briefing, order
-from compose.audit.judge import judge
+from compose.audit.judge import judged
 from compose.audit.wires import contact, report, sense
-from compose.record import WORLD_JOURNAL, books
+from compose.record import books
 
 RULES: tuple[Callable[[Case], Checks], ...] = (briefing, sense, contact, report, decision, order, outcome)
 """in the order of a tick: what differs first has caused what differs later"""
-ALONE: tuple[Callable[[Alone], Checks], ...] = (report, decision, alone.order)
+ALONE: tuple[Callable[[Alone], Checks], ...] = (report, decision, order_alone)
 """the same without a world"""
 
 
@@ -58,10 +58,7 @@ def replayed(journals: Mapping[str, Iterable[bytes]], folder: object = "the reco
 
     Raises journal.CorruptJournal like `replay`.
     """
-    if WORLD_JOURNAL in journals:
-        findings = judge(journals, folder, RULES)
-    else:
-        findings = judge_alone(journals, folder, ALONE)
+    findings = judged(journals, folder, RULES, ALONE)
     return Replay(
         findings.scenario,
         findings.ticks,

@@ -14,7 +14,7 @@ from msgspec import Meta
 from compose import scenario
 from compose.campaign.fields import NoSuchField, Steps, canonical, jsonable, steps
 from compose.status import UserError
-from compose.toml import BadFile, field_first, read_text, table_in
+from compose.toml import NotToml, field_first, read_text, table_in
 from protocol.units import NAME
 
 MAX_TRIALS = 10**7
@@ -102,7 +102,7 @@ def shipped() -> dict[str, Path]:
 def load(source: str, *, trials: int | None = None, seed: int | None = None) -> Campaign:
     """The campaign of that name, or in the file at that path; `trials` and `seed` override its own.
 
-    Raises BadSpec, and BadFile where it is not TOML.
+    Raises BadSpec, and NotToml where it is not TOML.
     """
     path = shipped().get(source, Path(source))
     try:
@@ -112,7 +112,7 @@ def load(source: str, *, trials: int | None = None, seed: int | None = None) -> 
         names = ", ".join(shipped())
         raise BadSpec(f"{source}: neither a file nor a campaign that ships ({names})") from None
     except msgspec.ValidationError as error:
-        raise BadSpec(f"{source}: {field_first(str(error))}") from None
+        raise BadSpec(f"{source}: {field_first(str(error), {})}") from None
     except ValueError as error:
         raise BadSpec(f"{source}: {error}") from None
     base = _base(spec, path, source)
@@ -140,7 +140,7 @@ def _base(spec: SpecFile, path: Path, source: str) -> dict[str, Any]:
             f"{source}: scenario: '{spec.scenario}' is neither a file beside it nor a scenario that ships "
             f"({names})"
         ) from None
-    except (ValueError, BadFile) as error:
+    except (ValueError, NotToml) as error:
         raise BadSpec(f"{source}: scenario: {error}") from None
 
 

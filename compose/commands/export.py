@@ -13,7 +13,7 @@ from protocol.inbox import Inbox, Interrupted
 
 
 def main(options: argparse.Namespace) -> int:
-    """Write the files; FAILED if a robot's journal is missing, of whom there is only what the world knows."""
+    """Write the files; FAILED if a robot's journal is missing: of that one there is only what others tell."""
     out: Path = options.out or options.record
     inbox = Inbox("tandem export")
     stop_by_signal(inbox)

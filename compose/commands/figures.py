@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 from compose.figures import FORMATS, PICTURES
 from compose.lab import need
 from compose.record import Record, agent_journal, legible, read
+from compose.robots import alone, casts
 from compose.status import ENDED, FAILED, UserError
 from compose.telling import counting
-from compose.worldless import casts, is_worldless
 from protocol.inbox import one_line
 from protocol.journal import CorruptJournal
 
@@ -26,7 +26,7 @@ def main(options: argparse.Namespace) -> int:
     """Draw each pair of the record; FAILED if a robot has left no journal that can be followed to its end."""
     need("matplotlib")
     with legible(options.record):
-        record = None if is_worldless(options.record) else read(options.record)
+        record = None if alone(options.record) else read(options.record)
         pairs = _casts(options.record, record)
     folder, status = options.record / "figures", ENDED
     kinds = [kind for kind in PICTURES if kind in (options.only or PICTURES)]

@@ -6,7 +6,7 @@ import argparse
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -81,10 +81,7 @@ def _in_process(options: argparse.Namespace, scenario: Scenario) -> int:
         status = conclude(options, played, folder, "in-process", began)
         inbox = Inbox("tandem run")
         stop_by_signal(inbox)
-        if not _exported(options, folder, inbox):
-            return STOPPED
-        stay(shows, inbox)
-        return status
+        return _afterwards(options, folder, shows, inbox, status)
 
 
 def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[Kill, ...]) -> int:
@@ -120,10 +117,7 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[
         for kill in spared:
             inbox.say(f"--kill {kill.text}: never came")
         status = conclude(options, read(folder), folder, "processes", began)
-        if not _exported(options, folder, inbox):
-            return STOPPED
-        stay(shows, inbox)
-        return status
+        return _afterwards(options, folder, shows, inbox, status)
 
 
 @contextmanager
@@ -152,17 +146,33 @@ def _shown(options: argparse.Namespace, scenario: Scenario, folder: Path) -> Ite
         yield shows
 
 
-def _exported(options: argparse.Namespace, folder: Path, inbox: Inbox) -> bool:
-    """Once the outcome has been told, which stands whatever becomes of this. False, if told to stop."""
-    if options.out is None or options.export is False:
-        return True
-    sys.stdout.flush()
+def _afterwards(
+    options: argparse.Namespace, folder: Path, shows: Sequence[Beside], inbox: Inbox, status: int
+) -> int:
+    """The outcome has been told: export the record, and stay as long as somebody looks; the exit status."""
     try:
-        exporting.exported(folder, folder, inbox)
-    except UserError as error:
-        if options.export or not options.quiet:
-            inbox.say(f"not exported: {error}")
+        exported = _export(options, folder, inbox)
     except Interrupted as signal_name:
         inbox.say(f"stopped by {signal_name} before all was exported")
+        return STOPPED
+    stay(shows, inbox)
+    return FAILED if options.export and not exported else status
+
+
+def _export(options: argparse.Namespace, folder: Path, inbox: Inbox) -> bool:
+    """Whether the record has been exported. Raises Interrupted."""
+    if options.out is None or options.export is False:
+        return False
+    sys.stdout.flush()
+    try:
+        need(*exporting.MODULES)
+    except UserError as error:
+        if not options.quiet:  # nobody asked for it
+            inbox.say(f"not exported: {error}")
+        return False
+    try:
+        exporting.exported(folder, folder, inbox, quiet=options.quiet)
+    except UserError as error:
+        inbox.say(f"not exported: {error}")
         return False
     return True

@@ -8,13 +8,15 @@ from typing import NamedTuple
 
 import msgspec
 
-from compose import record, worldless
+from compose import record
 from compose.export.frames import in_time
 from compose.export.recording import TooLong, write_mcap
 from compose.export.tables import At, frames_csv, write_ticks
+from compose.record import WORLD_JOURNAL
+from compose.robots import pasts
 from compose.scene import recorded
 from compose.status import UserError
-from compose.ticks import Row, rows, table
+from compose.ticks import Row, rows, rows_of, table
 from protocol.messages import Drive, Estimate
 
 
@@ -35,8 +37,6 @@ class _Ticks(NamedTuple):
     drives: dict[At, Drive]
     held: dict[At, Estimate]
     period: float
-    missing: tuple[str, ...]
-    """robots of which there is no journal"""
 
 
 FILES = ("run.mcap", "frames.csv", "ticks.csv", "ticks.parquet")
@@ -56,51 +56,56 @@ def export(
     UserError if it is too long for a format, or `out` cannot be written.
     """
     books = record.books(folder, alone=True)
-    told = _of_robots(folder) if worldless.is_worldless(folder) else _of_world(folder, books)
+    check()
+    robots, told = _of_world(folder, books) if WORLD_JOURNAL in books else _of_robots(folder)
+    check()
     run = recorded.read(folder)
     record.make(out)
     mcap, frames, ticks, parquet = files = tuple([out / name for name in FILES])
-    writers: dict[Path, Callable[[], object]] = {
-        mcap: lambda: write_mcap(books, run, mcap, check),
-        frames: lambda: frames.write_text(frames_csv(in_time(books), check), encoding="utf-8"),
-        ticks: lambda: ticks.write_text(table(told.rows), encoding="utf-8"),
-        parquet: lambda: write_ticks(told.rows, told.drives, told.held, told.period, parquet),
-    }
+    writers: tuple[Callable[[], object], ...] = (
+        lambda: write_mcap(books, run, mcap, check),
+        lambda: frames.write_text(frames_csv(in_time(books), check), encoding="utf-8"),
+        lambda: ticks.write_text(table(told.rows), encoding="utf-8"),
+        lambda: write_ticks(told.rows, told.drives, told.held, told.period, parquet),
+    )
     try:
-        for write in writers.values():
+        for write in writers:
+            check()
             write()
             done()
     except OSError as error:
         raise UserError(record.cannot_write(out, error)) from None
     except TooLong as error:
         raise UserError(str(error)) from None
+    names = [record.agent_journal(robot) for robot in robots]
     return Exported(
         files=files,
         torn={name: book.torn for name, book in books.items() if book.torn},
-        missing=tuple([record.agent_journal(robot) for robot in told.missing]),
+        missing=tuple([name for name in names if name not in books]),
     )
 
 
-def _of_world(folder: Path, books: Collection[str]) -> _Ticks:
+def _of_world(folder: Path, books: Collection[str]) -> tuple[list[str], _Ticks]:
+    """Of whom journals there should be, and what the tables say."""
     told = record.read(folder)
     ids = [robot.id for robot in told.scenario.robots]
     there = [robot for robot in ids if record.agent_journal(robot) in books]
-    return _Ticks(
+    return ids, _Ticks(
         list(rows(told)),
         {(robot, at.truth.tick): drive for at in told.moments for robot, drive in at.drives.items()},
         {(robot, one.tick): one for robot in there for one in record.estimates(folder, robot)},
         told.scenario.mission.period,
-        tuple([robot for robot in ids if robot not in there]),
     )
 
 
-def _of_robots(folder: Path) -> _Ticks:
-    told = worldless.pasts(folder)
+def _of_robots(folder: Path) -> tuple[list[str], _Ticks]:
+    """The same without a world."""
+    told = pasts(folder)
     if not told:
-        raise FileNotFoundError(folder)
+        raise UserError(f"{folder}: there is no {WORLD_JOURNAL}, and no robot in it was briefed")
     briefings = [past.briefing for past in told.values()]
-    return _Ticks(
-        list(worldless.rows(told)),
+    return sorted({*told, *[one.peer for one in briefings]}), _Ticks(
+        list(rows_of(told)),
         {
             (robot, step.sense.tick): step.drive
             for robot, past in told.items()
@@ -109,5 +114,4 @@ def _of_robots(folder: Path) -> _Ticks:
         },
         {(robot, one.tick): one for robot, past in told.items() for one in past.estimates},
         briefings[0].mission.period,
-        tuple([one.peer for one in briefings if one.peer not in told]),
     )

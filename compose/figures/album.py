@@ -54,7 +54,7 @@ def _ranges(pair: Pair) -> Iterator[Picture]:
 
 def _errors(pair: Pair) -> Iterator[Picture]:
     if pair.told:
-        yield f"errors-{pair.name}", over_time.errors(pair) if pair.record is not None else Absent(NO_TRUTH)
+        yield f"errors-{pair.name}", over_time.errors(pair)
 
 
 def _robot(pair: Pair) -> Iterator[Picture]:

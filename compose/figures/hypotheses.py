@@ -12,7 +12,7 @@ from agent.mind import Mind
 from agent.phases.surveying import Surveying, stride
 from compose.figures.pair import ROLES, Pair
 from compose.figures.series import Series, some, square
-from compose.figures.sheet import NO_ENCOUNTER, Absent, Window, circle, ending
+from compose.figures.sheet import NO_ENCOUNTER, Absent, Window, circle
 from compose.figures.style import COLOURS, INK, MARKS, PALE, PALER
 from protocol.mission import Role
 from protocol.motion import Pose, step
@@ -56,7 +56,7 @@ def draw(pair: Pair) -> Figure | Absent:
         f"{len(shown)} of {len(told)} decisions" if len(shown) < len(told) else f"all {len(told)} decisions"
     )
     title = f"Hypotheses of how both lie in the plane, and the manoeuvres chosen: {many}"
-    series = Series(len(shown), _window(pair, shown), WIDTH, NARROWEST, [ending(pair), title])
+    series = Series(len(shown), _window(pair, shown), WIDTH, NARROWEST, [pair.title, title])
     for i, one in enumerate(shown):
         axes = series.panel(i, _said(one, i + 1))
         _panel(axes, pair, one)
@@ -167,6 +167,6 @@ def _signs(axes: Axes, pair: Pair) -> None:
         )  # fmt: skip
     axes.plot([], [], "o", ls="", ms=4, mfc="white", mec=PALE, label="less likely")
     axes.plot([], [], "x-", ms=6, mew=1.5, lw=1.6, color=PALE, label="manoeuvre chosen")
-    known = "true" if pair.record is not None else "by the claim"
+    known = "true" if pair.true else "by the claim"
     axes.plot([], [], "+", ls="", ms=9, mew=1.2, color=INK, label=known)
     axes.plot([], [], "x", ls="", ms=6, mew=1.4, color="k", label="anchor")

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from agent.geometry import Placement
 from agent.phases.encounter import Array, Compared, LastManoeuvre, Plan, compared
 from compose.figures.pair import ROLES, Pair
-from compose.figures.sheet import ANCHORS, NO_ENCOUNTER, ROW, SMALL, Absent, Sheet, circle, ending, equal
+from compose.figures.sheet import ANCHORS, NO_ENCOUNTER, ROW, SMALL, Absent, Sheet, circle, equal
 from compose.figures.style import COLOURS, INK, MARKS, PALE, PALER
 from compose.figures.trajectory import heading
 from protocol.mission import Mission, Role
@@ -100,7 +100,7 @@ def _figure(pair: Pair, one: Planned) -> Figure:
     seen, plan, mission = scene(one.plan), one.plan, pair.mission
     ways = compared(plan.question, mission, pair.variant)
     below = 0.5 + ROW * math.ceil((SIGNS + len(seen.others)) / COLUMNS) + 0.05
-    sheet = Sheet(0.6 + PLANE + 0.75 + COST + 0.2, below + PLANE + 0.08, [ending(pair), _title(pair, one)])
+    sheet = Sheet(0.6 + PLANE + 0.75 + COST + 0.2, below + PLANE + 0.08, [pair.title, _title(pair, one)])
     axes = sheet.panel(0.6, below, PLANE, PLANE)
     half = AROUND * max(
         mission.max_speed * mission.period,

@@ -13,7 +13,7 @@ from matplotlib.ticker import LogFormatterMathtext, LogLocator, MaxNLocator, Nul
 
 from compose.claim import Claim
 from compose.figures.pair import ROLES, Pair
-from compose.figures.sheet import ANCHORS, ROW, SMALL, Absent, Sheet, ending
+from compose.figures.sheet import ANCHORS, NO_TRUTH, ROW, SMALL, Absent, Sheet
 from compose.figures.style import COLOURS, INK, MARKS, PALE, SHADE
 from protocol.messages import Estimate
 from protocol.mission import Role
@@ -41,9 +41,9 @@ Points = list[tuple[int, float]]
 
 
 def ranges(pair: Pair) -> Figure:
-    """What each sensor measured, and how far apart the two truly were."""
+    """What each sensor measured, and how far apart the two were."""
     tall, key = TALL + 0.4, 2 * ROW + 0.05
-    sheet = Sheet(_width(), 0.53 + tall + key, [ending(pair)])
+    sheet = Sheet(_width(), 0.53 + tall + key, [pair.title])
     panels = _panels(sheet, pair, key + 0.45, tall)
     for axes in panels:
         _shade(axes, pair)
@@ -96,7 +96,7 @@ def _ranges(axes: Axes, pair: Pair) -> None:
     if apart:
         axes.plot(
             range(len(apart)), apart, "-", lw=1.2, color=INK, zorder=2, gid="separation",
-            label="true separation" if pair.record is not None else "separation, as claimed",
+            label="true separation" if pair.true else "separation, as claimed",
         )  # fmt: skip
     for role in ROLES:
         _measured(
@@ -126,10 +126,12 @@ def _measured(
 
 def errors(pair: Pair) -> Figure | Absent:
     """How far off each robot's pose was: its position, and its heading."""
+    if not pair.true:
+        return Absent(NO_TRUTH)
     if not any(_held(pair, role) for role in ROLES):
         return Absent("neither robot held anything possible of where it is")
     key = KEY_ROWS * ROW + 0.05
-    sheet = Sheet(_width(), 0.53 + 2 * TALL + BETWEEN + key, [ending(pair)])
+    sheet = Sheet(_width(), 0.53 + 2 * TALL + BETWEEN + key, [pair.title])
     rows: list[tuple[str, str, Callable[[Pose, Pose], float], Callable[[Claim], float]]] = [
         ("position", "error of position [m]", _off, lambda claim: claim.position_error),
         ("heading", "error of heading [rad]", _askew, lambda claim: claim.heading_error),

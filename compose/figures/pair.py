@@ -7,13 +7,14 @@ from collections.abc import Mapping
 from functools import cached_property
 
 import msgspec
+from msgspec.structs import replace
 
 from agent.mind import Mind
-from compose import worldless
 from compose.claim import Claim
 from compose.figures.account import Account
 from compose.record import Record
-from compose.summary import ended, first_claim
+from compose.robots import outcome
+from compose.summary import broken_off, ended, first_claim
 from protocol.messages import Drive
 from protocol.mission import Anchor, Mission, Role, Variant
 from protocol.motion import Pose
@@ -38,7 +39,7 @@ class Side(msgspec.Struct, frozen=True):
     account: Account | None
     """none where its journal cannot be read"""
     claim: Claim | None = None
-    """the first that it made, against the truth"""
+    """the first that it made, held against the truth; none without a world"""
 
 
 class Pair(msgspec.Struct, frozen=True, dict=True):
@@ -52,7 +53,8 @@ class Pair(msgspec.Struct, frozen=True, dict=True):
     a: Side
     b: Side
     mutual: tuple[tuple[bool, float | None], ...]
-    """whether the two were in contact, and the range that was measured, tick by tick"""
+    """whether the two were in contact, and the range that was measured, tick by tick; where the two measured
+    it each for itself, a's, or where a has none, b's"""
     record: Record | None
     """of the truth; none without a world"""
 
@@ -72,9 +74,14 @@ class Pair(msgspec.Struct, frozen=True, dict=True):
         return max(0, len(self.mutual) - 1)
 
     @property
-    def placed(self) -> bool:
-        """Whether it is known, or claimed, where both were."""
-        return bool(self.a.path and self.b.path)
+    def true(self) -> bool:
+        """Whether paths are true, and not what the robots claim."""
+        return self.record is not None
+
+    @property
+    def placed(self) -> int:
+        """Ticks, from 0 on, in which it is known, or claimed, where both were."""
+        return min(len(self.a.path), len(self.b.path))
 
     def robot(self, role: Role) -> Side:
         """Who plays it."""
@@ -91,7 +98,7 @@ class Pair(msgspec.Struct, frozen=True, dict=True):
         return [role for role in ROLES if self.robot(role).account is not None]
 
     def minds(self, role: Role) -> tuple[Mind, ...]:
-        """After each tick, as far as there is anything else on record."""
+        """After each tick, as far as the rest of the record goes."""
         account = self.robot(role).account
         return account.minds[: max(1, len(self.mutual))] if account is not None else ()
 
@@ -124,36 +131,32 @@ class Pair(msgspec.Struct, frozen=True, dict=True):
 def of_record(record: Record, places: tuple[int, int], accounts: Mapping[str, Account]) -> Pair:
     """The robots at those places of the scenario, a first; `accounts` are those that can be read."""
     scenario, moments = record.scenario, record.moments
-    last = max(0, len(moments) - 1)
-    how = (
-        f"the record breaks off after {last} ticks"
-        if record.end is None
-        else ended(record.end.outcome, last, record.end.reason)
-    )
+    last = len(moments) - 1
+    how = ended(record.end.outcome, last, record.end.reason) if record.end is not None else broken_off(last)
     ranges = [anchor_ranges(one.truth, scenario) for one in moments]
     mutual = [mutual_ranges(one.truth, scenario, [places])[0] for one in moments]
 
     def side(role: Role, place: int) -> Side:
         robot = scenario.robots[place]
         return Side(
-            robot.id,
-            robot.anchor,
-            robot.rendezvous.of(role),
-            tuple([one.truth.poses[place] for one in moments] or [robot.start]),
-            tuple([one.drives.get(robot.id) for one in moments]),
-            tuple([each[place] for each in ranges]),
-            accounts.get(robot.id),
-            first_claim(record, place),
+            id=robot.id,
+            anchor=robot.anchor,
+            orbit=robot.rendezvous.of(role),
+            path=tuple([one.truth.poses[place] for one in moments] or [robot.start]),
+            drives=tuple([one.drives.get(robot.id) for one in moments]),
+            anchor_ranges=tuple([each[place] for each in ranges]),
+            account=accounts.get(robot.id),
+            claim=first_claim(record, place),
         )
 
     return Pair(
-        f"{scenario.name}, seed {scenario.seed}, {scenario.variant}: {how}",
-        scenario.mission,
-        scenario.variant,
-        side("a", places[0]),
-        side("b", places[1]),
-        tuple([(one is not None, one.range if one is not None else None) for one in mutual]),
-        record,
+        title=f"{scenario.name}, seed {scenario.seed}, {scenario.variant}: {how}",
+        mission=scenario.mission,
+        variant=scenario.variant,
+        a=side("a", places[0]),
+        b=side("b", places[1]),
+        mutual=tuple([(one is not None, one.range if one is not None else None) for one in mutual]),
+        record=record,
     )
 
 
@@ -161,34 +164,34 @@ def of_robots(accounts: Mapping[str, Account]) -> Pair:
     """Without a world: of one or both of a pair, each of whom was briefed."""
     told = {robot: one.past for robot, one in accounts.items() if one.past is not None}
     briefing = next(iter(told.values())).briefing
-    ticks = min([len(past.steps) for past in told.values()])
+    in_order = sorted(told.values(), key=lambda past: past.briefing.role)
     mutual: list[tuple[bool, float | None]] = []
-    for tick in range(ticks):
-        met = [one for past in told.values() if (one := worldless.contact(past, tick)) is not None]
+    for tick in range(max([len(past.steps) for past in told.values()])):
+        met = [one for past in in_order if (one := past.contact(tick)) is not None]
         mutual.append((bool(met), next((one.range for one in met if one.range is not None), None)))
 
     def side(role: Role) -> Side:
         own = briefing.role == role
         robot = briefing.robot if own else briefing.peer
         past = told.get(robot)
-        steps = past.steps[:ticks] if past is not None else ()
+        steps = past.steps if past is not None else ()
         return Side(
-            robot,
-            briefing.anchor if own else briefing.peer_anchor,
-            briefing.rendezvous.of(role),
-            worldless.path(past)[:ticks] if past is not None else (),
-            tuple([step.drive for step in steps]),
-            tuple([step.sense.anchor_range for step in steps]),
-            accounts.get(robot),
+            id=robot,
+            anchor=briefing.anchor if own else briefing.peer_anchor,
+            orbit=briefing.rendezvous.of(role),
+            path=past.path if past is not None else (),
+            drives=tuple([step.drive for step in steps]),
+            anchor_ranges=tuple([step.sense.anchor_range for step in steps]),
+            account=accounts.get(robot),
         )
 
-    places = "; places by their claims" if all(past.claim is not None for past in told.values()) else ""
-    return Pair(
-        f"{' and '.join(told)} without a world, {briefing.variant}: {worldless.outcome(told)}{places}",
-        briefing.mission,
-        briefing.variant,
-        side("a"),
-        side("b"),
-        tuple(mutual),
-        None,
+    pair = Pair(
+        title=f"{' and '.join(told)} without a world, {briefing.variant}: {outcome(told)}",
+        mission=briefing.mission,
+        variant=briefing.variant,
+        a=side("a"),
+        b=side("b"),
+        mutual=tuple(mutual),
+        record=None,
     )
+    return replace(pair, title=f"{pair.title}; places by their claims") if pair.placed else pair

@@ -13,7 +13,7 @@ from agent.belief import FLOOR, Branch
 from agent.mind import Mind
 from agent.phases.seeking import travelled
 from compose.figures.pair import Pair
-from compose.figures.sheet import ANCHORS, Absent, Sheet, around, circle, ending, equal, fitted
+from compose.figures.sheet import ANCHORS, Absent, Sheet, around, circle, equal, fitted
 from compose.figures.style import COLOURS, INK, MARKS, PALE, PALER
 from protocol.messages import BranchKind
 from protocol.mission import Role
@@ -62,7 +62,7 @@ def draw(pair: Pair, role: Role) -> Figure | Absent:
         points += [(x, y) for x in (-virtual, virtual) for y in (-virtual, virtual)]
     window = around(points, 0.05)
     width, height = fitted(window, WIDTH, TALLEST)
-    sheet = Sheet(0.6 + width + BESIDE, 0.5 + height, [ending(pair), _title(pair, role, mind)])
+    sheet = Sheet(0.6 + width + BESIDE, 0.5 + height, [pair.title, _title(pair, role, mind)])
     axes = sheet.panel(0.55, 0.42, width, height)
     circle(axes, (0, 0), reach, lw=1.2, ls="-", color="k", gid="range", label=f"$R$ = {reach:g} m")
     axes.plot(0, 0, "x", color="k", ms=7, mew=1.6, ls="", gid="anchor", label=f"anchor ${ANCHORS[role]}$")

@@ -13,7 +13,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from compose.figures.pair import Pair
 from compose.figures.style import INK
 from protocol.mission import Role
 
@@ -40,10 +39,13 @@ class Absent(NamedTuple):
 
 
 class Sheet:
-    """A figure of `width` by `height` inches below its title, whose first line is as long as it likes."""
+    """A figure of `width` by `height` inches below its title.
+
+    The first line of that is as long as it likes, and stands as it is written; in others `$` enclose symbols.
+    """
 
     def __init__(self, width: float, height: float, lines: Sequence[str]) -> None:
-        wrapped = [*textwrap.wrap(lines[0], int(CHARACTERS * width)), *lines[1:]]
+        wrapped = [*textwrap.wrap(plain(lines[0]), int(CHARACTERS * width)), *lines[1:]]
         self.width, self.height = width, height
         self.tall = height + 0.1 + LINE * len(wrapped)
         self.figure = Figure(figsize=(width, self.tall))
@@ -82,11 +84,6 @@ def circle(axes: Axes, place: tuple[float, float], radius: float, **look: Any) -
     axes.add_patch(Circle(place, radius, fill=False, gid=gid, **look))
     if label is not None:
         axes.plot([], [], label=label, **look)
-
-
-def ending(pair: Pair) -> str:
-    """Which run it is of, and how that ended."""
-    return plain(pair.title)
 
 
 def plain(text: str) -> str:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from compose.figures.pair import ROLES, Pair
 from compose.figures.series import Series, some, square
-from compose.figures.sheet import NO_ENCOUNTER, NO_PLACES, Absent, Window, circle, ending
+from compose.figures.sheet import NO_ENCOUNTER, NO_PLACES, Absent, Window, circle
 from compose.figures.style import COLOURS, DASHES, INK, MARKS, PALE
 from compose.figures.trajectory import heading
 from protocol.mission import Role
@@ -33,7 +33,7 @@ def draw(pair: Pair) -> Figure | Absent:
         return Absent(NO_ENCOUNTER if pair.met is None else "no mutual range was measured in it")
     shown = some(ticks)
     window = _window(pair, ticks[0], shown[-1])
-    series = Series(len(shown), window, WIDTH, NARROWEST, [ending(pair), _title(ticks, shown)])
+    series = Series(len(shown), window, WIDTH, NARROWEST, [pair.title, _title(ticks, shown)])
     for i, tick in enumerate(shown):
         axes = series.panel(i, _said(pair, tick, i + 1))
         _panel(axes, pair, ticks[0], shown[i - 1] if i else tick, tick)
@@ -47,7 +47,7 @@ def steps(pair: Pair) -> list[int]:
     if pair.met is None:
         return []
     told: list[int] = []
-    for tick in range(pair.met, pair.last + 1):
+    for tick in range(pair.met, min(pair.last + 1, pair.placed)):
         if pair.mutual[tick][1] is None:
             continue
         if told and all(pair.robot(role).path[told[-1]] == pair.robot(role).path[tick] for role in ROLES):

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from compose.figures.pair import ROLES, Pair
-from compose.figures.sheet import ANCHORS, NO_PLACES, Absent, Sheet, around, circle, ending, equal, fitted
+from compose.figures.sheet import ANCHORS, NO_PLACES, Absent, Sheet, around, circle, equal, fitted
 from compose.figures.style import COLOURS, DASHES, INK, MARKS, PALE
 from protocol.mission import Role
 from protocol.motion import Pose
@@ -28,7 +28,7 @@ def draw(pair: Pair) -> Figure | Absent:
     window = around(_extent(pair), 0.03)
     width, height = fitted(window, WIDTH, TALLEST)
     tall = max(height, 2.9)
-    sheet = Sheet(0.6 + width + BESIDE, 0.5 + tall, [ending(pair)])
+    sheet = Sheet(0.6 + width + BESIDE, 0.5 + tall, [pair.title])
     axes = sheet.panel(0.55, 0.42 + (tall - height), width, height)
     for role in ROLES:
         draw_anchor(axes, pair, role)
@@ -51,13 +51,9 @@ def _extent(pair: Pair) -> list[tuple[float, float]]:
     points = [(pose.x, pose.y) for role in ROLES for pose in pair.robot(role).path]
     for role in ROLES:
         one = pair.robot(role)
-        reach = max(pair.mission.sensing_range, _orbit_radius(pair, role))
+        reach = max(pair.mission.sensing_range, one.orbit.radius)
         points += [(one.anchor.x + dx, one.anchor.y + dy) for dx in (-reach, reach) for dy in (-reach, reach)]
     return points
-
-
-def _orbit_radius(pair: Pair, role: Role) -> float:
-    return pair.robot(role).orbit.radius
 
 
 def _arrow(pair: Pair) -> float:
@@ -89,7 +85,8 @@ def draw_anchor(axes: Axes, pair: Pair, role: Role) -> None:
 
 
 def _orbit(axes: Axes, pair: Pair, role: Role) -> None:
-    one, radius = pair.robot(role), _orbit_radius(pair, role)
+    one = pair.robot(role)
+    radius = one.orbit.radius
     circle(
         axes, (one.anchor.x, one.anchor.y), radius, ls=DASHES[role], lw=0.9, color=COLOURS[role],
         gid=f"orbit-{role}", label=f"orbit of {one.id}, {radius:.4g} m",
@@ -129,8 +126,8 @@ def heading(axes: Axes, pose: Pose, length: float, colour: str, zorder: float = 
 def _marks(axes: Axes, pair: Pair) -> None:
     """Where the two met, and where they were last."""
     axes.plot([], [], "s", ms=7, mfc="white", mec=INK, mew=1.5, label="released, heading")
-    if pair.contacts:
-        tick = pair.contacts[0][0]
+    tick = next((first for first, _ in pair.contacts if first < pair.placed), None)
+    if tick is not None:
         ends = [pair.robot(role).path[tick] for role in ROLES]
         axes.plot(
             [p.x for p in ends], [p.y for p in ends], ":", color=INK, lw=1.6, zorder=5, gid="contact",
@@ -141,4 +138,6 @@ def _marks(axes: Axes, pair: Pair) -> None:
         axes.plot(
             end.x, end.y, "*", ms=11, mfc=COLOURS[role], mec="white", mew=0.7, zorder=6, gid=f"last-{role}"
         )
-    axes.plot([], [], "*", ms=10, mfc=PALE, mec="white", ls="", label=f"last position, $k$ = {pair.last}")
+    last = sorted({len(pair.robot(role).path) - 1 for role in ROLES})
+    told = f"last position, $k$ = {' and '.join(map(str, last))}"
+    axes.plot([], [], "*", ms=10, mfc=PALE, mec="white", ls="", label=told)
