@@ -128,6 +128,28 @@ def picture(page: Page) -> str:
     return str(page.evaluate("document.getElementById('canvas').toDataURL()"))
 
 
+INKS = """() => {
+  const canvas = document.getElementById('canvas'), style = getComputedStyle(document.documentElement);
+  const data = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data, found = {};
+  for (const name of ['ring', 'orbit', 'ghost', 'range', 'link', 'fault', 'phase-1', 'phase-2', 'phase-3']) {
+    const hex = style.getPropertyValue('--' + name).trim();
+    const ink = [1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16));
+    found[name] = 0;
+    for (let i = 0; i < data.length; i += 4) {
+      if (data[i + 3] > 100 && ink.every((part, k) => Math.abs(data[i + k] - part) < 12)) found[name] += 1;
+    }
+  }
+  return found;
+}"""
+
+
+def inks(page: Page) -> dict[str, int]:
+    """How many pixels of the plane are of each of its colours, once all that was asked for is drawn."""
+    picture(page)
+    found: dict[str, int] = page.evaluate(INKS)
+    return found
+
+
 # --- a record ---------------------------------------------------------------------------------------
 
 
@@ -152,6 +174,43 @@ def test_a_record_scrubbed_to_tick_46_shows_the_first_contact(opened: Open, addr
     expect(page.locator("#scrub")).to_have_attribute("aria-valuetext", re.compile("^tick 46 of 48"))
     assert "tick=46" in page.url
     shot(page, "tick-46")
+
+
+@browsing
+def test_the_plane_is_drawn_in_the_colours_of_what_happens(opened: Open, address: str) -> None:
+    page = opened(address)
+    seen = {}
+    for tick in (0, 20, 45, 46, 47, 48):
+        page.locator("#scrub").evaluate(SCRUB, tick)
+        until_shown(page, tick)
+        seen[tick] = inks(page)
+    assert seen[0]["range"] > 3 * seen[20]["range"]  # both are in range of their anchors; neither is
+    assert seen[45]["link"] == 0 < seen[46]["link"]  # they meet
+    assert seen[47]["ghost"] > 3 * seen[46]["ghost"] > 300  # one place each is possible, then four
+    assert seen[0]["phase-2"] == 0 < seen[20]["phase-2"]  # trails
+    assert seen[20]["phase-1"] > 100
+    assert seen[45]["phase-3"] == 0 < seen[46]["phase-3"] < seen[48]["phase-3"]
+    page.locator("#truth").uncheck()
+    page.locator("#robot").select_option("b")
+    page.locator("#scrub").evaluate(SCRUB, 46)
+    until_shown(page, 46)
+    alone = inks(page)
+    assert alone["ring"] < 0.6 * seen[46]["ring"]  # its own anchor's range
+    assert alone["link"] > 100  # the ring on which a is
+
+
+@browsing
+def test_what_becomes_of_reports_is_drawn_on_their_way(opened: Open, tmp_path: Path) -> None:
+    seen = {}
+    for fault in ("loss=0", "loss=1", "corrupt=1"):
+        record = tmp_path / fault
+        record.mkdir()
+        inline.play(load("paper-1", faults=[f"{fault}, contact_ticks=0..1"]), record)
+        with watching(record) as (_, where):
+            page = opened(f"{where}#tick=46")
+            until_shown(page, 46)
+            seen[fault] = inks(page)["fault"]
+    assert seen["loss=0"] == 0 < seen["loss=1"] < seen["corrupt=1"]
 
 
 @browsing
