@@ -96,7 +96,8 @@ class OutOfOrder(CorruptJournal):
         """how many frames stand before it"""
         self.tick: int | None = getattr(message, "tick", None)
         at = f" of tick {self.tick}" if self.tick is not None else ""
-        self.what = f"a {type(message).__name__}{at} is out of order"
+        kind = type(message).__name__
+        self.what = f"{'an' if kind[0] in 'AE' else 'a'} {kind}{at} is out of order"
         super().__init__(f"{source}: {self.what}")
 
 

@@ -11,6 +11,7 @@ import itertools
 import json
 import math
 import random
+import re
 import shutil
 import socket
 import struct
@@ -412,6 +413,19 @@ def test_a_run_that_was_told_to_export_and_could_not_has_failed(tmp_path: Path) 
         ended = tandem("run", "paper-1", "-q", "--in-process", "--out", out, told)
         assert (ended.status, ended.out) == (status, "localised after 48 ticks\n")
         assert ended.err.startswith("tandem run: not exported: ") == (status == 3)
+
+
+def test_where_there_is_no_room_nothing_half_written_is_left(paper_1: Path, tmp_path: Path) -> None:
+    sizes = {name: (paper_1 / name).stat().st_size for name in FILES}
+    for name in FILES:
+        out = tmp_path / name
+        limit = f'ulimit -f {sizes[name] // 2 // 512}; exec "$@"'  # blocks of 512 bytes
+        with Command("export", paper_1, "--out", out, through=["sh", "-c", limit, "sh"]) as command:
+            ended = command.ended()
+        assert (ended.status, ended.out) == (2, "")
+        assert re.fullmatch(r"tandem export: --out: \S+ cannot be written: .*\n", ended.err), ended.err
+        assert {path.name: path.stat().st_size for path in out.iterdir()}.items() <= sizes.items()
+        assert name not in {path.name for path in out.iterdir()}
 
 
 def test_ctrl_c_ends_an_export_and_leaves_nothing_half_written(paper_1: Path, tmp_path: Path) -> None:

@@ -18,12 +18,17 @@ from signal import SIGINT, SIGKILL
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
+import msgpack
 import pytest
+from msgspec.structs import replace
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 from compose import inline
 from compose.record import read
 from compose.scenario import load
+from protocol import journal
+from protocol.messages import Message, OfRobot, Sense
+from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from tests.commands import (
     BOUND_S,
     ENDLESS,
@@ -286,6 +291,31 @@ def test_all_of_it_goes_by_keyboard_alone(opened: Open, address: str) -> None:
     press("Tab")
     focused = page.evaluate("document.activeElement.tagName")
     assert focused in {"A", "INPUT", "BUTTON", "SELECT"}
+
+
+@browsing
+def test_robots_without_a_world_are_shown_by_what_they_know(
+    opened: Open, paper_1: Path, tmp_path: Path
+) -> None:
+    for path in paper_1.glob("agent-*.journal"):
+        told = [decode(frame, OfRobot, MAX_FRAME_BYTES) for frame in journal.read(path)]
+        frames = [encode(as_a_driver_tells(one)) for one in told]
+        (tmp_path / path.name).write_bytes(b"".join([msgpack.packb(frame) for frame in frames]))
+    with watching(tmp_path) as (_, where):
+        page = opened(f"{where}#tick=46")
+        until_shown(page, 46)
+        expect(page.locator(".card[data-robot=a] dl")).to_contain_text("what b tells within the tick")
+        expect(page.locator(".card[data-robot=b] .doing")).to_contain_text("b stands still")
+        expect(page.locator("#seen")).to_contain_text("the truth is not on record")
+        expect(page.locator("#log")).to_contain_text("b claims to be at")
+        assert inks(page)["ghost"] > 100
+
+
+def as_a_driver_tells(message: Message) -> Message:
+    """Without a world nobody lists what is heard."""
+    if not isinstance(message, Sense):
+        return message
+    return replace(message, contacts=tuple([replace(one, heard=None) for one in message.contacts]))
 
 
 @browsing

@@ -44,6 +44,7 @@ def main(options: argparse.Namespace) -> int:
             pair = _pair(record, robots, accounts)
             if pair is None:
                 _say(f"no picture of {' and '.join(robots)}: nothing is on record")
+                status = FAILED
                 continue
             try:
                 draw(pair, kinds, formats, folder, done)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import NamedTuple
@@ -62,16 +63,16 @@ def export(
     run = recorded.read(folder)
     record.make(out)
     mcap, frames, ticks, parquet = files = tuple([out / name for name in FILES])
-    writers: tuple[Callable[[], object], ...] = (
-        lambda: write_mcap(books, run, mcap, check),
-        lambda: frames.write_text(frames_csv(in_time(books), check), encoding="utf-8"),
-        lambda: ticks.write_text(table(told.rows), encoding="utf-8"),
-        lambda: write_ticks(told.rows, told.drives, told.held, told.period, parquet),
-    )
+    writers: dict[Path, Callable[[Path], object]] = {
+        mcap: lambda path: write_mcap(books, run, path, check),
+        frames: lambda path: path.write_text(frames_csv(in_time(books), check), encoding="utf-8"),
+        ticks: lambda path: path.write_text(table(told.rows), encoding="utf-8"),
+        parquet: lambda path: write_ticks(told.rows, told.drives, told.held, told.period, path),
+    }
     try:
-        for write in writers:
+        for path, write in writers.items():
             check()
-            write()
+            _put(path, write)
             done()
     except OSError as error:
         raise UserError(record.cannot_write(out, error)) from None
@@ -83,6 +84,16 @@ def export(
         torn={name: book.torn for name, book in books.items() if book.torn},
         missing=tuple([name for name in names if name not in books]),
     )
+
+
+def _put(path: Path, write: Callable[[Path], object]) -> None:
+    """What `write` leaves at a path, at this one: all of it, or what was there before."""
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        write(draft)
+        draft.replace(path)
+    finally:
+        draft.unlink(missing_ok=True)
 
 
 def _of_world(folder: Path, books: Collection[str]) -> tuple[list[str], _Ticks]:

@@ -8,9 +8,10 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from heapq import merge
+from io import RawIOBase
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, BinaryIO, get_args
+from typing import Any, get_args
 
 import foxglove
 import msgspec
@@ -113,20 +114,17 @@ def write_mcap(
     last = max([scene.tick for scene in run.scenes], default=0)
     if nanoseconds(run.stage, last) >= LONGEST_S * 1_000_000_000:
         raise TooLong(f"the run lasts {last * run.stage.mission.period:g} s; MCAP can tell {LONGEST_S} s")
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
     context = Context()
     channels = Channels(context)
     try:
-        with draft.open("wb") as file:
+        with path.open("wb", buffering=0) as file:
             kept = _Kept(file)
             options = MCAPWriteOptions(chunk_size=CHUNK_BYTES, compression_threads=0)
             with foxglove.open_mcap(kept, context=context, writer_options=options):
                 count = _tell(books, run, channels, [kept.check, check])
             kept.check()
-        draft.replace(path)
     finally:
         channels.close()
-        draft.unlink(missing_ok=True)
     return count
 
 
@@ -160,11 +158,15 @@ def _by_tick(books: Mapping[str, Book], run: Performance) -> Iterator[tuple[int,
 
 
 class _Kept:
-    """A file whose first error is kept: the writer would go on, and say every time that it cannot."""
+    """A file whose first error is kept. From then on it seems to take what it is given, as if it had room.
 
-    def __init__(self, file: BinaryIO) -> None:
+    The writer would say every time that it cannot, and does not survive that places are not as it left them.
+    """
+
+    def __init__(self, file: RawIOBase) -> None:
         self._file = file
         self._error: OSError | None = None
+        self._at = self._end = 0
 
     def check(self) -> None:
         """Raises OSError if something could not be written."""
@@ -172,19 +174,21 @@ class _Kept:
             raise self._error
 
     def write(self, data: bytes | bytearray) -> int:
-        if self._error is None:
+        rest = memoryview(data)
+        while rest and self._error is None:
             try:
-                return self._file.write(data)
+                rest = rest[self._file.write(rest) or 0 :]
             except OSError as error:
                 self._error = error
+        self._at += len(data)
+        self._end = max(self._end, self._at)
         return len(data)
 
-    def seek(self, offset: int, whence: int = 0) -> int:
-        return self._file.seek(offset, whence) if self._error is None else 0
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        self._at = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: self._end}[whence]
+        if self._error is None:
+            self._file.seek(self._at)
+        return self._at
 
     def flush(self) -> None:
-        if self._error is None:
-            try:
-                self._file.flush()
-            except OSError as error:
-                self._error = error
+        """Nothing waits."""

@@ -115,6 +115,8 @@ def _measured(
     axes: Axes, values: Sequence[float | None], gid: str, colour: str, mark: dict[str, Any], label: str
 ) -> None:
     told = [(tick, rho) for tick, rho in enumerate(values) if rho is not None]
+    if not told:
+        return
     axes.plot(
         [tick for tick, _ in told], [rho for _, rho in told], ls="", ms=4, mew=1.0, color=colour, gid=gid,
         markevery=max(1, math.ceil(len(told) / (2 * MARKED))), label=label, zorder=3, **mark,

@@ -23,7 +23,7 @@ CHARACTERS = 14.8
 SMALL = 8
 NO_ENCOUNTER = "the two did not meet in phase 3"
 NO_TRUTH = "without a world nobody knows where the two truly were"
-NO_PLACES = "without a world there are only claims of where the two were, and not both have made one"
+NO_PLACES = "without a world there are only claims of where the two were, and not both claims are on record"
 
 
 ANCHORS: dict[Role, str] = {"a": "M_1", "b": "M_2"}

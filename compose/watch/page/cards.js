@@ -131,6 +131,7 @@ function inputs(player, robot) {
 function hears(player, robot) {
   const contact = player.contacts?.[0];
   if (!contact) return "nothing";
+  if (contact[2] === null) return `what ${robot.peer} tells within the tick`;  // without a world nobody lists it
   const ticks = (list) => `${list.length > 1 ? "ticks" : "tick"} ${list.join(", ")}`;
   const heard = contact[2].length ? `${robot.peer}'s report of ${ticks(contact[2])}` : `nothing of ${robot.peer}`;
   return contact[3].length ? `${heard}; refuses that of ${ticks(contact[3])}: damaged` : heard;

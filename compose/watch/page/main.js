@@ -256,7 +256,8 @@ function controls() {
   text($("notes"), notes);
   $("notes").hidden = !notes;
   const who = view.focus ?? "each robot";
-  const seen = view.truth ? (view.focus ? `the truth, and what ${who} believes` : "") :
+  const untold = store.scene(view.tick)?.players.every((player) => !player.pose);
+  const seen = view.truth && untold ? `the truth is not on record: only what ${who} knows` : view.truth ? (view.focus ? `the truth, and what ${who} believes` : "") :
     `only what ${who} knows${knows_bearing() ? "" : "; before it is placed, its anchor's frame is turned at will"}`;
   text($("seen"), seen);
   $("canvas").setAttribute("aria-label", described());
