@@ -92,6 +92,7 @@ class _Ear:
         self._there = there
         self.latest: dict[str, bytes] = {}
         self._count = Counter[str]()
+        self._over = False
 
     def listen(self, wait: float) -> None:
         """Until everybody who is there has said something; `wait` s at the most."""
@@ -103,10 +104,13 @@ class _Ear:
         until = time.monotonic() + wait
         while not all(map(self._is_heard, self._there)) and time.monotonic() < until:
             time.sleep(LOOK_AGAIN_S)
+        self._over = True
         for one in declared:
             one.undeclare()
 
     def _hand_over(self, sample: zenoh.Sample) -> None:
+        if self._over:  # what comes while one key after the other is given up would be of many ticks
+            return
         key = str(sample.key_expr)
         self.latest[key] = sample.payload.to_bytes()
         self._count[key] += 1
