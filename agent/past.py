@@ -76,9 +76,10 @@ class Past(msgspec.Struct, frozen=True):
     @property
     def path(self) -> tuple[Pose, ...]:
         """Where it was in the plane, by its claim: its odometry, laid through it. Empty, if it made none."""
-        if self.claim is None:
+        claim, odometry = self.claim, self.odometry
+        if claim is None:
             return ()
-        (tick, said), odometry = self.claim, self.odometry
+        tick, said = claim
         frame = compose(said.pose, inverse(odometry[tick]))
         return tuple([compose(frame, pose) for pose in odometry])
 

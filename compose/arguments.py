@@ -40,6 +40,14 @@ def natural(text: str) -> int:
     return int(text)
 
 
+def up_to(most: int, text: str) -> int:
+    """A whole number from 1 to `most`."""
+    value = natural(text)
+    if not 0 < value <= most:
+        raise ArgumentTypeError(f"{value} is not from 1 to {most}")
+    return value
+
+
 def port(text: str) -> int:
     """Of TCP; 0 is any that is free."""
     value = natural(text)
@@ -58,18 +66,12 @@ def address(text: str) -> str:
 
 def count(text: str) -> int:
     """Of what there can be a thousand of."""
-    value = natural(text)
-    if not 0 < value <= 1000:
-        raise ArgumentTypeError(f"{value} is not from 1 to 1000")
-    return value
+    return up_to(1000, text)
 
 
 def trials(text: str) -> int:
     """Of a cell."""
-    value = natural(text)
-    if not 0 < value <= 10**7:
-        raise ArgumentTypeError(f"{value} is not from 1 to 10000000")
-    return value
+    return up_to(10**7, text)
 
 
 def name(text: str) -> str:
@@ -91,10 +93,7 @@ def names(text: str) -> tuple[str, ...]:
 
 def days(text: str) -> int:
     """Up to a hundred years."""
-    value = natural(text)
-    if not 0 < value <= 36_500:
-        raise ArgumentTypeError(f"{value} is not from 1 to 36500")
-    return value
+    return up_to(36_500, text)
 
 
 def kill(text: str) -> Kill:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from compose.lab import need
 from compose.record import legible
 from compose.telling import counting
 from protocol.inbox import Inbox
@@ -14,12 +13,11 @@ if TYPE_CHECKING:
     from compose.export.folder import Exported
 
 MODULES = ("foxglove", "pyarrow")
-"""that it needs"""
+"""that it needs; whoever calls has made sure of them"""
 
 
 def exported(folder: Path, out: Path, inbox: Inbox, *, quiet: bool = False) -> Exported:
     """What `compose.export.folder.export` does. Raises UserError; Interrupted when `inbox` says so."""
-    need(*MODULES)
     from compose.export.folder import FILES, export  # noqa: PLC0415  # slow, and there may be no extra
 
     with legible(folder), counting("tandem export", 0 if quiet else len(FILES)) as done:

@@ -90,16 +90,14 @@ class Book(msgspec.Struct, frozen=True):
     """bytes of a torn write behind them"""
 
 
-def books(folder: Path, *, alone: bool = False) -> dict[str, Book]:
-    """Every journal of the record in `folder`, by its name; the world's is the first.
+def books(folder: Path) -> dict[str, Book]:
+    """Every journal of the record in `folder`, by its name; the world's is the first, if there is one.
 
-    With `alone`, there need not be one if there are robots'.
-
-    Raises OSError if that is not there or one cannot be read, journal.CorruptJournal where something stands
-    that is no frame.
+    Raises OSError if there is none at all or one cannot be read, journal.CorruptJournal where something
+    stands that is no frame.
     """
     names = sorted([path.name for path in folder.glob(agent_journal("*"))])
-    if not names or not alone or (folder / WORLD_JOURNAL).exists():
+    if not names or (folder / WORLD_JOURNAL).exists():
         names.insert(0, WORLD_JOURNAL)
     return {name: Book(*journal.torn(folder / name)) for name in names}
 

@@ -21,6 +21,7 @@ from mcap.records import (
     Statistics,
 )
 from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.well_known import Profile
 
 
 def complaints(path: Path) -> list[str]:
@@ -30,7 +31,11 @@ def complaints(path: Path) -> list[str]:
     end = next(i for i, record in enumerate(records) if isinstance(record, DataEnd))
     found: list[str] = []
     header, footer = records[0], records[-1]
-    if not isinstance(header, Header) or not header.library or header.profile not in ("", "ros1", "ros2"):
+    if (
+        not isinstance(header, Header)
+        or not header.library
+        or header.profile not in ("", Profile.ROS1, Profile.ROS2)
+    ):
         found.append(f"header: {header}")
     if not isinstance(footer, Footer):
         found.append("no footer")

@@ -37,7 +37,7 @@ def audit(folder: Path) -> Findings:
     Raises OSError if there is none, journal.CorruptJournal if a frame in it cannot be understood, or stands
     in the journal of another robot, or of another run than its peer's.
     """
-    return judged({name: book.frames for name, book in books(folder, alone=True).items()}, folder)
+    return judged({name: book.frames for name, book in books(folder).items()}, folder)
 
 
 def judged(

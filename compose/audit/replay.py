@@ -48,7 +48,7 @@ def replay(folder: Path) -> tuple[Replay, dict[str, int]]:
     Raises OSError if there is none, journal.CorruptJournal if a frame in it cannot be understood, or stands
     in the journal of another robot.
     """
-    found = books(folder, alone=True)
+    found = books(folder)
     told = replayed({name: book.frames for name, book in found.items()}, folder)
     return told, {name: book.torn for name, book in found.items()}
 

@@ -6,7 +6,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from compose.exporting import exported
+from compose.exporting import MODULES, exported
+from compose.lab import need
 from compose.status import ENDED, FAILED, STOPPED
 from compose.stop import stop_by_signal
 from protocol.inbox import Inbox, Interrupted
@@ -14,6 +15,7 @@ from protocol.inbox import Inbox, Interrupted
 
 def main(options: argparse.Namespace) -> int:
     """Write the files; FAILED if a robot's journal is missing: of that one there is only what others tell."""
+    need(*MODULES)
     out: Path = options.out or options.record
     inbox = Inbox("tandem export")
     stop_by_signal(inbox)

@@ -56,7 +56,7 @@ def export(
     Raises OSError if there is no record, journal.CorruptJournal if it is damaged before its end,
     UserError if it is too long for a format, or `out` cannot be written.
     """
-    books = record.books(folder, alone=True)
+    books = record.books(folder)
     check()
     robots, told = _of_world(folder, books) if WORLD_JOURNAL in books else _of_robots(folder)
     check()

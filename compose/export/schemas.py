@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import msgspec
 from msgspec import inspect
 
 
+@cache
 def schema(kind: type[msgspec.Struct]) -> bytes:
     """Of the messages of that kind. msgspec knows neither field's names in arrays nor ECMA's expressions."""
     told = msgspec.json.schema(kind)
