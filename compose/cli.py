@@ -66,6 +66,9 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     except Exception:  # noqa: BLE001  # whatever it is, it must not look like a mission's outcome
         traceback.print_exc()
         status = BUG
+    forked = sys.modules.get("compose.forked")
+    if forked is not None:
+        forked.close()
     session = sys.modules.get("protocol.session")
     if session is not None:
         session.leave(status)

@@ -40,11 +40,11 @@ class Agent:
 
     def again(self) -> None:
         """It has ended: by a signal, and it goes on from its journal; or raises ChildFailed."""
-        status, said = self._child.status, self._child.said()
+        status = self._child.status
         if status == ENDED:
             return
         if status > 0:
-            raise ChildFailed(f"{self._child.name} ended with status {status}{said and ': ' + said}")
+            raise ChildFailed(f"{self._child.name} {self._child.how()}")
         self._inbox.say(f"{self._child.name} was killed by signal {-status}, and is started again")
         self.end()
         time.sleep(max(0.0, self._started + LEAST_S - time.monotonic()))

@@ -26,6 +26,8 @@ from world.scenario import Scenario
 
 def main(options: argparse.Namespace) -> int:
     """Play the mission, as processes or in this one."""
+    if not options.in_process:
+        local.fork_server()  # it imports while the launcher does
     found = setting(options.scenario, options.fault)
     scenario = found.seeded(options.seed)
     if options.out is not None and any(options.out.glob("*.journal")):
