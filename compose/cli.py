@@ -6,6 +6,7 @@ import argparse
 import os
 import sys
 import traceback
+from functools import cache
 from importlib import import_module
 from typing import NoReturn, TextIO
 
@@ -80,6 +81,7 @@ def _leave_stream(stream: TextIO) -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
+@cache  # a process forked from one that has made it need not
 def parser() -> argparse.ArgumentParser:
     """Of the whole command line."""
     tandem = _Parser(prog="tandem", description="Two robots find out together where they are.")

@@ -1,6 +1,6 @@
-"""The process that a launcher's processes are forked from, `python -P -m compose.fork_server MODULE...`.
+"""The process that a launcher's processes are forked from, `python -P -m compose.fork_server MODULE:FUNCTION`.
 
-It has imported the modules, and opened nothing: no session, no thread. Its standard input is a socket to the
+It has imported what they need, and called the function; it has opened nothing: no session, no thread. Its standard input is a socket to the
 launcher (`compose/forked.py`), which asks for processes and signals on it and is told how each process ended.
 It ends with the launcher, and no process outlasts it.
 """
@@ -129,12 +129,16 @@ def _become(start: Start, streams: list[int], parent: int) -> None:
     setproctitle(one_line(" ".join(sys.argv)))
 
 
+def _call(name: str) -> None:
+    module, _, function = name.partition(":")
+    getattr(import_module(module), function)()
+
+
 def main() -> None:
-    """Import the modules, and fork processes until the launcher has gone."""
+    """Get ready, and fork processes until the launcher has gone."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
-    for module in sys.argv[1:]:
-        import_module(module)
+    _call(sys.argv[1])
     setproctitle(f"tandem fork-server of {os.getppid()}")
     gc.collect()
     gc.freeze()  # a collection in a child does not touch, and so copy, what was imported
@@ -143,8 +147,7 @@ def main() -> None:
     if start is None:
         server.linger()
         os._exit(0)
-    module, _, function = start.main.partition(":")
-    getattr(import_module(module), function)()
+    _call(start.main)
 
 
 if __name__ == "__main__":

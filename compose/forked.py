@@ -129,13 +129,13 @@ class Process:
 class ForkServer:
     """A fork server of this process, its launcher."""
 
-    def __init__(self, *modules: str) -> None:
-        """`modules` are what it is to import."""
+    def __init__(self, warm_up: str) -> None:
+        """`warm_up` is what it calls first, module:function."""
         self._socket, its = socket.socketpair()
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # closed with the server
         # -P: the user's directory may hold a folder called world, or agent
         self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "compose.fork_server", *modules],
+            [sys.executable, "-P", "-m", "compose.fork_server", warm_up],
             stdin=its,
             stdout=subprocess.DEVNULL,
             stderr=self._errors,
@@ -219,16 +219,16 @@ class ForkServer:
             process.ended(-signal.SIGKILL)
 
 
-_servers: dict[tuple[str, ...], ForkServer] = {}
+_servers: dict[str, ForkServer] = {}
 _lock = threading.Lock()
 
 
-def fork_server(*modules: str) -> ForkServer:
-    """Return this process's fork server that has imported `modules`; it is started if there is none."""
+def fork_server(warm_up: str) -> ForkServer:
+    """Return this process's fork server that has called `warm_up`; it is started if there is none."""
     with _lock:
-        server = _servers.get(modules)
+        server = _servers.get(warm_up)
         if server is None or server.gone:
-            server = _servers[modules] = ForkServer(*modules)
+            server = _servers[warm_up] = ForkServer(warm_up)
         return server
 
 

@@ -23,6 +23,10 @@ FOLLOW_S = 2.0
 """how long the agents may outlast the world"""
 STOP_S = 3.0
 """how long a process may take to end when told to; then it is killed"""
+JOIN_S = 60.0
+"""how long an agent may look for its world,"""
+JOIN_EACH_S = 0.5
+"""and how much longer for each robot of the run, all of which start at once"""
 LISTENING_PORTS = range(20_000, 32_000)
 """below those that the system gives to outgoing connections, which could take one in between"""
 
@@ -46,7 +50,7 @@ def free_endpoint(protocol: str = "tcp") -> str:
 
 def fork_server() -> ForkServer:
     """Return the fork server of this process's worlds and agents."""
-    return forked.fork_server("compose.cli", "compose.commands.agent", "compose.commands.world")
+    return forked.fork_server("compose.warm_up:missions")
 
 
 class Child:
@@ -86,7 +90,9 @@ class Child:
         """How it ended, for people."""
         if self._server.gone:
             return f"was killed: {self._server.why_gone()}"
-        how = f"was killed by signal {-self.status}" if self.status < 0 else f"ended with status {self.status}"
+        how = (
+            f"was killed by signal {-self.status}" if self.status < 0 else f"ended with status {self.status}"
+        )
         return f"{how}: {said}" if (said := self.said()) else how
 
     def hand(self, frame: bytes) -> None:
@@ -173,12 +179,14 @@ class _Run:
         def keyed(who: str) -> list[str]:
             return ["--keys", str(keys / who)] if keys is not None else []
 
+        wait = ["--wait", str(JOIN_S + JOIN_EACH_S * len(self._scenario.robots))]
         world = ["world", self._scenario.name, "--listen", endpoint, *keyed("world"), *shared, *real_time]
         return {WORLD: world} | {
             f"agent {robot.id}": [
                 *("agent", robot.id, "--connect", endpoint),
                 *keyed(f"agent-{robot.id}"),
                 *shared,
+                *wait,
             ]
             for robot in self._scenario.robots
         }

@@ -30,6 +30,8 @@ LISTEN_AGAIN_S = 0.1
 """how long to wait before trying once more to have a port"""
 
 MSGPACK = zenoh.Encoding("application/msgpack")
+REFUSAL = zenoh.Encoding.TEXT_PLAIN
+"""of an answer that says why there is none"""
 
 zenoh.init_log_from_env_or("off")
 
@@ -99,7 +101,15 @@ def subscribe(session: zenoh.Session, key: str, inbox: Inbox, topic: Topic) -> N
     def hand_over(sample: zenoh.Sample) -> None:
         inbox.put(topic, str(sample.key_expr), sample.payload.to_bytes())
 
-    session.declare_subscriber(key, hand_over)
+    session.declare_subscriber(key, _at_once(hand_over))
+
+
+def _at_once(hand_over: Callable[[zenoh.Sample], None]) -> zenoh.handlers.Callback[zenoh.Sample]:
+    """A callback that the thread which receives calls itself; it must be short, and never wait for Zenoh.
+
+    Otherwise each subscriber has a thread of its own, to which every message is handed on.
+    """
+    return zenoh.handlers.Callback(hand_over, indirect=False)
 
 
 def watch_liveliness(session: zenoh.Session, key: str, inbox: Inbox) -> None:
@@ -109,7 +119,7 @@ def watch_liveliness(session: zenoh.Session, key: str, inbox: Inbox) -> None:
         alive = sample.kind == zenoh.SampleKind.PUT
         inbox.put("alive" if alive else "gone", str(sample.key_expr))
 
-    session.liveliness().declare_subscriber(key, hand_over, history=True)
+    session.liveliness().declare_subscriber(key, _at_once(hand_over), history=True)
 
 
 def alive(session: zenoh.Session, key: str, timeout: float) -> list[str]:
@@ -128,7 +138,9 @@ def ask(session: zenoh.Session, key: str, timeout: float) -> bytes | str | None:
     for reply in session.get(key, timeout=timeout):
         if reply.ok is not None:
             return reply.ok.payload.to_bytes()
-        if reply.err is not None:
+        if (
+            reply.err is not None and reply.err.encoding == REFUSAL
+        ):  # Zenoh's own is that nobody answered in time
             return reply.err.payload.to_string()
     return None
 
@@ -139,7 +151,7 @@ def answer(session: zenoh.Session, key: str, reply: Callable[[str], Message | st
     def hand_over(query: zenoh.Query) -> None:
         said = reply(str(query.key_expr))
         if isinstance(said, str):
-            query.reply_err(said)
+            query.reply_err(said, encoding=REFUSAL)
         else:
             query.reply(query.key_expr, encode(said), encoding=MSGPACK)
 

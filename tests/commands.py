@@ -240,12 +240,15 @@ def until(condition: Callable[[], object], what: str, bound: float = BOUND_S) ->
 
 
 def processes_of(mark: str | Path) -> dict[int, list[str]]:
-    """The processes whose command line names `mark`: their words, by process id."""
+    """The processes whose command line names `mark`: their words, by process id.
+
+    A forked process shows its command line as one text.
+    """
     found = {}
     for process in Path("/proc").iterdir():
         if process.name.isdigit():
             try:
-                words = (process / "cmdline").read_bytes().decode(errors="replace").split("\0")
+                words = (process / "cmdline").read_bytes().decode(errors="replace").replace("\0", " ").split()
             except OSError:  # ended meanwhile
                 continue
             if str(mark) in words:

@@ -1,17 +1,18 @@
 """The world's process: its clock is the barrier of the tick.
 
-Lockstep goes as fast as the answers come, and no decision depends on a time-out. As long as somebody
-has not answered, everyone hears its Sense again: when a robot appears, and every REPEAT_S. That one
-rule serves late starters, lost messages and restarted agents; and a world that is started again, which
-says to everyone what it would have said. In real time a tick lasts its period, and a robot whose Drive did
-not come stands still.
+Lockstep goes as fast as the answers come, and no decision depends on a time-out. A robot that has not
+answered is sent its Sense again, and so is its peer, whose reports it may have lost: when it appears, and every
+REPEAT_S. That one rule serves late starters, lost messages and restarted agents; and a world that is started
+again, which says to everyone what it would have said. So that no link falls silent meanwhile, everyone is sent
+its Sense again every REPEAT_TO_ALL_S. In real time a tick lasts its period, and a robot whose Drive did not come
+stands still.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any
 
 import zenoh
@@ -27,6 +28,9 @@ SILENCE_S = 3.0
 """a replaceable link over which no robot has said anything for so long is replaced, as an agent's is"""
 REPEAT_S = 0.25
 """how often what is unanswered is said again"""
+REPEAT_TO_ALL_S = 1.0
+"""how often everyone is told again, as long as somebody has not answered; less than the silence after which
+an agent replaces its link"""
 FAREWELL_S = 2.0
 """how long the world waits for the last word of robots that had not answered any more"""
 
@@ -66,6 +70,9 @@ class WorldProcess:
         self._patience = patience
         self._inbox = inbox
         self._robots = [robot.id for robot in scenario.robots]
+        self._peers = {robot.id: robot.peer for robot in scenario.robots}
+        self._repeat = self._repeat_to_all = math.inf
+        """when what is unanswered is said again, and when it is said to everyone"""
         self._alive: set[str] = set()
         self._answered = time.monotonic()
         """when a robot last appeared, or answered something new"""
@@ -144,9 +151,9 @@ class WorldProcess:
         self._show_truth()
         drives: dict[str, Drive] = {}
         now = time.monotonic()
-        repeat = now + REPEAT_S
+        self._set_repeat(now)
         while due is not None or len(drives) < len(self._robots):
-            arrival = self._next((repeat if due is None else due) - now)
+            arrival = self._next((self._repeat if due is None else due) - now)
             now = time.monotonic()
             if arrival.topic == "drive":
                 drive = self._answer(arrival)
@@ -154,10 +161,11 @@ class WorldProcess:
                     drives[drive.robot] = drive
                     self._answered = now
             if arrival.topic == "alive":
-                self._tell_missed(keys.robot_of(arrival.key))
-            if arrival.topic == "alive" or (due is None and now >= repeat):
-                repeat = now + REPEAT_S
-                self._put(frames)
+                robot = keys.robot_of(arrival.key)
+                self._tell_missed(robot)
+                self._put_again(frames, [robot])
+            if due is None and now >= self._repeat:
+                self._put_all_again(frames, frames.keys() - drives.keys(), now)
             if len(drives) < len(self._robots) and now - self._answered > self._patience + self._tick_s:
                 raise NoAnswer(self._who_is_missing(drives))
             if due is not None and now >= due and (arrival is NOTHING or now >= due + self._tick_s):
@@ -167,6 +175,25 @@ class WorldProcess:
     def _put(self, frames: Mapping[str, bytes]) -> None:
         for robot, frame in frames.items():
             self._sense[robot].put(frame)
+
+    def _put_again(self, frames: Mapping[str, bytes], robots: Iterable[str]) -> None:
+        """To `robots`, and to their peers, whose reports they may have lost."""
+        named = {*robots} & self._peers.keys()
+        named |= {self._peers[robot] for robot in named}
+        self._put({robot: frame for robot, frame in frames.items() if robot in named})
+
+    def _set_repeat(self, now: float) -> None:
+        """Something new is said."""
+        self._repeat, self._repeat_to_all = now + REPEAT_S, now + REPEAT_TO_ALL_S
+
+    def _put_all_again(self, frames: Mapping[str, bytes], missing: Iterable[str], now: float) -> None:
+        """To those that are `missing`, and to everyone where the last time is long ago."""
+        self._repeat = now + REPEAT_S
+        if now < self._repeat_to_all:
+            self._put_again(frames, missing)
+        else:
+            self._repeat_to_all = now + REPEAT_TO_ALL_S
+            self._put(frames)
 
     def _tell_missed(self, robot: str) -> None:
         """In real time, what the others have been told while `robot` was away."""
@@ -196,7 +223,7 @@ class WorldProcess:
         except MalformedFrame as error:
             self._inbox.refuse(arrival, error)
             return None
-        if message.robot not in self._robots or message.robot != keys.robot_of(arrival.key):
+        if message.robot not in self._peers or message.robot != keys.robot_of(arrival.key):
             self._inbox.refuse(arrival, f"it says it is from '{message.robot}'")
             return None
         return message
@@ -244,8 +271,9 @@ class WorldProcess:
         """
         frames = dict.fromkeys(self._robots, encode(end))
         said = self._last_words = {**self._course.parted, **self._last_words}
-        now = repeat = time.monotonic()
+        now = time.monotonic()
         began = self._parting or now
+        self._repeat = self._repeat_to_all = now
         told = False
         while True:
             last_words = set(self._course.witnesses) - said.keys()
@@ -257,12 +285,11 @@ class WorldProcess:
                 told = True
                 names = ", ".join(sorted(last_words))
                 self._inbox.say(f"waiting {self._patience:g} s for the last word of {names}")
-            if now >= repeat:
-                repeat = now + REPEAT_S
-                self._put(frames)
-            arrival = self._next(min(repeat, give_up) - now)
+            if now >= self._repeat:
+                self._put_all_again(frames, last_words | others, now)
+            arrival = self._next(min(self._repeat, give_up) - now)
             if arrival.topic == "alive":
-                repeat = time.monotonic()
+                self._put_again(frames, [keys.robot_of(arrival.key)])
             if arrival.topic == "drive":
                 farewell = self._accepted(arrival, Drive | Farewell)
                 if isinstance(farewell, Farewell):

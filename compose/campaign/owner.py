@@ -39,7 +39,7 @@ class Child:
     def __init__(self) -> None:
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # gone with the child
         self._folder = tempfile.TemporaryDirectory(prefix="tandem-trials-", ignore_cleanup_errors=True)
-        self._process = fork_server("compose.campaign.worker").start(
+        self._process = fork_server("compose.campaign.worker:warm_up").start(
             "compose.campaign.worker:main",
             "tandem sweep worker",
             self._folder.name,

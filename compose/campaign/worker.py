@@ -1,4 +1,4 @@
-"""The process in which trials run, `python -P -m compose.campaign.worker FOLDER`.
+"""The process in which trials run, forked from a fork server that has imported this module.
 
 It is asked for chunks on its standard input and answers a row a trial on its standard output, each a frame:
 its length in four bytes, and msgpack. It ends with its standard input, even while a trial never does.
@@ -54,6 +54,10 @@ class Chunk(msgspec.Struct, frozen=True):
     def after(self, done: int) -> Chunk:
         """What is left of it after so many trials."""
         return msgspec.structs.replace(self, trials=self.trials[done:], seeds=self.seeds[done:])
+
+
+def warm_up() -> None:
+    """Get ready to fork such processes: importing this module is all."""
 
 
 def main() -> None:
@@ -119,7 +123,3 @@ def _function(path: str) -> Callable[[trial.Trial], trial.Row]:
     module, _, name = path.partition(":")
     found: Callable[[trial.Trial], trial.Row] = getattr(import_module(module), name)
     return found
-
-
-if __name__ == "__main__":
-    main()
