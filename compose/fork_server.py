@@ -1,8 +1,8 @@
-"""The process that a launcher's processes are forked from, `python -P -m compose.fork_server MODULE:FUNCTION`.
+"""The process that a launcher's processes are forked from: `python -P -m compose.fork_server WARM_UP`.
 
-It has imported what they need, and called the function; it has opened nothing: no session, no thread. Its standard input is a socket to the
-launcher (`compose/forked.py`), which asks for processes and signals on it and is told how each process ended.
-It ends with the launcher, and no process outlasts it.
+It has called WARM_UP (module:function), which imports what they need, and has opened nothing: no session, no
+thread. Its standard input is a socket to the launcher (`compose/forked.py`), which asks on it for processes
+and signals, and is told how each process ended. It ends with the launcher, and no process outlasts it.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Processes forked from a fork server, as their launcher sees them.
 
 A fork server (`compose/fork_server.py`) imports what its processes need once, so that each of them starts in
-about a millisecond. Such a process is one of its own in every other respect: it has its own session and process
-group, standard streams, signals and exit status. It is as the launcher was when the server began: the same
+milliseconds. Each is a process of its own in every other respect: it has its own session and process group,
+standard streams, signals and exit status. It is as the launcher was when the server began: the same
 environment, working directory and limits.
 """
 
@@ -47,16 +47,18 @@ class Signal(msgspec.Struct, frozen=True, tag=True):
     signal: int
 
 
+ENDED_BYTES = 8
+
+
 class Ended(NamedTuple):
     """What the launcher is told of a process."""
 
-    BYTES = 8
     number: int
     status: int
     """negative is the signal that killed it"""
 
     def frame(self) -> bytes:
-        """The same in BYTES."""
+        """The same in ENDED_BYTES."""
         return self.number.to_bytes(4, "big") + self.status.to_bytes(4, "big", signed=True)
 
     @classmethod
@@ -107,10 +109,14 @@ class Process:
         if not self.wait(timeout):
             self.signal(signal.SIGKILL)
         status = self.status
+        self.hang_up()
+        return status
+
+    def hang_up(self) -> None:
+        """Close the launcher's ends of its streams."""
         streams, self._streams = self._streams, []
         for stream in streams:
             os.close(stream)
-        return status
 
     def hand(self, data: bytes) -> None:
         """Write `data` to its standard input, if it has not ended."""
@@ -136,9 +142,9 @@ class ForkServer:
         # -P: the user's directory may hold a folder called world, or agent
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "compose.fork_server", warm_up],
-            stdin=its,
+            stdin=its.fileno(),
             stdout=subprocess.DEVNULL,
-            stderr=self._errors,
+            stderr=self._errors.fileno(),
             start_new_session=True,
         )
         its.close()
@@ -147,7 +153,8 @@ class ForkServer:
         self._lock = threading.Lock()
         self.gone = False
         """whether it has ended, and all its processes with it"""
-        threading.Thread(target=self._listen, daemon=True).start()
+        self._listener = threading.Thread(target=self._listen, daemon=True)
+        self._listener.start()
 
     def start(
         self,
@@ -186,12 +193,15 @@ class ForkServer:
         self._errors.seek(0)
         said = self._errors.read().decode(errors="replace").strip().splitlines()
         how = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
-        return f"the fork server {how}{said and ': ' + said[-1] or ''}"
+        return f"the fork server {how}{f': {said[-1]}' if said else ''}"
 
     def close(self) -> None:
         """End it, and any process of it that still runs."""
         self._process.kill()
         self._process.wait()
+        self._listener.join()
+        self._socket.close()
+        self._errors.close()
 
     def _ask(self, request: Start | Signal, streams: list[int]) -> None:
         body = msgspec.msgpack.encode(request)
@@ -205,8 +215,8 @@ class ForkServer:
         with suppress(OSError):
             while received := self._socket.recv(4096):
                 news += received
-                while len(news) >= Ended.BYTES:
-                    one, news = Ended.read(news[: Ended.BYTES]), news[Ended.BYTES :]
+                while len(news) >= ENDED_BYTES:
+                    one, news = Ended.read(news[:ENDED_BYTES]), news[ENDED_BYTES:]
                     self._running.pop(one.number).ended(one.status)
         self.gone = True
         self._end_all()

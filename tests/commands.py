@@ -77,7 +77,7 @@ LONG_JOURNAL_BYTES = 180_000
 
 def several_pairs(pairs: int) -> str:
     """A scenario of as many pairs, each on a line of its own; robots a and b are peers, c and d, ..."""
-    ids = "abcdefgh"
+    ids = "abcdefgh" if pairs <= 4 else [f"r{i}" for i in range(2 * pairs)]
     robots = [
         f'[[robot]]\nid = "{ids[i]}"\npeer = "{ids[i ^ 1]}"\nanchor = [{10.0 * (i % 2)}, {40.0 * (i // 2)}]\n'
         for i in range(2 * pairs)

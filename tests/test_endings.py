@@ -45,7 +45,7 @@ def journaled(bytes_written: int) -> Moment:
 
 
 def processes(number: int) -> Moment:
-    return lambda _run, out: len(processes_of(out)) >= number
+    return lambda run, out: run.catches(SIGTERM) and len(processes_of(out)) >= number
 
 
 def ready(run: Command, _out: Path) -> bool:

@@ -1,11 +1,11 @@
 """The world's process: its clock is the barrier of the tick.
 
 Lockstep goes as fast as the answers come, and no decision depends on a time-out. A robot that has not
-answered is sent its Sense again, and so is its peer, whose reports it may have lost: when it appears, and every
-REPEAT_S. That one rule serves late starters, lost messages and restarted agents; and a world that is started
-again, which says to everyone what it would have said. So that no link falls silent meanwhile, everyone is sent
-its Sense again every REPEAT_TO_ALL_S. In real time a tick lasts its period, and a robot whose Drive did not come
-stands still.
+answered is sent its Sense again when it appears, and every REPEAT_S; and so is its peer, whose reports it may
+have lost. That one rule serves late starters, lost messages and restarted agents; and a world that is started
+again, which says to everyone what it would have said. Everyone is sent its Sense again every REPEAT_TO_ALL_S,
+so that no link falls silent meanwhile. In real time a tick lasts its period, and a robot whose Drive did not
+come stands still.
 """
 
 from __future__ import annotations

@@ -44,12 +44,7 @@ def main(options: argparse.Namespace) -> int:
     if options.secure:
         need("cryptography", extra="deploy")
     if options.in_process:
-        if options.secure:
-            raise UserError("--secure: --in-process has no network")
-        if kills:
-            where = "--kill" if options.kill else f"{options.scenario}: kill"
-            raise UserError(f"{where}: --in-process has no processes to kill")
-        return _in_process(options, scenario)
+        return _in_process(options, scenario, kills)
     return _as_processes(options, scenario, kills)
 
 
@@ -64,9 +59,14 @@ def _kills(options: argparse.Namespace, found: Setting, scenario: Scenario) -> t
     return (*found.kills(scenario.seed), *options.kill)
 
 
-def _in_process(options: argparse.Namespace, scenario: Scenario) -> int:
+def _in_process(options: argparse.Namespace, scenario: Scenario, kills: tuple[Kill, ...]) -> int:
     from compose import inline  # noqa: PLC0415  # the launcher needs no planner
 
+    if options.secure:
+        raise UserError("--secure: --in-process has no network")
+    if kills:
+        where = "--kill" if options.kill else f"{options.scenario}: kill"
+        raise UserError(f"{where}: --in-process has no processes to kill")
     if options.rate is not None:
         raise UserError("--rate: --in-process knows no real time")
     if options.foxglove is not None:
