@@ -59,7 +59,7 @@ def left(tmp_path: Path) -> list[int]:
     found = []
     for pid in filter(str.isdigit, os.listdir("/proc")):
         try:
-            words = Path(f"/proc/{pid}/cmdline").read_bytes().decode().split("\0")
+            words = Path(f"/proc/{pid}/cmdline").read_bytes().decode().replace("\0", " ").split()
         except OSError:  # ended meanwhile
             continue
         if any(word.startswith(f"{tmp_path}/") for word in words):

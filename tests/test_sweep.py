@@ -71,14 +71,14 @@ def trial_processes(tmp_path: Path) -> list[int]:
         pid
         for pid in map(int, filter(str.isdigit, os.listdir("/proc")))
         if (words := said_by(pid))
-        and "compose.campaign.worker" in words
-        and words[-2].startswith(f"{tmp_path}/")
+        and words[:3] == ["tandem", "sweep", "worker"]
+        and words[-1].startswith(f"{tmp_path}/")
     ]
 
 
 def said_by(pid: int) -> list[str]:
     try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes().decode().split("\0")
+        return Path(f"/proc/{pid}/cmdline").read_bytes().decode().replace("\0", " ").split()
     except OSError:  # ended meanwhile
         return []
 
