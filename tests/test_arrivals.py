@@ -170,20 +170,6 @@ def test_wildcards_odd_keys_and_deletions_end_no_process_and_change_nothing(tmp_
     assert (out / "ticks.csv").read_bytes() == (alone / "ticks.csv").read_bytes()
 
 
-@pytest.mark.parametrize("robots", [["ghost"], ["ghost", "c" * 32]])
-def test_tokens_of_robots_that_a_world_has_not_do_not_keep_it(robots: list[str], tmp_path: Path) -> None:
-    """It waits for nobody's last word but that of its own robots."""
-    scenario = tmp_path / "pair.toml"
-    scenario.write_text(several_pairs(1))
-    with world(scenario, "--run", RUN, "--patience", "600") as (clock, endpoint), ExitStack() as others:
-        link = others.enter_context(stranger_at(endpoint))
-        shown = [link.liveliness().declare_token(keys.robot_alive(RUN, robot)) for robot in robots]
-        for robot in "ab":
-            others.enter_context(Command("agent", robot, "--connect", endpoint))
-        assert clock.ended().status == 0
-        del shown
-
-
 def test_an_answer_of_a_stranger_under_a_wildcard_is_no_briefing() -> None:
     briefing = load("paper-1").briefing("a")
     with session.open_router(listening("tcp/127.0.0.1:0")) as link:

@@ -64,9 +64,9 @@ class Ending:
         ):
             match verdict:
                 case Alarm(claim):
-                    return End(tick, "alarm", f"{who}: {other} tells {claim}"[:300])
+                    return End(tick, "alarm", f"{who}: {other} tells {claim}")
                 case Undecided(reason):
-                    return End(tick, "undecided", f"{who}: {reason}"[:300])
+                    return End(tick, "undecided", f"{who}: {reason}")
         if isinstance(self._peers, Localised):
             return End(tick, "localised", None)
         return End(tick, "undecided", f"{self._me} is localised; {self._peer} was not heard to be")

@@ -107,7 +107,7 @@ class Field:
             while end is None:
                 end = self._play_tick()
         except DriverFailed as failure:
-            end = End(max(self._tick, 0), "failed", f"{self._id}'s driver: {failure}"[:300])
+            end = End(max(self._tick, 0), "failed", f"{self._id}'s driver: {failure}")
         finally:
             self._stop()
         self._part(end)

@@ -15,7 +15,7 @@ from compose.audit.case import Case
 from compose.audit.findings import Checks, Violation, between
 from protocol.messages import End, Localised
 from protocol.motion import Pose
-from world.referee import Judgement, mistake
+from world.referee import mistake
 from world.scenario import Placed
 
 PLACES = 3
@@ -98,15 +98,15 @@ def outcome(case: Case) -> Checks:
     end, judgement = case.history.end, case.history.judgement
     if end is None:
         return
-    found = Judgement(end.outcome, end.reason)
-    if judgement is not None and found != judgement:
-        what = f"it ends {_told(found)}, expected {_told(judgement)}"
-        yield Violation("claim", end.tick, None, what, between(end, End(end.tick, *astuple(judgement))))
-    elif judgement is None and end.outcome != "failed":
-        yield Violation("claim", end.tick, None, f"it ends {_told(found)}, expected it to go on")
+    expected = End(end.tick, *astuple(judgement)) if judgement is not None else None
+    if expected is not None and end != expected:
+        what = f"it ends {_told(end)}, expected {_told(expected)}"
+        yield Violation("claim", end.tick, None, what, between(end, expected))
+    elif expected is None and end.outcome != "failed":
+        yield Violation("claim", end.tick, None, f"it ends {_told(end)}, expected it to go on")
     else:
         yield None
 
 
-def _told(judgement: Judgement) -> str:
-    return f"{judgement.outcome} ({judgement.reason})" if judgement.reason else judgement.outcome
+def _told(end: End) -> str:
+    return f"{end.outcome} ({end.reason})" if end.reason else end.outcome
