@@ -15,7 +15,7 @@ from compose.audit.case import Case
 from compose.audit.findings import Checks, Violation, between
 from protocol.messages import End, Localised
 from protocol.motion import Pose
-from world.referee import mistake
+from world.referee import inaccuracy, mistake
 from world.scenario import Placed
 
 PLACES = 3
@@ -23,13 +23,17 @@ PLACES = 3
 
 
 def claim(case: Case) -> Checks:
-    """Whoever claimed to be localised was right, and had a redundant range; the End is the referee's."""
+    """Whoever claimed to be localised was right, knew it as well as the mission asks for, and had a redundant
+    range; the End is the referee's."""
     for place, placed in enumerate(case.history.scenario.robots):
         tick, made = _first_claim(case, placed.id)
         if made is None:
             continue
-        why = mistake(made, case.history.ticks[tick].world.truth.poses[place])
+        mission = case.history.scenario.mission
+        why = mistake(made, case.history.ticks[tick].world.truth.poses[place], mission)
         yield None if why is None else Violation("claim", tick, placed.id, f"it claims a pose that is {why}")
+        vague = inaccuracy(made, mission)
+        yield None if vague is None else Violation("claim", tick, placed.id, f"it {vague}")
         past = case.pasts.get(placed.id)
         if past is not None and tick < len(past.steps) and past.steps[tick].drive is not None:
             yield _redundant(case, placed, past, tick)
