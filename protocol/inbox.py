@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 from collections import Counter
 from queue import Empty, SimpleQueue
 from typing import Literal, NamedTuple
 
 from protocol.keys import NOWHERE, Key
+from protocol.terminal import say
 
 Topic = Literal["sense", "drive", "report", "beat", "alive", "gone", "ended", "stop", "nothing"]
 
@@ -114,14 +114,9 @@ class Inbox:
 
     def say(self, line: str) -> None:
         """Tell whoever watches the process."""
-        print(one_line(f"{self._owner}: {line}"), file=sys.stderr, flush=True)
+        say(f"{self._owner}: {line}", error=True)
 
 
 def _size(arrival: Arrival) -> int:
     """About what it takes while it waits."""
     return len(arrival.frame) + len(arrival.key) + ARRIVAL_BYTES
-
-
-def one_line(text: str) -> str:
-    """`text` with whatever would break or garble a line escaped."""
-    return "".join([char if char.isprintable() else repr(char)[1:-1] for char in text])
