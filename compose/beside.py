@@ -16,6 +16,7 @@ from pathlib import Path
 from compose.local import STOP_S
 from compose.status import UserError
 from protocol.inbox import Inbox, Interrupted
+from protocol.terminal import say
 
 OVER = b"."
 """what it is told when the mission is over"""
@@ -33,7 +34,7 @@ class Beside:
 
     def announce(self) -> None:
         """Say where it is."""
-        print(f"{self._what} at {self.address}", flush=True)
+        say(f"{self._what} at {self.address}")
 
     def conclude(self) -> None:
         """The mission is over; it stays."""
@@ -41,7 +42,7 @@ class Beside:
         with suppress(BrokenPipeError):
             self._process.stdin.write(OVER)
             self._process.stdin.flush()
-        print(f"{self._what} stays at {self.address} until Ctrl-C", flush=True)
+        say(f"{self._what} stays at {self.address} until Ctrl-C")
 
     def put_end(self, inbox: Inbox) -> None:
         """Put "ended" into `inbox` once the process is gone."""

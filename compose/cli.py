@@ -25,7 +25,7 @@ from compose.arguments import (
 )
 from compose.figures import FORMATS, PICTURES
 from compose.status import BROKEN_PIPE, BUG, FAILED, USER_ERROR, UserError
-from protocol.inbox import one_line
+from protocol.terminal import one_line, say
 
 
 class _Parser(argparse.ArgumentParser):
@@ -42,7 +42,7 @@ class _Version(argparse.Action):
         from compose import installed  # noqa: PLC0415  # it takes time
         from protocol.wire import VERSION  # noqa: PLC0415
 
-        print(f"tandem {installed.version() or 'that is not installed'}, protocol version {VERSION}")
+        say(f"tandem {installed.version() or 'that is not installed'}, protocol version {VERSION}")
         parser.exit()
 
 
@@ -55,17 +55,17 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         status = import_module(f"compose.commands.{options.command}").main(options)
         sys.stdout.flush()
     except UserError as error:
-        print(one_line(f"tandem {options.command}: {error}"), file=sys.stderr)
+        say(f"tandem {options.command}: {error}", error=True)
         status = USER_ERROR
     except BrokenPipeError:
         _leave_stream(sys.stdout)
         status = BROKEN_PIPE
     except OSError as error:
         _leave_stream(sys.stdout)
-        print(one_line(f"tandem {options.command}: cannot go on: {error}"), file=sys.stderr)
+        say(f"tandem {options.command}: cannot go on: {error}", error=True)
         status = FAILED
     except Exception:  # noqa: BLE001  # whatever it is, it must not look like a mission's outcome
-        traceback.print_exc()
+        say(*traceback.format_exc().splitlines(), error=True)
         status = BUG
     forked = sys.modules.get("compose.forked")
     if forked is not None:

@@ -21,7 +21,7 @@ import msgspec
 from setproctitle import setproctitle
 
 from compose.forked import LENGTH_BYTES, STREAMS, Ended, Signal, Start
-from protocol.inbox import one_line
+from protocol.terminal import one_line
 
 NOT_FORKED = 71
 """exit status told of a process that could not be forked: EX_OSERR"""

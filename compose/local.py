@@ -16,6 +16,7 @@ from compose.forked import ForkServer
 from compose.kill import WORLD, Kill, taken
 from compose.status import ENDED
 from protocol.inbox import Inbox
+from protocol.terminal import say
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from world.scenario import Scenario
 
@@ -242,7 +243,7 @@ class _Run:
         _stop(self.children.values())
         for child in self.children.values():
             if child.status == ENDED and (said := child.said()):
-                print(said, file=sys.stderr)
+                say(*said.splitlines(), error=True)
             child.forget()
 
 

@@ -19,6 +19,7 @@ from compose.record import WORLD_JOURNAL
 from compose.summary import outcome_line
 from protocol.journal import Tail
 from protocol.messages import Drive, End, Farewell, Missed
+from protocol.terminal import one_line, say
 from protocol.wire import MAX_FRAME_BYTES, decode
 from world.scenario import Scenario
 
@@ -31,6 +32,11 @@ LATE_LEGEND = "late: ticks in which it stood still, as its drive had not come in
 SIGMA_LEGEND = "sigma: of the position, as claimed; "
 UNLIMITED = 1000
 """columns, of what is not a terminal"""
+
+
+def console(**options: Any) -> Console:
+    """A console that takes text as it is: `[red]` and `:smile:` are what somebody said, and no markup."""
+    return Console(markup=False, emoji=False, highlight=False, **options)
 
 
 @contextmanager
@@ -58,10 +64,14 @@ def live(scenario: Scenario, folder: Path) -> Iterator[None]:
             if drive is None:
                 rows.add_row(robot, "", "awaited", "", "")
             else:
-                rows.add_row(robot, str(drive.phase), drive.state, f"{drive.v:.3f}", f"{drive.omega:.3f}")
+                rows.add_row(
+                    robot, str(drive.phase), one_line(drive.state), f"{drive.v:.3f}", f"{drive.omega:.3f}"
+                )
         return rows
 
-    with Live(get_renderable=table, auto_refresh=True, transient=True, refresh_per_second=10):
+    with Live(
+        get_renderable=table, console=console(), auto_refresh=True, transient=True, refresh_per_second=10
+    ):
         yield
 
 
@@ -75,7 +85,7 @@ def result(summary: Mapping[str, Any]) -> None:
         rows.add_column(heading, justify="right")
     for name, cells in robots.items():
         rows.add_row(name, *cells.values())
-    page = Console(width=UNLIMITED, file=io.StringIO())
+    page = console(width=UNLIMITED, file=io.StringIO())
     with page.capture() as capture:
         page.print(rows)
     lines = [line.rstrip() for line in capture.get().splitlines() if line.strip()]
@@ -87,7 +97,7 @@ def result(summary: Mapping[str, Any]) -> None:
         ]
     title = f"{summary['scenario']}: {outcome_line(summary)}"
     legend = ("" if exact else SIGMA_LEGEND) + (LATE_LEGEND if late else "") + LEGEND
-    print(title, "", *lines, "", legend, sep="\n")
+    say(title, "", *lines, "", legend)
 
 
 def _cells(robot: Mapping[str, Any], exact: bool, late: bool) -> dict[str, str]:

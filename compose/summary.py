@@ -18,6 +18,7 @@ from compose.record import Record
 from compose.ticks import ticks_csv
 from protocol.messages import Farewell, Localised, Outcome
 from protocol.motion import Pose, wrap
+from protocol.terminal import one_line
 from world.sensors import mutual_ranges
 
 Mode = Literal["processes", "in-process"]
@@ -129,4 +130,4 @@ def broken_off(ticks: int) -> str:
 
 def ended(outcome: Outcome, ticks: int, reason: str | None) -> str:
     """How a run ended, in one line."""
-    return f"{outcome} after {ticks} ticks{f' ({reason})' if reason else ''}"
+    return f"{outcome} after {ticks} ticks{f' ({one_line(reason)})' if reason else ''}"

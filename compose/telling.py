@@ -15,6 +15,7 @@ from compose.summary import Mode, leave, outcome_line, summary
 from protocol.inbox import Inbox
 from protocol.journal import Journal
 from protocol.retrace import Retrace
+from protocol.terminal import say
 from world.scenario import Scenario
 
 
@@ -62,7 +63,7 @@ def conclude(
         except OSError as error:
             raise UserError(record.cannot_write(folder, error)) from None
     if options.quiet:
-        print(outcome_line(told))
+        say(outcome_line(told))
     else:
         from compose import show  # noqa: PLC0415  # as above
 

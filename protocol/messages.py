@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
+from msgspec.structs import force_setattr
 
 from protocol.lie import Lie
 from protocol.mission import Anchor, Mission, Role, Variant
@@ -35,15 +36,23 @@ BranchKind = Literal["three-ranges", "three-ranges-virtual", "circle", "on-ancho
 Odds = Annotated[float, Meta(ge=0.0, le=1.0)]
 """the probability of a hypothesis, given what has been measured"""
 
-MAX_REASON = 300
-"""characters"""
-Text = Annotated[str, Meta(max_length=MAX_REASON)]
+MAX_TEXT = 300
+"""characters (Unicode code points)"""
+Text = Annotated[str, Meta(max_length=MAX_TEXT)]
+"""in words, of what can be of any length; whoever holds one cuts it (`_cut`)"""
 Phase = Annotated[int, Meta(ge=1, le=3)]
 Word = Annotated[str, Meta(max_length=32)]
 
 MAX_REPORT_RUNS = 70
 MAX_REPORT_RANGES = 70
 """so many at the most that a report's frame stays within `wire.MAX_REPORT_BYTES`"""
+
+
+def _cut(said: msgspec.Struct, field: str) -> None:
+    """Cut the text in `field` to its bound, and escape what no frame can hold: half of a surrogate pair."""
+    words: str | None = getattr(said, field)
+    if words is not None:
+        force_setattr(said, field, words.encode("utf-8", "backslashreplace").decode()[:MAX_TEXT])
 
 
 class Message(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag=str.lower):
@@ -82,6 +91,9 @@ class Undecided(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fie
 
     reason: Text
 
+    def __post_init__(self) -> None:
+        _cut(self, "reason")
+
 
 class Alarm(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="alarm"):
     """The peer tells what cannot be so."""
@@ -92,6 +104,9 @@ class Alarm(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=
     """by how much it cannot: m, m/s or rad; under noise sigmas; none where nothing comes near it"""
     p_value: Odds = 0.0
     """how probable that much is, if the peer is honest"""
+
+    def __post_init__(self) -> None:
+        _cut(self, "claim")
 
 
 Verdict = Localised | Undecided | Alarm
@@ -218,6 +233,9 @@ class End(Message, frozen=True):
     outcome: Outcome
     reason: Text | None
 
+    def __post_init__(self) -> None:
+        _cut(self, "reason")
+
 
 class Farewell(Message, frozen=True):
     """Robot to world, the answer to End: how it went, seen from inside."""
@@ -254,6 +272,9 @@ class Farewell(Message, frozen=True):
     """of all kinds"""
     bytes_sent: Count
     """of reports"""
+
+    def __post_init__(self) -> None:
+        _cut(self, "missing")
 
 
 OfRobot = Briefing | Sense | Report | Drive | Estimate | Missed | End | Farewell

@@ -578,6 +578,17 @@ def test_a_claim_that_is_wrong_is_found_and_so_is_an_end_that_hides_it(folder: P
     ]
 
 
+def test_a_claim_that_is_less_accurate_than_was_asked_is_found(folder: Path) -> None:
+    pose = read(folder).moments[LAST].truth.poses[0]
+    vague = Covariance(1e15, 0.0, 0.0, 1e15, 0.0, 1e-4)
+    for name in (A, WORLD_JOURNAL):
+        plant(folder / name, (of(Drive, LAST, "a"), claims(pose, vague)))
+    assert what(audit(folder), "claim") == [
+        "it claims a position known to 4.47e+07 m, of 0.1",
+        "it ends localised, expected undecided (a claims a position known to 4.47e+07 m, of 0.1)",
+    ]
+
+
 def test_a_claim_without_a_redundant_range_is_found(folder: Path) -> None:
     pose = read(folder).moments[47].truth.poses[0]
     for name in (A, WORLD_JOURNAL):

@@ -214,7 +214,7 @@ def test_who_has_answered_is_not_told_again_as_often_as_who_has_not(tmp_path: Pa
         inbox = Inbox("a bystander")
         session.subscribe(link, keys.sense("mine", "*"), inbox, "sense")
         while heard["a"] < 12:
-            heard[keys.robot_of(inbox.next(10.0).key)] += 1
+            heard[inbox.next(10.0).source.robot] += 1
     assert heard["b"] >= 11
     assert 1 <= heard["c"] <= 5
     assert 1 <= heard["d"] <= 5

@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 
 from protocol.messages import Alarm, Briefing, Drive, End, Localised, Report, Undecided, Verdict
+from world.referee import inaccuracy
 
 LAST_WORDS = 4
 """ticks in which a robot goes on telling, once it knows all that it must"""
@@ -20,6 +21,7 @@ class Ending:
     def __init__(self, briefing: Briefing, max_ticks: int, patience: float) -> None:
         self._peer = briefing.peer
         self._me = briefing.robot
+        self._mission = briefing.mission
         self._max_ticks = max_ticks
         self._patience = patience
         self.verdict: Verdict | None = None
@@ -64,9 +66,12 @@ class Ending:
         ):
             match verdict:
                 case Alarm(claim):
-                    return End(tick, "alarm", f"{who}: {other} tells {claim}"[:300])
+                    return End(tick, "alarm", f"{who}: {other} tells {claim}")
                 case Undecided(reason):
-                    return End(tick, "undecided", f"{who}: {reason}"[:300])
+                    return End(tick, "undecided", f"{who}: {reason}")
+        for who, verdict in ((self._me, self.verdict), (self._peer, self._peers)):
+            if isinstance(verdict, Localised) and (vague := inaccuracy(verdict, self._mission)) is not None:
+                return End(tick, "undecided", f"{who} {vague}")
         if isinstance(self._peers, Localised):
             return End(tick, "localised", None)
         return End(tick, "undecided", f"{self._me} is localised; {self._peer} was not heard to be")

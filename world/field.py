@@ -107,7 +107,7 @@ class Field:
             while end is None:
                 end = self._play_tick()
         except DriverFailed as failure:
-            end = End(max(self._tick, 0), "failed", f"{self._id}'s driver: {failure}"[:300])
+            end = End(max(self._tick, 0), "failed", f"{self._id}'s driver: {failure}")
         finally:
             self._stop()
         self._part(end)
@@ -191,13 +191,13 @@ class Field:
             case "report":
                 self._on_report(arrival)
             case "alive":
-                self._alive.add(robot := keys.robot_of(arrival.key))
-                if robot == self._id:
+                self._alive.add(arrival.source.robot)
+                if arrival.source.robot == self._id:
                     self._answered = time.monotonic()
                     for _, frame in self._unanswered:  # while it was away
                         self._sense.put(frame)
             case "gone":
-                self._alive.discard(keys.robot_of(arrival.key))
+                self._alive.discard(arrival.source.robot)
             case "ended":
                 self._ended()
             case _:
@@ -211,7 +211,7 @@ class Field:
         except MalformedFrame as error:
             self._inbox.refuse(arrival, error)
             return None
-        if message.robot != keys.robot_of(arrival.key):
+        if message.robot != arrival.source.robot:
             self._inbox.refuse(arrival, f"it says it is from '{message.robot}'")
             return None
         return message
@@ -254,8 +254,8 @@ class Field:
             while (left := repeat - time.monotonic()) > 0.0:
                 arrival = self._inbox.next(left)
                 if arrival.topic == "gone":
-                    self._alive.discard(keys.robot_of(arrival.key))
-                elif arrival.topic == "drive" and _is_farewell(arrival.frame):
+                    self._alive.discard(arrival.source.robot)
+                elif arrival.topic == "drive" and _is_farewell(arrival.frame, self._id):
                     self._sense.put(arrival.frame)
                     return
 
@@ -273,9 +273,8 @@ def _sense(reading: Reading, tick: int, briefing: Briefing) -> bytes:
     return frame
 
 
-def _is_farewell(frame: bytes) -> bool:
+def _is_farewell(frame: bytes, robot: str) -> bool:
     try:
-        decode(frame, Farewell)
+        return decode(frame, Farewell).robot == robot
     except MalformedFrame:
         return False
-    return True

@@ -160,10 +160,9 @@ class WorldProcess:
                 if drive is not None and drive.robot not in drives:
                     drives[drive.robot] = drive
                     self._answered = now
-            if arrival.topic == "alive":
-                robot = keys.robot_of(arrival.key)
-                self._tell_missed(robot)
-                self._put_again(frames, [robot])
+            if arrival.topic == "alive" and arrival.source.robot in self._alive:
+                self._tell_missed(arrival.source.robot)
+                self._put_again(frames, [arrival.source.robot])
             if due is None and now >= self._repeat:
                 self._put_all_again(frames, frames.keys() - drives.keys(), now)
             if len(drives) < len(self._robots) and now - self._answered > self._patience + self._tick_s:
@@ -207,13 +206,13 @@ class WorldProcess:
             self._mute = now + self._silence
         elif time.monotonic() >= self._mute:
             raise LinkLost
-        if arrival.topic == "alive":
-            robot = keys.robot_of(arrival.key)
+        robot = arrival.source.robot
+        if arrival.topic == "alive" and robot in self._robots:
             if robot not in self._alive:
                 self._answered = time.monotonic()
             self._alive.add(robot)
         elif arrival.topic == "gone":
-            self._alive.discard(keys.robot_of(arrival.key))
+            self._alive.discard(robot)
         return arrival
 
     def _accepted(self, arrival: Arrival, kind: Any) -> Drive | Farewell | None:
@@ -223,7 +222,7 @@ class WorldProcess:
         except MalformedFrame as error:
             self._inbox.refuse(arrival, error)
             return None
-        if message.robot not in self._peers or message.robot != keys.robot_of(arrival.key):
+        if message.robot not in self._peers or message.robot != arrival.source.robot:
             self._inbox.refuse(arrival, f"it says it is from '{message.robot}'")
             return None
         return message
@@ -257,8 +256,7 @@ class WorldProcess:
     def _want_truth(self, wanted: bool) -> None:
         self._truth_wanted = wanted
 
-    def _brief(self, key: str) -> Message | str:
-        robot = key.rsplit("/", 1)[1]
+    def _brief(self, robot: str) -> Message | str:
         if robot not in self._robots:
             return f"this world has no robot '{robot}'; it has {', '.join(self._robots)}"
         return self._scenario.briefing(robot, self._period)
@@ -289,7 +287,7 @@ class WorldProcess:
                 self._put_all_again(frames, last_words | others, now)
             arrival = self._next(min(self._repeat, give_up) - now)
             if arrival.topic == "alive":
-                self._put_again(frames, [keys.robot_of(arrival.key)])
+                self._put_again(frames, [arrival.source.robot])
             if arrival.topic == "drive":
                 farewell = self._accepted(arrival, Drive | Farewell)
                 if isinstance(farewell, Farewell):

@@ -23,7 +23,8 @@ from compose.campaign.trial import Row, lost
 from compose.campaign.work import EngineFailed, Orders, Work, chunks_of
 from compose.campaign.worker import MAX_ERROR, Chunk
 from compose.status import UserError
-from protocol.inbox import Inbox, one_line
+from protocol.inbox import Inbox
+from protocol.terminal import one_line
 
 T = TypeVar("T")
 

@@ -18,7 +18,7 @@ import msgspec
 from compose.campaign.trial import lost
 from compose.campaign.worker import LENGTH_BYTES, MAX_ERROR, READY, Chunk, framed
 from compose.forked import fork_server
-from protocol.inbox import one_line
+from protocol.terminal import one_line
 
 START_S = 60.0
 """how long a process may take to import what it needs"""

@@ -20,7 +20,8 @@ from compose.campaign.cells import Cell
 from compose.campaign.folder import CELLS
 from compose.campaign.run import SUMMARY, Progress, Results
 from compose.campaign.summary import Counted, noted
-from compose.show import UNLIMITED
+from compose.show import UNLIMITED, console
+from protocol.terminal import say
 
 RATE_OVER_S = 10.0
 """what the rate is averaged over"""
@@ -78,28 +79,28 @@ def show(results: Results, out: Path, *, quiet: bool) -> None:
     """The table, and how to see one of its trials; or only the counts."""
     total = {name: sum([getattr(one, name) for one in results.figures.values()]) for name in OUTCOMES}
     counts = ", ".join([f"{count} {name}" for name, count in total.items() if count])
-    print(f"{results.campaign.name}: {counts} of {len(results.table)} trials in {_cells(len(results.cells))}")
+    say(f"{results.campaign.name}: {counts} of {len(results.table)} trials in {_cells(len(results.cells))}")
     if any(one.audited for one in results.figures.values()):
-        print(_audited(results))
+        say(_audited(results))
     if quiet:
         return
     legend = [LEGEND, NOISE_LEGEND] if _noisy(results) else [LEGEND]
     shown = len(_shown(results))
     if shown:
-        print("", *_lines(results), "", *legend, sep="\n")
+        say("", *_lines(results), "", *legend)
     if shown < len(results.cells):
-        print(f"all is well in {len(results.cells) - shown} cells, not listed: {out / SUMMARY}")
+        say(f"all is well in {len(results.cells) - shown} cells, not listed: {out / SUMMARY}")
     for index, figures in results.figures.items():
         if figures.refused is not None:
-            print(f"cell {index} cannot be played: {figures.refused}")
+            say(f"cell {index} cannot be played: {figures.refused}")
     note = noted(results.table)
     if note is not None:
         why = f" ({note.why})" if note.why else ""
         how = f"{note.outcome} after {note.ticks} ticks" if note.ticks is not None else note.outcome
         file = shlex.quote(str(out / CELLS / f"{note.cell:03d}.toml"))
-        print(f"to look at first: trial {note.trial} of cell {note.cell}, {how}{why}; any trial again:")
-        print(f"  tandem run {file} --seed {note.seed} --out record")
-    print(f"results: {out}")
+        say(f"to look at first: trial {note.trial} of cell {note.cell}, {how}{why}; any trial again:")
+        say(f"  tandem run {file} --seed {note.seed} --out record")
+    say(f"results: {out}")
 
 
 def _audited(results: Results) -> str:
@@ -158,7 +159,7 @@ def _table(results: Results, columns: Sequence[str]) -> list[str]:
         figures = results.figures[cell.index]
         said = _figures(figures)
         table.add_row(*_axes(results, cell), *[said[column] for column in columns])
-    page = Console(width=UNLIMITED, file=io.StringIO())
+    page = console(width=UNLIMITED, file=io.StringIO())
     with page.capture() as capture:
         page.print(table)
     return [line.rstrip() for line in capture.get().splitlines() if line.strip()]

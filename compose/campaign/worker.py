@@ -22,7 +22,7 @@ import msgspec
 
 from compose.campaign import trial
 from compose.scenario import Setting
-from protocol.inbox import one_line
+from protocol.terminal import one_line
 
 PLAY = "compose.campaign.trial:play"
 """what plays a trial"""

@@ -11,7 +11,7 @@ from compose.doctor.network import network
 from compose.doctor.papers import papers
 from compose.reach import reach
 from compose.status import AMISS, CLEAN
-from protocol.inbox import one_line
+from protocol.terminal import say
 
 
 def main(options: argparse.Namespace) -> int:
@@ -20,6 +20,6 @@ def main(options: argparse.Namespace) -> int:
     status = CLEAN
     checks = (versions(), ports(endpoints), papers(endpoints), network(endpoints, options.wait))
     for finding in chain.from_iterable(checks):
-        print(one_line(str(finding)), flush=True)
+        say(str(finding))
         status = AMISS if finding.mark == FIX else status
     return status

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import sys
+import json
 from collections.abc import Iterator
 
 import msgspec
@@ -13,7 +13,7 @@ from compose.linking import Unreached, linked
 from compose.missions import Mission, Participant
 from compose.reach import places
 from compose.status import ENDED, FAILED
-from protocol.inbox import one_line
+from protocol.terminal import say
 from protocol.wire import VERSION
 
 
@@ -26,19 +26,18 @@ def main(options: argparse.Namespace) -> int:
             with linked(place) as link:
                 seen = missions.look(link, options.wait)
         except Unreached as error:
-            print(one_line(f"tandem ps: {error}"), file=sys.stderr)
+            say(f"tandem ps: {error}", error=True)
             status = FAILED
             continue
         found += [(str(place), mission) for mission in seen]
         if not seen and not options.json:
-            print(f"no mission at {place}")
+            say(f"no mission at {place}")
     if options.json:
         told = [{"at": at, **msgspec.to_builtins(one), "missing": one.missing} for at, one in found]
-        print(msgspec.json.format(msgspec.json.encode({"missions": told})).decode())
+        say(*json.dumps({"missions": told}, indent=2).replace("\x7f", "\\u007f").splitlines())
     else:
         for at, mission in found:
-            for line in _lines(at, mission, options.wait):
-                print(one_line(line))
+            say(*_lines(at, mission, options.wait))
     return status
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from contextlib import closing
 
@@ -20,6 +19,7 @@ from protocol.endpoints import Endpoints
 from protocol.inbox import Inbox, Interrupted
 from protocol.messages import End, Localised
 from protocol.motion import wrap
+from protocol.terminal import say
 from world.field import Field, NoStart
 
 LEAST_S = 0.1
@@ -56,7 +56,7 @@ class Agent:
             self._child.stop()
         self._child.end(within or STOP_S)
         if not self._told and self._child.status == ENDED and (said := self._child.said()):
-            print(said, file=sys.stderr)
+            say(*said.splitlines(), error=True)
         self._told = True
         self._child.forget()
 
@@ -98,10 +98,10 @@ def main(options: argparse.Namespace) -> int:
             return STOPPED
     if not options.quiet and isinstance(field.verdict, Localised):
         pose = field.verdict.pose
-        print(f"{options.id}: claims {pose.x:.9f} {pose.y:.9f} {wrap(pose.heading):+.9f} (m, m, rad)")
+        say(f"{options.id}: claims {pose.x:.9f} {pose.y:.9f} {wrap(pose.heading):+.9f} (m, m, rad)")
     if not options.quiet:
-        print(f"{options.id}: stood {field.missed} of {end.tick + 1} ticks for want of a Drive in time")
-    print(f"{options.id}: {ended(end.outcome, end.tick, end.reason)}")
+        say(f"{options.id}: stood {field.missed} of {end.tick + 1} ticks for want of a Drive in time")
+    say(f"{options.id}: {ended(end.outcome, end.tick, end.reason)}")
     return status_of(end.outcome)
 
 
@@ -121,7 +121,7 @@ def _play(options: argparse.Namespace, field: Field, reached: Endpoints, inbox: 
         try:
             field.attach(link)
             if not options.quiet:
-                print(f"{options.id}: in run {field.run}, waiting for its peer", flush=True)
+                say(f"{options.id}: in run {field.run}, waiting for its peer")
             end = field.play(options.wait, agent.again)
             agent.end(STOP_S)
         finally:

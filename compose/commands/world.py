@@ -23,6 +23,7 @@ from protocol.endpoints import Endpoints
 from protocol.inbox import Inbox, Interrupted
 from protocol.journal import CannotRecord, CorruptJournal, Journal
 from protocol.retrace import Retrace
+from protocol.terminal import say
 from world.course import Course, again
 from world.process import LinkLost, WorldProcess
 from world.scenario import Scenario
@@ -168,7 +169,7 @@ def _play(options: argparse.Namespace, course: Course, way: _Way, folder: Path, 
         robots = ", ".join(robot.id for robot in scenario.robots)
         where = f", again, at tick {course.tick}" if course.tick else ""
         at = " and ".join(way.endpoints.listen) or way.endpoints
-        print(f"run {run} at {at}{where}: waiting for {robots}", flush=True)
+        say(f"run {run} at {at}{where}: waiting for {robots}")
     try:
         with progress(options, scenario, folder):
             way.play(process)

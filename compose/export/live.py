@@ -30,6 +30,7 @@ from compose.scene.stage import Stage
 from compose.stop import stop_with_launcher
 from protocol.inbox import Inbox, Interrupted
 from protocol.journal import CorruptJournal, Tail
+from protocol.terminal import say
 
 HOST = "127.0.0.1"
 LOOK_S = 0.05
@@ -150,9 +151,9 @@ def main(port: int, folder: Path, robots: Sequence[str]) -> int:
             message_backlog_size=MESSAGES,
         )
     except Exception as error:  # noqa: BLE001  # the SDK's own, of no type of its own
-        print(f"--foxglove: port {port} cannot be served: {error}", file=sys.stderr)
+        say(f"--foxglove: port {port} cannot be served: {error}", error=True)
         return 1
-    print(f"ws://{HOST}:{server.port}", flush=True)
+    say(f"ws://{HOST}:{server.port}")
     try:
         _serve(live, server, inbox)
     finally:
