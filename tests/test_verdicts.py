@@ -14,6 +14,7 @@ from protocol.messages import Drive, Localised, Report, Undecided
 from protocol.motion import ORIGIN, Covariance
 from tests.steps import steps
 from tests.surveys import scenario_of
+from tests.test_claims import EXACT, NOISY
 from world.ending import LAST_WORDS, Ending
 from world.referee import Judgement, inaccuracy, judge
 from world.tick import World, advance, release
@@ -68,26 +69,6 @@ def test_the_letter_gives_up_where_the_third_mutual_range_settles_nothing() -> N
 
 # --- how well a robot must know what it claims ----------------------------------------------------------
 
-NOISY = """
-name = "noisy"
-[mission]
-sensing_range = 3.0
-period = 1.0
-max_speed = 1.0
-max_turn_rate = 3.141592653589793
-accuracy = 0.1
-noise.anchor_sigma = 0.05
-noise.mutual_sigma = 0.05
-[[robot]]
-id = "a"
-anchor = [0.0, 0.0]
-start = [1.5, 0.0, 1.0]
-[[robot]]
-id = "b"
-anchor = [6.0, 0.0]
-start = [4.0, 0.0, 4.0]
-"""
-
 
 def covariance(position: float, heading: float) -> Covariance:
     """That of a position and a heading of these sigmas, in m and rad."""
@@ -128,7 +109,7 @@ def test_a_robot_that_knows_its_pose_less_well_than_was_asked_is_not_localised(
 def test_no_sigma_excuses_a_claim_that_is_farther_off_than_the_accuracy_allows() -> None:
     """Five times the accuracy, 0.1 m; where sensors are exact, a micrometre."""
     huge = covariance(4.5e7, 3.0)
-    for text, far, near in ((NOISY, 0.501, 0.499), (NOISY.replace("noise", "# noise"), 2e-6, 1e-7)):
+    for text, far, near in ((NOISY, 0.501, 0.499), (EXACT, 2e-6, 1e-7)):
         wrong, vague = judged(text, huge, off=far), judged(text, huge, off=near)
         assert isinstance(wrong, Judgement)
         assert isinstance(vague, Judgement)
