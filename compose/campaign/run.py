@@ -18,6 +18,7 @@ from compose.campaign.summary import Counted, counted, header, summary_csv
 from compose.campaign.trial import Row
 from compose.campaign.work import EngineFailed, Orders, Work
 from compose.campaign.worker import PLAY
+from protocol import files
 from protocol.inbox import Inbox, Interrupted
 
 SUMMARY = "summary.csv"
@@ -160,7 +161,7 @@ def _gathered(folder: Folder, stopped: str | None, interrupted: bool) -> Results
     cells = tuple(folder.cells.values())
     figures = _figures(table, cells, folder.refused)
     text = summary_csv(folder.campaign, cells, figures)
-    (folder.path / SUMMARY).write_text(text, encoding="utf-8")
+    files.write(folder.path / SUMMARY, text)
     trials = folder.campaign.trials * (len(cells) - len(folder.refused))
     return Results(folder.campaign, cells, table, figures, stopped, interrupted, trials)
 

@@ -11,6 +11,7 @@ from compose.scene.facts import Gathering
 from compose.scene.scene import Scene, scene
 from compose.scene.stage import Stage, of_briefings, of_scenario
 from compose.summary import SUMMARY
+from protocol import files
 from protocol.journal import CorruptJournal, Tail
 from protocol.messages import End, Farewell, OfRobot
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
@@ -151,7 +152,7 @@ class Journals:
 
     def _mode(self) -> str | None:
         try:
-            told = msgspec.json.decode((self.folder / SUMMARY).read_bytes())
+            told = msgspec.json.decode(files.read_bytes(self.folder / SUMMARY))
             return str(told["mode"])
         except (OSError, msgspec.MsgspecError, TypeError, KeyError):
             return None
