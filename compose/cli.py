@@ -24,6 +24,7 @@ from compose.arguments import (
 )
 from compose.figures import FORMATS, PICTURES
 from compose.status import BROKEN_PIPE, BUG, FAILED, USER_ERROR, UserError
+from protocol.files import said
 from protocol.inbox import one_line
 
 
@@ -61,7 +62,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         status = BROKEN_PIPE
     except OSError as error:
         _leave_stream(sys.stdout)
-        print(one_line(f"tandem {options.command}: cannot go on: {error}"), file=sys.stderr)
+        print(one_line(f"tandem {options.command}: cannot go on: {said(error)}"), file=sys.stderr)
         status = FAILED
     except Exception:  # noqa: BLE001  # whatever it is, it must not look like a mission's outcome
         traceback.print_exc()

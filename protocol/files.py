@@ -19,6 +19,12 @@ DRAFT = ".unfinished"
 """ends the name of a file that is being written"""
 
 
+def said(error: OSError) -> str:
+    """What went wrong, and with which file, as a user is told."""
+    why = error.strerror or str(error)
+    return f"{error.filename}: {why}" if error.filename else why
+
+
 class NotRegular(OSError):
     """A directory, FIFO, device or socket where a file should be."""
 
@@ -65,7 +71,7 @@ def draft(path: Path, mode: int = 0o666) -> Iterator[Path]:
     """Yield the path of an empty file beside `path`; it replaces `path` if the block ends without an error.
 
     It is locked meanwhile, so that drafts of processes that were killed are told from it, and removed. The
-    umask applies to `mode`. Raises OSError.
+    umask applies to `mode`. Raises OSError, which names `path`.
     """
     for left in path.parent.glob(f".{_literal(path.name)}.*{DRAFT}"):
         _remove_abandoned(left)
@@ -75,6 +81,9 @@ def draft(path: Path, mode: int = 0o666) -> Iterator[Path]:
         _lock(file)
         yield place
         place.replace(path)
+    except OSError as error:
+        error.filename, error.filename2 = str(path), None
+        raise
     finally:
         os.close(file)
         place.unlink(missing_ok=True)

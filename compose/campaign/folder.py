@@ -65,8 +65,8 @@ class Folder:
 
     def forget_lost(self) -> None:
         """The trials that were lost, to an error or with their process, have no row any more."""
-        table = self.gather()
-        files.write(self.path / TRIALS, encoded(table.filter(table["error"].is_null())))
+        table = self.table()
+        self.gather(table.filter(table["error"].is_null()))
 
     def ask(self, refused: Mapping[int, str]) -> None:
         """Put down what is about to be played, and each cell's scenario."""
@@ -86,15 +86,17 @@ class Folder:
             name = f"{rows[0].cell:05d}-{rows[0].trial:08d}.parquet"
             files.write(self._parts / name, encoded(of_rows(rows, self.campaign, self.cells, self.schema)))
 
-    def gather(self) -> pa.Table:
-        """All rows, in order; from now on `trials.parquet` holds them, and there are no parts."""
-        table = gathered([self.schema.empty_table(), *self._tables(self.schema.names)])
+    def table(self) -> pa.Table:
+        """All rows, in order."""
+        return gathered([self.schema.empty_table(), *self._tables(self.schema.names)])
+
+    def gather(self, table: pa.Table) -> None:
+        """From now on `trials.parquet` holds these rows, and there are no parts."""
         files.write(self.path / TRIALS, encoded(table))
         for part in self._parts.glob("*"):
             part.unlink()
         if self._parts.exists():
             self._parts.rmdir()
-        return table
 
     def _tables(self, columns: list[str]) -> Iterator[pa.Table]:
         """What has been gathered, then each part. Raises UserError if the former cannot be read."""

@@ -120,8 +120,8 @@ def read(path: Path, schema: pa.Schema, columns: list[str]) -> pa.Table:
         return file.read(columns)
 
 
-def encoded(table: pa.Table) -> pa.Buffer:
+def encoded(table: pa.Table) -> bytes:
     """What a file of it holds."""
     file = pa.BufferOutputStream()
     pq.write_table(table, file)
-    return file.getvalue()
+    return bytes(file.getvalue().to_pybytes())
