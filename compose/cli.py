@@ -24,6 +24,7 @@ from compose.arguments import (
 )
 from compose.figures import FORMATS, PICTURES
 from compose.status import BROKEN_PIPE, BUG, FAILED, USER_ERROR, UserError
+from protocol import limits
 from protocol.files import said
 from protocol.inbox import one_line
 
@@ -52,6 +53,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
     options = parser().parse_args(arguments)
     try:
+        limits.need_memory(limits.START_BYTES, "Tandem")
         status = import_module(f"compose.commands.{options.command}").main(options)
         sys.stdout.flush()
     except UserError as error:
@@ -64,9 +66,15 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         _leave_stream(sys.stdout)
         print(one_line(f"tandem {options.command}: cannot go on: {said(error)}"), file=sys.stderr)
         status = FAILED
-    except Exception:  # noqa: BLE001  # whatever it is, it must not look like a mission's outcome
-        traceback.print_exc()
-        status = BUG
+    except BaseException as error:  # whatever it is, it must not look like a mission's outcome
+        short = limits.shortage(error)
+        if short is None and not isinstance(error, Exception):
+            raise
+        if short is None:
+            traceback.print_exc()
+        else:
+            print(one_line(f"tandem {options.command}: cannot go on: {short}"), file=sys.stderr)
+        status = BUG if short is None else FAILED
     session = sys.modules.get("protocol.session")
     if session is not None:
         session.leave(status)

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from compose.kill import WORLD, Kill, taken
 from compose.status import ENDED
+from protocol import limits
 from protocol.inbox import Inbox
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from world.scenario import Scenario
@@ -24,6 +25,8 @@ FOLLOW_S = 2.0
 """how long the agents may outlast the world"""
 STOP_S = 3.0
 """how long a process may take to end when told to; then it is killed"""
+CHILD_FILES, SPARE_FILES = 2, 8
+"""descriptors that the launcher takes for each process of a run, and for starting one"""
 LISTENING_PORTS = range(20_000, 32_000)
 """below those that the system gives to outgoing connections, which could take one in between"""
 
@@ -136,6 +139,7 @@ def play(
     Returns those that never came. Raises ChildFailed, or Interrupted when `inbox` says so; no process is left
     then, either.
     """
+    limits.need_files(CHILD_FILES * (1 + len(scenario.robots)) + SPARE_FILES, "a run as processes")
     launched = _Run(scenario, out, inbox, run=run, rate=rate, patience=patience, keys=keys)
     try:
         for name in launched.names:
