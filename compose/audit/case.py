@@ -9,6 +9,7 @@ import msgspec
 
 from agent.past import OutOfOrder, Past, past
 from compose.record import WORLD_JOURNAL, agent_journal
+from protocol.environment import is_blank
 from protocol.journal import CorruptJournal
 from protocol.messages import Contact, Drive, Sense
 from world.history import History, history
@@ -89,7 +90,7 @@ _NONE = Testimony(None, missing=True)
 
 def testimony_of(frames: list[bytes], source: object) -> Testimony:
     """What `frames` tell, as far as that can be followed. Raises CorruptJournal."""
-    if not frames:
+    if is_blank(frames):
         return Testimony(None)
     try:
         return Testimony(past(frames, source))
