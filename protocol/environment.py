@@ -1,7 +1,7 @@
 """What the last bits of a computation depend on beside its inputs: versions of libraries, and the processor.
 
 The same planner decides the same to the bit only where these are the same: the C library and numpy choose
-other instructions for another processor, and other versions of them and of the linear algebra round otherwise.
+other instructions for another processor, and other versions of them and of linear algebra round otherwise.
 """
 
 from __future__ import annotations

@@ -21,6 +21,14 @@ def main(options: argparse.Namespace) -> int:
         print(one_line(_difference(first)))
         if more:
             print(f"and {len(more)} more, which `tandem audit` tells")
+        if played.versions is not None:
+            print(one_line(f"{played.versions}: that alone can lead to other decisions"))
+    elif played.rounding:
+        print(
+            f"{played.scenario}: as recorded but for the last bits, in {played.ticks} ticks: "
+            f"{played.rounding} of {played.checks} checks differ by rounding alone"
+        )
+        print(one_line(str(played.versions)))
     else:
         print(f"{played.scenario}: as recorded, to the bit, in {played.ticks} ticks ({played.checks} checks)")
     for tear in played.tears:
