@@ -47,7 +47,7 @@ def changed(path: Path, kind: type, change: Callable[..., object | None], first:
             continue
         done = True
         new = change(message)
-        frames += [] if new is None else [encode(new)]  # type: ignore[arg-type]
+        frames += [] if new is None else [encode(new)]
     path.write_bytes(journal.packed(frames))
 
 
