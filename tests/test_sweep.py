@@ -6,9 +6,9 @@ import csv
 import json
 import os
 import re
-import socket
 import shlex
 import shutil
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
