@@ -25,6 +25,8 @@ from compose.arguments import (
 )
 from compose.figures import FORMATS, PICTURES
 from compose.status import BROKEN_PIPE, BUG, FAILED, USER_ERROR, UserError
+from protocol import limits
+from protocol.files import said
 from protocol.terminal import one_line, say
 
 
@@ -52,6 +54,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
     options = parser().parse_args(arguments)
     try:
+        limits.need_memory(limits.START_BYTES, "Tandem")
         status = import_module(f"compose.commands.{options.command}").main(options)
         sys.stdout.flush()
     except UserError as error:
@@ -62,11 +65,17 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         status = BROKEN_PIPE
     except OSError as error:
         _leave_stream(sys.stdout)
-        say(f"tandem {options.command}: cannot go on: {error}", error=True)
+        say(f"tandem {options.command}: cannot go on: {said(error)}", error=True)
         status = FAILED
-    except Exception:  # noqa: BLE001  # whatever it is, it must not look like a mission's outcome
-        say(*traceback.format_exc().splitlines(), error=True)
-        status = BUG
+    except BaseException as error:  # whatever it is, it must not look like a mission's outcome
+        short = limits.shortage(error)
+        if short is None and not isinstance(error, Exception):
+            raise
+        if short is None:
+            say(*traceback.format_exc().splitlines(), error=True)
+        else:
+            say(f"tandem {options.command}: cannot go on: {short}", error=True)
+        status = BUG if short is None else FAILED
     forked = sys.modules.get("compose.forked")
     if forked is not None:
         forked.close()

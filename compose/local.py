@@ -15,6 +15,7 @@ from compose import forked
 from compose.forked import ForkServer
 from compose.kill import WORLD, Kill, taken
 from compose.status import ENDED
+from protocol import limits
 from protocol.inbox import Inbox
 from protocol.terminal import say
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
@@ -28,6 +29,8 @@ JOIN_S = 60.0
 """how long an agent may look for its world,"""
 JOIN_EACH_S = 0.5
 """and how much longer for each robot of the run, all of which start at once"""
+CHILD_FILES, SPARE_FILES = 2, 12
+"""descriptors that the launcher takes for each process of a run, and for starting one"""
 LISTENING_PORTS = range(20_000, 32_000)
 """below those that the system gives to outgoing connections, which could take one in between"""
 
@@ -138,6 +141,7 @@ def play(
     Returns those that never came. Raises ChildFailed, or Interrupted when `inbox` says so; no process is left
     then, either.
     """
+    limits.need_files(CHILD_FILES * (1 + len(scenario.robots)) + SPARE_FILES, "a run as processes")
     launched = _Run(scenario, out, inbox, run=run, rate=rate, patience=patience, keys=keys)
     try:
         for name in launched.names:

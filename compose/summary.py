@@ -16,6 +16,7 @@ from compose.claim import Claim, claim, matrix
 from compose.installed import version
 from compose.record import Record
 from compose.ticks import ticks_csv
+from protocol import files
 from protocol.messages import Farewell, Localised, Outcome
 from protocol.motion import Pose, wrap
 from protocol.terminal import one_line
@@ -114,8 +115,8 @@ def versions() -> dict[str, str | None]:
 
 def leave(record: Record, summary: Mapping[str, Any], folder: Path) -> None:
     """Write `ticks.csv` and `summary.json` into `folder`."""
-    (folder / "ticks.csv").write_text(ticks_csv(record), encoding="utf-8")
-    (folder / SUMMARY).write_bytes(msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n")
+    files.write(folder / "ticks.csv", ticks_csv(record))
+    files.write(folder / SUMMARY, msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n")
 
 
 def outcome_line(summary: Mapping[str, Any]) -> str:

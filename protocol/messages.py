@@ -112,6 +112,20 @@ class Alarm(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=
 Verdict = Localised | Undecided | Alarm
 
 
+Version = Annotated[str, Meta(max_length=64)]
+
+
+class Environment(Message, frozen=True):
+    """The first frame of a journal: what the last bits of its numbers depend on beside the inputs."""
+
+    tandem: Version
+    c_library: Version
+    instruction_set: Version
+    numpy: Version | None = None
+    """and the instructions that it uses; none in a world's journal, which is made without, nor the next"""
+    linear_algebra: Version | None = None
+
+
 class Briefing(Message, frozen=True):
     """Everything that a robot needs to start."""
 
@@ -277,5 +291,5 @@ class Farewell(Message, frozen=True):
         _cut(self, "missing")
 
 
-OfRobot = Briefing | Sense | Report | Drive | Estimate | Missed | End | Farewell
+OfRobot = Environment | Briefing | Sense | Report | Drive | Estimate | Missed | End | Farewell
 """what stands in an agent's journal"""

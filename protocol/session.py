@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 
 import zenoh
 
-from protocol import keys
+from protocol import keys, limits
 from protocol.endpoints import Endpoints, zenoh_config
 from protocol.inbox import COMPLAINT, Inbox, Topic
 from protocol.keys import Key
@@ -62,12 +62,19 @@ def _closing(session: zenoh.Session) -> Iterator[zenoh.Session]:
         closer.join(CLOSE_TIMEOUT_S)
 
 
+def _check_limits() -> None:
+    """Raises OSError where a session could not be opened, or would hang."""
+    limits.need_files(limits.SESSION_FILES, "a Zenoh session")
+    limits.need_memory(limits.SESSION_BYTES, "a Zenoh session")
+
+
 @contextmanager
 def open_router(endpoints: Endpoints, wait: float = 0.0) -> Iterator[zenoh.Session]:
     """The session of a router; waits `wait` seconds for where it listens to be free.
 
     Routers that it connects to may come later, and go. Raises CannotListen.
     """
+    _check_limits()
     give_up = time.monotonic() + wait
     while True:
         try:
@@ -89,6 +96,7 @@ def open_client(endpoints: Endpoints, unanswered: Callable[[], None]) -> Iterato
 
     Calls `unanswered` after each attempt of CONNECT_TIMEOUT_S in vain; it may raise to give up.
     """
+    _check_limits()
     for attempt in count():
         try:
             session = zenoh.open(zenoh_config(endpoints, first=attempt))

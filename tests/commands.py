@@ -160,9 +160,9 @@ class Command:
         self.until(lambda: size(path) >= amount, f"{path.name} holds {amount} bytes")
 
     def until_answered(self, robot: str, record: Path) -> None:
-        """Wait until `robot` has answered tick 0: briefing, Sense, Drive and Estimate are on record."""
+        """Wait until `robot` has answered tick 0: its Sense, Drive and Estimate are on record."""
         path = record / f"agent-{robot}.journal"
-        self.until(lambda: path.exists() and len(list(journal.read(path))) >= 4, f"{robot} answers tick 0")
+        self.until(lambda: path.exists() and len(list(journal.read(path))) >= 5, f"{robot} answers tick 0")
 
     def ended(self, within: float = BOUND_S) -> Ended:
         """Its end, which must come `within` seconds."""

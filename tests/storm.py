@@ -35,7 +35,7 @@ from protocol import keys, session
 from protocol.endpoints import at
 from protocol.inbox import Inbox
 from protocol.journal import read
-from protocol.messages import Briefing, Drive, End, Estimate, Farewell, Report, Sense
+from protocol.messages import Briefing, Drive, End, Environment, Estimate, Farewell, Report, Sense
 from protocol.motion import Controls
 from protocol.wire import MAX_SENT_BYTES, decode, encode
 from tests.commands import BOUND_S, SECTION_IV, Command, until, world
@@ -110,7 +110,9 @@ class Genuine:
         peers = {robot.id: robot.peer for robot in played.robots}
         for robot, peer in peers.items():
             for frame in read(folder / f"agent-{robot}.journal"):
-                message: Any = decode(frame, Briefing | Sense | Report | Drive | Estimate | End | Farewell)
+                message: Any = decode(
+                    frame, Environment | Briefing | Sense | Report | Drive | Estimate | End | Farewell
+                )
                 match message:
                     case Sense():
                         key = keys.sense(RUN, robot)

@@ -14,7 +14,7 @@ from compose.record import Record
 from compose.scenario import load
 from compose.summary import summary
 from protocol import journal
-from protocol.messages import Briefing, Drive, End, Estimate, Farewell, Report, Sense
+from protocol.messages import Briefing, Drive, End, Environment, Estimate, Farewell, Report, Sense
 from protocol.wire import decode
 from tests.commands import journals, several_pairs, tandem
 from tests.surveys import scenario_of
@@ -150,7 +150,7 @@ def test_what_was_heard_refused_and_lost_adds_up_to_what_the_world_let_through(
 def senses(folder: Path, robot: str) -> Iterator[Sense]:
     """What `robot` sensed, by its own journal."""
     for frame in frames(folder, f"agent-{robot}.journal"):
-        message = decode(frame, Briefing | Sense | Report | Drive | Estimate | End | Farewell)
+        message = decode(frame, Environment | Briefing | Sense | Report | Drive | Estimate | End | Farewell)
         if isinstance(message, Sense):
             yield message
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from itertools import product
+from itertools import islice, product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -107,8 +107,7 @@ def recorded(number: int, folder: Path) -> None:
 def said(folder: Path, robot: str) -> Iterator[Sense | Report | Drive]:
     """What the journal of `robot` has in and out, until it claims."""
     frames = journal.read(folder / f"agent-{robot}.journal")
-    next(frames)
-    for frame in frames:
+    for frame in islice(frames, 2, None):
         match decode(frame, Sense | Report | Drive | Estimate | End | Farewell):
             case Sense() | Report() as message:
                 yield message
@@ -140,7 +139,7 @@ def remembered(folder: Path, robot: str) -> tuple[Mind, Localised]:
 
     It has come to a verdict before it began, so it decides nothing, and takes no time.
     """
-    briefing = decode(next(journal.read(folder / f"agent-{robot}.journal")), Briefing)
+    briefing = decode(list(journal.read(folder / f"agent-{robot}.journal"))[1], Briefing)
     mind = Mind(briefing, Done(1, Undecided("was not asked")))
     heard: list[Report] = []
     for message in said(folder, robot):

@@ -11,7 +11,7 @@ from signal import SIGCONT, SIGINT, SIGSTOP
 import pytest
 
 from protocol import journal
-from protocol.messages import Drive, End, Farewell, Missed
+from protocol.messages import Drive, End, Environment, Farewell, Missed
 from protocol.wire import MAX_FRAME_BYTES, decode
 from tests.commands import ASSURED, ENDLESS, PAPER_1, Command, process_of, tandem
 from world.scenario import Scenario
@@ -19,7 +19,7 @@ from world.scenario import Scenario
 
 def missed(path: Path, robot: str) -> int:
     """In how many ticks the world went without `robot`'s Drive."""
-    kinds = Scenario | Drive | Missed | End | Farewell
+    kinds = Environment | Scenario | Drive | Missed | End | Farewell
     messages = [decode(frame, kinds, MAX_FRAME_BYTES) for frame in journal.read(path)]
     return sum(isinstance(message, Missed) and message.robot == robot for message in messages)
 

@@ -28,7 +28,7 @@ from protocol import journal, keys, session
 from protocol.endpoints import listening
 from protocol.inbox import Inbox
 from protocol.journal import CannotRecord, CorruptJournal, Journal
-from protocol.messages import Contact, Drive, End, Farewell, Missed, Report, Sense
+from protocol.messages import Contact, Drive, End, Environment, Farewell, Missed, Report, Sense
 from protocol.retrace import Retrace
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from tests.commands import ASSURED, BOUND_S, PAPER_1, Command, Ended, journals, processes_of, tandem, world
@@ -136,7 +136,7 @@ def test_in_real_time_whoever_is_away_stands_still_and_is_told_what_it_missed(tm
         away = [row for row in csv.DictReader(file) if row["state"] == ""]
     assert "a" in {row["robot"] for row in away}
     assert {(row["v"], row["omega"]) for row in away} == {("0.0", "0.0")}
-    kinds = Scenario | Drive | Missed | End | Farewell
+    kinds = Environment | Scenario | Drive | Missed | End | Farewell
     messages = [decode(frame, kinds, MAX_FRAME_BYTES) for frame in journal.read(out / "world.journal")]
     assert sum(isinstance(message, Missed) for message in messages) == len(away)
     for robot in ("a", "b"):

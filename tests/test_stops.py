@@ -16,7 +16,7 @@ from compose.scenario import load
 from protocol import journal, keys, session
 from protocol.endpoints import at, listening
 from protocol.inbox import Inbox
-from protocol.messages import Drive, End, Farewell, Missed
+from protocol.messages import Drive, End, Environment, Farewell, Missed
 from protocol.wire import MAX_FRAME_BYTES, decode
 from tests.commands import (
     ASSURED,
@@ -206,8 +206,8 @@ def test_in_real_time_a_world_that_is_stopped_goes_on(assured: Path, tmp_path: P
     assert not processes_of(out)
 
 
-def played(out: Path) -> list[Scenario | Drive | Missed | End | Farewell]:
-    kinds = Scenario | Drive | Missed | End | Farewell
+def played(out: Path) -> list[Environment | Scenario | Drive | Missed | End | Farewell]:
+    kinds = Environment | Scenario | Drive | Missed | End | Farewell
     return [decode(frame, kinds, MAX_FRAME_BYTES) for frame in journal.read(out / "world.journal")]
 
 

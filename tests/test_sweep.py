@@ -8,6 +8,7 @@ import os
 import re
 import shlex
 import shutil
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -201,10 +202,18 @@ def test_rows_are_the_same_by_a_scheduler_and_workers_started_by_hand_even_if_on
 
 
 def test_a_scheduler_that_is_not_there_is_one_line(folder: Path) -> None:
-    for address in ("tcp://127.0.0.1:9", "nonsense://x", "nonsense"):
+    for address in ("tcp://127.0.0.1:9", "nonsense://x", "nonsense", "ucx://127.0.0.1:9", "inproc://x"):
         ended = sweep(folder, "both.toml", "out", "--scheduler", address)
         assert ended.status == 2
         assert re.fullmatch(rf"tandem sweep: --scheduler: {address} cannot be reached: [^\n]+\n", ended.err)
+
+
+def test_a_scheduler_that_accepts_and_says_nothing_is_waited_for_with_a_bound(folder: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        address = f"tcp://127.0.0.1:{mute.getsockname()[1]}"
+        ended = sweep(folder, "both.toml", "out", "--scheduler", address)
+    assert ended.status == 2
+    assert ended.err == f"tandem sweep: --scheduler: {address} cannot be reached: no answer within 5 s\n"
 
 
 def test_a_seed_follows_from_the_campaign_the_cell_and_the_trial(folder: Path) -> None:

@@ -33,6 +33,10 @@ def _show(findings: Findings) -> None:
         say(
             f"{link.link:16}{link.sent:>8}{link.heard:>8}{link.late:>8}{link.twice:>8}{link.damaged:>9}{link.lost:>8}"
         )
+    if findings.rounding:
+        say("", f"{len(findings.rounding)} checks differ by rounding alone: {findings.versions}")
+    elif findings.violations and findings.versions is not None:
+        say("", f"{findings.versions}: that alone can lead to other decisions")
     if findings.violations:
         say("")
     for violation in findings.violations[:SHOWN]:

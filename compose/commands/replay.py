@@ -21,6 +21,14 @@ def main(options: argparse.Namespace) -> int:
         say(_difference(first))
         if more:
             say(f"and {len(more)} more, which `tandem audit` tells")
+        if played.versions is not None:
+            say(f"{played.versions}: that alone can lead to other decisions")
+    elif played.rounding:
+        say(
+            f"{played.scenario}: as recorded but for the last bits, in {played.ticks} ticks: "
+            f"{played.rounding} of {played.checks} checks differ by rounding alone"
+        )
+        say(str(played.versions))
     else:
         say(f"{played.scenario}: as recorded, to the bit, in {played.ticks} ticks ({played.checks} checks)")
     for tear in played.tears:

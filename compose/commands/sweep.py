@@ -42,9 +42,12 @@ def main(options: argparse.Namespace) -> int:
             f"{results.stopped}: {len(results.table)} of {results.trials} trials are done; "
             "the same command goes on from there"
         )
+        if len(results.table) == results.trials:
+            report.show(results, out, quiet=True)
         return STOPPED if results.interrupted else FAILED
-    figures.draw(results, out / "figures")
     report.show(results, out, quiet=options.quiet)
+    sys.stdout.flush()
+    figures.draw(results, out / "figures")
     return status_of(results)
 
 

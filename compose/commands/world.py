@@ -18,7 +18,7 @@ from compose.scenario import check_rate, run_name, setting
 from compose.status import ENDED, FAILED, STOPPED, UserError
 from compose.stop import stop_by_signal, stop_with_launcher
 from compose.telling import break_off, conclude, going_on, progress
-from protocol import refusal, session
+from protocol import limits, refusal, session
 from protocol.endpoints import Endpoints
 from protocol.inbox import Inbox, Interrupted
 from protocol.journal import CannotRecord, CorruptJournal, Journal
@@ -46,6 +46,7 @@ def main(options: argparse.Namespace) -> int:
         endpoints = _endpoints(options)
         record = _record(options)
         course = again(scenario, record) if record is not None else None
+        limits.need_files(limits.SESSION_FILES + len(scenario.robots), "a world with a link to each robot")
         with ExitStack() as stack:
             wait = RELISTEN_S if record is not None else 0.0
             way = stack.enter_context(_Way(endpoints, options.patience, inbox, wait))

@@ -11,6 +11,7 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
+from protocol import files
 from protocol.mission import Role
 
 COLOURS: dict[Role, str] = {"a": "#0b62a4", "b": "#c4451c"}
@@ -47,7 +48,8 @@ def save(figure: Figure, path: Path, formats: Sequence[str] = ("svg", "png")) ->
     _settle(figure)
     written = [path.with_name(f"{path.name}.{ending}") for ending in formats]
     for ending, place in zip(formats, written, strict=True):
-        figure.savefig(place, dpi=DPI, metadata=_DATES[ending])
+        with files.draft(place) as drawn:
+            figure.savefig(drawn, format=ending, dpi=DPI, metadata=_DATES[ending])
     return tuple(written)
 
 
