@@ -13,11 +13,13 @@ from compose.audit.conduct import decision, limits, log
 from compose.audit.findings import Checks, Findings, counted
 from compose.audit.journals import briefing, order
 from compose.audit.radio import befallen, faults
+from compose.audit.settings import scenario
 from compose.audit.wires import contact, report, sense
 from compose.record import WORLD_JOURNAL, books
 
 RULES: tuple[Callable[[Case], Checks], ...] = (
     order,
+    scenario,
     briefing,
     sense,
     faults,
