@@ -731,8 +731,8 @@ def test_the_command_tells_the_first_twenty_and_how_many_more(folder: Path) -> N
     lines = ended.out.splitlines()
     assert lines[0] == "paper-1: 48 violations in 49 ticks"
     assert re.fullmatch(r"decision +204 +48", lines[10])
-    assert lines[13:15] == ["", "tick 0, a, decision: in its Estimate, localised is true, expected false"]
-    assert len(lines[14:]) == 21
+    assert lines[14:16] == ["", "tick 0, a, decision: in its Estimate, localised is true, expected false"]
+    assert len(lines[15:]) == 21
     assert lines[-1] == "and 28 more"
 
 

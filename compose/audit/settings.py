@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 from compose.audit.case import Case, Testified
 from compose.audit.findings import Checks, Violation, difference
@@ -19,18 +18,16 @@ def scenario(case: Case) -> Checks:
     told = case.history.scenario
     for why in (noise_obstacle(told.mission), safety_obstacle(told.mission)):
         yield _violation(None, why and f"mission.{why}")
-    places = {robot.id: place for place, robot in enumerate(told.robots)}
+    place = {robot.id: place for place, robot in enumerate(told.robots)}
     for robot in told.robots:
-        for why in _misplaced(robot, told.mission):
+        peer = told.robots[place[robot.peer]]
+        for why in (
+            _off_role(robot, first=place[robot.id] < place[robot.peer]),
+            _off_range(robot, told.mission),
+            _off_lie(robot),
+            _off_plan(robot.rendezvous, told.mission, told.variant, robot.anchor, peer.anchor),
+        ):
             yield _violation(robot.id, why)
-        first = places[robot.id] < places[robot.peer]
-        yield _violation(
-            robot.id,
-            None if (robot.role == "a") == first else f"role is {robot.role}: the first of a pair is a",
-        )
-        peer = told.robots[places[robot.peer]]
-        why_not = _plan(robot.rendezvous, told.mission, told.variant, robot.anchor, peer.anchor)
-        yield _violation(robot.id, why_not)
 
 
 def briefing(case: Testified) -> Checks:
@@ -40,19 +37,28 @@ def briefing(case: Testified) -> Checks:
     """
     for robot, past in case.pasts.items():
         told = past.briefing
-        why = _plan(told.rendezvous, told.mission, told.variant, told.anchor, told.peer_anchor)
+        why = _off_plan(told.rendezvous, told.mission, told.variant, told.anchor, told.peer_anchor)
         yield Violation("briefing", None, robot, why) if why is not None else None
 
 
-def _misplaced(robot: Placed, mission: Mission) -> Iterator[str | None]:
+def _off_role(robot: Placed, *, first: bool) -> str | None:
+    return None if (robot.role == "a") == first else f"role is {robot.role}: the first of a pair is a"
+
+
+def _off_range(robot: Placed, mission: Mission) -> str | None:
     rho0 = math.dist((robot.start.x, robot.start.y), (robot.anchor.x, robot.anchor.y))
     reach = mission.sensing_range
-    yield f"it starts {rho0:.12g} m from its anchor, outside R = {reach:.12g} m" if rho0 > reach else None
-    early = robot.lie is not None and robot.lie.kind in OF_THE_START
-    yield "its lie is of the start, and not of all" if early and robot.lie.part != "all" else None
+    return f"it starts {rho0:.12g} m from its anchor, outside R = {reach:.12g} m" if rho0 > reach else None
 
 
-def _plan(found: Rendezvous, mission: Mission, variant: Variant, anchor: Anchor, peer: Anchor) -> str | None:
+def _off_lie(robot: Placed) -> str | None:
+    early = robot.lie is not None and robot.lie.kind in OF_THE_START and robot.lie.part != "all"
+    return "its lie is of the start, and not of all" if early else None
+
+
+def _off_plan(
+    found: Rendezvous, mission: Mission, variant: Variant, anchor: Anchor, peer: Anchor
+) -> str | None:
     """Why `found` is not the plan for these anchors; None if it is."""
     distance = math.dist((anchor.x, anchor.y), (peer.x, peer.y))
     if distance < NEAREST_ANCHORS:
