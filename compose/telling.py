@@ -66,7 +66,7 @@ def conclude(
     else:
         from compose import show  # noqa: PLC0415  # as above
 
-        show.result(told)
+        show.result(told, getattr(options, "rate", None))
     return status_of(told["outcome"])
 
 

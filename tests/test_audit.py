@@ -389,8 +389,8 @@ def plant_scenario(folder: Path, change: Callable[[Scenario], Scenario]) -> None
     """Change the scenario, and every briefing that follows from it."""
     plant(folder / WORLD_JOURNAL, (of(Scenario), change))
     (told,) = [one for one in messages(folder / WORLD_JOURNAL) if isinstance(one, Scenario)]
-    for robot, name in (("a", A), ("b", B)):
-        plant(folder / name, (of(Briefing), lambda _, robot=robot: told.briefing(robot)))
+    for name in (A, B):
+        plant(folder / name, (of(Briefing), lambda briefed: told.briefing(briefed.robot)))
 
 
 def with_robots(**fields: Any) -> Callable[[Scenario], Scenario]:

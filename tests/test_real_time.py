@@ -5,15 +5,19 @@ from __future__ import annotations
 import csv
 import json
 import os
+import threading
+from contextlib import ExitStack
 from pathlib import Path
 from signal import SIGCONT, SIGINT, SIGSTOP
 
 import pytest
+import zenoh
 
-from protocol import journal
-from protocol.messages import Drive, End, Farewell, Missed
-from protocol.wire import MAX_FRAME_BYTES, decode
-from tests.commands import ASSURED, ENDLESS, PAPER_1, Command, process_of, tandem
+from protocol import journal, keys, session
+from protocol.endpoints import at
+from protocol.messages import Drive, End, Farewell, Missed, Sense
+from protocol.wire import MAX_FRAME_BYTES, decode, encode
+from tests.commands import ASSURED, BOUND_S, ENDLESS, PAPER_1, Command, process_of, tandem, world
 from world.scenario import Scenario
 
 
@@ -71,3 +75,39 @@ def test_a_robot_whose_agent_is_stopped_stands_still_and_the_mission_goes_on(tmp
     told = json.loads((out / "summary.json").read_text())["robots"]
     assert told["a"]["deadlines_missed"] == len(rows)
     assert {(row["v"], row["omega"]) for row in rows} == {("0.0", "0.0")}
+
+
+def test_a_world_says_why_there_is_no_farewell_of_a_robot(tmp_path: Path) -> None:
+    """Both answer the first tick only; then b leaves."""
+    out = tmp_path / "out"
+    (tmp_path / "short.toml").write_text("max_ticks = 9\n" + ASSURED.partition("\n")[2])
+    with (
+        world(tmp_path / "short.toml", "--rate", "20", "--run", "r", "--out", out) as (clock, endpoint),
+        session.open_client(at(endpoint), lambda: None) as a,
+        ExitStack() as leaves,
+    ):
+        b = leaves.enter_context(session.open_client(at(endpoint), lambda: None))
+        tokens = [session.show_alive(link, keys.robot_alive("r", one)) for link, one in ((a, "a"), (b, "b"))]
+        drives = {one: session.publisher(a, keys.drive("r", one)) for one in "ab"}
+        answered = threading.Event()
+
+        def answer(sample: zenoh.Sample) -> None:
+            sense = decode(sample.payload.to_bytes(), Sense | End)
+            if isinstance(sense, Sense) and sense.tick == 0:
+                drives[sense.robot].put(encode(Drive(0, sense.robot, 0.0, 0.0, 1, "straight")))
+            elif isinstance(sense, Sense):
+                answered.set()
+
+        subscribed = [a.declare_subscriber(keys.sense("r", one), answer) for one in "ab"]
+        assert answered.wait(BOUND_S)
+        leaves.close()
+        ended = clock.ended()
+    assert tokens
+    assert subscribed
+    assert ended.status == 1
+    behind, gone = [line for line in ended.err.splitlines() if "no Farewell" in line]
+    assert behind.startswith("tandem world: no Farewell of a: behind, at tick 0 of 9; a lower --rate leaves")
+    assert gone == "tandem world: no Farewell of b: gone; the last Drive was of tick 0"
+    assert "deadlines missed, of 9: a 8, b 8; a lower --rate, such as --rate 10, leaves" in ended.out
+    robots = json.loads((out / "summary.json").read_text())["robots"]
+    assert robots["a"]["no_farewell"] == "its last Drive in time was of tick 0 of 9"

@@ -100,7 +100,10 @@ def main(options: argparse.Namespace) -> int:
         pose = field.verdict.pose
         print(f"{options.id}: claims {pose.x:.9f} {pose.y:.9f} {wrap(pose.heading):+.9f} (m, m, rad)")
     if not options.quiet:
-        print(f"{options.id}: stood {field.missed} of {end.tick + 1} ticks for want of a Drive in time")
+        slower = f"; a lower --rate, such as {rate / 2:g}, leaves more time" if field.missed else ""
+        print(
+            f"{options.id}: stood {field.missed} of {end.tick + 1} ticks for want of a Drive in time{slower}"
+        )
     print(f"{options.id}: {ended(end.outcome, end.tick, end.reason)}")
     return status_of(end.outcome)
 
