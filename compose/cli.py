@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import sys
 import traceback
+from collections.abc import Sequence
 from importlib import import_module
 from typing import NoReturn, TextIO
 
@@ -25,13 +27,23 @@ from compose.arguments import (
 from compose.figures import FORMATS, PICTURES
 from compose.status import BROKEN_PIPE, BUG, FAILED, USER_ERROR, UserError
 from protocol.inbox import one_line
+from protocol.spelling import did_you_mean
 
 
 class _Parser(argparse.ArgumentParser):
     """Says what is wrong in one line."""
 
     def error(self, message: str) -> NoReturn:
+        wrong = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
+        if wrong is not None:
+            message += did_you_mean(wrong[1], re.findall(r"[\w.-]+", wrong[2]))
         self.exit(USER_ERROR, one_line(f"{self.prog}: {message}") + "\n")
+
+    def refuse(self, unknown: Sequence[str]) -> NoReturn:
+        """Words of the command line that mean nothing: the first option among them may be mistyped."""
+        first = next((word for word in unknown if word.startswith("-")), "").partition("=")[0]
+        known = [flag for flag in self._option_string_actions if flag.startswith("--")]
+        self.error(f"unrecognized arguments: {' '.join(unknown)}{did_you_mean(first, known)}")
 
 
 class _Version(argparse.Action):
@@ -49,7 +61,9 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     """Parse, and do as told; ends the process."""
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115  # closed by whoever started this
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
-    options = parser().parse_args(arguments)
+    options, unknown = parser().parse_known_args(arguments)
+    if unknown:
+        options.parser.refuse(unknown)
     try:
         status = import_module(f"compose.commands.{options.command}").main(options)
         sys.stdout.flush()
@@ -84,7 +98,9 @@ def parser() -> argparse.ArgumentParser:
     commands = tandem.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
 
     def command(name: str, what: str) -> argparse.ArgumentParser:
-        return commands.add_parser(name, help=what, description=what)
+        added = commands.add_parser(name, help=what, description=what)
+        added.set_defaults(parser=added)
+        return added
 
     run = command("run", "Play a mission on this machine.")
     _add_scenario(run)

@@ -10,6 +10,7 @@ from importlib import import_module
 from compose.scenario import setting
 from compose.status import UserError
 from protocol.messages import Briefing
+from protocol.spelling import did_you_mean
 from world.driver import THINKING, Driver
 from world.scenario import Scenario
 
@@ -65,7 +66,8 @@ def mission(source: str, robot: str) -> Scenario:
     if scenario.faults:
         raise UserError(f"{source}: fault: without a world, the radio is as it is")
     if robot not in (ids := [placed.id for placed in scenario.robots]):
-        raise UserError(f"{source}: there is no robot '{robot}'; there are {', '.join(ids)}")
+        near = did_you_mean(robot, ids)
+        raise UserError(f"{source}: there is no robot '{robot}'; there are {', '.join(ids)}{near}")
     return scenario
 
 

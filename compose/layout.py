@@ -14,6 +14,8 @@ from rich.table import Table
 
 UNLIMITED = 1000
 """columns, of what is not a terminal"""
+LEAST = 20
+"""columns beside an indent"""
 
 
 def room() -> int:
@@ -53,7 +55,8 @@ def notes(wanted: Iterable[tuple[str, str]], columns: Iterable[str]) -> list[str
 
 
 def wrapped(text: str, indent: int = 0) -> list[str]:
-    """`text`, broken between words, with all lines but the first indented."""
-    return textwrap.wrap(
-        text, max(room(), indent + 20), subsequent_indent=indent * " ", break_long_words=False
-    )
+    """`text`, broken between words where the terminal ends, with all lines but the first indented."""
+    if not sys.stdout.isatty():
+        return [text]
+    width = max(room(), indent + LEAST)
+    return textwrap.wrap(text, width, subsequent_indent=indent * " ", break_long_words=False)

@@ -25,6 +25,7 @@ from protocol.messages import Briefing
 from protocol.mission import Anchor, Mission, Role, Variant, noise_obstacle, obstacle, safety_obstacle
 from protocol.motion import TAU, Pose
 from protocol.rendezvous import Rendezvous, rendezvous, tick_budget
+from protocol.spelling import did_you_mean
 from protocol.units import NAME, RobotId
 from protocol.wire import MalformedFrame, decode, encode
 from world.faults import Fault, hold_up
@@ -170,8 +171,13 @@ def setting(source: str, faults: Sequence[str] = ()) -> Setting:
     try:
         text = read_text(path)
     except FileNotFoundError:
-        names = ", ".join(shipped())
-        raise BadScenario(f"{source}: neither a file nor a scenario that ships ({names})") from None
+        names, sweeps = shipped(), shipped("sweeps")
+        if source in sweeps:
+            raise BadScenario(f"{source} is a campaign: `tandem sweep {source}` plays it") from None
+        near = did_you_mean(source, [*names, *sweeps])
+        raise BadScenario(
+            f"{source}: neither a file nor a scenario that ships ({', '.join(names)}){near}"
+        ) from None
     except ValueError as error:
         raise BadScenario(f"{source}: {error}") from None
     return validate(table_in(text, source), source, faults)
@@ -309,7 +315,8 @@ def _peers(robots: list[RobotTable], source: str) -> dict[str, str]:
                 f"{source}: robot[{i}].peer: '{robot.id}' needs one: of {len(ids)} robots, two are a pair"
             )
         if robot.peer not in ids:
-            raise BadScenario(f"{source}: robot[{i}].peer: there is no robot '{robot.peer}'")
+            near = did_you_mean(robot.peer, ids)
+            raise BadScenario(f"{source}: robot[{i}].peer: there is no robot '{robot.peer}'{near}")
         peers[robot.id] = robot.peer
     for i, robot in enumerate(robots):
         if peers[robot.id] == robot.id or peers[peers[robot.id]] != robot.id:

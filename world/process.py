@@ -19,6 +19,7 @@ import zenoh
 from protocol import keys, session
 from protocol.inbox import NOTHING, Arrival, Inbox
 from protocol.messages import Drive, End, Farewell, Message, Sense, Truth
+from protocol.spelling import did_you_mean
 from protocol.wire import MalformedFrame, decode, encode
 from world.course import Course
 from world.referee import Judgement
@@ -258,7 +259,8 @@ class WorldProcess:
     def _brief(self, key: str) -> Message | str:
         robot = key.rsplit("/", 1)[1]
         if robot not in self._robots:
-            return f"this world has no robot '{robot}'; it has {', '.join(self._robots)}"
+            near = did_you_mean(robot, self._robots)
+            return f"this world has no robot '{robot}'; it has {', '.join(self._robots)}{near}"
         return self._scenario.briefing(robot, self._period)
 
     def _farewells(self, end: End, expected: Collection[str]) -> list[Farewell]:

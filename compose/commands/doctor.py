@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from itertools import chain
 
+from compose import layout
 from compose.doctor.finding import FIX
 from compose.doctor.machine import ports, versions
 from compose.doctor.network import network
@@ -20,6 +21,6 @@ def main(options: argparse.Namespace) -> int:
     status = CLEAN
     checks = (versions(), ports(endpoints), papers(endpoints), network(endpoints, options.wait))
     for finding in chain.from_iterable(checks):
-        print(one_line(str(finding)), flush=True)
+        print(*layout.wrapped(one_line(str(finding)), len(finding.mark) + 2), sep="\n", flush=True)
         status = AMISS if finding.mark == FIX else status
     return status

@@ -8,13 +8,16 @@ from collections.abc import Iterator
 
 import msgspec
 
-from compose import missions
+from compose import layout, missions
 from compose.linking import Unreached, linked
 from compose.missions import Mission, Participant
 from compose.reach import places
 from compose.status import ENDED, FAILED
 from protocol.inbox import one_line
 from protocol.wire import VERSION
+
+INDENT = 4
+"""of what is too long for a line"""
 
 
 def main(options: argparse.Namespace) -> int:
@@ -38,7 +41,7 @@ def main(options: argparse.Namespace) -> int:
     else:
         for at, mission in found:
             for line in _lines(at, mission, options.wait):
-                print(one_line(line))
+                print(*layout.wrapped(one_line(line), INDENT), sep="\n")
     return status
 
 
