@@ -279,6 +279,7 @@ def _add_robot(parser: argparse.ArgumentParser) -> None:
     _add_reaching(parser)
     _add_listening(parser, "where the peer reaches it, such as tcp/127.0.0.1:7447; as often as you like")
     parser.add_argument("--run", type=name, metavar="NAME", help="what the mission is called (its name)")
+    parser.add_argument("--fsync", action="store_true", help="the journals survive a power cut")
     parser.add_argument(
         "--wait", type=positive, default=60.0, metavar="S", help="how long to look for the peer (60)"
     )

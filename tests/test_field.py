@@ -16,6 +16,7 @@ from msgspec.structs import replace
 
 from agent.past import Past, past
 from compose.local import free_endpoint
+from compose.scenario import load
 from protocol import journal
 from protocol.messages import Drive, OfRobot
 from protocol.motion import REST
@@ -201,12 +202,16 @@ def test_a_robot_whose_peer_does_not_come_has_not_moved(tmp_path: Path) -> None:
         (("a", "--mission", "paper-1", "--option", "colour"), "--option: 'colour' is no option"),
         (("a", "--mission", "paper-1", "--rate", "1e8"), "--rate: 1e+08 makes a tick of 1 s last"),
         (("a", "--mission", "paper-1", "--listen", "7447"), "--listen: '7447' is no endpoint"),
-        (("a", "--mission", "paper-1", "--out", "{record}"), "holds a record of a already"),
+        (
+            ("a", "--mission", "paper-1", "--out", "{record}"),
+            "driver-a.journal is not; choose another folder",
+        ),
     ],
 )
 def test_a_mistake_is_one_line(tmp_path: Path, arguments: tuple[str, ...], said: str) -> None:
     (tmp_path / "faults.toml").write_text(f"{PAPER_1}\n[[fault]]\nloss = 0.5\n")
-    (tmp_path / "agent-a.journal").touch()
+    with journal.Journal(tmp_path / "agent-a.journal") as old:
+        old.write(encode(load("paper-1").briefing("a")))
     words = [word.format(faults=tmp_path / "faults.toml", record=tmp_path) for word in arguments]
     ended = tandem("robot", *words, "--driver", "docs.rover:Rover")
     assert ended.status == 2
