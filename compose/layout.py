@@ -42,7 +42,7 @@ def fits(lines: Iterable[str]) -> bool:
 
 def lines(made: Table, width: int = UNLIMITED) -> list[str]:
     """The lines of a table, no wider than `width`: text that is too long is folded within its column."""
-    page = Console(width=width, file=io.StringIO())
+    page = Console(width=width, file=io.StringIO(), markup=False, emoji=False, highlight=False)
     with page.capture() as capture:
         page.print(made)
     return [line.rstrip() for line in capture.get().splitlines() if line.strip()]

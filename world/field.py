@@ -8,6 +8,7 @@ hears nothing.
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -31,6 +32,9 @@ FAREWELL_S = 2.0
 """how long to wait for the agent's last word"""
 ASTRAY = 64
 """ticks that a's beat may be ahead of b; a beat of long ago is of an a that was started again, and lost"""
+
+UNKNOWN = -math.inf
+"""a time; clocks may begin at 0, and what is late lies before that"""
 
 M = TypeVar("M", Drive, Beat, Report)
 
@@ -85,7 +89,7 @@ class Field:
         self._answered = 0.0
         """when it last did, or appeared"""
         self._tick = -1
-        self._next = 0.0
+        self._next = UNKNOWN
         """when the tick after this one begins"""
         self.missed = 0
         """manoeuvres that the robot stood instead"""
@@ -172,12 +176,12 @@ class Field:
             return False
         if self._resumed:
             return True
-        return self._next > 0.0 if self._briefing.role == "b" else self._peer in self._alive
+        return self._next != UNKNOWN if self._briefing.role == "b" else self._peer in self._alive
 
     def _play_tick(self) -> End | None:
         self._tick += 1
         tick = self._tick
-        self._next = (self._next or time.monotonic()) + self._tick_s
+        self._next = (time.monotonic() if self._next == UNKNOWN else self._next) + self._tick_s
         self._beat.put(encode(Beat(tick, self._id)))
         reading = self._reading(tick)
         sense = _sense(reading, tick, self._briefing)
