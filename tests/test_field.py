@@ -24,8 +24,8 @@ from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from tests.commands import PAPER_1, Command, Ended, process_of, processes_of, tandem
 
 STARTS = {"a": "2.4,-1.2,4.8", "b": "11.3,-0.4,3.6"}
-ASSURED = PAPER_1.replace('"paper"', '"assured"').replace('name = "paper-1"', 'name = "field"')
-"""of the variant for which standing still is no harm"""
+ASSURED = "max_ticks = 1_000_000\n" + PAPER_1.replace('"paper"', '"assured"').replace('"paper-1"', '"field"')
+"""of the variant for which standing still is no harm, however long a busy machine makes robots stand"""
 
 
 @contextmanager

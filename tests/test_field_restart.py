@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -49,7 +48,7 @@ class Pair:
     def kill(self, *names: str) -> None:
         """All processes of these robots, at once."""
         for name in names:
-            os.kill(self.robots[name].pid, SIGKILL)
+            self.robots[name].tell(SIGKILL)  # unless it has ended
         for name in names:
             self.robots[name].ended()
 
