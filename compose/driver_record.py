@@ -9,6 +9,7 @@ from pathlib import Path
 
 import msgspec
 
+from compose.driving import again
 from compose.record import agent_journal
 from compose.telling import going_on
 from protocol.inbox import Inbox
@@ -16,7 +17,9 @@ from protocol.journal import CannotRecord, CorruptJournal, Journal
 from protocol.messages import Briefing, OfRobot, Sense
 from protocol.retrace import Retrace
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode, encode
+from world.driver import Driver
 from world.driver_journal import DriverPast, driver_journal, driver_past
+from world.field import Field
 
 RELEASE_S = 10.0
 """how long the agent of a launcher that has just been killed may take to end: it has its journal locked"""
@@ -30,6 +33,15 @@ class DriverRecord(msgspec.Struct, frozen=True):
     past: DriverPast
     known: int
     """the latest tick in the agent's; -1 where there is none"""
+    again: bool
+    """whether they were there before"""
+
+    def take_up(self, driver: Driver, name: str, field: Field) -> None:
+        """Go on where they end, by the driver of that name. Raises UserError if it cannot."""
+        if self.past.ticks:
+            again(driver, name, self.past)
+        if self.again:
+            field.resume(self.past, self.known)
 
 
 @contextmanager
@@ -45,7 +57,7 @@ def recorded(folder: Path, briefing: Briefing, inbox: Inbox, *, fsync: bool) -> 
             raise CannotRecord(f"{agents} is there already, and {path.name} is not; choose another folder")
         with Journal(path, fsync=fsync) as journal:
             journal.write(encode(briefing))
-            yield DriverRecord(journal, DriverPast(), -1)
+            yield DriverRecord(journal, DriverPast(), -1, again=False)
         return
     old = Retrace(path, fsync=fsync)
     try:
@@ -56,7 +68,7 @@ def recorded(folder: Path, briefing: Briefing, inbox: Inbox, *, fsync: bool) -> 
         old.close()
         raise
     with going_on(old, inbox) as journal:
-        yield DriverRecord(journal, past, known)
+        yield DriverRecord(journal, past, known, again=True)
 
 
 def _frames(path: Path, inbox: Inbox) -> list[bytes]:

@@ -33,7 +33,7 @@ from tests.stage import Stage
 from world.driver import THINKING, Reading
 from world.driver_journal import DrivenTick, DriverPast
 from world.ending import LAST_WORDS, Ending
-from world.field import Field
+from world.field import UNHEARD, Field
 
 Answer = Callable[[int], Iterable[bytes]]
 """what somebody says to the Sense of a tick"""
@@ -332,3 +332,22 @@ def test_an_a_that_was_not_down_does_not_go_by_its_peers_ticks(stage: Stage, pla
     stage.comes("beat", keys.beat("r", "b"), encode(Beat(4, "b")), 0.05)
     played(driver, lambda tick: [encode(drive(tick))])
     assert driver.ticks[-1][1] - driver.ticks[0][1] == pytest.approx(5 * (1 + THINKING) * MANOEUVRE_S)
+
+
+def test_a_b_that_was_killed_before_tick_0_begins_though_a_waits_for_it(stage: Stage) -> None:
+    """a is there, and says nothing; when it does, it turns out to be behind, and b waits for it."""
+    driver = Recorded()
+    driver.clock = stage.monotonic
+    briefing = briefed(parse(ASSURED, "assured"), "b", MANOEUVRE_S)
+    field = Field(driver, briefing, "r", stage, max_ticks=9, manoeuvre_s=MANOEUVRE_S)
+    field.resume(DriverPast(), known=-1)
+    stage.alive("a", "b")
+    tick_s = (1.0 + THINKING) * MANOEUVRE_S
+    stage.comes("beat", keys.beat("r", "a"), encode(Beat(0, "a")), 9.5 * tick_s)
+    field.attach(LINK)
+    end = field.play(10.0, lambda: None)
+    times = dict(driver.ticks)
+    assert times[0] == pytest.approx(UNHEARD * tick_s)
+    assert times[5] == pytest.approx(times[0] + 5 * tick_s)
+    assert times[6] == pytest.approx((9.5 + 6) * tick_s)
+    assert end.tick == 9

@@ -36,6 +36,9 @@ ASTRAY = 64
 UNKNOWN = -math.inf
 """a time; clocks may begin at 0, and what is late lies before that"""
 
+UNHEARD = 4.0
+"""ticks within which a robot that goes on tells that it does"""
+
 M = TypeVar("M", Drive, Beat, Report)
 
 
@@ -80,6 +83,8 @@ class Field:
         self._ending = Ending(briefing, max_ticks, self._patience)
         self._end: End | None = None
         """once it is on record"""
+        self._again = False
+        """whether its process was killed before, be it before tick 0"""
         self._resumed = False
         self._astray = ASTRAY
         """ticks that the peer's beat may be ahead"""
@@ -99,13 +104,14 @@ class Field:
 
         The robot stood while this process was down, so the peer may be any number of ticks ahead.
         """
+        self._again = True
         for one in past.ticks:
             for report in one.reports:
                 self._ending.told(report)
             self._end = self._ending.after(one.sense.tick, one.drive, peer_there=True)
             self.missed += one.drive is None
         self._end = past.end or self._end
-        self._tick, self._resumed, self._astray = past.tick, past.tick >= 0, self._max_ticks
+        self._tick, self._resumed, self._astray = past.tick, past.tick >= 0, self._max_ticks + 1
         self._unanswered.extend((one.sense.tick, one.frame) for one in past.ticks[known + 1 :])
 
     @property
@@ -161,14 +167,20 @@ class Field:
     def _gather(self, give_up: float) -> None:
         """Until tick 0: a's begins when both agents are there, b's when a's has.
 
-        Whoever resumes waits for its own agent only: the peer may have come to its end.
+        Whoever resumes waits for its own agent only: the peer may have come to its end. A b that was killed
+        before tick 0 may have missed that a has begun, and that a now waits for it.
         """
+        unheard = time.monotonic() + UNHEARD * self._tick_s
         while not self._may_begin():
+            if self._again and self._peer in self._alive and time.monotonic() >= unheard:
+                self._next = time.monotonic()
+                continue
             if time.monotonic() >= give_up:
                 missing = [one for one in (self._id, self._peer) if one not in self._alive]
                 moved = "" if self._resumed else "; nobody has moved"
                 raise NoStart(f"{' and '.join(missing) or self._peer}: not there{moved}")
-            self._take(self._inbox.next(give_up - time.monotonic()))
+            until = min(give_up, unheard) if self._again and unheard > time.monotonic() else give_up
+            self._take(self._inbox.next(until - time.monotonic()))
         self._answered = time.monotonic()
 
     def _may_begin(self) -> bool:
@@ -294,7 +306,7 @@ class Field:
         left = self._tick + 1 - beat.tick
         if self._briefing.role == "a" and (left >= 0 or not self._resumed):
             return
-        if -self._astray <= left <= 2:
+        if -self._astray <= left <= (2 if self._resumed or self._astray == ASTRAY else ASTRAY):
             self._astray = ASTRAY
             self._next = time.monotonic() + left * self._tick_s
         else:

@@ -9,7 +9,7 @@ from contextlib import closing
 from pathlib import Path
 
 from compose.driver_record import recorded
-from compose.driving import again, briefed, driver_class, made, mission, options_of
+from compose.driving import briefed, driver_class, made, mission, options_of
 from compose.local import STOP_S, Child, ChildFailed, free_endpoint
 from compose.reach import beyond, reach
 from compose.record import folder_for
@@ -95,9 +95,7 @@ def main(options: argparse.Namespace) -> int:
                 patience=options.patience,
                 journal=record.journal,
             )
-            if record.past.ticks:
-                again(driver, options.driver, record.past)
-                field.resume(record.past, record.known)
+            record.take_up(driver, options.driver, field)
             end = _play(options, field, reached, folder, inbox)
     except session.CannotListen as error:
         raise UserError(f"--listen: {error}") from None
