@@ -453,7 +453,7 @@ STANDING = {"/stage", "/a/pose", "/b/trail", "/contact", "/a/belief", "/journal/
 
 
 async def watched(port: int, until: str) -> dict[str, str]:
-    """Topics with their schemas, once a log line begins with `until` and all of STANDING has told something."""
+    """Topics with their schemas, once a log line begins with `until`, and all of STANDING was told."""
     async with websockets.connect(
         f"ws://127.0.0.1:{port}",
         subprotocols=[websockets.Subprotocol("foxglove.sdk.v1")],
