@@ -351,3 +351,11 @@ def test_a_b_that_was_killed_before_tick_0_begins_though_a_waits_for_it(stage: S
     assert times[5] == pytest.approx(times[0] + 5 * tick_s)
     assert times[6] == pytest.approx((9.5 + 6) * tick_s)
     assert end.tick == 9
+
+
+def test_a_robot_says_why_there_is_no_farewell(stage: Stage, capsys: pytest.CaptureFixture[str]) -> None:
+    stage.alive("a", "b")
+    field = Field(Recorded(), BRIEFING, "r", stage, max_ticks=2, manoeuvre_s=MANOEUVRE_S)
+    field.attach(LINK)
+    field.play(10.0, lambda: None)
+    assert "no Farewell of a: no answer to the End" in capsys.readouterr().err

@@ -332,6 +332,8 @@ class Field:
                 elif arrival.topic == "drive" and _is_farewell(arrival.frame):
                     self._sense.put(arrival.frame)
                     return
+        why = "no answer to the End" if self._id in self._alive else "its agent has gone"
+        self._inbox.say(f"no Farewell of {self._id}: {why}")
 
 
 def _sense(reading: Reading, tick: int, briefing: Briefing) -> bytes:
