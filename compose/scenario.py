@@ -135,6 +135,21 @@ def shipped(folder: str = "scenarios") -> dict[str, Path]:
     return {file.stem: file for file in sorted(path.glob("*.toml"))}
 
 
+SHIPPED = {"scenarios": ("scenario", "run"), "sweeps": ("campaign", "sweep")}
+"""of each folder: what a file in it is, and the command that plays it"""
+
+
+def unknown(source: str, folder: str) -> str:
+    """Return why there is nothing called `source` to be read, where a file of `folder` was expected."""
+    names = {one: shipped(one) for one in SHIPPED}
+    for other, (kind, command) in SHIPPED.items():
+        if other != folder and source in names[other]:
+            return f"{source} is a {kind}: `tandem {command} {source}` plays it"
+    near = did_you_mean(source, [name for found in names.values() for name in found])
+    ships = ", ".join(names[folder])
+    return f"{source}: neither a file nor a {SHIPPED[folder][0]} that ships ({ships}){near}"
+
+
 def run_name(scenario: Scenario, out: Path | None = None) -> str:
     """A name for a run of it that no other run has; the same again for one that goes on in `out`."""
     mark = secrets.token_hex(3)
@@ -171,13 +186,7 @@ def setting(source: str, faults: Sequence[str] = ()) -> Setting:
     try:
         text = read_text(path)
     except FileNotFoundError:
-        names, sweeps = shipped(), shipped("sweeps")
-        if source in sweeps:
-            raise BadScenario(f"{source} is a campaign: `tandem sweep {source}` plays it") from None
-        near = did_you_mean(source, [*names, *sweeps])
-        raise BadScenario(
-            f"{source}: neither a file nor a scenario that ships ({', '.join(names)}){near}"
-        ) from None
+        raise BadScenario(unknown(source, "scenarios")) from None
     except ValueError as error:
         raise BadScenario(f"{source}: {error}") from None
     return validate(table_in(text, source), source, faults)

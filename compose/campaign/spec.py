@@ -15,7 +15,6 @@ from compose import scenario
 from compose.campaign.fields import NoSuchField, Steps, canonical, jsonable, steps
 from compose.status import UserError
 from compose.toml import NotToml, field_first, read_text, table_in
-from protocol.spelling import did_you_mean
 from protocol.units import NAME
 
 MAX_TRIALS = 10**7
@@ -110,13 +109,7 @@ def load(source: str, *, trials: int | None = None, seed: int | None = None) -> 
         table = table_in(read_text(path), source)
         spec = msgspec.convert(table, SpecFile)
     except FileNotFoundError:
-        names, scenarios = shipped(), scenario.shipped()
-        if source in scenarios:
-            raise BadSpec(f"{source} is a scenario: `tandem run {source}` plays it") from None
-        near = did_you_mean(source, [*names, *scenarios])
-        raise BadSpec(
-            f"{source}: neither a file nor a campaign that ships ({', '.join(names)}){near}"
-        ) from None
+        raise BadSpec(scenario.unknown(source, "sweeps")) from None
     except msgspec.ValidationError as error:
         raise BadSpec(f"{source}: {field_first(str(error), {})}") from None
     except ValueError as error:
