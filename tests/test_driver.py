@@ -359,3 +359,19 @@ def test_a_robot_says_why_there_is_no_farewell(stage: Stage, capsys: pytest.Capt
     field.attach(LINK)
     field.play(10.0, lambda: None)
     assert "no Farewell of a: no answer to the End" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("robot", ["a", "b"])
+def test_a_robot_that_was_killed_waits_for_its_agent_however_long_its_peer_is_there(
+    robot: str, stage: Stage
+) -> None:
+    driver = Recorded()
+    driver.clock = stage.monotonic
+    briefing = briefed(parse(ASSURED, "assured"), robot, MANOEUVRE_S)
+    field = Field(driver, briefing, "r", stage, max_ticks=25, manoeuvre_s=MANOEUVRE_S)
+    field.resume(past_of(20, robot=robot), known=19)
+    stage.alive("b" if robot == "a" else "a")
+    stage.comes("alive", keys.robot_alive("r", robot), after=3.0)
+    field.attach(LINK)
+    assert field.play(10.0, lambda: None).tick == 25
+    assert driver.ticks[0] == (20, pytest.approx(3.0))

@@ -52,7 +52,7 @@ def pair(out: Path, *more: str | Path, protocol: str = "tcp") -> Iterator[dict[s
         def robot(name: str, flag: str) -> Command:
             return Command(
                 *("robot", name, "--mission", out / "field.toml", "--driver", "docs.rover:Rover"),
-                *("--rate", "6", flag, endpoint, *more, "--out", out / name, "--patience", "20"),
+                *("--rate", "4", flag, endpoint, *more, "--out", out / name, "--patience", "20"),
                 *("--option", f"start={STARTS[name]}", "--option", f"beacon={air}"),
             )
 

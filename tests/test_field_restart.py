@@ -35,7 +35,7 @@ class Pair:
         return self._open.enter_context(
             Command(
                 *("robot", name, "--mission", self._out / "field.toml", "--driver", "docs.rover:Rover"),
-                *("--rate", "6", "--listen" if name == "a" else "--connect", self._endpoint),
+                *("--rate", "4", "--listen" if name == "a" else "--connect", self._endpoint),
                 *("--out", self._out / name, "--option", f"state={self._out / f'body-{name}'}"),
                 *("--option", f"start={STARTS[name]}", "--option", f"beacon={self._air}"),
                 *("--option", "patience=60"),
@@ -179,7 +179,7 @@ def test_a_record_of_another_mission_is_refused(pair: Pair, tmp_path: Path) -> N
     pair.robots["a"].until_written(pair.path("a"), 1500)
     pair.kill("a", "b")
     other = tandem(
-        *("robot", "a", "--mission", "paper-2", "--driver", "docs.rover:Rover", "--rate", "6"),
+        *("robot", "a", "--mission", "paper-2", "--driver", "docs.rover:Rover", "--rate", "4"),
         *("--out", tmp_path / "a"),
     )
     assert other.status == 2
@@ -200,7 +200,7 @@ def test_a_driver_that_cannot_resume_is_refused_and_not_moved(pair: Pair, tmp_pa
             "--driver",
             "tests.broken_drivers:CannotResume",
         ),
-        *("--rate", "6", "--out", tmp_path / "a"),
+        *("--rate", "4", "--out", tmp_path / "a"),
     )
     assert ended.status == 2
     assert "has no resume() for it; choose another folder" in ended.err

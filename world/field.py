@@ -172,9 +172,9 @@ class Field:
         """
         unheard = time.monotonic() + UNHEARD * self._tick_s
         while not self._may_begin():
-            if self._again and self._peer in self._alive and time.monotonic() >= unheard:
+            if self._again and {self._id, self._peer} <= self._alive and time.monotonic() >= unheard:
                 self._next = time.monotonic()
-                continue
+                break
             if time.monotonic() >= give_up:
                 missing = [one for one in (self._id, self._peer) if one not in self._alive]
                 moved = "" if self._resumed else "; nobody has moved"
