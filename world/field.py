@@ -193,8 +193,10 @@ class Field:
     def _play_tick(self) -> End | None:
         self._tick += 1
         tick = self._tick
-        self._next = (time.monotonic() if self._next == UNKNOWN else self._next) + self._tick_s
-        self._beat.put(encode(Beat(tick, self._id)))
+        now = time.monotonic()
+        self._next = (now if self._next == UNKNOWN else self._next) + self._tick_s
+        if not self._resumed or self._next > now:  # one that catches up says so once it is there
+            self._beat.put(encode(Beat(tick, self._id)))
         reading = self._reading(tick)
         sense = _sense(reading, tick, self._briefing)
         self._write(*_mark(reading, tick, self._id), sense)
