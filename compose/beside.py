@@ -45,23 +45,29 @@ class Beside:
         say(f"{self._what} stays at {self.address} until Ctrl-C")
 
     def put_end(self, inbox: Inbox) -> None:
-        """Put "ended" into `inbox` once the process is gone."""
+        """Put "ended" with its address into `inbox` once the process is gone."""
 
         def wait() -> None:
-            inbox.put("ended", str(self._process.wait()))
+            self._process.wait()
+            inbox.put("ended", self.address)
 
         threading.Thread(target=wait, daemon=True).start()
 
 
 def stay(shows: Sequence[Beside], inbox: Inbox) -> None:
-    """The mission is over: wait for Ctrl-C, or for the end of all of `shows`."""
+    """The mission is over: wait for Ctrl-C, or for the end of all of `shows`.
+
+    A process of the mission may end after it, and is none of them.
+    """
     for show in shows:
         show.conclude()
         show.put_end(inbox)
-    left = len(shows)
+    left = {show.address for show in shows}
     with suppress(Interrupted):
         while left:
-            left -= inbox.next(None).topic == "ended"
+            arrival = inbox.next(None)
+            if arrival.topic == "ended":
+                left.discard(arrival.key)
 
 
 @contextmanager

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import sys
 import traceback
+from collections.abc import Sequence
 from functools import cache
 from importlib import import_module
 from typing import NoReturn, TextIO
@@ -27,6 +29,7 @@ from compose.figures import FORMATS, PICTURES
 from compose.status import BROKEN_PIPE, BUG, FAILED, USER_ERROR, UserError
 from protocol import limits
 from protocol.files import said
+from protocol.spelling import did_you_mean
 from protocol.terminal import one_line, say
 
 
@@ -34,7 +37,16 @@ class _Parser(argparse.ArgumentParser):
     """Says what is wrong in one line."""
 
     def error(self, message: str) -> NoReturn:
+        wrong = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
+        if wrong is not None:
+            message += did_you_mean(wrong[1], re.findall(r"[\w.-]+", wrong[2]))
         self.exit(USER_ERROR, one_line(f"{self.prog}: {message}") + "\n")
+
+    def refuse(self, unknown: Sequence[str]) -> NoReturn:
+        """Words of the command line that mean nothing: the first option among them may be mistyped."""
+        first = next((word for word in unknown if word.startswith("-")), "").partition("=")[0]
+        known = [flag for flag in self._option_string_actions if flag.startswith("--")]
+        self.error(f"unrecognized arguments: {' '.join(unknown)}{did_you_mean(first, known)}")
 
 
 class _Version(argparse.Action):
@@ -52,7 +64,9 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     """Parse, and do as told; ends the process."""
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115  # closed by whoever started this
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
-    options = parser().parse_args(arguments)
+    options, unknown = parser().parse_known_args(arguments)
+    if unknown:
+        options.parser.refuse(unknown)
     try:
         limits.need_memory(limits.START_BYTES, "Tandem")
         status = import_module(f"compose.commands.{options.command}").main(options)
@@ -98,7 +112,9 @@ def parser() -> argparse.ArgumentParser:
     commands = tandem.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
 
     def command(name: str, what: str) -> argparse.ArgumentParser:
-        return commands.add_parser(name, help=what, description=what)
+        added = commands.add_parser(name, help=what, description=what)
+        added.set_defaults(parser=added)
+        return added
 
     run = command("run", "Play a mission on this machine.")
     _add_scenario(run)
@@ -277,6 +293,7 @@ def _add_robot(parser: argparse.ArgumentParser) -> None:
     _add_reaching(parser)
     _add_listening(parser, "where the peer reaches it, such as tcp/127.0.0.1:7447; as often as you like")
     parser.add_argument("--run", type=name, metavar="NAME", help="what the mission is called (its name)")
+    parser.add_argument("--fsync", action="store_true", help="the journals survive a power cut")
     parser.add_argument(
         "--wait", type=positive, default=60.0, metavar="S", help="how long to look for the peer (60)"
     )

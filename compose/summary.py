@@ -93,8 +93,21 @@ def _robot_summary(record: Record, place: int) -> dict[str, Any]:
         "heading_sigma_rad": covariance.heading_sigma if covariance is not None else None,
         "nees": claimed.nees if claimed is not None else None,
         **{field: getattr(farewell, field, None) for field in _SAID},
+        "no_farewell": None if farewell is not None else _why_none(record, robot),
         "deadlines_missed": sum([robot not in moment.drives for moment in record.moments[:-1]]),
     }
+
+
+def _why_none(record: Record, robot: str) -> str:
+    """Why there is no Farewell of `robot`, as far as the world's journal tells."""
+    if record.end is None:
+        return "the record breaks off"
+    latest = max([moment.truth.tick for moment in record.moments if robot in moment.drives], default=None)
+    if latest is None:
+        return "no Drive of it came in time"
+    if latest < record.end.tick:
+        return f"its last Drive in time was of tick {latest} of {record.end.tick}"
+    return "it did not answer the End"
 
 
 _SAID = [field for field in Farewell.__struct_fields__ if field != "robot"]

@@ -65,7 +65,7 @@ def conclude(
     else:
         from compose import show  # noqa: PLC0415  # as above
 
-        show.result(told)
+        show.result(told, getattr(options, "rate", None))
     if folder is not None and options.out is not None:
         sys.stdout.flush()
         try:

@@ -68,6 +68,10 @@ ASSURED = "max_ticks = 1_000_000\n" + PAPER_1.replace('"paper"', '"assured"').re
     "10.0, 0.0", "60.0, 0.0"
 ).replace("11.3", "61.3")
 """of the variant for which standing still is no harm, however long a busy machine makes robots stand"""
+REAL_TIME = ASSURED.replace("1_000_000", "600")
+"""the same for `--rate 20`: it is over after half a minute, whatever the robots come to by then"""
+OVER = (0, 1)
+"""statuses of a mission that has come to its end; in real time nobody promises which"""
 ENDLESS = (
     LONG.replace("60.0", "400.0").replace("max_speed = 1.0", "max_speed = 0.1").replace('"long"', '"endless"')
 )

@@ -7,6 +7,8 @@ import os
 import re
 import signal
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +17,9 @@ from signal import SIGINT, SIGKILL, SIGSTOP, SIGTERM
 
 import pytest
 
+from compose.beside import Beside, stay
 from compose.local import free_endpoint
+from protocol.inbox import Arrival, Inbox
 from protocol.refusal import MUTE
 from tests.commands import (
     ENDLESS,
@@ -247,3 +251,28 @@ def test_processes_end_when_their_launcher_is_killed(endless: Path, tmp_path: Pa
         run.until_written(out / "world.journal", 10_000)
         os.kill(run.pid, SIGKILL)
         until(lambda: not processes_of(out), "all have ended")
+
+
+# --- what stays -------------------------------------------------------------------------------------
+
+
+def test_a_page_that_stays_is_not_ended_by_another_process_that_ends_late() -> None:
+    """It ends by a second byte, which comes once the end of a late agent has been taken from the inbox."""
+    script = "import sys; sys.stdin.buffer.read(2)"
+    with subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE) as process:
+
+        class Watched(Inbox):
+            taken = 0
+
+            def next(self, timeout: float | None) -> Arrival:
+                self.taken += 1
+                if self.taken == 2 and process.stdin is not None:
+                    process.stdin.write(b".")
+                    process.stdin.flush()
+                return super().next(timeout)
+
+        inbox = Watched("test")
+        inbox.put("ended", "agent a")
+        stay([Beside("the page", process, "here")], inbox)
+        assert inbox.taken == 2
+        assert process.poll() == 0

@@ -47,7 +47,7 @@ from protocol import journal
 from protocol.messages import Estimate, Sense
 from protocol.motion import wrap
 from protocol.wire import decode
-from tests.commands import ASSURED, BOUND_S, Command, tandem
+from tests.commands import BOUND_S, OVER, REAL_TIME, Command, tandem
 from tests.doctor import complaints
 from tests.replays import journals_of, killed
 from world.referee import errors
@@ -453,7 +453,7 @@ STANDING = {"/stage", "/a/pose", "/b/trail", "/contact", "/a/belief", "/journal/
 
 
 async def watched(port: int, until: str) -> dict[str, str]:
-    """Topics with their schemas, once a log line says `until`, and something was told on all of STANDING."""
+    """Topics with their schemas, once a log line begins with `until`, and all of STANDING was told."""
     async with websockets.connect(
         f"ws://127.0.0.1:{port}",
         subprotocols=[websockets.Subprotocol("foxglove.sdk.v1")],
@@ -464,7 +464,7 @@ async def watched(port: int, until: str) -> dict[str, str]:
         topics: dict[int, dict[str, Any]] = {}
         told: set[str] = set()
         lines: list[str] = []
-        while until not in lines or not told >= STANDING:
+        while not any(line.startswith(until) for line in lines) or not told >= STANDING:
             frame = await link.recv()
             if isinstance(frame, str):
                 said = json.loads(frame)
@@ -495,16 +495,16 @@ def log_message(channel: dict[str, Any], data: bytes) -> str:
 def test_a_viewer_sees_a_run_while_it_is_played_and_to_its_end(tmp_path: Path) -> None:
     port = int(free_endpoint().rsplit(":", 1)[1])
     out = tmp_path / "out"
-    (tmp_path / "assured.toml").write_text(ASSURED)
+    (tmp_path / "assured.toml").write_text(REAL_TIME)
     scenario = tmp_path / "assured.toml"
     with Command("run", scenario, "-q", "--rate", "40", "--foxglove", str(port), "--out", out) as played:
         played.until_says(f"what Foxglove's viewers show at ws://127.0.0.1:{port}")
-        topics = asyncio.run(asyncio.wait_for(watched(port, "The mission ends: localised"), BOUND_S))
+        topics = asyncio.run(asyncio.wait_for(watched(port, "The mission ends: "), BOUND_S))
         played.until_says("until Ctrl-C")
         assert played.tell(Signals.SIGINT)
         ended = played.ended()
-    assert ended.status == 0
-    assert "\nlocalised after " in ended.out
+    assert ended.status in OVER
+    assert re.search(r"\n(localised|undecided) after ", ended.out)
     assert topics["/tf"] == "foxglove.FrameTransforms"
     assert topics["/journal/agent-a/sense"] == "tandem.Sense"
     again, _ = replay(out)

@@ -36,10 +36,17 @@ class Ending:
         self._known: int | None = None
         """in which tick all was known"""
 
-    def told(self, report: Report) -> None:
-        """The peer has said `report`."""
+    def told(self, report: Report) -> bool:
+        """The peer has said `report`; whether anything follows from it."""
+        before = self._peers, self._heard
         self._acknowledged = max(self._acknowledged, report.heard)
         self._peers = self._peers or report.verdict
+        return (self._peers, self._heard) != before
+
+    @property
+    def _heard(self) -> bool:
+        """Whether the peer knows this robot's verdict."""
+        return self.verdict is not None and self._acknowledged >= self._at
 
     def after(self, tick: int, drive: Drive | None, *, peer_there: bool) -> End | None:
         """The End, if `tick` was the last, in which the robot gave `drive`; else none."""
@@ -49,9 +56,8 @@ class Ending:
             if tick >= self._max_ticks:
                 return End(tick, "undecided", f"max_ticks: {self._me} not localised by then")
             return None
-        acknowledged = self._acknowledged >= self._at
         gone = not peer_there and self._peers is not None
-        if self._known is None and self._peers is not None and (acknowledged or gone):
+        if self._known is None and self._peers is not None and (self._heard or gone):
             self._known = tick
         if self._known is not None and tick >= self._known + LAST_WORDS:
             return self._end(tick)

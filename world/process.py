@@ -20,6 +20,7 @@ import zenoh
 from protocol import keys, session
 from protocol.inbox import NOTHING, Arrival, Inbox
 from protocol.messages import Drive, End, Farewell, Message, Sense, Truth
+from protocol.spelling import did_you_mean
 from protocol.wire import MalformedFrame, decode, encode
 from world.course import Course
 from world.referee import Judgement
@@ -78,6 +79,8 @@ class WorldProcess:
         """when a robot last appeared, or answered something new"""
         self._late = 0
         """Drives of ticks that are over"""
+        self._latest: dict[str, int] = {}
+        """of each robot: the tick of the latest Drive that came, in time or not"""
         self._truth_wanted = False
         self._mute = math.inf
         """when its link counts as lost, if nothing comes until then"""
@@ -131,6 +134,7 @@ class WorldProcess:
         self._parting = time.monotonic() if self._parting is None else self._parting
         self.playing_s = self._parting - self._began if self._began is not None else 0.0
         course.farewells(self._farewells(end, expected))
+        self._say_who_gave_none()
         self._put({robot: encode(farewell) for robot, farewell in course.parted.items()})
         if refused := self._inbox.refused.total():
             late = f", and left aside {self._late} of ticks past" if self._late else ""
@@ -232,6 +236,8 @@ class WorldProcess:
         drive = self._accepted(arrival, Drive)
         if not isinstance(drive, Drive):
             return None
+        if drive.tick <= self._course.tick:
+            self._latest[drive.robot] = drive.tick
         if drive.tick == self._course.tick:
             return drive
         if drive.tick > self._course.tick:
@@ -244,6 +250,26 @@ class WorldProcess:
         missing = [robot for robot in self._robots if robot not in drives]
         names = ", ".join(robot if robot in self._alive else f"{robot} (not there)" for robot in missing)
         return f"no answer from {names} at tick {self._course.tick} for {self._patience:g} s"
+
+    def _say_who_gave_none(self) -> None:
+        """Tell of which robots there is no Farewell, and why."""
+        reasons: dict[str, list[str]] = {}
+        for robot in self._robots:
+            if robot not in self._course.parted:
+                reasons.setdefault(self._why_none(robot), []).append(robot)
+        for reason, robots in reasons.items():
+            self._inbox.say(f"no Farewell of {', '.join(robots)}: {reason}")
+
+    def _why_none(self, robot: str) -> str:
+        latest = self._latest.get(robot)
+        if robot not in self._alive:
+            return "not there" if latest is None else f"gone; the last Drive was of tick {latest}"
+        if latest is None:
+            return "there, but no Drive has come"
+        if latest < self._course.tick:
+            slower = "; a lower --rate leaves more time for each tick" if self._period is not None else ""
+            return f"behind, at tick {latest} of {self._course.tick}{slower}"
+        return "no answer to the End"
 
     # --- beside the tick ---
 
@@ -258,7 +284,8 @@ class WorldProcess:
 
     def _brief(self, robot: str) -> Message | str:
         if robot not in self._robots:
-            return f"this world has no robot '{robot}'; it has {', '.join(self._robots)}"
+            near = did_you_mean(robot, self._robots)
+            return f"this world has no robot '{robot}'; it has {', '.join(self._robots)}{near}"
         return self._scenario.briefing(robot, self._period)
 
     def _farewells(self, end: End, expected: Collection[str]) -> list[Farewell]:
@@ -289,7 +316,9 @@ class WorldProcess:
             if arrival.topic == "alive":
                 self._put_again(frames, [arrival.source.robot])
             if arrival.topic == "drive":
-                farewell = self._accepted(arrival, Drive | Farewell)
-                if isinstance(farewell, Farewell):
-                    said[farewell.robot] = farewell
+                last = self._accepted(arrival, Drive | Farewell)
+                if isinstance(last, Farewell):
+                    said[last.robot] = last
+                elif last is not None and last.tick <= end.tick:
+                    self._latest[last.robot] = last.tick
             now = time.monotonic()

@@ -15,6 +15,7 @@ from compose.audit.case import Testimony, other_versions, testimony_of
 from compose.audit.conduct import decision, limits, log
 from compose.audit.findings import Checks, Findings, findings_of
 from compose.audit.journals import broken_off, whole
+from compose.audit.settings import briefing
 from compose.audit.wires import report
 from compose.robots import agree
 from protocol.journal import CorruptJournal
@@ -41,7 +42,7 @@ def order(alone: Alone) -> Checks:
             yield whole(robot, testimony.past, step, excused=True)
 
 
-RULES: tuple[Callable[[Alone], Checks], ...] = (order, report, decision, limits, log)
+RULES: tuple[Callable[[Alone], Checks], ...] = (order, briefing, report, decision, limits, log)
 """each by its name; where one violation follows from another, it comes later"""
 
 

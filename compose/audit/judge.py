@@ -13,12 +13,14 @@ from compose.audit.conduct import decision, limits, log
 from compose.audit.findings import Checks, Findings, findings_of
 from compose.audit.journals import briefing, order
 from compose.audit.radio import befallen, faults
+from compose.audit.settings import scenario
 from compose.audit.wires import contact, report, sense
 from compose.record import WORLD_JOURNAL, books
 from protocol.environment import of_world, otherwise
 
 RULES: tuple[Callable[[Case], Checks], ...] = (
     order,
+    scenario,
     briefing,
     sense,
     faults,

@@ -2,31 +2,33 @@
 
 from __future__ import annotations
 
-import io
 import shlex
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 from rich import progress as bars
-from rich.box import SIMPLE_HEAD
-from rich.cells import cell_len
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from compose import layout
 from compose.campaign.cells import Cell
 from compose.campaign.folder import CELLS
 from compose.campaign.run import SUMMARY, Progress, Results
 from compose.campaign.summary import Counted, noted
-from compose.show import UNLIMITED, console
 from protocol.terminal import say
 
 RATE_OVER_S = 10.0
 """what the rate is averaged over"""
 OUTCOMES = ("localised", "undecided", "alarm", "wrong", "failed")
-LEGEND = "rate: 95 % interval (Wilson); ticks: of trials that localised; error: m, of the worse robot"
+NOTES = (
+    ("rate_low", "rate: 95 % interval (Wilson)"),
+    ("p50", "p50, p95, max: ticks of trials that localised"),
+    ("error p50", "error: m, of the worse robot"),
+    ("within", "within: claims within 3 x accuracy"),
+    ("nees low", "nees: in the mean, and the 99 % band of true covariances"),
+)
+"""each with the column that it is a footnote to"""
 WIDEST = (*OUTCOMES, "clean", "rate", "rate_low", "rate_high", "p50", "p95", "max", "error p50", "error max")
 CHOICES = (
     ("trials", *WIDEST),
@@ -38,9 +40,6 @@ CHOICES = (
 """of the columns; the first that fits"""
 OF_NOISE = ("within", "nees", "nees low", "nees high")
 """more of them, where covariances are claimed"""
-NOISE_LEGEND = "within: claims within 3 x accuracy; nees: in the mean, and the 99 % band of true covariances"
-
-
 MOST_ROWS = 100
 """cells that are listed whether or not all was well"""
 
@@ -84,10 +83,10 @@ def show(results: Results, out: Path, *, quiet: bool) -> None:
         say(_audited(results))
     if quiet:
         return
-    legend = [LEGEND, NOISE_LEGEND] if _noisy(results) else [LEGEND]
     shown = len(_shown(results))
     if shown:
-        say("", *_lines(results), "", *legend)
+        lines, columns = _lines(results)
+        say("", *lines, "", *layout.notes(NOTES, columns))
     if shown < len(results.cells):
         say(f"all is well in {len(results.cells) - shown} cells, not listed: {out / SUMMARY}")
     for index, figures in results.figures.items():
@@ -112,15 +111,14 @@ def _audited(results: Results) -> str:
     return f"audited: {audited} of {len(results.table)} trials, {clean} clean{first}"
 
 
-def _lines(results: Results) -> list[str]:
-    """The table, as wide as there is room."""
-    room = Console().width if sys.stdout.isatty() else UNLIMITED
-    lines: list[str] = []
+def _lines(results: Results) -> tuple[list[str], Sequence[str]]:
+    """The table, as wide as there is room, and its columns."""
+    columns: Sequence[str] = ()
     for columns in _choices(results):
-        lines = _table(results, columns)
-        if max(map(cell_len, lines)) <= room:
-            break
-    return lines
+        lines = layout.lines(_table(results, columns))
+        if layout.fits(lines):
+            return lines, columns
+    return layout.lines(_table(results, columns), layout.room()), columns
 
 
 def _shown(results: Results) -> list[Cell]:
@@ -148,21 +146,13 @@ def _choices(results: Results) -> tuple[tuple[str, ...], ...]:
     return tuple((*columns, *OF_NOISE) for columns in CHOICES) + CHOICES[-1:]
 
 
-def _table(results: Results, columns: Sequence[str]) -> list[str]:
-    axes = results.campaign.axes
-    table = Table("cell", box=SIMPLE_HEAD, pad_edge=False)
-    for axis in axes:
-        table.add_column(axis.name.rpartition(".")[2])
-    for heading in columns:
-        table.add_column(heading, justify="right")
+def _table(results: Results, columns: Sequence[str]) -> Table:
+    axes = [axis.name.rpartition(".")[2] for axis in results.campaign.axes]
+    rows = []
     for cell in _shown(results):
-        figures = results.figures[cell.index]
-        said = _figures(figures)
-        table.add_row(*_axes(results, cell), *[said[column] for column in columns])
-    page = console(width=UNLIMITED, file=io.StringIO())
-    with page.capture() as capture:
-        page.print(table)
-    return [line.rstrip() for line in capture.get().splitlines() if line.strip()]
+        said = _figures(results.figures[cell.index])
+        rows.append([*_axes(results, cell), *[said[column] for column in columns]])
+    return layout.table(["cell", *axes], columns, rows)
 
 
 def _axes(results: Results, cell: Cell) -> list[str]:

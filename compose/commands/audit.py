@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import argparse
 
-from compose.audit.findings import Findings
+from msgspec.structs import astuple
+
+from compose import layout
+from compose.audit.findings import Befallen, Findings
 from compose.audit.judge import audit
 from compose.record import legible
 from compose.status import CLEAN, VIOLATED
@@ -28,11 +31,9 @@ def _show(findings: Findings) -> None:
     for one in findings.counts:
         say(f"{one.rule:10}{one.checks:>8}{one.violations:>12}")
     if findings.radio:
-        say("", f"{'link':16}{'sent':>8}{'heard':>8}{'late':>8}{'twice':>8}{'damaged':>9}{'lost':>8}")
-    for link in findings.radio:
-        say(
-            f"{link.link:16}{link.sent:>8}{link.heard:>8}{link.late:>8}{link.twice:>8}{link.damaged:>9}{link.lost:>8}"
-        )
+        rows = [[str(value) for value in astuple(link)] for link in findings.radio]
+        made = layout.table(["link"], Befallen.__struct_fields__[1:], rows)
+        say("", *layout.lines(made, layout.room()))
     if findings.rounding:
         say("", f"{len(findings.rounding)} checks differ by rounding alone: {findings.versions}")
     elif findings.violations and findings.versions is not None:

@@ -5,12 +5,15 @@ from __future__ import annotations
 import argparse
 from contextlib import closing
 
+from compose import layout
 from compose.conformance import judged
 from compose.driving import briefed, driver_class, made, mission, options_of
 from compose.exercise import Broken, Trial
 from compose.scenario import check_rate
 from compose.status import CLEAN, VIOLATED
-from protocol.terminal import say
+from protocol.terminal import one_line, say
+
+MARKED = len("wrong  ")
 
 
 def main(options: argparse.Namespace) -> int:
@@ -31,5 +34,6 @@ def main(options: argparse.Namespace) -> int:
             return VIOLATED
     found = judged(trial)
     for one in found:
-        say(f"wrong  {one.check}: {one.wrong}" if one.wrong else f"ok     {one.check}")
+        line = f"wrong  {one.check}: {one.wrong}" if one.wrong else f"ok     {one.check}"
+        say(*layout.wrapped(one_line(line), MARKED))
     return VIOLATED if any(one.wrong for one in found) else CLEAN

@@ -8,13 +8,16 @@ from collections.abc import Iterator
 
 import msgspec
 
-from compose import missions
+from compose import layout, missions
 from compose.linking import Unreached, linked
 from compose.missions import Mission, Participant
 from compose.reach import places
 from compose.status import ENDED, FAILED
-from protocol.terminal import say
+from protocol.terminal import one_line, say
 from protocol.wire import VERSION
+
+INDENT = 4
+"""of what is too long for a line"""
 
 
 def main(options: argparse.Namespace) -> int:
@@ -37,7 +40,8 @@ def main(options: argparse.Namespace) -> int:
         say(*json.dumps({"missions": told}, indent=2).replace("\x7f", "\\u007f").splitlines())
     else:
         for at, mission in found:
-            say(*_lines(at, mission, options.wait))
+            for line in _lines(at, mission, options.wait):
+                say(*layout.wrapped(one_line(line), INDENT))
     return status
 
 

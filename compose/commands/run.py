@@ -21,6 +21,7 @@ from compose.stop import stop_by_signal
 from compose.telling import break_off, conclude, progress
 from protocol.inbox import Inbox, Interrupted
 from protocol.journal import CannotRecord
+from protocol.spelling import did_you_mean
 from world.scenario import Scenario
 
 
@@ -53,8 +54,9 @@ def _kills(options: argparse.Namespace, found: Setting, scenario: Scenario) -> t
     ids = [robot.id for robot in scenario.robots]
     for kill in options.kill:
         if kill.who not in (*ids, WORLD):
+            near = did_you_mean(kill.who, [*ids, WORLD])
             raise UserError(
-                f"--kill: {kill.text}: there is no '{kill.who}'; there are {', '.join(ids)}, {WORLD}"
+                f"--kill: {kill.text}: there is no '{kill.who}'; there are {', '.join(ids)}, {WORLD}{near}"
             )
     return (*found.kills(scenario.seed), *options.kill)
 

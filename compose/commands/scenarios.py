@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from itertools import takewhile
 from pathlib import Path
 
+from compose import layout
 from compose.scenario import shipped
 from compose.status import ENDED
 from protocol.terminal import say
@@ -24,7 +25,8 @@ def main(_options: argparse.Namespace) -> int:
 def _list(files: Mapping[str, Path]) -> None:
     width = max(map(len, files))
     for name, path in files.items():
-        say(f"{name:{width}} {_sentence(path.read_text(encoding='utf-8'))}")
+        line = f"{name:{width}} {_sentence(path.read_text(encoding='utf-8'))}"
+        say(*layout.wrapped(line, width + 1))
 
 
 def _sentence(text: str) -> str:
