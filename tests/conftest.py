@@ -2,11 +2,14 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+from playwright.sync_api import Browser
 
+from tests.browser import Open, chromium, pages
 from tests.commands import tandem
 
 settings.register_profile("tandem", derandomize=True, deadline=None, database=None)
@@ -31,3 +34,17 @@ def mine(keys: Path, tmp_path: Path) -> Path:
     """Those of a, to be spoilt."""
     shutil.copytree(keys / "agent-a", tmp_path / "mine")
     return tmp_path / "mine"
+
+
+@pytest.fixture(scope="module")  # no longer: playwright's event loop would be in the way of others
+def browser() -> Iterator[Browser]:
+    """The test skips where there is none."""
+    with chromium() as found:
+        yield found
+
+
+@pytest.fixture
+def opened(browser: Browser) -> Iterator[Open]:
+    """Opens pages; in the end none must have complained, or asked anybody but the server."""
+    with pages(browser) as opens:
+        yield opens
