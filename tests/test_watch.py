@@ -422,21 +422,37 @@ def test_the_page_ends_with_whoever_launched_it(tmp_path: Path) -> None:
         until(lambda: not processes_of(tmp_path / "record"), "nobody is left")
 
 
-def test_the_server_answers_to_its_own_name_only_and_seals_what_it_sends(address: str) -> None:
+def test_the_server_answers_its_own_page_only_and_seals_what_it_sends(address: str) -> None:
     host = address.removeprefix("http://").rstrip("/")
-    connection = http.client.HTTPConnection(host, timeout=BOUND_S)
-    connection.request("GET", "/", headers={"Host": "elsewhere.example"})
-    assert connection.getresponse().status == 400
-    connection.close()
-    connection.request("GET", "/")
-    answer = connection.getresponse()
-    assert answer.status == 200
-    assert (answer.getheader("content-security-policy") or "").startswith("default-src 'self'")
-    connection.close()
-    for path in ("/page/../server.py", "/page/%2e%2e/server.py", "/api/figures/x.svg", "/api/shows/none"):
-        connection.request("GET", path)
-        assert connection.getresponse().status == 404
+    port = host.rpartition(":")[2]
+
+    def asked(path: str, **headers: str) -> http.client.HTTPResponse:
+        connection = http.client.HTTPConnection(host, timeout=BOUND_S)
+        connection.request("GET", path, headers=headers)
+        answer = connection.getresponse()
+        answer.read()
         connection.close()
+        return answer
+
+    for headers, status in (
+        ({}, 200),
+        ({"Host": f"localhost:{port}"}, 200),
+        ({"Origin": f"http://{host}"}, 200),
+        ({"Host": "elsewhere.example"}, 403),
+        ({"Host": f"elsewhere.example:{port}", "Origin": f"http://elsewhere.example:{port}"}, 403),
+        ({"Origin": "http://elsewhere.example"}, 403),
+        ({"Origin": "http://127.0.0.1:1"}, 403),
+        ({"Origin": "null"}, 403),
+    ):
+        for path in ("/", "/api/shows/paper-1"):
+            answer = asked(path, **headers)
+            assert (headers, answer.status) == (headers, status)
+            policy = answer.getheader("content-security-policy") or ""
+            assert policy.startswith("default-src 'self'")
+            assert "frame-ancestors 'none'" in policy
+            assert answer.getheader("cross-origin-resource-policy") == "same-origin"
+    for path in ("/page/../server.py", "/page/%2e%2e/server.py", "/api/figures/x.svg", "/api/shows/none"):
+        assert asked(path).status == 404
 
 
 def test_ctrl_c_ends_the_page_with_somebody_watching(paper_1: Path) -> None:
@@ -490,7 +506,7 @@ def test_a_page_on_every_address_is_told_of_and_answers_to_the_names_of_this_mac
         assert address.startswith("http://127.0.0.1:")
         with urlopen(address, timeout=BOUND_S) as answer:
             assert answer.status == 200
-        with pytest.raises(HTTPError, match="400"):
+        with pytest.raises(HTTPError, match="403"):
             urlopen(Request(address, headers={"Host": "robot.example"}), timeout=BOUND_S)
 
 

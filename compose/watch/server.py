@@ -9,7 +9,7 @@ import asyncio
 import ipaddress
 import signal
 import socket
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Collection
 from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
@@ -17,14 +17,15 @@ from typing import Any
 import msgspec
 import uvicorn
 from starlette.applications import Starlette
+from starlette.datastructures import Headers
 from starlette.middleware import Middleware
-from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, Response, StreamingResponse
+from starlette.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from compose.origin import LOOPBACK_NAMES, refusal
 from compose.scene.recorded import scenes
 from compose.status import UserError
 from compose.watch import campaign
@@ -40,12 +41,14 @@ IDLE_S = 0.5
 PLAYERS_AT_ONCE = 4000
 """robots times ticks in one answer: some megabytes, and some hundredths of a second of work"""
 HEADERS = {
-    b"content-security-policy": b"default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:",
+    b"content-security-policy": b"default-src 'self'; style-src 'self' 'unsafe-inline'; "
+    b"img-src 'self' data:; frame-ancestors 'none'",
+    b"cross-origin-resource-policy": b"same-origin",
     b"x-content-type-options": b"nosniff",
     b"referrer-policy": b"no-referrer",
     b"cache-control": b"no-store",
 }
-"""the page may ask nobody else for anything"""
+"""the page may ask nobody else for anything, and no other page may show it, or a part of it"""
 
 
 class CannotServe(OSError):
@@ -113,10 +116,26 @@ def application(site: Site, address: str = LOOPBACK) -> Starlette:
             Mount("/page", StaticFiles(directory=PAGE)),
         ],
         middleware=[
-            Middleware(TrustedHostMiddleware, allowed_hosts=[*{LOOPBACK, "localhost", host(address)}]),
             Middleware(_Sealed),
+            Middleware(_Own, names={*LOOPBACK_NAMES, host(address)}),
         ],
     )
+
+
+class _Own:
+    """Refuses what pages of others ask."""
+
+    def __init__(self, app: ASGIApp, names: Collection[str]) -> None:
+        self._app = app
+        self._names = names
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        headers = Headers(scope=scope)
+        why = refusal(headers.getlist("host"), headers.getlist("origin"), self._names)
+        if why is not None:
+            await PlainTextResponse(f"{why}\n", 403)(scope, receive, send)
+        else:
+            await self._app(scope, receive, send)
 
 
 class _Sealed:
