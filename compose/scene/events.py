@@ -52,7 +52,7 @@ def events(
 def _presence(who: str | None, before: Facts | None, now: Facts) -> Iterator[Event]:
     name = who or "The world"
     if who in now.down and (before is None or who not in before.down - before.back):
-        yield Event(now.tick, "down", who, f"{name} is down: its process has ended")
+        yield Event(now.tick, "down", who, f"{name} is down: its process is gone")
     if who in now.back:
         yield Event(now.tick, "back", who, f"{name} is back: its process runs again")
 

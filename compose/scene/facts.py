@@ -64,14 +64,14 @@ class Gathering:
         self.true = False
         """whether the truth of any tick is known"""
         self._seen: set[str | None] = set()
-        self._gone: set[str | None] = set()
-        """whose process was seen, and whose is not there any more; none is the world's"""
+        self.gone: set[str | None] = set()
+        """those whose process was seen, and is not there any more; none is the world's"""
         self.touched: int | None = None
         """the earliest tick of which something has become known since somebody last set this to none"""
 
     def at(self, tick: int) -> Facts:
         """What is known of `tick`, to be added to."""
-        down = self._gone if tick > self.last else ()
+        down = self.gone if tick > self.last else ()
         self.last = max(self.last, tick)
         if self.touched is None or tick < self.touched:
             self.touched = tick
@@ -89,11 +89,11 @@ class Gathering:
             return
         if there:
             self._seen.add(who)
-            if who in self._gone:
-                self._gone.remove(who)
+            if who in self.gone:
+                self.gone.remove(who)
                 self.at(self.last).back.add(who)
-        elif who in self._seen - self._gone and self.end is None and who not in self.farewells:
-            self._gone.add(who)
+        elif who in self._seen - self.gone and self.end is None and who not in self.farewells:
+            self.gone.add(who)
             now = self.at(self.last)
             now.down.add(who)
             now.back.discard(who)

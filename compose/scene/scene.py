@@ -100,7 +100,7 @@ def _player(seat: Seat, now: Facts) -> Player:
     sentence = f"{robot} has not answered"
     down = robot in now.down - now.back
     if down:
-        sentence = f"{robot} is down: its process has ended"
+        sentence = f"{robot} is down: its process is gone"
     elif drive is not None:
         sentence = doing(seat, drive.phase, drive.state, drive.verdict)
     elif robot in now.late:

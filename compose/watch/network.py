@@ -44,6 +44,8 @@ class Heard(Show):
         super().__init__(run, Gathering())
         self.stage = None
         self.live = True
+        self._robots: dict[str, bool] = {}
+        """those whose tokens have appeared or gone since the last poll: whether they are there"""
 
     def take(self, frame: bytes) -> None:
         """Fold in a frame; one that is malformed is nothing that a viewer could refuse."""
@@ -64,11 +66,19 @@ class Heard(Show):
         robots = len(self.stage.robots) if self.stage is not None else 1
         while len(self.known.ticks) * robots > TICKS_KEPT:
             del self.known.ticks[next(iter(self.known.ticks))]
+        for robot, there in self._robots.items():
+            if self.live:  # without its world, who may be the router, nobody is heard of
+                self.known.present(robot, there)
+        self._robots.clear()
         self.revised()
 
-    def there(self, alive: bool) -> None:
-        """Whether its world shows itself."""
+    def there(self, key: str, alive: bool) -> None:
+        """Fold in whether its world, or a robot, shows itself by the token at `key`."""
+        if key != keys.world_alive(self.name):
+            self._robots[keys.robot_of(key)] = alive
+            return
         self.live = alive and self.known.end is None
+        self.known.present(None, alive)
 
 
 class Listener:
@@ -103,7 +113,7 @@ class Listener:
             run = keys.run_of(arrival.key)
             match arrival.topic:
                 case "alive" | "gone":
-                    self._show(run).there(arrival.topic == "alive")
+                    self._show(run).there(arrival.key, arrival.topic == "alive")
                 case _:
                     self._show(run).take(arrival.frame)
         while True:
@@ -149,6 +159,7 @@ class Listener:
         for key in LISTENED:
             link.declare_subscriber(key, self._hand_over(heard))
         session.watch_liveliness(link, keys.world_alive("*"), self._inbox)
+        session.watch_liveliness(link, keys.robot_alive("*", "*"), self._inbox)
         told: Any = link.liveliness()
         told.declare_subscriber(
             keys.robot_alive("*", "*"), lambda sample: appeared.put(str(sample.key_expr)), history=True

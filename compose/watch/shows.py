@@ -57,9 +57,12 @@ class Show(ABC):
 
     @property
     def head(self) -> int:
-        """The latest tick to show: while more may come, one in which every robot has answered."""
+        """The latest tick to show: while more may come, one in which every robot has answered.
+
+        While a process is gone, nothing more comes, but that it is.
+        """
         last = self.known.last
-        if not self.live or self.stage is None:
+        if not self.live or self.stage is None or self.known.gone:
             return last
         robots = len(self.stage.robots)
         for tick in range(last, max(last - UNANSWERED, -1), -1):

@@ -55,14 +55,14 @@ export class Signals {
     pen.lineWidth = 1.5;
     pen.setLineDash([6, 5]);
     for (const pose of poses) {
-      const [x, y] = this.plane.at(pose);
       pen.beginPath();
-      pen.arc(x, y, radius, 0, TAU);
+      pen.arc(...this.plane.at(pose), radius, 0, TAU);
       pen.stroke();
-      label(pen, `${contact[0]}: ${metres(contact[1])}`, x, y + radius + 14, look.link, "center", look);
     }
-    pen.globalAlpha = 1;
     pen.setLineDash([]);
+    const [x, y] = this.plane.at(poses[0]);
+    label(pen, `${contact[0]}: ${metres(contact[1])}`, x, y + radius + 14, look.link, "center", look);
+    pen.globalAlpha = 1;
   }
 
   contact(view, robot) {
