@@ -96,7 +96,9 @@ class Card {
     this.root.classList.toggle("down", Boolean(player.down));
     this.phase.textContent = `phase ${phase}: ${PHASES[phase]}${player.down ? "; down" : ""}`;
     if (this.doing.textContent !== player.doing) this.doing.textContent = player.doing;
-    this.error.textContent = truth && player.pose && held?.world.length ? error(held, player.pose) : "";
+    const [off, range] = truth && player.pose && held?.world.length ? error(held, player.pose) : ["", ""];
+    this.error.textContent = off;
+    this.error.title = range;
     this.#row("senses", inputs(player, this.robot));
     this.#row("hears", hears(player, this.robot));
     this.#row("decides", drive ? decides(drive) : "–");
@@ -121,11 +123,11 @@ class Card {
   }
 }
 
-/** How far it is from where it takes itself to be; of several poses none of which leads, from the nearest to the farthest. */
+/** How far it is from where it takes itself to be; of several poses none of which leads, from the farthest. */
 function error(held, pose) {
-  const off = held.world.map((one) => distance(one, pose));
-  if (leads(held)) return `${metres(off[0])} off`;
-  return `${metres(Math.min(...off))} to ${metres(Math.max(...off))} off, of ${off.length} poses`;
+  const off = held.world.map((one) => distance(one, pose)), least = metres(Math.min(...off)), most = metres(Math.max(...off));
+  if (leads(held)) return [`${metres(off[0])} off`, ""];
+  return [`up to ${most} off`, `${least} to ${most}: ${off.length} poses are possible, and none is likelier than the others together`];
 }
 
 function inputs(player, robot) {

@@ -63,7 +63,7 @@ export const MEANINGS = [
   ["a filled robot", "where it truly is; a pointed one plays a, a round one b"],
   ["an outlined robot", "where it may be, for all it knows; the paler, the less likely; crossed out: ruled out just now"],
   ["an ellipse", "three sigma of the likeliest"],
-  ["a hollow robot, crossed out", "its process is gone; where it is, and what it knows, stand as they were"],
+  ["a hollow robot, crossed out", "its process is gone"],
   ["a line to an anchor", "a range, in the tick in which it is measured"],
   ["a double line", "contact; the dots on it are reports: filled heard, with a tail late, hollow lost, crossed damaged"],
   ["a dotted trail", "phase 1; a thin one phase 2, a thick one phase 3"],
