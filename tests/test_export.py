@@ -545,6 +545,9 @@ def test_of_web_pages_only_foxglove_s_app_and_those_named_see_a_run() -> None:
                 heads = {"Host": f"{host}:{port}"} | ({"Origin": origin} if origin is not None else {})
                 assert (origin, host, asked(port, heads)) == (origin, host, status if known else 403)
         assert asked(port, {"Host": f"127.0.0.1:{port}", "Upgrade": "h2c"}) == 403
+        with pytest.raises(ConnectionError):
+            asked(port, {"X-Much": "x" * 100_000})
+        assert asked(port, {}) == 101
         # the server of the SDK is nowhere that a page could know
         listening = {place for place in listened_by(processes_of(str(port))) if place[1] != port}
         assert all(host.startswith("127.") and host != "127.0.0.1" for host, _ in listening)

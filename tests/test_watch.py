@@ -498,7 +498,7 @@ def test_a_port_that_is_taken_is_one_line(paper_1: Path) -> None:
             assert ended.err == said
 
 
-def test_a_page_on_every_address_is_told_of_and_answers_to_the_names_of_this_machine(paper_1: Path) -> None:
+def test_a_page_on_every_address_is_told_of_and_answers_to_addresses_and_to_no_names(paper_1: Path) -> None:
     with Command("watch", paper_1, "--address", "0.0.0.0") as command:
         command.until_says("until Ctrl-C")
         assert "tandem watch: --address: whoever reaches 0.0.0.0 can watch\n" in command.err
@@ -506,6 +506,9 @@ def test_a_page_on_every_address_is_told_of_and_answers_to_the_names_of_this_mac
         assert address.startswith("http://127.0.0.1:")
         with urlopen(address, timeout=BOUND_S) as answer:
             assert answer.status == 200
+        for known in ("192.0.2.1", "192.0.2.1:8080", "[2001:db8::1]:8080", "localhost"):
+            with urlopen(Request(address, headers={"Host": known}), timeout=BOUND_S) as answer:
+                assert answer.status == 200
         with pytest.raises(HTTPError, match="403"):
             urlopen(Request(address, headers={"Host": "robot.example"}), timeout=BOUND_S)
 

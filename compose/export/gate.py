@@ -11,11 +11,11 @@ import asyncio
 import secrets
 import socket
 import threading
-from asyncio import StreamReader, StreamWriter
+from asyncio import LimitOverrunError, StreamReader, StreamWriter
 from collections.abc import Sequence
 from contextlib import closing, suppress
 
-from compose.origin import LOOPBACK_NAMES, refusal
+from compose.origin import refusal
 
 FOXGLOVE = ("https://app.foxglove.dev", "file://")
 """origins of Foxglove's own app, in a browser and installed; not `null`, which any page can have"""
@@ -51,7 +51,7 @@ class Gate:
         await server.serve_forever()
 
     async def _admit(self, reader: StreamReader, writer: StreamWriter) -> None:
-        with closing(writer), suppress(OSError, ValueError, EOFError, TimeoutError):
+        with closing(writer), suppress(OSError, EOFError, LimitOverrunError):
             head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), HEAD_S)
             why = self._refusal(head)
             if why is not None:
@@ -70,7 +70,7 @@ class Gate:
 
         if [value.lower() for value in values("upgrade")] != ["websocket"]:
             return "only viewers are served here, over WebSocket"  # so a connection has one head
-        return refusal(values("host"), values("origin"), LOOPBACK_NAMES, self._origins)
+        return refusal(values("host"), values("origin"), self._origins)
 
     async def _hand_on(self, head: bytes, reader: StreamReader, writer: StreamWriter) -> None:
         """Both ways, until one end closes; who reads slowly holds up the SDK's server, not the gate."""

@@ -1,4 +1,4 @@
-"""Who serves the page: on loopback if not told otherwise, to whoever asks for it by that name.
+"""Who serves the page: on loopback if not told otherwise, to programs and to its own page.
 
 It reads, and writes nothing.
 """
@@ -9,7 +9,7 @@ import asyncio
 import ipaddress
 import signal
 import socket
-from collections.abc import AsyncIterator, Callable, Collection
+from collections.abc import AsyncIterator, Callable
 from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from compose.origin import LOOPBACK_NAMES, refusal
+from compose.origin import refusal
 from compose.scene.recorded import scenes
 from compose.status import UserError
 from compose.watch import campaign
@@ -102,8 +102,8 @@ class _Answers:
         return StreamingResponse(told, media_type="text/event-stream")
 
 
-def application(site: Site, address: str = LOOPBACK) -> Starlette:
-    """The pages of `site`, for whoever asks for them by a name of loopback, or by `address`."""
+def application(site: Site) -> Starlette:
+    """The pages of `site`, for whoever asks for them by an address, and is no page of another."""
     answers = _Answers(site)
     return Starlette(
         routes=[
@@ -117,7 +117,7 @@ def application(site: Site, address: str = LOOPBACK) -> Starlette:
         ],
         middleware=[
             Middleware(_Sealed),
-            Middleware(_Own, names={*LOOPBACK_NAMES, host(address)}),
+            Middleware(_Own),
         ],
     )
 
@@ -125,13 +125,12 @@ def application(site: Site, address: str = LOOPBACK) -> Starlette:
 class _Own:
     """Refuses what pages of others ask."""
 
-    def __init__(self, app: ASGIApp, names: Collection[str]) -> None:
+    def __init__(self, app: ASGIApp) -> None:
         self._app = app
-        self._names = names
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         headers = Headers(scope=scope)
-        why = refusal(headers.getlist("host"), headers.getlist("origin"), self._names)
+        why = refusal(headers.getlist("host"), headers.getlist("origin"))
         if why is not None:
             await PlainTextResponse(f"{why}\n", 403)(scope, receive, send)
         else:
@@ -244,7 +243,7 @@ def serve(site: Site, taken: socket.socket, ready: Ready) -> None:
 async def _serve(site: Site, taken: socket.socket, ready: Ready) -> None:
     server = _Server(
         uvicorn.Config(
-            application(site, taken.getsockname()[0]),
+            application(site),
             log_config=None,
             lifespan="off",
             timeout_graceful_shutdown=1,
