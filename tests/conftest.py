@@ -9,7 +9,9 @@ import pytest
 from hypothesis import settings
 from playwright.sync_api import Browser
 
-from tests.browser import Open, chromium, pages
+from compose import inline
+from compose.scenario import load
+from tests.browser import Open, chromium, pages, watching
 from tests.commands import tandem
 
 settings.register_profile("tandem", derandomize=True, deadline=None, database=None)
@@ -48,3 +50,19 @@ def opened(browser: Browser) -> Iterator[Open]:
     """Opens pages; in the end none must have complained, or asked anybody but the server."""
     with pages(browser) as opens:
         yield opens
+
+
+@pytest.fixture(scope="module")
+def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The record of paper-1; nobody changes anything in it."""
+    folder = tmp_path_factory.mktemp("recorded") / "paper-1"
+    folder.mkdir()
+    inline.play(load("paper-1"), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def address(paper_1: Path) -> Iterator[str]:
+    """That of the page on the record of paper-1."""
+    with watching(paper_1) as (_, found):
+        yield found

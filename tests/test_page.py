@@ -6,7 +6,6 @@ Tests that ask for `opened` need a browser, and skip where there is none (tests/
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from signal import SIGKILL
@@ -14,9 +13,7 @@ from signal import SIGKILL
 import pytest
 from playwright.sync_api import Page, expect
 
-from compose import inline
 from compose.record import WORLD_JOURNAL, estimates, read
-from compose.scenario import load
 from protocol import journal
 from protocol.journal import Journal
 from protocol.messages import OfRobot, Sense
@@ -24,22 +21,6 @@ from protocol.wire import MAX_FRAME_BYTES, decode
 from tests.browser import Open, inks, picture, shot, until_shown, watching
 from tests.commands import ENDLESS, Command, until, world
 from world.referee import errors
-
-
-@pytest.fixture(scope="module")
-def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("page") / "paper-1"
-    folder.mkdir()
-    inline.play(load("paper-1"), folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def address(paper_1: Path) -> Iterator[str]:
-    """Of the page on the record of paper-1."""
-    with watching(paper_1) as (_, found):
-        yield found
-
 
 # --- live -------------------------------------------------------------------------------------------
 

@@ -12,7 +12,6 @@ import shutil
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from signal import SIGINT, SIGKILL
 from urllib.error import HTTPError
@@ -47,21 +46,6 @@ FAST_TICKS = 1000
 """about a second of a mission that nobody slows"""
 PATIENT = ("--patience", "600")
 """a mission that waits while browsers start"""
-
-
-@pytest.fixture(scope="module")
-def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("watch") / "paper-1"
-    folder.mkdir()
-    inline.play(load("paper-1"), folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def address(paper_1: Path) -> Iterator[str]:
-    """Of the page on the record of paper-1."""
-    with watching(paper_1) as (_, found):
-        yield found
 
 
 # --- a record ---------------------------------------------------------------------------------------

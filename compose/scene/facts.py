@@ -61,7 +61,7 @@ class Gathering:
         self.end: End | None = None
         self.last = -1
         """the latest tick of which anything is known"""
-        self.true = False
+        self.has_truth = False
         """whether the truth of any tick is known"""
         self._seen: set[str | None] = set()
         self.gone: set[str | None] = set()
@@ -114,7 +114,7 @@ class Gathering:
                 self.at(tick).reports.setdefault(robot, Said(message, size))
             case Truth(tick, poses):
                 self.at(tick).truth.update(poses)
-                self.true = True
+                self.has_truth = True
             case Missed(tick, robot):
                 facts = self.at(tick)
                 (facts.late if teller is None else facts.without).add(teller or robot)

@@ -166,7 +166,7 @@ def _state(show: Show) -> dict[str, Any]:
         "last": show.head,
         "first": next(iter(show.known.ticks), 0),
         "live": show.live,
-        "true": show.known.true,
+        "has_truth": show.known.has_truth,
         "end": show.known.end,
         "farewells": show.known.farewells,
         "notes": show.notes,

@@ -20,7 +20,7 @@ const view = {
   tick: 0, share: 0, playing: false, follow: true, focus: null, moving: false, speed: USUAL,
   wanted: true,
   /** Whether the truth is shown: where it is not known, there is only what robots believe. */
-  get truth() { return this.wanted && (store?.true ?? true); },
+  get truth() { return this.wanted && (store?.has_truth ?? true); },
 };
 let listed = null;
 let source = null;
@@ -257,7 +257,7 @@ function controls() {
   $("follow").hidden = !store.live;
   $("follow").setAttribute("aria-pressed", String(view.follow));
   $("truth").checked = view.truth;
-  $("truth").disabled = !store.true;
+  $("truth").disabled = !store.has_truth;
   if ($("robot").value !== (view.focus ?? "")) $("robot").value = view.focus ?? "";
   if ($("speed").value !== String(view.speed)) $("speed").value = String(view.speed);
   const notes = store.state.notes.join(" · ");
@@ -265,8 +265,9 @@ function controls() {
   $("notes").hidden = !notes;
   const who = view.focus ?? "each robot";
   const placed = knows_bearing() ? "" : "; before it is placed, its anchor's frame is turned at will";
-  const alone = `${store.true ? "" : "the truth is not on record: "}only what ${who} knows${placed}`;
-  text($("seen"), !view.truth ? alone : view.focus ? `the truth, and what ${who} believes` : "");
+  const alone = `${store.has_truth ? "" : "the truth is not on record: "}only what ${who} knows${placed}`;
+  const untold = store.scene(view.tick)?.players.every((player) => !player.pose) ? "the truth of this tick is not known" : "";
+  text($("seen"), !view.truth ? alone : untold || (view.focus ? `the truth, and what ${who} believes` : ""));
   $("canvas").setAttribute("aria-label", described());
 }
 
@@ -322,7 +323,7 @@ function pace(direction) {
 }
 
 function show_truth(on) {
-  if (store.true) view.wanted = on;
+  if (store.has_truth) view.wanted = on;
   draw();
 }
 

@@ -31,7 +31,7 @@ export class Store {
   get first() { return this.state.first; }
   get live() { return this.state.live; }
   /** Whether the truth of any tick is known. */
-  get true() { return this.state.true; }
+  get has_truth() { return this.state.has_truth; }
   get end() { return this.state.end && { tick: this.state.end[1], outcome: this.state.end[2], reason: this.state.end[3] }; }
   /** Every tick before this one is there. */
   get whole() { return this.#whole; }
