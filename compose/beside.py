@@ -103,9 +103,10 @@ def page(folder: Path, port: int) -> tuple[str, ...]:
     return ("the page", "compose", "watch", str(folder), "--launched", "--port", str(port))
 
 
-def viewers(folder: Path, port: int, robots: Sequence[str]) -> tuple[str, ...]:
-    """The same for Foxglove's viewers, of a run of `robots`."""
-    return ("what Foxglove's viewers show", "compose.export.live", str(port), str(folder), *robots)
+def viewers(folder: Path, port: int, origins: Sequence[str], robots: Sequence[str]) -> tuple[str, ...]:
+    """The same for Foxglove's viewers, of a run of `robots`; web pages of `origins` may look, too."""
+    words = (str(port), ",".join(origins), str(folder), *robots)
+    return ("what Foxglove's viewers show", "compose.export.live", *words)
 
 
 def _address(process: subprocess.Popen[bytes]) -> str | None:

@@ -21,6 +21,7 @@ from compose.arguments import (
     name,
     names,
     natural,
+    origin,
     port,
     positive,
     trials,
@@ -127,6 +128,14 @@ def parser() -> argparse.ArgumentParser:
         help="leave run.mcap and tables in --out DIR, too (default: where the extra lab is installed)",
     )
     run.add_argument("--foxglove", type=port, metavar="PORT", help="serve Foxglove's viewers there, live")
+    run.add_argument(
+        "--foxglove-origin",
+        type=origin,
+        action="append",
+        default=[],
+        metavar="ORIGIN",
+        help="web pages of this origin may look there, beside Foxglove's app; may be repeated",
+    )
     run.add_argument("--watch", action="store_true", help="serve a page that shows it, live and afterwards")
     run.add_argument(
         "--kill",

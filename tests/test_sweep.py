@@ -389,7 +389,7 @@ def test_results_are_left_in_a_folder_named_for_the_campaign(folder: Path) -> No
     figures = {path.name: path.stat().st_size for path in (out / "figures").iterdir()}
     assert set(figures) == {
         f"{name}.{kind}"
-        for kind in ("svg", "png")
+        for kind in ("svg", "pdf", "png")
         for name in (
             *("success-robot-b-anchor-0", "success-planner-variant", "meeting"),
             *("ticks-robot-b-anchor-0", "ticks-planner-variant"),

@@ -33,10 +33,7 @@ def main(options: argparse.Namespace) -> int:
     scenario = found.seeded(options.seed)
     if options.out is not None and any(options.out.glob("*.journal")):
         raise UserError(f"--out: {options.out} holds a record already; choose another folder")
-    if options.port is not None and not options.watch:
-        raise UserError("--port: of the page, and there is none without --watch")
-    if options.foxglove is not None:
-        need("foxglove")
+    _check_viewers(options)
     if options.export:
         need(*exporting.MODULES)
         if options.out is None:
@@ -47,6 +44,16 @@ def main(options: argparse.Namespace) -> int:
     if options.in_process:
         return _in_process(options, scenario, kills)
     return _as_processes(options, scenario, kills)
+
+
+def _check_viewers(options: argparse.Namespace) -> None:
+    """Raises UserError."""
+    if options.port is not None and not options.watch:
+        raise UserError("--port: of the page, and there is none without --watch")
+    if options.foxglove is not None:
+        need("foxglove")
+    elif options.foxglove_origin:
+        raise UserError("--foxglove-origin: of a page that shows what --foxglove serves, and there is none")
 
 
 def _kills(options: argparse.Namespace, found: Setting, scenario: Scenario) -> tuple[Kill, ...]:
@@ -142,7 +149,8 @@ def _shown(options: argparse.Namespace, scenario: Scenario, folder: Path) -> Ite
     """What is to show the mission that is recorded in `folder`: it is there, and where has been said."""
     wanted = [page(folder, options.port or 0)] if options.watch else []
     if options.foxglove is not None:
-        wanted.append(viewers(folder, options.foxglove, [robot.id for robot in scenario.robots]))
+        ids = [robot.id for robot in scenario.robots]
+        wanted.append(viewers(folder, options.foxglove, options.foxglove_origin, ids))
     with ExitStack() as stack:
         shows = [stack.enter_context(beside(*one)) for one in wanted]
         for show in shows:

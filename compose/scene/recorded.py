@@ -150,6 +150,7 @@ class Journals:
         ids = [robot.id for robot in world.scenario.robots]
         facts = self.known.at(world.truth.tick)
         facts.truth.update(zip(ids, world.truth.poses, strict=True))
+        self.known.has_truth = True
         if world.air:
             links = [link for one, other in world.pairs for link in ((one, other), (other, one))]
             for (sender, receiver), air in zip(links, world.air, strict=True):

@@ -69,6 +69,8 @@ class Heard(Show):
         self.live = True
         self._tick: int | None = None
         """the latest of which the world has spoken"""
+        self._robots: dict[str, bool] = {}
+        """those whose tokens have appeared or gone since the last poll: whether they are there"""
 
     def take(self, source: Key, frame: bytes) -> None:
         """Fold in what came under `source`.
@@ -105,11 +107,20 @@ class Heard(Show):
         robots = len(self.stage.robots) if self.stage is not None else 1
         while len(self.known.ticks) * robots > TICKS_KEPT:
             del self.known.ticks[next(iter(self.known.ticks))]
+        if not self.live:  # without its world, which may be the router, nobody is heard of
+            self._robots.clear()
+        for robot in self._robots.keys() & self.known.briefings.keys():
+            self.known.present(robot, self._robots.pop(robot))
         self.revised()
 
-    def there(self, alive: bool) -> None:
-        """Whether its world shows itself."""
+    def there(self, source: Key, alive: bool) -> None:
+        """Fold in whether its world, or a robot, shows itself by the token at `source`."""
+        if source.kind is not keys.world_alive:
+            if len(self._robots) < MOST_APPEARING:
+                self._robots[source.robot] = alive
+            return
         self.live = alive and self.known.end is None
+        self.known.present(None, alive)
 
 
 class Listener:
@@ -154,12 +165,13 @@ class Listener:
     def _take(self, arrival: Arrival) -> None:
         """Fold it in. A mission is one whose world has shown itself."""
         run = arrival.source.run
-        if arrival.topic == "alive" and run not in self.shows and len(self.shows) < MOST_RUNS:
+        appears = arrival.topic == "alive" and arrival.source.kind is keys.world_alive
+        if appears and run not in self.shows and len(self.shows) < MOST_RUNS:
             self.shows[run] = Heard(run)
         if run not in self.shows:
             return
         if arrival.topic in ("alive", "gone"):
-            self.shows[run].there(arrival.topic == "alive")
+            self.shows[run].there(arrival.source, arrival.topic == "alive")
             return
         try:
             self.shows[run].take(arrival.source, arrival.frame)
@@ -201,6 +213,7 @@ class Listener:
         session.watch_liveliness(link, keys.world_alive("*"), self._inbox)
         for key in LISTENED:
             link.declare_subscriber(key, self._hand_over(heard))
+        session.watch_liveliness(link, keys.robot_alive("*", "*"), self._inbox)
         told: Any = link.liveliness()
         told.declare_subscriber(keys.robot_alive("*", "*"), appears, history=True)
         silent = 0.0
