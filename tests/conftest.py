@@ -2,12 +2,20 @@ from __future__ import annotations
 
 import os
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
 from tests.commands import tandem
+
+if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
+    # Thousands of short processes must not compile the same modules again, each for itself.
+    sys.pycache_prefix = os.environ["PYTHONPYCACHEPREFIX"] = str(
+        Path(__file__).parents[1] / ".pytest_cache/pyc"
+    )
+    sys.dont_write_bytecode = False
 
 settings.register_profile("tandem", derandomize=True, deadline=None, database=None)
 settings.load_profile("tandem")
