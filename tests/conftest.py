@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +14,12 @@ from compose import inline
 from compose.scenario import load
 from tests.browser import Open, chromium, pages, watching
 from tests.commands import tandem
+
+if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
+    # Thousands of short processes must not compile the same modules again, each for itself.
+    compiled = Path(__file__).parents[1] / ".pytest_cache" / "compiled"
+    sys.pycache_prefix = os.environ["PYTHONPYCACHEPREFIX"] = str(compiled)
+    sys.dont_write_bytecode = False
 
 settings.register_profile("tandem", derandomize=True, deadline=None, database=None)
 settings.load_profile("tandem")

@@ -437,6 +437,7 @@ def _turned(frame: bytes, tick: int) -> bytes:
 # --- the command ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_the_same_record_gives_the_same_bytes_in_each_format(records: Path, tmp_path: Path) -> None:
     folder = copied(recorded("paper-1", records), tmp_path)
     runs: list[dict[str, bytes]] = []

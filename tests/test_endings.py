@@ -34,6 +34,7 @@ from tests.commands import (
     until,
     world,
 )
+from tests.series import series
 
 AT_ONCE_S = 4.0
 """less than the 5 s after which a process that was told to stop is killed"""
@@ -90,8 +91,8 @@ def long(tmp_path: Path) -> Path:
 # --- told to stop -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("number", [SIGINT, SIGTERM], ids=["SIGINT", "SIGTERM"])
-@pytest.mark.parametrize("moment", MOMENTS)
+@pytest.mark.parametrize("number", series([SIGINT, SIGTERM]), ids=["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("moment", series(MOMENTS, 9))
 def test_a_run_that_is_told_to_stop_says_so_and_leaves_no_process(
     moment: str, number: signal.Signals, endless: Path, tmp_path: Path
 ) -> None:
@@ -104,7 +105,7 @@ def test_a_run_that_is_told_to_stop_says_so_and_leaves_no_process(
     assert not processes_of(out)
 
 
-@pytest.mark.parametrize("number", [SIGINT, SIGTERM], ids=["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("number", series([SIGINT, SIGTERM]), ids=["SIGINT", "SIGTERM"])
 @pytest.mark.parametrize("moment", LAST_MOMENTS)
 def test_a_run_that_is_told_to_stop_as_it_ends_says_either(
     moment: str, number: signal.Signals, long: Path, tmp_path: Path
@@ -122,7 +123,7 @@ def test_a_run_that_is_told_to_stop_as_it_ends_says_either(
         assert ended[1:] == (f"localised after {LONG_TICKS} ticks\n", "")
 
 
-@pytest.mark.parametrize("delay", [round(0.15 * draw(), 3) for _ in range(6)])
+@pytest.mark.parametrize("delay", series([round(0.15 * draw(), 3) for _ in range(6)], 3))
 def test_a_run_that_is_told_to_stop_while_it_starts_leaves_no_process(
     delay: float, endless: Path, tmp_path: Path
 ) -> None:
@@ -147,7 +148,7 @@ def test_a_second_ctrl_c_changes_nothing(endless: Path, tmp_path: Path) -> None:
     assert "Traceback" not in ended.err
 
 
-@pytest.mark.parametrize("number", [SIGINT, SIGTERM], ids=["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("number", series([SIGINT, SIGTERM]), ids=["SIGINT", "SIGTERM"])
 def test_a_world_and_an_agent_that_are_told_to_stop_say_so(number: signal.Signals) -> None:
     with world("paper-1") as (clock, endpoint):
         with Command("agent", "a", "--connect", endpoint) as agent:

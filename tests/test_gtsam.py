@@ -30,6 +30,7 @@ from protocol.messages import Briefing, Drive, End, Estimate, Farewell, Localise
 from protocol.motion import Controls, Pose, compose, step
 from protocol.noise import Drift, Noise
 from protocol.wire import decode
+from tests.series import series
 
 pytest.importorskip("gtsam", reason="gtsam has no wheel for this platform or this Python")
 import gtsam
@@ -276,7 +277,7 @@ class Compared(NamedTuple):
     theirs: Optimum
 
 
-@pytest.fixture(scope="module", params=range(MISSIONS))
+@pytest.fixture(scope="module", params=series(range(MISSIONS), 5))
 def mission(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Compared:
     folder = tmp_path_factory.mktemp("recorded")
     recorded(request.param, folder)

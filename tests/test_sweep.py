@@ -153,6 +153,7 @@ def test_rows_are_the_same_on_one_worker_and_on_two(folder: Path) -> None:
     assert [row["seed"] for row in found[:12]] == [row["seed"] for row in found[12:24]], "paired"
 
 
+@pytest.mark.long
 def test_rows_are_the_same_as_processes_over_zenoh(folder: Path) -> None:
     played(folder, "both.toml", "inline", trials=1)
     assert sweep(folder, "both.toml", "zenoh", "--trials", "1", "--processes").status in (0, 1)
@@ -174,6 +175,7 @@ def dask(stack: ExitStack, module: str, *arguments: str | Path, cwd: Path) -> su
     return process
 
 
+@pytest.mark.long
 def test_rows_are_the_same_by_a_scheduler_and_workers_started_by_hand_even_if_one_is_lost(
     folder: Path,
 ) -> None:
@@ -274,6 +276,7 @@ def test_trials_that_raise_die_or_hang_are_rows_and_the_others_go_on(folder: Pat
     assert rows(folder / "out") == expected
 
 
+@pytest.mark.long
 def test_a_campaign_that_is_killed_twice_goes_on_where_it_was(folder: Path) -> None:
     out = folder / "killed"
     for already in (0, 1):
@@ -408,6 +411,7 @@ def test_results_are_left_in_a_folder_named_for_the_campaign(folder: Path) -> No
     assert ended.out.splitlines()[-1] == "results: sweep-both"
 
 
+@pytest.mark.long
 def test_the_command_that_the_table_prints_plays_the_trial_again(folder: Path) -> None:
     ended = sweep(folder, "both.toml", "out")
     command = shlex.split(next(line for line in ended.out.splitlines() if line.startswith("  tandem run ")))
@@ -425,6 +429,7 @@ def test_the_command_that_the_table_prints_plays_the_trial_again(folder: Path) -
     assert row["bytes_sent"] == sum(robot["bytes_sent"] for robot in summary["robots"].values())
 
 
+@pytest.mark.long
 def test_of_more_cells_than_fit_a_screen_those_in_which_all_is_well_are_counted(folder: Path) -> None:
     starts = ", ".join([f"[{0.3 + 0.01 * i:.2f}, 0.1, 1.0]" for i in range(101)])
     axis = f'[[axis]]\nfield = "robot.a.start"\nvalues = [{starts}]\n'
