@@ -47,6 +47,8 @@ class Signal(msgspec.Struct, frozen=True, tag=True):
     signal: int
 
 
+KILL_S = 5.0
+"""how long a process that is killed may take to end; then its fork server does not answer, and is killed"""
 ENDED_BYTES = 8
 
 
@@ -108,6 +110,8 @@ class Process:
         """Return its exit status; it is killed after `timeout` seconds."""
         if not self.wait(timeout):
             self.signal(signal.SIGKILL)
+            if not self.wait(KILL_S):
+                self._server.kill()
         status = self.status
         self.hang_up()
         return status
@@ -195,10 +199,14 @@ class ForkServer:
         how = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
         return f"the fork server {how}{f': {said[-1]}' if said else ''}"
 
-    def close(self) -> None:
+    def kill(self) -> None:
         """End it, and any process of it that still runs."""
         self._process.kill()
         self._process.wait()
+
+    def close(self) -> None:
+        """The same, and free what it takes in the launcher."""
+        self.kill()
         self._listener.join()
         self._socket.close()
         self._errors.close()

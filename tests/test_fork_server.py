@@ -28,6 +28,7 @@ from tests.commands import (
     world,
 )
 
+FAR_PAIR = (("c", "d", 0.0), ("d", "c", 400.0))
 NAMES = ("world", "agent a", "agent b")
 
 
@@ -137,6 +138,34 @@ def test_a_run_whose_fork_server_is_killed_says_so_and_leaves_no_process(
     said = r"tandem run: failed: (world|agent [ab]) was killed: the fork server was killed by signal 9\n"
     assert re.fullmatch(said, ended.err), ended
     assert not processes_of(out)
+
+
+def test_a_run_whose_fork_server_is_stopped_can_be_stopped_all_the_same(
+    endless: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    with Command("run", endless, "--out", out, "-q") as run:
+        run.until_written(out / "world.journal", 5_000)
+        (server,) = fork_servers_of(run.pid)
+        os.kill(server, SIGSTOP)
+        run.tell(signal.SIGINT)
+        assert run.ended().status == 130
+    assert not processes_of(out)
+
+
+def test_the_more_robots_a_run_starts_the_longer_each_looks_for_its_world(
+    endless: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    others = (f'[[robot]]\nid = "{one}"\npeer = "{two}"\nanchor = [{x}, 90.0]\n' for one, two, x in FAR_PAIR)
+    mission = endless.read_text()
+    for one, two in (("a", "b"), ("b", "a")):
+        mission = mission.replace(f'id = "{one}"', f'id = "{one}"\npeer = "{two}"')
+    endless.write_text(mission + "".join(others))
+    with Command("run", endless, "--out", out, "-q") as run:
+        run.until_written(out / "agent-c.journal", 1)
+        words = processes_of(out)[process_of(out, "agent", "c")]
+    assert words[words.index("--wait") + 1] == "62.0"
 
 
 def test_processes_that_are_stopped_end_too_when_their_launcher_is_killed(
