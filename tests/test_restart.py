@@ -553,7 +553,7 @@ def test_a_world_that_has_lost_its_record_is_told_so(record: Path, paper_1: str)
     tick = past(journal.read(record / "agent-a.journal"), "a").steps[-1].sense.tick
     assert ended.status == 3
     said = f"started again without its record: the world is at tick 0, a knows it up to {tick}"
-    assert ended.err == f"tandem agent a: {said}\n"
+    assert ended.err.splitlines()[-1] == f"tandem agent a: {said}"  # it may have told of a torn write before
 
 
 def test_a_run_is_a_new_one(record: Path) -> None:
