@@ -7,6 +7,7 @@ import compose.commands.world  # noqa: F401  # imported to be there
 from compose import inline
 from compose.cli import parser
 from compose.scenario import load
+from protocol import environment
 
 MISSION = "paper-1"
 
@@ -15,3 +16,5 @@ def missions() -> None:
     """Get ready for worlds and agents: what is imported, the command line, and code that has run."""
     parser()
     inline.play(load(MISSION))
+    environment.of_world()
+    environment.of_robot()
