@@ -257,8 +257,8 @@ def test_a_mission_that_ends_undecided_is_drawn(noise: str, variant: str, tmp_pa
 @pytest.mark.parametrize("ticks", [0, 1, 17])
 def test_a_record_that_breaks_off_is_drawn_as_far_as_it_goes(ticks: int, noisy: Path, tmp_path: Path) -> None:
     folder = copied(noisy, tmp_path)
-    cut(folder / "world.journal", 1 + 2 * ticks)
-    cut(folder / "agent-b.journal", 1 + ticks)
+    cut(folder / "world.journal", 2 + 2 * ticks)
+    cut(folder / "agent-b.journal", 2 + ticks)
     assert len(read(folder).moments) == ticks
     for robot in "ab":
         words = texts(picture(folder, robot))

@@ -8,13 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
 
 from protocol.journal import CorruptJournal
 from protocol.messages import Briefing, Drive, End, Message, Report, Sense
-from protocol.units import RobotId, Tick
+from protocol.units import Finite, RobotId, Tick
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
+
+MAX_MARK = 64
+"""numbers of a mark"""
 
 
 def driver_journal(robot: str) -> str:
@@ -27,7 +31,7 @@ class Mark(Message, frozen=True):
 
     tick: Tick
     robot: RobotId
-    mark: tuple[float, ...]
+    mark: Annotated[tuple[Finite, ...], msgspec.Meta(max_length=MAX_MARK)]
 
 
 class DrivenTick(msgspec.Struct, frozen=True):
