@@ -233,6 +233,10 @@ def test_an_error_is_told_of_a_pose_that_leads_and_else_as_a_range(
 # --- keys -------------------------------------------------------------------------------------------
 
 
+TIMELESS = "var real = requestAnimationFrame; window.requestAnimationFrame = (draw) => real(() => draw(1))"
+"""for a page that draws, and for which no time passes while it plays"""
+
+
 def test_space_after_a_click_plays_and_pauses_and_does_nothing_else(opened: Open, address: str) -> None:
     for click in (
         "#back",
@@ -250,6 +254,7 @@ def test_space_after_a_click_plays_and_pauses_and_does_nothing_else(opened: Open
         page.locator(click).click()
         tick = page.locator("body").get_attribute("data-tick")
         before = state(page)
+        page.evaluate(TIMELESS)
         page.keyboard.press("Space")
         expect(page.locator("#play")).to_have_attribute("aria-label", "Pause")
         page.keyboard.press("Space")

@@ -140,7 +140,7 @@ def test_a_robot_that_comes_back_too_late_fails_the_run_by_the_patience(tmp_path
 def test_in_real_time_whoever_is_away_stands_still_and_is_told_what_it_missed(tmp_path: Path) -> None:
     out = tmp_path / "out"
     (tmp_path / "assured.toml").write_text(REAL_TIME)
-    kills = options("a@20 world@60:report")
+    kills = options("a@20+0.5s world@60:report")  # ten periods: a process is back in less than one
     ended = tandem("run", tmp_path / "assured.toml", "--rate", "20", "-q", "--out", out, *kills)
     assert ended.status in OVER, ended
     with (out / "ticks.csv").open(newline="") as file:
