@@ -233,7 +233,10 @@ def test_an_error_is_told_of_a_pose_that_leads_and_else_as_a_range(
 # --- keys -------------------------------------------------------------------------------------------
 
 
-TIMELESS = "var real = requestAnimationFrame; window.requestAnimationFrame = (draw) => real(() => draw(1))"
+TIMELESS = """() => {
+    const real = window.requestAnimationFrame.bind(window);
+    window.requestAnimationFrame = (draw) => real(() => draw(1));
+}"""
 """for a page that draws, and for which no time passes while it plays"""
 
 
