@@ -22,6 +22,7 @@ from protocol.messages import Drive, OfRobot
 from protocol.motion import REST
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from tests.commands import PAPER_1, Command, Ended, process_of, processes_of, tandem
+from tests.series import series
 
 STARTS = {"a": "2.4,-1.2,4.8", "b": "11.3,-0.4,3.6"}
 ASSURED = "max_ticks = 1_000_000\n" + PAPER_1.replace('"paper"', '"assured"').replace('"paper-1"', '"field"')
@@ -134,7 +135,7 @@ def test_a_decision_that_does_not_follow_is_found_without_a_world(tmp_path: Path
     assert f"tick {drive.tick}, a, Drive v: recorded {0.5 * drive.v}, recomputed {drive.v}" in replayed.out
 
 
-@pytest.mark.parametrize("killed", ["a", "b"])
+@pytest.mark.parametrize("killed", series(["b", "a"]))
 def test_a_robot_whose_agent_is_killed_stands_still_and_goes_on_from_its_record(
     tmp_path: Path, killed: str
 ) -> None:

@@ -17,6 +17,7 @@ from protocol import journal
 from protocol.messages import Sense
 from protocol.wire import MalformedFrame, decode
 from tests.commands import Command, processes_of, size, tandem, until
+from tests.series import series
 from tests.test_field import ASSURED, STARTS, beacon, both_localised, messages, told
 
 
@@ -94,7 +95,7 @@ def all_is_well(out: Path, pair: Pair) -> None:
     assert audited.status == 0, audited.out
 
 
-@pytest.mark.parametrize("killed", ["a", "b"])
+@pytest.mark.parametrize("killed", series(["a", "b"]))
 def test_a_robot_that_is_killed_goes_on_from_its_record(pair: Pair, killed: str, tmp_path: Path) -> None:
     pair.robots[killed].until_written(pair.path(killed), 2500)
     pair.kill(killed)
