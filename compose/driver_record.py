@@ -18,7 +18,7 @@ from protocol.messages import Briefing, OfRobot, Sense
 from protocol.retrace import Retrace
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode, encode
 from world.driver import Driver
-from world.driver_journal import DriverPast, driver_journal, driver_past
+from world.driver_journal import DriverPast, Start, boot, driver_journal, driver_past
 from world.field import Field
 
 RELEASE_S = 10.0
@@ -48,26 +48,35 @@ class DriverRecord(msgspec.Struct, frozen=True):
 def recorded(folder: Path, briefing: Briefing, inbox: Inbox, *, fsync: bool) -> Iterator[DriverRecord]:
     """The recording in `folder` of the robot that was told `briefing`; a new one, if there is none.
 
-    Raises CannotRecord; CorruptJournal where the two journals are not of one robot in one run.
+    Raises CannotRecord; CorruptJournal where the two journals are not of one robot in one run, or may lack
+    what the robot has told.
     """
+    start = encode(Start(boot(), fsync))
     path = folder / driver_journal(briefing.robot)
     agents = folder / agent_journal(briefing.robot)
     if not path.exists():
         if _frames(agents, inbox):
             raise CannotRecord(f"{agents} is there already, and {path.name} is not; choose another folder")
         with Journal(path, fsync=fsync) as journal:
-            journal.write(encode(briefing))
+            journal.write(encode(briefing), start)
             yield DriverRecord(journal, DriverPast(), -1, again=False)
         return
     old = Retrace(path, fsync=fsync)
     try:
         past = driver_past(old.frames, briefing, path)
+        if past.may_lack:
+            raise CorruptJournal(
+                f"{path} was written without --fsync, and this computer has been started again since: "
+                "what the robot has told its peer may be missing in it"
+            )
         known = _known(_frames(agents, inbox), past, agents)
         old.write(*(old.frames or [encode(briefing)]))
     except BaseException:
         old.close()
         raise
     with going_on(old, inbox) as journal:
+        if past.end is None:
+            journal.write(start)
         yield DriverRecord(journal, past, known, again=True)
 
 
