@@ -35,6 +35,8 @@ class DriverRecord(msgspec.Struct, frozen=True):
     """the latest tick in the agent's; -1 where there is none"""
     again: bool
     """whether they were there before"""
+    start: Start
+    """of this process"""
 
     def take_up(self, driver: Driver, name: str, field: Field) -> None:
         """Go on where they end, by the driver of that name. Raises UserError if it cannot."""
@@ -42,6 +44,8 @@ class DriverRecord(msgspec.Struct, frozen=True):
             again(driver, name, self.past)
         if self.again:
             field.resume(self.past, self.known)
+        if self.past.end is None and self.past.start != self.start:
+            self.journal.write(encode(self.start))
 
 
 @contextmanager
@@ -51,15 +55,15 @@ def recorded(folder: Path, briefing: Briefing, inbox: Inbox, *, fsync: bool) -> 
     Raises CannotRecord; CorruptJournal where the two journals are not of one robot in one run, or may lack
     what the robot has told.
     """
-    start = encode(Start(boot(), fsync))
+    start = Start(boot(), fsync)
     path = folder / driver_journal(briefing.robot)
     agents = folder / agent_journal(briefing.robot)
     if not path.exists():
         if _frames(agents, inbox):
             raise CannotRecord(f"{agents} is there already, and {path.name} is not; choose another folder")
         with Journal(path, fsync=fsync) as journal:
-            journal.write(encode(briefing), start)
-            yield DriverRecord(journal, DriverPast(), -1, again=False)
+            journal.write(encode(briefing))
+            yield DriverRecord(journal, DriverPast(), -1, again=False, start=start)
         return
     old = Retrace(path, fsync=fsync)
     try:
@@ -75,9 +79,7 @@ def recorded(folder: Path, briefing: Briefing, inbox: Inbox, *, fsync: bool) -> 
         old.close()
         raise
     with going_on(old, inbox) as journal:
-        if past.end is None:
-            journal.write(start)
-        yield DriverRecord(journal, past, known, again=True)
+        yield DriverRecord(journal, past, known, again=True, start=start)
 
 
 def _frames(path: Path, inbox: Inbox) -> list[bytes]:

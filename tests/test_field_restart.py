@@ -8,6 +8,8 @@ from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
 from signal import SIGKILL
+from types import SimpleNamespace
+from typing import Any
 
 import msgpack
 import pytest
@@ -138,9 +140,12 @@ def test_a_recording_that_a_power_cut_may_have_shortened_is_refused(
     """What was told may be missing, unless each write was synced; a kill takes nothing along."""
     briefing, inbox = load("paper-1").briefing("a"), Inbox("robot")
     path = tmp_path / "driver-a.journal"
+    driver: Any = SimpleNamespace(stop=lambda: None, resume=lambda *_: None)
+    field: Any = SimpleNamespace(resume=lambda *_: None)
 
     def taken_up() -> DriverPast:
         with recorded(tmp_path, briefing, inbox, fsync=fsync) as record:
+            record.take_up(driver, "any", field)
             sense = Sense(record.past.tick + 1, "a", REST if record.again else None, 1.0, ())
             record.journal.write(encode(sense))
             return record.past
