@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import shutil
+import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +19,7 @@ from msgspec.structs import replace
 from agent.past import Past, past
 from compose.local import free_endpoint
 from compose.scenario import load
+from docs.rover import Rover
 from protocol import journal
 from protocol.messages import Drive, OfRobot
 from protocol.motion import REST
@@ -186,6 +189,19 @@ def test_ctrl_c_ends_a_robot_and_leaves_nobody_behind(tmp_path: Path) -> None:
             assert "stopped by SIGINT" in ended.err
             assert "Traceback" not in ended.err
             assert processes_of((tmp_path / name).resolve()) == {}
+
+
+def test_a_robot_without_a_beacon_waits_for_it_idle_and_gives_up() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as nobody:
+        nobody.bind(("127.0.0.1", 0))
+        where = f"127.0.0.1:{nobody.getsockname()[1]}"
+    rover = Rover(load("paper-1").briefing("a"), 0.25, beacon=where, patience="1")
+    busy = time.process_time()
+    with pytest.raises(TimeoutError, match="no answer of the beacon for 1 s"):
+        rover.sense(0)
+    assert time.process_time() - busy < 0.1
+    rover.stop()
+    rover.close()
 
 
 def test_a_robot_whose_peer_does_not_come_has_not_moved(tmp_path: Path) -> None:
