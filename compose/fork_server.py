@@ -118,8 +118,7 @@ def _become(start: Start, streams: list[int], parent: int) -> None:
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGCHLD])
     os.setsid()
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    _signal_when_parent_ends(signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(-signal.SIGKILL)
     for number, stream in enumerate(streams):
@@ -127,6 +126,11 @@ def _become(start: Start, streams: list[int], parent: int) -> None:
         os.close(stream)
     sys.argv = [start.title, *start.arguments]
     setproctitle(one_line(" ".join(sys.argv)))
+
+
+def _signal_when_parent_ends(number: signal.Signals) -> None:
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, number)
 
 
 def _call(name: str) -> None:
@@ -138,6 +142,7 @@ def main() -> None:
     """Get ready, and fork processes until the launcher has gone."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
+    _signal_when_parent_ends(signal.SIGCONT)  # should it be suspended then, it would never end
     _call(sys.argv[1])
     setproctitle(f"tandem fork-server of {os.getppid()}")
     gc.collect()

@@ -69,7 +69,9 @@ class Rover:
         self._tick = 0
         self._give_up_s = float(patience)
         self._state = Path(state) if state else None
-        if self._state is not None and self._state.exists():
+        self._found = self._state is not None and self._state.exists()
+        """whether where the body is has been found, and not made up"""
+        if self._state is not None and self._found:
             self._load(self._state)
         host, _, port = beacon.rpartition(":")
         self._radio = socket.socket(socket.AF_INET, socket.SOCK_DGRAM) if beacon else None
@@ -94,7 +96,9 @@ class Rover:
         self._save()
 
     def resume(self, tick: int, mark: tuple[float, ...]) -> None:  # noqa: ARG002  # the state tells enough
-        """Take back a reading that nobody has put on record."""
+        """Take back a reading that nobody has put on record. Raises RuntimeError if there was no `state`."""
+        if not self._found:
+            raise RuntimeError("where the body was is not known without --option state=FILE")
         if self._tick > tick:
             self._driven = Controls(
                 self._executed.v + self._driven.v, self._executed.omega + self._driven.omega

@@ -227,6 +227,16 @@ def test_a_driver_that_cannot_resume_is_refused_and_not_moved(pair: Pair, tmp_pa
     assert {path.name: path.read_bytes() for path in (tmp_path / "a").iterdir()} == before
 
 
+def test_a_rover_whose_body_is_not_on_file_is_not_made_up_elsewhere(pair: Pair, tmp_path: Path) -> None:
+    pair.robots["a"].until_written(pair.path("a"), 1500)
+    pair.kill("a", "b")
+    pair.nobody_is_left("a")
+    mission = ("--mission", tmp_path / "field.toml", "--driver", "docs.rover:Rover", "--rate", "4")
+    ended = tandem("robot", "a", *mission, "--out", tmp_path / "a")
+    assert ended.status == 2
+    assert "where the body was is not known without --option state=FILE" in ended.err
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("amount", range(200, 8000, 600))
 @pytest.mark.parametrize("killed", ["a", "b", "ab"])

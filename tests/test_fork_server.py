@@ -31,6 +31,7 @@ from tests.commands import (
     world,
 )
 
+ON_LINUX = pytest.mark.skipif(sys.platform != "linux", reason="a feature of Linux")
 CAP_SYS_ADMIN, CAP_SYS_RESOURCE = 21, 24
 """<linux/capability.h>"""
 PR_CAPBSET_DROP = 24
@@ -175,8 +176,9 @@ def test_the_more_robots_a_run_starts_the_longer_each_looks_for_its_world(
     assert words[words.index("--wait") + 1] == "62.0"
 
 
+@pytest.mark.parametrize("server_too", [False, pytest.param(True, marks=ON_LINUX)])
 def test_processes_that_are_stopped_end_too_when_their_launcher_is_killed(
-    endless: Path, tmp_path: Path
+    server_too: bool, endless: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
     with Command("run", endless, "--out", out, "-q") as run:
@@ -184,6 +186,8 @@ def test_processes_that_are_stopped_end_too_when_their_launcher_is_killed(
         (server,) = fork_servers_of(run.pid)
         for name in NAMES:
             os.kill(process_of(out, *name.split()), SIGSTOP)
+        if server_too:
+            os.kill(server, SIGSTOP)
         os.kill(run.pid, SIGKILL)
         until(lambda: not processes_of(out) and gone(server), "all have ended")
 
@@ -241,7 +245,7 @@ def without_privileges() -> None:
         ctypes.CDLL(None).prctl(PR_CAPBSET_DROP, capability, 0, 0, 0)  # fails where there is none to drop
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="a limit of Linux")
+@ON_LINUX
 def test_no_process_is_forgotten_where_its_user_may_have_no_more_descriptors_under_way() -> None:
     ran = subprocess.run(
         [sys.executable, "-c", CROWD],
