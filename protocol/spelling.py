@@ -9,5 +9,6 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     """Return "; did you mean 'name'?" for the name in `known` that is most like `word`, or nothing."""
     from difflib import get_close_matches  # noqa: PLC0415  # only where there is a mistake to be told
 
-    close = get_close_matches(word, known, n=1)
-    return f"; did you mean '{close[0]}'?" if close else ""
+    names = {name.lstrip("-"): name for name in known}  # dashes are no likeness
+    close = get_close_matches(word.lstrip("-"), names, n=1)
+    return f"; did you mean '{names[close[0]]}'?" if close else ""

@@ -470,6 +470,7 @@ def test_an_agents_record_is_never_overwritten(tmp_path: Path) -> None:
         ("sweep los", "; did you mean 'loss'?"),
         ("rnu paper-1", "; did you mean 'run'?"),
         ("run paper-1 --sede 3", "tandem run: unrecognized arguments: --sede 3; did you mean '--seed'?"),
+        ("figures x --out y", "tandem figures: unrecognized arguments: --out y"),
         ("figures x --only encunter", "; did you mean 'encounter'?"),
         ("run paper-1 --kill wolrd@3", "; did you mean 'world'?"),
         ("robot robot2 --mission FILE --driver docs.rover:Rover", "; did you mean 'robot-2'?"),
