@@ -15,8 +15,8 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from agent import apart, letter, lying, meeting, radio, survey, trust
-from agent.belief import ON_ANCHOR, Branch, branches, weigh_branches
+from agent import apart, letter, lying, meeting, precision, radio, survey, trust
+from agent.belief import Branch, branches, weigh_branches
 from agent.mind import Asleep, Done, Mind
 from agent.phases import anchor, encounter, rendezvous, seeking
 from agent.phases.anchor import ThirdPoint
@@ -27,6 +27,7 @@ from agent.phases.surveying import Retreating, Surveying
 from protocol import messages
 from protocol.messages import Alarm, Drive, Estimate, Localised, Ranged, Report, Sense, Undecided
 from protocol.motion import ORIGIN, REST, Controls, Pose, step
+from protocol.rounding import SAME
 
 # --- a tick -----------------------------------------------------------------------------------------
 
@@ -202,9 +203,7 @@ def _released(mind: Mind, rho0: float | None) -> Mind:
         return mind  # and listens
     if rho0 is None:
         return mind.undecided("the anchor is out of range at the start")
-    if (
-        rho0 <= ON_ANCHOR and mind.briefing.mission.noise.exact
-    ):  # the heading is radial by definition, and nothing is left to find out
+    if rho0 <= SAME * precision.drifted(mind, mind.log, mind.tick) and mind.briefing.mission.noise.exact:  # it is on its anchor: the heading is radial by definition, and nothing is left to find out
         return _located(mind, Branch(0.0, ORIGIN), "on-anchor")
     return replace(mind, state=Straight("anchor", mind.odometry, rho0))
 
@@ -219,10 +218,18 @@ def _second_range(mind: Mind) -> Mind:
     rho0, rho = mind.log.ranges[0].range, mind.log.ranges[-1].range
     possible = branches(rho0, mind.odometry, rho)
     mind = replace(mind, findings=replace(mind.findings, possible=possible))
-    left = weigh_branches(possible, mind.seen(), mind.briefing.mission.sensing_range)
-    if isinstance(mind.state, Circling) and len(left) == 1:
+    floor = precision.drifted(mind, mind.log, mind.tick)
+    left = weigh_branches(possible, mind.seen(), mind.briefing.mission.sensing_range, floor)
+    if isinstance(mind.state, Circling) and len(left) == 1 and _sure(mind, left[0]):
         return _located(mind, left[0], "circle")
     return _to_third_point(mind, left)
+
+
+def _sure(mind: Mind, branch: Branch) -> bool:
+    """Whether the ranges fix the anchor as exactly as the claim needs; the letter takes no more of them."""
+    if mind.briefing.variant == "paper":
+        return True
+    return precision.own_anchor(mind, branch.start, mind.log) <= precision.enough(mind)
 
 
 def _to_third_point(mind: Mind, left: tuple[Branch, ...]) -> Mind:
@@ -242,8 +249,9 @@ def _third_range(mind: Mind, state: ThirdPoint) -> Mind:
     if not mind.briefing.mission.noise.exact:
         mind, likely = letter.with_branches(mind)
         return _located(mind, likely[0], kind) if likely else _to_third_point(mind, likely)
-    left = weigh_branches(state.branches, mind.seen(), mind.briefing.mission.sensing_range)
-    if len(left) == 1:
+    floor = precision.drifted(mind, mind.log, mind.tick)
+    left = weigh_branches(state.branches, mind.seen(), mind.briefing.mission.sensing_range, floor)
+    if len(left) == 1 and _sure(mind, left[0]):
         return _located(mind, left[0], kind)
     if len(left) > 1 and mind.briefing.variant == "paper":
         return mind.undecided("the third range does not tell +alpha from -alpha")

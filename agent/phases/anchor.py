@@ -52,7 +52,7 @@ def third_point(places: Sequence[Pose], mission: Mission, variant: Variant) -> C
             reach = max(_reach(along, across, mission) for along, across in outward)
             length = min(longest, reach)
             value = _separation(length, [along for along, _ in outward])
-            if length > ARRIVED and (best is None or value > best_value * (1.0 + PREFERENCE)):
+            if length > ARRIVED * mission.first_straight and (best is None or value > best_value * (1.0 + PREFERENCE)):
                 best, best_value = Controls(forward * min(length / unit, mission.max_speed), omega), value
     return best
 

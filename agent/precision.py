@@ -1,0 +1,65 @@
+"""How exactly a robot knows poses where sensors are exact: the floors of `protocol.rounding` for what it computes.
+
+Both robots of a pair compute the same from the same logs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from agent.belief import Sighting, anchor_error, turn_error
+from agent.geometry import Placement
+from agent.logbook import Logbook
+from agent.mind import Mind
+from protocol.motion import ORIGIN, Pose
+from protocol.rounding import SURE, foothold, rounding
+
+
+def size(mind: Mind) -> float:
+    """Return D + R in m: the largest coordinate that either robot, or the world, computes with."""
+    return mind.briefing.anchor_distance + mind.briefing.mission.sensing_range
+
+
+def enough(mind: Mind) -> float:
+    """Return how exactly, in m, a robot must know where its anchor is when phase 1 ends."""
+    return foothold(size(mind), mind.briefing.anchor_distance, mind.briefing.mission.sensing_range)
+
+
+def drifted(mind: Mind, log: Logbook, tick: int) -> float:
+    """Return how far, in m, rounding may have put the odometry of `log` off by `tick`."""
+    return rounding(size(mind), tick, log.turned(tick) * mind.briefing.mission.period)
+
+
+def own_anchor(mind: Mind, start: Pose, log: Logbook) -> float:
+    """Return how far, in m, the anchor may be from where phase 1 put it for the robot of `log`.
+
+    Phase 1 ended with the first ranges that were enough, or, for a robot that is not as exact, with later ones.
+    """
+    period, bound = mind.briefing.mission.period, enough(mind)
+    error, ranged = bound, []
+    for one in log.ranges:
+        if one.tick > log.through:
+            break
+        ranged.append((log.pose(ORIGIN, one.tick, period), one.range))
+        error = anchor_error(start, ranged, drifted(mind, log, one.tick))
+        if error <= bound:
+            break
+    return error
+
+
+def anchors(mind: Mind) -> float:
+    """Return how far off, in m, the anchors of both may be together, relative to where the robots are now."""
+    assert mind.radio.start is not None
+    last = min(mind.tick, mind.radio.peer.through)
+    robots = ((mind.start, mind.log), (mind.radio.start, mind.radio.peer))
+    return sum([own_anchor(mind, start, log) + drifted(mind, log, last) for start, log in robots])
+
+
+def pinned_down(mind: Mind, placement: Placement, sightings: Sequence[Sighting]) -> bool:
+    """Whether the ranges in `sightings` fix `placement` as exactly as a claim has to be."""
+    ticks = [sighting.tick for sighting in sightings if sighting.range is not None]
+    span = ticks[-1] - ticks[0]
+    period = mind.briefing.mission.period
+    turned = max(log.turned(ticks[-1]) for log in (mind.log, mind.radio.peer)) * period
+    floor, off = rounding(size(mind), span, turned), anchors(mind)
+    return off + turn_error(placement, sightings, floor, off) * max(1.0, size(mind)) <= SURE
