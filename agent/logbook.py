@@ -30,9 +30,10 @@ class Logbook(msgspec.Struct, frozen=True):
             at_rest += run.ticks
         return self.through - at_rest
 
-    def turned(self, through: int) -> float:
-        """Return the sum of |omega| over the ticks in [0, through], in rad/s."""
-        return sum([abs(run.omega) * run.ticks for run in _between(self.runs, 0, through)])
+    def travelled(self, through: int) -> tuple[float, float]:
+        """Return the sums of |v| and of |omega| over the ticks in [0, through], in m/s and rad/s."""
+        runs = _between(self.runs, 0, through)
+        return sum([abs(run.v) * run.ticks for run in runs]), sum([abs(run.omega) * run.ticks for run in runs])
 
     def drove(self, v: float, omega: float, ticks: int = 1) -> Logbook:
         """The log after `ticks` more of one manoeuvre."""

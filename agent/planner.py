@@ -236,7 +236,8 @@ def _to_third_point(mind: Mind, left: tuple[Branch, ...]) -> Mind:
     if not left:
         return mind.undecided("no pose explains the anchor ranges")
     mission, variant = mind.briefing.mission, mind.briefing.variant
-    controls = anchor.third_point(anchor.local(left, mind.odometry), mission, variant)
+    pinning = variant == "assured" and len(left) == 1 and mission.noise.exact
+    controls = anchor.third_point(anchor.local(left, mind.odometry), mission, variant, pinning=pinning)
     if controls is None:
         return mind.undecided("eq. (5) leaves no way to a third range")
     return replace(mind, state=ThirdPoint(left, mind.odometry, controls))

@@ -27,7 +27,9 @@ def enough(mind: Mind) -> float:
 
 def drifted(mind: Mind, log: Logbook, tick: int) -> float:
     """Return how far, in m, rounding may have put the odometry of `log` off by `tick`."""
-    return rounding(size(mind), tick, log.turned(tick) * mind.briefing.mission.period)
+    period = mind.briefing.mission.period
+    v, omega = log.travelled(tick)
+    return rounding(size(mind), tick, v * period, omega * period)
 
 
 def own_anchor(mind: Mind, start: Pose, log: Logbook) -> float:
@@ -56,10 +58,16 @@ def anchors(mind: Mind) -> float:
 
 
 def pinned_down(mind: Mind, placement: Placement, sightings: Sequence[Sighting]) -> bool:
-    """Whether the ranges in `sightings` fix `placement` as exactly as a claim has to be."""
+    """Whether the ranges in `sightings` fix `placement` as exactly as a claim has to be.
+
+    What was driven between the first and the last of them is all that puts one range off against another; what
+    was driven before moves all of them alike, with the anchors.
+    """
     ticks = [sighting.tick for sighting in sightings if sighting.range is not None]
-    span = ticks[-1] - ticks[0]
-    period = mind.briefing.mission.period
-    turned = max(log.turned(ticks[-1]) for log in (mind.log, mind.radio.peer)) * period
-    floor, off = rounding(size(mind), span, turned), anchors(mind)
+    span, period = ticks[-1] - ticks[0], mind.briefing.mission.period
+    floor, off = 0.0, anchors(mind)
+    for log in (mind.log, mind.radio.peer):
+        v, omega = log.travelled(ticks[-1])
+        driven = v - log.travelled(ticks[0])[0]
+        floor += 0.5 * rounding(size(mind), span, driven * period, omega * period)
     return off + turn_error(placement, sightings, floor, off) * max(1.0, size(mind)) <= SURE

@@ -25,6 +25,7 @@ from protocol.messages import Briefing
 from protocol.mission import Anchor, Mission, Role, Variant, noise_obstacle, obstacle, safety_obstacle
 from protocol.motion import TAU, Pose
 from protocol.rendezvous import Rendezvous, rendezvous, tick_budget
+from protocol.rounding import TOLERANCE
 from protocol.units import NAME, RobotId
 from protocol.wire import MalformedFrame, decode, encode
 from world.faults import Fault, hold_up
@@ -37,8 +38,8 @@ Place = Annotated[float, Meta(ge=-1e6, le=1e6)]
 """m: nobody gets so far from there that `units.Coordinate` would not hold it"""
 EXCHANGES = 20
 """reports for which a mission may have to wait as long as they hardly ever take"""
-NEAREST_ANCHORS = 1e-3
-"""m: that is one anchor, not two"""
+NEAREST_ANCHORS = TOLERANCE
+"""m: two that are nearer are in one place, as exactly as poses are claimed"""
 TICK_S = (5e-4, 3600.0)
 """s of wall time that a tick in real time may last"""
 WITHIN = 1.0 - 1e-9

@@ -1,15 +1,16 @@
 """Bounds on what double precision does to poses and ranges: every floor of a test with exact sensors.
 
-The world moves the robots, and a robot its odometry, by one `step` a tick. Let `length` be the largest
-coordinate, `ticks` the number of steps, `turned` the sum of |omega T_s| over them, and u = 2^-53.
+The world moves the robots, and a robot its odometry, by one `step` a tick. Let `size` (D + R) be the largest
+coordinate, `path` the length driven over `ticks` steps, `turned` the sum of |omega T_s| over them, u = 2^-53.
 
-- A heading grows to TAU + `turned`, the first by the branch or the start, and each addition to it is rounded by
-  at most u (TAU + turned). Equal turns are rounded alike, so the errors add up, and they swing a position
-  by at most themselves times `length`: ticks u (TAU + turned) length.
-- A coordinate is rounded by u `length` in each step, and a chord and its sine and cosine by less than that.
-- A range of two points is rounded a few times more: RANGED u `length`.
+- A coordinate is rounded by u `size` in each step; a chord, its sine and its cosine by less than that.
+- A heading grows to TAU + `turned`, TAU being that of the start or the branch, and each addition to it is rounded
+  by at most u (TAU + turned). Equal turns are rounded alike, so the errors add up, to ticks u (TAU + turned).
+  They swing what was driven: a place by at most themselves times `path`, or times 2 `size` where that is less.
+- A range is the hypotenuse of two differences of such coordinates, in frames that lead to each other: RANGED u
+  `size`.
 
-Both sides err, the world and whoever recomputes it: twice u.
+Both sides err alike, the world and whoever recomputes it: twice u.
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ from protocol.motion import TAU
 EPSILON = 2.0**-52
 """2 u"""
 
-RANGED = 8.0
-"""EPSILON of a length: the rounding of a range, of a closed form that inverts it, and of the frames between"""
+RANGED = 4.0
+"""u of the size: two differences, the hypotenuse, and the turn of a frame"""
 
-SAME = 4.0
+SAME = 2.0
 """floors: two anchors so near each other predict ranges that differ by a floor each at the most, on either side
 of what is measured; so nothing tells them apart"""
 
@@ -34,9 +35,9 @@ SURE = 0.5 * TOLERANCE
 placements that are merged (`same_turn`)"""
 
 
-def rounding(length: float, ticks: int, turned: float) -> float:
+def rounding(size: float, ticks: int, path: float, turned: float) -> float:
     """Return the bound in m, derived above, on how far a computed range may be from the measured one."""
-    return EPSILON * length * (RANGED + ticks * (1.0 + TAU + turned))
+    return EPSILON * (size * (RANGED + ticks) + min(path, 2.0 * size) * ticks * (TAU + turned))
 
 
 def same_turn(size: float) -> float:
@@ -51,6 +52,6 @@ def foothold(size: float, distance: float, sensing_range: float) -> float:
     """Return how exactly, in m, a robot must know where its anchor is when phase 1 ends.
 
     An anchor that is off by e turns the line between the anchors by e / D, and b, whose place is R / 8 from its
-    own, by 8 e / R; either puts a pose off by `size` times that, and two robots err. Half of SURE goes there.
+    own, by 8 e / R; either puts a pose off by `size` times that, and two robots err. All of SURE goes there: most places are much better, and `turn_error` knows.
     """
-    return 0.25 * SURE * min(distance, 0.125 * sensing_range) / max(1.0, size)
+    return 0.5 * SURE * min(distance, 0.125 * sensing_range) / max(1.0, size)

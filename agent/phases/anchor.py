@@ -29,13 +29,17 @@ class ThirdPoint(msgspec.Struct, frozen=True):
     drive: Controls
 
 
-def third_point(places: Sequence[Pose], mission: Mission, variant: Variant) -> Controls | None:
+def third_point(
+    places: Sequence[Pose], mission: Mission, variant: Variant, *, pinning: bool = False
+) -> Controls | None:
     """The manoeuvre whose end tells best which of `places` (poses in the anchor's frame) the robot is at.
 
     Eq. (4) has its best turn rate where the branches mirror each other along the heading, and is best
     straight ahead where they mirror across it (after a circle); both are tried, with the longest chord
     that surely leaves one branch in range, eq. (5). The letter drives forward, `assured` either way.
-    None where the letter's own bound leaves no way to go.
+    None where the letter's own bound leaves no way to go. With `pinning`, one branch is left, and the ranges do
+    not fix it well enough: then the end is best that is farthest off the line from the anchor through p_0,
+    where a range tells most of the heading.
     """
     best: Controls | None = None
     best_value = 0.0
@@ -51,7 +55,15 @@ def third_point(places: Sequence[Pose], mission: Mission, variant: Variant) -> C
             outward = [_outward(place, half, forward) for place in places]
             reach = max(_reach(along, across, mission) for along, across in outward)
             length = min(longest, reach)
-            value = _separation(length, [along for along, _ in outward])
+            if pinning:
+                value = max(
+                    [
+                        abs(place.y + forward * length * math.sin(place.heading + half))
+                        for place in places
+                    ]
+                )
+            else:
+                value = _separation(length, [along for along, _ in outward])
             if length > ARRIVED * mission.first_straight and (best is None or value > best_value * (1.0 + PREFERENCE)):
                 best, best_value = Controls(forward * min(length / unit, mission.max_speed), omega), value
     return best
