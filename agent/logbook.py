@@ -30,10 +30,11 @@ class Logbook(msgspec.Struct, frozen=True):
             at_rest += run.ticks
         return self.through - at_rest
 
-    def travelled(self, through: int) -> tuple[float, float]:
-        """Return the sums of |v| and of |omega| over the ticks in [0, through], in m/s and rad/s."""
+    def travelled(self, through: int) -> tuple[int, float, float]:
+        """Return the number of runs in [0, through], and the sums of |v| and |omega| over its ticks."""
         runs = _between(self.runs, 0, through)
-        return sum([abs(run.v) * run.ticks for run in runs]), sum([abs(run.omega) * run.ticks for run in runs])
+        v = sum([abs(run.v) * run.ticks for run in runs])
+        return len(runs), v, sum([abs(run.omega) * run.ticks for run in runs])
 
     def drove(self, v: float, omega: float, ticks: int = 1) -> Logbook:
         """The log after `ticks` more of one manoeuvre."""
@@ -85,9 +86,8 @@ class Logbook(msgspec.Struct, frozen=True):
         pose = self.pose(start, first, period)
         track = [pose]
         for run in _between(self.runs, first, last):
-            for _ in range(run.ticks):
-                pose = step(pose, run.v, run.omega, period)
-                track.append(pose)
+            pose = track[-1]
+            track += [step(pose, run.v, run.omega, k * period) for k in range(1, run.ticks + 1)]
         return track
 
 

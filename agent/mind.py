@@ -118,6 +118,8 @@ class Mind(msgspec.Struct, frozen=True):
     radio: Radio = Radio()
     in_contact: bool = False
     """whether the peer is in range in this tick"""
+    leg: Pose = ORIGIN
+    """the odometry when the last run of the log began"""
 
     @property
     def orbit(self) -> Orbit:

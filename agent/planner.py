@@ -34,11 +34,14 @@ from protocol.rounding import SAME
 
 def observe(mind: Mind, sense: Sense) -> Mind:
     """What the robot knows once it has sensed: where it drove, what was in range and what was silent."""
-    log, odometry = mind.log, mind.odometry
+    log, odometry, leg = mind.log, mind.odometry, mind.leg
     if sense.executed is not None:
         v, omega = sense.executed.v, sense.executed.omega
         log = log.drove(v, omega)
-        odometry = step(odometry, v, omega, mind.briefing.mission.period)
+        ticks = log.runs[-1].ticks
+        if ticks == 1:
+            leg = odometry
+        odometry = step(leg, v, omega, ticks * mind.briefing.mission.period)
     if sense.anchor_range is not None and not _again(mind, sense):
         log = log.ranged(sense.anchor_range)
     mutual, near = mind.mutual, False
@@ -48,7 +51,7 @@ def observe(mind: Mind, sense: Sense) -> Mind:
             if contact.range is not None:
                 mutual = (*mutual, Ranged(sense.tick, contact.range))
     sensed = Mind(
-        mind.briefing, mind.state, sense.tick, odometry, log, mutual, mind.findings, mind.radio, near
+        mind.briefing, mind.state, sense.tick, odometry, log, mutual, mind.findings, mind.radio, near, leg
     )
     return _advanced(sensed, sense.anchor_range)
 

@@ -28,8 +28,8 @@ def enough(mind: Mind) -> float:
 def drifted(mind: Mind, log: Logbook, tick: int) -> float:
     """Return how far, in m, rounding may have put the odometry of `log` off by `tick`."""
     period = mind.briefing.mission.period
-    v, omega = log.travelled(tick)
-    return rounding(size(mind), tick, v * period, omega * period)
+    runs, v, omega = log.travelled(tick)
+    return rounding(size(mind), runs, v * period, omega * period)
 
 
 def own_anchor(mind: Mind, start: Pose, log: Logbook) -> float:
@@ -64,10 +64,9 @@ def pinned_down(mind: Mind, placement: Placement, sightings: Sequence[Sighting])
     was driven before moves all of them alike, with the anchors.
     """
     ticks = [sighting.tick for sighting in sightings if sighting.range is not None]
-    span, period = ticks[-1] - ticks[0], mind.briefing.mission.period
+    period = mind.briefing.mission.period
     floor, off = 0.0, anchors(mind)
     for log in (mind.log, mind.radio.peer):
-        v, omega = log.travelled(ticks[-1])
-        driven = v - log.travelled(ticks[0])[0]
-        floor += 0.5 * rounding(size(mind), span, driven * period, omega * period)
+        (runs, v, omega), before = log.travelled(ticks[-1]), log.travelled(ticks[0])
+        floor += 0.5 * rounding(size(mind), runs - before[0] + 1, (v - before[1]) * period, omega * period)
     return off + turn_error(placement, sightings, floor, off) * max(1.0, size(mind)) <= SURE

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from protocol.motion import TAU
 from protocol.noise import Noise
 from protocol.rounding import EPSILON, SAME, SURE, foothold, rounding
 from protocol.units import Clearance, Coordinate, Duration, Length, Speed, TurnRate
@@ -111,20 +112,24 @@ MARGIN = 1.5
 
 
 def _anchor_error(mission: Mission, size: float) -> float:
-    """Return how exactly (m) phase 1 finds the anchor from the worst start: on the rim, heading along the radius.
+    """Return how exactly (m) phase 1 finds the anchor from the worst starts, both on the rim.
 
-    After two ranges on the radius, each tick leads A_0 farther and turns by as much as it can; the ranges are off
-    by `rounding`, and the fit of the heading (`belief.anchor_error`) by that over the way off the radius.
+    The ranges are off by `rounding`, and the fit of the heading (`belief.anchor_error`) by that over the way off
+    the radius. Heading along the radius, the first two ranges tell nothing of it, and each further tick leads A_0
+    on and turns by as much as it can. Heading along the tangent, the second range is that at the end of a circle
+    of radius A_0, after a quarter turn on the spot and at most two thirds of the way round.
     """
     step, reach = mission.first_straight, mission.sensing_range
     turn = min(third_point_turn_rate(mission) * mission.period, math.pi)
-    best, y, across, moment = math.inf, 0.0, 0.0, 0.0
+    radial, y, across, moment = math.inf, 0.0, 0.0, 0.0
     for k in range(1, math.ceil(math.pi / turn) + 1):
         y = min(y + step * math.sin((k - 0.5) * turn) * math.sin(0.5 * turn) / (0.5 * turn), 0.5 * reach)
         across, moment = across + 2.0 * reach * y, moment + y * y
         floor = rounding(size, k + 2, (k + 2) * step, k * turn)
-        best = min(best, floor * (1.0 + SAME + across / moment))
-    return best
+        radial = min(radial, floor * (1.0 + SAME + across / moment))
+    round_it = 0.5 * math.pi + 2.0 * TAU / 3.0
+    floor = rounding(size, 6, (TAU + 4.0) * step, round_it)
+    return max(radial, floor * (1.0 + SAME + 2.0 * reach / step))
 
 
 def safety_obstacle(mission: Mission) -> str | None:

@@ -1,12 +1,13 @@
 """Bounds on what double precision does to poses and ranges: every floor of a test with exact sensors.
 
-The world moves the robots, and a robot its odometry, by one `step` a tick. Let `size` (D + R) be the largest
-coordinate, `path` the length driven over `ticks` steps, `turned` the sum of |omega T_s| over them, u = 2^-53.
+The world moves the robots, and a robot its odometry, along the same arcs: equal manoeuvres, a run of them, are one
+arc from where the run began. Let `size` (D + R) be the largest coordinate, `path` the length driven in `runs`
+runs, `turned` the sum of |omega T_s| over all ticks, u = 2^-53.
 
-- A coordinate is rounded by u `size` in each step; a chord, its sine and its cosine by less than that.
-- A heading grows to TAU + `turned`, TAU being that of the start or the branch, and each addition to it is rounded
-  by at most u (TAU + turned). Equal turns are rounded alike, so the errors add up, to ticks u (TAU + turned).
-  They swing what was driven: a place by at most themselves times `path`, or times 2 `size` where that is less.
+- A coordinate is rounded by u `size` in each run; a chord, its sine and its cosine by less than that.
+- A heading grows to TAU + `turned`, TAU being that of the start or the branch, and is rounded by u of that in each
+  run. The errors may add up, and they swing what was driven: a place by at most themselves times `path`, or
+  times 2 `size` where that is less.
 - A range is the hypotenuse of two differences of such coordinates, in frames that lead to each other: RANGED u
   `size`.
 
@@ -35,9 +36,9 @@ SURE = 0.5 * TOLERANCE
 placements that are merged (`same_turn`)"""
 
 
-def rounding(size: float, ticks: int, path: float, turned: float) -> float:
+def rounding(size: float, runs: int, path: float, turned: float) -> float:
     """Return the bound in m, derived above, on how far a computed range may be from the measured one."""
-    return EPSILON * (size * (RANGED + ticks) + min(path, 2.0 * size) * ticks * (TAU + turned))
+    return EPSILON * (size * (RANGED + runs) + min(path, 2.0 * size) * runs * (TAU + turned))
 
 
 def same_turn(size: float) -> float:

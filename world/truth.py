@@ -11,6 +11,14 @@ from protocol.mission import Anchor, Mission
 from protocol.motion import REST, Controls, Pose, step
 
 
+class Leg(msgspec.Struct, frozen=True, gc=False):
+    """Equal manoeuvres of one robot, so far."""
+
+    begin: Pose
+    ticks: int
+    controls: Controls
+
+
 class Truth(msgspec.Struct, frozen=True):
     """The true state at one tick.
 
@@ -22,6 +30,8 @@ class Truth(msgspec.Struct, frozen=True):
     local: tuple[Pose, ...]
     """relative to `origins`; the axes are the world's"""
     origins: tuple[Anchor, ...]
+    legs: tuple[Leg | None, ...] = ()
+    """what led each robot there: equal manoeuvres are one arc, so rounding does not grow with their number"""
 
     @property
     def poses(self) -> tuple[Pose, ...]:
@@ -33,11 +43,16 @@ class Truth(msgspec.Struct, frozen=True):
 
     def moved(self, controls: Sequence[Controls], period: float) -> Truth:
         """Where everyone is one tick later, having driven `controls`."""
-        return Truth(
-            self.tick + 1,
-            tuple([step(pose, c.v, c.omega, period) for pose, c in zip(self.local, controls, strict=True)]),
-            self.origins,
-        )
+        legs = tuple(map(_onward, self.legs or (None,) * len(self.local), self.local, controls))
+        local = [step(leg.begin, leg.controls.v, leg.controls.omega, leg.ticks * period) for leg in legs]
+        return Truth(self.tick + 1, tuple(local), self.origins, legs)
+
+
+def _onward(leg: Leg | None, pose: Pose, controls: Controls) -> Leg:
+    """Return the leg of a robot that is at `pose` after `leg`, and drives `controls` for a tick."""
+    if leg is not None and leg.controls == controls:
+        return Leg(leg.begin, leg.ticks + 1, controls)
+    return Leg(pose, 1, controls)
 
 
 def asked(drive: Drive | None, mission: Mission) -> Controls:
