@@ -30,6 +30,10 @@ SPEEDS = (1.0, -1.0, 0.75, -0.75, 0.5, -0.5, 0.25, -0.25, 0.1, -0.1)
 ELSEWHERE = 1e-6
 """m: a range taken nearer than this to where another was says nothing new"""
 
+ON_THE_OTHER = 1e-6
+"""of a's way between two ranges: nearer to M1 than this, b may be on it, and eq. (7) has a's turn about M1 by
+1e-16 over this at the best"""
+
 FAINT = 1e-8
 """of (D + R)^2 for phi and of D^2 for psi, the most that a range tells: added to the information there is, so
 that the first of two missing ranges counts"""
@@ -110,20 +114,33 @@ class Compared(NamedTuple):
 
 
 def base(sightings: Sequence[Sighting]) -> tuple[Sighting, Sighting] | None:
-    """The two ranges that eq. (7) is solved from: the first two between which only a has moved."""
+    """The two ranges that eq. (7) is solved from: the first two between which only a has moved.
+
+    Others go before two by which b may stand on M1: there any turn of a about it would do.
+    """
     ranged: list[Sighting] = []
     for sighting in sightings:
         if sighting.range is not None and not (
             ranged and (ranged[-1].a, ranged[-1].b) == (sighting.a, sighting.b)  # both have stood since
         ):
             ranged.append(sighting)
+    found: tuple[Sighting, Sighting] | None = None
     for first in ranged:
         for second in ranged:
             if first.tick < second.tick and travelled(first.b, second.b) < ELSEWHERE < travelled(
                 first.a, second.a
             ):
-                return first, second
-    return None
+                near = ON_THE_OTHER * travelled(first.a, second.a)
+                if not (_as_far(first, near) and _as_far(second, near)):
+                    return first, second
+                found = found or (first, second)
+    return found
+
+
+def _as_far(sighting: Sighting, near: float) -> bool:
+    """Whether a is as far from its own anchor as from b, to `near` m."""
+    assert sighting.range is not None
+    return abs(math.hypot(sighting.a.x, sighting.a.y) - sighting.range) <= near
 
 
 def solve(distance: float, base: tuple[Sighting, Sighting]) -> list[Placement]:
