@@ -230,9 +230,7 @@ def _second_range(mind: Mind) -> Mind:
 
 def _sure(mind: Mind, branch: Branch) -> bool:
     """Whether the ranges fix the anchor as exactly as the claim needs; the letter takes no more of them."""
-    if mind.briefing.variant == "paper":
-        return True
-    return precision.own_anchor(mind, branch.start, mind.log) <= precision.enough(mind)
+    return mind.briefing.variant == "paper" or precision.own_anchor(mind, branch.start, mind.log)[1]
 
 
 def _to_third_point(mind: Mind, left: tuple[Branch, ...]) -> Mind:

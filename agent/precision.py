@@ -5,6 +5,7 @@ Both robots of a pair compute the same from the same logs.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from agent.belief import Sighting, anchor_error, turn_error
@@ -12,17 +13,12 @@ from agent.geometry import Placement
 from agent.logbook import Logbook
 from agent.mind import Mind
 from protocol.motion import ORIGIN, Pose
-from protocol.rounding import SURE, foothold, rounding
+from protocol.rounding import BETTER, SURE, WELL, foothold, rounding
 
 
 def size(mind: Mind) -> float:
     """Return D + R in m: the largest coordinate that either robot, or the world, computes with."""
     return mind.briefing.anchor_distance + mind.briefing.mission.sensing_range
-
-
-def enough(mind: Mind) -> float:
-    """Return how exactly, in m, a robot must know where its anchor is when phase 1 ends."""
-    return foothold(size(mind), mind.briefing.anchor_distance, mind.briefing.mission.sensing_range)
 
 
 def drifted(mind: Mind, log: Logbook, tick: int) -> float:
@@ -32,21 +28,24 @@ def drifted(mind: Mind, log: Logbook, tick: int) -> float:
     return rounding(size(mind), runs, v * period, omega * period)
 
 
-def own_anchor(mind: Mind, start: Pose, log: Logbook) -> float:
-    """Return how far, in m, the anchor may be from where phase 1 put it for the robot of `log`.
+def own_anchor(mind: Mind, start: Pose, log: Logbook) -> tuple[float, bool]:
+    """Return how far, in m, the anchor may be from where phase 1 puts it for the robot of `log`; and if that is final.
 
-    Phase 1 ended with the first ranges that were enough, or, for a robot that is not as exact, with later ones.
+    It is once it is well known; or known well enough, while another range made it hardly any better. That is when
+    phase 1 ends, and no later range makes the robot think again.
     """
-    period, bound = mind.briefing.mission.period, enough(mind)
-    error, ranged = bound, []
+    mission = mind.briefing.mission
+    enough = foothold(size(mind), mind.briefing.anchor_distance, mission.sensing_range)
+    error, ranged = math.inf, []
     for one in log.ranges:
         if one.tick > log.through:
             break
-        ranged.append((log.pose(ORIGIN, one.tick, period), one.range))
-        error = anchor_error(start, ranged, drifted(mind, log, one.tick))
-        if error <= bound:
-            break
-    return error
+        ranged.append((log.pose(ORIGIN, one.tick, mission.period), one.range))
+        before, error = error, anchor_error(start, ranged, drifted(mind, log, one.tick))
+        stalled = len(ranged) > 2 and error > BETTER * before
+        if error <= (enough if stalled else WELL * enough):
+            return error, True
+    return error, False
 
 
 def anchors(mind: Mind) -> float:
@@ -54,7 +53,7 @@ def anchors(mind: Mind) -> float:
     assert mind.radio.start is not None
     last = min(mind.tick, mind.radio.peer.through)
     robots = ((mind.start, mind.log), (mind.radio.start, mind.radio.peer))
-    return sum([own_anchor(mind, start, log) + drifted(mind, log, last) for start, log in robots])
+    return sum([own_anchor(mind, start, log)[0] + drifted(mind, log, last) for start, log in robots])
 
 
 def pinned_down(mind: Mind, placement: Placement, sightings: Sequence[Sighting]) -> bool:

@@ -107,7 +107,7 @@ def obstacle(mission: Mission, distance: float) -> str | None:
     return None
 
 
-MARGIN = 1.5
+MARGIN = 1.2
 """by which phase 1 must be able to find an anchor better than it has to: its manoeuvres are not the best ones"""
 
 

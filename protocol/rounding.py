@@ -49,10 +49,17 @@ def same_turn(size: float) -> float:
     return SURE / max(1.0, size)
 
 
+WELL = 0.125
+"""of `foothold`: an anchor that is known so well is known well enough from whatever places the robots meet"""
+
+BETTER = 0.9
+"""by which another range must better what is known of an anchor, for one more to be worth it"""
+
+
 def foothold(size: float, distance: float, sensing_range: float) -> float:
     """Return how exactly, in m, a robot must know where its anchor is when phase 1 ends.
 
     An anchor that is off by e turns the line between the anchors by e / D, and b, whose place is R / 8 from its
-    own, by 8 e / R; either puts a pose off by `size` times that, and two robots err. All of SURE goes there: most places are much better, and `turn_error` knows.
+    own, by 8 e / R; either puts a pose off by `size` times that, and two robots err.
     """
     return 0.5 * SURE * min(distance, 0.125 * sensing_range) / max(1.0, size)
