@@ -32,7 +32,7 @@ FIRST_STRAIGHT_LIMIT = 0.9
 SHORTEST_STEP = 1e-4
 """m: with manoeuvres A_0 that are shorter, places would be no farther apart than RANGE_MARGIN leaves of them"""
 
-AMPLIFIED = 200.0
+AMPLIFIED = 500.0
 """EPSILON of the size, in a range of the encounter, that A_0 (D + R) / max(1, R / D) must be able to bear: found on
 random settings, where `assured` gets on with any that it allows"""
 

@@ -61,6 +61,9 @@ class Draws(msgspec.Struct, frozen=True):
     fields: tuple[Draw, ...] = ()
     starts: StartsTable | None = None
 
+    def __bool__(self) -> bool:
+        return bool(self.fields) or self.starts is not None
+
     def table(self, base: Mapping[str, Any], seed: int) -> dict[str, Any]:
         """Return the scenario table `base` with what the trial of that `seed` draws."""
         table = dict(base)
@@ -70,11 +73,13 @@ class Draws(msgspec.Struct, frozen=True):
             value /= math.prod([value_at(table, way) for way in draw.over])
             table = with_value(table, draw.way, value)
         if self.starts is not None:
-            robots = table["robot"]
             for i, start in enumerate(_starts(self.starts, table, seed)):
                 table = with_value(table, ("robot", i, "start"), list(start))
-            assert len(robots) == len(table["robot"])
         return table
+
+    def values(self, table: Mapping[str, Any]) -> dict[str, float]:
+        """Return what `table` holds of the fields that are drawn."""
+        return {draw.field: value_at(table, draw.way) for draw in self.fields}
 
 
 def _stream(seed: int, name: str) -> Callable[[], float]:

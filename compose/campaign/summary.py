@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import math
+import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from statistics import NormalDist
 from typing import Any, get_args
@@ -12,15 +14,18 @@ from typing import Any, get_args
 import msgspec
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 from scipy.special import gammainccinv, gammaincinv  # type: ignore[import-untyped]
 
 from compose.campaign.cells import Cell
 from compose.campaign.fields import canonical
 from compose.campaign.spec import Campaign
+from compose.campaign.trial import TrialOutcome
 from compose.claim import DEGREES_OF_FREEDOM
 from protocol.messages import Outcome
 
+_NUMBER = re.compile(r"[-+]?\d[\d.]*(e[-+]?\d+)?")
 Floats = NDArray[np.float64]
 CONFIDENCE = 0.95
 """of an interval"""
@@ -84,6 +89,8 @@ class Counted(msgspec.Struct, frozen=True):
     reports_lost: int
     """of all trials"""
     reports_refused: int
+    refused_trials: int
+    """trials in whose drawn setting no mission can be played; no other figure counts them"""
     refused: str | None
     """why no mission can be played in this setting"""
 
@@ -94,13 +101,15 @@ class Noted(msgspec.Struct, frozen=True):
     cell: int
     trial: int
     seed: int
-    outcome: Outcome
+    outcome: TrialOutcome
     ticks: int | None
     why: str | None
 
 
 def counted(table: pa.Table, refused: str | None = None) -> Counted:
     """The figures of these trials."""
+    everything = len(table)
+    table = table.filter(pc.not_equal(table["outcome"], "refused"))
     outcomes = table["outcome"].to_pylist()
     counts = {outcome: outcomes.count(outcome) for outcome in get_args(Outcome)}
     k, n = counts["localised"], len(outcomes)
@@ -141,6 +150,7 @@ def counted(table: pa.Table, refused: str | None = None) -> Counted:
         violations=int(violations.sum()),
         reports_lost=int(_known(column(table, "reports_lost")).sum()),
         reports_refused=int(_known(column(table, "reports_refused")).sum()),
+        refused_trials=everything - n,
         refused=refused,
     )
 
@@ -220,8 +230,20 @@ def header(campaign: Campaign) -> list[str]:
     return ["cell", *axes, *Counted.__struct_fields__]
 
 
+def refusals(table: pa.Table) -> list[tuple[str, int]]:
+    """Return why trials were refused, and how many: the first reason of each kind, the numbers in it aside."""
+    first: dict[str, str] = {}
+    counts: Counter[str] = Counter()
+    for reason in table.filter(pc.equal(table["outcome"], "refused"))["reason"].to_pylist():
+        kind = _NUMBER.sub("", reason)
+        counts[kind] += 1
+        first.setdefault(kind, reason)
+    return [(first[kind], count) for kind, count in counts.most_common()]
+
+
 def noted(table: pa.Table) -> Noted | None:
-    """The trial to look at first, if there is any."""
+    """The trial to look at first, if any was played."""
+    table = table.filter(pc.not_equal(table["outcome"], "refused"))
     if not len(table):
         return None
     outcomes = table["outcome"].to_pylist()
