@@ -1,8 +1,9 @@
 """What a robot still holds possible: branches in phase 1, placements in phase 3.
 
 Closed forms make the candidates, measurements weigh them. The sensors are exact here, so weighing is an
-exact test with a floor in m, of `protocol.rounding`, and a candidate that passes is only polished: where the closed form
-is well conditioned that is the identity, and next to a double root it restores the digits lost there.
+exact test with a floor in m, of `protocol.rounding`, and a candidate that passes is only polished: where
+the closed form is well conditioned that is the identity, and next to a double root it restores the digits
+lost there.
 """
 
 from __future__ import annotations
@@ -90,11 +91,11 @@ def weigh_branches(
 def anchor_error(start: Pose, ranged: Sequence[tuple[Pose, float]], floor: float) -> float:
     """Return how far (m) the anchor may be from where the branch that begins at `start` puts it.
 
-    To first order, by the ranges in `ranged`, each of which rounding may put off by `floor`. They are fitted
-    in squares: at a point that lies y off the line from the anchor through p_0, the slope of the squared range
-    by the heading is 2 rho_0 y, and its error 2 floor (rho + rho_0), with that of rho_0. Whatever the heading,
-    the anchor is rho_0 away: no more than 2 rho_0 of error is left, on the anchor none. What `weigh_branches`
-    merges, it puts off, too.
+    To first order, by the ranges in `ranged`, each of which rounding may put off by `floor`. They are
+    fitted in squares: at a point that lies y off the line from the anchor through p_0, the slope of the
+    squared range by the heading is 2 rho_0 y, and its error 2 floor (rho + rho_0), with that of rho_0.
+    Whatever the heading, the anchor is rho_0 away: no more than 2 rho_0 of error is left, on the anchor
+    none. What `weigh_branches` merges, it puts off, too.
     """
     rho0 = start.x
     c, s = math.cos(start.heading), math.sin(start.heading)
@@ -175,14 +176,12 @@ def _explains(
     return True
 
 
-def turn_error(
-    placement: Placement, sightings: Sequence[Sighting], floor: float, anchors: float
-) -> float:
-    """Return how far (rad), at the most, either robot may be turned about its anchor from what `placement` says.
+def turn_error(placement: Placement, sightings: Sequence[Sighting], floor: float, anchors: float) -> float:
+    """Return how far (rad), at the most, either robot may be turned about its anchor off `placement`.
 
-    To first order, of least squares over all ranges in `sightings`: each is off by `floor` m on its own, and all
-    of them together by the two anchors, which are off by `anchors` m in all. Infinite where they leave a turn
-    open, next to a double root of eq. (7).
+    To first order, of least squares over all ranges in `sightings`: each is off by `floor` m on its own,
+    and all of them together by the two anchors, which are off by `anchors` m in all. Infinite where they
+    leave a turn open, next to a double root of eq. (7).
     """
     pp, pq, qq = information(placement, sightings)
     determinant = pp * qq - pq * pq

@@ -206,7 +206,9 @@ def _released(mind: Mind, rho0: float | None) -> Mind:
         return mind  # and listens
     if rho0 is None:
         return mind.undecided("the anchor is out of range at the start")
-    if rho0 <= SAME * precision.drifted(mind, mind.log, mind.tick) and mind.briefing.mission.noise.exact:  # it is on its anchor: the heading is radial by definition, and nothing is left to find out
+    if (
+        rho0 <= SAME * precision.drifted(mind, mind.log, mind.tick) and mind.briefing.mission.noise.exact
+    ):  # it is on its anchor: the heading is radial by definition, and nothing is left to find out
         return _located(mind, Branch(0.0, ORIGIN), "on-anchor")
     return replace(mind, state=Straight("anchor", mind.odometry, rho0))
 

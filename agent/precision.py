@@ -1,4 +1,4 @@
-"""How exactly a robot knows poses where sensors are exact: the floors of `protocol.rounding` for what it computes.
+"""How exactly a robot knows poses where sensors are exact: by the bounds of `protocol.rounding`.
 
 Both robots of a pair compute the same from the same logs.
 """
@@ -29,10 +29,10 @@ def drifted(mind: Mind, log: Logbook, tick: int) -> float:
 
 
 def own_anchor(mind: Mind, start: Pose, log: Logbook) -> tuple[float, bool]:
-    """Return how far, in m, the anchor may be from where phase 1 puts it for the robot of `log`; and if that is final.
+    """Return how far, in m, the anchor may be off for the robot of `log`, and whether phase 1 may end.
 
-    It is once it is well known; or known well enough, while another range made it hardly any better. That is when
-    phase 1 ends, and no later range makes the robot think again.
+    It may once the anchor is known well; or well enough, and the last range made it hardly any better. Later
+    ranges are not looked at: both robots of a pair, which know the same ranges, find the same.
     """
     mission = mind.briefing.mission
     enough = foothold(size(mind), mind.briefing.anchor_distance, mission.sensing_range)
@@ -59,8 +59,8 @@ def anchors(mind: Mind) -> float:
 def pinned_down(mind: Mind, placement: Placement, sightings: Sequence[Sighting]) -> bool:
     """Whether the ranges in `sightings` fix `placement` as exactly as a claim has to be.
 
-    What was driven between the first and the last of them is all that puts one range off against another; what
-    was driven before moves all of them alike, with the anchors.
+    What was driven between the first and the last of them is all that puts one range off against another;
+    what was driven before moves all of them alike, with the anchors.
     """
     ticks = [sighting.tick for sighting in sightings if sighting.range is not None]
     period = mind.briefing.mission.period

@@ -30,11 +30,12 @@ FIRST_STRAIGHT_LIMIT = 0.9
 
 
 SHORTEST_STEP = 1e-4
-"""m: with manoeuvres A_0 that are shorter, places would be no farther apart than RANGE_MARGIN leaves of them"""
+"""m: with manoeuvres A_0 that are shorter, places would be no farther apart than RANGE_MARGIN leaves of
+them"""
 
 AMPLIFIED = 500.0
-"""EPSILON of the size, in a range of the encounter, that A_0 (D + R) / max(1, R / D) must be able to bear: found on
-random settings, where `assured` gets on with any that it allows"""
+"""EPSILON of the size, in a range of the encounter, that A_0 (D + R) / max(1, R / D) must be able to bear:
+found on random settings, where `assured` gets on with any that it allows"""
 
 MOST_RANGES = 1e4
 """(sigma / accuracy)^2 at most: so many ranges it takes to average sigma down to the accuracy, each of them
@@ -95,10 +96,9 @@ def obstacle(mission: Mission, distance: float) -> str | None:
             "nothing for sure: raise max_speed or period"
         )
     size = distance + reach
-    if (
-        AMPLIFIED * EPSILON * size * max(1.0, reach / distance) * max(1.0, size) / step > SURE
-        or MARGIN * _anchor_error(mission, size) > foothold(size, distance, reach)
-    ):
+    if AMPLIFIED * EPSILON * size * max(1.0, reach / distance) * max(
+        1.0, size
+    ) / step > SURE or MARGIN * _anchor_error(mission, size) > foothold(size, distance, reach):
         return (
             f"with {distance:.6g} m between the anchors and ranges up to {reach:.6g} m, manoeuvres of "
             f"{step:.3g} m are too short for a pose to be sure to a micrometre in double precision: "
@@ -108,16 +108,18 @@ def obstacle(mission: Mission, distance: float) -> str | None:
 
 
 MARGIN = 1.2
-"""by which phase 1 must be able to find an anchor better than it has to: its manoeuvres are not the best ones"""
+"""by which phase 1 must be able to find an anchor better than it has to: its manoeuvres are not the best
+ones"""
 
 
 def _anchor_error(mission: Mission, size: float) -> float:
     """Return how exactly (m) phase 1 finds the anchor from the worst starts, both on the rim.
 
-    The ranges are off by `rounding`, and the fit of the heading (`belief.anchor_error`) by that over the way off
-    the radius. Heading along the radius, the first two ranges tell nothing of it, and each further tick leads A_0
-    on and turns by as much as it can. Heading along the tangent, the second range is that at the end of a circle
-    of radius A_0, after a quarter turn on the spot and at most two thirds of the way round.
+    The ranges are off by `rounding`, and the fit of the heading (`belief.anchor_error`) by that over the
+    way off the radius. Heading along the radius, the first two ranges tell nothing of it, and each further
+    tick leads A_0 on and turns by as much as it can. Heading along the tangent, the second range is that at
+    the end of a circle of radius A_0, after a quarter turn on the spot and at most two thirds of the way
+    round.
     """
     step, reach = mission.first_straight, mission.sensing_range
     turn = min(third_point_turn_rate(mission) * mission.period, math.pi)

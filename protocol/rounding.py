@@ -1,15 +1,15 @@
 """Bounds on what double precision does to poses and ranges: every floor of a test with exact sensors.
 
-The world moves the robots, and a robot its odometry, along the same arcs: equal manoeuvres, a run of them, are one
-arc from where the run began. Let `size` (D + R) be the largest coordinate, `path` the length driven in `runs`
-runs, `turned` the sum of |omega T_s| over all ticks, u = 2^-53.
+The world moves the robots, and a robot its odometry, along the same arcs: equal manoeuvres, a run of them,
+are one arc from where the run began. Let `size` (D + R) be the largest coordinate, `path` the length driven
+in `runs` runs, `turned` the sum of |omega T_s| over all ticks, u = 2^-53.
 
 - A coordinate is rounded by u `size` in each run; a chord, its sine and its cosine by less than that.
-- A heading grows to TAU + `turned`, TAU being that of the start or the branch, and is rounded by u of that in each
-  run. The errors may add up, and they swing what was driven: a place by at most themselves times `path`, or
-  times 2 `size` where that is less.
-- A range is the hypotenuse of two differences of such coordinates, in frames that lead to each other: RANGED u
-  `size`.
+- A heading grows to TAU + `turned`, TAU being that of the start or the branch, and is rounded by u of that
+  in each run. The errors may add up, and they swing what was driven: a place by at most themselves times
+  `path`, or times 2 `size` where that is less.
+- A range is the hypotenuse of two differences of such coordinates, in frames that lead to each other:
+  RANGED u `size`.
 
 Both sides err alike, the world and whoever recomputes it: twice u.
 """
@@ -25,8 +25,8 @@ RANGED = 4.0
 """u of the size: two differences, the hypotenuse, and the turn of a frame"""
 
 SAME = 2.0
-"""floors: two anchors so near each other predict ranges that differ by a floor each at the most, on either side
-of what is measured; so nothing tells them apart"""
+"""floors: two anchors so near each other predict ranges that differ by a floor each at the most, on either
+side of what is measured; so nothing tells them apart"""
 
 TOLERANCE = 1e-6
 """m and rad: a claim that is farther off than this is wrong, where sensors are exact"""
@@ -59,7 +59,7 @@ BETTER = 0.9
 def foothold(size: float, distance: float, sensing_range: float) -> float:
     """Return how exactly, in m, a robot must know where its anchor is when phase 1 ends.
 
-    An anchor that is off by e turns the line between the anchors by e / D, and b, whose place is R / 8 from its
-    own, by 8 e / R; either puts a pose off by `size` times that, and two robots err.
+    An anchor that is off by e turns the line between the anchors by e / D, and b, whose place is R / 8 from
+    its own, by 8 e / R; either puts a pose off by `size` times that, and two robots err.
     """
     return 0.5 * SURE * min(distance, 0.125 * sensing_range) / max(1.0, size)

@@ -35,10 +35,10 @@ def third_point(
     """The manoeuvre whose end tells best which of `places` (poses in the anchor's frame) the robot is at.
 
     Eq. (4) has its best turn rate where the branches mirror each other along the heading, and is best
-    straight ahead where they mirror across it (after a circle); both are tried, with the longest chord
-    that surely leaves one branch in range, eq. (5). The letter drives forward, `assured` either way.
-    None where the letter's own bound leaves no way to go. With `pinning`, one branch is left, and the ranges do
-    not fix it well enough: then the end is best that is farthest off the line from the anchor through p_0,
+    straight ahead where they mirror across it (after a circle); both are tried, with the longest chord that
+    surely leaves one branch in range, eq. (5). The letter drives forward, `assured` either way. None where
+    the letter's own bound leaves no way to go. With `pinning`, one branch is left, and the ranges do not
+    fix it well enough: then the end is best that is farthest off the line from the anchor through p_0,
     where a range tells most of the heading.
     """
     best: Controls | None = None
@@ -57,14 +57,13 @@ def third_point(
             length = min(longest, reach)
             if pinning:
                 value = max(
-                    [
-                        abs(place.y + forward * length * math.sin(place.heading + half))
-                        for place in places
-                    ]
+                    [abs(place.y + forward * length * math.sin(place.heading + half)) for place in places]
                 )
             else:
                 value = _separation(length, [along for along, _ in outward])
-            if length > ARRIVED * mission.first_straight and (best is None or value > best_value * (1.0 + PREFERENCE)):
+            if length > ARRIVED * mission.first_straight and (
+                best is None or value > best_value * (1.0 + PREFERENCE)
+            ):
                 best, best_value = Controls(forward * min(length / unit, mission.max_speed), omega), value
     return best
 

@@ -123,30 +123,23 @@ def _start(
     reach: float,
     first: Start | None,
 ) -> Start:
-    """Return a start at most `reach` from `anchor`; `other` is the peer's, `first` the peer's start, if known."""
+    """Return a start at most `reach` from `anchor`.
+
+    `other` is the peer's anchor, and `first` the peer's start, where that is drawn already.
+    """
     line = math.atan2(other[1] - anchor[1], other[0] - anchor[0])
     place, heading_kind = _one_of(draw, kinds.places), _one_of(draw, kinds.headings)
-    rho, bearing = reach * math.sqrt(draw()), TAU * draw()
+    rho, bearing = _polar(place, draw, line, reach)
     heading = TAU * draw()
-    match place:
-        case "on-anchor":
-            rho = 0.0
-        case "near-anchor":
-            rho = min(_between(draw, NEAR), reach)
-        case "rim":
-            rho = reach * (1.0 - abs(_off(draw)))
-        case "collinear":
-            bearing = line + _one_of(draw, (0.0, math.pi)) + _off(draw)
-        case "coincident" if first is not None:
-            dx, dy = first[0] - anchor[0], first[1] - anchor[1]
-            rho, bearing, heading = math.hypot(dx, dy), math.atan2(dy, dx), first[2]
-            if rho <= reach and draw() < 0.5:
-                return first
-        case "mirrored" if first is not None:
-            rho = math.dist(first[:2], other)
-            bearing = line + line - math.pi - math.pi - math.atan2(first[1] - other[1], first[0] - other[0])
-            bearing += math.pi
-            heading = line + line + math.pi - first[2]
+    if first is not None and place == "coincident":
+        bearing, heading = math.atan2(first[1] - anchor[1], first[0] - anchor[0]), first[2]
+        rho = math.dist(first[:2], anchor)
+        if rho <= reach and draw() < 0.5:
+            return first
+    if first is not None and place == "mirrored":
+        rho = math.dist(first[:2], other)
+        bearing = 2.0 * line + math.pi - math.atan2(first[1] - other[1], first[0] - other[0])
+        heading = 2.0 * line + math.pi - first[2]
     match heading_kind:
         case "radial":
             heading = bearing + _one_of(draw, (0.0, math.pi)) + _off(draw)
@@ -155,6 +148,23 @@ def _start(
         case "collinear":
             heading = line + _one_of(draw, (0.0, math.pi)) + _off(draw)
     return _within(anchor, min(rho, reach), bearing, heading, reach)
+
+
+def _polar(place: Place, draw: Callable[[], float], line: float, reach: float) -> tuple[float, float]:
+    """Return the distance and the bearing of a start from its anchor; `line` is the bearing of the other
+    one."""
+    rho, bearing = reach * math.sqrt(draw()), TAU * draw()
+    match place:
+        case "on-anchor":
+            return 0.0, bearing
+        case "near-anchor":
+            return _between(draw, NEAR), bearing
+        case "rim":
+            return reach * (1.0 - abs(_off(draw))), bearing
+        case "collinear":
+            return rho, line + _one_of(draw, (0.0, math.pi)) + _off(draw)
+        case _:
+            return rho, bearing
 
 
 def _within(anchor: Sequence[float], rho: float, bearing: float, heading: float, reach: float) -> Start:

@@ -14,7 +14,6 @@ from typing import Any, get_args
 import msgspec
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from numpy.typing import NDArray
 from scipy.special import gammainccinv, gammaincinv  # type: ignore[import-untyped]
 
@@ -109,7 +108,7 @@ class Noted(msgspec.Struct, frozen=True):
 def counted(table: pa.Table, refused: str | None = None) -> Counted:
     """The figures of these trials."""
     everything = len(table)
-    table = table.filter(pc.not_equal(table["outcome"], "refused"))
+    table = _played(table)
     outcomes = table["outcome"].to_pylist()
     counts = {outcome: outcomes.count(outcome) for outcome in get_args(Outcome)}
     k, n = counts["localised"], len(outcomes)
@@ -230,11 +229,20 @@ def header(campaign: Campaign) -> list[str]:
     return ["cell", *axes, *Counted.__struct_fields__]
 
 
+def _played(table: pa.Table) -> pa.Table:
+    """Return the trials that were not refused."""
+    return table.filter(
+        pa.array([outcome != "refused" for outcome in table["outcome"].to_pylist()], pa.bool_())
+    )
+
+
 def refusals(table: pa.Table) -> list[tuple[str, int]]:
-    """Return why trials were refused, and how many: the first reason of each kind, the numbers in it aside."""
+    """Return why trials were refused, and how many; of reasons that differ in numbers only, the first."""
     first: dict[str, str] = {}
     counts: Counter[str] = Counter()
-    for reason in table.filter(pc.equal(table["outcome"], "refused"))["reason"].to_pylist():
+    for outcome, reason in zip(table["outcome"].to_pylist(), table["reason"].to_pylist(), strict=True):
+        if outcome != "refused":
+            continue
         kind = _NUMBER.sub("", reason)
         counts[kind] += 1
         first.setdefault(kind, reason)
@@ -243,7 +251,7 @@ def refusals(table: pa.Table) -> list[tuple[str, int]]:
 
 def noted(table: pa.Table) -> Noted | None:
     """The trial to look at first, if any was played."""
-    table = table.filter(pc.not_equal(table["outcome"], "refused"))
+    table = _played(table)
     if not len(table):
         return None
     outcomes = table["outcome"].to_pylist()
