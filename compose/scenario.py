@@ -23,7 +23,7 @@ from compose.toml import field_first, read_text, table_in
 from protocol.lie import OF_THE_START, Kind, Lie, Part
 from protocol.messages import Briefing
 from protocol.mission import Anchor, Mission, Role, Variant, noise_obstacle, obstacle, safety_obstacle
-from protocol.motion import TAU, Pose
+from protocol.motion import TAU, Pose, wrap
 from protocol.rendezvous import Rendezvous, rendezvous, tick_budget
 from protocol.rounding import TOLERANCE
 from protocol.units import NAME, RobotId
@@ -324,7 +324,8 @@ def _peers(robots: list[RobotTable], source: str) -> dict[str, str]:
 def _start(robot: RobotTable, sensing_range: float, seed: int) -> Pose:
     """Where the robot is released: as the file says, or uniform in its anchor's range, any heading."""
     if robot.start is not None:
-        return Pose(*robot.start)
+        x, y, heading = robot.start
+        return Pose(x, y, heading if abs(heading) <= TAU else wrap(heading))  # many turns would cost digits
     draw = random.Random(f"{seed}/start/{robot.id}").random
     radius = WITHIN * sensing_range * math.sqrt(draw())
     bearing, heading = TAU * draw(), TAU * draw()

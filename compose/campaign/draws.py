@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta
@@ -16,6 +16,7 @@ from msgspec import Meta
 from compose.campaign.fields import Steps, value_at, with_value
 from protocol.motion import TAU
 
+T = TypeVar("T")
 Interval = tuple[float, float]
 Place = Literal["inside", "on-anchor", "near-anchor", "rim", "collinear", "coincident", "mirrored"]
 Heading = Literal["any", "radial", "tangential", "collinear"]
@@ -92,7 +93,7 @@ def _between(draw: Callable[[], float], interval: Interval, *, logarithmic: bool
     return low * (high / low) ** draw() if logarithmic else low + (high - low) * draw()
 
 
-def _one_of(draw: Callable[[], float], kinds: Sequence[Any]) -> Any:
+def _one_of(draw: Callable[[], float], kinds: Sequence[T]) -> T:
     return kinds[int(draw() * len(kinds))]
 
 
