@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 from protocol.motion import Pose, compose, wrap
 
-SLACK = 1e-6
+SLACK = 1e-7
 """of a triangle's three sides: by so much may rounding break its inequality; residuals weigh later what that
-lets in. Sides are sums of some thousand numbers up to a thousand times as long: 1e-16 of 1e6 is far less"""
+lets in. Sides are sums of some thousand numbers up to a thousand times as long: 1e-16 of 1e6 is less"""
 
 SAME = 1e-9
 """rad, and of the lengths at hand: placements nearer than this are one (a double root)"""
