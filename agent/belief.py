@@ -66,10 +66,12 @@ def weigh_branches(
     seen: Iterable[tuple[Pose, float | None]],
     sensing_range: float,
     floor: float,
+    margin: float,
 ) -> tuple[Branch, ...]:
     """Those of `candidates` that explain every odometry pose in `seen` with its range, or its silence.
 
-    `floor` is by how much (m) rounding may put a predicted range off.
+    `floor` is by how much (m) rounding may put a predicted range off. `margin` is how far inside the range a
+    point must lie to count on it: half of that is left for what two ranges leave open of a heading.
 
     Two that put the anchor in the same place are one: so near the anchor, or so nearly radial, they are.
     """
@@ -81,7 +83,7 @@ def weigh_branches(
         branch = _polished(candidate, ranged)
         if (
             all(abs(branch.distance(pose) - rho) <= floor for pose, rho in ranged)
-            and all(branch.distance(pose) > sensing_range - floor for pose in silent)
+            and all(branch.distance(pose) > sensing_range - 0.5 * margin for pose in silent)
             and not any(math.dist(branch.anchor, other.anchor) < SAME * floor for other in left)
         ):
             left.append(branch)

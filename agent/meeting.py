@@ -91,9 +91,10 @@ def _settled(mind: Mind) -> Mind:
     if checked and len(left) == 1 and precision.pinned_down(mind, left[0], sightings):
         return replace(mind, state=Done(3, Localised(mind.world_pose(left[0]))))
     mover = mind.briefing.role
-    if mover != (encounter.turn(sightings) if checked and variant == "assured" else "b"):
+    alone = variant == "assured" and isinstance(mind.radio.verdict, Localised)  # the peer stands for good
+    if not alone and mover != (encounter.turn(sightings) if checked and variant == "assured" else "b"):
         return mind
-    if variant == "assured" and mind.radio.state not in PEER_RESTS:
+    if variant == "assured" and not alone and mind.radio.state not in PEER_RESTS:
         return mind
     if variant == "paper" and mind.findings.plan is not None:
         failure = "does not settle where they are" if checked else "could not be taken: b left a's range"

@@ -224,7 +224,9 @@ def _second_range(mind: Mind) -> Mind:
     possible = branches(rho0, mind.odometry, rho)
     mind = replace(mind, findings=replace(mind.findings, possible=possible))
     floor = precision.drifted(mind, mind.log, mind.tick)
-    left = weigh_branches(possible, mind.seen(), mind.briefing.mission.sensing_range, floor)
+    left = weigh_branches(
+        possible, mind.seen(), mind.briefing.mission.sensing_range, floor, precision.margin(mind)
+    )
     if isinstance(mind.state, Circling) and len(left) == 1 and _sure(mind, left[0]):
         return _located(mind, left[0], "circle")
     return _to_third_point(mind, left)
@@ -240,7 +242,9 @@ def _to_third_point(mind: Mind, left: tuple[Branch, ...]) -> Mind:
         return mind.undecided("no pose explains the anchor ranges")
     mission, variant = mind.briefing.mission, mind.briefing.variant
     pinning = variant == "assured" and len(left) == 1 and mission.noise.exact
-    controls = anchor.third_point(anchor.local(left, mind.odometry), mission, variant, pinning=pinning)
+    controls = anchor.third_point(
+        anchor.local(left, mind.odometry), mission, variant, margin=precision.margin(mind), pinning=pinning
+    )
     if controls is None:
         return mind.undecided("eq. (5) leaves no way to a third range")
     return replace(mind, state=ThirdPoint(left, mind.odometry, controls))
@@ -254,7 +258,9 @@ def _third_range(mind: Mind, state: ThirdPoint) -> Mind:
         mind, likely = letter.with_branches(mind)
         return _located(mind, likely[0], kind) if likely else _to_third_point(mind, likely)
     floor = precision.drifted(mind, mind.log, mind.tick)
-    left = weigh_branches(state.branches, mind.seen(), mind.briefing.mission.sensing_range, floor)
+    left = weigh_branches(
+        state.branches, mind.seen(), mind.briefing.mission.sensing_range, floor, precision.margin(mind)
+    )
     if len(left) == 1 and _sure(mind, left[0]):
         return _located(mind, left[0], kind)
     if len(left) > 1 and mind.briefing.variant == "paper":

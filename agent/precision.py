@@ -12,6 +12,7 @@ from agent.belief import Sighting, anchor_error, turn_error
 from agent.geometry import Placement
 from agent.logbook import Logbook
 from agent.mind import Mind
+from protocol.mission import RANGE_MARGIN
 from protocol.motion import ORIGIN, Pose
 from protocol.rounding import BETTER, SURE, WELL, foothold, rounding
 
@@ -26,6 +27,17 @@ def drifted(mind: Mind, log: Logbook, tick: int) -> float:
     period = mind.briefing.mission.period
     runs, v, omega = log.travelled(tick)
     return rounding(size(mind), runs, v * period, omega * period)
+
+
+def margin(mind: Mind) -> float:
+    """Return how far inside R, in m, a point must lie in phase 1 to count on its range.
+
+    Two ranges on a radius, A_0 apart and off by a floor, leave a heading open to sqrt(2 floor / A_0), so the
+    range of a point anywhere to R times that.
+    """
+    mission = mind.briefing.mission
+    floor = drifted(mind, mind.log, mind.tick)
+    return max(RANGE_MARGIN, mission.sensing_range * math.sqrt(2.0 * floor / mission.first_straight))
 
 
 def own_anchor(mind: Mind, start: Pose, log: Logbook) -> tuple[float, bool]:

@@ -224,7 +224,7 @@ def test_a_third_range_leaves_the_true_branch_as_it_was(rho0: float, alpha: floa
     second = Pose(1.0, 0.0, 0.0)
     third = step(second, 1.0, omega, 1.0)
     seen = [(pose, local(truth, pose)) for pose in (Pose(0.0, 0.0, 0.0), second, third)]
-    left = weigh_branches(branches(rho0, second, local(truth, second)), seen, 100.0, FLOOR)
+    left = weigh_branches(branches(rho0, second, local(truth, second)), seen, 100.0, FLOOR, FLOOR)
     assert len(left) == 1
     assert turned(left[0].start.heading, alpha) < EXACT
     assert left[0].alpha == pytest.approx(alpha, abs=EXACT)
@@ -244,7 +244,9 @@ def test_silence_where_a_branch_would_have_been_heard_rules_it_out(
     far = max(true, mirrored)
     assume(far - min(true, mirrored) > 1e-3)
     seen = [(second, local(truth, second)), (third, None)]
-    left = weigh_branches(branches(rho0, second, local(truth, second)), seen, 0.5 * (true + mirrored), FLOOR)
+    left = weigh_branches(
+        branches(rho0, second, local(truth, second)), seen, 0.5 * (true + mirrored), FLOOR, FLOOR
+    )
     assert len(left) == 1
     assert left[0].distance(third) == pytest.approx(far, abs=ROUNDING)
 

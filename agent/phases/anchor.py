@@ -30,7 +30,12 @@ class ThirdPoint(msgspec.Struct, frozen=True):
 
 
 def third_point(
-    places: Sequence[Pose], mission: Mission, variant: Variant, *, pinning: bool = False
+    places: Sequence[Pose],
+    mission: Mission,
+    variant: Variant,
+    *,
+    margin: float = RANGE_MARGIN,
+    pinning: bool = False,
 ) -> Controls | None:
     """The manoeuvre whose end tells best which of `places` (poses in the anchor's frame) the robot is at.
 
@@ -53,7 +58,7 @@ def third_point(
         half = 0.5 * mission.period * omega
         for forward in (1.0,) if variant == "paper" else (1.0, -1.0):
             outward = [_outward(place, half, forward) for place in places]
-            reach = max(_reach(along, across, mission) for along, across in outward)
+            reach = max(_reach(along, across, mission, margin) for along, across in outward)
             length = min(longest, reach)
             if pinning:
                 value = max(
@@ -75,9 +80,9 @@ def _outward(place: Pose, half_turn: float, forward: float) -> tuple[float, floa
     return place.x * c + place.y * s, place.y * c - place.x * s
 
 
-def _reach(along: float, across: float, mission: Mission) -> float:
+def _reach(along: float, across: float, mission: Mission, margin: float) -> float:
     """m: how far a robot can go before it is out of range, eq. (5); negative where it is already."""
-    rim = mission.sensing_range - max(RANGE_MARGIN, SIGMAS * mission.noise.anchor_sigma)
+    rim = mission.sensing_range - max(margin, SIGMAS * mission.noise.anchor_sigma)
     inside = rim * rim - across * across
     return math.sqrt(inside) - along if inside >= 0.0 else -math.inf
 
