@@ -23,6 +23,9 @@ POLISHING_STEPS = 12
 DAMPING = 1e-9
 """of a fit's curvature, added to it: so a step goes only where the ranges tell something"""
 
+CLOSEST = 1e-12
+"""of D: a shorter range weighs no more than this one"""
+
 SINGULAR = 1e-14
 """how nearly parallel two columns may be before they count as one (the sine of their angle, squared)"""
 
@@ -230,7 +233,9 @@ def _slopes(
 
 
 def _polished_placement(placement: Placement, sightings: Sequence[Sighting]) -> Placement:
-    """The placement nearby that fits all ranges best, in squares; M1 stays D from M2 (Gauss-Newton).
+    """The placement nearby that fits all ranges best; M1 stays D from M2 (Gauss-Newton).
+
+    The squares are weighed so that an error is one of the range: a tiny one would not count beside others.
 
     The unknowns are phi and the bearing psi of M1 in <b(M2)>. Two ranges determine them exactly; more
     of them tell apart what eq. (7) alone gives as a double root.
@@ -248,9 +253,10 @@ def _polished_placement(placement: Placement, sightings: Sequence[Sighting]) -> 
         for a, b, rho in ranged:
             ax, ay = c * a.x - s * a.y, s * a.x + c * a.y
             x, y = tx + ax - b.x, ty + ay - b.y
-            error = x * x + y * y - rho * rho
-            by_phi = 2.0 * (y * ax - x * ay)
-            by_psi = 2.0 * (y * tx - x * ty)
+            weight = 0.5 / max(rho, CLOSEST * distance)
+            error = weight * (x * x + y * y - rho * rho)
+            by_phi = weight * 2.0 * (y * ax - x * ay)
+            by_psi = weight * 2.0 * (y * tx - x * ty)
             cost += error * error
             pp += by_phi * by_phi
             pq += by_phi * by_psi

@@ -401,7 +401,7 @@ def test_the_last_manoeuvre_leaves_no_more_placements_out_of_range_than_it_must(
     assert counts == {0, 1}
 
 
-@pytest.mark.parametrize("seed", [64, 78, 83, 86])
+@pytest.mark.parametrize("seed", [64, 78, 83])
 def test_silence_names_the_placement_left_out_and_b_drives_back_to_tell(seed: int, tmp_path: Path) -> None:
     moments = list(steps_of(tmp_path, SLOW, seed))
     doing = [moment.drives["b"].state for moment in moments]
