@@ -83,12 +83,13 @@ def _settled(mind: Mind) -> Mind:
     if base is None:  # yet; or, where a report was missed, b was still driving as a went straight
         again = isinstance(mind.state, Waiting) and mind.radio.state == WORDS[Standing]
         return met(mind) if again and variant == "assured" else mind
-    mind = _weighed(mind, sightings, base)
+    off = precision.anchors(mind)
+    mind = _weighed(mind, sightings, base, off)
     left = mind.findings.placements
     checked = encounter.redundant(sightings, base)
     if not left:
         return mind.alarmed(Alarm("a path that no placement brings together with the mutual ranges"))
-    if checked and len(left) == 1 and precision.pinned_down(mind, left[0], sightings):
+    if checked and len(left) == 1 and precision.pinned_down(mind, left[0], sightings, off):
         return replace(mind, state=Done(3, Localised(mind.world_pose(left[0]))))
     mover = mind.briefing.role
     alone = variant == "assured" and isinstance(mind.radio.verdict, Localised)  # the peer stands for good
@@ -113,9 +114,11 @@ def _settled(mind: Mind) -> Mind:
     )
 
 
-def _weighed(mind: Mind, sightings: Sequence[Sighting], base: tuple[Sighting, Sighting]) -> Mind:
+def _weighed(
+    mind: Mind, sightings: Sequence[Sighting], base: tuple[Sighting, Sighting], floor: float
+) -> Mind:
     """The placements of eq. (7) that every range and every silent tick in `sightings` leave."""
-    reach, findings, floor = mind.briefing.mission.sensing_range, mind.findings, precision.anchors(mind)
+    reach, findings = mind.briefing.mission.sensing_range, mind.findings
     if findings.candidates is None:
         solutions = encounter.solve(mind.briefing.anchor_distance, base)
         silence = [sighting for sighting in sightings if sighting.range is None]

@@ -68,15 +68,15 @@ def anchors(mind: Mind) -> float:
     return sum([own_anchor(mind, start, log)[0] + drifted(mind, log, last) for start, log in robots])
 
 
-def pinned_down(mind: Mind, placement: Placement, sightings: Sequence[Sighting]) -> bool:
-    """Whether the ranges in `sightings` fix `placement` as exactly as a claim has to be.
+def pinned_down(mind: Mind, placement: Placement, sightings: Sequence[Sighting], off: float) -> bool:
+    """Whether the ranges in `sightings` fix `placement` as exactly as a claim has to be; `off` is `anchors`.
 
     What was driven between the first and the last of them is all that puts one range off against another;
     what was driven before moves all of them alike, with the anchors.
     """
     ticks = [sighting.tick for sighting in sightings if sighting.range is not None]
     period = mind.briefing.mission.period
-    floor, off = 0.0, anchors(mind)
+    floor = 0.0
     for log in (mind.log, mind.radio.peer):
         (runs, v, omega), before = log.travelled(ticks[-1]), log.travelled(ticks[0])
         floor += 0.5 * rounding(size(mind), runs - before[0] + 1, (v - before[1]) * period, omega * period)
