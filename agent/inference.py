@@ -17,7 +17,7 @@ from agent.estimation.smoothing import deviation, poses
 from agent.logbook import Logbook
 from agent.mind import Mind
 from agent.phases.surveying import Held
-from protocol.mission import Mission
+from protocol.mission import HEADING_ACCURACY, Mission
 from protocol.motion import Covariance, Pose, compose, inverse, wrap
 
 
@@ -152,8 +152,8 @@ def missing_for(
         if not position <= mission.accuracy:
             return f"{robot}'s position is known to {position:.3g} m, of {mission.accuracy:g}"
         heading = deviation(covariance[i + 2, i + 2])
-        if not heading <= ASKEW:
-            return f"{robot}'s heading is known to {heading:.3g} rad, of {ASKEW:g}"
+        if not heading <= HEADING_ACCURACY:
+            return f"{robot}'s heading is known to {heading:.3g} rad, of {HEADING_ACCURACY:g}"
     return None
 
 
@@ -163,10 +163,6 @@ def finished(mind: Mind, weighed: Sequence[Weighed]) -> Mind:
         return mind
     missing = f"the likeliest hypothesis still moves, by {weighed[0].fit.last_step:.3g} sigmas"
     return replace(mind, findings=replace(mind.findings, missing=missing))
-
-
-ASKEW = 0.2
-"""rad: with a heading less well known than this the ellipse is no likeness of what is possible"""
 
 
 def with_pair(mind: Mind, weighed: Sequence[Weighed], pair: Pair, mutual: int) -> Mind:

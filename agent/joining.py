@@ -73,7 +73,7 @@ def join(link: zenoh.Session, run: str | None, robot: str, search: Search) -> tu
     until = time.monotonic() + SESSION_S
     played: str | None = None
     while time.monotonic() < until:
-        worlds = [keys.run_of(key) for key in session.alive(link, keys.world_alive(run or "*"), QUERY_S)]
+        worlds = [key.run for key in session.alive(link, keys.world_alive(run or "*"), QUERY_S)]
         if len(worlds) > 1:
             raise Unwelcome(f"several runs are alive: {', '.join(worlds)}; choose one with --run")
         played = None
@@ -85,10 +85,7 @@ def join(link: zenoh.Session, run: str | None, robot: str, search: Search) -> tu
             if isinstance(answer, str):
                 raise Unwelcome(answer)
             if answer is not None:
-                try:
-                    return world, decode(answer, Briefing)
-                except MalformedFrame as error:
-                    raise Unwelcome(f"the world's briefing is not understood: {error}") from None
+                return world, _briefing(answer, robot)
         if played is None:
             search.go_on(linked=session.linked(link))
         else:
@@ -96,3 +93,14 @@ def join(link: zenoh.Session, run: str | None, robot: str, search: Search) -> tu
     if played is not None:
         raise Unwelcome(f"robot '{robot}' is in run '{played}' already")
     return None
+
+
+def _briefing(answer: bytes, robot: str) -> Briefing:
+    """The briefing of `robot` in what the world answered. Raises Unwelcome."""
+    try:
+        briefing = decode(answer, Briefing)
+    except MalformedFrame as error:
+        raise Unwelcome(f"the world's briefing is not understood: {error}") from None
+    if briefing.robot != robot:
+        raise Unwelcome(f"the world's briefing is for '{briefing.robot}', not for '{robot}'")
+    return briefing

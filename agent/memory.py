@@ -11,9 +11,11 @@ import msgspec
 
 from agent.past import past
 from agent.robot import Robot, Told
+from protocol import environment
 from protocol.journal import CorruptJournal
 from protocol.messages import Briefing, End, Farewell, Sense
 from protocol.retrace import Otherwise, Retrace
+from protocol.wire import encode
 
 REPORTS_KEPT = 64
 """ticks for which a report of the peer is kept that no Sense has listed yet"""
@@ -42,10 +44,13 @@ def remember(record: Retrace) -> Memory | None:
 
     Raises CorruptJournal if it tells no mission, or one in which other decisions were taken.
     """
-    if not record.frames:
+    if environment.is_blank(record.frames):
         return None
+    named = environment.named_in(record.frames)
     lived = past(record.frames, record.path)
-    robot = Robot(lived.briefing, record)
+    robot = Robot(lived.briefing)
+    robot.keep(record)
+    record.write(*[encode(one) for one in (named, lived.briefing) if one is not None])
     told: deque[Told] = deque(maxlen=REPORTS_TOLD)
     for step in lived.steps:
         try:
@@ -58,7 +63,7 @@ def remember(record: Retrace) -> Memory | None:
         except Otherwise:
             raise CorruptJournal(
                 f"{record.path}: on record it decided otherwise at tick {step.sense.tick}: "
-                "the journal is another version's"
+                + (environment.otherwise(named, environment.of_robot()) or "the journal is another version's")
             ) from None
     if lived.farewell is not None:  # counts what the wire brought, too, which no fold can
         record.write(*record.frames[-2:])

@@ -19,7 +19,7 @@ from agent.phases.seeking import Backing, Circling, Homing, Straight, Turning
 from agent.phases.surveying import Listening, Retreating, Surveying
 from agent.radio import Radio
 from protocol import messages
-from protocol.messages import MAX_REASON, Alarm, Briefing, Localised, Ranged, Undecided
+from protocol.messages import Alarm, Briefing, Localised, Ranged, Undecided
 from protocol.motion import ORIGIN, Covariance, Pose, compose
 from protocol.rendezvous import Orbit
 
@@ -173,7 +173,7 @@ class Mind(msgspec.Struct, frozen=True):
 
     def undecided(self, reason: str) -> Mind:
         """It cannot go on, and does not guess."""
-        return replace(self, state=Done(self.phase, Undecided(reason[:MAX_REASON])))
+        return replace(self, state=Done(self.phase, Undecided(reason)))
 
     def alarmed(self, alarm: Alarm) -> Mind:
         """The peer tells what cannot be so."""

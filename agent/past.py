@@ -10,12 +10,14 @@ from msgspec.structs import replace
 
 from agent.robot import Told
 from protocol import motion
+from protocol.environment import named_in
 from protocol.journal import CorruptJournal
 from protocol.messages import (
     Briefing,
     Contact,
     Drive,
     End,
+    Environment,
     Estimate,
     Farewell,
     Localised,
@@ -50,6 +52,8 @@ class Past(msgspec.Struct, frozen=True):
     steps: tuple[Step, ...]
     end: End | None = None
     farewell: Farewell | None = None
+    environment: Environment | None = None
+    """where it was written; none of an older recording"""
 
     @property
     def estimates(self) -> tuple[Estimate, ...]:
@@ -104,16 +108,19 @@ class OutOfOrder(CorruptJournal):
 
 def past(frames: Iterable[bytes], source: object) -> Past:
     """What `frames` tell. Raises CorruptJournal, whose text begins with `source`."""
+    frames = list(frames)
+    environment = named_in(frames)
+    first = int(environment is not None)
     briefing: Briefing | None = None
     steps: list[Step] = []
     end: End | None = None
     farewell: Farewell | None = None
-    for place, frame in enumerate(frames):
+    for place, frame in enumerate(frames[first:], first):
         message = _message(frame, source)
-        if place == 0 and not isinstance(message, Briefing):
+        if place == first and not isinstance(message, Briefing):
             raise CorruptJournal(f"{source}: an agent's journal begins with its Briefing")
         match message:
-            case Briefing() if place == 0:
+            case Briefing() if place == first:
                 briefing = message
             case End() if end is None:
                 end = message
@@ -131,7 +138,7 @@ def past(frames: Iterable[bytes], source: object) -> Past:
                 raise OutOfOrder(message, place, source)
     if briefing is None:
         raise CorruptJournal(f"{source}: there is no Briefing in it")
-    return Past(briefing, tuple(steps), end, farewell)
+    return Past(briefing, tuple(steps), end, farewell, environment)
 
 
 def _answered(steps: Sequence[Step]) -> bool:

@@ -7,7 +7,6 @@ from collections.abc import Collection, Iterable, Sequence
 from agent import radio
 from agent.memory import REPORTS_KEPT
 from agent.robot import Told
-from protocol import keys
 from protocol.inbox import Arrival, Inbox
 from protocol.messages import Report
 from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode
@@ -34,7 +33,7 @@ class Post:
             self._inbox.refuse(arrival, error)
             return
         wrong = radio.contradiction(report)
-        if report.robot != keys.robot_of(arrival.key):
+        if report.robot != arrival.source.robot:
             wrong = f"it says it is from '{report.robot}'"
         if wrong is not None:
             self._inbox.refuse(arrival, wrong)

@@ -11,6 +11,7 @@ import msgspec
 
 from agent import planner
 from agent.mind import Mind
+from protocol import environment
 from protocol.journal import Sink
 from protocol.messages import Briefing, Drive, End, Farewell, Missed, Report, Sense
 from protocol.wire import encode
@@ -43,7 +44,7 @@ class Robot:
         """a Sense that nothing has followed from yet; journaled with the Drive, before that is sent"""
         self._journal = journal
         if journal is not None:
-            journal.write(encode(briefing))
+            journal.write(encode(environment.of_robot()), encode(briefing))
 
     def keep(self, journal: Sink | None) -> None:
         """Go on journaling there."""

@@ -62,6 +62,13 @@ def port(text: str) -> int:
     return value
 
 
+def origin(text: str) -> str:
+    """The origin of a web page, as a browser sends it."""
+    if text != "null" and not re.fullmatch(r"[a-z][a-z0-9+.-]*://[A-Za-z0-9.\[\]:-]*", text):
+        raise ArgumentTypeError(f"'{text}' is no origin; one looks like https://viewer.example:8080")
+    return text
+
+
 def address(text: str) -> str:
     """Of IP."""
     try:

@@ -16,6 +16,7 @@ from pathlib import Path
 from compose.local import STOP_S
 from compose.status import UserError
 from protocol.inbox import Inbox, Interrupted
+from protocol.terminal import say
 
 OVER = b"."
 """what it is told when the mission is over"""
@@ -33,7 +34,7 @@ class Beside:
 
     def announce(self) -> None:
         """Say where it is."""
-        print(f"{self._what} at {self.address}", flush=True)
+        say(f"{self._what} at {self.address}")
 
     def conclude(self) -> None:
         """The mission is over; it stays."""
@@ -41,26 +42,32 @@ class Beside:
         with suppress(BrokenPipeError):
             self._process.stdin.write(OVER)
             self._process.stdin.flush()
-        print(f"{self._what} stays at {self.address} until Ctrl-C", flush=True)
+        say(f"{self._what} stays at {self.address} until Ctrl-C")
 
     def put_end(self, inbox: Inbox) -> None:
-        """Put "ended" into `inbox` once the process is gone."""
+        """Put "ended" with its address into `inbox` once the process is gone."""
 
         def wait() -> None:
-            inbox.put("ended", str(self._process.wait()))
+            self._process.wait()
+            inbox.put("ended", self.address)
 
         threading.Thread(target=wait, daemon=True).start()
 
 
 def stay(shows: Sequence[Beside], inbox: Inbox) -> None:
-    """The mission is over: wait for Ctrl-C, or for the end of all of `shows`."""
+    """The mission is over: wait for Ctrl-C, or for the end of all of `shows`.
+
+    A process of the mission may end after it, and is none of them.
+    """
     for show in shows:
         show.conclude()
         show.put_end(inbox)
-    left = len(shows)
+    left = {show.address for show in shows}
     with suppress(Interrupted):
         while left:
-            left -= inbox.next(None).topic == "ended"
+            arrival = inbox.next(None)
+            if arrival.topic == "ended":
+                left.discard(arrival.key)
 
 
 @contextmanager
@@ -96,9 +103,10 @@ def page(folder: Path, port: int) -> tuple[str, ...]:
     return ("the page", "compose", "watch", str(folder), "--launched", "--port", str(port))
 
 
-def viewers(folder: Path, port: int, robots: Sequence[str]) -> tuple[str, ...]:
-    """The same for Foxglove's viewers, of a run of `robots`."""
-    return ("what Foxglove's viewers show", "compose.export.live", str(port), str(folder), *robots)
+def viewers(folder: Path, port: int, origins: Sequence[str], robots: Sequence[str]) -> tuple[str, ...]:
+    """The same for Foxglove's viewers, of a run of `robots`; web pages of `origins` may look, too."""
+    words = (str(port), ",".join(origins), str(folder), *robots)
+    return ("what Foxglove's viewers show", "compose.export.live", *words)
 
 
 def _address(process: subprocess.Popen[bytes]) -> str | None:

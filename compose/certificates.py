@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import ipaddress
 import json
-import os
 import re
 import shutil
 import tempfile
@@ -30,12 +29,15 @@ from cryptography.hazmat.primitives.serialization import (
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from compose.reach import KEYED
-from protocol import access
+from protocol import access, files
 
 AUTHORITY_DAYS = 36_500
 """as long as certificates may last"""
 SKEW = timedelta(days=1)
 """by how much a robot's clock may be behind"""
+SECRET = 0o600
+"""only the owner reads such a file, from the first byte on"""
+GITIGNORE = ".gitignore"
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
 """names that everybody who may be a router has"""
 
@@ -59,6 +61,8 @@ def make(folder: Path, robots: Sequence[str], hosts: Sequence[str], days: int) -
     """
     folder.mkdir(parents=True, exist_ok=True)
     authority = _authority(folder)
+    if not (folder / GITIGNORE).exists():
+        files.write(folder / GITIGNORE, "# Keys do not belong into a repository.\n*\n")
     known = {path.parent.name.removeprefix("agent-") for path in folder.glob(f"agent-*/{KEYED}")}
     everyone = sorted(known | set(robots))
     made, kept = [], []
@@ -68,13 +72,13 @@ def make(folder: Path, robots: Sequence[str], hosts: Sequence[str], days: int) -
             for file in ("cert.pem", "key.pem", "ca.pem"):
                 if not (own / file).is_file():
                     raise BadKeys(f"{own} has no {file}; remove the folder, and it is made anew")
-            if (own / "ca.pem").read_bytes() != (folder / "ca.pem").read_bytes():
+            if files.read_bytes(own / "ca.pem") != files.read_bytes(folder / "ca.pem"):
                 raise BadKeys(f"{own} is of another authority than {folder / 'ca.pem'}")
             kept.append(name)
         else:
             _participant(own, name, authority, hosts, days)
             made.append(name)
-        _replace(own / KEYED, configuration(name, everyone))
+        files.write(own / KEYED, configuration(name, everyone))
     return made, kept
 
 
@@ -106,14 +110,14 @@ def _authority(folder: Path) -> Authority:
     certificate, key = folder / "ca.pem", folder / "ca-key.pem"
     if certificate.exists() and key.exists():
         try:
-            private = load_pem_private_key(key.read_bytes(), None)
-            found = x509.load_pem_x509_certificate(certificate.read_bytes())
+            private = load_pem_private_key(files.read_bytes(key), None)
+            found = x509.load_pem_x509_certificate(files.read_bytes(certificate))
         except (TypeError, ValueError) as error:
             raise BadKeys(f"{folder}: its authority cannot be read: {error}") from None
         if not isinstance(private, ec.EllipticCurvePrivateKey) or private.public_key() != found.public_key():
             raise BadKeys(f"{key} is not the key of {certificate}")
         return Authority(found, private)
-    if any(folder.iterdir()):
+    if any(path.name != GITIGNORE and path.suffix != files.DRAFT for path in folder.iterdir()):
         raise BadKeys(f"{folder} is not empty, and holds no ca.pem with ca-key.pem; choose another folder")
     private = ec.generate_private_key(ec.SECP256R1())
     name = _name(f"Tandem {x509.random_serial_number() % 16**8:08x}")
@@ -131,8 +135,9 @@ def _authority(folder: Path) -> Authority:
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(private.public_key()), critical=False)
         .sign(private, hashes.SHA256())
     )
-    _secret(key, _pem(private))
-    certificate.write_bytes(signed.public_bytes(Encoding.PEM))
+    with files.draft(key, SECRET) as one, files.draft(certificate) as other:  # neither, if one has no room
+        one.write_bytes(_pem(private))
+        other.write_bytes(signed.public_bytes(Encoding.PEM))
     return Authority(signed, private)
 
 
@@ -143,7 +148,7 @@ def _participant(own: Path, name: str, authority: Authority, hosts: Sequence[str
     issued = issue(authority, name, private.public_key(), names, timedelta(days=days))
     draft = Path(tempfile.mkdtemp(prefix=f".{name}-", dir=own.parent))
     try:
-        _secret(draft / "key.pem", _pem(private))
+        files.write(draft / "key.pem", _pem(private), SECRET)
         (draft / "cert.pem").write_bytes(issued.public_bytes(Encoding.PEM))
         (draft / "ca.pem").write_bytes(authority.certificate.public_bytes(Encoding.PEM))
         draft.rename(own)
@@ -220,15 +225,3 @@ def _usage(*, signs: bool) -> x509.KeyUsage:
 
 def _pem(key: ec.EllipticCurvePrivateKey) -> bytes:
     return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
-
-
-def _secret(path: Path, text: bytes) -> None:
-    """Only its owner reads it, from the first byte on; what is there already is left alone."""
-    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
-        file.write(text)
-
-
-def _replace(path: Path, text: str) -> None:
-    draft = path.with_name(f".{path.name}")
-    draft.write_text(text, encoding="utf-8")
-    draft.replace(path)

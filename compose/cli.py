@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import sys
 import traceback
+from collections.abc import Sequence
+from functools import cache
 from importlib import import_module
 from typing import NoReturn, TextIO
 
@@ -19,20 +22,33 @@ from compose.arguments import (
     name,
     names,
     natural,
+    origin,
     port,
     positive,
     trials,
 )
 from compose.figures import FORMATS, PICTURES
 from compose.status import BROKEN_PIPE, BUG, FAILED, USER_ERROR, UserError
-from protocol.inbox import one_line
+from protocol import limits
+from protocol.files import said
+from protocol.spelling import did_you_mean
+from protocol.terminal import one_line, say
 
 
 class _Parser(argparse.ArgumentParser):
     """Says what is wrong in one line."""
 
     def error(self, message: str) -> NoReturn:
+        wrong = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
+        if wrong is not None:
+            message += did_you_mean(wrong[1], re.findall(r"[\w.-]+", wrong[2]))
         self.exit(USER_ERROR, one_line(f"{self.prog}: {message}") + "\n")
+
+    def refuse(self, unknown: Sequence[str]) -> NoReturn:
+        """Words of the command line that mean nothing: the first option among them may be mistyped."""
+        first = next((word for word in unknown if word.startswith("-")), "").partition("=")[0]
+        known = [flag for flag in self._option_string_actions if flag.startswith("--")]
+        self.error(f"unrecognized arguments: {' '.join(unknown)}{did_you_mean(first, known)}")
 
 
 class _Version(argparse.Action):
@@ -42,7 +58,7 @@ class _Version(argparse.Action):
         from compose import installed  # noqa: PLC0415  # it takes time
         from protocol.wire import VERSION  # noqa: PLC0415
 
-        print(f"tandem {installed.version() or 'that is not installed'}, protocol version {VERSION}")
+        say(f"tandem {installed.version() or 'that is not installed'}, protocol version {VERSION}")
         parser.exit()
 
 
@@ -50,23 +66,35 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     """Parse, and do as told; ends the process."""
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115  # closed by whoever started this
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
-    options = parser().parse_args(arguments)
+    options, unknown = parser().parse_known_args(arguments)
+    if unknown:
+        options.parser.refuse(unknown)
     try:
+        limits.need_memory(limits.START_BYTES, "Tandem")
         status = import_module(f"compose.commands.{options.command}").main(options)
         sys.stdout.flush()
     except UserError as error:
-        print(one_line(f"tandem {options.command}: {error}"), file=sys.stderr)
+        say(f"tandem {options.command}: {error}", error=True)
         status = USER_ERROR
     except BrokenPipeError:
         _leave_stream(sys.stdout)
         status = BROKEN_PIPE
     except OSError as error:
         _leave_stream(sys.stdout)
-        print(one_line(f"tandem {options.command}: cannot go on: {error}"), file=sys.stderr)
+        say(f"tandem {options.command}: cannot go on: {said(error)}", error=True)
         status = FAILED
-    except Exception:  # noqa: BLE001  # whatever it is, it must not look like a mission's outcome
-        traceback.print_exc()
-        status = BUG
+    except BaseException as error:  # whatever it is, it must not look like a mission's outcome
+        short = limits.shortage(error)
+        if short is None and not isinstance(error, Exception):
+            raise
+        if short is None:
+            say(*traceback.format_exc().splitlines(), error=True)
+        else:
+            say(f"tandem {options.command}: cannot go on: {short}", error=True)
+        status = BUG if short is None else FAILED
+    forked = sys.modules.get("compose.forked")
+    if forked is not None:
+        forked.close()
     session = sys.modules.get("protocol.session")
     if session is not None:
         session.leave(status)
@@ -78,6 +106,7 @@ def _leave_stream(stream: TextIO) -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
+@cache  # a process forked from one that has made it need not
 def parser() -> argparse.ArgumentParser:
     """Of the whole command line."""
     tandem = _Parser(prog="tandem", description="Two robots find out together where they are.")
@@ -85,7 +114,9 @@ def parser() -> argparse.ArgumentParser:
     commands = tandem.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
 
     def command(name: str, what: str) -> argparse.ArgumentParser:
-        return commands.add_parser(name, help=what, description=what)
+        added = commands.add_parser(name, help=what, description=what)
+        added.set_defaults(parser=added)
+        return added
 
     run = command("run", "Play a mission on this machine.")
     _add_scenario(run)
@@ -98,6 +129,14 @@ def parser() -> argparse.ArgumentParser:
         help="leave run.mcap and tables in --out DIR, too (default: where the extra lab is installed)",
     )
     run.add_argument("--foxglove", type=port, metavar="PORT", help="serve Foxglove's viewers there, live")
+    run.add_argument(
+        "--foxglove-origin",
+        type=origin,
+        action="append",
+        default=[],
+        metavar="ORIGIN",
+        help="web pages of this origin may look there, beside Foxglove's app; may be repeated",
+    )
     run.add_argument("--watch", action="store_true", help="serve a page that shows it, live and afterwards")
     run.add_argument(
         "--kill",
@@ -264,6 +303,7 @@ def _add_robot(parser: argparse.ArgumentParser) -> None:
     _add_reaching(parser)
     _add_listening(parser, "where the peer reaches it, such as tcp/127.0.0.1:7447; as often as you like")
     parser.add_argument("--run", type=name, metavar="NAME", help="what the mission is called (its name)")
+    parser.add_argument("--fsync", action="store_true", help="the journals survive a power cut")
     parser.add_argument(
         "--wait", type=positive, default=60.0, metavar="S", help="how long to look for the peer (60)"
     )

@@ -10,7 +10,9 @@ from importlib import import_module
 from compose.scenario import setting
 from compose.status import UserError
 from protocol.messages import Briefing
+from protocol.spelling import did_you_mean
 from world.driver import THINKING, Driver
+from world.driver_journal import DriverPast
 from world.scenario import Scenario
 
 METHODS = ("sense", "drive", "stop", "close")
@@ -48,6 +50,18 @@ def made(maker: Maker, name: str, briefing: Briefing, manoeuvre_s: float, given:
         raise UserError(f"{name}: cannot be made: {type(error).__name__}: {error}") from None
 
 
+def again(driver: Driver, name: str, past: DriverPast) -> None:
+    """Stop the robot, and have its driver go on where `past` ends. Raises UserError."""
+    resume = getattr(driver, "resume", None)
+    if not callable(resume):
+        raise UserError(f"--out: holds a record, and {name} has no resume() for it; choose another folder")
+    try:
+        driver.stop()
+        resume(past.tick, past.mark)
+    except Exception as error:  # noqa: BLE001  # as above
+        raise UserError(f"{name}: cannot go on: {type(error).__name__}: {error}") from None
+
+
 def options_of(words: list[str]) -> dict[str, str]:
     """What NAME=VALUE, as often as it was said, gives a driver. Raises UserError."""
     given = {}
@@ -65,7 +79,8 @@ def mission(source: str, robot: str) -> Scenario:
     if scenario.faults:
         raise UserError(f"{source}: fault: without a world, the radio is as it is")
     if robot not in (ids := [placed.id for placed in scenario.robots]):
-        raise UserError(f"{source}: there is no robot '{robot}'; there are {', '.join(ids)}")
+        near = did_you_mean(robot, ids)
+        raise UserError(f"{source}: there is no robot '{robot}'; there are {', '.join(ids)}{near}")
     return scenario
 
 

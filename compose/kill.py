@@ -12,6 +12,8 @@ from typing import Annotated, Literal, cast, get_args
 import msgspec
 from msgspec import Meta
 
+from protocol.spelling import did_you_mean
+
 Point = Literal["sense", "report", "journal", "drive"]
 """How far a tick has come. An agent's: its Sense is there, and nothing on record; its Report is sent; its
 Drive is on record, and not sent; it is sent. The world's: no Sense is sent; all are; all Drives are on
@@ -79,7 +81,8 @@ class KillTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         for name in named:
             who = draw.choice(anyone) if name == DRAWN else name
             if who not in anyone:
-                raise BadKill(f"who: there is no '{who}'; there are {', '.join(anyone)}")
+                near = did_you_mean(who, anyone)
+                raise BadKill(f"who: there is no '{who}'; there are {', '.join(anyone)}{near}")
             point = draw.choice(POINTS) if self.point == DRAWN else self.point
             found.append(parse(f"{who}@{tick}:{point}{after if self.after else ''}"))
         return found

@@ -5,18 +5,19 @@ from __future__ import annotations
 import random
 import signal
 import socket
-import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
 from pathlib import Path
 
+from compose import forked
+from compose.forked import ForkServer
 from compose.kill import WORLD, Kill, taken
 from compose.status import ENDED
+from protocol import limits
 from protocol.inbox import Inbox
+from protocol.terminal import say
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from world.scenario import Scenario
 
@@ -24,6 +25,12 @@ FOLLOW_S = 2.0
 """how long the agents may outlast the world"""
 STOP_S = 3.0
 """how long a process may take to end when told to; then it is killed"""
+JOIN_S = 60.0
+"""how long an agent may look for its world,"""
+JOIN_EACH_S = 0.5
+"""and how much longer for each robot of the run, all of which start at once"""
+CHILD_FILES, SPARE_FILES = 2, 12
+"""descriptors that the launcher takes for each process of a run, and for starting one"""
 LISTENING_PORTS = range(20_000, 32_000)
 """below those that the system gives to outgoing connections, which could take one in between"""
 
@@ -45,6 +52,11 @@ def free_endpoint(protocol: str = "tcp") -> str:
         return f"{protocol}/127.0.0.1:{port}"
 
 
+def fork_server() -> ForkServer:
+    """Return the fork server of this process's worlds and agents."""
+    return forked.fork_server("compose.warm_up:missions")
+
+
 class Child:
     """A process of the run. It is in a session of its own: Ctrl-C reaches it only through the launcher."""
 
@@ -53,59 +65,52 @@ class Child:
         self.kills = list(kills)
         """those that it is to take"""
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # gone with the child
-        # -P: the user's directory may hold a folder called world, or agent
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "compose", *arguments]
-            + [word for kill in kills for word in ("--kill", kill.text)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=self._errors,
-            start_new_session=True,
+        self._server = fork_server()
+        self._process = self._server.start(
+            "compose.cli:main",
+            "tandem",
+            *arguments,
+            *[word for kill in kills for word in ("--kill", kill.text)],
+            errors=self._errors.fileno(),
+            on_end=lambda: inbox.put("ended", name),
         )
-        self._inbox = inbox
-        assert self._process.stdin is not None
-        self._input = self._process.stdin  # open as long as the launcher lives: the child ends with it
-        threading.Thread(target=self._wait, daemon=True).start()
-
-    def _wait(self) -> None:
-        self._process.wait()
-        self._inbox.put("ended", self.name)
 
     @property
     def running(self) -> bool:
         """Whether it has not ended yet."""
-        return self._process.poll() is None
+        return self._process.running
 
     @property
     def status(self) -> int:
         """Its exit status, once it has ended; negative is the signal that killed it."""
-        return self._process.wait()
+        return self._process.status
 
     def said(self) -> str:
         """What it wrote to its standard error."""
         self._errors.seek(0)
         return self._errors.read().decode(errors="replace").strip()
 
+    def how(self) -> str:
+        """How it ended, for people."""
+        if self._server.gone:
+            return f"was killed: {self._server.why_gone()}"
+        how = (
+            f"was killed by signal {-self.status}" if self.status < 0 else f"ended with status {self.status}"
+        )
+        return f"{how}: {said}" if (said := self.said()) else how
+
     def hand(self, frame: bytes) -> None:
         """Give it `frame` to start from."""
-        with suppress(BrokenPipeError):
-            self._input.write(len(frame).to_bytes(4, "big") + frame)
-            self._input.flush()
+        self._process.hand(len(frame).to_bytes(4, "big") + frame)
 
     def stop(self) -> None:
         """Tell it to end, even if it has been suspended."""
-        self._process.terminate()
-        self._process.send_signal(signal.SIGCONT)
+        self._process.signal(signal.SIGTERM)
+        self._process.signal(signal.SIGCONT)
 
     def end(self, timeout: float) -> None:
         """Wait `timeout` seconds for it to end; then kill it."""
-        try:
-            self._process.wait(max(timeout, 0.0))
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        with suppress(BrokenPipeError):
-            self._input.close()
+        self._process.end(timeout)
 
     def forget(self) -> None:
         """What it said is of no more use."""
@@ -136,6 +141,7 @@ def play(
     Returns those that never came. Raises ChildFailed, or Interrupted when `inbox` says so; no process is left
     then, either.
     """
+    limits.need_files(CHILD_FILES * (1 + len(scenario.robots)) + SPARE_FILES, "a run as processes")
     launched = _Run(scenario, out, inbox, run=run, rate=rate, patience=patience, keys=keys)
     try:
         for name in launched.names:
@@ -178,12 +184,14 @@ class _Run:
         def keyed(who: str) -> list[str]:
             return ["--keys", str(keys / who)] if keys is not None else []
 
+        wait = ["--wait", str(JOIN_S + JOIN_EACH_S * len(self._scenario.robots))]
         world = ["world", self._scenario.name, "--listen", endpoint, *keyed("world"), *shared, *real_time]
         return {WORLD: world} | {
             f"agent {robot.id}": [
                 *("agent", robot.id, "--connect", endpoint),
                 *keyed(f"agent-{robot.id}"),
                 *shared,
+                *wait,
             ]
             for robot in self._scenario.robots
         }
@@ -223,10 +231,9 @@ class _Run:
 
     def _bury(self, child: Child) -> None:
         """It is to be started again if it took a kill. Raises ChildFailed if not, or if it is never to be."""
-        said = child.said()
-        kill = taken(child.kills, said) if child.status == -signal.SIGKILL else None
+        kill = taken(child.kills, child.said()) if child.status == -signal.SIGKILL else None
         if kill is None:
-            raise ChildFailed(f"{child.name} {_how(child.status)}{said and ': ' + said}")
+            raise ChildFailed(f"{child.name} {child.how()}")
         if kill.after is None:
             raise ChildFailed(f"{child.name} was killed at tick {kill.tick} (--kill {kill.text})")
         child.kills.remove(kill)
@@ -240,12 +247,8 @@ class _Run:
         _stop(self.children.values())
         for child in self.children.values():
             if child.status == ENDED and (said := child.said()):
-                print(said, file=sys.stderr)
+                say(*said.splitlines(), error=True)
             child.forget()
-
-
-def _how(status: int) -> str:
-    return f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
 
 
 def _stop(children: Iterable[Child]) -> None:

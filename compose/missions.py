@@ -15,6 +15,7 @@ import msgspec
 import zenoh
 
 from protocol import keys, session
+from protocol.keys import Key
 from protocol.messages import Briefing, Drive, End, Farewell, Outcome, Phase, Sense
 from protocol.wire import MalformedFrame, decode, version_of
 
@@ -23,6 +24,8 @@ ASK_S = 2.0
 FIND_S = 0.5
 """how long to look for a mission where none is to be seen: routers may have been linked just now"""
 LOOK_AGAIN_S = 0.02
+AHEAD = 4
+"""ticks by which a Drive may be ahead of the latest Sense that was heard, which may come by another way"""
 
 
 class Participant(msgspec.Struct, frozen=True):
@@ -78,20 +81,20 @@ def _there(link: zenoh.Session) -> dict[str, frozenset[str]]:
         if worlds or robots or time.monotonic() >= until:
             break
         time.sleep(LOOK_AGAIN_S)
-    found: dict[str, set[str]] = {keys.run_of(key): {""} for key in worlds}
-    for key in robots:
-        found.setdefault(keys.run_of(key), set()).add(keys.robot_of(key))
+    found: dict[str, set[str]] = {}
+    for key in (*worlds, *robots):
+        found.setdefault(key.run, set()).add(key.robot)
     return {run: frozenset(found[run]) for run in sorted(found)}
 
 
 class _Ear:
-    """The latest frame of each key, and how many there were."""
+    """The latest frame of each key, and how many there were. What comes under no such key is not heard."""
 
     def __init__(self, link: zenoh.Session, there: dict[str, frozenset[str]]) -> None:
         self._link = link
         self._there = there
-        self.latest: dict[str, bytes] = {}
-        self._count = Counter[str]()
+        self.latest: dict[Key, bytes] = {}
+        self._count = Counter[Key]()
         self._over = False
 
     def listen(self, wait: float) -> None:
@@ -111,43 +114,51 @@ class _Ear:
     def _hand_over(self, sample: zenoh.Sample) -> None:
         if self._over:  # what comes while one key after the other is given up would be of many ticks
             return
-        key = str(sample.key_expr)
-        self.latest[key] = sample.payload.to_bytes()
-        self._count[key] += 1
+        key = keys.parse(str(sample.key_expr))
+        if key is not None:
+            self.latest[key] = sample.payload.to_bytes()
+            self._count[key] += 1
 
     def _is_heard(self, run: str) -> bool:
         """The world speaks to all its robots in turn: who is spoken to twice was so after all the others."""
         robots = self._there[run] - {""}
         if "" not in self._there[run]:
             return True
-        again = any(self._count[keys.sense(run, robot)] > 1 for robot in self.named(run, keys.sense))
+        again = any(self._count[Key(keys.sense, run, one)] > 1 for one in self.named(run, keys.sense))
         return again and robots <= self.named(run, keys.drive)
 
-    def named(self, run: str, key: Any) -> set[str]:
+    def named(self, run: str, kind: Any) -> set[str]:
         """The robots under whose key of this kind something came."""
-        robots = {keys.robot_of(one) for one in tuple(self.latest) if keys.run_of(one) == run}
-        return {robot for robot in robots if key(run, robot) in self.latest}
+        return {one.robot for one in tuple(self.latest) if (one.kind, one.run) == (kind, run)}
+
+    def said(self, key: Key, messages: Any) -> Any:
+        """The latest message under `key`, if it is one of `messages` and of the robot that the key names."""
+        message = _said(self.latest.get(key), messages)
+        return message if getattr(message, "robot", key.robot) == key.robot else None
 
 
 def _mission(link: zenoh.Session, ear: _Ear, run: str, there: frozenset[str]) -> Mission:
     frames = [
-        ear.latest[key(run, robot)] for key in (keys.sense, keys.drive) for robot in ear.named(run, key)
+        ear.latest[Key(kind, run, robot)]
+        for kind in (keys.sense, keys.drive)
+        for robot in ear.named(run, kind)
     ]
     answers = _briefings(link, run, ear.named(run, keys.sense) | there - {""}) if "" in there else {}
     frames += answers.values()
     briefed = [one for frame in answers.values() if (one := _said(frame, Briefing)) is not None]
     named = there - {""} | ear.named(run, keys.sense) | ear.named(run, keys.drive)
     named |= {one.peer for one in briefed}
-    said = [_said(ear.latest.get(keys.sense(run, robot)), Sense | End | Farewell) for robot in named]
+    said = [ear.said(Key(keys.sense, run, robot), Sense | End | Farewell) for robot in named]
     ends = [one for one in said if isinstance(one, End)]
+    tick = max((one.tick for one in said if isinstance(one, Sense | End)), default=None)
     return Mission(
         run,
         "" in there,
-        max((one.tick for one in said if isinstance(one, Sense | End)), default=None),
+        tick,
         ends[0].outcome if ends else None,
         tuple(sorted({version for frame in frames if (version := version_of(frame)) is not None})),
         tuple(
-            _participant(robot, robot in there, ear.latest.get(keys.drive(run, robot)))
+            _participant(robot, robot in there, tick, ear.said(Key(keys.drive, run, robot), Drive | Farewell))
             for robot in sorted(named)
         ),
     )
@@ -168,9 +179,9 @@ def _briefings(link: zenoh.Session, run: str, robots: set[str]) -> dict[str, byt
     return found
 
 
-def _participant(robot: str, there: bool, frame: bytes | None) -> Participant:
-    drive = _said(frame, Drive | Farewell)
-    if not isinstance(drive, Drive):
+def _participant(robot: str, there: bool, latest: int | None, drive: Drive | Farewell | None) -> Participant:
+    """As `drive` tells it, unless that is of a tick to come: the world is in tick `latest`."""
+    if not isinstance(drive, Drive) or (latest is not None and drive.tick > latest + AHEAD):
         return Participant(robot, there)
     return Participant(robot, there, drive.tick, drive.phase, drive.state)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,8 +13,9 @@ import msgspec
 
 from compose.status import UserError
 from protocol import journal
+from protocol.environment import is_blank
 from protocol.messages import Drive, End, Estimate, Farewell
-from world.history import history, scenario_of
+from world.history import history, opened
 from world.scenario import Scenario
 from world.truth import Truth
 
@@ -133,14 +135,14 @@ def past_of(folder: Path, robot: str) -> Past | None:
 
     path = folder / agent_journal(robot)
     frames = list(journal.read(path))
-    if not frames:
+    if is_blank(frames):
         return None
     told = past(frames, path)
     if told.briefing.robot != robot:
         raise journal.CorruptJournal(f"{path} is the journal of {told.briefing.robot}")
     world = folder / WORLD_JOURNAL
-    first = next(iter(journal.read(world)), None) if world.exists() else None
-    if first is not None and not scenario_of(first, world).is_of(told.briefing):
+    head = list(islice(journal.read(world), 2)) if world.exists() else []
+    if not is_blank(head) and not opened(head, world)[0].is_of(told.briefing):
         raise journal.CorruptJournal(f"{path}: another run's: its briefing is not this world's")
     return told
 

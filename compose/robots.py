@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from compose.record import WORLD_JOURNAL, agent_journal, journals_in, past_of, robot_of
 from compose.summary import broken_off, ended
 from protocol import journal
+from protocol.environment import named_in
 from protocol.journal import CorruptJournal
 from protocol.messages import Briefing
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
@@ -84,7 +85,8 @@ def _briefing(path: Path) -> Briefing | None:
     """None where it does not begin with one."""
     try:
         frames = journal.Tail(path).news()
-        return decode(frames[0], Briefing, MAX_FRAME_BYTES) if frames else None
+        head = frames[named_in(frames) is not None :]
+        return decode(head[0], Briefing, MAX_FRAME_BYTES) if head else None
     except (CorruptJournal, MalformedFrame):
         return None
 

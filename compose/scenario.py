@@ -26,6 +26,7 @@ from protocol.mission import Anchor, Mission, Role, Variant, noise_obstacle, obs
 from protocol.motion import TAU, Pose, wrap
 from protocol.rendezvous import Rendezvous, rendezvous, tick_budget
 from protocol.rounding import TOLERANCE
+from protocol.spelling import did_you_mean
 from protocol.units import NAME, RobotId
 from protocol.wire import MalformedFrame, decode, encode
 from world.faults import Fault, hold_up
@@ -135,6 +136,21 @@ def shipped(folder: str = "scenarios") -> dict[str, Path]:
     return {file.stem: file for file in sorted(path.glob("*.toml"))}
 
 
+SHIPPED = {"scenarios": ("scenario", "run"), "sweeps": ("campaign", "sweep")}
+"""of each folder: what a file in it is, and the command that plays it"""
+
+
+def unknown(source: str, folder: str) -> str:
+    """Return why there is nothing called `source` to be read, where a file of `folder` was expected."""
+    names = {one: shipped(one) for one in SHIPPED}
+    for other, (kind, command) in SHIPPED.items():
+        if other != folder and source in names[other]:
+            return f"{source} is a {kind}: `tandem {command} {source}` plays it"
+    near = did_you_mean(source, [name for found in names.values() for name in found])
+    ships = ", ".join(names[folder])
+    return f"{source}: neither a file nor a {SHIPPED[folder][0]} that ships ({ships}){near}"
+
+
 def run_name(scenario: Scenario, out: Path | None = None) -> str:
     """A name for a run of it that no other run has; the same again for one that goes on in `out`."""
     mark = secrets.token_hex(3)
@@ -171,8 +187,7 @@ def setting(source: str, faults: Sequence[str] = ()) -> Setting:
     try:
         text = read_text(path)
     except FileNotFoundError:
-        names = ", ".join(shipped())
-        raise BadScenario(f"{source}: neither a file nor a scenario that ships ({names})") from None
+        raise BadScenario(unknown(source, "scenarios")) from None
     except ValueError as error:
         raise BadScenario(f"{source}: {error}") from None
     return validate(table_in(text, source), source, faults)
@@ -310,7 +325,8 @@ def _peers(robots: list[RobotTable], source: str) -> dict[str, str]:
                 f"{source}: robot[{i}].peer: '{robot.id}' needs one: of {len(ids)} robots, two are a pair"
             )
         if robot.peer not in ids:
-            raise BadScenario(f"{source}: robot[{i}].peer: there is no robot '{robot.peer}'")
+            near = did_you_mean(robot.peer, ids)
+            raise BadScenario(f"{source}: robot[{i}].peer: there is no robot '{robot.peer}'{near}")
         peers[robot.id] = robot.peer
     for i, robot in enumerate(robots):
         if peers[robot.id] == robot.id or peers[peers[robot.id]] != robot.id:

@@ -2,35 +2,44 @@
 
 from __future__ import annotations
 
-import io
-import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from rich.box import SIMPLE_HEAD
-from rich.cells import cell_len
-from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
+from compose import layout
 from compose.record import WORLD_JOURNAL
 from compose.summary import outcome_line
 from protocol.journal import Tail
 from protocol.messages import Drive, End, Farewell, Missed
+from protocol.terminal import one_line, say
 from protocol.wire import MAX_FRAME_BYTES, decode
 from world.scenario import Scenario
 
-SIGMA = "sigma m"
-"""a column only where sensors are not exact"""
-LATE = "late"
-"""a column only where a drive came too late, in real time"""
-LEGEND = "m and rad; ranges to the anchor + to the peer; reports sent / heard"
-LATE_LEGEND = "late: ticks in which it stood still, as its drive had not come in time; "
-SIGMA_LEGEND = "sigma: of the position, as claimed; "
-UNLIMITED = 1000
-"""columns, of what is not a terminal"""
+IS_AT, THINKS, ERROR, SIGMA = "is at x, y, heading", "thinks it is at", "error m", "sigma m"
+RANGES, REPORTS, LATE = "ranges", "reports", "late"
+NOTES = (
+    (SIGMA, "sigma: of the position, as claimed"),
+    (LATE, "late: ticks in which it stood still, as its drive had not come in time"),
+    (ERROR, "m and rad"),
+    (RANGES, "ranges to the anchor + to the peer"),
+    (REPORTS, "reports sent / heard"),
+)
+"""each with the column that it is a footnote to"""
+CHOICES = (
+    (IS_AT, THINKS, ERROR, SIGMA, RANGES, REPORTS, LATE),
+    (THINKS, ERROR, SIGMA, RANGES, REPORTS, LATE),
+    (ERROR, SIGMA, RANGES, REPORTS, LATE),
+    (ERROR, SIGMA, LATE),
+)
+"""of the columns: the first that fits; sigma and late only where there is something to show"""
+LISTED = 4
+"""robots that are listed with all their figures where a table of all columns does not fit"""
+NAMED = 10
+"""robots that a sentence names at the most"""
 
 
 @contextmanager
@@ -52,56 +61,76 @@ def live(scenario: Scenario, folder: Path) -> Iterator[None]:
         latest = max((drive.tick for drive in drives.values()), default=0)
         rows = Table(title=f"{scenario.name}, tick {latest} of {scenario.max_ticks} at most")
         for heading in ("robot", "phase", "state", "v m/s", "omega rad/s"):
-            rows.add_column(heading)
+            rows.add_column(heading, no_wrap=True)
         for robot in ids:
             drive = drives.get(robot)
             if drive is None:
                 rows.add_row(robot, "", "awaited", "", "")
             else:
-                rows.add_row(robot, str(drive.phase), drive.state, f"{drive.v:.3f}", f"{drive.omega:.3f}")
+                rows.add_row(
+                    robot, str(drive.phase), one_line(drive.state), f"{drive.v:.3f}", f"{drive.omega:.3f}"
+                )
         return rows
 
-    with Live(get_renderable=table, auto_refresh=True, transient=True, refresh_per_second=10):
+    with Live(
+        get_renderable=table,
+        console=layout.console(),
+        auto_refresh=True,
+        transient=True,
+        refresh_per_second=10,
+    ):
         yield
 
 
-def result(summary: Mapping[str, Any]) -> None:
-    """The table at the end of a run: a line each robot, or a few where the terminal is narrow."""
-    exact = all(robot["covariance"] is None for robot in summary["robots"].values())
-    late = any(robot["deadlines_missed"] for robot in summary["robots"].values())
-    robots = {name: _cells(robot, exact, late) for name, robot in summary["robots"].items()}
-    rows = Table("robot", box=SIMPLE_HEAD, pad_edge=False)
-    for heading in next(iter(robots.values())):
-        rows.add_column(heading, justify="right")
-    for name, cells in robots.items():
-        rows.add_row(name, *cells.values())
-    page = Console(width=UNLIMITED, file=io.StringIO())
-    with page.capture() as capture:
-        page.print(rows)
-    lines = [line.rstrip() for line in capture.get().splitlines() if line.strip()]
-    if sys.stdout.isatty() and max(map(cell_len, lines)) > Console().width:
-        lines = [
-            line
-            for name, cells in robots.items()
-            for line in (name, *(f"  {heading}: {cell}" for heading, cell in cells.items()))
-        ]
-    title = f"{summary['scenario']}: {outcome_line(summary)}"
-    legend = ("" if exact else SIGMA_LEGEND) + (LATE_LEGEND if late else "") + LEGEND
-    print(title, "", *lines, "", legend, sep="\n")
+def result(summary: Mapping[str, Any], rate: float | None = None) -> None:
+    """The table at the end of a run that went at `rate`, and what became of deadlines and Farewells."""
+    robots: Mapping[str, Any] = summary["robots"]
+    exact = all(robot["covariance"] is None for robot in robots.values())
+    late = {name: missed for name, robot in robots.items() if (missed := robot["deadlines_missed"])}
+    left_out = {*([SIGMA] if exact else []), *([] if late else [LATE])}
+    for choice in CHOICES:
+        columns = [column for column in choice if column not in left_out]
+        cells = {name: _cells(robot, columns) for name, robot in robots.items()}
+        rows = [(name, *of_robot.values()) for name, of_robot in cells.items()]
+        made = layout.table(["robot"], columns, rows)
+        lines = layout.lines(made)
+        if layout.fits(lines):
+            break
+        if len(robots) <= LISTED:
+            lines = [
+                line
+                for name, of_robot in cells.items()
+                for line in (name, *(f"  {heading}: {cell}" for heading, cell in of_robot.items()))
+            ]
+            break
+    else:
+        lines = layout.lines(made, layout.room())
+    say(f"{summary['scenario']}: {outcome_line(summary)}", "", *lines, "", *layout.notes(NOTES, columns))
+    if late:
+        say(*layout.wrapped(_missed(late, summary["ticks"], rate)))
 
 
-def _cells(robot: Mapping[str, Any], exact: bool, late: bool) -> dict[str, str]:
+def _missed(late: Mapping[str, int], ticks: int, rate: float | None) -> str:
+    """That deadlines were missed, by whom, and what to do about it."""
+    worst = sorted(late.items(), key=lambda one: -one[1])
+    names = ", ".join([f"{name} {missed}" for name, missed in worst[:NAMED]])
+    more = f" and {len(worst) - NAMED} more robots" if len(worst) > NAMED else ""
+    slower = f", such as --rate {rate / 2:g}," if rate is not None else ""
+    return f"deadlines missed, of {ticks}: {names}{more}; a lower --rate{slower} leaves more time for each"
+
+
+def _cells(robot: Mapping[str, Any], columns: Sequence[str]) -> dict[str, str]:
     """What stands in its line, by column."""
-    sigma = {} if exact else {SIGMA: _number(robot["position_sigma_m"], ".1e")}
-    return {
-        "is at x, y, heading": _pose(robot["truth"]),
-        "thinks it is at": _pose(robot["estimate"]),
-        "error m": _number(robot["position_error_m"], ".1e"),
-        **sigma,
-        "ranges": f"{_number(robot['anchor_ranges'])} + {_number(robot['mutual_ranges'])}",
-        "reports": f"{_number(robot['reports_sent'])} / {_number(robot['reports_heard'])}",
-        **({LATE: _number(robot["deadlines_missed"])} if late else {}),
+    all_of_it = {
+        IS_AT: _pose(robot["truth"]),
+        THINKS: _pose(robot["estimate"]),
+        ERROR: _number(robot["position_error_m"], ".1e"),
+        SIGMA: _number(robot["position_sigma_m"], ".1e"),
+        RANGES: f"{_number(robot['anchor_ranges'])} + {_number(robot['mutual_ranges'])}",
+        REPORTS: f"{_number(robot['reports_sent'])} / {_number(robot['reports_heard'])}",
+        LATE: _number(robot["deadlines_missed"]),
     }
+    return {column: all_of_it[column] for column in columns}
 
 
 def _pose(pose: list[float] | None) -> str:

@@ -16,8 +16,10 @@ from compose.claim import Claim, claim, matrix
 from compose.installed import version
 from compose.record import Record
 from compose.ticks import ticks_csv
+from protocol import files
 from protocol.messages import Farewell, Localised, Outcome
 from protocol.motion import Pose, wrap
+from protocol.terminal import one_line
 from world.sensors import mutual_ranges
 
 Mode = Literal["processes", "in-process"]
@@ -91,8 +93,21 @@ def _robot_summary(record: Record, place: int) -> dict[str, Any]:
         "heading_sigma_rad": covariance.heading_sigma if covariance is not None else None,
         "nees": claimed.nees if claimed is not None else None,
         **{field: getattr(farewell, field, None) for field in _SAID},
+        "no_farewell": None if farewell is not None else _why_none(record, robot),
         "deadlines_missed": sum([robot not in moment.drives for moment in record.moments[:-1]]),
     }
+
+
+def _why_none(record: Record, robot: str) -> str:
+    """Why there is no Farewell of `robot`, as far as the world's journal tells."""
+    if record.end is None:
+        return "the record breaks off"
+    latest = max([moment.truth.tick for moment in record.moments if robot in moment.drives], default=None)
+    if latest is None:
+        return "no Drive of it came in time"
+    if latest < record.end.tick:
+        return f"its last Drive in time was of tick {latest} of {record.end.tick}"
+    return "it did not answer the End"
 
 
 _SAID = [field for field in Farewell.__struct_fields__ if field != "robot"]
@@ -113,8 +128,8 @@ def versions() -> dict[str, str | None]:
 
 def leave(record: Record, summary: Mapping[str, Any], folder: Path) -> None:
     """Write `ticks.csv` and `summary.json` into `folder`."""
-    (folder / "ticks.csv").write_text(ticks_csv(record), encoding="utf-8")
-    (folder / SUMMARY).write_bytes(msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n")
+    files.write(folder / "ticks.csv", ticks_csv(record))
+    files.write(folder / SUMMARY, msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n")
 
 
 def outcome_line(summary: Mapping[str, Any]) -> str:
@@ -129,4 +144,4 @@ def broken_off(ticks: int) -> str:
 
 def ended(outcome: Outcome, ticks: int, reason: str | None) -> str:
     """How a run ended, in one line."""
-    return f"{outcome} after {ticks} ticks{f' ({reason})' if reason else ''}"
+    return f"{outcome} after {ticks} ticks{f' ({one_line(reason)})' if reason else ''}"

@@ -15,6 +15,7 @@ from compose.summary import Mode, leave, outcome_line, summary
 from protocol.inbox import Inbox
 from protocol.journal import Journal
 from protocol.retrace import Retrace
+from protocol.terminal import say
 from world.scenario import Scenario
 
 
@@ -54,19 +55,23 @@ def conclude(
     mode: Mode,
     began: float,
 ) -> int:
-    """Leave the views of the record in `folder`, if it is to stay, and say how it went; the status."""
+    """Say how it went, and leave the views of the record in `folder`, if it is to stay; the status.
+
+    Raises UserError if there is no room for them.
+    """
     told = summary(played, mode, round(time.perf_counter() - began, 6))
+    if options.quiet:
+        say(outcome_line(told))
+    else:
+        from compose import show  # noqa: PLC0415  # as above
+
+        show.result(told, getattr(options, "rate", None))
     if folder is not None and options.out is not None:
+        sys.stdout.flush()
         try:
             leave(played, told, folder)
         except OSError as error:
             raise UserError(record.cannot_write(folder, error)) from None
-    if options.quiet:
-        print(outcome_line(told))
-    else:
-        from compose import show  # noqa: PLC0415  # as above
-
-        show.result(told)
     return status_of(told["outcome"])
 
 

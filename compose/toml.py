@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 
 from compose.status import UserError
+from protocol import files
 
 
 class NotToml(UserError):
@@ -19,7 +20,7 @@ class NotToml(UserError):
 def read_text(path: Path) -> str:
     """What the file says. Raises FileNotFoundError, and ValueError, whose text says why it cannot be read."""
     try:
-        return path.read_text(encoding="utf-8")
+        return files.read_text(path)
     except FileNotFoundError:
         raise
     except OSError as error:

@@ -17,6 +17,9 @@ import json
 import math
 import socket
 import time
+from pathlib import Path
+
+import msgspec
 
 from protocol.messages import Briefing
 from protocol.motion import REST, Controls, Pose, step, wrap
@@ -24,15 +27,27 @@ from world.driver import Reading
 
 ASK_AGAIN_S = 0.05
 """a datagram may be lost"""
-GIVE_UP_S = 10.0
-"""this robot has no drop-outs: rather than call silence what is none, it gives up"""
 
 
 class Rover:
     """Wheels, odometry, an anchor's range and the peer's, all without error."""
 
-    def __init__(self, briefing: Briefing, manoeuvre_s: float, *, start: str = "", beacon: str = "") -> None:
-        """`start` is x,y,heading in <W>, which no agent is told; `beacon` HOST:PORT, or there is no peer."""
+    def __init__(
+        self,
+        briefing: Briefing,
+        manoeuvre_s: float,
+        *,
+        start: str = "",
+        beacon: str = "",
+        state: str = "",
+        patience: str = "10",
+    ) -> None:
+        """`start` is x,y,heading in <W>, which no agent is told; `beacon` HOST:PORT, or there is no peer.
+
+        `state` is a file that stands for the robot's body, which outlasts this process: where it is, and what
+        its wheels are at. `patience` (s) bounds the wait for the peer to stand in the same tick: this robot
+        has no drop-outs, and rather than call silence what is none, it gives up.
+        """
         self._briefing = briefing
         self._manoeuvre_s = manoeuvre_s
         anchor = briefing.anchor
@@ -48,7 +63,13 @@ class Rover:
         """how much of the manoeuvre is in `pose`"""
         self._driven = REST
         """since the last reading"""
+        self._executed = REST
+        """what that told"""
         self._tick = 0
+        self._give_up_s = float(patience)
+        self._state = Path(state) if state else None
+        if self._state is not None and self._state.exists():
+            self._load(self._state)
         host, _, port = beacon.rpartition(":")
         self._radio = socket.socket(socket.AF_INET, socket.SOCK_DGRAM) if beacon else None
         if self._radio is not None:
@@ -57,9 +78,10 @@ class Rover:
 
     def sense(self, tick: int) -> Reading:
         """Where it has come to, and what is in range there."""
-        self._tick = tick
         self._settle()
         executed, self._driven = self._driven, REST
+        self._tick, self._executed = tick, executed
+        self._save()
         anchor, reach = self._briefing.anchor, self._briefing.mission.sensing_range
         rho = math.hypot(self.pose.x - anchor.x, self.pose.y - anchor.y)
         return Reading(executed, rho if rho <= reach else None, self._mutual_range(tick))
@@ -68,12 +90,21 @@ class Rover:
         """Hold them for a manoeuvre; what was left of the one before is not driven any more."""
         self._settle()
         self._controls, self._began, self._done = Controls(v, omega), time.monotonic(), 0.0
+        self._save()
+
+    def resume(self, tick: int, mark: tuple[float, ...]) -> None:  # noqa: ARG002  # the state tells enough
+        """Take back a reading that nobody has put on record."""
+        if self._tick > tick:
+            self._driven = Controls(
+                self._executed.v + self._driven.v, self._executed.omega + self._driven.omega
+            )
 
     def stop(self) -> None:
         """Stand, and stay in range of whoever ranges it."""
         self._settle()
         if self._done < 1.0:
             self._controls, self._done = REST, 1.0
+        self._save()
         self._tell(self._tick, parked=True)
 
     def close(self) -> None:
@@ -91,9 +122,23 @@ class Rover:
         self.pose = step(self.pose, v, omega, self._briefing.mission.period)
         self._driven = Controls(self._driven.v + v, self._driven.omega + omega)
 
+    def _save(self) -> None:
+        """Put on file where the body is, and what its wheels are at, whole or not at all."""
+        if self._state is not None:
+            wheels = self._controls, self._began, self._done
+            body = self.pose, *wheels, self._driven, self._executed, self._tick
+            draft = self._state.with_suffix(".draft")
+            draft.write_bytes(msgspec.json.encode(body))
+            draft.replace(self._state)
+
+    def _load(self, state: Path) -> None:
+        kinds = tuple[Pose, Controls, float, float, Controls, Controls, int]
+        body = msgspec.json.decode(state.read_bytes(), type=kinds)
+        self.pose, self._controls, self._began, self._done, self._driven, self._executed, self._tick = body
+
     def _mutual_range(self, tick: int) -> float | None:
         """m; none if the peer, standing in the same tick, is out of range. Raises TimeoutError."""
-        give_up = time.monotonic() + GIVE_UP_S
+        give_up = time.monotonic() + self._give_up_s
         while self._radio is not None and time.monotonic() < give_up:
             self._tell(tick)
             try:
@@ -104,7 +149,7 @@ class Rover:
                 return said["range"] if said["range"] is None else float(said["range"])
         if self._radio is None:
             return None
-        raise TimeoutError(f"no answer of the beacon for {GIVE_UP_S:g} s")
+        raise TimeoutError(f"no answer of the beacon for {self._give_up_s:g} s")
 
     def _tell(self, tick: int, *, parked: bool = False) -> None:
         where = {"robot": self._briefing.robot, "peer": self._briefing.peer, "tick": tick, "parked": parked}
@@ -128,6 +173,7 @@ def main() -> None:
         one = json.loads(message)
         robot, peer, tick = one["robot"], one["peer"], one["tick"]
         senders[robot] = sender
+        told.pop((robot, "parked"), None)  # it goes on, or is parked elsewhere
         place = told.setdefault((robot, "parked" if one["parked"] else str(tick)), (one["x"], one["y"]))
         other = told.get((peer, str(tick)), told.get((peer, "parked")))
         if other is not None and not one["parked"]:

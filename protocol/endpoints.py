@@ -16,6 +16,8 @@ from typing import Any
 import msgspec
 import zenoh
 
+from protocol.files import open_file, read_text
+
 CONNECT_TIMEOUT_S = 1.0
 """one attempt; a client makes as many as fit its patience"""
 RETRY_MS = 50
@@ -155,7 +157,7 @@ def configured(file: Path, connect: Sequence[str] = (), listen: Sequence[str] = 
     for name in _FILES:
         if (path := endpoints.file(name)) is not None:
             try:
-                path.open("rb").close()
+                open_file(path).close()
             except OSError as error:
                 raise BadConfiguration(f"{file}: {name}: {path}: {error.strerror or error}") from None
     return endpoints
@@ -199,7 +201,7 @@ def _said(endpoints: Any, mode: str) -> tuple[str, ...]:
 def _read(file: Path) -> str:
     """The text of a configuration that Zenoh understands. Raises BadConfiguration."""
     try:
-        text = file.read_text(encoding="utf-8")
+        text = read_text(file)
         zenoh.Config.from_json5(text)
     except OSError as error:
         raise BadConfiguration(f"{file}: cannot be read: {error.strerror or error}") from None

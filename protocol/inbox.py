@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 from collections import Counter
 from queue import Empty, SimpleQueue
 from typing import Literal, NamedTuple
+
+from protocol.keys import NOWHERE, Key
+from protocol.terminal import say
 
 Topic = Literal["sense", "drive", "report", "beat", "alive", "gone", "ended", "stop", "nothing"]
 
@@ -30,6 +32,8 @@ class Arrival(NamedTuple):
     topic: Topic
     key: str = ""
     frame: bytes = b""
+    source: Key = NOWHERE
+    """what `key` names"""
 
 
 NOTHING = Arrival("nothing")
@@ -45,37 +49,47 @@ class Inbox:
 
     def __init__(self, owner: str) -> None:
         self.refused = Counter[Topic]()
-        """frames that were malformed, not from whom they said, out of step, or more than there is room for"""
+        """frames that were malformed, under no key, not from whom they said, out of step, or without room"""
         self._owner = owner
         self._queue: SimpleQueue[Arrival] = SimpleQueue()
         self._complaints: set[tuple[str, str]] = set()
         self._waiting = Counter[Topic]()
         """bytes"""
-        self._dropped = Counter[tuple[Topic, str]]()
-        """by topic and key, those for which there was no room, until they are counted as refused"""
+        self._turned_away = Counter[tuple[Topic, str, str]]()
+        """by topic, key and reason: frames that never waited here, until they are counted as refused"""
         self._lock = threading.RLock()  # a signal handler may interrupt its holder
 
-    def put(self, topic: Topic, key: str = "", frame: bytes = b"") -> None:
+    def put(self, topic: Topic, key: str = "", frame: bytes = b"", source: Key = NOWHERE) -> None:
         """From any thread, and from a signal handler."""
-        arrival = Arrival(topic, key, frame)
+        arrival = Arrival(topic, key, frame, source)
         with self._lock:
             waiting = self._waiting[topic]
             if waiting and waiting + _size(arrival) > ROOM_BYTES:
-                self._dropped[topic, key] += 1
+                self.turn_away(topic, key, "too many wait")
                 return
             self._waiting[topic] = waiting + _size(arrival)
         self._queue.put(arrival)
+
+    def turn_away(self, topic: Topic, key: str, why: str) -> None:
+        """Refuse, from any thread, a frame that is not to wait here; `next` counts and tells it."""
+        with self._lock:
+            told = topic, key[:COMPLAINT], why
+            if told not in self._turned_away and len(self._turned_away) >= COMPLAINTS:
+                told = topic, "other keys", why
+            self._turned_away[told] += 1
 
     def next(self, timeout: float | None) -> Arrival:
         """The next arrival; NOTHING after `timeout` seconds without. Raises Interrupted on "stop"."""
         try:
             arrival = self._queue.get(timeout=max(timeout, 0.0) if timeout is not None else None)
         except Empty:
+            arrival = NOTHING
+        if self._turned_away:
+            self._count_turned_away()
+        if arrival is NOTHING:
             return NOTHING
         with self._lock:
             self._waiting[arrival.topic] -= _size(arrival)
-        if self._dropped:
-            self._count_dropped()
         if arrival.topic == "stop":
             raise Interrupted(arrival.key)
         return arrival
@@ -85,12 +99,12 @@ class Inbox:
         self.refused[arrival.topic] += 1
         self._complain(arrival.key, str(why)[:COMPLAINT])
 
-    def _count_dropped(self) -> None:
+    def _count_turned_away(self) -> None:
         with self._lock:
-            dropped, self._dropped = self._dropped, Counter()
-        for (topic, key), frames in dropped.items():
+            turned_away, self._turned_away = self._turned_away, Counter()
+        for (topic, key, why), frames in turned_away.items():
             self.refused[topic] += frames
-            self._complain(key, "too many wait")
+            self._complain(key, why)
 
     def _complain(self, key: str, why: str) -> None:
         complaint = (key, why)
@@ -100,14 +114,9 @@ class Inbox:
 
     def say(self, line: str) -> None:
         """Tell whoever watches the process."""
-        print(one_line(f"{self._owner}: {line}"), file=sys.stderr, flush=True)
+        say(f"{self._owner}: {line}", error=True)
 
 
 def _size(arrival: Arrival) -> int:
     """About what it takes while it waits."""
     return len(arrival.frame) + len(arrival.key) + ARRIVAL_BYTES
-
-
-def one_line(text: str) -> str:
-    """`text` with whatever would break or garble a line escaped."""
-    return "".join([char if char.isprintable() else repr(char)[1:-1] for char in text])

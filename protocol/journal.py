@@ -18,6 +18,7 @@ from typing import Protocol
 
 import msgpack
 
+from protocol.files import open_file
 from protocol.wire import MAX_FRAME_BYTES, is_sound
 
 _packer = msgpack.Packer()
@@ -173,7 +174,7 @@ class Tail:
 
         Raises OSError if it cannot be read, CorruptJournal where something stands that is no frame.
         """
-        with self.path.open("rb") as file:
+        with open_file(self.path) as file:
             file.seek(self.whole)
             data = file.read()
         unpacker = msgpack.Unpacker(max_buffer_size=0)

@@ -1,10 +1,18 @@
-"""The key-expression tree, one function a key, and who may do what. `run` and robot ids are single chunks."""
+"""The key-expression tree, one function a key, and who may do what. `run` and robot ids are single chunks.
+
+`parse` is the one reader of keys that arrive.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
+from functools import lru_cache
+from inspect import signature
 from types import MappingProxyType
 from typing import Literal, NamedTuple
+
+from protocol.units import MAX_ROBOT_ID, NAME
 
 ROOT = "tandem"
 
@@ -84,12 +92,44 @@ RULES: Mapping[Callable[..., str], Rule] = MappingProxyType(
 """of every key; what no rule allows a robot or a viewer, no router lets pass"""
 
 
-def run_of(key: str) -> str:
-    """The run that `key` belongs to."""
-    return key.split("/")[1]
+class Key(NamedTuple):
+    """A key under which something arrived."""
+
+    kind: Callable[..., str] | None
+    """the function above that makes such keys"""
+    run: str
+    robot: str = ""
+    """the robot whose drive, estimate or liveliness it is, and whose report; the peer is not it"""
+    peer: str = ""
 
 
-def robot_of(key: str) -> str:
-    """The robot whose drive, estimate or liveliness `key` is, and whose report; the peer is not it."""
-    chunks = key.split("/")
-    return chunks[4] if chunks[2] == "alive" else chunks[3]
+NOWHERE = Key(None, "")
+"""the key of what did not come over the network"""
+
+_LONGEST = 256
+"""characters of a key that is looked at"""
+_NAME = re.compile(NAME)
+_PATTERNS = {
+    kind: re.compile(kind(**{name: f"(?P<{name}>[^/]+)" for name in signature(kind).parameters}))
+    for kind in RULES
+}
+
+
+def parse(key: str) -> Key | None:
+    """Return what `key` names, or None if it is not one of the keys above, or is a wildcard.
+
+    Anybody may put, ask or show a token under any key expression, and a wildcard reaches whoever listens to
+    one of the keys that it covers.
+    """
+    return _parsed(key) if len(key) <= _LONGEST else None
+
+
+@lru_cache(maxsize=1024)
+def _parsed(key: str) -> Key | None:
+    for kind, pattern in _PATTERNS.items():
+        if (match := pattern.fullmatch(key)) is not None:
+            named = match.groupdict()
+            robots = [named[name] for name in named if name != "run"]
+            if all(map(_NAME.search, named.values())) and all(len(one) <= MAX_ROBOT_ID for one in robots):
+                return Key(kind, **named)
+    return None

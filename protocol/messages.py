@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
+from msgspec.structs import force_setattr
 
 from protocol.lie import Lie
 from protocol.mission import Anchor, Mission, Role, Variant
@@ -35,15 +36,23 @@ BranchKind = Literal["three-ranges", "three-ranges-virtual", "circle", "on-ancho
 Odds = Annotated[float, Meta(ge=0.0, le=1.0)]
 """the probability of a hypothesis, given what has been measured"""
 
-MAX_REASON = 300
-"""characters"""
-Text = Annotated[str, Meta(max_length=MAX_REASON)]
+MAX_TEXT = 300
+"""characters (Unicode code points)"""
+Text = Annotated[str, Meta(max_length=MAX_TEXT)]
+"""in words, of what can be of any length; whoever holds one cuts it (`_cut`)"""
 Phase = Annotated[int, Meta(ge=1, le=3)]
 Word = Annotated[str, Meta(max_length=32)]
 
 MAX_REPORT_RUNS = 70
 MAX_REPORT_RANGES = 70
 """so many at the most that a report's frame stays within `wire.MAX_REPORT_BYTES`"""
+
+
+def _cut(said: msgspec.Struct, field: str) -> None:
+    """Cut the text in `field` to its bound, and escape what no frame can hold: half of a surrogate pair."""
+    words: str | None = getattr(said, field)
+    if words is not None:
+        force_setattr(said, field, words.encode("utf-8", "backslashreplace").decode()[:MAX_TEXT])
 
 
 class Message(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag=str.lower):
@@ -82,6 +91,9 @@ class Undecided(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fie
 
     reason: Text
 
+    def __post_init__(self) -> None:
+        _cut(self, "reason")
+
 
 class Alarm(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="alarm"):
     """The peer tells what cannot be so."""
@@ -93,8 +105,25 @@ class Alarm(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=
     p_value: Odds = 0.0
     """how probable that much is, if the peer is honest"""
 
+    def __post_init__(self) -> None:
+        _cut(self, "claim")
+
 
 Verdict = Localised | Undecided | Alarm
+
+
+Version = Annotated[str, Meta(max_length=64)]
+
+
+class Environment(Message, frozen=True):
+    """The first frame of a journal: what the last bits of its numbers depend on beside the inputs."""
+
+    tandem: Version
+    c_library: Version
+    instruction_set: Version
+    numpy: Version | None = None
+    """and the instructions that it uses; none in a world's journal, which is made without, nor the next"""
+    linear_algebra: Version | None = None
 
 
 class Briefing(Message, frozen=True):
@@ -218,6 +247,9 @@ class End(Message, frozen=True):
     outcome: Outcome
     reason: Text | None
 
+    def __post_init__(self) -> None:
+        _cut(self, "reason")
+
 
 class Farewell(Message, frozen=True):
     """Robot to world, the answer to End: how it went, seen from inside."""
@@ -255,6 +287,9 @@ class Farewell(Message, frozen=True):
     bytes_sent: Count
     """of reports"""
 
+    def __post_init__(self) -> None:
+        _cut(self, "missing")
 
-OfRobot = Briefing | Sense | Report | Drive | Estimate | Missed | End | Farewell
+
+OfRobot = Environment | Briefing | Sense | Report | Drive | Estimate | Missed | End | Farewell
 """what stands in an agent's journal"""

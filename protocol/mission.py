@@ -83,6 +83,10 @@ class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return min(self.accuracy, FOOTHOLD * self.sensing_range)
 
 
+HEADING_ACCURACY = 0.2
+"""rad: how well they must know their headings before they claim to, as a standard deviation; with a heading
+less well known than this the ellipse is no likeness of what is possible"""
+
 FOOTHOLD = 0.05
 """of R: with a worse one, the orbit's margin would take too much of R"""
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from protocol.files import open_regular
 from protocol.journal import CannotRecord, Journal, lock, packed, torn
 
 
@@ -26,7 +27,7 @@ class Retrace:
         self._met = 0
         self._more: list[bytes] = []
         try:
-            self._file = os.open(path, os.O_RDWR | os.O_APPEND)
+            self._file = open_regular(path, os.O_RDWR | os.O_APPEND | os.O_NOFOLLOW)
         except OSError as error:
             raise CannotRecord(f"{path} cannot be opened: {error.strerror or error}") from None
         lock(self._file, path)

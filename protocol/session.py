@@ -19,8 +19,10 @@ from typing import Any, NoReturn
 
 import zenoh
 
+from protocol import keys, limits
 from protocol.endpoints import Endpoints, zenoh_config
-from protocol.inbox import Inbox, Topic
+from protocol.inbox import COMPLAINT, Inbox, Topic
+from protocol.keys import Key
 from protocol.messages import Message
 from protocol.wire import encode
 
@@ -29,8 +31,19 @@ CLOSE_TIMEOUT_S = 2.0
 LISTEN_AGAIN_S = 0.1
 """how long to wait before trying once more to have a port"""
 
-MSGPACK = zenoh.Encoding("application/msgpack")
+NO_KEY = "not a key of one mission and robot"
+"""why something that came under a wildcard, or under an unknown key, is refused"""
 
+MSGPACK = zenoh.Encoding("application/msgpack")
+REFUSAL = zenoh.Encoding.TEXT_PLAIN
+"""of an answer that says why there is none"""
+
+RUNTIME = (
+    "(app: (worker_threads: 1), net: (handover: app), acc: (handover: app), "
+    "rx: (handover: app), tx: (handover: app))"
+)
+"""Zenoh's thread pools: one with one thread, instead of five between which each message is handed on"""
+os.environ.setdefault("ZENOH_RUNTIME", RUNTIME)
 zenoh.init_log_from_env_or("off")
 
 
@@ -49,12 +62,19 @@ def _closing(session: zenoh.Session) -> Iterator[zenoh.Session]:
         closer.join(CLOSE_TIMEOUT_S)
 
 
+def _check_limits() -> None:
+    """Raises OSError where a session could not be opened, or would hang."""
+    limits.need_files(limits.SESSION_FILES, "a Zenoh session")
+    limits.need_memory(limits.SESSION_BYTES, "a Zenoh session")
+
+
 @contextmanager
 def open_router(endpoints: Endpoints, wait: float = 0.0) -> Iterator[zenoh.Session]:
     """The session of a router; waits `wait` seconds for where it listens to be free.
 
     Routers that it connects to may come later, and go. Raises CannotListen.
     """
+    _check_limits()
     give_up = time.monotonic() + wait
     while True:
         try:
@@ -76,6 +96,7 @@ def open_client(endpoints: Endpoints, unanswered: Callable[[], None]) -> Iterato
 
     Calls `unanswered` after each attempt of CONNECT_TIMEOUT_S in vain; it may raise to give up.
     """
+    _check_limits()
     for attempt in count():
         try:
             session = zenoh.open(zenoh_config(endpoints, first=attempt))
@@ -95,27 +116,49 @@ def open_session(
 
 def subscribe(session: zenoh.Session, key: str, inbox: Inbox, topic: Topic) -> None:
     """Put into `inbox` everything that is put under `key`."""
+    session.declare_subscriber(key, _at_once(lambda sample: deliver(sample, inbox, topic)))
 
-    def hand_over(sample: zenoh.Sample) -> None:
-        inbox.put(topic, str(sample.key_expr), sample.payload.to_bytes())
 
-    session.declare_subscriber(key, hand_over)
+def _at_once(hand_over: Callable[[zenoh.Sample], None]) -> zenoh.handlers.Callback[zenoh.Sample]:
+    """A callback that the thread which receives calls itself; it must be short, and never wait for Zenoh.
+
+    Otherwise each subscriber has a thread of its own, to which every message is handed on.
+    """
+    return zenoh.handlers.Callback(hand_over, indirect=False)
+
+
+def deliver(sample: zenoh.Sample, inbox: Inbox, topic: Topic) -> None:
+    """Put what has come into `inbox`, or have it refused there: a wildcard, an unknown key, a deletion."""
+    key = str(sample.key_expr)
+    source = keys.parse(key)
+    if source is None:
+        inbox.turn_away(topic, key, NO_KEY)
+    elif sample.kind == zenoh.SampleKind.DELETE:
+        inbox.turn_away(topic, key, "a deletion")
+    else:
+        inbox.put(topic, key, sample.payload.to_bytes(), source)
 
 
 def watch_liveliness(session: zenoh.Session, key: str, inbox: Inbox) -> None:
     """Put "alive" or "gone" into `inbox` for tokens under `key`, those already there included."""
 
     def hand_over(sample: zenoh.Sample) -> None:
-        alive = sample.kind == zenoh.SampleKind.PUT
-        inbox.put("alive" if alive else "gone", str(sample.key_expr))
+        topic: Topic = "alive" if sample.kind == zenoh.SampleKind.PUT else "gone"
+        shown = str(sample.key_expr)
+        source = keys.parse(shown)
+        if source is None:
+            inbox.turn_away(topic, shown, NO_KEY)
+        else:
+            inbox.put(topic, shown, source=source)
 
-    session.liveliness().declare_subscriber(key, hand_over, history=True)
+    session.liveliness().declare_subscriber(key, _at_once(hand_over), history=True)
 
 
-def alive(session: zenoh.Session, key: str, timeout: float) -> list[str]:
+def alive(session: zenoh.Session, key: str, timeout: float) -> list[Key]:
     """The keys of the liveliness tokens under `key`, now; waits `timeout` seconds at the most."""
     replies = session.liveliness().get(key, timeout=timeout)
-    return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})
+    shown = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
+    return [source for one in sorted(shown) if (source := keys.parse(one)) is not None]
 
 
 def linked(session: zenoh.Session) -> bool:
@@ -126,20 +169,23 @@ def linked(session: zenoh.Session) -> bool:
 def ask(session: zenoh.Session, key: str, timeout: float) -> bytes | str | None:
     """What the queryable at `key` answers: a frame, or its refusal in words, or None if nobody is there."""
     for reply in session.get(key, timeout=timeout):
-        if reply.ok is not None:
+        if reply.ok is not None and str(reply.ok.key_expr) == key:
             return reply.ok.payload.to_bytes()
-        if reply.err is not None:
-            return reply.err.payload.to_string()
+        if (
+            reply.err is not None and reply.err.encoding == REFUSAL
+        ):  # Zenoh's own is that nobody answered in time
+            return reply.err.payload.to_bytes()[:COMPLAINT].decode(errors="replace")
     return None
 
 
 def answer(session: zenoh.Session, key: str, reply: Callable[[str], Message | str]) -> None:
-    """Answer queries under `key` with what `reply` makes of the key asked for: a message, or a refusal."""
+    """Answer queries under `key` with what `reply` makes of the robot asked for: a message, or a refusal."""
 
     def hand_over(query: zenoh.Query) -> None:
-        said = reply(str(query.key_expr))
+        asked = keys.parse(str(query.key_expr))
+        said = reply(asked.robot) if asked is not None else NO_KEY
         if isinstance(said, str):
-            query.reply_err(said)
+            query.reply_err(said, encoding=REFUSAL)
         else:
             query.reply(query.key_expr, encode(said), encoding=MSGPACK)
 

@@ -41,4 +41,6 @@ TickCount = Annotated[int, Meta(ge=1, le=2**31)]
 Count = Annotated[int, Meta(ge=0, le=2**53)]
 NAME = r"\A[A-Za-z0-9][A-Za-z0-9_-]{0,63}\Z"
 """of a robot, a run, a scenario: one chunk of a key expression, part of a file's name, never an option"""
-RobotId = Annotated[str, Meta(pattern=NAME, max_length=32)]
+MAX_ROBOT_ID = 32
+"""characters"""
+RobotId = Annotated[str, Meta(pattern=NAME, max_length=MAX_ROBOT_ID)]

@@ -133,3 +133,9 @@ class LosesItsSensors(Rover):
 
 class NoDriver:
     def sense(self, tick: int) -> None: ...
+
+
+class CannotResume(Rover):
+    """One that has no memory of what its wheels did."""
+
+    resume = None  # type: ignore[assignment]

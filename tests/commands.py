@@ -68,6 +68,10 @@ ASSURED = "max_ticks = 1_000_000\n" + PAPER_1.replace('"paper"', '"assured"').re
     "10.0, 0.0", "60.0, 0.0"
 ).replace("11.3", "61.3")
 """of the variant for which standing still is no harm, however long a busy machine makes robots stand"""
+REAL_TIME = ASSURED.replace("1_000_000", "600")
+"""the same for `--rate 20`: it is over after half a minute, whatever the robots come to by then"""
+OVER = (0, 1)
+"""statuses of a mission that has come to its end; in real time nobody promises which"""
 ENDLESS = (
     LONG.replace("60.0", "400.0").replace("max_speed = 1.0", "max_speed = 0.1").replace('"long"', '"endless"')
 )
@@ -77,7 +81,7 @@ LONG_JOURNAL_BYTES = 180_000
 
 def several_pairs(pairs: int) -> str:
     """A scenario of as many pairs, each on a line of its own; robots a and b are peers, c and d, ..."""
-    ids = "abcdefgh"
+    ids = "abcdefgh" if pairs <= 4 else [f"r{i}" for i in range(2 * pairs)]
     robots = [
         f'[[robot]]\nid = "{ids[i]}"\npeer = "{ids[i ^ 1]}"\nanchor = [{10.0 * (i % 2)}, {40.0 * (i // 2)}]\n'
         for i in range(2 * pairs)
@@ -160,9 +164,9 @@ class Command:
         self.until(lambda: size(path) >= amount, f"{path.name} holds {amount} bytes")
 
     def until_answered(self, robot: str, record: Path) -> None:
-        """Wait until `robot` has answered tick 0: briefing, Sense, Drive and Estimate are on record."""
+        """Wait until `robot` has answered tick 0: its Sense, Drive and Estimate are on record."""
         path = record / f"agent-{robot}.journal"
-        self.until(lambda: path.exists() and len(list(journal.read(path))) >= 4, f"{robot} answers tick 0")
+        self.until(lambda: path.exists() and len(list(journal.read(path))) >= 5, f"{robot} answers tick 0")
 
     def ended(self, within: float = BOUND_S) -> Ended:
         """Its end, which must come `within` seconds."""
@@ -240,12 +244,15 @@ def until(condition: Callable[[], object], what: str, bound: float = BOUND_S) ->
 
 
 def processes_of(mark: str | Path) -> dict[int, list[str]]:
-    """The processes whose command line names `mark`: their words, by process id."""
+    """The processes whose command line names `mark`: their words, by process id.
+
+    A forked process shows its command line as one text.
+    """
     found = {}
     for process in Path("/proc").iterdir():
         if process.name.isdigit():
             try:
-                words = (process / "cmdline").read_bytes().decode(errors="replace").split("\0")
+                words = (process / "cmdline").read_bytes().decode(errors="replace").replace("\0", " ").split()
             except OSError:  # ended meanwhile
                 continue
             if str(mark) in words:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from compose.scenario import load
 from protocol.messages import (
+    Alarm,
     Beat,
     Contact,
     Drive,
@@ -58,4 +59,5 @@ EXAMPLES: tuple[Message, ...] = (
     Farewell("b", 0, 0, None, None, None, None, None, None, None, None, None, 0, 0, 0, 0, 0, 0, 0),
     Sense(8, "a", Controls(1.0, -0.5), None, (Contact("b", 1.25, None),)),
     Beat(7, "a"),
+    Drive(4, "b", 0.0, 0.0, 3, "alarm", Alarm("a start that it told otherwise before", 0.5, 0.25)),
 )

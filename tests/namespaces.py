@@ -24,7 +24,7 @@ from typing import NamedTuple
 from compose.reach import KEYED
 from protocol import journal, session
 from protocol.endpoints import Endpoints, configured
-from protocol.messages import Drive, End, Farewell, Missed
+from protocol.messages import Drive, End, Environment, Farewell, Missed
 from protocol.wire import MAX_FRAME_BYTES, decode
 from tests.commands import LONG, PAPER_1, Command, Ended, journals, size, tandem, until
 from world.scenario import Scenario
@@ -140,7 +140,7 @@ class Run:
 
     def answered(self) -> int:
         """The latest tick in which both answered."""
-        kinds = Scenario | Drive | Missed | End | Farewell
+        kinds = Environment | Scenario | Drive | Missed | End | Farewell
         both: dict[int, int] = {}
         for frame in journal.read(self.out / "world.journal"):
             message = decode(frame, kinds, MAX_FRAME_BYTES)

@@ -18,7 +18,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -35,7 +35,7 @@ from protocol import keys, session
 from protocol.endpoints import at
 from protocol.inbox import Inbox
 from protocol.journal import read
-from protocol.messages import Briefing, Drive, End, Estimate, Farewell, Report, Sense
+from protocol.messages import Briefing, Drive, End, Environment, Estimate, Farewell, Report, Sense
 from protocol.motion import Controls
 from protocol.wire import MAX_SENT_BYTES, decode, encode
 from tests.commands import BOUND_S, SECTION_IV, Command, until, world
@@ -93,7 +93,8 @@ class Shot(NamedTuple):
 
     kind: str
     key: str
-    frame: bytes
+    frame: bytes | None
+    """none is a deletion"""
     fate: Fate
 
 
@@ -109,7 +110,9 @@ class Genuine:
         peers = {robot.id: robot.peer for robot in played.robots}
         for robot, peer in peers.items():
             for frame in read(folder / f"agent-{robot}.journal"):
-                message: Any = decode(frame, Briefing | Sense | Report | Drive | Estimate | End | Farewell)
+                message: Any = decode(
+                    frame, Environment | Briefing | Sense | Report | Drive | Estimate | End | Farewell
+                )
                 match message:
                     case Sense():
                         key = keys.sense(RUN, robot)
@@ -145,6 +148,17 @@ class Storm:
         ]
         """others of the mission, and nothing put on them changes anything"""
         self.ghost = keys.drive(RUN, "ghost")
+        self.wild = [
+            *("**", "tandem/**", f"tandem/{RUN}/**", "tandem/*/robot/*/drive", f"tandem/{RUN}/robot/*/drive"),
+            *(f"tandem/{RUN}/robot/a/*", f"tandem/{RUN}/r$*/a/sense", "*/*/*/*/*", "**/to/*"),
+            *(f"{keys.drive(RUN, 'a')}/**", f"tandem/{RUN}/robot/*/**/b"),
+        ]
+        """wildcards, each of which covers keys by which somebody acts on frames"""
+        self.odd = [
+            *("tandem", "drive", f"tandem/{RUN}", f"tandem/{RUN}/robot", f"tandem/{RUN}/robot/a"),
+            *(f"{key}/more" for key in self.acted_on),
+        ]
+        """keys of too few chunks, and of too many: nobody listens"""
         kinds: dict[Callable[[str, int], Shot], int] = {
             self.truncated: 15,
             self.flipped: 15,
@@ -155,6 +169,9 @@ class Storm:
             self.posing: 12,
             self.to_come: 12,
             self.again: 3,
+            self.everywhere: 5,
+            self.nowhere: 2,
+            self.deleted: 5,
         }
         self._kinds, self._weights = list(kinds), list(kinds.values())
 
@@ -163,7 +180,9 @@ class Storm:
         [kind] = self._draw.choices(self._kinds, self._weights)
         if self._draw.random() < 0.1:
             shot = kind(self._draw.choice(self.acted_on), tick)
-            return shot._replace(key=self._draw.choice(self.watched), fate="unheard")
+            if keys.parse(shot.key) is not None:
+                shot = shot._replace(key=self._draw.choice(self.watched), fate="unheard")
+            return shot
         return kind(self._draw.choice(self.acted_on), tick)
 
     def truncated(self, key: str, tick: int) -> Shot:
@@ -210,7 +229,7 @@ class Storm:
 
     def posing(self, key: str, tick: int) -> Shot:
         """By the key of one robot, from another; or for it."""
-        robot = keys.robot_of(key)
+        robot = _robot(key)
         message = replace(self._forged(key, tick, end=False), robot="c" if robot == "a" else "a")
         if _topic(key) == "drive" and self._draw.random() < 0.3:
             return Shot("from another", self.ghost, encode(replace(message, robot="ghost")), "refused")
@@ -223,6 +242,15 @@ class Storm:
             return self.flipped(key, tick)
         return Shot("of this tick, again", key, frame, "either")
 
+    def everywhere(self, _: str, tick: int) -> Shot:
+        return Shot("on a wildcard", self._draw.choice(self.wild), self._any(tick), "refused")
+
+    def nowhere(self, _: str, tick: int) -> Shot:
+        return Shot("of too few or many chunks", self._draw.choice(self.odd), self._any(tick), "unheard")
+
+    def deleted(self, key: str, _: int) -> Shot:
+        return Shot("deletion", key, None, "refused")
+
     def _any(self, tick: int) -> bytes:
         return self._of(self._draw.choice(list(self._genuine)), tick)
 
@@ -234,7 +262,7 @@ class Storm:
 
     def _forged(self, key: str, tick: int, *, end: bool = True) -> Any:
         """Of `tick`, and nothing that is ever said."""
-        robot, some = keys.robot_of(key), self._draw.uniform(0.01, 3.0)
+        robot, some = _robot(key), self._draw.uniform(0.01, 3.0)
         match _topic(key):
             case "sense" if end and self._draw.random() < 0.3:
                 return End(tick, "localised" if some < 1.0 else "failed", None)
@@ -244,6 +272,12 @@ class Storm:
                 return Drive(tick, robot, some / 3.0, -some, 2, "storming")
             case _:
                 return Report(tick, robot, 1, "storming", None, 0, 0, (), 0, (), 0, self._draw.randint(0, 1))
+
+
+def _robot(key: str) -> str:
+    found = keys.parse(key)
+    assert found is not None
+    return found.robot
 
 
 def _topic(key: str) -> str:
@@ -278,8 +312,10 @@ class Tally:
 
     def note(self, shot: Shot) -> None:
         """It was put."""
-        self.fates[_recipient(shot.key), shot.fate] += 1
-        self.kinds[shot.kind, _topic(shot.key) if shot.fate != "unheard" else "others"] += 1
+        for process in recipients(shot.key):
+            self.fates[process, shot.fate] += 1
+        concrete = shot.fate != "unheard" and keys.parse(shot.key) is not None
+        self.kinds[shot.kind, _topic(shot.key) if concrete else "others"] += 1
 
     def accounted(self, process: str) -> bool:
         """Whether it has refused what it must, and nothing that it must not."""
@@ -287,10 +323,22 @@ class Tally:
         return must <= self.refused[process] <= must + self.fates[process, "either"]
 
 
-def _recipient(key: str) -> str:
-    """The process that gets what is put on `key`, of those that act on it."""
-    chunks = key.split("/")
-    return {"sense": chunks[3], "to": chunks[-1]}.get(chunks[4] if len(chunks) > 4 else "", "world")
+LISTENED = (
+    ("world", keys.drive(RUN, "*")),
+    *[
+        (one, key)
+        for one, other in (PLAYED, PLAYED[::-1])
+        for key in (keys.sense(RUN, one), keys.report(RUN, other, one))
+    ],
+)
+"""who listens to what, of the processes that act on it"""
+
+
+@cache
+def recipients(key: str) -> Sequence[str]:
+    """The processes that get what is put on `key`; one gets a wildcard once for each key that it covers."""
+    put = zenoh.KeyExpr(key)
+    return [process for process, heard in LISTENED if put.intersects(zenoh.KeyExpr(heard))]
 
 
 def rage(
@@ -321,7 +369,10 @@ def rage(
                     _look(processes, tally)
                     due = next(looks)
                 shot = storm.shot(tick)
-                publishers[shot.key].put(shot.frame)
+                if shot.frame is None:
+                    publishers[shot.key].delete()
+                else:
+                    publishers[shot.key].put(shot.frame)
                 tally.note(shot)
                 advance()
             if tally.frames == frames and not tally.seconds:
@@ -351,8 +402,8 @@ def stranger_at(endpoint: str) -> zenoh.Session:
 
 def _publishers(link: zenoh.Session, storm: Storm) -> dict[str, zenoh.Publisher]:
     """One for each key, once everybody listens: a put before that would be lost."""
-    heeded = [*storm.acted_on, storm.ghost]
-    found = {key: session.publisher(link, key) for key in (*heeded, *storm.watched)}
+    heeded = [*storm.acted_on, storm.ghost, *storm.wild]
+    found = {key: session.publisher(link, key) for key in (*heeded, *storm.watched, *storm.odd)}
     heard: dict[str, bool] = {}
     for key in heeded:
         session.on_matching(found[key], partial(heard.__setitem__, key))
@@ -383,7 +434,7 @@ def _played(inbox: Inbox, drives: dict[str, zenoh.Publisher], genuine: Genuine) 
     while len(parted) < len(PUPPETS):
         arrival = inbox.next(BOUND_S)
         assert arrival.topic == "sense", "the world is silent"
-        robot = keys.robot_of(arrival.key)
+        robot = arrival.source.robot
         message: Sense | End | Farewell = decode(arrival.frame, Sense | End | Farewell)
         match message:
             case Sense(tick):

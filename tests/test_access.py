@@ -185,7 +185,7 @@ class Participant:
         self._settled()
         found = session.alive(self._world, elsewhere, BOUND_S)
         undeclare(token)
-        return found == [elsewhere]
+        return found == [keys.parse(elsewhere)]
 
     def see(self, key: str) -> bool:
         """Whether they are told that somebody is alive there, asking or listening."""
@@ -203,7 +203,7 @@ class Participant:
         self._settled()
         told()
         undeclare(declared)
-        assert came == set(asked)
+        assert {keys.parse(one) for one in came} == set(asked)
         return bool(came)
 
 

@@ -303,6 +303,17 @@ def test_the_last_error_is_that_of_the_claim(name: str, records: Path) -> None:
     assert bool(found(figure, "position-sigma-a")) == (name == "noisy")
 
 
+def test_in_grey_no_line_of_errors_looks_like_one_of_the_other_robot_or_of_something_else(
+    records: Path,
+) -> None:
+    figure = drawn(over_time.errors(pair(recorded("noisy", records))))
+    dashes: dict[str, Any] = {}
+    for gid in (f"position-{what}{role}" for what in ("", "alone-", "sigma-") for role in "ab"):
+        (one,) = found(figure, gid)[:1]
+        dashes[gid] = str(one._unscaled_dash_pattern)  # type: ignore[attr-defined]
+    assert len(set(dashes.values())) == len(dashes) == 6
+
+
 def test_under_noise_a_panel_has_each_hypothesis_that_the_journal_tells_of(records: Path) -> None:
     folder = recorded("noisy", records)
     told = pair(folder)
@@ -398,8 +409,20 @@ def test_a_journal_of_another_version_is_followed_to_where_it_decides_otherwise(
     assert ended.err == (
         "tandem figures: of b only up to where its journal can be followed: on record it decided otherwise "
         "at tick 20: the journal is another version's\n"
-        "tandem figures: no plan-a-b: no last manoeuvre was planned\n"
+        "tandem figures: no plan-a-b: the journal of b is missing, or cannot be followed to its end\n"
     )
+
+
+def test_no_plan_is_said_to_be_none_where_only_a_journal_is_missing(records: Path, tmp_path: Path) -> None:
+    for name, whole in (("paper-1", "no last manoeuvre was planned"), ("noisy", "they never weighed")):
+        folder = tmp_path / name
+        folder.mkdir()
+        copied(recorded(name, records), folder)
+        (folder / "agent-b.journal").unlink()
+        cut(folder / "agent-a.journal", 4)
+        ended = tandem("figures", folder, "--only", "plan", "--format", "svg")
+        assert (ended.status, whole in ended.err) == (3, False)
+        assert "no plan-a-b: the journal of b is missing, or cannot be followed to its end" in ended.err
 
 
 def _turned(frame: bytes, tick: int) -> bytes:
@@ -414,6 +437,7 @@ def _turned(frame: bytes, tick: int) -> bytes:
 # --- the command ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_the_same_record_gives_the_same_bytes_in_each_format(records: Path, tmp_path: Path) -> None:
     folder = copied(recorded("paper-1", records), tmp_path)
     runs: list[dict[str, bytes]] = []
@@ -429,7 +453,11 @@ def test_the_same_record_gives_the_same_bytes_in_each_format(records: Path, tmp_
     svg = runs[0]["plan-b-47.svg"].decode()
     assert {f"candidate-{i}" for i in range(1, 5)} <= set(re.findall(r'id="([^"]+)"', svg))
     assert "<dc:date>" not in svg
-    assert b"CreationDate" not in runs[0]["plan-b-47.pdf"]
+    for name in drawn:
+        pdf = runs[0][f"{name}.pdf"]
+        assert b"CreationDate" not in pdf
+        assert b"/Subtype /Type3" not in pdf
+        assert b"/FontFile2" in pdf  # TrueType, embedded
 
 
 def test_a_terminal_shows_how_far_it_is_and_each_file_on_a_line_of_its_own(

@@ -457,3 +457,37 @@ def test_an_agents_record_is_never_overwritten(tmp_path: Path) -> None:
     says = f"--out: {tmp_path}/agent-a.journal: damaged at byte 0"
     refused(ended, says, "; choose another folder")
     assert (tmp_path / "agent-a.journal").read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("run noise", "noise is a campaign: `tandem sweep noise` plays it"),
+        ("world noise --listen tcp/127.0.0.1:7447", "noise is a campaign: `tandem sweep noise` plays it"),
+        ("sweep noisy", "noisy is a scenario: `tandem run noisy` plays it"),
+        ("run papr-1", "; did you mean 'paper-1'?"),
+        ("run niose", "; did you mean 'noise'?"),
+        ("sweep los", "; did you mean 'loss'?"),
+        ("rnu paper-1", "; did you mean 'run'?"),
+        ("run paper-1 --sede 3", "tandem run: unrecognized arguments: --sede 3; did you mean '--seed'?"),
+        ("figures x --only encunter", "; did you mean 'encounter'?"),
+        ("run paper-1 --kill wolrd@3", "; did you mean 'world'?"),
+        ("robot robot2 --mission FILE --driver docs.rover:Rover", "; did you mean 'robot-2'?"),
+    ],
+)
+def test_a_misspelt_name_is_told_with_the_one_that_is_near(words: str, said: str, tmp_path: Path) -> None:
+    file = tmp_path / "named.toml"
+    file.write_text(PAPER_1.replace('"a"', '"robot-1"').replace('"b"', '"robot-2"'))
+    ended = tandem(*[word.replace("FILE", str(file)) for word in words.split()])
+    assert (ended.status, ended.out) == (2, "")
+    assert ended.err.rstrip("\n").endswith(said)
+    assert ended.err.count("\n") == 1
+
+
+def test_an_agent_with_a_misspelt_name_is_told_the_one_that_is_near(tmp_path: Path) -> None:
+    file = tmp_path / "named.toml"
+    file.write_text(PAPER_1.replace('"a"', '"robot-1"').replace('"b"', '"robot-2"'))
+    with world(file) as (_, endpoint):
+        ended = tandem("agent", "robot2", "--connect", endpoint)
+    assert ended.status == 2
+    assert "it has robot-1, robot-2; did you mean 'robot-2'?" in ended.err

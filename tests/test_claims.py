@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+from collections.abc import Container
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,9 @@ from compose.campaign.cells import cells
 from compose.campaign.summary import Counted, counted
 from compose.campaign.table import of_rows, schema_of
 from compose.claim import matrix, nees
+from compose.inline import play
 from compose.record import Moment, Record
-from compose.scenario import parse
+from compose.scenario import load, parse
 from compose.show import result
 from compose.summary import leave, summary
 from protocol.messages import Drive, End, Farewell, Localised
@@ -266,12 +268,75 @@ def test_the_table_of_a_campaign_gives_the_nees_where_covariances_are_claimed(
     assert heading.split()[-6:] == ["within", "nees", "nees", "low", "nees", "high"]
     (line,) = (line for line in noisy if line.startswith(" 0 "))
     assert line.split()[-4:] == ["1.0000", "1.1", "0.0717", "12.8"]
-    assert any(line.startswith("within: claims within 3 x accuracy; nees: ") for line in noisy)
+    assert any("; within: claims within 3 x accuracy; nees: " in line for line in noisy)
     report.show(results_of([row_of(claimed(EXACT, None, by=0.0))], tmp_path), tmp_path, quiet=False)
     assert "nees" not in capsys.readouterr().out
 
 
 # --- the table ----------------------------------------------------------------------------------------
+
+
+PLAYED = play(load("paper-1"))
+
+
+def missing_at(record: Record, robot: str, ticks: Container[int]) -> Record:
+    """The record without that robot's Drives of `ticks`, and without its Farewell."""
+    moments = [
+        replace(one, drives={who: drive for who, drive in one.drives.items() if who != robot})
+        if one.truth.tick in ticks
+        else one
+        for one in record.moments
+    ]
+    farewells = {who: said for who, said in record.farewells.items() if who != robot}
+    return replace(record, moments=tuple(moments), farewells=farewells)
+
+
+def test_the_end_says_how_many_deadlines_each_robot_missed_and_suggests_a_lower_rate(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    record = missing_at(missing_at(PLAYED, "a", range(3, 10)), "b", [5])
+    result(summary(record, "processes", 0.5), 40.0)
+    last = record.moments[-1].truth.tick
+    said = capsys.readouterr().out.splitlines()[-1]
+    assert said == (
+        f"deadlines missed, of {last}: a 7, b 1; a lower --rate, such as --rate 20, leaves more time for each"
+    )
+
+
+@pytest.mark.parametrize(
+    ("ticks", "why"),
+    [
+        (range(1000), "no Drive of it came in time"),
+        (range(9, 1000), "its last Drive in time was of tick 8 of LAST"),
+        ((), "it did not answer the End"),
+    ],
+)
+def test_the_summary_says_why_a_robot_has_no_farewell(ticks: Container[int], why: str) -> None:
+    record = missing_at(PLAYED, "a", ticks)
+    told = summary(record, "processes", 0.5)["robots"]
+    assert told["a"]["no_farewell"] == why.replace("LAST", str(record.moments[-1].truth.tick))
+    assert told["b"]["no_farewell"] is None
+    assert told["a"]["reports_sent"] is None
+    cut = summary(replace(record, end=None), "processes", 0.5)["robots"]
+    assert cut["a"]["no_farewell"] == "the record breaks off"
+
+
+def test_the_table_of_many_robots_fits_a_narrow_terminal_and_explains_only_its_columns(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    told = summary(claimed(NOISY, SURE), "in-process", 0.5)
+    many = {f"{i:03d}-{'x' * 28}": told["robots"]["a"] for i in range(200)}
+    result({**told, "robots": many})
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    rows = [line.split() for line in lines if "x" * 28 in line]
+    assert len(rows) == 200
+    heading = next(line for line in lines if line.startswith(" robot"))
+    notes = " ".join(lines[lines.index("", 3) :])
+    for column, note in (("sigma m", "sigma: "), ("reports", "reports sent"), ("ranges", "ranges to")):
+        assert (column in heading) == (note in notes)
 
 
 def table(record: Record, capsys: pytest.CaptureFixture[str]) -> list[str]:

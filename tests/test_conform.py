@@ -8,7 +8,7 @@ from compose.conformance import judged
 from compose.driving import briefed
 from compose.exercise import Trial
 from compose.scenario import load
-from tests import broken_drivers
+from tests import broken_drivers, virtual_time
 from tests.commands import tandem
 
 MANOEUVRE_S = 0.1
@@ -16,7 +16,7 @@ BRIEFING = briefed(load("paper-1"), "a", MANOEUVRE_S)
 
 
 def test_the_example_keeps_the_contract() -> None:
-    ended = tandem("conform", "docs.rover:Rover", "--rate", "8")
+    ended = tandem("conform", "tests.virtual_time:Rover", "--rate", "8")
     assert ended.status == 0, ended.out
     lines = [line for line in ended.out.splitlines() if "truly at" not in line]
     assert len(lines) == 8
@@ -41,7 +41,12 @@ def test_the_example_keeps_the_contract() -> None:
         ("WaitsForItsWheels", "of a manoeuvre, expected 0.05 at the most: it must not wait"),
     ],
 )
-def test_a_broken_driver_is_told_what_it_breaks(broken: str, said: str) -> None:
+def test_a_broken_driver_is_told_what_it_breaks(
+    broken: str, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = virtual_time.Clock()
+    for module in virtual_time.MODULES:
+        monkeypatch.setattr(module, "time", clock)
     driver = getattr(broken_drivers, broken)(BRIEFING, MANOEUVRE_S)
     trial = Trial(driver, BRIEFING, MANOEUVRE_S)
     trial.go_through()

@@ -59,7 +59,7 @@ def left(tmp_path: Path) -> list[int]:
     found = []
     for pid in filter(str.isdigit, os.listdir("/proc")):
         try:
-            words = Path(f"/proc/{pid}/cmdline").read_bytes().decode().split("\0")
+            words = Path(f"/proc/{pid}/cmdline").read_bytes().decode().replace("\0", " ").split()
         except OSError:  # ended meanwhile
             continue
         if any(word.startswith(f"{tmp_path}/") for word in words):
@@ -107,6 +107,7 @@ def test_a_process_that_is_never_started_again_ends_its_trial() -> None:
         play(Trial(0, 0, load("paper-1"), processes=False, kills=kills))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("how", ["killed, then hung", "campaign stopped", "campaign killed"])
 def test_however_a_trial_ends_its_processes_end_with_it(how: str, tmp_path: Path) -> None:
     (tmp_path / "endless.toml").write_text(ENDLESS + '[[kill]]\nwho = "a"\ntick = 1\n')

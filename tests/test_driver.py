@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
+from typing import cast
 
 import pytest
 import zenoh
+from msgspec.structs import replace
 
 from compose.driving import briefed
-from compose.local import free_endpoint
 from compose.scenario import parse
-from protocol import keys, session
-from protocol.endpoints import at, listening
-from protocol.inbox import Inbox
+from protocol import keys
 from protocol.messages import (
     Alarm,
     Beat,
@@ -29,17 +27,26 @@ from protocol.messages import (
     Verdict,
 )
 from protocol.motion import ORIGIN, REST, Controls
-from protocol.wire import MalformedFrame, decode, encode
+from protocol.wire import decode, encode
 from tests.commands import ASSURED, PAPER_1
+from tests.stage import Stage
 from world.driver import THINKING, Reading
+from world.driver_journal import DrivenTick, DriverPast
 from world.ending import LAST_WORDS, Ending
-from world.field import Field
+from world.field import UNHEARD, Field
 
 Answer = Callable[[int], Iterable[bytes]]
 """what somebody says to the Sense of a tick"""
+LINK = cast(zenoh.Session, None)
+"""a stage needs none"""
 MANOEUVRE_S = 0.1
 SCENARIO = parse(PAPER_1, "paper-1")
 BRIEFING = briefed(SCENARIO, "a", MANOEUVRE_S)
+
+
+@pytest.fixture
+def stage(monkeypatch: pytest.MonkeyPatch) -> Stage:
+    return Stage(monkeypatch)
 
 
 class Recorded:
@@ -49,11 +56,12 @@ class Recorded:
         self.drives: list[tuple[float, float]] = []
         self.ticks: list[tuple[int, float]] = []
         self.stopped = 0
+        self.clock = time.monotonic
         self._fails_at = fails_at
         self._reading = reading or Reading(REST, 2.0)
 
     def sense(self, tick: int) -> Reading:
-        self.ticks.append((tick, time.monotonic()))
+        self.ticks.append((tick, self.clock()))
         if tick == self._fails_at:
             raise OSError("no such device")
         return self._reading
@@ -68,32 +76,6 @@ class Recorded:
         pass
 
 
-class Stranger:
-    """Whoever answers in the agent's place."""
-
-    def __init__(self, link: zenoh.Session, answer: Answer) -> None:
-        self.ticks: list[int] = []
-        self.end: End | None = None
-        self._drive = session.publisher(link, keys.drive("r", "a"))
-        self._answer = answer
-        link.declare_subscriber(keys.sense("r", "a"), self._on_sense)
-        self._tokens = [session.show_alive(link, keys.robot_alive("r", one)) for one in ("a", "b")]
-
-    def _on_sense(self, sample: zenoh.Sample) -> None:
-        try:
-            message = decode(sample.payload.to_bytes(), Sense | End | Farewell)
-        except MalformedFrame:
-            return
-        match message:
-            case Sense(tick):
-                self.ticks.append(tick)
-                for frame in self._answer(tick):
-                    self._drive.put(frame)
-            case End():
-                self.end = message
-                self._drive.put(encode(FAREWELL))
-
-
 FAREWELL = Farewell("a", 0, 0, None, None, None, None, None, None, None, None, None, 0, 0, 0, 0, 0, 0, 0)
 
 
@@ -101,31 +83,54 @@ def drive(tick: int, robot: str = "a", v: float = 0.5, verdict: Verdict | None =
     return Drive(tick, robot, v, 0.25, 1, "straight", verdict)
 
 
-def played(
-    driver: Recorded, answer: Answer, ticks: int = 5, manoeuvre_s: float = MANOEUVRE_S
-) -> tuple[Field, End, Stranger]:
-    endpoint, inbox = free_endpoint(), Inbox("field")
-    field = Field(driver, BRIEFING, "r", inbox, max_ticks=ticks, manoeuvre_s=manoeuvre_s, patience=1.0)
-    with (
-        session.open_router(listening(endpoint)) as link,
-        session.open_client(at(endpoint), lambda: None) as other,
-    ):
-        field.attach(link)
-        stranger = Stranger(other, answer)
-        end = field.play(10.0, lambda: None)
-    return field, end, stranger
+Play = Callable[..., tuple[Field, End, list[End]]]
 
 
-def test_a_drive_in_time_is_driven_and_a_tick_is_a_manoeuvre_and_a_moment_to_think() -> None:
+@pytest.fixture
+def played(stage: Stage) -> Play:
+    """Plays a mission of a with that driver, and an agent that says `answer` to each Sense, `after` a while.
+
+    The field, the End that it came to, and those that it told.
+    """
+
+    def play(
+        driver: Recorded, answer: Answer, ticks: int = 5, patience: float = 60.0, after: float = 0.001
+    ) -> tuple[Field, End, list[End]]:
+        driver.clock = stage.monotonic
+        ends: list[End] = []
+
+        def said(key: str, frame: bytes) -> None:
+            if key != keys.sense("r", "a"):
+                return
+            match decode(frame, Sense | End | Farewell):
+                case Sense(tick):
+                    for one in answer(tick):
+                        stage.comes("drive", keys.drive("r", "a"), one, after)
+                case End() as end:
+                    ends.append(end)
+                    stage.comes("drive", keys.drive("r", "a"), encode(FAREWELL))
+
+        stage.answer = said
+        stage.alive("a", "b")
+        field = Field(
+            driver, BRIEFING, "r", stage, max_ticks=ticks, manoeuvre_s=MANOEUVRE_S, patience=patience
+        )
+        field.attach(LINK)
+        return field, field.play(10.0, lambda: None), ends
+
+    return play
+
+
+def test_a_drive_in_time_is_driven_and_a_tick_is_a_manoeuvre_and_a_moment_to_think(played: Play) -> None:
     driver = Recorded()
-    field, end, stranger = played(driver, lambda tick: [encode(drive(tick))])
+    field, end, told = played(driver, lambda tick: [encode(drive(tick))])
     assert (end.tick, end.outcome, field.missed) == (5, "undecided", 0)
     assert driver.drives == [(0.5, 0.25)] * 6
     assert [tick for tick, _ in driver.ticks] == [0, 1, 2, 3, 4, 5]
-    assert stranger.end == end
+    assert told == [end]
     assert driver.stopped >= 1
     took = driver.ticks[-1][1] - driver.ticks[0][1]
-    assert took == pytest.approx(5 * (1 + THINKING) * MANOEUVRE_S, rel=0.3)
+    assert took == pytest.approx(5 * (1 + THINKING) * MANOEUVRE_S)
 
 
 NONSENSE: dict[str, Answer] = {
@@ -142,7 +147,7 @@ NONSENSE: dict[str, Answer] = {
 
 
 @pytest.mark.parametrize("kind", NONSENSE)
-def test_a_robot_whose_agent_speaks_nonsense_stands_still(kind: str) -> None:
+def test_a_robot_whose_agent_speaks_nonsense_stands_still(kind: str, played: Play) -> None:
     driver = Recorded()
     field, end, _ = played(driver, NONSENSE[kind])
     assert driver.drives == []
@@ -150,22 +155,21 @@ def test_a_robot_whose_agent_speaks_nonsense_stands_still(kind: str) -> None:
     assert end.outcome == "undecided"
 
 
-def test_nobody_drives_faster_than_the_mission_says() -> None:
+def test_nobody_drives_faster_than_the_mission_says(played: Play) -> None:
     driver = Recorded()
     played(driver, lambda tick: [encode(Drive(tick, "a", -7.0, 1e6, 1, "straight"))], ticks=1)
     assert driver.drives == [(-1.0, 3.141592653589793)] * 2
 
 
-def test_a_drive_that_comes_late_is_not_driven() -> None:
-    driver, late = Recorded(), threading.Event()
-
-    def answer(_: int) -> Iterator[bytes]:
-        late.wait(0.6 * MANOEUVRE_S)
-        yield encode(drive(_))
-
-    field, end, _ = played(driver, answer)
+def test_a_drive_that_comes_late_is_not_driven(played: Play) -> None:
+    driver = Recorded()
+    late = THINKING * MANOEUVRE_S
+    field, end, _ = played(driver, lambda tick: [encode(drive(tick))], after=1.01 * late)
     assert driver.drives == []
     assert field.missed == end.tick + 1
+    in_time = Recorded()
+    field, end, _ = played(in_time, lambda tick: [encode(drive(tick))], after=0.99 * late)
+    assert len(in_time.drives) == end.tick + 1
 
 
 @pytest.mark.parametrize(
@@ -178,17 +182,19 @@ def test_a_drive_that_comes_late_is_not_driven() -> None:
         (Recorded(reading="2.0"), "a's driver: sense(0): gives str, expected a Reading"),  # type: ignore[arg-type]
     ],
 )
-def test_a_driver_that_cannot_go_on_ends_the_mission_and_stands(driver: Recorded, said: str) -> None:
-    _, end, stranger = played(driver, lambda tick: [encode(drive(tick))])
+def test_a_driver_that_cannot_go_on_ends_the_mission_and_stands(
+    driver: Recorded, said: str, played: Play
+) -> None:
+    _, end, told = played(driver, lambda tick: [encode(drive(tick))])
     assert end.outcome == "failed"
     assert end.reason is not None
     assert end.reason.startswith(said)
     assert driver.stopped >= 1
-    assert stranger.end == end
+    assert told == [end]
 
 
-def test_an_agent_that_never_answers_ends_the_mission_after_the_patience() -> None:
-    _, end, _ = played(Recorded(), lambda _: [], ticks=1000)
+def test_an_agent_that_never_answers_ends_the_mission_after_the_patience(played: Play) -> None:
+    _, end, _ = played(Recorded(), lambda _: [], ticks=1000, patience=1.0)
     assert end.outcome == "failed"
     assert end.reason is not None
     assert end.reason.startswith("no answer from a's agent for 1.")
@@ -248,43 +254,126 @@ def test_it_is_over_when_the_peer_is_silent_for_too_long() -> None:
 # --- the clock ----------------------------------------------------------------------------------------
 
 
-def test_b_begins_when_a_does_and_counts_a_s_ticks() -> None:
+def test_b_begins_when_a_does_and_counts_a_s_ticks(stage: Stage) -> None:
     """Late by seven ticks, it goes through those at once, standing; then it drives in a's."""
-    driver, endpoint = Recorded(), free_endpoint()
+    driver = Recorded()
+    driver.clock = stage.monotonic
     briefing = briefed(parse(ASSURED, "assured"), "b", MANOEUVRE_S)
-    inbox = Inbox("field")
-    field = Field(driver, briefing, "r", inbox, max_ticks=12, manoeuvre_s=MANOEUVRE_S)
-    with (
-        session.open_router(listening(endpoint)) as link,
-        session.open_client(at(endpoint), lambda: None) as other,
-    ):
-        field.attach(link)
-        answers = session.publisher(other, keys.drive("r", "b"))
+    field = Field(driver, briefing, "r", stage, max_ticks=12, manoeuvre_s=MANOEUVRE_S)
 
-        def answer(sample: zenoh.Sample) -> None:
-            sense = decode(sample.payload.to_bytes(), Sense | End | Farewell)
-            if isinstance(sense, Sense):
-                answers.put(encode(drive(sense.tick, "b")))
-            elif isinstance(sense, End):
-                answers.put(encode(FAREWELL))
+    def answer(key: str, frame: bytes) -> None:
+        if key == keys.sense("r", "b"):
+            sense = decode(frame, Sense | End | Farewell)
+            said = drive(sense.tick, "b") if isinstance(sense, Sense) else FAREWELL
+            stage.comes("drive", keys.drive("r", "b"), encode(said), 0.001)
 
-        other.declare_subscriber(keys.sense("r", "b"), answer)
-        token = session.show_alive(other, keys.robot_alive("r", "b"))
-        beat = session.publisher(other, keys.beat("r", "a"))
-        assert token is not None
-
-        def say(tick: int) -> None:
-            beat.put(encode(Beat(tick, "a")))
-
-        threading.Timer(0.5, say, [7]).start()
-        threading.Timer(0.5 + 2.5 * MANOEUVRE_S, say, [0]).start()  # of an a that has lost its past
-        threading.Timer(0.5 + 2.5 * MANOEUVRE_S, say, [500]).start()
-        before = time.monotonic()
-        end = field.play(10.0, lambda: None)
+    stage.answer = answer
+    stage.alive("b")
+    later = 0.5 + 2.5 * MANOEUVRE_S
+    for tick, after in ((7, 0.5), (0, later), (500, later)):  # 0 is of an a that lost its past
+        stage.comes("beat", keys.beat("r", "a"), encode(Beat(tick, "a")), after)
+    field.attach(LINK)
+    end = field.play(10.0, lambda: None)
     assert end.tick == 12
-    assert driver.ticks[0][1] - before >= 0.4
+    assert driver.ticks[0][1] == pytest.approx(0.5)
     assert [tick for tick, _ in driver.ticks] == list(range(13))
-    assert driver.ticks[7][1] - driver.ticks[0][1] < 2 * MANOEUVRE_S
+    assert driver.ticks[7][1] == pytest.approx(0.5)
     assert field.missed == 7
-    assert inbox.refused["beat"] == 2
+    assert stage.refused["beat"] == 2
     assert len(driver.drives) == 6
+
+
+def past_of(ticks: int, *, robot: str) -> DriverPast:
+    """What a driver has on record that has come so far, driving in every second tick."""
+    senses = [Sense(tick, robot, REST if tick else None, 2.0) for tick in range(ticks)]
+    return DriverPast(
+        tuple(
+            [
+                DrivenTick(one, encode(one), drive(one.tick, robot) if one.tick % 2 == 0 else None)
+                for one in senses
+            ]
+        )
+    )
+
+
+@pytest.mark.parametrize(("robot", "peer"), ["ab", "ba"])
+def test_a_robot_that_was_down_catches_up_with_its_peer_standing(robot: str, peer: str, stage: Stage) -> None:
+    """However many ticks it was down; then it goes on in the peer's."""
+    driver = Recorded()
+    driver.clock = stage.monotonic
+    briefing = briefed(parse(ASSURED, "assured"), robot, MANOEUVRE_S)
+    field = Field(driver, briefing, "r", stage, max_ticks=305, manoeuvre_s=MANOEUVRE_S)
+    field.resume(past_of(20, robot=robot), known=17)
+    sent: list[int] = []
+
+    def answer(key: str, frame: bytes) -> None:
+        if key == keys.sense("r", robot):
+            sense = decode(frame, Sense | End | Farewell)
+            sent.extend([sense.tick] if isinstance(sense, Sense) else [])
+            said = drive(sense.tick, robot) if isinstance(sense, Sense) else replace(FAREWELL, robot=robot)
+            stage.comes("drive", keys.drive("r", robot), encode(said), 0.001)
+
+    stage.answer = answer
+    stage.alive(robot)
+    stage.comes("beat", keys.beat("r", peer), encode(Beat(300, peer)), 0.01)
+    field.attach(LINK)
+    end = field.play(10.0, lambda: None)
+    assert end.tick == 305
+    assert sent == list(range(18, 306))
+    assert [tick for tick, _ in driver.ticks] == list(range(20, 306))
+    times = dict(driver.ticks)
+    assert times[299] - times[21] < 2 * (1 + THINKING) * MANOEUVRE_S
+    assert times[305] - times[301] == pytest.approx(4 * (1 + THINKING) * MANOEUVRE_S)
+    assert 5 <= len(driver.drives) <= 7
+
+
+def test_an_a_that_was_not_down_does_not_go_by_its_peers_ticks(stage: Stage, played: Play) -> None:
+    driver = Recorded()
+    stage.comes("beat", keys.beat("r", "b"), encode(Beat(4, "b")), 0.05)
+    played(driver, lambda tick: [encode(drive(tick))])
+    assert driver.ticks[-1][1] - driver.ticks[0][1] == pytest.approx(5 * (1 + THINKING) * MANOEUVRE_S)
+
+
+def test_a_b_that_was_killed_before_tick_0_begins_though_a_waits_for_it(stage: Stage) -> None:
+    """a is there, and says nothing; when it does, it turns out to be behind, and b waits for it."""
+    driver = Recorded()
+    driver.clock = stage.monotonic
+    briefing = briefed(parse(ASSURED, "assured"), "b", MANOEUVRE_S)
+    field = Field(driver, briefing, "r", stage, max_ticks=9, manoeuvre_s=MANOEUVRE_S)
+    field.resume(DriverPast(), known=-1)
+    stage.alive("a", "b")
+    tick_s = (1.0 + THINKING) * MANOEUVRE_S
+    stage.comes("beat", keys.beat("r", "a"), encode(Beat(0, "a")), 9.5 * tick_s)
+    field.attach(LINK)
+    end = field.play(10.0, lambda: None)
+    times = dict(driver.ticks)
+    assert times[0] == pytest.approx(UNHEARD * tick_s)
+    assert times[5] == pytest.approx(times[0] + 5 * tick_s)
+    assert times[6] == pytest.approx((9.5 + 6) * tick_s)
+    assert end.tick == 9
+
+
+def test_a_robot_says_why_there_is_no_farewell(stage: Stage, capsys: pytest.CaptureFixture[str]) -> None:
+    stage.alive("a", "b")
+    field = Field(Recorded(), BRIEFING, "r", stage, max_ticks=2, manoeuvre_s=MANOEUVRE_S)
+    field.attach(LINK)
+    field.play(10.0, lambda: None)
+    assert "no Farewell of a: no answer to the End" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("robot", ["a", "b"])
+def test_a_robot_that_was_killed_waits_for_its_agent_however_long_its_peer_is_there(
+    robot: str, stage: Stage
+) -> None:
+    driver = Recorded()
+    driver.clock = stage.monotonic
+    briefing = briefed(parse(ASSURED, "assured"), robot, MANOEUVRE_S)
+    field = Field(driver, briefing, "r", stage, max_ticks=25, manoeuvre_s=MANOEUVRE_S)
+    field.resume(past_of(20, robot=robot), known=19)
+    stage.alive("b" if robot == "a" else "a")
+    stage.comes("alive", keys.robot_alive("r", robot), after=3.0)
+    field.attach(LINK)
+    assert field.play(10.0, lambda: None).tick == 25
+    tick, began = driver.ticks[0]
+    assert tick == 20
+    assert began == pytest.approx(3.0)

@@ -7,6 +7,8 @@ import os
 import re
 import signal
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +17,9 @@ from signal import SIGINT, SIGKILL, SIGSTOP, SIGTERM
 
 import pytest
 
+from compose.beside import Beside, stay
 from compose.local import free_endpoint
+from protocol.inbox import Arrival, Inbox
 from protocol.refusal import MUTE
 from tests.commands import (
     ENDLESS,
@@ -30,6 +34,7 @@ from tests.commands import (
     until,
     world,
 )
+from tests.series import series
 
 AT_ONCE_S = 4.0
 """less than the 5 s after which a process that was told to stop is killed"""
@@ -45,7 +50,7 @@ def journaled(bytes_written: int) -> Moment:
 
 
 def processes(number: int) -> Moment:
-    return lambda _run, out: len(processes_of(out)) >= number
+    return lambda run, out: run.catches(SIGTERM) and len(processes_of(out)) >= number
 
 
 def ready(run: Command, _out: Path) -> bool:
@@ -86,8 +91,8 @@ def long(tmp_path: Path) -> Path:
 # --- told to stop -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("number", [SIGINT, SIGTERM], ids=["SIGINT", "SIGTERM"])
-@pytest.mark.parametrize("moment", MOMENTS)
+@pytest.mark.parametrize("number", series([SIGINT, SIGTERM]), ids=["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("moment", series(MOMENTS, 9))
 def test_a_run_that_is_told_to_stop_says_so_and_leaves_no_process(
     moment: str, number: signal.Signals, endless: Path, tmp_path: Path
 ) -> None:
@@ -100,7 +105,7 @@ def test_a_run_that_is_told_to_stop_says_so_and_leaves_no_process(
     assert not processes_of(out)
 
 
-@pytest.mark.parametrize("number", [SIGINT, SIGTERM], ids=["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("number", series([SIGINT, SIGTERM]), ids=["SIGINT", "SIGTERM"])
 @pytest.mark.parametrize("moment", LAST_MOMENTS)
 def test_a_run_that_is_told_to_stop_as_it_ends_says_either(
     moment: str, number: signal.Signals, long: Path, tmp_path: Path
@@ -118,7 +123,7 @@ def test_a_run_that_is_told_to_stop_as_it_ends_says_either(
         assert ended[1:] == (f"localised after {LONG_TICKS} ticks\n", "")
 
 
-@pytest.mark.parametrize("delay", [round(0.15 * draw(), 3) for _ in range(6)])
+@pytest.mark.parametrize("delay", series([round(0.15 * draw(), 3) for _ in range(6)], 3))
 def test_a_run_that_is_told_to_stop_while_it_starts_leaves_no_process(
     delay: float, endless: Path, tmp_path: Path
 ) -> None:
@@ -143,7 +148,7 @@ def test_a_second_ctrl_c_changes_nothing(endless: Path, tmp_path: Path) -> None:
     assert "Traceback" not in ended.err
 
 
-@pytest.mark.parametrize("number", [SIGINT, SIGTERM], ids=["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("number", series([SIGINT, SIGTERM]), ids=["SIGINT", "SIGTERM"])
 def test_a_world_and_an_agent_that_are_told_to_stop_say_so(number: signal.Signals) -> None:
     with world("paper-1") as (clock, endpoint):
         with Command("agent", "a", "--connect", endpoint) as agent:
@@ -247,3 +252,28 @@ def test_processes_end_when_their_launcher_is_killed(endless: Path, tmp_path: Pa
         run.until_written(out / "world.journal", 10_000)
         os.kill(run.pid, SIGKILL)
         until(lambda: not processes_of(out), "all have ended")
+
+
+# --- what stays -------------------------------------------------------------------------------------
+
+
+def test_a_page_that_stays_is_not_ended_by_another_process_that_ends_late() -> None:
+    """It ends by a second byte, which comes once the end of a late agent has been taken from the inbox."""
+    script = "import sys; sys.stdin.buffer.read(2)"
+    with subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE) as process:
+
+        class Watched(Inbox):
+            taken = 0
+
+            def next(self, timeout: float | None) -> Arrival:
+                self.taken += 1
+                if self.taken == 2 and process.stdin is not None:
+                    process.stdin.write(b".")
+                    process.stdin.flush()
+                return super().next(timeout)
+
+        inbox = Watched("test")
+        inbox.put("ended", "agent a")
+        stay([Beside("the page", process, "here")], inbox)
+        assert inbox.taken == 2
+        assert process.poll() == 0

@@ -70,7 +70,7 @@ def picture(folder: Path, robot: str) -> Path:
     story = Story(record, place, estimates(folder, robot))
     (folder / "figures").mkdir(exist_ok=True)
     with look():
-        svg, _ = save(figure_of(story), folder / "figures" / f"robot-{robot}")
+        svg, *_ = save(figure_of(story), folder / "figures" / f"robot-{robot}")
     return svg
 
 

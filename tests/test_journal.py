@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from compose.inline import play
 from compose.scenario import load
 from protocol import journal
+from protocol.environment import of_world
 from protocol.journal import CorruptJournal, Journal, RecordExists, Tail
-from protocol.messages import Drive, End, Farewell
+from protocol.messages import Drive, End, Environment, Farewell
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from tests.examples import EXAMPLES
 from world.scenario import Scenario
@@ -46,12 +47,12 @@ def test_any_msgpack_library_reads_a_journal(tmp_path: Path) -> None:
     play(load("paper-1"), tmp_path)
     with (tmp_path / "world.journal").open("rb") as file:
         frames = list(msgpack.Unpacker(file))
-    kinds = Scenario | Drive | End | Farewell
+    kinds = Environment | Scenario | Drive | End | Farewell
     messages = [decode(frame, kinds) for frame in frames]
-    assert messages[0] == load("paper-1")
+    assert messages[:2] == [of_world(), load("paper-1")]
     assert [type(message) for message in messages[-3:]] == [End, Farewell, Farewell]
-    assert len(messages) == 1 + 2 * 49 + 3
-    assert msgpack.unpackb(frames[1][5:])[:3] == ["drive", 0, "a"]
+    assert len(messages) == 2 + 2 * 49 + 3
+    assert msgpack.unpackb(frames[2][5:])[:3] == ["drive", 0, "a"]
 
 
 def test_a_journal_cut_anywhere_reads_back_every_whole_frame(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import ssl
+import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import timedelta
@@ -55,6 +56,14 @@ def test_everybody_has_a_folder_with_all_that_one_machine_needs(keys: Path) -> N
         certificate = x509.load_pem_x509_certificate((own / "cert.pem").read_bytes())
         certificate.verify_directly_issued_by(x509.load_pem_x509_certificate((own / "ca.pem").read_bytes()))
         assert certificate.subject.rfc4514_string() == f"CN={name}"
+
+
+def test_a_folder_of_keys_keeps_itself_out_of_repositories(keys: Path) -> None:
+    subprocess.run(["git", "init", "-q", keys.parent], check=True)
+    told = ["git", "status", "--porcelain", "--untracked-files=all", keys.name]
+    listed = subprocess.run(told, cwd=keys.parent, capture_output=True, text=True, check=True)
+    shutil.rmtree(keys.parent / ".git")
+    assert listed.stdout == ""
 
 
 def test_only_its_owner_reads_a_private_key(keys: Path) -> None:

@@ -76,7 +76,9 @@ def test_honest_missions_localise_and_lies_are_alarms(results: run.Results) -> N
 
 def test_the_pictures_show_what_became_of_each_lie(results: run.Results, tmp_path: Path) -> None:
     figures.draw(results, tmp_path)
-    assert {"lies.svg", "lies.png", "roc.svg", "roc.png"} <= {path.name for path in tmp_path.iterdir()}
+    assert {f"{name}.{kind}" for name in ("lies", "roc") for kind in ("svg", "pdf", "png")} <= {
+        path.name for path in tmp_path.iterdir()
+    }
     place = lies.axis_of_lies(results)
     assert place == 0
     exact, noisy = lies.outcomes(results, place).axes

@@ -25,6 +25,7 @@ from protocol.motion import REST, Controls, Covariance, Pose, step
 from protocol.noise import Drift, Noise
 from protocol.wire import decode, encode
 from tests.commands import SECTION_IV, journals, tandem
+from tests.series import series
 from world import sensors
 from world.course import Course
 from world.draws import gaussian, uniform
@@ -504,7 +505,7 @@ def noisy(noise: str, folder: Path) -> Path:
 
 
 @by_noise
-@pytest.mark.parametrize("seed", ["10", "11"])
+@pytest.mark.parametrize("seed", series(["10", "11"]))
 def test_processes_leave_the_same_bytes_as_one_process(noise: str, seed: str, tmp_path: Path) -> None:
     file = noisy(noise, tmp_path)
     for out, mode in (("processes", []), ("one", ["--in-process"])):

@@ -18,7 +18,7 @@ from compose.scenario import load
 from compose.summary import summary
 from compose.ticks import ticks_csv
 from protocol import journal
-from protocol.messages import Briefing, Drive, End, Estimate, Farewell, Report, Sense
+from protocol.messages import Briefing, Drive, End, Environment, Estimate, Farewell, Report, Sense
 from protocol.mission import Mission
 from protocol.motion import Pose, wrap
 from protocol.rendezvous import half_arc, longest_meeting, rendezvous
@@ -83,7 +83,7 @@ def test_a_robot_senses_the_references_ranges_and_what_it_drove(
 ) -> None:
     reference = SIMULATIONS[name]
     play(load(name), tmp_path)
-    kinds = Briefing | Sense | Report | Drive | Estimate | End | Farewell
+    kinds = Environment | Briefing | Sense | Report | Drive | Estimate | End | Farewell
     frames = [decode(frame, kinds) for frame in journal.read(tmp_path / f"agent-{robot}.journal")]
     senses = [frame for frame in frames if isinstance(frame, Sense)]
     controls = reference.u_a if robot == "a" else reference.u_b

@@ -8,6 +8,7 @@ import pytest
 
 from compose import inline, scenario
 from protocol.messages import Localised
+from tests.series import series
 from world.referee import errors
 from world.scenario import Scenario
 
@@ -25,7 +26,7 @@ def share(number: int) -> range:
     return range(number * STARTS // SHARES, (number + 1) * STARTS // SHARES)
 
 
-@pytest.mark.parametrize("number", range(SHARES))
+@pytest.mark.parametrize("number", series(range(SHARES)))
 def test_assured_localises_every_random_start_to_a_micrometre(number: int) -> None:
     for seed in share(number):
         record = inline.play(started(seed, "assured"))
@@ -40,7 +41,7 @@ def test_assured_localises_every_random_start_to_a_micrometre(number: int) -> No
             assert heading < 1e-6, f"seed {seed}"
 
 
-@pytest.mark.parametrize("number", range(SHARES))
+@pytest.mark.parametrize("number", series(range(SHARES)))
 def test_the_letter_localises_most_random_starts_and_guesses_at_none(number: int) -> None:
     outcomes = Counter[str]()
     for seed in share(number):

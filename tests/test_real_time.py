@@ -5,21 +5,37 @@ from __future__ import annotations
 import csv
 import json
 import os
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from signal import SIGCONT, SIGINT, SIGSTOP
 
 import pytest
+import zenoh
 
-from protocol import journal
-from protocol.messages import Drive, End, Farewell, Missed
-from protocol.wire import MAX_FRAME_BYTES, decode
-from tests.commands import ASSURED, ENDLESS, PAPER_1, Command, process_of, tandem
+from protocol import journal, keys, session
+from protocol.endpoints import at
+from protocol.messages import Drive, End, Environment, Farewell, Missed, Sense
+from protocol.wire import MAX_FRAME_BYTES, decode, encode
+from tests.commands import (
+    ASSURED,
+    BOUND_S,
+    ENDLESS,
+    OVER,
+    PAPER_1,
+    REAL_TIME,
+    Command,
+    process_of,
+    tandem,
+    world,
+)
 from world.scenario import Scenario
 
 
 def missed(path: Path, robot: str) -> int:
     """In how many ticks the world went without `robot`'s Drive."""
-    kinds = Scenario | Drive | Missed | End | Farewell
+    kinds = Environment | Scenario | Drive | Missed | End | Farewell
     messages = [decode(frame, kinds, MAX_FRAME_BYTES) for frame in journal.read(path)]
     return sum(isinstance(message, Missed) and message.robot == robot for message in messages)
 
@@ -35,14 +51,35 @@ def test_a_rate_that_cannot_be_kept_can_still_be_stopped(tmp_path: Path) -> None
     assert "Traceback" not in ended.err
 
 
+@contextmanager
+def robots_at(endpoint: str, answers: Callable[[Sense], bool]) -> Iterator[ExitStack]:
+    """Robots a and b of run r, which rest in the ticks that `answers` picks; b leaves when it is closed."""
+    with session.open_client(at(endpoint), lambda: None) as a, ExitStack() as leaves:
+        b = leaves.enter_context(session.open_client(at(endpoint), lambda: None))
+        drives = {one: session.publisher(a, keys.drive("r", one)) for one in "ab"}
+
+        def answer(sample: zenoh.Sample) -> None:
+            sense = decode(sample.payload.to_bytes(), Sense | End)
+            if isinstance(sense, Sense) and answers(sense):
+                drives[sense.robot].put(encode(Drive(sense.tick, sense.robot, 0.0, 0.0, 1, "straight")))
+
+        subscribed = [a.declare_subscriber(keys.sense("r", one), answer) for one in "ab"]
+        tokens = [session.show_alive(link, keys.robot_alive("r", one)) for link, one in ((a, "a"), (b, "b"))]
+        yield leaves
+        assert subscribed
+        assert tokens
+
+
 def test_a_tick_may_last_longer_than_the_patience(tmp_path: Path) -> None:
     scenario = tmp_path / "slow.toml"
     scenario.write_text("max_ticks = 2\n" + PAPER_1)
-    ended = tandem("run", scenario, "--rate", "0.5", "--patience", "1", "-q")
-    assert (ended.status, ended.out) == (
-        1,
-        "undecided after 2 ticks (max_ticks: a, b not localised by then)\n",
-    )
+    with (
+        world(scenario, "--rate", "0.5", "--patience", "1", "--run", "r") as (clock, endpoint),
+        robots_at(endpoint, lambda _: True),
+    ):
+        ended = clock.ended()
+    assert ended.status == 1
+    assert "undecided after 2 ticks (max_ticks: a, b not localised by then)" in " ".join(ended.out.split())
 
 
 @pytest.mark.parametrize(("rate", "lasts"), [("1e-8", "1e+08"), ("1e8", "1e-08")])
@@ -55,7 +92,7 @@ def test_a_rate_beyond_all_sense_is_refused(rate: str, lasts: str) -> None:
 
 def test_a_robot_whose_agent_is_stopped_stands_still_and_the_mission_goes_on(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    (tmp_path / "assured.toml").write_text(ASSURED)
+    (tmp_path / "assured.toml").write_text(REAL_TIME)
     with Command("run", tmp_path / "assured.toml", "--rate", "20", "--out", out) as run:
         run.until_written(out / "world.journal", 3000)
         stopped = process_of(out, "agent", "a")
@@ -63,11 +100,39 @@ def test_a_robot_whose_agent_is_stopped_stands_still_and_the_mission_goes_on(tmp
         run.until(lambda: missed(out / "world.journal", "a") >= 10, "ten of a's Drives are missed")
         os.kill(stopped, SIGCONT)
         ended = run.ended()
-    assert ended.status == 0
+    assert ended.status in OVER
     assert "late: ticks in which it stood still" in ended.out
+    told = json.loads((out / "summary.json").read_text())
     with (out / "ticks.csv").open(newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["robot"] == "a" and row["state"] == ""]
-    assert len(rows) >= 10
-    told = json.loads((out / "summary.json").read_text())["robots"]
-    assert told["a"]["deadlines_missed"] == len(rows)
+    assert len(rows) == missed(out / "world.journal", "a")
+    rows = [row for row in rows if int(row["tick"]) < told["ticks"]]
+    assert told["robots"]["a"]["deadlines_missed"] == len(rows) >= 10
     assert {(row["v"], row["omega"]) for row in rows} == {("0.0", "0.0")}
+
+
+def test_a_world_says_why_there_is_no_farewell_of_a_robot(tmp_path: Path) -> None:
+    """Both answer the first tick only; then b leaves."""
+    out = tmp_path / "out"
+    (tmp_path / "short.toml").write_text("max_ticks = 9\n" + ASSURED.partition("\n")[2])
+    second = threading.Event()
+
+    def answers(sense: Sense) -> bool:
+        if sense.tick:
+            second.set()
+        return sense.tick == 0
+
+    with (
+        world(tmp_path / "short.toml", "--rate", "20", "--run", "r", "--out", out) as (clock, endpoint),
+        robots_at(endpoint, answers) as leaves,
+    ):
+        assert second.wait(BOUND_S)
+        leaves.close()
+        ended = clock.ended()
+    assert ended.status == 1
+    behind, gone = [line for line in ended.err.splitlines() if "no Farewell" in line]
+    assert behind.startswith("tandem world: no Farewell of a: behind, at tick 0 of 9; a lower --rate leaves")
+    assert gone == "tandem world: no Farewell of b: gone; the last Drive was of tick 0"
+    assert "deadlines missed, of 9: a 8, b 8; a lower --rate, such as --rate 10, leaves" in ended.out
+    robots = json.loads((out / "summary.json").read_text())["robots"]
+    assert robots["a"]["no_farewell"] == "its last Drive in time was of tick 0 of 9"

@@ -28,10 +28,21 @@ from protocol import journal, keys, session
 from protocol.endpoints import listening
 from protocol.inbox import Inbox
 from protocol.journal import CannotRecord, CorruptJournal, Journal
-from protocol.messages import Contact, Drive, End, Farewell, Missed, Report, Sense
+from protocol.messages import Contact, Drive, End, Environment, Farewell, Missed, Report, Sense
 from protocol.retrace import Retrace
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
-from tests.commands import ASSURED, BOUND_S, PAPER_1, Command, Ended, journals, processes_of, tandem, world
+from tests.commands import (
+    BOUND_S,
+    OVER,
+    PAPER_1,
+    REAL_TIME,
+    Command,
+    Ended,
+    journals,
+    processes_of,
+    tandem,
+    world,
+)
 from world.course import Course, again
 from world.history import history
 from world.scenario import Scenario
@@ -128,15 +139,15 @@ def test_a_robot_that_comes_back_too_late_fails_the_run_by_the_patience(tmp_path
 
 def test_in_real_time_whoever_is_away_stands_still_and_is_told_what_it_missed(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    (tmp_path / "assured.toml").write_text(ASSURED)
+    (tmp_path / "assured.toml").write_text(REAL_TIME)
     kills = options("a@20 world@60:report")
     ended = tandem("run", tmp_path / "assured.toml", "--rate", "20", "-q", "--out", out, *kills)
-    assert ended.status == 0, ended
+    assert ended.status in OVER, ended
     with (out / "ticks.csv").open(newline="") as file:
         away = [row for row in csv.DictReader(file) if row["state"] == ""]
     assert "a" in {row["robot"] for row in away}
     assert {(row["v"], row["omega"]) for row in away} == {("0.0", "0.0")}
-    kinds = Scenario | Drive | Missed | End | Farewell
+    kinds = Environment | Scenario | Drive | Missed | End | Farewell
     messages = [decode(frame, kinds, MAX_FRAME_BYTES) for frame in journal.read(out / "world.journal")]
     assert sum(isinstance(message, Missed) for message in messages) == len(away)
     for robot in ("a", "b"):
@@ -542,7 +553,7 @@ def test_a_world_that_has_lost_its_record_is_told_so(record: Path, paper_1: str)
     tick = past(journal.read(record / "agent-a.journal"), "a").steps[-1].sense.tick
     assert ended.status == 3
     said = f"started again without its record: the world is at tick 0, a knows it up to {tick}"
-    assert ended.err == f"tandem agent a: {said}\n"
+    assert ended.err.splitlines()[-1] == f"tandem agent a: {said}"  # it may have told of a torn write before
 
 
 def test_a_run_is_a_new_one(record: Path) -> None:

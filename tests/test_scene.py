@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -11,11 +12,14 @@ from agent.mind import WORDS
 from compose import inline
 from compose.record import read as read_record
 from compose.scenario import load
+from compose.scene.facts import Gathering
 from compose.scene.fates import fates
-from compose.scene.recorded import Performance, read
+from compose.scene.recorded import Journals, Performance, read, scenes
 from compose.scene.stage import of_scenario
 from compose.scene.words import DOING, SEEKING, doing
+from compose.watch.shows import writers_of
 from protocol import journal
+from protocol.journal import Journal
 from protocol.motion import compose, wrap
 from world.history import history
 
@@ -152,6 +156,63 @@ def test_every_report_has_the_fate_that_the_air_gave_it(tmp_path: Path) -> None:
         assert (flight.fate == "lost") == (not came)
         under_way = flight.tick in [one.tick for one in airs[flight.sender][-1].flying]
         assert came or under_way or (flight.sender, flight.tick) in lost
+
+
+def test_whose_process_is_gone_is_down_in_every_tick_until_it_is_back(paper_1: Path) -> None:
+    journals = Journals(paper_1)
+    journals.read()
+    known, stage = Gathering(), journals.stage
+    assert stage is not None
+
+    def begin(tick: int) -> None:
+        for drive in journals.known.ticks[tick].drives.values():
+            known.take(drive, 0)
+
+    def present(**there: bool) -> None:
+        for robot, one in there.items():
+            known.present(robot, one)
+
+    present(a=False)  # nothing has begun
+    begin(0)
+    present(a=False, b=True)  # not there yet
+    present(a=True)
+    begin(1)
+    present(a=False)
+    present(a=False)
+    begin(2)
+    known.present(None, True)
+    known.present(None, False)
+    present(a=True)
+    known.present(None, True)
+    begin(3)
+    present(b=False)
+    present(b=True)
+    known.take(journals.known.farewells["a"], 0)
+    present(a=False)  # it has done its part
+    shown = scenes(stage, known)
+    assert [one.player("a").down for one in shown] == [False, True, False, False]
+    assert shown[1].player("a").doing == "a is down: its process is gone"
+    assert [
+        (event.tick, event.kind, event.robot)
+        for one in shown
+        for event in one.events
+        if event.kind in ("down", "back")
+    ] == [
+        (1, "down", "a"),
+        (2, "down", None),
+        (2, "back", None),
+        (2, "back", "a"),
+        (3, "down", "b"),
+        (3, "back", "b"),
+    ]
+
+
+def test_the_process_that_writes_a_journal_is_known_by_its_lock(tmp_path: Path) -> None:
+    path, other = tmp_path / "agent-a.journal", tmp_path / "agent-b.journal"
+    other.touch()
+    with Journal(path):
+        assert writers_of([path, other, tmp_path / "none"]) == {path.name: os.getpid()}
+    assert writers_of([path]) == {}
 
 
 def test_every_state_has_its_sentence() -> None:

@@ -8,6 +8,7 @@ import os
 import re
 import shlex
 import shutil
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -71,14 +72,14 @@ def trial_processes(tmp_path: Path) -> list[int]:
         pid
         for pid in map(int, filter(str.isdigit, os.listdir("/proc")))
         if (words := said_by(pid))
-        and "compose.campaign.worker" in words
-        and words[-2].startswith(f"{tmp_path}/")
+        and words[:3] == ["tandem", "sweep", "worker"]
+        and words[-1].startswith(f"{tmp_path}/")
     ]
 
 
 def said_by(pid: int) -> list[str]:
     try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes().decode().split("\0")
+        return Path(f"/proc/{pid}/cmdline").read_bytes().decode().replace("\0", " ").split()
     except OSError:  # ended meanwhile
         return []
 
@@ -152,6 +153,7 @@ def test_rows_are_the_same_on_one_worker_and_on_two(folder: Path) -> None:
     assert [row["seed"] for row in found[:12]] == [row["seed"] for row in found[12:24]], "paired"
 
 
+@pytest.mark.long
 def test_rows_are_the_same_as_processes_over_zenoh(folder: Path) -> None:
     played(folder, "both.toml", "inline", trials=1)
     assert sweep(folder, "both.toml", "zenoh", "--trials", "1", "--processes").status in (0, 1)
@@ -173,6 +175,7 @@ def dask(stack: ExitStack, module: str, *arguments: str | Path, cwd: Path) -> su
     return process
 
 
+@pytest.mark.long
 def test_rows_are_the_same_by_a_scheduler_and_workers_started_by_hand_even_if_one_is_lost(
     folder: Path,
 ) -> None:
@@ -201,10 +204,18 @@ def test_rows_are_the_same_by_a_scheduler_and_workers_started_by_hand_even_if_on
 
 
 def test_a_scheduler_that_is_not_there_is_one_line(folder: Path) -> None:
-    for address in ("tcp://127.0.0.1:9", "nonsense://x", "nonsense"):
+    for address in ("tcp://127.0.0.1:9", "nonsense://x", "nonsense", "ucx://127.0.0.1:9", "inproc://x"):
         ended = sweep(folder, "both.toml", "out", "--scheduler", address)
         assert ended.status == 2
         assert re.fullmatch(rf"tandem sweep: --scheduler: {address} cannot be reached: [^\n]+\n", ended.err)
+
+
+def test_a_scheduler_that_accepts_and_says_nothing_is_waited_for_with_a_bound(folder: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        address = f"tcp://127.0.0.1:{mute.getsockname()[1]}"
+        ended = sweep(folder, "both.toml", "out", "--scheduler", address)
+    assert ended.status == 2
+    assert ended.err == f"tandem sweep: --scheduler: {address} cannot be reached: no answer within 5 s\n"
 
 
 def test_a_seed_follows_from_the_campaign_the_cell_and_the_trial(folder: Path) -> None:
@@ -265,6 +276,7 @@ def test_trials_that_raise_die_or_hang_are_rows_and_the_others_go_on(folder: Pat
     assert rows(folder / "out") == expected
 
 
+@pytest.mark.long
 def test_a_campaign_that_is_killed_twice_goes_on_where_it_was(folder: Path) -> None:
     out = folder / "killed"
     for already in (0, 1):
@@ -380,7 +392,7 @@ def test_results_are_left_in_a_folder_named_for_the_campaign(folder: Path) -> No
     figures = {path.name: path.stat().st_size for path in (out / "figures").iterdir()}
     assert set(figures) == {
         f"{name}.{kind}"
-        for kind in ("svg", "png")
+        for kind in ("svg", "pdf", "png")
         for name in (
             *("success-robot-b-anchor-0", "success-planner-variant", "meeting"),
             *("ticks-robot-b-anchor-0", "ticks-planner-variant"),
@@ -399,6 +411,7 @@ def test_results_are_left_in_a_folder_named_for_the_campaign(folder: Path) -> No
     assert ended.out.splitlines()[-1] == "results: sweep-both"
 
 
+@pytest.mark.long
 def test_the_command_that_the_table_prints_plays_the_trial_again(folder: Path) -> None:
     ended = sweep(folder, "both.toml", "out")
     command = shlex.split(next(line for line in ended.out.splitlines() if line.startswith("  tandem run ")))
@@ -416,6 +429,7 @@ def test_the_command_that_the_table_prints_plays_the_trial_again(folder: Path) -
     assert row["bytes_sent"] == sum(robot["bytes_sent"] for robot in summary["robots"].values())
 
 
+@pytest.mark.long
 def test_of_more_cells_than_fit_a_screen_those_in_which_all_is_well_are_counted(folder: Path) -> None:
     starts = ", ".join([f"[{0.3 + 0.01 * i:.2f}, 0.1, 1.0]" for i in range(101)])
     axis = f'[[axis]]\nfield = "robot.a.start"\nvalues = [{starts}]\n'

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import pytest
 from msgspec.structs import replace
 
 from agent import planner
 from compose.inline import play
 from compose.scenario import parse, shipped
-from protocol.messages import Localised, Undecided
-from protocol.motion import ORIGIN
+from protocol.messages import Drive, Localised, Report, Undecided
+from protocol.motion import ORIGIN, Covariance
 from tests.steps import steps
-from world.referee import Judgement, judge
-from world.tick import World, advance
+from tests.surveys import scenario_of
+from tests.test_claims import EXACT, NOISY
+from world.ending import LAST_WORDS, Ending
+from world.referee import Judgement, inaccuracy, judge
+from world.tick import World, advance, release
 
 GAVE_UP = Undecided("no pose explains the anchor ranges")
 
@@ -59,3 +65,99 @@ def test_the_letter_gives_up_where_the_third_mutual_range_settles_nothing() -> N
     assert record.end.reason == "b: the third mutual range does not settle where they are"
     states = [(moment.drives["a"].state, moment.drives["b"].state) for moment in record.moments]
     assert states[-3:] == [("straight", "standing"), ("waiting", "last-manoeuvre"), ("waiting", "undecided")]
+
+
+# --- how well a robot must know what it claims ----------------------------------------------------------
+
+
+def covariance(position: float, heading: float) -> Covariance:
+    """That of a position and a heading of these sigmas, in m and rad."""
+    return Covariance(position**2 / 2.0, 0.0, 0.0, position**2 / 2.0, 0.0, heading**2)
+
+
+def judged(text: str, a: Covariance | None, *, off: float = 0.0) -> Judgement | World:
+    """Both claim where they are at once; a's claim is `off` by so many metres, and has this covariance."""
+    world = release(parse(text, "noisy", seed=1))
+    there, other = world.truth.poses
+    claim = Localised(replace(there, x=there.x + off), a)
+    return advance(
+        world,
+        {
+            "a": Drive(0, "a", 0.0, 0.0, 3, "localised", claim),
+            "b": Drive(0, "b", 0.0, 0.0, 3, "localised", Localised(other)),
+        },
+    )
+
+
+@pytest.mark.parametrize(
+    ("position", "heading", "what"),
+    [
+        (0.0999, 0.199, None),
+        (0.101, 0.01, "a claims a position known to 0.101 m, of 0.1"),
+        (0.01, 0.201, "a claims a heading known to 0.201 rad, of 0.2"),
+        (4.5e7, 0.01, "a claims a position known to 4.5e+07 m, of 0.1"),
+        (3e7, 3e7, "a claims a position known to 3e+07 m, of 0.1"),
+    ],
+)
+def test_a_robot_that_knows_its_pose_less_well_than_was_asked_is_not_localised(
+    position: float, heading: float, what: str | None
+) -> None:
+    expected = Judgement("localised") if what is None else Judgement("undecided", what)
+    assert judged(NOISY, covariance(position, heading)) == expected
+
+
+def test_no_sigma_excuses_a_claim_that_is_farther_off_than_the_accuracy_allows() -> None:
+    """Five times the accuracy, 0.1 m; where sensors are exact, a micrometre."""
+    huge = covariance(4.5e7, 3.0)
+    for text, far, near in ((NOISY, 0.501, 0.499), (EXACT, 2e-6, 1e-7)):
+        wrong, vague = judged(text, huge, off=far), judged(text, huge, off=near)
+        assert isinstance(wrong, Judgement)
+        assert isinstance(vague, Judgement)
+        assert (wrong.outcome, vague.outcome) == ("wrong", "undecided")
+
+
+@pytest.mark.parametrize("whose", ["its own", "its peer's"])
+def test_without_a_world_a_claim_less_accurate_than_was_asked_does_not_end_localised(whose: str) -> None:
+    briefing = parse(NOISY, "noisy", seed=1).briefing("a")
+    good, vague = (Localised(ORIGIN, covariance(sigma, 0.01)) for sigma in (0.05, 4.5e7))
+    own, peers = (vague, good) if whose == "its own" else (good, vague)
+    for mine, other, outcome in ((own, peers, "undecided"), (good, good, "localised")):
+        ending = Ending(briefing, 100, 30.0)
+        ending.told(Report(0, "b", 3, "localised", ORIGIN, 0, 0, (), 0, (), 0, 0, other))
+        drive = Drive(0, "a", 0.0, 0.0, 3, "localised", mine)
+        ends = [ending.after(tick, drive, peer_there=True) for tick in range(LAST_WORDS + 1)]
+        assert ends[-1] is not None
+        assert ends[-1].outcome == outcome
+
+
+def honest_claims(variant: str, sigmas: Sequence[float], seeds: Sequence[int], outliers: float = 0.0) -> int:
+    """How many claims honest robots make under such noise, each as accurate as was asked for."""
+    claims = 0
+    for sigma in sigmas:
+        for seed in seeds:
+            noise = f"anchor_sigma = {sigma}\nmutual_sigma = {sigma}\noutliers = {outliers}"
+            record = play(scenario_of(noise, seed, variant=variant))
+            assert record.end is not None
+            for moment in record.moments:
+                for drive in moment.drives.values():
+                    if isinstance(drive.verdict, Localised):
+                        claims += 1
+                        assert inaccuracy(drive.verdict, record.scenario.mission) is None, (sigma, seed)
+            assert "claims a" not in (record.end.reason or ""), (sigma, seed, record.end)
+    return claims
+
+
+@pytest.mark.parametrize("variant", ["paper", "assured"])
+def test_every_claim_of_an_honest_robot_is_as_accurate_as_was_asked(variant: str) -> None:
+    assert honest_claims(variant, [0.001, 0.05], range(3)) > 0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("sigma", [0.001, 0.01, 0.05, 0.1])
+@pytest.mark.parametrize("outliers", [0.0, 0.05])
+@pytest.mark.parametrize("variant", ["paper", "assured"])
+def test_every_claim_of_many_noisy_missions_is_as_accurate_as_was_asked(
+    variant: str, outliers: float, sigma: float
+) -> None:
+    found = honest_claims(variant, [sigma], range(25), outliers)
+    assert found > 0 or variant == "paper"

@@ -1,7 +1,6 @@
 """The page on which a run is watched: what it shows, in a real browser, and whom it asks.
 
-The browser is Debian's: `apt-get install chromium`. Where there is none, its tests skip.
-With TANDEM_SHOTS=DIR, each of them leaves a picture of what it saw there.
+Tests that ask for `opened` need a browser, and skip where there is none (tests/browser.py).
 """
 
 from __future__ import annotations
@@ -11,8 +10,8 @@ import os
 import re
 import shutil
 import socket
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import subprocess
+import sys
 from pathlib import Path
 from signal import SIGINT, SIGKILL
 from urllib.error import HTTPError
@@ -21,7 +20,7 @@ from urllib.request import Request, urlopen
 import msgpack
 import pytest
 from msgspec.structs import replace
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import expect
 
 from compose import inline
 from compose.record import read
@@ -29,6 +28,7 @@ from compose.scenario import load
 from protocol import journal
 from protocol.messages import Message, OfRobot, Sense
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
+from tests.browser import SCRUB, Open, address_of, inks, picture, shot, until_shown, watching
 from tests.commands import (
     BOUND_S,
     ENDLESS,
@@ -42,123 +42,15 @@ from tests.commands import (
     world,
 )
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-browsing = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium: apt-get install chromium")
-BOUND_MS = 1000 * BOUND_S
-expect.set_options(timeout=BOUND_MS)
-SERVER_GONE = "ERR_CONNECTION_REFUSED|ERR_INCOMPLETE_CHUNKED_ENCODING"
-"""what a browser says where a test has stopped the server"""
 FAST_TICKS = 1000
 """about a second of a mission that nobody slows"""
 PATIENT = ("--patience", "600")
 """a mission that waits while browsers start"""
-SCRUB = "(scrub, tick) => { scrub.value = tick; scrub.dispatchEvent(new Event('input')); }"
-Open = Callable[..., Page]
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        found = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield found
-        found.close()
-
-
-@pytest.fixture
-def opened(browser: Browser) -> Iterator[Open]:
-    """Opens pages; in the end none must have complained, or asked anybody but the server."""
-    complaints: list[str] = []
-    hosts: set[str] = set()
-    pages: list[Page] = []
-
-    def opens(address: str, *, width: int = 1280, height: int = 800, dark: bool = False) -> Page:
-        page = browser.new_page(
-            viewport={"width": width, "height": height}, color_scheme="dark" if dark else "light"
-        )
-        pages.append(page)
-        page.on("console", lambda said: complaints.append(said.text) if said.type == "error" else None)
-        page.on("pageerror", lambda error: complaints.append(str(error)))
-        page.on("request", lambda request: hosts.add(re.sub(r"^(\w+://[^/:]+).*", r"\1", request.url)))
-        page.set_default_timeout(BOUND_MS)
-        page.goto(address)
-        return page
-
-    yield opens
-    for page in pages:
-        page.close()
-    assert [said for said in complaints if not re.search(SERVER_GONE, said)] == []
-    assert hosts <= {"http://127.0.0.1"}
-
-
-@pytest.fixture(scope="module")
-def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("watch") / "paper-1"
-    folder.mkdir()
-    inline.play(load("paper-1"), folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def address(paper_1: Path) -> Iterator[str]:
-    """Of the page on the record of paper-1."""
-    with watching(paper_1) as (_, found):
-        yield found
-
-
-@contextmanager
-def watching(*arguments: str | Path) -> Iterator[tuple[Command, str]]:
-    with Command("watch", *arguments) as command:
-        yield command, address_of(command)
-
-
-def address_of(command: Command) -> str:
-    command.until_says("http://127.0.0.1:")
-    found = re.search(r"http://\S+", command.out)
-    assert found is not None
-    return found[0]
-
-
-def until_shown(page: Page, tick: int) -> None:
-    expect(page.locator("body")).to_have_attribute("data-shown", str(tick))
-
-
-def shot(page: Page, name: str) -> None:
-    if folder := os.environ.get("TANDEM_SHOTS"):
-        page.screenshot(path=Path(folder) / f"{name}.png")
-
-
-def picture(page: Page) -> str:
-    """The plane, pixel by pixel, once all that was asked for is drawn."""
-    page.evaluate("() => new Promise(drawn => requestAnimationFrame(() => requestAnimationFrame(drawn)))")
-    return str(page.evaluate("document.getElementById('canvas').toDataURL()"))
-
-
-INKS = """() => {
-  const canvas = document.getElementById('canvas'), style = getComputedStyle(document.documentElement);
-  const data = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data, found = {};
-  for (const name of ['ring', 'orbit', 'ghost', 'range', 'link', 'fault', 'phase-1', 'phase-2', 'phase-3']) {
-    const hex = style.getPropertyValue('--' + name).trim();
-    const ink = [1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16));
-    found[name] = 0;
-    for (let i = 0; i < data.length; i += 4) {
-      if (data[i + 3] > 100 && ink.every((part, k) => Math.abs(data[i + k] - part) < 12)) found[name] += 1;
-    }
-  }
-  return found;
-}"""
-
-
-def inks(page: Page) -> dict[str, int]:
-    """How many pixels of the plane are of each of its colours, once all that was asked for is drawn."""
-    picture(page)
-    found: dict[str, int] = page.evaluate(INKS)
-    return found
 
 
 # --- a record ---------------------------------------------------------------------------------------
 
 
-@browsing
 def test_a_record_scrubbed_to_tick_46_shows_the_first_contact(opened: Open, address: str) -> None:
     page = opened(f"{address}#tick=45")
     until_shown(page, 45)
@@ -181,7 +73,6 @@ def test_a_record_scrubbed_to_tick_46_shows_the_first_contact(opened: Open, addr
     shot(page, "tick-46")
 
 
-@browsing
 def test_the_plane_is_drawn_in_the_colours_of_what_happens(opened: Open, address: str) -> None:
     page = opened(address)
     seen = {}
@@ -207,7 +98,6 @@ def test_the_plane_is_drawn_in_the_colours_of_what_happens(opened: Open, address
     assert inks(page)["phase-3"] < 50 < seen[47]["phase-3"]  # where it truly is, nothing is drawn
 
 
-@browsing
 def test_what_becomes_of_reports_is_drawn_on_their_way(opened: Open, tmp_path: Path) -> None:
     seen = {}
     for fault in ("loss=0", "loss=1", "corrupt=1"):
@@ -221,7 +111,6 @@ def test_what_becomes_of_reports_is_drawn_on_their_way(opened: Open, tmp_path: P
     assert seen["loss=0"] == 0 < 1.7 * seen["loss=1"] < seen["corrupt=1"]  # dashed; whole, and crossed out
 
 
-@browsing
 def test_with_the_truth_hidden_only_what_a_robot_knows_is_there(opened: Open, address: str) -> None:
     page = opened(f"{address}#tick=20")
     until_shown(page, 20)
@@ -245,7 +134,6 @@ def test_with_the_truth_hidden_only_what_a_robot_knows_is_there(opened: Open, ad
     shot(page, "truth-shown")
 
 
-@browsing
 def test_all_of_it_goes_by_keyboard_alone(opened: Open, address: str) -> None:
     page = opened(f"{address}#tick=0")
     until_shown(page, 0)
@@ -293,7 +181,6 @@ def test_all_of_it_goes_by_keyboard_alone(opened: Open, address: str) -> None:
     assert focused in {"A", "INPUT", "BUTTON", "SELECT"}
 
 
-@browsing
 def test_robots_without_a_world_are_shown_by_what_they_know(
     opened: Open, paper_1: Path, tmp_path: Path
 ) -> None:
@@ -318,7 +205,6 @@ def as_a_driver_tells(message: Message) -> Message:
     return replace(message, contacts=tuple([replace(one, heard=None) for one in message.contacts]))
 
 
-@browsing
 def test_it_can_be_read_on_360_pixels(opened: Open, address: str) -> None:
     page = opened(f"{address}#tick=48", width=360, height=740)
     until_shown(page, 48)
@@ -330,7 +216,6 @@ def test_it_can_be_read_on_360_pixels(opened: Open, address: str) -> None:
     expect(page.locator("#log")).to_contain_text("The mission ends: localised")
 
 
-@browsing
 def test_it_is_dark_where_the_system_is(opened: Open, address: str) -> None:
     page = opened(f"{address}#tick=47", dark=True)
     until_shown(page, 47)
@@ -342,7 +227,6 @@ def test_it_is_dark_where_the_system_is(opened: Open, address: str) -> None:
     assert picture(light) != picture(page)
 
 
-@browsing
 def test_fifty_robots_are_shown(opened: Open, tmp_path: Path) -> None:
     scenario = tmp_path / "fifty.toml"
     robots = [
@@ -367,7 +251,6 @@ def test_fifty_robots_are_shown(opened: Open, tmp_path: Path) -> None:
         shot(page, "fifty-b7")
 
 
-@browsing
 def test_lost_late_and_damaged_reports_are_told(opened: Open, tmp_path: Path) -> None:
     record = tmp_path / "record"
     record.mkdir()
@@ -384,7 +267,6 @@ def test_lost_late_and_damaged_reports_are_told(opened: Open, tmp_path: Path) ->
         expect(page.locator("#log")).not_to_contain_text("is lost")
 
 
-@browsing
 def test_the_records_in_a_folder_are_listed(opened: Open, paper_1: Path, tmp_path: Path) -> None:
     shutil.copytree(paper_1, tmp_path / "whole")
     shutil.copytree(paper_1, tmp_path / "torn")
@@ -402,7 +284,6 @@ def test_the_records_in_a_folder_are_listed(opened: Open, paper_1: Path, tmp_pat
         expect(links).to_have_count(2)
 
 
-@browsing
 def test_a_campaign_shows_its_cells_and_its_figures(opened: Open, tmp_path: Path) -> None:
     spec = tmp_path / "speeds.toml"
     spec.write_text(
@@ -425,7 +306,6 @@ def test_a_campaign_shows_its_cells_and_its_figures(opened: Open, tmp_path: Path
 # --- live -------------------------------------------------------------------------------------------
 
 
-@browsing
 def test_a_mission_is_followed_to_its_end_from_its_journals_and_from_the_network(
     opened: Open, tmp_path: Path
 ) -> None:
@@ -462,8 +342,6 @@ def test_a_mission_is_followed_to_its_end_from_its_journals_and_from_the_network
             assert b.ended().status == 0
 
 
-@browsing
-@browsing
 def test_a_page_keeps_up_with_a_mission_as_fast_as_it_goes(opened: Open, tmp_path: Path) -> None:
     """By leaving out frames: thousands of ticks are past, and it is never far behind for long."""
     scenario, out = tmp_path / "endless.toml", tmp_path / "out"
@@ -500,6 +378,22 @@ def test_run_watch_stays_until_ctrl_c_and_leaves_the_record_that_it_would_have_l
     assert journals(tmp_path / "record") == journals(paper_1)
 
 
+def test_every_test_that_opens_a_page_skips_where_there_is_no_browser(tmp_path: Path) -> None:
+    ran = subprocess.run(
+        [sys.executable, "-m", "pytest", "-n0", "-p", "no:cacheprovider", "-rs", "tests/test_watch.py"]
+        + ["-k", "run_watch_stays or by_keyboard_alone"],
+        cwd=Path(__file__).parents[1],
+        env=os.environ | {"PATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        timeout=BOUND_S,
+        check=False,
+    )
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    assert "2 skipped" in ran.stdout
+    assert "there is no chromium: apt-get install chromium" in ran.stdout
+
+
 # --- the command ------------------------------------------------------------------------------------
 
 
@@ -512,21 +406,37 @@ def test_the_page_ends_with_whoever_launched_it(tmp_path: Path) -> None:
         until(lambda: not processes_of(tmp_path / "record"), "nobody is left")
 
 
-def test_the_server_answers_to_its_own_name_only_and_seals_what_it_sends(address: str) -> None:
+def test_the_server_answers_its_own_page_only_and_seals_what_it_sends(address: str) -> None:
     host = address.removeprefix("http://").rstrip("/")
-    connection = http.client.HTTPConnection(host, timeout=BOUND_S)
-    connection.request("GET", "/", headers={"Host": "elsewhere.example"})
-    assert connection.getresponse().status == 400
-    connection.close()
-    connection.request("GET", "/")
-    answer = connection.getresponse()
-    assert answer.status == 200
-    assert (answer.getheader("content-security-policy") or "").startswith("default-src 'self'")
-    connection.close()
-    for path in ("/page/../server.py", "/page/%2e%2e/server.py", "/api/figures/x.svg", "/api/shows/none"):
-        connection.request("GET", path)
-        assert connection.getresponse().status == 404
+    port = host.rpartition(":")[2]
+
+    def asked(path: str, **headers: str) -> http.client.HTTPResponse:
+        connection = http.client.HTTPConnection(host, timeout=BOUND_S)
+        connection.request("GET", path, headers=headers)
+        answer = connection.getresponse()
+        answer.read()
         connection.close()
+        return answer
+
+    for headers, status in (
+        ({}, 200),
+        ({"Host": f"localhost:{port}"}, 200),
+        ({"Origin": f"http://{host}"}, 200),
+        ({"Host": "elsewhere.example"}, 403),
+        ({"Host": f"elsewhere.example:{port}", "Origin": f"http://elsewhere.example:{port}"}, 403),
+        ({"Origin": "http://elsewhere.example"}, 403),
+        ({"Origin": "http://127.0.0.1:1"}, 403),
+        ({"Origin": "null"}, 403),
+    ):
+        for path in ("/", "/api/shows/paper-1"):
+            answer = asked(path, **headers)
+            assert (headers, answer.status) == (headers, status)
+            policy = answer.getheader("content-security-policy") or ""
+            assert policy.startswith("default-src 'self'")
+            assert "frame-ancestors 'none'" in policy
+            assert answer.getheader("cross-origin-resource-policy") == "same-origin"
+    for path in ("/page/../server.py", "/page/%2e%2e/server.py", "/api/figures/x.svg", "/api/shows/none"):
+        assert asked(path).status == 404
 
 
 def test_ctrl_c_ends_the_page_with_somebody_watching(paper_1: Path) -> None:
@@ -572,7 +482,7 @@ def test_a_port_that_is_taken_is_one_line(paper_1: Path) -> None:
             assert ended.err == said
 
 
-def test_a_page_on_every_address_is_told_of_and_answers_to_the_names_of_this_machine(paper_1: Path) -> None:
+def test_a_page_on_every_address_is_told_of_and_answers_to_addresses_and_to_no_names(paper_1: Path) -> None:
     with Command("watch", paper_1, "--address", "0.0.0.0") as command:
         command.until_says("until Ctrl-C")
         assert "tandem watch: --address: whoever reaches 0.0.0.0 can watch\n" in command.err
@@ -580,7 +490,10 @@ def test_a_page_on_every_address_is_told_of_and_answers_to_the_names_of_this_mac
         assert address.startswith("http://127.0.0.1:")
         with urlopen(address, timeout=BOUND_S) as answer:
             assert answer.status == 200
-        with pytest.raises(HTTPError, match="400"):
+        for known in ("192.0.2.1", "192.0.2.1:8080", "[2001:db8::1]:8080", "localhost"):
+            with urlopen(Request(address, headers={"Host": known}), timeout=BOUND_S) as answer:
+                assert answer.status == 200
+        with pytest.raises(HTTPError, match="403"):
             urlopen(Request(address, headers={"Host": "robot.example"}), timeout=BOUND_S)
 
 

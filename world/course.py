@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+from protocol import environment
 from protocol.journal import CorruptJournal, Sink
-from protocol.messages import Drive, End, Farewell, Missed, Sense
+from protocol.messages import Drive, End, Environment, Farewell, Missed, Sense
 from protocol.retrace import Otherwise, Retrace
 from protocol.wire import encode
 from world.history import history
@@ -32,7 +33,7 @@ class Course:
         """what robots have sensed since they last answered in time; a process that comes back may not know"""
         self._journal = journal
         if journal is not None:
-            journal.write(encode(scenario))
+            journal.write(encode(environment.of_world()), encode(scenario))
 
     @property
     def tick(self) -> int:
@@ -105,21 +106,22 @@ def again(scenario: Scenario, record: Retrace) -> Course:
     """
     course = Course(scenario)
     course.keep(record)
-    if record.frames:
-        _retrace(course, record)
+    named = environment.named_in(record.frames)
+    if environment.is_blank(record.frames):
+        record.write(encode(named or environment.of_world()), encode(scenario))
     else:
-        record.write(encode(scenario))
+        _retrace(course, record, named)
     return course
 
 
-def _retrace(course: Course, record: Retrace) -> None:
+def _retrace(course: Course, record: Retrace, named: Environment | None) -> None:
     lived = history(record.frames, record.path)
     if lived.disorder is not None:
         raise CorruptJournal(f"{record.path}: {lived.disorder.what}")
     if lived.scenario != course.world.scenario:
         raise CorruptJournal(f"{record.path}: the record of another scenario, {lived.scenario.name}")
     try:
-        record.write(encode(lived.scenario))
+        record.write(*[encode(one) for one in (named, lived.scenario) if one is not None])
         for tick in lived.ticks:
             course.drive(tick.drives)
         if lived.end is not None and course.over is None:
@@ -128,5 +130,5 @@ def _retrace(course: Course, record: Retrace) -> None:
     except Otherwise:
         raise CorruptJournal(
             f"{record.path}: on record the world went on otherwise at tick {course.tick}: "
-            "the journal is another version's"
+            + (environment.otherwise(named, environment.of_world()) or "the journal is another version's")
         ) from None

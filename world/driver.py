@@ -31,6 +31,8 @@ class Reading(msgspec.Struct, frozen=True):
     """m, to its peer, measured while both stood in this same tick; else none, as above"""
     contact: bool = False
     """whether the peer is near though no range was had; a range is a contact anyway"""
+    mark: tuple[float, ...] = ()
+    """numbers that are handed to `resume`, such as the odometer's at this reading"""
 
 
 class Driver(Protocol):
@@ -56,3 +58,14 @@ class Driver(Protocol):
 
     def close(self) -> None:
         """Let go of the hardware; nothing comes after that."""
+
+
+class Resumable(Driver, Protocol):
+    """A driver that goes on from a record after its process was killed; without `resume` none can."""
+
+    def resume(self, tick: int, mark: tuple[float, ...]) -> None:
+        """Comes once after a restart, after `stop` and before the first `sense`.
+
+        The latest reading on record is that of `tick`, and carried `mark`. One that was taken after it is
+        lost, and is taken again: the next `executed` is what was driven since the reading on record.
+        """

@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 
 from protocol.messages import Alarm, Briefing, Drive, End, Localised, Report, Undecided, Verdict
+from world.referee import inaccuracy
 
 LAST_WORDS = 4
 """ticks in which a robot goes on telling, once it knows all that it must"""
@@ -20,6 +21,7 @@ class Ending:
     def __init__(self, briefing: Briefing, max_ticks: int, patience: float) -> None:
         self._peer = briefing.peer
         self._me = briefing.robot
+        self._mission = briefing.mission
         self._max_ticks = max_ticks
         self._patience = patience
         self.verdict: Verdict | None = None
@@ -34,10 +36,17 @@ class Ending:
         self._known: int | None = None
         """in which tick all was known"""
 
-    def told(self, report: Report) -> None:
-        """The peer has said `report`."""
+    def told(self, report: Report) -> bool:
+        """The peer has said `report`; whether anything follows from it."""
+        before = self._peers, self._heard
         self._acknowledged = max(self._acknowledged, report.heard)
         self._peers = self._peers or report.verdict
+        return (self._peers, self._heard) != before
+
+    @property
+    def _heard(self) -> bool:
+        """Whether the peer knows this robot's verdict."""
+        return self.verdict is not None and self._acknowledged >= self._at
 
     def after(self, tick: int, drive: Drive | None, *, peer_there: bool) -> End | None:
         """The End, if `tick` was the last, in which the robot gave `drive`; else none."""
@@ -47,9 +56,8 @@ class Ending:
             if tick >= self._max_ticks:
                 return End(tick, "undecided", f"max_ticks: {self._me} not localised by then")
             return None
-        acknowledged = self._acknowledged >= self._at
         gone = not peer_there and self._peers is not None
-        if self._known is None and self._peers is not None and (acknowledged or gone):
+        if self._known is None and self._peers is not None and (self._heard or gone):
             self._known = tick
         if self._known is not None and tick >= self._known + LAST_WORDS:
             return self._end(tick)
@@ -64,9 +72,12 @@ class Ending:
         ):
             match verdict:
                 case Alarm(claim):
-                    return End(tick, "alarm", f"{who}: {other} tells {claim}"[:300])
+                    return End(tick, "alarm", f"{who}: {other} tells {claim}")
                 case Undecided(reason):
-                    return End(tick, "undecided", f"{who}: {reason}"[:300])
+                    return End(tick, "undecided", f"{who}: {reason}")
+        for who, verdict in ((self._me, self.verdict), (self._peer, self._peers)):
+            if isinstance(verdict, Localised) and (vague := inaccuracy(verdict, self._mission)) is not None:
+                return End(tick, "undecided", f"{who} {vague}")
         if isinstance(self._peers, Localised):
             return End(tick, "localised", None)
         return End(tick, "undecided", f"{self._me} is localised; {self._peer} was not heard to be")

@@ -8,6 +8,7 @@ hears nothing.
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -18,9 +19,11 @@ import zenoh
 
 from protocol import keys, session
 from protocol.inbox import Arrival, Inbox
+from protocol.journal import Sink
 from protocol.messages import Beat, Briefing, Contact, Drive, End, Farewell, Report, Sense, Verdict
 from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode, encode
 from world.driver import THINKING, Driver, Reading
+from world.driver_journal import DriverPast, Mark
 from world.ending import Ending
 
 REPEAT_S = 0.25
@@ -29,6 +32,12 @@ FAREWELL_S = 2.0
 """how long to wait for the agent's last word"""
 ASTRAY = 64
 """ticks that a's beat may be ahead of b; a beat of long ago is of an a that was started again, and lost"""
+
+UNKNOWN = -math.inf
+"""a time; clocks may begin at 0, and what is late lies before that"""
+
+UNHEARD = 4.0
+"""ticks within which a robot that goes on tells that it does"""
 
 M = TypeVar("M", Drive, Beat, Report)
 
@@ -54,8 +63,12 @@ class Field:
         max_ticks: int,
         manoeuvre_s: float,
         patience: float = 30.0,
+        journal: Sink | None = None,
     ) -> None:
-        """`manoeuvre_s` (s) is T_s by the clock; `patience` (s) bounds every wait for an answer."""
+        """`manoeuvre_s` (s) is T_s by the clock; `patience` (s) bounds every wait for an answer.
+
+        What is measured and driven goes to `journal`, which begins with the briefing.
+        """
         self._driver = driver
         self._briefing = briefing
         self._id, self._peer = briefing.robot, briefing.peer
@@ -65,17 +78,46 @@ class Field:
         self._tick_s = (1.0 + THINKING) * manoeuvre_s
         self._patience = patience + self._tick_s
         self._ended: Callable[[], None] = lambda: None
+        self._journal = journal
+        self._max_ticks = max_ticks
         self._ending = Ending(briefing, max_ticks, self._patience)
+        self._end: End | None = None
+        """once it is on record"""
+        self._again = False
+        """whether its process was killed before, be it before tick 0"""
+        self._resumed = False
+        self._astray = ASTRAY
+        """ticks that the peer's beat may be ahead"""
         self._alive: set[str] = set()
         self._unanswered: deque[tuple[int, bytes]] = deque()
         """Senses that the agent has not answered"""
         self._answered = 0.0
         """when it last did, or appeared"""
         self._tick = -1
-        self._next = 0.0
+        self._next = UNKNOWN
         """when the tick after this one begins"""
         self.missed = 0
         """manoeuvres that the robot stood instead"""
+
+    def resume(self, past: DriverPast, known: int) -> None:
+        """Go on where the driver's journal ends; `known` is the latest tick on the agent's.
+
+        The robot stood while this process was down, so the peer may be any number of ticks ahead.
+        """
+        self._again = True
+        for one in past.ticks:
+            for report in one.reports:
+                self._ending.told(report)
+            self._end = self._ending.after(one.sense.tick, one.drive, peer_there=True)
+            self.missed += one.drive is None
+        self._end = past.end or self._end
+        self._tick, self._resumed, self._astray = past.tick, past.tick >= 0, self._max_ticks + 1
+        self._unanswered.extend((one.sense.tick, one.frame) for one in past.ticks[known + 1 :])
+
+    @property
+    def tick(self) -> int:
+        """The latest that has begun; -1 before any."""
+        return self._tick
 
     @property
     def verdict(self) -> Verdict | None:
@@ -101,42 +143,70 @@ class Field:
         whatever `ended` raises; Interrupted when told to stop.
         """
         self._ended = ended
-        end: End | None = None
+        end = self._end
         try:
             self._gather(time.monotonic() + wait)
             while end is None:
                 end = self._play_tick()
         except DriverFailed as failure:
-            end = End(max(self._tick, 0), "failed", f"{self._id}'s driver: {failure}"[:300])
+            end = End(max(self._tick, 0), "failed", f"{self._id}'s driver: {failure}")
         finally:
             self._stop()
+        if self._end is None:
+            self._write(encode(end))
         self._part(end)
         return end
+
+    def _write(self, *frames: bytes) -> None:
+        """Put them on record. Raises CannotRecord."""
+        if self._journal is not None:
+            self._journal.write(*frames)
 
     # --- a tick ---
 
     def _gather(self, give_up: float) -> None:
-        """Until tick 0: a's begins when both agents are there, b's when a's has."""
-        follows = self._briefing.role == "b"
-        while not (self._id in self._alive and (self._next > 0.0 if follows else self._peer in self._alive)):
+        """Until tick 0: a's begins when both agents are there, b's when a's has.
+
+        Whoever resumes waits for its own agent only: the peer may have come to its end. A b that was killed
+        before tick 0 may have missed that a has begun, and that a now waits for it.
+        """
+        unheard = time.monotonic() + UNHEARD * self._tick_s
+        while not self._may_begin():
+            if self._again and {self._id, self._peer} <= self._alive and time.monotonic() >= unheard:
+                self._next = time.monotonic()
+                break
             if time.monotonic() >= give_up:
                 missing = [one for one in (self._id, self._peer) if one not in self._alive]
-                raise NoStart(f"{' and '.join(missing) or self._peer}: not there; nobody has moved")
-            self._take(self._inbox.next(give_up - time.monotonic()))
+                moved = "" if self._resumed else "; nobody has moved"
+                raise NoStart(f"{' and '.join(missing) or self._peer}: not there{moved}")
+            until = min(give_up, unheard) if self._again and unheard > time.monotonic() else give_up
+            self._take(self._inbox.next(until - time.monotonic()))
         self._answered = time.monotonic()
+
+    def _may_begin(self) -> bool:
+        if self._id not in self._alive:
+            return False
+        if self._resumed:
+            return True
+        return self._next != UNKNOWN if self._briefing.role == "b" else self._peer in self._alive
 
     def _play_tick(self) -> End | None:
         self._tick += 1
         tick = self._tick
-        self._next = (self._next or time.monotonic()) + self._tick_s
-        self._beat.put(encode(Beat(tick, self._id)))
-        sense = _sense(self._reading(tick), tick, self._briefing)
+        now = time.monotonic()
+        self._next = (now if self._next == UNKNOWN else self._next) + self._tick_s
+        if not self._resumed or self._next > now:  # one that catches up says so once it is there
+            self._beat.put(encode(Beat(tick, self._id)))
+        reading = self._reading(tick)
+        sense = _sense(reading, tick, self._briefing)
+        self._write(*_mark(reading, tick, self._id), sense)
         self._unanswered.append((tick, sense))
         self._sense.put(sense)
         drive = self._awaited(tick)
         until = time.monotonic()
         if drive is not None:
-            until += self._manoeuvre_s
+            self._write(encode(drive))
+            until = time.monotonic() + self._manoeuvre_s
             self._set_off(drive)
         else:
             self.missed += 1
@@ -191,13 +261,13 @@ class Field:
             case "report":
                 self._on_report(arrival)
             case "alive":
-                self._alive.add(robot := keys.robot_of(arrival.key))
-                if robot == self._id:
+                self._alive.add(arrival.source.robot)
+                if arrival.source.robot == self._id:
                     self._answered = time.monotonic()
                     for _, frame in self._unanswered:  # while it was away
                         self._sense.put(frame)
             case "gone":
-                self._alive.discard(keys.robot_of(arrival.key))
+                self._alive.discard(arrival.source.robot)
             case "ended":
                 self._ended()
             case _:
@@ -211,7 +281,7 @@ class Field:
         except MalformedFrame as error:
             self._inbox.refuse(arrival, error)
             return None
-        if message.robot != keys.robot_of(arrival.key):
+        if message.robot != arrival.source.robot:
             self._inbox.refuse(arrival, f"it says it is from '{message.robot}'")
             return None
         return message
@@ -228,20 +298,26 @@ class Field:
         return drive
 
     def _on_beat(self, arrival: Arrival) -> None:
-        """b's next tick begins as many ticks after that of a's as it is farther on: at once, if it is not."""
+        """b's next tick begins as many ticks after that of a's as it is farther on: at once, if it is not.
+
+        An a that has been started again goes by b in the same way, as long as it is behind.
+        """
         beat = self._accepted(arrival, Beat)
-        if beat is None or self._briefing.role == "a":
+        if beat is None:
             return
         left = self._tick + 1 - beat.tick
-        if -ASTRAY <= left <= 2:
+        if self._briefing.role == "a" and (left >= 0 or not self._resumed):
+            return
+        if -self._astray <= left <= (2 if self._resumed or self._astray == ASTRAY else ASTRAY):
+            self._astray = ASTRAY
             self._next = time.monotonic() + left * self._tick_s
         else:
             self._inbox.refuse(arrival, f"it is of tick {beat.tick}, this is tick {max(self._tick, 0)}")
 
     def _on_report(self, arrival: Arrival) -> None:
         report = self._accepted(arrival, Report)
-        if report is not None:
-            self._ending.told(report)
+        if report is not None and self._ending.told(report):
+            self._write(arrival.frame)
 
     # --- the end ---
 
@@ -254,10 +330,12 @@ class Field:
             while (left := repeat - time.monotonic()) > 0.0:
                 arrival = self._inbox.next(left)
                 if arrival.topic == "gone":
-                    self._alive.discard(keys.robot_of(arrival.key))
-                elif arrival.topic == "drive" and _is_farewell(arrival.frame):
+                    self._alive.discard(arrival.source.robot)
+                elif arrival.topic == "drive" and _is_farewell(arrival.frame, self._id):
                     self._sense.put(arrival.frame)
                     return
+        why = "no answer to the End" if self._id in self._alive else "its agent has gone"
+        self._inbox.say(f"no Farewell of {self._id}: {why}")
 
 
 def _sense(reading: Reading, tick: int, briefing: Briefing) -> bytes:
@@ -273,9 +351,20 @@ def _sense(reading: Reading, tick: int, briefing: Briefing) -> bytes:
     return frame
 
 
-def _is_farewell(frame: bytes) -> bool:
+def _mark(reading: Reading, tick: int, robot: str) -> list[bytes]:
+    """The frame of the mark of `reading`, if it has one. Raises DriverFailed if it is none."""
+    if not reading.mark:
+        return []
     try:
-        decode(frame, Farewell)
+        frame = encode(Mark(tick, robot, reading.mark))
+        decode(frame, Mark)
+    except (MalformedFrame, TypeError, msgspec.MsgspecError) as error:
+        raise DriverFailed(f"sense({tick}): mark: {error}") from None
+    return [frame]
+
+
+def _is_farewell(frame: bytes, robot: str) -> bool:
+    try:
+        return decode(frame, Farewell).robot == robot
     except MalformedFrame:
         return False
-    return True

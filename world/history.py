@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import msgspec
+from msgspec.structs import replace
 
+from protocol.environment import named_in
 from protocol.journal import CorruptJournal
-from protocol.messages import Drive, End, Farewell, Missed
+from protocol.messages import Drive, End, Environment, Farewell, Missed
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 from world.referee import Judgement
 from world.scenario import Scenario
@@ -41,6 +43,8 @@ class History(msgspec.Struct, frozen=True):
     end: End | None = None
     farewells: dict[str, Farewell] = {}
     disorder: Disorder | None = None
+    environment: Environment | None = None
+    """where it was written; none of an older recording"""
 
     @property
     def worlds(self) -> tuple[World, ...]:
@@ -50,15 +54,25 @@ class History(msgspec.Struct, frozen=True):
 
 def history(frames: Iterable[bytes], source: object) -> History:
     """What `frames` tell, the world moved by their Drives. Raises CorruptJournal, which names `source`."""
-    rest = iter(frames)
-    reading = Reading(scenario_of(next(rest, b""), source))
+    scenario, named, rest = opened(list(frames), source)
+    reading = Reading(scenario)
     try:
         for frame in rest:
             if not reading.take(frame):
                 break
     except MalformedFrame as error:
         raise CorruptJournal(f"{source}: {error}") from None
-    return reading.told()
+    return replace(reading.told(), environment=named)
+
+
+def opened(frames: Sequence[bytes], source: object) -> tuple[Scenario, Environment | None, Sequence[bytes]]:
+    """What a world's journal begins with, and the frames after it.
+
+    Raises CorruptJournal, which names `source`.
+    """
+    named = named_in(frames)
+    rest = frames if named is None else frames[1:]
+    return _scenario_of(rest[0] if rest else b"", source), named, rest[1:]
 
 
 class Reading:
@@ -123,7 +137,7 @@ class Reading:
         )
 
 
-def scenario_of(frame: bytes, source: object) -> Scenario:
+def _scenario_of(frame: bytes, source: object) -> Scenario:
     """The scenario that a world's journal begins with. Raises CorruptJournal, which names `source`."""
     if not frame:
         raise CorruptJournal(f"{source}: there is no scenario in it")

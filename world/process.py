@@ -1,17 +1,18 @@
 """The world's process: its clock is the barrier of the tick.
 
-Lockstep goes as fast as the answers come, and no decision depends on a time-out. As long as somebody
-has not answered, everyone hears its Sense again: when a robot appears, and every REPEAT_S. That one
-rule serves late starters, lost messages and restarted agents; and a world that is started again, which
-says to everyone what it would have said. In real time a tick lasts its period, and a robot whose Drive did
-not come stands still.
+Lockstep goes as fast as the answers come, and no decision depends on a time-out. A robot that has not
+answered is sent its Sense again when it appears, and every REPEAT_S; and so is its peer, whose reports it may
+have lost. That one rule serves late starters, lost messages and restarted agents; and a world that is started
+again, which says to everyone what it would have said. Everyone is sent its Sense again every REPEAT_TO_ALL_S,
+so that no link falls silent meanwhile. In real time a tick lasts its period, and a robot whose Drive did not
+come stands still.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any
 
 import zenoh
@@ -19,6 +20,7 @@ import zenoh
 from protocol import keys, session
 from protocol.inbox import NOTHING, Arrival, Inbox
 from protocol.messages import Drive, End, Farewell, Message, Sense, Truth
+from protocol.spelling import did_you_mean
 from protocol.wire import MalformedFrame, decode, encode
 from world.course import Course
 from world.referee import Judgement
@@ -27,6 +29,9 @@ SILENCE_S = 3.0
 """a replaceable link over which no robot has said anything for so long is replaced, as an agent's is"""
 REPEAT_S = 0.25
 """how often what is unanswered is said again"""
+REPEAT_TO_ALL_S = 1.0
+"""how often everyone is told again, as long as somebody has not answered; less than the silence after which
+an agent replaces its link"""
 FAREWELL_S = 2.0
 """how long the world waits for the last word of robots that had not answered any more"""
 
@@ -66,11 +71,16 @@ class WorldProcess:
         self._patience = patience
         self._inbox = inbox
         self._robots = [robot.id for robot in scenario.robots]
+        self._peers = {robot.id: robot.peer for robot in scenario.robots}
+        self._repeat = self._repeat_to_all = math.inf
+        """when what is unanswered is said again, and when it is said to everyone"""
         self._alive: set[str] = set()
         self._answered = time.monotonic()
         """when a robot last appeared, or answered something new"""
         self._late = 0
         """Drives of ticks that are over"""
+        self._latest: dict[str, int] = {}
+        """of each robot: the tick of the latest Drive that came, in time or not"""
         self._truth_wanted = False
         self._mute = math.inf
         """when its link counts as lost, if nothing comes until then"""
@@ -124,6 +134,7 @@ class WorldProcess:
         self._parting = time.monotonic() if self._parting is None else self._parting
         self.playing_s = self._parting - self._began if self._began is not None else 0.0
         course.farewells(self._farewells(end, expected))
+        self._say_who_gave_none()
         self._put({robot: encode(farewell) for robot, farewell in course.parted.items()})
         if refused := self._inbox.refused.total():
             late = f", and left aside {self._late} of ticks past" if self._late else ""
@@ -144,20 +155,20 @@ class WorldProcess:
         self._show_truth()
         drives: dict[str, Drive] = {}
         now = time.monotonic()
-        repeat = now + REPEAT_S
+        self._set_repeat(now)
         while due is not None or len(drives) < len(self._robots):
-            arrival = self._next((repeat if due is None else due) - now)
+            arrival = self._next((self._repeat if due is None else due) - now)
             now = time.monotonic()
             if arrival.topic == "drive":
                 drive = self._answer(arrival)
                 if drive is not None and drive.robot not in drives:
                     drives[drive.robot] = drive
                     self._answered = now
-            if arrival.topic == "alive":
-                self._tell_missed(keys.robot_of(arrival.key))
-            if arrival.topic == "alive" or (due is None and now >= repeat):
-                repeat = now + REPEAT_S
-                self._put(frames)
+            if arrival.topic == "alive" and arrival.source.robot in self._alive:
+                self._tell_missed(arrival.source.robot)
+                self._put_again(frames, [arrival.source.robot])
+            if due is None and now >= self._repeat:
+                self._put_all_again(frames, frames.keys() - drives.keys(), now)
             if len(drives) < len(self._robots) and now - self._answered > self._patience + self._tick_s:
                 raise NoAnswer(self._who_is_missing(drives))
             if due is not None and now >= due and (arrival is NOTHING or now >= due + self._tick_s):
@@ -167,6 +178,25 @@ class WorldProcess:
     def _put(self, frames: Mapping[str, bytes]) -> None:
         for robot, frame in frames.items():
             self._sense[robot].put(frame)
+
+    def _put_again(self, frames: Mapping[str, bytes], robots: Iterable[str]) -> None:
+        """To `robots`, and to their peers, whose reports they may have lost."""
+        named = {*robots} & self._peers.keys()
+        named |= {self._peers[robot] for robot in named}
+        self._put({robot: frame for robot, frame in frames.items() if robot in named})
+
+    def _set_repeat(self, now: float) -> None:
+        """Something new is said."""
+        self._repeat, self._repeat_to_all = now + REPEAT_S, now + REPEAT_TO_ALL_S
+
+    def _put_all_again(self, frames: Mapping[str, bytes], missing: Iterable[str], now: float) -> None:
+        """To those that are `missing`, and to everyone where the last time is long ago."""
+        self._repeat = now + REPEAT_S
+        if now < self._repeat_to_all:
+            self._put_again(frames, missing)
+        else:
+            self._repeat_to_all = now + REPEAT_TO_ALL_S
+            self._put(frames)
 
     def _tell_missed(self, robot: str) -> None:
         """In real time, what the others have been told while `robot` was away."""
@@ -180,13 +210,13 @@ class WorldProcess:
             self._mute = now + self._silence
         elif time.monotonic() >= self._mute:
             raise LinkLost
-        if arrival.topic == "alive":
-            robot = keys.robot_of(arrival.key)
+        robot = arrival.source.robot
+        if arrival.topic == "alive" and robot in self._robots:
             if robot not in self._alive:
                 self._answered = time.monotonic()
             self._alive.add(robot)
         elif arrival.topic == "gone":
-            self._alive.discard(keys.robot_of(arrival.key))
+            self._alive.discard(robot)
         return arrival
 
     def _accepted(self, arrival: Arrival, kind: Any) -> Drive | Farewell | None:
@@ -196,7 +226,7 @@ class WorldProcess:
         except MalformedFrame as error:
             self._inbox.refuse(arrival, error)
             return None
-        if message.robot not in self._robots or message.robot != keys.robot_of(arrival.key):
+        if message.robot not in self._peers or message.robot != arrival.source.robot:
             self._inbox.refuse(arrival, f"it says it is from '{message.robot}'")
             return None
         return message
@@ -206,6 +236,8 @@ class WorldProcess:
         drive = self._accepted(arrival, Drive)
         if not isinstance(drive, Drive):
             return None
+        if drive.tick <= self._course.tick:
+            self._latest[drive.robot] = drive.tick
         if drive.tick == self._course.tick:
             return drive
         if drive.tick > self._course.tick:
@@ -219,6 +251,26 @@ class WorldProcess:
         names = ", ".join(robot if robot in self._alive else f"{robot} (not there)" for robot in missing)
         return f"no answer from {names} at tick {self._course.tick} for {self._patience:g} s"
 
+    def _say_who_gave_none(self) -> None:
+        """Tell of which robots there is no Farewell, and why."""
+        reasons: dict[str, list[str]] = {}
+        for robot in self._robots:
+            if robot not in self._course.parted:
+                reasons.setdefault(self._why_none(robot), []).append(robot)
+        for reason, robots in reasons.items():
+            self._inbox.say(f"no Farewell of {', '.join(robots)}: {reason}")
+
+    def _why_none(self, robot: str) -> str:
+        latest = self._latest.get(robot)
+        if robot not in self._alive:
+            return "not there" if latest is None else f"gone; the last Drive was of tick {latest}"
+        if latest is None:
+            return "there, but no Drive has come"
+        if latest < self._course.tick:
+            slower = "; a lower --rate leaves more time for each tick" if self._period is not None else ""
+            return f"behind, at tick {latest} of {self._course.tick}{slower}"
+        return "no answer to the End"
+
     # --- beside the tick ---
 
     def _show_truth(self) -> None:
@@ -230,10 +282,10 @@ class WorldProcess:
     def _want_truth(self, wanted: bool) -> None:
         self._truth_wanted = wanted
 
-    def _brief(self, key: str) -> Message | str:
-        robot = key.rsplit("/", 1)[1]
+    def _brief(self, robot: str) -> Message | str:
         if robot not in self._robots:
-            return f"this world has no robot '{robot}'; it has {', '.join(self._robots)}"
+            near = did_you_mean(robot, self._robots)
+            return f"this world has no robot '{robot}'; it has {', '.join(self._robots)}{near}"
         return self._scenario.briefing(robot, self._period)
 
     def _farewells(self, end: End, expected: Collection[str]) -> list[Farewell]:
@@ -244,8 +296,9 @@ class WorldProcess:
         """
         frames = dict.fromkeys(self._robots, encode(end))
         said = self._last_words = {**self._course.parted, **self._last_words}
-        now = repeat = time.monotonic()
+        now = time.monotonic()
         began = self._parting or now
+        self._repeat = self._repeat_to_all = now
         told = False
         while True:
             last_words = set(self._course.witnesses) - said.keys()
@@ -257,14 +310,15 @@ class WorldProcess:
                 told = True
                 names = ", ".join(sorted(last_words))
                 self._inbox.say(f"waiting {self._patience:g} s for the last word of {names}")
-            if now >= repeat:
-                repeat = now + REPEAT_S
-                self._put(frames)
-            arrival = self._next(min(repeat, give_up) - now)
+            if now >= self._repeat:
+                self._put_all_again(frames, last_words | others, now)
+            arrival = self._next(min(self._repeat, give_up) - now)
             if arrival.topic == "alive":
-                repeat = time.monotonic()
+                self._put_again(frames, [arrival.source.robot])
             if arrival.topic == "drive":
-                farewell = self._accepted(arrival, Drive | Farewell)
-                if isinstance(farewell, Farewell):
-                    said[farewell.robot] = farewell
+                last = self._accepted(arrival, Drive | Farewell)
+                if isinstance(last, Farewell):
+                    said[last.robot] = last
+                elif last is not None and last.tick <= end.tick:
+                    self._latest[last.robot] = last.tick
             now = time.monotonic()

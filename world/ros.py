@@ -124,7 +124,8 @@ class Ros2:
             pose, _ = self._pose
             driven = executed(self._last or pose, pose, self._mission.period)
             self._last = pose
-            return Reading(driven, self._fresh(self._anchor, since), self._fresh(self._peer, since))
+            ranges = self._fresh(self._anchor, since), self._fresh(self._peer, since)
+            return Reading(driven, *ranges, mark=(pose.x, pose.y, pose.heading))
 
     def drive(self, v: float, omega: float) -> None:
         """Say it over and over, for the time of a manoeuvre; then to rest."""
@@ -142,6 +143,14 @@ class Ros2:
 
         self._saying = threading.Thread(target=say, daemon=True)
         self._saying.start()
+
+    def resume(self, tick: int, mark: tuple[float, ...]) -> None:  # noqa: ARG002  # the odometer tells
+        """Go on from the odometry of the latest reading, which the bridge, or the base, has outlived."""
+        with self._changed:
+            self._last = Pose(*mark)
+            pose, came = self._pose or (self._last, -math.inf)
+            heading = self._last.heading + wrap(pose.heading - self._last.heading)
+            self._pose = Pose(pose.x, pose.y, heading), came
 
     def stop(self) -> None:
         """Twist zero, now."""

@@ -11,10 +11,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 import msgspec
 
 from agent.past import Past
-from compose.audit.case import Testimony, testimony_of
+from compose.audit.case import Testimony, other_versions, testimony_of
 from compose.audit.conduct import decision, limits, log
-from compose.audit.findings import Checks, Findings, counted
+from compose.audit.findings import Checks, Findings, findings_of
 from compose.audit.journals import broken_off, whole
+from compose.audit.settings import briefing
 from compose.audit.wires import report
 from compose.robots import agree
 from protocol.journal import CorruptJournal
@@ -41,7 +42,7 @@ def order(alone: Alone) -> Checks:
             yield whole(robot, testimony.past, step, excused=True)
 
 
-RULES: tuple[Callable[[Alone], Checks], ...] = (order, report, decision, limits, log)
+RULES: tuple[Callable[[Alone], Checks], ...] = (order, briefing, report, decision, limits, log)
 """each by its name; where one violation follows from another, it comes later"""
 
 
@@ -63,10 +64,10 @@ def judge_alone(
         testimonies[robot] = testimony
     alone = Alone(testimonies)
     agree({robot: past.briefing for robot, past in alone.pasts.items()}, folder)
-    counts, violations = counted(rules, alone)
-    return Findings(
-        f"{' and '.join(testimonies)}, without a world",
-        max([len(past.steps) for past in alone.pasts.values()], default=0),
-        counts,
-        violations,
+    return findings_of(
+        rules,
+        alone,
+        other_versions(alone.pasts),
+        scenario=f"{' and '.join(testimonies)}, without a world",
+        ticks=max([len(past.steps) for past in alone.pasts.values()], default=0),
     )

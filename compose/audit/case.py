@@ -9,6 +9,7 @@ import msgspec
 
 from agent.past import OutOfOrder, Past, past
 from compose.record import WORLD_JOURNAL, agent_journal
+from protocol.environment import is_blank, of_robot, otherwise
 from protocol.journal import CorruptJournal
 from protocol.messages import Contact, Drive, Sense
 from world.history import History, history
@@ -89,9 +90,15 @@ _NONE = Testimony(None, missing=True)
 
 def testimony_of(frames: list[bytes], source: object) -> Testimony:
     """What `frames` tell, as far as that can be followed. Raises CorruptJournal."""
-    if not frames:
+    if is_blank(frames):
         return Testimony(None)
     try:
         return Testimony(past(frames, source))
     except OutOfOrder as error:
         return Testimony(past(frames[: error.place], source), error.what, error.tick)
+
+
+def other_versions(pasts: Mapping[str, Past]) -> str | None:
+    """In what the first robot's versions differ from those here, of the robots whose do."""
+    told = [otherwise(past.environment, of_robot()) for past in pasts.values()]
+    return next((one for one in told if one is not None), None)

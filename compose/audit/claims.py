@@ -15,7 +15,7 @@ from compose.audit.case import Case
 from compose.audit.findings import Checks, Violation, between
 from protocol.messages import End, Localised
 from protocol.motion import Pose
-from world.referee import Judgement, mistake
+from world.referee import inaccuracy, mistake
 from world.scenario import Placed
 
 PLACES = 3
@@ -23,13 +23,17 @@ PLACES = 3
 
 
 def claim(case: Case) -> Checks:
-    """Whoever claimed to be localised was right, and had a redundant range; the End is the referee's."""
+    """Whoever claimed to be localised was right, knew it as well as the mission asks for, and had a redundant
+    range; the End is the referee's."""
     for place, placed in enumerate(case.history.scenario.robots):
         tick, made = _first_claim(case, placed.id)
         if made is None:
             continue
-        why = mistake(made, case.history.ticks[tick].world.truth.poses[place])
+        mission = case.history.scenario.mission
+        why = mistake(made, case.history.ticks[tick].world.truth.poses[place], mission)
         yield None if why is None else Violation("claim", tick, placed.id, f"it claims a pose that is {why}")
+        vague = inaccuracy(made, mission)
+        yield None if vague is None else Violation("claim", tick, placed.id, f"it {vague}")
         past = case.pasts.get(placed.id)
         if past is not None and tick < len(past.steps) and past.steps[tick].drive is not None:
             yield _redundant(case, placed, past, tick)
@@ -98,15 +102,15 @@ def outcome(case: Case) -> Checks:
     end, judgement = case.history.end, case.history.judgement
     if end is None:
         return
-    found = Judgement(end.outcome, end.reason)
-    if judgement is not None and found != judgement:
-        what = f"it ends {_told(found)}, expected {_told(judgement)}"
-        yield Violation("claim", end.tick, None, what, between(end, End(end.tick, *astuple(judgement))))
-    elif judgement is None and end.outcome != "failed":
-        yield Violation("claim", end.tick, None, f"it ends {_told(found)}, expected it to go on")
+    expected = End(end.tick, *astuple(judgement)) if judgement is not None else None
+    if expected is not None and end != expected:
+        what = f"it ends {_told(end)}, expected {_told(expected)}"
+        yield Violation("claim", end.tick, None, what, between(end, expected))
+    elif expected is None and end.outcome != "failed":
+        yield Violation("claim", end.tick, None, f"it ends {_told(end)}, expected it to go on")
     else:
         yield None
 
 
-def _told(judgement: Judgement) -> str:
-    return f"{judgement.outcome} ({judgement.reason})" if judgement.reason else judgement.outcome
+def _told(end: End) -> str:
+    return f"{end.outcome} ({end.reason})" if end.reason else end.outcome

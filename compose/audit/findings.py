@@ -7,6 +7,10 @@ from typing import Any, TypeVar
 
 import msgspec
 
+ROUNDING = 1e-6
+"""of a value, or of 1 where it is less: how far apart two computations may come by rounding alone"""
+RECOMPUTED = ("sense", "decision", "briefing")
+"""rules that hold the recording against what is computed here"""
 MAX_VALUE = 60
 """characters of a value that is quoted"""
 
@@ -20,6 +24,8 @@ class Difference(msgspec.Struct, frozen=True):
     """where in the message it stands, such as `contacts[0].range`"""
     found: str
     expected: str
+    by_rounding: bool
+    """no value in the two messages differs by more than ROUNDING"""
 
 
 class Violation(msgspec.Struct, frozen=True):
@@ -84,20 +90,38 @@ class Findings(msgspec.Struct, frozen=True):
     """the earliest first"""
     radio: tuple[Befallen, ...] = ()
     """of each link, under a fault plan"""
+    rounding: tuple[Violation, ...] = ()
+    """what differs by rounding alone, in a recording that was made with other versions: no violations"""
+    versions: str | None = None
+    """in what they are others than here"""
 
 
 T = TypeVar("T")
 
 
-def counted(
-    rules: Sequence[Callable[[T], Checks]], case: T
-) -> tuple[tuple[Count, ...], tuple[Violation, ...]]:
-    """What each of `rules`, which goes by its name, finds in `case`; the earliest violations first."""
-    found = {rule.__name__: list(rule(case)) for rule in rules}
-    violations = [one for checks in found.values() for one in checks if one is not None]
-    violations.sort(key=lambda one: -1 if one.tick is None else one.tick)
-    counts = [Count(rule, len(checks), len(checks) - checks.count(None)) for rule, checks in found.items()]
-    return tuple(counts), tuple(violations)
+def findings_of(
+    rules: Sequence[Callable[[T], Checks]],
+    case: T,
+    versions: str | None,
+    *,
+    scenario: str,
+    ticks: int,
+    radio: tuple[Befallen, ...] = (),
+) -> Findings:
+    """What each of `rules`, which goes by its name, finds in `case`; `versions` are those that are others."""
+    checks = {rule.__name__: list(rule(case)) for rule in rules}
+    found = [one for some in checks.values() for one in some if one is not None]
+    found.sort(key=lambda one: -1 if one.tick is None else one.tick)
+    rounding = tuple([one for one in found if versions is not None and _by_rounding(one)])
+    violations = tuple([one for one in found if one not in rounding])
+    counts = [
+        Count(rule, len(some), sum([one.rule == rule for one in violations])) for rule, some in checks.items()
+    ]
+    return Findings(scenario, ticks, tuple(counts), violations, radio, rounding, versions)
+
+
+def _by_rounding(one: Violation) -> bool:
+    return one.rule in RECOMPUTED and one.difference is not None and one.difference.by_rounding
 
 
 def difference(found: msgspec.Struct, expected: msgspec.Struct) -> str:
@@ -117,7 +141,20 @@ def difference(found: msgspec.Struct, expected: msgspec.Struct) -> str:
 def between(found: msgspec.Struct, expected: msgspec.Struct) -> Difference:
     """The first value in which they differ, however deep it stands."""
     field, one, other = _first("", found, expected)
-    return Difference(type(found).__name__, field, said(one), said(other))
+    return Difference(type(found).__name__, field, said(one), said(other), _close(found, expected))
+
+
+def _close(one: Any, other: Any) -> bool:
+    """Whether the two are the same but for rounding."""
+    if isinstance(one, float) and isinstance(other, float):
+        return abs(one - other) <= ROUNDING * max(1.0, abs(one), abs(other))
+    if type(one) is not type(other):
+        return False
+    if isinstance(one, msgspec.Struct):
+        return all(_close(getattr(one, name), getattr(other, name)) for name in one.__struct_fields__)
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(map(_close, one, other))
+    return bool(one == other)
 
 
 def _first(path: str, found: Any, expected: Any) -> tuple[str, Any, Any]:

@@ -121,9 +121,10 @@ def _same_farewell(case: Case, robot: str, past: Past) -> Violation | None:
 
 
 def briefing(case: Case) -> Checks:
-    """Every robot was told what the scenario says; how long a tick lasts, the scenario leaves open."""
+    """Every robot was told what the scenario says, and all of them the same duration of a tick."""
+    tick_s = next((past.briefing.tick_s for past in case.pasts.values()), None)
     for robot, past in case.pasts.items():
-        expected = case.history.scenario.briefing(robot, past.briefing.tick_s)
+        expected = case.history.scenario.briefing(robot, tick_s)
         if encode(past.briefing) == encode(expected):
             yield None
         else:

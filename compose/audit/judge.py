@@ -7,17 +7,20 @@ from pathlib import Path
 
 from compose.audit import alone
 from compose.audit.alone import Alone, judge_alone
-from compose.audit.case import Case, case_of
+from compose.audit.case import Case, case_of, other_versions
 from compose.audit.claims import claim
 from compose.audit.conduct import decision, limits, log
-from compose.audit.findings import Checks, Findings, counted
+from compose.audit.findings import Checks, Findings, findings_of
 from compose.audit.journals import briefing, order
 from compose.audit.radio import befallen, faults
+from compose.audit.settings import scenario
 from compose.audit.wires import contact, report, sense
 from compose.record import WORLD_JOURNAL, books
+from protocol.environment import of_world, otherwise
 
 RULES: tuple[Callable[[Case], Checks], ...] = (
     order,
+    scenario,
     briefing,
     sense,
     faults,
@@ -65,6 +68,12 @@ def judge(
     Raises journal.CorruptJournal like `audit`.
     """
     case = case_of(journals, folder)
-    counts, violations = counted(rules, case)
-    name, ticks = case.history.scenario.name, len(case.history.ticks)
-    return Findings(name, ticks, counts, violations, befallen(case))
+    told = case.history
+    return findings_of(
+        rules,
+        case,
+        otherwise(told.environment, of_world()) or other_versions(case.pasts),
+        scenario=told.scenario.name,
+        ticks=len(told.ticks),
+        radio=befallen(case),
+    )

@@ -40,6 +40,10 @@ class Replay(msgspec.Struct, frozen=True):
     """the first of them first"""
     tears: tuple[Violation, ...]
     """where journals break off"""
+    rounding: int = 0
+    """messages that differ by rounding alone, in a recording that was made with other versions"""
+    versions: str | None = None
+    """in what they are others than here"""
 
 
 def replay(folder: Path) -> tuple[Replay, dict[str, int]]:
@@ -65,4 +69,6 @@ def replayed(journals: Mapping[str, Iterable[bytes]], folder: object = "the reco
         sum([count.checks for count in findings.counts]),
         tuple([one for one in findings.violations if not one.breaks_off]),
         tuple([one for one in findings.violations if one.breaks_off]),
+        len(findings.rounding),
+        findings.versions,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import secrets
 import tempfile
@@ -16,19 +17,23 @@ import dask
 import msgspec
 from distributed import Client, Future, KilledWorker, LocalCluster
 from distributed.comm.addressing import parse_address, parse_host_port
-from distributed.comm.registry import get_backend
+from distributed.core import rpc
+from distributed.security import Security
 
 from compose.campaign import owner
 from compose.campaign.trial import Row, lost
 from compose.campaign.work import EngineFailed, Orders, Work, chunks_of
 from compose.campaign.worker import MAX_ERROR, Chunk
 from compose.status import UserError
-from protocol.inbox import Inbox, one_line
+from protocol.inbox import Inbox
+from protocol.terminal import one_line
 
 T = TypeVar("T")
 
 AHEAD = 2
 """chunks for each thread that plays them: one that it plays, one that waits"""
+SCHEMES = ("tcp", "tls", "ws", "wss")
+"""of addresses of schedulers"""
 CONNECT_S = 5.0
 LOOK_S = 1.0
 """how often to look how many threads there are"""
@@ -46,11 +51,9 @@ def connect(workers: int, scheduler: str | None) -> Iterator[Client]:
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # what is to be said, we say
     if scheduler is not None:
         try:
-            scheme, location = parse_address(scheduler)
-            get_backend(scheme)
-            parse_host_port(location)
+            asyncio.run(_look_for(scheduler))
             client = Client(scheduler, timeout=CONNECT_S, set_as_default=False)
-        except (OSError, ValueError, TypeError) as error:
+        except (OSError, ValueError, TypeError, RuntimeError, ImportError) as error:
             why = one_line(str(error).splitlines()[0] if str(error) else type(error).__name__)
             raise UserError(f"--scheduler: {scheduler} cannot be reached: {why}") from None
         with client:
@@ -71,6 +74,23 @@ def connect(workers: int, scheduler: str | None) -> Iterator[Client]:
         Client(cluster, set_as_default=False) as client,
     ):
         yield client
+
+
+async def _look_for(address: str) -> None:
+    """Raises an error unless a scheduler answers within CONNECT_S: a Client would wait for it without end."""
+    scheme, location = parse_address(address)
+    if scheme not in SCHEMES:
+        raise ValueError(f"'{scheme}' is none of {', '.join(SCHEMES)}")
+    parse_host_port(location)
+    try:
+        async with asyncio.timeout(CONNECT_S):
+            arguments = Security().get_connection_args("client")
+            async with rpc(address, timeout=CONNECT_S, connection_args=arguments) as there:
+                known = await there.identity()
+    except TimeoutError:
+        raise TimeoutError(f"no answer within {CONNECT_S:g} s") from None
+    if known.get("type") != "Scheduler":
+        raise ValueError(f"a {known.get('type', 'stranger')} answers there, and no scheduler")
 
 
 def play(

@@ -42,7 +42,7 @@ APART = 0.45
 
 
 def draw(results: Results, folder: Path) -> None:
-    """Draw them anew, each as SVG and PNG, into `folder`."""
+    """Draw them anew, each as SVG, PDF and PNG, into `folder`."""
     folder.mkdir(exist_ok=True)
     with look():
         for place, axis in enumerate(results.campaign.axes):

@@ -24,9 +24,8 @@ from compose.campaign.table import encoded, gathered, of_rows, read, schema_of
 from compose.campaign.trial import Row
 from compose.record import make
 from compose.status import UserError
+from protocol import files
 
-UNFINISHED = ".unfinished"
-"""ends the name of a file that is being written"""
 TRIALS = "trials.parquet"
 CAMPAIGN = "campaign.json"
 PARTS = "parts"
@@ -66,36 +65,38 @@ class Folder:
 
     def forget_lost(self) -> None:
         """The trials that were lost, to an error or with their process, have no row any more."""
-        table = self.gather()
-        _write(self.path / TRIALS, encoded(table.filter(table["error"].is_null())))
+        table = self.table()
+        self.gather(table.filter(table["error"].is_null()))
 
     def ask(self, refused: Mapping[int, str]) -> None:
         """Put down what is about to be played, and each cell's scenario."""
         self.refused = dict(refused)
         asked = msgspec.json.encode(Asked(self.campaign, self.refused))
-        _write(self.path / CAMPAIGN, msgspec.json.format(asked, indent=2) + b"\n")
+        files.write(self.path / CAMPAIGN, msgspec.json.format(asked, indent=2) + b"\n")
         (self.path / CELLS).mkdir(exist_ok=True)
         self._parts.mkdir(exist_ok=True)
         for cell in self.cells.values():
             comment = f"# Cell {cell.index} of {self.campaign.name}: {label(self.campaign, cell)}."
             text = f"{comment}\n{tomli_w.dumps(cell.table)}"
-            _write(self.path / CELLS / cell.file_name, text.encode())
+            files.write(self.path / CELLS / cell.file_name, text.encode())
 
     def add(self, rows: Sequence[Row]) -> None:
         """Keep the rows of a chunk."""
         if rows:
             name = f"{rows[0].cell:05d}-{rows[0].trial:08d}.parquet"
-            _write(self._parts / name, encoded(of_rows(rows, self.campaign, self.cells, self.schema)))
+            files.write(self._parts / name, encoded(of_rows(rows, self.campaign, self.cells, self.schema)))
 
-    def gather(self) -> pa.Table:
-        """All rows, in order; from now on `trials.parquet` holds them, and there are no parts."""
-        table = gathered([self.schema.empty_table(), *self._tables(self.schema.names)])
-        _write(self.path / TRIALS, encoded(table))
+    def table(self) -> pa.Table:
+        """All rows, in order."""
+        return gathered([self.schema.empty_table(), *self._tables(self.schema.names)])
+
+    def gather(self, table: pa.Table) -> None:
+        """From now on `trials.parquet` holds these rows, and there are no parts."""
+        files.write(self.path / TRIALS, encoded(table))
         for part in self._parts.glob("*"):
             part.unlink()
         if self._parts.exists():
             self._parts.rmdir()
-        return table
 
     def _tables(self, columns: list[str]) -> Iterator[pa.Table]:
         """What has been gathered, then each part. Raises UserError if the former cannot be read."""
@@ -140,7 +141,7 @@ def opened(path: Path, campaign: Campaign) -> Iterator[Folder]:
 def _refused_before(path: Path, campaign: Campaign) -> dict[int, str]:
     """The cells that an earlier run found unworkable. Raises UserError if it was of another campaign."""
     try:
-        asked = msgspec.json.decode((path / CAMPAIGN).read_bytes(), type=Asked)
+        asked = msgspec.json.decode(files.read_bytes(path / CAMPAIGN), type=Asked)
     except FileNotFoundError:
         if (path / TRIALS).exists() or (path / PARTS).exists():
             raise UserError(f"--out: {path} holds the rows of an unknown campaign") from None
@@ -179,10 +180,3 @@ def _difference(there: Any, here: Any, where: str = "") -> str | None:
 def _cut(value: Any) -> str:
     said = "left out" if value is None else canonical(value)
     return said if len(said) <= MAX_DIFFERENCE else f"{said[: MAX_DIFFERENCE - 3]}..."
-
-
-def _write(path: Path, content: bytes | pa.Buffer) -> None:
-    """All at once, by renaming."""
-    unfinished = path.with_name(path.name + UNFINISHED)
-    unfinished.write_bytes(content)
-    unfinished.replace(path)

@@ -9,18 +9,16 @@ from __future__ import annotations
 import os
 import select
 import signal
-import subprocess
-import sys
 import tempfile
 import threading
 import time
-from contextlib import suppress
 
 import msgspec
 
 from compose.campaign.trial import lost
 from compose.campaign.worker import LENGTH_BYTES, MAX_ERROR, READY, Chunk, framed
-from protocol.inbox import one_line
+from compose.forked import fork_server
+from protocol.terminal import one_line
 
 START_S = 60.0
 """how long a process may take to import what it needs"""
@@ -41,28 +39,22 @@ class Child:
     def __init__(self) -> None:
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # gone with the child
         self._folder = tempfile.TemporaryDirectory(prefix="tandem-trials-", ignore_cleanup_errors=True)
-        # -P: the user's directory may hold a folder called world, or agent
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "compose.campaign.worker", self._folder.name],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._errors,
-            start_new_session=True,
-            bufsize=0,
+        self._process = fork_server("compose.campaign.worker:warm_up").start(
+            "compose.campaign.worker:main",
+            "tandem sweep worker",
+            self._folder.name,
+            errors=self._errors.fileno(),
+            answers=True,
         )
         assert self._process.stdout is not None
-        self._output = self._process.stdout.fileno()
+        self._output = self._process.stdout
         self._poll = select.poll()
         self._poll.register(self._output, select.POLLIN)
         self._read = b""
 
     def ask(self, chunk: Chunk) -> None:
         """Have it play the trials of `chunk`."""
-        assert self._process.stdin is not None
-        frame = memoryview(framed(msgspec.msgpack.encode(chunk)))
-        with suppress(BrokenPipeError):  # the answer tells
-            while frame:
-                frame = frame[self._process.stdin.write(frame) :]
+        self._process.hand(framed(msgspec.msgpack.encode(chunk)))
 
     def answer(self, timeout: float) -> bytes:
         """The next frame. Raises Hung after `timeout` seconds without one, and Died."""
@@ -85,11 +77,10 @@ class Child:
         return body
 
     def _how(self) -> str:
-        try:
-            status = self._process.wait(1.0)
-        except subprocess.TimeoutExpired:  # it has closed its standard output, and goes on
+        if not self._process.wait(1.0):  # it has closed its standard output, and goes on
             self.kill()
             return "it closed its standard output"
+        status = self._process.status
         size = os.fstat(self._errors.fileno()).st_size
         said = os.pread(self._errors.fileno(), MAX_ERROR, max(0, size - MAX_ERROR)).decode(errors="replace")
         last = one_line(said.strip().splitlines()[-1]) if said.strip() else ""
@@ -98,15 +89,11 @@ class Child:
 
     def kill(self) -> None:
         """End it now. What its trials started ends with it."""
-        with suppress(ProcessLookupError):
-            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.signal(signal.SIGKILL)
 
     def close(self) -> None:
         """End it, and leave nothing of it behind."""
-        if self._process.poll() is None:
-            self.kill()
-        with self._process, suppress(BrokenPipeError):
-            self._process.wait()
+        self._process.end()
         self._errors.close()
         self._folder.cleanup()
 

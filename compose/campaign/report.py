@@ -2,30 +2,33 @@
 
 from __future__ import annotations
 
-import io
 import shlex
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 from rich import progress as bars
-from rich.box import SIMPLE_HEAD
-from rich.cells import cell_len
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from compose import layout
 from compose.campaign.cells import Cell
 from compose.campaign.folder import CELLS
 from compose.campaign.run import SUMMARY, Progress, Results
 from compose.campaign.summary import Counted, noted, refusals
-from compose.show import UNLIMITED
+from protocol.terminal import say
 
 RATE_OVER_S = 10.0
 """what the rate is averaged over"""
 OUTCOMES = ("localised", "undecided", "alarm", "wrong", "failed")
-LEGEND = "rate: 95 % interval (Wilson); ticks: of trials that localised; error: m, of the worse robot"
+NOTES = (
+    ("rate_low", "rate: 95 % interval (Wilson)"),
+    ("p50", "p50, p95, max: ticks of trials that localised"),
+    ("error p50", "error: m, of the worse robot"),
+    ("within", "within: claims within 3 x accuracy"),
+    ("nees low", "nees: in the mean, and the 99 % band of true covariances"),
+)
+"""each with the column that it is a footnote to"""
 WIDEST = (*OUTCOMES, "clean", "rate", "rate_low", "rate_high", "p50", "p95", "max", "error p50", "error max")
 CHOICES = (
     ("trials", *WIDEST),
@@ -37,9 +40,6 @@ CHOICES = (
 """of the columns; the first that fits"""
 OF_NOISE = ("within", "nees", "nees low", "nees high")
 """more of them, where covariances are claimed"""
-NOISE_LEGEND = "within: claims within 3 x accuracy; nees: in the mean, and the 99 % band of true covariances"
-
-
 MOST_ROWS = 100
 """cells that are listed whether or not all was well"""
 
@@ -79,34 +79,34 @@ def show(results: Results, out: Path, *, quiet: bool) -> None:
     total = {name: sum([getattr(one, name) for one in results.figures.values()]) for name in OUTCOMES}
     total["refused"] = sum([one.refused_trials for one in results.figures.values()])
     counts = ", ".join([f"{count} {name}" for name, count in total.items() if count])
-    print(f"{results.campaign.name}: {counts} of {len(results.table)} trials in {_cells(len(results.cells))}")
+    say(f"{results.campaign.name}: {counts} of {len(results.table)} trials in {_cells(len(results.cells))}")
     if any(one.audited for one in results.figures.values()):
-        print(_audited(results))
+        say(_audited(results))
     if quiet:
         return
-    legend = [LEGEND, NOISE_LEGEND] if _noisy(results) else [LEGEND]
     shown = len(_shown(results))
     if shown:
-        print("", *_lines(results), "", *legend, sep="\n")
+        lines, columns = _lines(results)
+        say("", *lines, "", *layout.notes(NOTES, columns))
     if shown < len(results.cells):
-        print(f"all is well in {len(results.cells) - shown} cells, not listed: {out / SUMMARY}")
+        say(f"all is well in {len(results.cells) - shown} cells, not listed: {out / SUMMARY}")
     for index, figures in results.figures.items():
         if figures.refused is not None:
-            print(f"cell {index} cannot be played: {figures.refused}")
+            say(f"cell {index} cannot be played: {figures.refused}")
     for reason, count in refusals(results.table):
-        print(f"refused: {count}: {reason}")
+        say(f"refused: {count}: {reason}")
     note = noted(results.table)
     if note is not None:
         why = f" ({note.why})" if note.why else ""
         how = f"{note.outcome} after {note.ticks} ticks" if note.ticks is not None else note.outcome
         file = shlex.quote(str(out / CELLS / f"{note.cell:03d}.toml"))
-        print(f"to look at first: trial {note.trial} of cell {note.cell}, {how}{why}; any trial again:")
+        say(f"to look at first: trial {note.trial} of cell {note.cell}, {how}{why}; any trial again:")
         if results.campaign.draws:
             source = shlex.quote(results.campaign.source)
-            print(f"  tandem sweep {source} --print-trial {note.cell}:{note.trial} > trial.toml")
+            say(f"  tandem sweep {source} --print-trial {note.cell}:{note.trial} > trial.toml")
             file = "trial.toml"
-        print(f"  tandem run {file} --seed {note.seed} --out record")
-    print(f"results: {out}")
+        say(f"  tandem run {file} --seed {note.seed} --out record")
+    say(f"results: {out}")
 
 
 def _audited(results: Results) -> str:
@@ -119,15 +119,14 @@ def _audited(results: Results) -> str:
     return f"audited: {audited} of {played} trials, {clean} clean{first}"
 
 
-def _lines(results: Results) -> list[str]:
-    """The table, as wide as there is room."""
-    room = Console().width if sys.stdout.isatty() else UNLIMITED
-    lines: list[str] = []
+def _lines(results: Results) -> tuple[list[str], Sequence[str]]:
+    """The table, as wide as there is room, and its columns."""
+    columns: Sequence[str] = ()
     for columns in _choices(results):
-        lines = _table(results, columns)
-        if max(map(cell_len, lines)) <= room:
-            break
-    return lines
+        lines = layout.lines(_table(results, columns))
+        if layout.fits(lines):
+            return lines, columns
+    return layout.lines(_table(results, columns), layout.room()), columns
 
 
 def _shown(results: Results) -> list[Cell]:
@@ -155,21 +154,13 @@ def _choices(results: Results) -> tuple[tuple[str, ...], ...]:
     return tuple((*columns, *OF_NOISE) for columns in CHOICES) + CHOICES[-1:]
 
 
-def _table(results: Results, columns: Sequence[str]) -> list[str]:
-    axes = results.campaign.axes
-    table = Table("cell", box=SIMPLE_HEAD, pad_edge=False)
-    for axis in axes:
-        table.add_column(axis.name.rpartition(".")[2])
-    for heading in columns:
-        table.add_column(heading, justify="right")
+def _table(results: Results, columns: Sequence[str]) -> Table:
+    axes = [axis.name.rpartition(".")[2] for axis in results.campaign.axes]
+    rows = []
     for cell in _shown(results):
-        figures = results.figures[cell.index]
-        said = _figures(figures)
-        table.add_row(*_axes(results, cell), *[said[column] for column in columns])
-    page = Console(width=UNLIMITED, file=io.StringIO())
-    with page.capture() as capture:
-        page.print(table)
-    return [line.rstrip() for line in capture.get().splitlines() if line.strip()]
+        said = _figures(results.figures[cell.index])
+        rows.append([*_axes(results, cell), *[said[column] for column in columns]])
+    return layout.table(["cell", *axes], columns, rows)
 
 
 def _axes(results: Results, cell: Cell) -> list[str]:

@@ -18,6 +18,7 @@ from compose.campaign.summary import Counted, counted, header, summary_csv
 from compose.campaign.trial import Row
 from compose.campaign.work import EngineFailed, Orders, Work
 from compose.campaign.worker import PLAY
+from protocol import files
 from protocol.inbox import Inbox, Interrupted
 
 SUMMARY = "summary.csv"
@@ -98,6 +99,10 @@ def sweep(campaign: Campaign, out: Path, means: Means, inbox: Inbox, progress: P
                 stopped, interrupted = f"stopped by {signal_name}", True
             except EngineFailed as error:
                 stopped = str(error)
+            except BrokenPipeError:
+                raise
+            except OSError as error:
+                stopped = f"cannot go on: {files.said(error)}"
         return _gathered(folder, stopped, interrupted)
 
 
@@ -158,11 +163,14 @@ def _play(folder: Folder, work: list[Work], means: Means, inbox: Inbox, progress
 
 
 def _gathered(folder: Folder, stopped: str | None, interrupted: bool) -> Results:
-    table = folder.gather()
+    table = folder.table()
     cells = tuple(folder.cells.values())
     figures = _figures(table, cells, folder.refused)
-    text = summary_csv(folder.campaign, cells, figures)
-    (folder.path / SUMMARY).write_text(text, encoding="utf-8")
+    try:
+        folder.gather(table)
+        files.write(folder.path / SUMMARY, summary_csv(folder.campaign, cells, figures))
+    except OSError as error:
+        stopped = stopped or f"cannot be written: {files.said(error)}"
     trials = folder.campaign.trials * (len(cells) - len(folder.refused))
     return Results(folder.campaign, cells, table, figures, stopped, interrupted, trials)
 

@@ -116,8 +116,7 @@ def load(source: str, *, trials: int | None = None, seed: int | None = None) -> 
         table = table_in(read_text(path), source)
         spec = msgspec.convert(table, SpecFile)
     except FileNotFoundError:
-        names = ", ".join(shipped())
-        raise BadSpec(f"{source}: neither a file nor a campaign that ships ({names})") from None
+        raise BadSpec(scenario.unknown(source, "sweeps")) from None
     except msgspec.ValidationError as error:
         raise BadSpec(f"{source}: {field_first(str(error), {})}") from None
     except ValueError as error:

@@ -14,6 +14,7 @@ from compose.campaign.cells import Cell
 from compose.campaign.fields import canonical
 from compose.campaign.spec import Campaign
 from compose.campaign.trial import RobotRow, Row
+from protocol.files import open_file
 from protocol.motion import Covariance
 
 _KINDS: dict[str, pa.DataType] = {
@@ -116,14 +117,14 @@ def gathered(tables: Sequence[pa.Table]) -> pa.Table:
 
 def read(path: Path, schema: pa.Schema, columns: list[str]) -> pa.Table:
     """Those columns of a file of the schema. Raises OSError or ValueError if it is none."""
-    with path.open("rb") as opened, pq.ParquetFile(opened) as file:  # a path with a colon it takes for a URI
+    with open_file(path) as opened, pq.ParquetFile(opened) as file:  # a path with a colon it takes for a URI
         if not file.schema_arrow.equals(schema):
             raise ValueError("its columns are others")
         return file.read(columns)
 
 
-def encoded(table: pa.Table) -> pa.Buffer:
+def encoded(table: pa.Table) -> bytes:
     """What a file of it holds."""
     file = pa.BufferOutputStream()
     pq.write_table(table, file)
-    return file.getvalue()
+    return bytes(file.getvalue().to_pybytes())

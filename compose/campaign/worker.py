@@ -1,4 +1,4 @@
-"""The process in which trials run, `python -P -m compose.campaign.worker FOLDER`.
+"""The process in which trials run, forked from a fork server that has imported this module.
 
 It is asked for chunks on its standard input and answers a row a trial on its standard output, each a frame:
 its length in four bytes, and msgpack. It ends with its standard input, even while a trial never does.
@@ -24,7 +24,7 @@ from msgspec.structs import replace
 from compose.campaign import trial
 from compose.campaign.draws import Draws
 from compose.scenario import Setting, Unworkable, validate
-from protocol.inbox import one_line
+from protocol.terminal import one_line
 
 PLAY = "compose.campaign.trial:play"
 """what plays a trial"""
@@ -60,6 +60,10 @@ class Chunk(msgspec.Struct, frozen=True):
     def after(self, done: int) -> Chunk:
         """What is left of it after so many trials."""
         return msgspec.structs.replace(self, trials=self.trials[done:], seeds=self.seeds[done:])
+
+
+def warm_up() -> None:
+    """Get ready to fork such processes: importing this module is all."""
 
 
 def main() -> None:
@@ -134,7 +138,3 @@ def _function(path: str) -> Callable[[trial.Trial], trial.Row]:
     module, _, name = path.partition(":")
     found: Callable[[trial.Trial], trial.Row] = getattr(import_module(module), name)
     return found
-
-
-if __name__ == "__main__":
-    main()

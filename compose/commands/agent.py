@@ -23,6 +23,7 @@ from protocol.inbox import Inbox, Interrupted
 from protocol.journal import CannotRecord, CorruptJournal, Journal
 from protocol.messages import Briefing, End
 from protocol.retrace import Retrace
+from protocol.terminal import say
 
 STILL_THERE_S = 3.0
 """how long an agent whose mission has ended looks for a world that may not know its last word"""
@@ -54,7 +55,7 @@ def main(options: argparse.Namespace) -> int:
         return STOPPED
     if options.launched:
         return ENDED
-    print(f"{options.id}: {ended(end.outcome, end.tick, end.reason)}")
+    say(f"{options.id}: {ended(end.outcome, end.tick, end.reason)}")
     return status_of(end.outcome)
 
 
@@ -93,7 +94,7 @@ def _play(options: argparse.Namespace, inbox: Inbox) -> End:
                     if not (options.quiet or options.launched):
                         again = memory.sense
                         where = f", again, from tick {again.tick} on" if again is not None else ""
-                        print(f"{options.id}: in run {run}, with {briefing.peer}{where}", flush=True)
+                        say(f"{options.id}: in run {run}, with {briefing.peer}{where}")
                 else:
                     process.attach(link)
                 return process.play()

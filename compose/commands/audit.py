@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import argparse
 
-from compose.audit.findings import Findings
+from msgspec.structs import astuple
+
+from compose import layout
+from compose.audit.findings import Befallen, Findings
 from compose.audit.judge import audit
 from compose.record import legible
 from compose.status import CLEAN, VIOLATED
-from protocol.inbox import one_line
+from protocol.terminal import say
 
 SHOWN = 20
 """violations that are told in full"""
@@ -23,22 +26,24 @@ def main(options: argparse.Namespace) -> int:
 
 
 def _show(findings: Findings) -> None:
-    print(f"{findings.scenario}: {_count(len(findings.violations))} in {findings.ticks} ticks\n")
-    print(f"{'rule':10}{'checks':>8}{'violations':>12}")
+    say(f"{findings.scenario}: {_count(len(findings.violations))} in {findings.ticks} ticks", "")
+    say(f"{'rule':10}{'checks':>8}{'violations':>12}")
     for one in findings.counts:
-        print(f"{one.rule:10}{one.checks:>8}{one.violations:>12}")
+        say(f"{one.rule:10}{one.checks:>8}{one.violations:>12}")
     if findings.radio:
-        print(f"\n{'link':16}{'sent':>8}{'heard':>8}{'late':>8}{'twice':>8}{'damaged':>9}{'lost':>8}")
-    for link in findings.radio:
-        print(
-            f"{link.link:16}{link.sent:>8}{link.heard:>8}{link.late:>8}{link.twice:>8}{link.damaged:>9}{link.lost:>8}"
-        )
+        rows = [[str(value) for value in astuple(link)] for link in findings.radio]
+        made = layout.table(["link"], Befallen.__struct_fields__[1:], rows)
+        say("", *layout.lines(made, layout.room()))
+    if findings.rounding:
+        say("", f"{len(findings.rounding)} checks differ by rounding alone: {findings.versions}")
+    elif findings.violations and findings.versions is not None:
+        say("", f"{findings.versions}: that alone can lead to other decisions")
     if findings.violations:
-        print()
+        say("")
     for violation in findings.violations[:SHOWN]:
-        print(one_line(violation.line))
+        say(violation.line)
     if len(findings.violations) > SHOWN:
-        print(f"and {len(findings.violations) - SHOWN} more")
+        say(f"and {len(findings.violations) - SHOWN} more")
 
 
 def _count(violations: int) -> str:

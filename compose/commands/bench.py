@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import resource
 import subprocess
 import sys
 import tempfile
@@ -53,6 +54,18 @@ NOISY_SIGMA = 0.1
 """m"""
 NOISY_MISSIONS = 20
 """random missions with such ranges a round, in-process"""
+ROBOTS = 200
+"""in many pairs"""
+STARTED = 20
+"""robots that only start, and end: enough for the CPU of one"""
+MANY_MISSION = """
+[mission]
+sensing_range = 3.0
+period = 1.0
+max_speed = 1.0
+max_turn_rate = 3.141592653589793
+"""
+"""that of the paper's section IV"""
 BARE_IMPORTS = "import zenoh, numpy, scipy.optimize, msgspec"
 
 
@@ -60,8 +73,9 @@ def main(options: argparse.Namespace) -> int:
     """Measure and print."""
     need("cryptography", extra="deploy")
     rounds = options.rounds
-    with counting("tandem bench", 4 * rounds) as done:
-        tables = [_ticks(rounds, done), _missions(rounds, done), _noisy(rounds, done), _start(rounds, done)]
+    parts = (_ticks, _missions, _noisy, _start, _many)
+    with counting("tandem bench", len(parts) * rounds) as done:
+        tables = [part(rounds, done) for part in parts]
     for table in tables:
         Console().print(table)
     return LOCALISED
@@ -293,6 +307,52 @@ def _wall(command: Sequence[str]) -> float:
     began = time.perf_counter()
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     return time.perf_counter() - began
+
+
+# --- many robots ------------------------------------------------------------------------------------
+
+
+def _many(rounds: int, done: Callable[[], None]) -> Table:
+    """The whole of `tandem run` with ROBOTS robots, against one process; and what a robot's start costs."""
+    processes: list[float] = []
+    one: list[float] = []
+    starts: list[float] = []
+    with tempfile.TemporaryDirectory() as folder:
+        many, some, two = [Path(folder, f"{name}.toml") for name in ("many", "some", "two")]
+        many.write_text(_pairs(ROBOTS))
+        some.write_text(f"max_ticks = 1\n{_pairs(STARTED)}")
+        two.write_text(f"max_ticks = 1\n{_pairs(2)}")
+        for _ in range(rounds):
+            processes.append(_used(["run", str(many), "-q"])[0])
+            one.append(_used(["run", str(many), "-q", "--in-process"])[0])
+            more_s = _used(["run", str(some), "-q"])[1] - _used(["run", str(two), "-q"])[1]
+            starts.append(1e3 * more_s / (STARTED - 2))
+            done()
+    table = _table(f"Wall time of a whole command, {ROBOTS} robots")
+    _row(table, "tandem run, as processes (at most 6)", processes, "s")
+    _row(table, "the same with --in-process", one, "s")
+    _row(table, "as processes / in-process", [a / b for a, b in zip(processes, one, strict=True)], "")
+    _row(table, "CPU of a robot's start, first tick and end", starts, "ms")
+    return table
+
+
+def _pairs(robots: int) -> str:
+    """A scenario of so many robots, each pair on a line of its own."""
+    tables = [
+        f'[[robot]]\nid = "r{i}"\npeer = "r{i ^ 1}"\nanchor = [{10.0 * (i % 2)}, {40.0 * (i // 2)}]\n'
+        for i in range(robots)
+    ]
+    return f'name = "pairs"\nseed = {SEED}\n{MANY_MISSION}' + "".join(tables)
+
+
+def _used(arguments: Sequence[str]) -> tuple[float, float]:
+    """Seconds of wall time and of CPU that the command takes, with all its processes."""
+    began, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
+    command = [sys.executable, "-P", "-m", "compose", *arguments]
+    subprocess.run(command, check=False, stdout=subprocess.DEVNULL)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return time.perf_counter() - began, cpu
 
 
 # --- tables -----------------------------------------------------------------------------------------

@@ -5,12 +5,15 @@ from __future__ import annotations
 import argparse
 from contextlib import closing
 
+from compose import layout
 from compose.conformance import judged
 from compose.driving import briefed, driver_class, made, mission, options_of
 from compose.exercise import Broken, Trial
 from compose.scenario import check_rate
 from compose.status import CLEAN, VIOLATED
-from protocol.inbox import one_line
+from protocol.terminal import one_line, say
+
+MARKED = len("wrong  ")
 
 
 def main(options: argparse.Namespace) -> int:
@@ -27,9 +30,10 @@ def main(options: argparse.Namespace) -> int:
             trial.go_through()
         except Broken as broken:
             where = trial.tries[-1].what if trial.tries else "the start"
-            print(one_line(f"wrong  the exercise can be gone through: after '{where}': {broken}"))
+            say(f"wrong  the exercise can be gone through: after '{where}': {broken}")
             return VIOLATED
     found = judged(trial)
     for one in found:
-        print(one_line(f"wrong  {one.check}: {one.wrong}" if one.wrong else f"ok     {one.check}"))
+        line = f"wrong  {one.check}: {one.wrong}" if one.wrong else f"ok     {one.check}"
+        say(*layout.wrapped(one_line(line), MARKED))
     return VIOLATED if any(one.wrong for one in found) else CLEAN

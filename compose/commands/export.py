@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 from compose.exporting import MODULES, exported
@@ -11,6 +10,7 @@ from compose.lab import need
 from compose.status import ENDED, FAILED, STOPPED
 from compose.stop import stop_by_signal
 from protocol.inbox import Inbox, Interrupted
+from protocol.terminal import say
 
 
 def main(options: argparse.Namespace) -> int:
@@ -25,9 +25,9 @@ def main(options: argparse.Namespace) -> int:
         inbox.say(f"stopped by {signal_name}")
         return STOPPED
     for path in done.files:
-        print(path)
+        say(str(path))
     for name, size in done.torn.items():
-        print(f"{name} ends with {size} bytes of a torn write", file=sys.stderr)
+        say(f"{name} ends with {size} bytes of a torn write", error=True)
     for name in done.missing:
-        print(f"{name} is missing", file=sys.stderr)
+        say(f"{name} is missing", error=True)
     return FAILED if done.missing else ENDED

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,8 +13,8 @@ from compose.record import Record, agent_journal, legible, read
 from compose.robots import alone, casts
 from compose.status import ENDED, FAILED, UserError
 from compose.telling import counting
-from protocol.inbox import one_line
 from protocol.journal import CorruptJournal
+from protocol.terminal import say
 
 if TYPE_CHECKING:
     from compose.figures.account import Account
@@ -92,7 +91,7 @@ def draw(
                     _say(f"no {name}: {figure.why}")
                     continue
                 for path in style.save(figure, folder / name, formats):
-                    print(path, flush=True)
+                    say(str(path))
         done()
 
 
@@ -117,4 +116,4 @@ def _account(folder: Path, robot: str) -> Account | None:
 
 
 def _say(words: str) -> None:
-    print(one_line(f"tandem figures: {words}"), file=sys.stderr)
+    say(f"tandem figures: {words}", error=True)

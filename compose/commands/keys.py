@@ -6,6 +6,7 @@ import argparse
 
 from compose.lab import need
 from compose.status import ENDED, UserError
+from protocol.terminal import say
 
 
 def main(options: argparse.Namespace) -> int:
@@ -23,8 +24,8 @@ def main(options: argparse.Namespace) -> int:
     except OSError as error:
         raise UserError(f"{options.folder} cannot be written: {error.strerror or error}") from None
     if made:
-        print(f"made, for {options.days} days: {', '.join(made)}")
+        say(f"made, for {options.days} days: {', '.join(made)}")
     if kept:
-        print(f"kept, with their keys and names: {', '.join(kept)}")
-    print(f"copy each folder in {options.folder} to its machine only; ca-key.pem, which signs, to none")
+        say(f"kept, with their keys and names: {', '.join(kept)}")
+    say(f"copy each folder in {options.folder} to its machine only; ca-key.pem, which signs, to none")
     return ENDED

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import argparse
-import sys
+import json
 from collections.abc import Iterator
 
 import msgspec
 
-from compose import missions
+from compose import layout, missions
 from compose.linking import Unreached, linked
 from compose.missions import Mission, Participant
 from compose.reach import places
 from compose.status import ENDED, FAILED
-from protocol.inbox import one_line
+from protocol.terminal import one_line, say
 from protocol.wire import VERSION
+
+INDENT = 4
+"""of what is too long for a line"""
 
 
 def main(options: argparse.Namespace) -> int:
@@ -26,19 +29,19 @@ def main(options: argparse.Namespace) -> int:
             with linked(place) as link:
                 seen = missions.look(link, options.wait)
         except Unreached as error:
-            print(one_line(f"tandem ps: {error}"), file=sys.stderr)
+            say(f"tandem ps: {error}", error=True)
             status = FAILED
             continue
         found += [(str(place), mission) for mission in seen]
         if not seen and not options.json:
-            print(f"no mission at {place}")
+            say(f"no mission at {place}")
     if options.json:
         told = [{"at": at, **msgspec.to_builtins(one), "missing": one.missing} for at, one in found]
-        print(msgspec.json.format(msgspec.json.encode({"missions": told})).decode())
+        say(*json.dumps({"missions": told}, indent=2).replace("\x7f", "\\u007f").splitlines())
     else:
         for at, mission in found:
             for line in _lines(at, mission, options.wait):
-                print(one_line(line))
+                say(*layout.wrapped(one_line(line), INDENT))
     return status
 
 

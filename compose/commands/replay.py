@@ -8,7 +8,7 @@ from compose.audit.findings import Violation
 from compose.audit.replay import replay
 from compose.record import legible
 from compose.status import CLEAN, VIOLATED
-from protocol.inbox import one_line
+from protocol.terminal import say
 
 
 def main(options: argparse.Namespace) -> int:
@@ -17,17 +17,25 @@ def main(options: argparse.Namespace) -> int:
         played, torn = replay(options.record)
     if played.differences:
         first, *more = played.differences
-        print(f"{played.scenario}: not as recorded")
-        print(one_line(_difference(first)))
+        say(f"{played.scenario}: not as recorded")
+        say(_difference(first))
         if more:
-            print(f"and {len(more)} more, which `tandem audit` tells")
+            say(f"and {len(more)} more, which `tandem audit` tells")
+        if played.versions is not None:
+            say(f"{played.versions}: that alone can lead to other decisions")
+    elif played.rounding:
+        say(
+            f"{played.scenario}: as recorded but for the last bits, in {played.ticks} ticks: "
+            f"{played.rounding} of {played.checks} checks differ by rounding alone"
+        )
+        say(str(played.versions))
     else:
-        print(f"{played.scenario}: as recorded, to the bit, in {played.ticks} ticks ({played.checks} checks)")
+        say(f"{played.scenario}: as recorded, to the bit, in {played.ticks} ticks ({played.checks} checks)")
     for tear in played.tears:
-        print(f"{_where(tear)}: {tear.what}")
+        say(f"{_where(tear)}: {tear.what}")
     for name, size in torn.items():
         if size:
-            print(f"{name} ends with {size} bytes of a torn write")
+            say(f"{name} ends with {size} bytes of a torn write")
     return VIOLATED if played.differences else CLEAN
 
 

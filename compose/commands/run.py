@@ -21,19 +21,19 @@ from compose.stop import stop_by_signal
 from compose.telling import break_off, conclude, progress
 from protocol.inbox import Inbox, Interrupted
 from protocol.journal import CannotRecord
+from protocol.spelling import did_you_mean
 from world.scenario import Scenario
 
 
 def main(options: argparse.Namespace) -> int:
     """Play the mission, as processes or in this one."""
+    if not options.in_process:
+        local.fork_server()  # it imports while the launcher does
     found = setting(options.scenario, options.fault)
     scenario = found.seeded(options.seed)
     if options.out is not None and any(options.out.glob("*.journal")):
         raise UserError(f"--out: {options.out} holds a record already; choose another folder")
-    if options.port is not None and not options.watch:
-        raise UserError("--port: of the page, and there is none without --watch")
-    if options.foxglove is not None:
-        need("foxglove")
+    _check_viewers(options)
     if options.export:
         need(*exporting.MODULES)
         if options.out is None:
@@ -42,13 +42,18 @@ def main(options: argparse.Namespace) -> int:
     if options.secure:
         need("cryptography", extra="deploy")
     if options.in_process:
-        if options.secure:
-            raise UserError("--secure: --in-process has no network")
-        if kills:
-            where = "--kill" if options.kill else f"{options.scenario}: kill"
-            raise UserError(f"{where}: --in-process has no processes to kill")
-        return _in_process(options, scenario)
+        return _in_process(options, scenario, kills)
     return _as_processes(options, scenario, kills)
+
+
+def _check_viewers(options: argparse.Namespace) -> None:
+    """Raises UserError."""
+    if options.port is not None and not options.watch:
+        raise UserError("--port: of the page, and there is none without --watch")
+    if options.foxglove is not None:
+        need("foxglove")
+    elif options.foxglove_origin:
+        raise UserError("--foxglove-origin: of a page that shows what --foxglove serves, and there is none")
 
 
 def _kills(options: argparse.Namespace, found: Setting, scenario: Scenario) -> tuple[Kill, ...]:
@@ -56,15 +61,21 @@ def _kills(options: argparse.Namespace, found: Setting, scenario: Scenario) -> t
     ids = [robot.id for robot in scenario.robots]
     for kill in options.kill:
         if kill.who not in (*ids, WORLD):
+            near = did_you_mean(kill.who, [*ids, WORLD])
             raise UserError(
-                f"--kill: {kill.text}: there is no '{kill.who}'; there are {', '.join(ids)}, {WORLD}"
+                f"--kill: {kill.text}: there is no '{kill.who}'; there are {', '.join(ids)}, {WORLD}{near}"
             )
     return (*found.kills(scenario.seed), *options.kill)
 
 
-def _in_process(options: argparse.Namespace, scenario: Scenario) -> int:
+def _in_process(options: argparse.Namespace, scenario: Scenario, kills: tuple[Kill, ...]) -> int:
     from compose import inline  # noqa: PLC0415  # the launcher needs no planner
 
+    if options.secure:
+        raise UserError("--secure: --in-process has no network")
+    if kills:
+        where = "--kill" if options.kill else f"{options.scenario}: kill"
+        raise UserError(f"{where}: --in-process has no processes to kill")
     if options.rate is not None:
         raise UserError("--rate: --in-process knows no real time")
     if options.foxglove is not None:
@@ -138,7 +149,8 @@ def _shown(options: argparse.Namespace, scenario: Scenario, folder: Path) -> Ite
     """What is to show the mission that is recorded in `folder`: it is there, and where has been said."""
     wanted = [page(folder, options.port or 0)] if options.watch else []
     if options.foxglove is not None:
-        wanted.append(viewers(folder, options.foxglove, [robot.id for robot in scenario.robots]))
+        ids = [robot.id for robot in scenario.robots]
+        wanted.append(viewers(folder, options.foxglove, options.foxglove_origin, ids))
     with ExitStack() as stack:
         shows = [stack.enter_context(beside(*one)) for one in wanted]
         for show in shows:

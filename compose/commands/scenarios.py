@@ -8,14 +8,16 @@ from collections.abc import Mapping
 from itertools import takewhile
 from pathlib import Path
 
+from compose import layout
 from compose.scenario import shipped
 from compose.status import ENDED
+from protocol.terminal import say
 
 
 def main(_options: argparse.Namespace) -> int:
     """List the scenarios and the campaigns that ship, with the first sentence of each."""
     _list(shipped())
-    print("campaigns, for `tandem sweep`:")
+    say("campaigns, for `tandem sweep`:")
     _list(shipped("sweeps"))
     return ENDED
 
@@ -23,7 +25,8 @@ def main(_options: argparse.Namespace) -> int:
 def _list(files: Mapping[str, Path]) -> None:
     width = max(map(len, files))
     for name, path in files.items():
-        print(f"{name:{width}} {_sentence(path.read_text(encoding='utf-8'))}")
+        line = f"{name:{width}} {_sentence(path.read_text(encoding='utf-8'))}"
+        say(*layout.wrapped(line, width + 1))
 
 
 def _sentence(text: str) -> str:

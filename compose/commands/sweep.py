@@ -14,6 +14,7 @@ from compose.lab import need
 from compose.status import FAILED, LOCALISED, NOT_LOCALISED, STOPPED, UserError
 from compose.stop import stop_by_signal
 from protocol.inbox import Inbox
+from protocol.terminal import say
 
 if TYPE_CHECKING:
     from compose.campaign.run import Results
@@ -46,9 +47,12 @@ def main(options: argparse.Namespace) -> int:
             f"{results.stopped}: {len(results.table)} of {results.trials} trials are done; "
             "the same command goes on from there"
         )
+        if len(results.table) == results.trials:
+            report.show(results, out, quiet=True)
         return STOPPED if results.interrupted else FAILED
-    figures.draw(results, out / "figures")
     report.show(results, out, quiet=options.quiet)
+    sys.stdout.flush()
+    figures.draw(results, out / "figures")
     return status_of(results)
 
 
@@ -59,7 +63,7 @@ def print_trial(campaign: Campaign, cell: int, trial: int) -> int:
     found = next((one for one in cells(campaign) if one.index == cell), None)
     if found is None:
         raise UserError(f"--print-trial: {campaign.source} has no cell {cell}")
-    print(tomli_w.dumps(trial_table(campaign, found, trial)), end="")
+    say(*tomli_w.dumps(trial_table(campaign, found, trial)).splitlines())
     return LOCALISED
 
 

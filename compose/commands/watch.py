@@ -6,7 +6,6 @@ import argparse
 import errno
 import ipaddress
 import os
-import sys
 import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING
 from compose.beside import OVER
 from compose.lab import need
 from compose.status import ENDED, UserError
-from protocol.inbox import one_line
+from protocol.terminal import say
 
 if TYPE_CHECKING:
     from compose.watch.site import Site
@@ -38,7 +37,7 @@ def main(options: argparse.Namespace) -> int:
     else:
         shown = site.of_record(options.record) if options.launched else site.of_folder(options.record)
     for note in shown.notes:
-        print(one_line(f"tandem watch: {note}"), file=sys.stderr)
+        say(f"tandem watch: {note}", error=True)
     try:
         taken = server.bound(options.port or 0, options.address)
     except server.CannotServe as error:
@@ -47,16 +46,14 @@ def main(options: argparse.Namespace) -> int:
             what = f"--port: {options.port}"
         raise UserError(f"{what} cannot be had: {error.strerror}") from None
     if not ipaddress.ip_address(options.address).is_loopback:
-        print(f"tandem watch: --address: whoever reaches {options.address} can watch", file=sys.stderr)
+        say(f"tandem watch: --address: whoever reaches {options.address} can watch", error=True)
     if shown.waiting:
         os.nice(NICENESS)
 
     def ready(stop: Callable[[], None]) -> None:
         if options.launched:
             threading.Thread(target=_follow_launcher, args=(shown, stop), daemon=True).start()
-        print(
-            server.address(taken) if options.launched else f"{server.address(taken)} until Ctrl-C", flush=True
-        )
+        say(server.address(taken) if options.launched else f"{server.address(taken)} until Ctrl-C")
 
     shown.start()
     try:

@@ -18,11 +18,12 @@ from compose.scenario import check_rate, run_name, setting
 from compose.status import ENDED, FAILED, STOPPED, UserError
 from compose.stop import stop_by_signal, stop_with_launcher
 from compose.telling import break_off, conclude, going_on, progress
-from protocol import refusal, session
+from protocol import limits, refusal, session
 from protocol.endpoints import Endpoints
 from protocol.inbox import Inbox, Interrupted
 from protocol.journal import CannotRecord, CorruptJournal, Journal
 from protocol.retrace import Retrace
+from protocol.terminal import say
 from world.course import Course, again
 from world.process import LinkLost, WorldProcess
 from world.scenario import Scenario
@@ -45,6 +46,7 @@ def main(options: argparse.Namespace) -> int:
         endpoints = _endpoints(options)
         record = _record(options)
         course = again(scenario, record) if record is not None else None
+        limits.need_files(limits.SESSION_FILES + len(scenario.robots), "a world with a link to each robot")
         with ExitStack() as stack:
             wait = RELISTEN_S if record is not None else 0.0
             way = stack.enter_context(_Way(endpoints, options.patience, inbox, wait))
@@ -168,7 +170,7 @@ def _play(options: argparse.Namespace, course: Course, way: _Way, folder: Path, 
         robots = ", ".join(robot.id for robot in scenario.robots)
         where = f", again, at tick {course.tick}" if course.tick else ""
         at = " and ".join(way.endpoints.listen) or way.endpoints
-        print(f"run {run} at {at}{where}: waiting for {robots}", flush=True)
+        say(f"run {run} at {at}{where}: waiting for {robots}")
     try:
         with progress(options, scenario, folder):
             way.play(process)

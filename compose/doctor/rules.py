@@ -31,6 +31,8 @@ MATCHED_S = 0.5
 """how long a world may take to learn that somebody listens to its truth"""
 TICKS = 3
 """that go by after that before it counts that nothing was heard: a truth is said after the tick's Senses"""
+RING = 16
+"""samples that wait on a key, so that others' wildcards do not displace what is looked for"""
 NO_FRAME = b"?"
 RENEW = "the router must enforce the rules: start it by its zenoh.json5 as `tandem keys` left it"
 
@@ -48,7 +50,7 @@ class Pair(NamedTuple):
         for key in what.values():
             self.speaker.put(key, NO_FRAME)
         self._settle()
-        came = {name: sample for name, ear in ears.items() if (sample := ear.try_recv()) is not None}
+        came = {name: sample for name, ear in ears.items() if (sample := _under(what[name], ear)) is not None}
         for ear in ears.values():
             ear.undeclare()
         return came
@@ -114,7 +116,7 @@ def _forged(pair: Pair, who: str, me: str | None, other: str) -> Iterator[Findin
 
 
 def _runs(link: zenoh.Session) -> list[str]:
-    return [keys.run_of(key) for key in session.alive(link, keys.world_alive("*"), ASK_S)]
+    return [key.run for key in session.alive(link, keys.world_alive("*"), ASK_S)]
 
 
 def _overheard(pair: Pair, run: str, me: str, wait: float) -> Iterator[Finding]:
@@ -126,7 +128,7 @@ def _overheard(pair: Pair, run: str, me: str, wait: float) -> Iterator[Finding]:
         )
         return
     forbidden = {_short(key): key for key in (keys.truth(run), keys.drive(run, peer), keys.sense(run, peer))}
-    latest: Any = zenoh.handlers.RingChannel(1)
+    latest: Any = zenoh.handlers.RingChannel(RING)
     ears: dict[str, Any] = {
         name: pair.hearer.declare_subscriber(key, latest) for name, key in forbidden.items()
     }
@@ -138,9 +140,9 @@ def _overheard(pair: Pair, run: str, me: str, wait: float) -> Iterator[Finding]:
     while len(ticks) < TICKS and len(came) < len(ears) and now < until:
         time.sleep(LOOK_AGAIN_S)
         now = time.monotonic()
-        if (sample := own.try_recv()) is not None and now >= matched:
+        if (sample := _under(keys.sense(run, me), own)) is not None and now >= matched:
             ticks |= _ticks(sample.payload.to_bytes())
-        came |= {name for name, ear in ears.items() if ear.try_recv() is not None}
+        came |= {name for name, ear in ears.items() if _under(forbidden[name], ear) is not None}
     for one in (own, *ears.values()):
         one.undeclare()
     what = ", ".join(sorted(forbidden))
@@ -160,6 +162,12 @@ def _peer(link: zenoh.Session, run: str, me: str) -> str | None:
         return decode(answer, Briefing).peer if isinstance(answer, bytes) else None
     except MalformedFrame:
         return None
+
+
+def _under(key: str, ear: Any) -> zenoh.Sample | None:
+    """Return the next sample that came under `key` itself; what came under a wildcard tells nothing of it."""
+    samples: Iterator[zenoh.Sample] = iter(ear.try_recv, None)
+    return next((sample for sample in samples if str(sample.key_expr) == key), None)
 
 
 def _ticks(frame: bytes) -> set[int]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import NamedTuple
@@ -18,6 +17,7 @@ from compose.robots import pasts
 from compose.scene import recorded
 from compose.status import UserError
 from compose.ticks import Row, rows, rows_of, table
+from protocol import files
 from protocol.messages import Drive, Estimate
 
 
@@ -62,7 +62,7 @@ def export(
     check()
     run = recorded.read(folder)
     record.make(out)
-    mcap, frames, ticks, parquet = files = tuple([out / name for name in FILES])
+    mcap, frames, ticks, parquet = paths = tuple([out / name for name in FILES])
     writers: dict[Path, Callable[[Path], object]] = {
         mcap: lambda path: write_mcap(books, run, path, check),
         frames: lambda path: path.write_text(frames_csv(in_time(books), check), encoding="utf-8"),
@@ -72,7 +72,8 @@ def export(
     try:
         for path, write in writers.items():
             check()
-            _put(path, write)
+            with files.draft(path) as place:
+                write(place)
             done()
     except OSError as error:
         raise UserError(record.cannot_write(out, error)) from None
@@ -80,20 +81,10 @@ def export(
         raise UserError(str(error)) from None
     names = [record.agent_journal(robot) for robot in robots]
     return Exported(
-        files=files,
+        files=paths,
         torn={name: book.torn for name, book in books.items() if book.torn},
         missing=tuple([name for name in names if name not in books]),
     )
-
-
-def _put(path: Path, write: Callable[[Path], object]) -> None:
-    """What `write` leaves at a path, at this one: all of it, or what was there before."""
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        write(draft)
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)
 
 
 def _of_world(folder: Path, books: Collection[str]) -> tuple[list[str], _Ticks]:

@@ -10,11 +10,11 @@ import msgspec
 
 from compose.record import Book
 from protocol.journal import CorruptJournal
-from protocol.messages import Drive, End, Estimate, Farewell, Message, Missed, OfRobot, Sense
+from protocol.messages import Drive, End, Environment, Estimate, Farewell, Message, Missed, OfRobot, Sense
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, body, decode
 from world.scenario import Scenario
 
-OfWorld = Scenario | Drive | Missed | End | Farewell
+OfWorld = Environment | Scenario | Drive | Missed | End | Farewell
 """what stands in a world's journal"""
 KINDS = Scenario | OfRobot
 """what stands in a journal"""

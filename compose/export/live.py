@@ -1,6 +1,6 @@
 """A run served to Foxglove's viewers while it is played, by a process of its own that reads its journals.
 
-    python -m compose.export.live PORT FOLDER ROBOT ...
+    python -m compose.export.live PORT ORIGIN,... FOLDER ROBOT ...
 
 The mission knows nothing of it. What cannot be shown as fast as it happens is left out: the frames of every
 tick are told, but of a backlog only the latest tick is seen. It ends when its standard input does.
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import sys
 import time
 from collections.abc import Sequence
@@ -21,6 +22,7 @@ from foxglove import Context
 from foxglove.websocket import Capability, ChannelView, Client, ServerListener, WebSocketServer
 
 from compose.export.frames import Telling
+from compose.export.gate import Gate, private_host
 from compose.export.recording import Channels
 from compose.export.views import Views, nanoseconds
 from compose.record import WORLD_JOURNAL, agent_journal
@@ -30,6 +32,7 @@ from compose.scene.stage import Stage
 from compose.stop import stop_with_launcher
 from protocol.inbox import Inbox, Interrupted
 from protocol.journal import CorruptJournal, Tail
+from protocol.terminal import say
 
 HOST = "127.0.0.1"
 LOOK_S = 0.05
@@ -126,10 +129,11 @@ class _Door(ServerListener):
         self._live.asked = True
 
 
-def main(port: int, folder: Path, robots: Sequence[str]) -> int:
+def main(port: int, origins: Sequence[str], folder: Path, robots: Sequence[str]) -> int:
     """Serve until standard input ends. 1 if the port cannot be had.
 
     Channels are there before anyone can come: under load the SDK refuses who asks for one that is new.
+    Web pages of `origins` may look, too.
     """
     os.nice(NICE)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the launcher's to handle
@@ -139,20 +143,23 @@ def main(port: int, folder: Path, robots: Sequence[str]) -> int:
     channels = Channels(context)
     channels.open(robots)
     live = Live(folder, channels)
+    behind = private_host()
     try:
+        taken = socket.create_server((HOST, port))
         server = foxglove.start_server(
             name="tandem",
-            host=HOST,
-            port=port,
+            host=behind,
+            port=0,
             context=context,
             capabilities=[Capability.Time],
             server_listener=_Door(live),
             message_backlog_size=MESSAGES,
         )
     except Exception as error:  # noqa: BLE001  # the SDK's own, of no type of its own
-        print(f"--foxglove: port {port} cannot be served: {error}", file=sys.stderr)
+        say(f"--foxglove: port {port} cannot be served: {error}", error=True)
         return 1
-    print(f"ws://{HOST}:{server.port}", flush=True)
+    Gate(taken, (behind, server.port), origins).open()
+    say(f"ws://{HOST}:{taken.getsockname()[1]}")
     try:
         _serve(live, server, inbox)
     finally:
@@ -173,4 +180,5 @@ def _serve(live: Live, server: WebSocketServer, inbox: Inbox) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(int(sys.argv[1]), Path(sys.argv[2]), sys.argv[3:]))
+    _, where, pages, record, *ids = sys.argv
+    sys.exit(main(int(where), [one for one in pages.split(",") if one], Path(record), ids))

@@ -50,7 +50,8 @@ def draw(pair: Pair) -> Figure | Absent:
     """A panel a decision; as many as have room."""
     told = decisions(pair)
     if not told:
-        return Absent(NO_ENCOUNTER if pair.met is None else "they never weighed how both lie in the plane")
+        why = pair.unknown or "they never weighed how both lie in the plane"
+        return Absent(NO_ENCOUNTER if pair.met is None else why)
     shown = some(told)
     many = (
         f"{len(shown)} of {len(told)} decisions" if len(shown) < len(told) else f"all {len(told)} decisions"

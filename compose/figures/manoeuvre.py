@@ -56,8 +56,8 @@ def draw(pair: Pair) -> dict[str, Figure | Absent]:
         for one in planned(pair, role):
             found[f"{pair.robot(role).id}-{one.tick}"] = _figure(pair, one)
     if not found:
-        met = pair.met is not None
-        found[pair.name] = Absent("no last manoeuvre was planned" if met else NO_ENCOUNTER)
+        why = pair.unknown or "no last manoeuvre was planned"
+        found[pair.name] = Absent(NO_ENCOUNTER if pair.met is None else why)
     return found
 
 

@@ -30,7 +30,11 @@ MARKED = 90
 """points, of which each has room for its mark"""
 LEAST = 1e-16
 """what an error is drawn as that is less"""
-LINES = {"a": "-", "b": (0, (4, 1.5))}
+LINES: dict[Role, Any] = {"a": "-", "b": (0, (4, 1.5))}
+ALONE: dict[Role, Any] = {"a": "-.", "b": (0, (1, 1))}
+CLAIMED: dict[Role, Any] = {"a": (0, (6, 1.5, 1, 1.5, 1, 1.5)), "b": (0, (1, 3))}
+"""lines of the likeliest pose, before the encounter, and of sigmas: a's are solid or dashed and dotted, b's
+dashed or dotted, and no two are the same"""
 SIGMAS = 3.0
 ROOM = 4.0
 """how many times more, and less, than what is drawn the scale of errors goes"""
@@ -178,7 +182,7 @@ def _errors(axes: Axes, pair: Pair, role: Role, name: str, off: Callable[[Pose, 
         for one, truth in held
         if one.local and not one.world
     ]  # fmt: skip
-    _line(axes, alone, ls=":" if role == "a" else "-.", lw=1.1, color=colour, gid=f"{name}-alone-{role}",
+    _line(axes, alone, ls=ALONE[role], lw=1.1, color=colour, gid=f"{name}-alone-{role}",
           label=f"{robot.id}, seen from its anchor")  # fmt: skip
     single = [one for one in held if one[0].world and (one[0].odds or len(one[0].world) == 1)]
     others = [
@@ -197,8 +201,7 @@ def _errors(axes: Axes, pair: Pair, role: Role, name: str, off: Callable[[Pose, 
         for one, _ in single
         if (c := one.covariance) is not None
     ]
-    _line(axes, sigmas, lw=0.9,
-           ls="-." if role == "a" else (0, (1, 1)), color=colour, gid=f"{name}-sigma-{role}",
+    _line(axes, sigmas, lw=0.9, ls=CLAIMED[role], color=colour, gid=f"{name}-sigma-{role}",
           label=rf"{robot.id}, 3 $\sigma$ as claimed")  # fmt: skip
 
 

@@ -93,6 +93,18 @@ class Pair(msgspec.Struct, frozen=True, dict=True):
         return drives[tick] if tick < len(drives) else None
 
     @property
+    def unknown(self) -> str | None:
+        """The reason why what the two planned is not known to the end; none if it is."""
+        robots = [
+            side.id
+            for side in (self.a, self.b)
+            if side.account is None or side.account.broken is not None
+        ]  # fmt: skip
+        if not robots:
+            return None
+        return f"the journal of {' and '.join(robots)} is missing, or cannot be followed to its end"
+
+    @property
     def told(self) -> list[Role]:
         """Those whose journal can be read."""
         return [role for role in ROLES if self.robot(role).account is not None]

@@ -11,6 +11,8 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
+from compose.figures import FORMATS
+from protocol import files
 from protocol.mission import Role
 
 COLOURS: dict[Role, str] = {"a": "#0b62a4", "b": "#c4451c"}
@@ -36,18 +38,22 @@ _DATES: dict[str, dict[str, None]] = {"svg": {"Date": None}, "pdf": {"CreationDa
 def look(symbols: bool = False) -> AbstractContextManager[None]:
     """Matplotlib's settings, within which pictures are drawn and saved.
 
-    With that salt the same picture is the same bytes. Text is as it stands, `$` and `_` included; or, with
-    `symbols`, what is between two `$` is set as the paper sets it.
+    With that salt the same picture is the same bytes. Fonts are embedded as TrueType (42): publishers refuse
+    Type 3, matplotlib's default. Text is as it stands, `$` and `_` included; or, with `symbols`, what is
+    between two `$` is set as the paper sets it.
     """
-    return mpl.rc_context({"svg.hashsalt": "tandem", "font.size": 9, "text.parse_math": symbols})
+    return mpl.rc_context(
+        {"svg.hashsalt": "tandem", "pdf.fonttype": 42, "font.size": 9, "text.parse_math": symbols}
+    )
 
 
-def save(figure: Figure, path: Path, formats: Sequence[str] = ("svg", "png")) -> tuple[Path, ...]:
+def save(figure: Figure, path: Path, formats: Sequence[str] = FORMATS) -> tuple[Path, ...]:
     """In each of `formats`, `path` with that ending; none carries a date. Raises OSError."""
     _settle(figure)
     written = [path.with_name(f"{path.name}.{ending}") for ending in formats]
     for ending, place in zip(formats, written, strict=True):
-        figure.savefig(place, dpi=DPI, metadata=_DATES[ending])
+        with files.draft(place) as drawn:
+            figure.savefig(drawn, format=ending, dpi=DPI, metadata=_DATES[ending])
     return tuple(written)
 
 

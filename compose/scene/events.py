@@ -19,7 +19,7 @@ from protocol.motion import wrap
 Kind = Literal[
     "anchor", "anchor-lost", "contact", "contact-lost", "phase", "state", "branch", "candidates",
     "claim", "undecided", "alarm", "report-lost", "report-damaged", "report-late", "report-doubled",
-    "late", "end",
+    "late", "down", "back", "end",
 ]  # fmt: skip
 
 
@@ -29,7 +29,7 @@ class Event(msgspec.Struct, frozen=True):
     tick: int
     kind: Kind
     robot: str | None
-    """whom it concerns, first; none at the end"""
+    """whom it concerns, first; none is the world, or all"""
     text: str
 
 
@@ -37,6 +37,8 @@ def events(
     stage: Stage, before: Facts | None, now: Facts, passages: Sequence[Passage], end: End | None
 ) -> Iterator[Event]:
     """Robot by robot, then on the radio; `before` is the tick before, if it is known."""
+    for who in (None, *stage.ids):
+        yield from _presence(who, before, now)
     for seat in stage.robots:
         yield from _sensing(seat, before, now)
         yield from _deciding(seat, before, now)
@@ -45,6 +47,14 @@ def events(
     if end is not None and end.tick == now.tick:
         why = f" ({end.reason})" if end.reason else ""
         yield Event(now.tick, "end", None, f"The mission ends: {end.outcome}{why}")
+
+
+def _presence(who: str | None, before: Facts | None, now: Facts) -> Iterator[Event]:
+    name = who or "The world"
+    if who in now.down and (before is None or who not in before.down - before.back):
+        yield Event(now.tick, "down", who, f"{name} is down: its process is gone")
+    if who in now.back:
+        yield Event(now.tick, "back", who, f"{name} is back: its process runs again")
 
 
 def _radio(tick: int, passages: Sequence[Passage]) -> Iterator[Event]:

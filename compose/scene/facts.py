@@ -45,6 +45,10 @@ class Facts(msgspec.Struct, frozen=True):
     """robots that went without their peer's report, which did not come in time"""
     under_way: dict[Link, tuple[int, ...]] = msgspec.field(default_factory=dict)
     """the ticks of the reports that are on that link after this tick; known only to the world"""
+    down: set[str | None] = msgspec.field(default_factory=set)
+    """robots whose process was seen to be gone in this tick; none is the world's. No journal tells of it"""
+    back: set[str | None] = msgspec.field(default_factory=set)
+    """of these, those whose process was then seen again"""
 
 
 class Gathering:
@@ -57,18 +61,42 @@ class Gathering:
         self.end: End | None = None
         self.last = -1
         """the latest tick of which anything is known"""
+        self.has_truth = False
+        """whether the truth of any tick is known"""
+        self._seen: set[str | None] = set()
+        self.gone: set[str | None] = set()
+        """those whose process was seen, and is not there any more; none is the world's"""
         self.touched: int | None = None
         """the earliest tick of which something has become known since somebody last set this to none"""
 
     def at(self, tick: int) -> Facts:
         """What is known of `tick`, to be added to."""
+        down = self.gone if tick > self.last else ()
         self.last = max(self.last, tick)
         if self.touched is None or tick < self.touched:
             self.touched = tick
         known = self.ticks.get(tick)
         if known is None:
-            known = self.ticks[tick] = Facts(tick)
+            known = self.ticks[tick] = Facts(tick, down=set(down))
         return known
+
+    def present(self, who: str | None, there: bool) -> None:
+        """Fold in whether the process of a robot, or none for the world's, is there now.
+
+        One that has not been seen yet is not missed, nor one that has done its part.
+        """
+        if self.last < 0:
+            return
+        if there:
+            self._seen.add(who)
+            if who in self.gone:
+                self.gone.remove(who)
+                self.at(self.last).back.add(who)
+        elif who in self._seen - self.gone and self.end is None and who not in self.farewells:
+            self.gone.add(who)
+            now = self.at(self.last)
+            now.down.add(who)
+            now.back.discard(who)
 
     def take(self, message: Message, size: int, teller: str | None = None) -> None:
         """Fold in `message`, of a frame of `size` bytes; what is known already stays.
@@ -86,6 +114,7 @@ class Gathering:
                 self.at(tick).reports.setdefault(robot, Said(message, size))
             case Truth(tick, poses):
                 self.at(tick).truth.update(poses)
+                self.has_truth = True
             case Missed(tick, robot):
                 facts = self.at(tick)
                 (facts.late if teller is None else facts.without).add(teller or robot)

@@ -11,10 +11,12 @@ from compose.scene.facts import Gathering
 from compose.scene.scene import Scene, scene
 from compose.scene.stage import Stage, of_briefings, of_scenario
 from compose.summary import SUMMARY
+from protocol import files
+from protocol.environment import is_blank
 from protocol.journal import CorruptJournal, Tail
 from protocol.messages import End, Farewell, OfRobot
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
-from world.history import Reading, scenario_of
+from world.history import Reading, opened
 from world.tick import World, senses
 
 
@@ -70,6 +72,8 @@ class Journals:
         """journals that are damaged; what stands in one from there on is left out"""
         self._tails: dict[str, Tail] = {}
         self._world: Reading | None = None
+        self._head: list[bytes] = []
+        """of the world's journal, while its scenario has not come"""
 
     def read(self) -> None:
         """Fold in what has come since the last time. Raises OSError."""
@@ -113,13 +117,15 @@ class Journals:
 
     def _fold_world(self, frames: list[bytes], path: Path) -> None:
         if self._world is None:
-            if not frames:
+            frames = self._head + frames
+            if is_blank(frames):
+                self._head = frames
                 return
-            scenario = scenario_of(frames[0], path)
+            scenario, _, rest = opened(frames, path)
             self._world = Reading(scenario)
             self.stage = of_scenario(scenario, self._mode())
             self._show(self._world.world)
-            frames = frames[1:]
+            frames = list(rest)
         reading = self._world
         told = len(reading.ticks)
         for frame in frames:
@@ -144,6 +150,7 @@ class Journals:
         ids = [robot.id for robot in world.scenario.robots]
         facts = self.known.at(world.truth.tick)
         facts.truth.update(zip(ids, world.truth.poses, strict=True))
+        self.known.has_truth = True
         if world.air:
             links = [link for one, other in world.pairs for link in ((one, other), (other, one))]
             for (sender, receiver), air in zip(links, world.air, strict=True):
@@ -151,7 +158,7 @@ class Journals:
 
     def _mode(self) -> str | None:
         try:
-            told = msgspec.json.decode((self.folder / SUMMARY).read_bytes())
+            told = msgspec.json.decode(files.read_bytes(self.folder / SUMMARY))
             return str(told["mode"])
         except (OSError, msgspec.MsgspecError, TypeError, KeyError):
             return None

@@ -58,6 +58,8 @@ class Player(msgspec.Struct, frozen=True, omit_defaults=True):
     """the true one; its heading is wrapped"""
     sensed: bool = False
     """whether its Sense is known; if not, no range tells nothing"""
+    down: bool = False
+    """whether its process was seen to be gone, and has not been seen again"""
     executed: Controls | None = None
     """until this tick, as its odometry measured it"""
     anchor_range: float | None = None
@@ -96,7 +98,10 @@ def _player(seat: Seat, now: Facts) -> Player:
     pose, sense, said = now.truth.get(robot), now.senses.get(robot), now.reports.get(robot)
     drive, estimate = now.drives.get(robot), now.estimates.get(robot)
     sentence = f"{robot} has not answered"
-    if drive is not None:
+    down = robot in now.down - now.back
+    if down:
+        sentence = f"{robot} is down: its process is gone"
+    elif drive is not None:
         sentence = doing(seat, drive.phase, drive.state, drive.verdict)
     elif robot in now.late:
         sentence = f"{robot} has not answered in time, and stands still"
@@ -105,6 +110,7 @@ def _player(seat: Seat, now: Facts) -> Player:
         doing=sentence,
         pose=Pose(pose.x, pose.y, wrap(pose.heading)) if pose is not None else None,
         sensed=sense is not None,
+        down=down,
         executed=sense.executed if sense is not None else None,
         anchor_range=sense.anchor_range if sense is not None else None,
         contacts=sense.contacts if sense is not None else (),

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import csv
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from compose.status import UserError
+from protocol import files
 
 CAMPAIGN = "campaign.json"
 SUMMARY = "summary.csv"
@@ -24,7 +26,7 @@ def is_campaign(folder: Path) -> bool:
 def told(folder: Path) -> dict[str, Any]:
     """What there is to see, now: a sweep that is under way has no summary yet. Raises UserError."""
     try:
-        asked = msgspec.json.decode((folder / CAMPAIGN).read_bytes())
+        asked = msgspec.json.decode(files.read_bytes(folder / CAMPAIGN))
         campaign = asked["campaign"]
         axes = [
             {
@@ -37,8 +39,7 @@ def told(folder: Path) -> dict[str, Any]:
         ]
         rows: list[dict[str, str]] = []
         if (folder / SUMMARY).is_file():
-            with (folder / SUMMARY).open(newline="", encoding="utf-8") as file:
-                rows = list(csv.DictReader(file))
+            rows = list(csv.DictReader(StringIO(files.read_text(folder / SUMMARY), newline="")))
         return {
             "folder": str(folder),
             "name": campaign["name"],

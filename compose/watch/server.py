@@ -1,4 +1,4 @@
-"""Who serves the page: on loopback if not told otherwise, to whoever asks for it by that name.
+"""Who serves the page: on loopback if not told otherwise, to programs and to its own page.
 
 It reads, and writes nothing.
 """
@@ -17,14 +17,15 @@ from typing import Any
 import msgspec
 import uvicorn
 from starlette.applications import Starlette
+from starlette.datastructures import Headers
 from starlette.middleware import Middleware
-from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, Response, StreamingResponse
+from starlette.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from compose.origin import refusal
 from compose.scene.recorded import scenes
 from compose.status import UserError
 from compose.watch import campaign
@@ -40,12 +41,14 @@ IDLE_S = 0.5
 PLAYERS_AT_ONCE = 4000
 """robots times ticks in one answer: some megabytes, and some hundredths of a second of work"""
 HEADERS = {
-    b"content-security-policy": b"default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:",
+    b"content-security-policy": b"default-src 'self'; style-src 'self' 'unsafe-inline'; "
+    b"img-src 'self' data:; frame-ancestors 'none'",
+    b"cross-origin-resource-policy": b"same-origin",
     b"x-content-type-options": b"nosniff",
     b"referrer-policy": b"no-referrer",
     b"cache-control": b"no-store",
 }
-"""the page may ask nobody else for anything"""
+"""the page may ask nobody else for anything, and no other page may show it, or a part of it"""
 
 
 class CannotServe(OSError):
@@ -99,8 +102,8 @@ class _Answers:
         return StreamingResponse(told, media_type="text/event-stream")
 
 
-def application(site: Site, address: str = LOOPBACK) -> Starlette:
-    """The pages of `site`, for whoever asks for them by a name of loopback, or by `address`."""
+def application(site: Site) -> Starlette:
+    """The pages of `site`, for whoever asks for them by an address, and is no page of another."""
     answers = _Answers(site)
     return Starlette(
         routes=[
@@ -113,10 +116,25 @@ def application(site: Site, address: str = LOOPBACK) -> Starlette:
             Mount("/page", StaticFiles(directory=PAGE)),
         ],
         middleware=[
-            Middleware(TrustedHostMiddleware, allowed_hosts=[*{LOOPBACK, "localhost", host(address)}]),
             Middleware(_Sealed),
+            Middleware(_Own),
         ],
     )
+
+
+class _Own:
+    """Refuses what pages of others ask."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        headers = Headers(scope=scope)
+        why = refusal(headers.getlist("host"), headers.getlist("origin"))
+        if why is not None:
+            await PlainTextResponse(f"{why}\n", 403)(scope, receive, send)
+        else:
+            await self._app(scope, receive, send)
 
 
 class _Sealed:
@@ -148,6 +166,7 @@ def _state(show: Show) -> dict[str, Any]:
         "last": show.head,
         "first": next(iter(show.known.ticks), 0),
         "live": show.live,
+        "has_truth": show.known.has_truth,
         "end": show.known.end,
         "farewells": show.known.farewells,
         "notes": show.notes,
@@ -224,7 +243,7 @@ def serve(site: Site, taken: socket.socket, ready: Ready) -> None:
 async def _serve(site: Site, taken: socket.socket, ready: Ready) -> None:
     server = _Server(
         uvicorn.Config(
-            application(site, taken.getsockname()[0]),
+            application(site),
             log_config=None,
             lifespan="off",
             timeout_graceful_shutdown=1,

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import deque
+from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
-from compose.record import journals_in
+from compose.record import WORLD_JOURNAL, agent_journal, journals_in
 from compose.scene.facts import Gathering
 from compose.scene.recorded import Journals
 from compose.scene.stage import Stage
@@ -55,9 +57,12 @@ class Show(ABC):
 
     @property
     def head(self) -> int:
-        """The latest tick to show: while more may come, one in which every robot has answered."""
+        """The latest tick to show: while more may come, one in which every robot has answered.
+
+        While a process is gone, nothing more comes, but that it is.
+        """
         last = self.known.last
-        if not self.live or self.stage is None:
+        if not self.live or self.stage is None or self.known.gone:
             return last
         robots = len(self.stage.robots)
         for tick in range(last, max(last - UNANSWERED, -1), -1):
@@ -80,33 +85,56 @@ class Recorded(Show):
         self.live = True
         self._expected = expected
         self._over = False
+        self._writers: dict[str, int] = {}
+        """the process that was seen last to have a journal locked, by the journal's name"""
 
     def poll(self) -> None:
         """Fold in what has come. Raises OSError."""
-        written = self._expected or any(is_written(path) for path in journals_in(self.folder))
+        writers = writers_of(journals_in(self.folder))  # first: all that a process wrote that is gone is read
+        written = self._expected or bool(writers)
         if self._over and not written:
             return
         self._journals.read()
         self.stage = self._journals.stage
+        if written:
+            self._attend(writers)
         self.live = written and self.known.end is None
         self._over = not written  # until whoever went on with it writes again
         if self._over:
             self._journals.fill()
         self.revised()
 
+    def _attend(self, writers: dict[str, int]) -> None:
+        """Fold in whose process has ended, and whose is another since."""
+        robots = self.stage.ids if self.stage is not None else ()
+        for who, name in ((None, WORLD_JOURNAL), *((robot, agent_journal(robot)) for robot in robots)):
+            process = writers.get(name)
+            if process != self._writers.get(name):
+                self.known.present(who, False)
+            if process is not None:
+                self.known.present(who, True)
+                self._writers[name] = process
+
     def concluded(self) -> None:
         """Nobody writes it any more."""
         self._expected = False
 
 
-def is_written(path: Path) -> bool:
-    """Whether a process has the journal locked. To try to lock it could keep its writer from it."""
+def writers_of(journals: Iterable[Path]) -> dict[str, int]:
+    """Return the processes that have `journals` locked, by the journal's name.
+
+    To try to lock one could keep its writer from it.
+    """
     try:
-        inode = path.stat().st_ino
-        locks = LOCKS.read_text(encoding="ascii")
-    except OSError:  # no file, or a system that does not tell
-        return False
-    return any(line.split()[1] == "FLOCK" and f":{inode} " in line for line in locks.splitlines())
+        locks = [line.split() for line in LOCKS.read_text(encoding="ascii").splitlines()]
+    except OSError:  # a system that does not tell
+        return {}
+    by_inode = {lock[5].rpartition(":")[2]: int(lock[4]) for lock in locks if lock[1] == "FLOCK"}
+    found = {}
+    for path in journals:
+        with suppress(OSError, KeyError):
+            found[path.name] = by_inode[str(path.stat().st_ino)]
+    return found
 
 
 LOCKS = Path("/proc/locks")

@@ -1,7 +1,8 @@
 // What robots hold possible, and what they have just ruled out.
 
-import { compose, distance, ellipse, frame_of, step, TAU } from "./geometry.js";
-import { label, shape } from "./pen.js";
+import { between, compose, distance, ellipse, frame_of, step, TAU } from "./geometry.js";
+import { held_now } from "./held.js";
+import { cross, label, shape } from "./pen.js";
 import { odds } from "./words.js";
 
 const FADING = 3;
@@ -15,20 +16,19 @@ export class Beliefs {
     const { store, scene, truth, look, size, tick } = view;
     const player = scene.players[store.places.get(robot.id)], held = player?.held;
     if (!held) return this.#somewhere(view, robot, player);
-    const pen = this.plane.context, frame = frame_of(robot, truth);
-    const poses = held.world.length ? held.world : held.local.map((local) => compose(frame, local));
+    const pen = this.plane.context, { poses, covariance } = held_now(view, robot);
     if (!poses.length) return this.#somewhere(view, robot, player);
-    this.#ruled_out(view, robot, poses, tick);
-    if (!held.world.length && !truth) this.#any_bearing(view, robot, held);
+    this.#ruled_out(view, robot);
+    if (!held.world.length && !truth) this.#any_bearing(view, robot, poses[0]);
     poses.slice(0, 60).forEach((pose, place) => {
       const chance = held.odds[place] ?? 1 / poses.length;
       const [x, y] = this.plane.at(pose);
       pen.globalAlpha = 0.3 + 0.7 * Math.sqrt(chance);
-      if (place === 0 && held.covariance && held.world.length) this.#ellipse(pose, held.covariance, look);
+      if (place === 0 && covariance && held.world.length) this.#ellipse(pose, covariance, look);
       const grown = truth ? size * 1.45 : size * 1.15;
       shape(pen, robot.role, x, y, pose[2], grown);
       if (!truth && poses.length === 1) {
-        pen.fillStyle = look.phase[player.drive?.phase ?? 1];
+        pen.fillStyle = player.down ? look.paper : look.phase[store.phase(tick, robot.id)];
         pen.fill();
       }
       pen.strokeStyle = look.ghost;
@@ -39,7 +39,8 @@ export class Beliefs {
       if (held.odds.length > 1 && place < 6 && chance > 0.01 && size > 6) {
         label(pen, odds(chance), x - grown - 4, y + grown + 8, look.ghost, "right", look);
       }
-      if (!truth && place === 0) label(pen, robot.id, x + grown + 3, y - grown, look.ink, "left", look, look.bold);
+      if (!truth && place === 0 && player.down) cross(pen, x, y, grown, look);
+      if (!truth && place === 0) label(pen, player.down ? `${robot.id} is down` : robot.id, x + grown + 3, y - grown, look.ink, "left", look, look.bold);
     });
     pen.globalAlpha = 1;
     return undefined;
@@ -61,9 +62,9 @@ export class Beliefs {
   }
 
   /** Its place relative to its anchor is known, the bearing is not: the frame is turned at will. */
-  #any_bearing({ look }, robot, held) {
+  #any_bearing({ look }, robot, pose) {
     const pen = this.plane.context, [x, y] = this.plane.at(robot.anchor);
-    const radius = Math.hypot(held.local[0][0], held.local[0][1]) * this.plane.scale;
+    const radius = distance(pose, robot.anchor) * this.plane.scale;
     pen.beginPath();
     pen.arc(x, y, radius, 0, TAU);
     pen.strokeStyle = look.ghost;
@@ -77,8 +78,10 @@ export class Beliefs {
   }
 
   /** What was held possible up to FADING ticks ago, moved on, and is not any more. */
-  #ruled_out({ store, truth, look, size }, robot, poses, tick) {
+  #ruled_out(view, robot) {
+    const { store, truth, look, size, tick, share, moving } = view;
     const pen = this.plane.context, period = store.stage.mission.period;
+    const { poses } = held_now({ ...view, moving: false }, robot);
     for (let age = 1; age <= FADING && tick - age >= 0; age++) {
       const held = store.player(tick - age, robot.id)?.held;
       const later = store.player(tick - age + 1, robot.id)?.held;
@@ -95,7 +98,8 @@ export class Beliefs {
           if (k === tick - age + 1 && has.some((one) => distance(one, pose) < 0.15)) { pose = null; break; }
         }
         if (!pose || poses.some((one) => distance(one, pose) < 0.15)) continue;
-        const [x, y] = this.plane.at(pose), r = 0.7 * size;
+        if (moving) pose = between(pose, null, store.player(tick + 1, robot.id)?.executed, share, period);
+        const [x, y] = this.plane.at(pose);
         pen.globalAlpha = 0.75 / age;
         shape(pen, robot.role, x, y, pose[2], size * 1.3);
         pen.strokeStyle = look.ghost;
@@ -103,11 +107,7 @@ export class Beliefs {
         pen.setLineDash([2, 3]);
         pen.stroke();
         pen.setLineDash([]);
-        pen.strokeStyle = look.fault;
-        pen.lineWidth = 2;
-        pen.beginPath();
-        pen.moveTo(x - r, y - r); pen.lineTo(x + r, y + r); pen.moveTo(x + r, y - r); pen.lineTo(x - r, y + r);
-        pen.stroke();
+        cross(pen, x, y, size, look);
       }
       pen.globalAlpha = 1;
     }

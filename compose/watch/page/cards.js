@@ -1,6 +1,7 @@
 // Beside the plane: what each robot does, in words; what came in, what it decides, what it believes and has counted.
 
 import { distance, wrap } from "./geometry.js";
+import { leads } from "./held.js";
 import { metres, odds, PHASES, place, plural, rad, speed, turning } from "./words.js";
 
 const MOST_ODDS = 5;
@@ -46,8 +47,8 @@ export class Cards {
       card.draw(store, tick, truth, focus === robot.id);
     }
     for (const [id, entry] of this.entries ?? []) {
-      const player = store.player(tick, id), phase = player?.drive?.phase ?? 0;
-      const text = `${id} ${player?.drive?.state ?? "–"}`;
+      const player = store.player(tick, id), phase = player ? store.phase(tick, id) : 0;
+      const text = `${id} ${player?.down ? "is down" : player?.drive?.state ?? "–"}`;
       if (entry.textContent !== text) entry.textContent = text;
       entry.dataset.phase = phase;
       entry.setAttribute("aria-pressed", String(id === focus));
@@ -90,11 +91,14 @@ class Card {
     this.name.title = chosen ? "Show all robots (A)" : `Show what ${this.robot.id} knows`;
     if (!player) return void (this.doing.textContent = "…");
     const { drive, held } = player;
-    this.root.dataset.phase = drive?.phase ?? 0;
-    this.phase.textContent = drive ? `phase ${drive.phase}: ${PHASES[drive.phase]}` : "";
+    const phase = store.phase(tick, this.robot.id);
+    this.root.dataset.phase = phase;
+    this.root.classList.toggle("down", Boolean(player.down));
+    this.phase.textContent = `phase ${phase}: ${PHASES[phase]}${player.down ? "; down" : ""}`;
     if (this.doing.textContent !== player.doing) this.doing.textContent = player.doing;
-    this.error.textContent = truth && player.pose && held?.world.length
-      ? `${metres(distance(held.world[0], player.pose))} off` : "";
+    const [off, range] = truth && player.pose && held?.world.length ? error(held, player.pose) : ["", ""];
+    this.error.textContent = off;
+    this.error.title = range;
     this.#row("senses", inputs(player, this.robot));
     this.#row("hears", hears(player, this.robot));
     this.#row("decides", drive ? decides(drive) : "–");
@@ -117,6 +121,13 @@ class Card {
       bar.lastChild.textContent = odds(chance);
     });
   }
+}
+
+/** How far it is from where it takes itself to be; of several poses none of which leads, from the farthest. */
+function error(held, pose) {
+  const off = held.world.map((one) => distance(one, pose)), least = metres(Math.min(...off)), most = metres(Math.max(...off));
+  if (leads(held)) return [`${metres(off[0])} off`, ""];
+  return [`up to ${most} off`, `${least} to ${most}: ${off.length} poses are possible, and none is likelier than the others together`];
 }
 
 function inputs(player, robot) {

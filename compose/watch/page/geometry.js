@@ -35,12 +35,13 @@ export function ellipse([xx, xy, , yy], sigmas) {
   return { major: root(mean + spread), minor: root(mean - spread), turn: Math.atan2(2 * xy, xx - yy) / 2 };
 }
 
-/** The pose between two ticks, a share of the way along what was driven. */
+/** The pose between two ticks, a share of the way along what was driven; as driven, if none is known in the next. */
 export function between(from, to, driven, share, period) {
-  if (!to || share <= 0) return from;
-  if (!driven) return share < 1 ? from : to;
+  if (share <= 0) return from;
+  if (!driven) return share < 1 || !to ? from : to;
   const [v, omega] = driven;
   const end = step(from, v, omega, period), now = step(from, v, omega, period * share);
+  if (!to) return now;
   return [
     now[0] + share * (to[0] - end[0]),
     now[1] + share * (to[1] - end[1]),

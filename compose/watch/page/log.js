@@ -18,22 +18,23 @@ export class Log {
     this.store = store;
     this.events = [];
     this.read = 0;
-    this.revision = store.revision;
     this.dirty = true;
   }
 
   #read() {
     const { store } = this;
-    if (store.revision !== this.revision || store.whole < this.read) {
-      this.revision = store.revision;
-      this.read = Math.min(this.read, store.whole);
-      while (this.events.length && this.events.at(-1).tick >= this.read) this.events.pop();
-      this.dirty = true;
-    }
     for (; this.read < store.whole; this.read++) {
       const events = store.scene(this.read)?.events ?? [];
       if (events.length) { this.events.push(...events); this.dirty = true; }
     }
+  }
+
+  /** What has been read of `tick` and later is not so any more. */
+  forget(tick) {
+    if (tick >= this.read) return;
+    this.read = tick;
+    while (this.events.length && this.events.at(-1).tick >= tick) this.events.pop();
+    this.dirty = true;
   }
 
   #wanted(event, focus) {
@@ -58,7 +59,7 @@ export class Log {
     let now = wanted.findIndex((event) => event.tick >= tick);
     if (now < 0) now = wanted.length;
     const from = Math.max(0, now - NEAR), shown = wanted.slice(from, now + NEAR);
-    const key = `${from}/${shown.length}/${shown[0]?.tick}/${shown.at(-1)?.tick}/${shown.at(-1)?.text}/${focus}/${truth}`;
+    const key = `${from}/${focus}/${truth}/${shown.map((event) => event.tick + event.text).join("/")}`;
     if (key !== this.key) {
       this.key = key;
       this.root.replaceChildren(...shown.map((event) => this.#item(event, truth)));

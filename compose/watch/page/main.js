@@ -2,6 +2,7 @@
 
 import { campaign } from "./campaign.js";
 import { Cards, make } from "./cards.js";
+import { leads } from "./held.js";
 import { Log } from "./log.js";
 import { Plane } from "./plane.js";
 import { Store } from "./store.js";
@@ -14,8 +15,13 @@ const TELL_MS = 900;
 
 const $ = (id) => document.getElementById(id);
 const still = matchMedia("(prefers-reduced-motion: reduce)");
-const view = { tick: 0, share: 0, playing: false, follow: true, focus: null, truth: true, moving: false, speed: USUAL };
 let store = null;
+const view = {
+  tick: 0, share: 0, playing: false, follow: true, focus: null, moving: false, speed: USUAL,
+  wanted: true,
+  /** Whether the truth is shown: where it is not known, there is only what robots believe. */
+  get truth() { return this.wanted && (store?.has_truth ?? true); },
+};
 let listed = null;
 let source = null;
 let due = false;
@@ -46,7 +52,7 @@ function tell_address() {
   if (listed && listed.shows.length > 1) said.set("show", store.name);
   if (!(view.follow && store.live)) said.set("tick", view.tick);
   if (view.focus) said.set("robot", view.focus);
-  if (!view.truth) said.set("truth", "0");
+  if (!view.wanted) said.set("truth", "0");
   const hash = `#${said}`;
   if (location.hash !== hash && (location.hash || String(said))) history.replaceState(null, "", hash);
 }
@@ -101,10 +107,11 @@ async function open(name) {
     store?.close();
     store = new Store(name, await answer.json(), draw);
     store.onstage = staged;
+    store.onforget = (tick) => { timeline.forget(tick); log.forget(tick); };
     const { tick, robot, truth } = asked();
     view.follow = tick === null;
     view.tick = tick ?? (store.live ? Math.max(store.last, 0) : store.first);
-    view.truth = truth;
+    view.wanted = truth;
     view.playing = false;
     view.focus = store.places.has(robot) ? robot : null;
     staged();
@@ -250,16 +257,17 @@ function controls() {
   $("follow").hidden = !store.live;
   $("follow").setAttribute("aria-pressed", String(view.follow));
   $("truth").checked = view.truth;
+  $("truth").disabled = !store.has_truth;
   if ($("robot").value !== (view.focus ?? "")) $("robot").value = view.focus ?? "";
   if ($("speed").value !== String(view.speed)) $("speed").value = String(view.speed);
   const notes = store.state.notes.join(" · ");
   text($("notes"), notes);
   $("notes").hidden = !notes;
   const who = view.focus ?? "each robot";
-  const untold = store.scene(view.tick)?.players.every((player) => !player.pose);
-  const seen = view.truth && untold ? `the truth is not on record: only what ${who} knows` : view.truth ? (view.focus ? `the truth, and what ${who} believes` : "") :
-    `only what ${who} knows${knows_bearing() ? "" : "; before it is placed, its anchor's frame is turned at will"}`;
-  text($("seen"), seen);
+  const placed = knows_bearing() ? "" : "; before it is placed, its anchor's frame is turned at will";
+  const alone = `${store.has_truth ? "" : "the truth is not on record: "}only what ${who} knows${placed}`;
+  const untold = store.scene(view.tick)?.players.every((player) => !player.pose) ? "the truth of this tick is not known" : "";
+  text($("seen"), !view.truth ? alone : untold || (view.focus ? `the truth, and what ${who} believes` : ""));
   $("canvas").setAttribute("aria-label", described());
 }
 
@@ -273,8 +281,9 @@ function described() {
   if (!scene) return `Tick ${view.tick}, not here yet`;
   const shown = scene.players.filter((player) => !view.focus || player.robot === view.focus).slice(0, 4);
   const at = shown.map((player) => {
-    const pose = view.truth ? player.pose : player.held?.world[0];
-    return pose ? `${player.robot} at ${place(pose)}, heading ${rad(pose[2])}` : `${player.robot} nowhere known`;
+    const { robot, held } = player, pose = view.truth ? player.pose : held && leads(held) ? held.world[0] : null;
+    if (pose) return `${robot} at ${place(pose)}, heading ${rad(pose[2])}`;
+    return held?.world.length > 1 ? `${robot} at one of ${held.world.length} places` : `${robot} nowhere known`;
   });
   return `The plane at tick ${view.tick}: ${at.join("; ")}`;
 }
@@ -314,7 +323,7 @@ function pace(direction) {
 }
 
 function show_truth(on) {
-  view.truth = on;
+  if (store.has_truth) view.wanted = on;
   draw();
 }
 
@@ -323,11 +332,28 @@ function fit() {
   draw();
 }
 
+/** Whether what has the keyboard needs that key for itself. */
+function needed({ target, key }) {
+  const { tagName, type } = target;
+  if (tagName === "SELECT") {
+    return ["ArrowUp", "ArrowDown", "Enter"].includes(key) || (target === $("robot") ? /^[\w-]$/ : /^\d$/).test(key);
+  }
+  return [" ", "Enter"].includes(key) && (["BUTTON", "A"].includes(tagName) || (tagName === "INPUT" && type === "checkbox"));
+}
+
+/** What was clicked or chosen with the pointer gives the keyboard back: space then plays, and does not repeat it. */
+let pointing = false;
+for (const [name, on] of [["pointerdown", true], ["keydown", false]]) document.addEventListener(name, () => { pointing = on; }, true);
+for (const name of ["click", "change"]) {
+  document.addEventListener(name, ({ target }) => {
+    const control = target.closest("button, a, select, input[type=checkbox]");
+    if (pointing && control && (name === "change" || control.tagName !== "SELECT")) control.blur();
+  });
+}
+
 function pressed(event) {
   if (!store || event.ctrlKey || event.metaKey || event.altKey || $("keys").open) return;
-  const { tagName, type } = event.target, typing = tagName === "SELECT";
-  const on_button = tagName === "BUTTON" || (tagName === "INPUT" && type === "checkbox") || tagName === "A";
-  if (typing || (on_button && [" ", "Enter"].includes(event.key))) return;
+  if (needed(event)) return;
   const far = event.shiftKey ? 10 : 1;
   const deeds = {
     " ": () => play(), ArrowLeft: () => go(view.tick - far), ArrowRight: () => go(view.tick + far),
@@ -373,7 +399,7 @@ window.addEventListener("hashchange", () => {
   const { show, tick, robot, truth } = asked();
   if (!store || (show || store.name) !== store.name || (!show && listed?.shows.length > 1)) return void (listed && on_list(listed));
   view.focus = store.places.has(robot) ? robot : null;
-  view.truth = truth;
+  view.wanted = truth;
   if (tick !== null) go(tick);
   else draw();
 });

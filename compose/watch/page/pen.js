@@ -20,6 +20,16 @@ export function shape(pen, role, x, y, heading, size) {
   pen.closePath();
 }
 
+/** Crossed out. */
+export function cross(pen, x, y, size, look) {
+  const r = 0.7 * size;
+  pen.strokeStyle = look.fault;
+  pen.lineWidth = 2;
+  pen.beginPath();
+  pen.moveTo(x - r, y - r); pen.lineTo(x + r, y + r); pen.moveTo(x + r, y - r); pen.lineTo(x - r, y + r);
+  pen.stroke();
+}
+
 export function label(pen, text, x, y, colour, align, look, font = look.font) {
   pen.font = font;
   pen.textAlign = align;

@@ -2,7 +2,7 @@
 
 import { Beliefs } from "./beliefs.js";
 import { between, TAU } from "./geometry.js";
-import { label, Look, shape, unit } from "./pen.js";
+import { cross, label, Look, shape, unit } from "./pen.js";
 import { Signals } from "./signals.js";
 import { Trails } from "./trails.js";
 import { metres } from "./words.js";
@@ -206,27 +206,28 @@ export class Plane {
   #place({ store, scene, tick, share, moving }, robot) {
     const player = scene.players[store.places.get(robot.id)];
     if (!player?.pose) return null;
-    if (!moving) return player.pose;
     const next = store.player(tick + 1, robot.id);
-    return between(player.pose, next?.pose, next?.executed, share, store.stage.mission.period);
+    if (!moving || !next?.pose) return player.pose;
+    return between(player.pose, next.pose, next.executed, share, store.stage.mission.period);
   }
 
-  #robot({ look, size, focus, scene, store }, robot, pose) {
+  #robot({ look, size, focus, scene, store, tick }, robot, pose) {
     if (!pose) return;
     const pen = this.context, [x, y] = this.at(pose);
-    const phase = scene.players[store.places.get(robot.id)]?.drive?.phase ?? 1;
+    const down = scene.players[store.places.get(robot.id)]?.down;
     pen.globalAlpha = focus && robot.id !== focus && robot.peer !== focus ? 0.45 : 1;
     shape(pen, robot.role, x, y, pose[2], size);
     pen.lineWidth = size > 6 ? 4.5 : 3;
     pen.strokeStyle = look.paper;
     pen.stroke();
-    pen.fillStyle = look.phase[phase];
+    pen.fillStyle = down ? look.paper : look.phase[store.phase(tick, robot.id)];
     pen.fill();
-    pen.lineWidth = size > 6 ? 1.6 : 1;
-    pen.strokeStyle = look.ink;
+    pen.lineWidth = down ? 3 : size > 6 ? 1.6 : 1;
+    pen.strokeStyle = down ? look.phase[store.phase(tick, robot.id)] : look.ink;
     pen.stroke();
-    if (size > 6 || robot.id === focus) {
-      label(pen, robot.id, x + size + 4, y - size - 2, look.ink, "left", look, look.bold);
+    if (down) cross(pen, x, y, size, look);
+    if (size > 6 || down || robot.id === focus) {
+      label(pen, down ? `${robot.id} is down` : robot.id, x + size + 4, y - size - 2, look.ink, "left", look, look.bold);
     }
     pen.globalAlpha = 1;
   }

@@ -1,27 +1,37 @@
 // What robots measure, and what they say to each other.
 
-import { compose, distance, frame_of, TAU } from "./geometry.js";
+import { distance, TAU } from "./geometry.js";
+import { held_now, leads } from "./held.js";
 import { label } from "./pen.js";
 import { metres } from "./words.js";
+
+const MOST_ORIGINS = 6;
+
+/** What is measured in a tick fades until the next. */
+const fading = (share, moving) => (moving ? Math.max(0, 1 - 1.6 * share) : 1);
 
 export class Signals {
   constructor(plane) { this.plane = plane; }
 
-  #origin({ truth, scene, store, places }, robot) {
-    if (truth) return places.get(robot.id);
-    const held = scene.players[store.places.get(robot.id)]?.held;
-    if (!held) return null;
-    if (held.world.length) return held.world[0];
-    return held.local.length ? compose(frame_of(robot, false), held.local[0]) : null;
+  /** Where a robot may have been when it measured, the likeliest first: all of them, if none is that. */
+  #origins(view, robot) {
+    const held = view.scene.players[view.store.places.get(robot.id)]?.held;
+    if (!held) return [];
+    return held_now({ ...view, moving: false }, robot).poses.slice(0, leads(held) ? 1 : MOST_ORIGINS);
   }
 
   anchor_range(view, robot) {
     const { scene, store, look, share, moving } = view;
     const range = scene.players[store.places.get(robot.id)]?.anchor_range;
-    const pose = view.truth ? scene.players[store.places.get(robot.id)]?.pose : this.#origin(view, robot);
-    if (range === undefined || !pose) return;
+    const true_pose = scene.players[store.places.get(robot.id)]?.pose;
+    const poses = view.truth ? [true_pose].filter(Boolean) : this.#origins(view, robot);
+    if (range === undefined || !poses.length) return;
+    for (const pose of poses) this.#anchor_line(pose, robot, range, look, fading(share, moving));
+  }
+
+  #anchor_line(pose, robot, range, look, alpha) {
     const pen = this.plane.context, from = this.plane.at(pose), to = this.plane.at(robot.anchor);
-    pen.globalAlpha = moving ? Math.max(0, 1 - 1.6 * share) : 1;
+    pen.globalAlpha = alpha;
     pen.beginPath();
     pen.moveTo(...from); pen.lineTo(...to);
     pen.strokeStyle = look.range;
@@ -35,25 +45,24 @@ export class Signals {
 
   /** Without the truth, a range to the peer is a ring. */
   mutual_ring(view, robot) {
-    const { scene, store, look } = view;
+    const { scene, store, look, share, moving } = view;
     const contact = scene.players[store.places.get(robot.id)]?.contacts?.[0];
-    const pose = this.#origin(view, robot);
-    if (!contact || contact[1] === null || !pose) return;
-    const pen = this.plane.context, [x, y] = this.plane.at(pose), radius = contact[1] * this.plane.scale;
-    const held = scene.players[store.places.get(robot.id)].held;
-    const poses = held.world.length > 1 && held.world.length <= 6 ? held.world : [pose];
+    const poses = this.#origins(view, robot);
+    if (!contact || contact[1] === null || !poses.length) return;
+    const pen = this.plane.context, radius = contact[1] * this.plane.scale;
+    pen.globalAlpha = fading(share, moving) * (poses.length > 1 ? 0.6 : 1);
     pen.strokeStyle = look.link;
     pen.lineWidth = 1.5;
     pen.setLineDash([6, 5]);
-    for (const one of poses) {
-      pen.globalAlpha = one === poses[0] ? 1 : 0.45;
+    for (const pose of poses) {
       pen.beginPath();
-      pen.arc(...this.plane.at(one), radius, 0, TAU);
+      pen.arc(...this.plane.at(pose), radius, 0, TAU);
       pen.stroke();
     }
-    pen.globalAlpha = 1;
     pen.setLineDash([]);
+    const [x, y] = this.plane.at(poses[0]);
     label(pen, `${contact[0]}: ${metres(contact[1])}`, x, y + radius + 14, look.link, "center", look);
+    pen.globalAlpha = 1;
   }
 
   contact(view, robot) {

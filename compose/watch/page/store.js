@@ -14,6 +14,7 @@ export class Store {
     this.wanted = 0;
     this.closed = false;
     this.revision = 0;
+    this.onforget = () => {};
     this.#changed = changed;
     this.#counts = told.stage.robots.map(() => []);
     this.#fill();
@@ -29,6 +30,8 @@ export class Store {
   get last() { return this.state.last; }
   get first() { return this.state.first; }
   get live() { return this.state.live; }
+  /** Whether the truth of any tick is known. */
+  get has_truth() { return this.state.has_truth; }
   get end() { return this.state.end && { tick: this.state.end[1], outcome: this.state.end[2], reason: this.state.end[3] }; }
   /** Every tick before this one is there. */
   get whole() { return this.#whole; }
@@ -41,6 +44,15 @@ export class Store {
   scene(tick) { return this.scenes[tick]; }
 
   player(tick, robot) { return this.scenes[tick]?.players[this.places.get(robot)]; }
+
+  /** The phase in which a robot is; in a tick in which it has decided nothing, that of before. */
+  phase(tick, robot) {
+    for (let k = tick; k >= this.first; k--) {
+      const drive = this.player(k, robot)?.drive;
+      if (drive) return drive.phase;
+    }
+    return 1;
+  }
 
   /** The tick has something to show, or is being fetched. */
   want(tick) {
@@ -76,6 +88,7 @@ export class Store {
       this.revision += 1;
     }
     this.#whole = Math.min(this.#whole, from);
+    this.onforget(from);
     for (const counts of this.#counts) counts.length = Math.min(counts.length, from);
   }
 

@@ -1,8 +1,9 @@
 // The time line: a band a robot, its phases; contact shaded across; faults, claims and the end marked above.
 
 import { unit } from "./pen.js";
-import { FAULTS } from "./words.js";
+import { FAULTS, SIGNS } from "./words.js";
 
+const MARKED = Object.fromEntries(["contact", "claim", "alarm", "undecided", "down", "back"].map((kind) => [kind, SIGNS[kind]]));
 const MOST_BANDS = 6;
 const MARKS = 15;
 
@@ -35,7 +36,6 @@ export class Timeline {
   stage(store) {
     this.store = store;
     this.read = 0;
-    this.revision = store.revision;
     this.spans = new Map(store.stage.robots.map((robot) => [robot.id, []]));
     this.contacts = new Map(store.stage.robots.map((robot) => [robot.id, []]));
     this.marks = [];
@@ -44,23 +44,24 @@ export class Timeline {
   /** Fold in the scenes that have come. */
   #read() {
     const { store } = this;
-    if (store.revision !== this.revision || store.whole < this.read) this.#back_to(store.whole);
-    this.revision = store.revision;
     for (; this.read < store.whole; this.read++) {
       const scene = store.scene(this.read);
       if (!scene) continue;
       for (const player of scene.players) {
-        lengthen(this.spans.get(player.robot), this.read, player.drive?.phase ?? 0);
+        const spans = this.spans.get(player.robot), phase = player.drive?.phase ?? Math.abs(spans.at(-1)?.value ?? 1);
+        lengthen(spans, this.read, player.down ? -phase : phase);
         if (player.contacts?.length) lengthen(this.contacts.get(player.robot), this.read, 1);
       }
       for (const event of scene.events) {
         if (FAULTS.has(event.kind)) this.marks.push([this.read, "fault", event.robot]);
-        else if (["contact", "claim", "undecided", "alarm"].includes(event.kind)) this.marks.push([this.read, event.kind, event.robot]);
+        else if (event.kind in MARKED) this.marks.push([this.read, event.kind, event.robot]);
       }
     }
   }
 
-  #back_to(tick) {
+  /** What has been read of `tick` and later is not so any more. */
+  forget(tick) {
+    if (tick >= this.read) return;
     for (const spans of [...this.spans.values(), ...this.contacts.values()]) {
       while (spans.length && spans.at(-1).from >= tick) spans.pop();
       if (spans.length) spans.at(-1).to = Math.min(spans.at(-1).to, tick - 1);
@@ -103,13 +104,18 @@ export class Timeline {
       pen.fillStyle = of("grid");
       pen.fillRect(x(0), y, x(this.last) - x(0), band);
       for (const { from, to, value } of this.spans.get(robot.id)) {
-        if (!value) continue;
         const left = x(from), width = Math.max(x(Math.min(to + 1, this.last)) - left, 1.5);
-        pen.fillStyle = of(`phase-${value}`);
-        const inner = { 1: 0.4, 2: 0.62, 3: 1 }[value] * band;
-        pen.fillRect(left, y + (band - inner) / 2, width, inner);
+        const phase = Math.abs(value), inner = { 1: 0.4, 2: 0.62, 3: 1 }[phase] * band;
+        pen.fillStyle = pen.strokeStyle = of(`phase-${phase}`);
+        if (value < 0) {
+          pen.lineWidth = 1;
+          pen.strokeRect(left + 0.5, y + (band - inner) / 2 + 0.5, Math.max(width - 1, 0.5), inner - 1);
+        } else {
+          pen.fillRect(left, y + (band - inner) / 2, width, inner);
+        }
         if (width > 54) {
           pen.fillStyle = value === 3 ? of("paper") : of("faint");
+          if (value < 0) pen.fillText("down", left + 5, y + band - 3.5);
           if (value === 3) pen.fillText(`phase ${value}`, left + 5, y + band - 3.5);
         }
       }
@@ -119,10 +125,10 @@ export class Timeline {
       }
     });
     for (const [k, kind, robot] of this.marks) {
-      if (!ids.has(robot)) continue;
+      if (robot !== null && !ids.has(robot)) continue;
       pen.textAlign = "center";
-      pen.fillStyle = kind === "fault" || kind === "alarm" || kind === "undecided" ? of("fault") : of("ink");
-      pen.fillText({ fault: "×", contact: "⇄", claim: "★", alarm: "!", undecided: "…" }[kind], x(k), 11);
+      pen.fillStyle = ["contact", "claim", "back"].includes(kind) ? of("ink") : of("fault");
+      pen.fillText(kind === "fault" ? "×" : MARKED[kind], x(k), 11);
     }
     this.#ticks(pen, x, MARKS + shown.length * (band + 3) + 11, of("faint"), wide);
     const now = x(Math.min(tick + (moving ? share : 0), this.last));

@@ -1,11 +1,13 @@
 // Where robots were: truly, or if what they now hold likeliest is true.
 
-import { between, compose, frame_of, inverse } from "./geometry.js";
+import { between, compose, inverse } from "./geometry.js";
+import { held_now, leads } from "./held.js";
 import { unit } from "./pen.js";
 
 const TRAIL = { 1: { dash: [1.5, 4.5], width: 2.4 }, 2: { dash: [], width: 1.6 }, 3: { dash: [], width: 4 } };
 const CHUNK = 64;
 const BENDS = 6;
+const MOST_TRAILS = 6;
 
 export class Trails {
   constructor(plane) { this.plane = plane; }
@@ -47,7 +49,7 @@ export class Trails {
           const pose = between(player.pose, next.pose, next.executed, way, store.stage.mission.period);
           path.lineTo(pose[0], pose[1]);
         }
-        stroke(path, player.drive?.phase ?? 1);
+        stroke(path, store.phase(tick, robot.id));
       }
     }
     pen.restore();
@@ -67,7 +69,7 @@ export class Trails {
         complete = complete && Boolean(here && next);
         continue;
       }
-      const now = here.drive?.phase ?? phase ?? 1;
+      const now = here.drive?.phase ?? phase ?? store.phase(k, robot.id);
       if (now !== phase || !path) {
         path = new Path2D();
         path.moveTo(here.pose[0], here.pose[1]);
@@ -85,28 +87,36 @@ export class Trails {
     return pieces;
   }
 
-  /** Where the robot was, if what it now holds likeliest is true. */
-  believed_trail({ store, tick, look }, robot) {
-    const now = store.player(tick, robot.id)?.held;
+  /** Where the robot was, if what it now holds likeliest is true; or each pose that is equally likely. */
+  believed_trail(view, robot) {
+    const { store, tick, share, moving } = view, now = store.player(tick, robot.id)?.held;
     if (!now?.local.length) return;
-    const here = now.world.length ? now.world[0] : compose(frame_of(robot, false), now.local[0]);
-    const turn = compose(here, inverse(now.local[0])), pen = this.plane.context;
-    const { period } = store.stage.mission;
+    const here = held_now({ ...view, moving: false }, robot).poses, there = held_now(view, robot).poses;
+    const most = leads(now) ? 1 : MOST_TRAILS;
+    const driven = moving && share > 0 ? store.player(tick + 1, robot.id)?.executed : null;
+    for (let i = Math.min(here.length, most) - 1; i >= 0; i--) {
+      this.#believed(view, robot, compose(here[i], inverse(now.local[now.world.length ? 0 : i])), there[i], driven, most > 1);
+    }
+  }
+
+  /** One of them: `turn` leads from the anchor's frame to the plane; it ends at `there`, now. */
+  #believed({ store, tick, share, look }, robot, turn, there, driven, faint) {
+    const pen = this.plane.context, { period } = store.stage.mission;
     let phase = null, last = null;
+    const go = (to, by, part) => {
+      const bends = bends_of(by, period);
+      for (let bend = 1; bend <= bends; bend++) {
+        pen.lineTo(...this.plane.at(between(last, to, by, (part * bend) / bends, period)));
+      }
+    };
     pen.save();
-    pen.globalAlpha = 0.8;
+    pen.globalAlpha = faint ? 0.4 : 0.8;
     for (let k = Math.max(store.first, tick - 4000); k <= tick; k++) {
       const player = store.player(k, robot.id);
       if (!player?.held?.local.length || (player.held.local.length > 1 && k < tick)) continue;
-      const there = compose(turn, player.held.local[0]), [x, y] = this.plane.at(there);
-      const next = player.drive?.phase ?? 1;
-      if (phase !== null && last) {
-        const bends = bends_of(player.executed, period);
-        for (let bend = 1; bend <= bends; bend++) {
-          pen.lineTo(...this.plane.at(between(last, there, player.executed, bend / bends, period)));
-        }
-      }
-      last = there;
+      const pose = compose(turn, player.held.local[0]), next = player.drive?.phase ?? phase ?? store.phase(k, robot.id);
+      if (phase !== null && last) go(pose, player.executed, 1);
+      last = pose;
       if (next !== phase) {
         if (phase !== null) pen.stroke();
         phase = next;
@@ -115,8 +125,12 @@ export class Trails {
         pen.lineWidth = width;
         pen.strokeStyle = look.phase[phase];
         pen.beginPath();
-        pen.moveTo(x, y);
+        pen.moveTo(...this.plane.at(pose));
       }
+    }
+    if (driven && last) {
+      go(null, driven, share);
+      pen.lineTo(...this.plane.at(there));
     }
     if (phase !== null) pen.stroke();
     pen.restore();

@@ -29,14 +29,14 @@ export const plural = (count, one) => `${count} ${one}${count === 1 ? "" : "s"}`
 /** Kinds of events: a sign of its own for each, since colour says too little. */
 export const SIGNS = {
   anchor: "◎", "anchor-lost": "○", contact: "⇄", "contact-lost": "⇎", phase: "§", state: "·",
-  branch: "∠", candidates: "∴", claim: "★", undecided: "…", alarm: "!", late: "◔", end: "■",
+  branch: "∠", candidates: "∴", claim: "★", undecided: "…", alarm: "!", late: "◔", end: "■", down: "⊘", back: "↻",
   "report-lost": "✕", "report-damaged": "⊗", "report-late": "◷", "report-doubled": "‖",
 };
 
 export const KIND_NAMES = {
   anchor: "anchor in range", "anchor-lost": "anchor out of range", contact: "contact", "contact-lost": "contact lost",
   phase: "phase", state: "state", branch: "branch chosen", candidates: "candidates", claim: "claim",
-  undecided: "undecided", alarm: "alarm", late: "late", end: "end", "report-lost": "report lost",
+  undecided: "undecided", alarm: "alarm", late: "late", end: "end", down: "process gone", back: "process runs again", "report-lost": "report lost",
   "report-damaged": "report damaged", "report-late": "report late", "report-doubled": "report doubled",
 };
 
@@ -63,6 +63,7 @@ export const MEANINGS = [
   ["a filled robot", "where it truly is; a pointed one plays a, a round one b"],
   ["an outlined robot", "where it may be, for all it knows; the paler, the less likely; crossed out: ruled out just now"],
   ["an ellipse", "three sigma of the likeliest"],
+  ["a hollow robot, crossed out", "its process is gone"],
   ["a line to an anchor", "a range, in the tick in which it is measured"],
   ["a double line", "contact; the dots on it are reports: filled heard, with a tail late, hollow lost, crossed damaged"],
   ["a dotted trail", "phase 1; a thin one phase 2, a thick one phase 3"],

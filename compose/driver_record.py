@@ -1,0 +1,107 @@
+"""The recording of one robot without a world, as it is found: its agent's journal, and its driver's."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+
+from compose.driving import again
+from compose.record import agent_journal
+from compose.telling import going_on
+from protocol.inbox import Inbox
+from protocol.journal import CannotRecord, CorruptJournal, Journal
+from protocol.messages import Briefing, OfRobot, Sense
+from protocol.retrace import Retrace
+from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode, encode
+from world.driver import Driver
+from world.driver_journal import DriverPast, driver_journal, driver_past
+from world.field import Field
+
+RELEASE_S = 10.0
+"""how long the agent of a launcher that has just been killed may take to end: it has its journal locked"""
+LOOK_AGAIN_S = 0.02
+
+
+class DriverRecord(msgspec.Struct, frozen=True):
+    """Both journals, read; that of the driver is open."""
+
+    journal: Journal
+    past: DriverPast
+    known: int
+    """the latest tick in the agent's; -1 where there is none"""
+    again: bool
+    """whether they were there before"""
+
+    def take_up(self, driver: Driver, name: str, field: Field) -> None:
+        """Go on where they end, by the driver of that name. Raises UserError if it cannot."""
+        if self.past.ticks:
+            again(driver, name, self.past)
+        if self.again:
+            field.resume(self.past, self.known)
+
+
+@contextmanager
+def recorded(folder: Path, briefing: Briefing, inbox: Inbox, *, fsync: bool) -> Iterator[DriverRecord]:
+    """The recording in `folder` of the robot that was told `briefing`; a new one, if there is none.
+
+    Raises CannotRecord; CorruptJournal where the two journals are not of one robot in one run.
+    """
+    path = folder / driver_journal(briefing.robot)
+    agents = folder / agent_journal(briefing.robot)
+    if not path.exists():
+        if _frames(agents, inbox):
+            raise CannotRecord(f"{agents} is there already, and {path.name} is not; choose another folder")
+        with Journal(path, fsync=fsync) as journal:
+            journal.write(encode(briefing))
+            yield DriverRecord(journal, DriverPast(), -1, again=False)
+        return
+    old = Retrace(path, fsync=fsync)
+    try:
+        past = driver_past(old.frames, briefing, path)
+        known = _known(_frames(agents, inbox), past, agents)
+        old.write(*(old.frames or [encode(briefing)]))
+    except BaseException:
+        old.close()
+        raise
+    with going_on(old, inbox) as journal:
+        yield DriverRecord(journal, past, known, again=True)
+
+
+def _frames(path: Path, inbox: Inbox) -> list[bytes]:
+    """What is in the agent's journal, once its process has ended. Raises CannotRecord or CorruptJournal."""
+    give_up = time.monotonic() + RELEASE_S
+    while path.exists():
+        try:
+            old = Retrace(path)
+        except CannotRecord:
+            if time.monotonic() >= give_up:
+                raise
+            inbox.next(LOOK_AGAIN_S)
+        else:
+            old.close()
+            return old.frames
+    return []
+
+
+def _known(frames: list[bytes], past: DriverPast, path: Path) -> int:
+    """The latest tick of the agent, whose Senses are all of the driver. Raises CorruptJournal."""
+    known = -1
+    for frame in frames:
+        try:
+            message = decode(frame, OfRobot, MAX_FRAME_BYTES)
+        except MalformedFrame as error:
+            raise CorruptJournal(f"{path}: {error}") from None
+        if isinstance(message, Sense):
+            known += 1
+            if known > past.tick:
+                raise CorruptJournal(
+                    f"{path} goes on after tick {past.tick}, where the driver's journal ends; "
+                    "only with --fsync both survive a power cut"
+                )
+            if frame != past.ticks[known].frame:
+                raise CorruptJournal(f"{path}: at tick {known} another Sense than the driver's journal has")
+    return known

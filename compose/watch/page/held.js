@@ -1,0 +1,48 @@
+// What a robot holds possible, where it is then: between two ticks each pose moves to what it is in the next.
+
+import { between, compose, distance, frame_of, wrap } from "./geometry.js";
+
+/** A pose goes on in the next tick if it is so near to where it was driven to, of the sensing range and in rad. */
+const NEAR = 0.05, TURNED = 0.5;
+
+/** Whether the first pose is the only one, or likelier than all others together. */
+export const leads = ({ world, local, odds }) => (world.length || local.length) === 1 || odds[0] > 0.5;
+
+/** The poses that a robot holds possible, on the plane, and the covariance of the first; none if it holds none. */
+export function held_now({ store, scene, truth, tick, share, moving }, robot) {
+  const held = scene.players[store.places.get(robot.id)]?.held;
+  if (!held) return null;
+  const frame = frame_of(robot, truth);
+  const poses = placed(held, frame);
+  if (!moving || share <= 0) return { poses, covariance: held.covariance };
+  const next = store.player(tick + 1, robot.id), { period, sensing_range } = store.stage.mission;
+  if (!next?.executed) return { poses, covariance: held.covariance };
+  const goals = next.held && (next.held.world.length > 0) === (held.world.length > 0) ? placed(next.held, frame) : [];
+  const pairs = matched(poses, goals, next.executed, period, NEAR * sensing_range);
+  return {
+    poses: poses.map((pose, i) => {
+      const driven = between(pose, null, next.executed, share, period);
+      return pairs[i] === null ? driven : between(pose, goals[pairs[i]], next.executed, share, period);
+    }),
+    covariance: pairs[0] === 0 ? mixed(held.covariance, next.held.covariance, share) : held.covariance,
+  };
+}
+
+const placed = (held, frame) => (held.world.length ? held.world : held.local.map((local) => compose(frame, local)));
+
+const mixed = (one, other, share) => (one && other ? one.map((value, i) => value + share * (other[i] - value)) : one);
+
+/** Which of `goals` each of `poses` goes on as; none for one that does not. */
+function matched(poses, goals, driven, period, near) {
+  const free = new Set(goals.keys());
+  return poses.map((pose) => {
+    const ahead = between(pose, null, driven, 1, period);
+    let found = null, least = near;
+    for (const i of free) {
+      const off = distance(ahead, goals[i]);
+      if (off <= least && Math.abs(wrap(ahead[2] - goals[i][2])) <= TURNED) { found = i; least = off; }
+    }
+    free.delete(found);
+    return found;
+  });
+}

@@ -1,0 +1,134 @@
+"""What the last bits of a computation depend on beside its inputs: versions of libraries, and the processor.
+
+The same planner decides the same to the bit only where these are the same: the C library and numpy choose
+other instructions for another processor, and other versions of them and of linear algebra round otherwise.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from protocol.messages import Environment
+from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
+
+PACKAGE = "tandem-ranging"
+LONGEST = 64
+"""characters of a version"""
+LEVELS = (
+    ("x86-64-v4", {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}),
+    ("x86-64-v3", {"avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "movbe"}),
+    ("x86-64-v2", {"sse4_1", "sse4_2", "ssse3", "popcnt"}),
+)
+"""of the processors of that family, the highest first, and what each has beside the next"""
+
+
+@cache
+def of_world() -> Environment:
+    """That of a world's journal: what is true follows from the C library's functions alone."""
+    return Environment(_version(), _c_library(), _instructions())
+
+
+@cache
+def of_robot() -> Environment:
+    """That of an agent's journal."""
+    import numpy as np  # noqa: PLC0415  # a world does without
+
+    built: Mapping[str, Any] = np.show_config(mode="dicts") or {}
+    used = built.get("SIMD Extensions", {}).get("found") or ["baseline"]
+    return Environment(
+        _version(),
+        _c_library(),
+        _instructions(),
+        f"{np.__version__} ({used[-1]})"[:LONGEST],
+        (_kernels(Path(np.__file__).parent.parent / "numpy.libs") or _library(built))[:LONGEST],
+    )
+
+
+def named_in(frames: Sequence[bytes]) -> Environment | None:
+    """The environment that a journal's first frame names; older journals name none."""
+    try:
+        return decode(frames[0], Environment, MAX_FRAME_BYTES) if frames else None
+    except MalformedFrame:
+        return None
+
+
+def is_blank(frames: Sequence[bytes]) -> bool:
+    """Whether a journal of `frames` tells nothing but its environment."""
+    return len(frames) <= (named_in(frames) is not None)
+
+
+def otherwise(recorded: Environment | None, here: Environment) -> str | None:
+    """In what the two environments differ, if they do."""
+    if recorded is None:
+        return "the recording does not name the versions that it was made with"
+    fields = [name for name in here.__struct_fields__ if getattr(recorded, name) != getattr(here, name)]
+    if not fields:
+        return None
+    there, now = (
+        ", ".join([f"{name.replace('_', ' ')} {getattr(one, name)}" for name in fields])
+        for one in (recorded, here)
+    )
+    return f"recorded with {there}; here is {now}"
+
+
+def _version() -> str:
+    try:
+        return metadata.version(PACKAGE)
+    except metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def _c_library() -> str:
+    """Such as "glibc 2.36"."""
+    try:
+        return os.confstr("CS_GNU_LIBC_VERSION") or _system()
+    except (AttributeError, OSError, ValueError):
+        return _system()
+
+
+def _system() -> str:
+    return f"{platform.system()} {platform.release()}"[:LONGEST]
+
+
+def _instructions() -> str:
+    """The instruction set of the processor, such as "x86-64-v3"."""
+    try:
+        with Path("/proc/cpuinfo").open(encoding="ascii", errors="replace") as file:
+            flags = next((set(line.split()) for line in file if line.startswith("flags")), set[str]())
+    except OSError:
+        flags = set()
+    below = set[str]()
+    for i, (name, _) in enumerate(LEVELS):
+        below = set.union(*[wanted for _, wanted in LEVELS[i:]])
+        if below <= flags:
+            return name
+    return platform.machine()[:LONGEST]
+
+
+def _kernels(folder: Path) -> str | None:
+    """The library that numpy has brought along, and the kernels it chose: "OpenBLAS 0.3.31 (Haswell)"."""
+    import ctypes  # noqa: PLC0415  # a world does without, as above
+
+    for file in folder.glob("libscipy_openblas*"):
+        for ending in ("64_", ""):
+            try:
+                tell = getattr(ctypes.CDLL(str(file)), f"scipy_openblas_get_config{ending}")
+            except (OSError, AttributeError):
+                continue
+            tell.restype = ctypes.c_char_p
+            words = tell().decode(errors="replace").split()
+            core = [word for word in words[2:] if not word.isupper() and "=" not in word]
+            return f"{' '.join(words[:2])} ({' '.join(core) or 'one kernel'})"
+    return None
+
+
+def _library(built: Mapping[str, Any]) -> str:
+    """The one that numpy was built with."""
+    said = built.get("Build Dependencies", {}).get("lapack", {})
+    return f"{said.get('name', 'unknown')} {said.get('version', '')}".strip()

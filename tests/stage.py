@@ -1,0 +1,69 @@
+"""A stage for a `Field`: time passes only while it waits, and the test answers what it says."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable
+from types import SimpleNamespace
+
+import pytest
+
+from protocol import keys
+from protocol.inbox import NOTHING, Arrival, Inbox, Topic
+from world import ending, field
+
+TRANSPORT_S = 1e-4
+"""how long whatever is said is on its way"""
+
+
+class Stage(Inbox):
+    """The clock, the network and the inbox of a `Field`, in one thread: nothing depends on the machine."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        super().__init__("field")
+        self.now = 0.0
+        self.put_frames: list[tuple[str, bytes]] = []
+        """what the field has said: key and frame"""
+        self.answer: Callable[[str, bytes], None] = lambda _key, _frame: None
+        self._coming: list[tuple[float, int, Arrival]] = []
+        for module in (field, ending):
+            monkeypatch.setattr(module, "time", self)
+        monkeypatch.setattr(
+            field,
+            "session",
+            SimpleNamespace(
+                publisher=lambda _link, key: SimpleNamespace(put=lambda frame: self._said(key, frame)),
+                subscribe=lambda *_: None,
+                watch_liveliness=lambda *_: None,
+                answer=lambda *_: None,
+                show_alive=lambda *_: None,
+            ),
+        )
+
+    def monotonic(self) -> float:
+        """The time on stage."""
+        return self.now
+
+    def alive(self, *robots: str) -> None:
+        """These robots' agents are there."""
+        for robot in robots:
+            self.comes("alive", keys.robot_alive("r", robot))
+
+    def comes(self, topic: Topic, key: str, frame: bytes = b"", after: float = TRANSPORT_S) -> None:
+        """That arrives `after` so many seconds from now."""
+        heapq.heappush(self._coming, (self.now + after, len(self._coming), Arrival(topic, key, frame)))
+
+    def next(self, timeout: float | None) -> Arrival:
+        """The next arrival, once it is time for it; NOTHING after `timeout` seconds without."""
+        assert timeout is not None
+        until = self.now + max(timeout, 0.0)
+        if self._coming and self._coming[0][0] <= until:
+            when, _, arrival = heapq.heappop(self._coming)
+            self.now = max(self.now, when)
+            return arrival
+        self.now = until
+        return NOTHING
+
+    def _said(self, key: str, frame: bytes) -> None:
+        self.put_frames.append((key, frame))
+        self.answer(key, frame)

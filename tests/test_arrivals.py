@@ -1,0 +1,226 @@
+"""Whatever key a frame, a token or a question arrives under, no process ends of it, and nothing changes."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from compose.scenario import load
+from protocol import keys, session
+from protocol.endpoints import listening
+from protocol.inbox import COMPLAINTS, NOTHING, Inbox
+from protocol.messages import Drive, Report, Sense
+from protocol.motion import ORIGIN
+from protocol.wire import encode
+from tests.commands import BOUND_S, Command, several_pairs, tandem, until, world
+from tests.storm import stranger_at
+
+RUN = "mine"
+NAMED = {"run": RUN, "robot": "a", "peer": "b"}
+KEYS = {
+    kind.__name__: kind(*[NAMED[name] for name in inspect.signature(kind).parameters]) for kind in keys.RULES
+}
+
+by_kind = pytest.mark.parametrize("kind", keys.RULES, ids=lambda kind: str(kind.__name__))
+
+
+# --- the parser ---------------------------------------------------------------------------------------
+
+
+@by_kind
+def test_a_key_names_its_kind_run_robot_and_peer(kind: Callable[..., str]) -> None:
+    named = {name: NAMED[name] for name in inspect.signature(kind).parameters}
+    assert keys.parse(kind(**named)) == keys.Key(kind, **named)
+
+
+def spoilt(key: str) -> Iterator[str]:
+    """Keys of the same look that are none."""
+    chunks = key.split("/")
+    for i, chunk in enumerate(chunks):
+        for other in (
+            "*",
+            "**",
+            f"{chunk[:1]}$*",
+            "",
+            " ",
+            "@x",
+            "ä",
+            "\u202e",
+            "a\n",
+            "-a",
+            "a.b",
+            "a" * 65,
+        ):
+            yield "/".join([*chunks[:i], other, *chunks[i + 1 :]])
+        yield "/".join([*chunks[:i], *chunks[i + 1 :]])
+        yield "/".join([*chunks[:i], chunk, chunk, *chunks[i + 1 :]])
+    yield from (
+        f"/{key}",
+        f"{key}/",
+        f"{key}\n",
+        f" {key}",
+        key.upper(),
+        f"{key}/**",
+        f"{key}/{'x' * 60_000}",
+    )
+
+
+@by_kind
+def test_a_wildcard_and_a_key_with_too_few_or_many_chunks_are_none_of_ours(kind: Callable[..., str]) -> None:
+    named = {name: NAMED[name] for name in inspect.signature(kind).parameters}
+    for key in spoilt(kind(**named)):
+        assert keys.parse(key) is None, key
+    for name in named.keys() - {"run"}:
+        assert keys.parse(kind(**named | {name: "a" * 32})) is not None
+        assert keys.parse(kind(**named | {name: "a" * 33})) is None
+
+
+@given(
+    st.text(max_size=300)
+    | st.lists(st.sampled_from(["tandem", "r", "a", "*", "robot", "world", "to", ""])).map("/".join)
+)
+@example("**")
+@example("tandem/**")
+def test_any_text_is_a_key_of_ours_or_none(text: str) -> None:
+    found = keys.parse(text)
+    if found is not None:
+        assert found.kind is not None
+        named = {name: getattr(found, name) for name in inspect.signature(found.kind).parameters}
+        assert found.kind(**named) == text
+
+
+# --- processes ----------------------------------------------------------------------------------------
+
+WILD = [
+    *("**", "tandem/**", "*/**", f"tandem/{RUN}/**", "tandem/*/robot/*/drive", "*/*/*/*/*", "**/drive"),
+    *(f"tandem/{RUN}/robot/*/*", f"tandem/{RUN}/robot/*/to/*", f"tandem/{RUN}/robot/a/**", "tandem/r$*/**"),
+    *("tandem/*/alive/**", f"tandem/{RUN}/alive/*", "tandem/*/alive/robot/*", "tandem/*/world/**"),
+]
+ODD = [
+    *("tandem", "a", f"tandem/{RUN}", f"tandem/{RUN}/robot", f"tandem/{RUN}/robot/a", f"tandem/{RUN}/alive"),
+    *(f"tandem/{RUN}/robot/ä\u202e/drive", f"tandem/{RUN}/robot/{'x' * 5000}/drive"),
+    *(f"{key}/more" for key in KEYS.values()),
+]
+FRAMES = [
+    b"",
+    b"\xff" * 40,
+    encode(Drive(0, "a", 1.0, 1.0, 1, "forged")),
+    encode(Sense(0, "a", None, 1.0)),
+    encode(Report(0, "b", 1, "forged", ORIGIN, 0, 0, (), 0, (), 0, 0)),
+]
+
+
+def attack(link: zenoh.Session) -> list[zenoh.LivelinessToken]:
+    """Put, delete, ask and show tokens under every wildcard and odd key; tokens come and go."""
+    for key in (*WILD, *ODD):
+        for frame in FRAMES:
+            link.put(key, frame, encoding="text/plain", attachment=b"\xff" * 100)
+        link.delete(key)
+    for key in KEYS.values():
+        link.delete(key)
+    shown = [link.liveliness().declare_token(key) for key in (*WILD, *ODD)]
+    gone: list[Any] = [link.liveliness().declare_token(key) for key in WILD]
+    for token in gone:
+        token.undeclare()
+    for key in (*WILD, *ODD):
+        for reply in link.get(key, timeout=BOUND_S):
+            assert reply.ok is None
+    return shown
+
+
+def test_wildcards_odd_keys_and_deletions_end_no_process_and_change_nothing(tmp_path: Path) -> None:
+    """Robot d is not there yet, so the tick stands still while everyone listens."""
+    scenario, out, alone = tmp_path / "pairs.toml", tmp_path / "out", tmp_path / "alone"
+    scenario.write_text(several_pairs(2))
+    with world(scenario, "--run", RUN, "--out", out) as (clock, endpoint), ExitStack() as others:
+
+        def start(*arguments: str | Path) -> Command:
+            return others.enter_context(Command(*arguments, "--connect", endpoint))
+
+        watch = start("watch", "--port", "0")
+        watch.until_says("http://")
+        agents = {robot: start("agent", robot, "--out", out) for robot in "abc"}
+        for robot, agent in agents.items():
+            agent.until_answered(robot, out)
+        stranger = others.enter_context(stranger_at(endpoint))
+        shown = attack(stranger)
+        for process in (clock, *agents.values()):
+            process.until_says("not a key of one mission and robot")
+            process.until_says("a deletion" if process is not agents["c"] else "not a key")
+        listed = tandem("ps", "--connect", endpoint, "--json", "--wait", "1")
+        doctor = tandem("doctor", "--connect", endpoint, "--wait", "1")
+        assert (listed.status, doctor.status) == (0, 0), listed.err + doctor.out
+        [mission] = json.loads(listed.out)["missions"]
+        assert [robot["robot"] for robot in mission["robots"]] == ["a", "b", "c", "d"]
+        agents["d"] = start("agent", "d", "--out", out)
+        assert [process.ended().status for process in (clock, *agents.values())] == [0] * 5
+        assert watch.running
+        assert not any("Traceback" in process.err for process in (watch, clock, *agents.values()))
+        del shown
+    assert tandem("run", scenario, "--in-process", "-q", "--out", alone).status == 0
+    assert (out / "ticks.csv").read_bytes() == (alone / "ticks.csv").read_bytes()
+
+
+def test_an_answer_of_a_stranger_under_a_wildcard_is_no_briefing() -> None:
+    briefing = load("paper-1").briefing("a")
+    with session.open_router(listening("tcp/127.0.0.1:0")) as link:
+        declared: list[Any] = []
+
+        def answers(key: str, reply: Callable[[zenoh.Query], None]) -> bytes | str | None:
+            declared.append(link.declare_queryable(key, reply))
+            try:
+                return session.ask(link, keys.briefing(RUN, "a"), BOUND_S)
+            finally:
+                declared.pop().undeclare()
+
+        asked = keys.briefing(RUN, "a")
+        assert answers("tandem/**", lambda query: query.reply("tandem/**", encode(briefing))) is None
+        assert answers(asked, lambda query: query.reply(asked, encode(briefing))) == encode(briefing)
+        refusal = answers(asked, lambda query: query.reply_err(b"\xff\xfe" * 1000))
+        assert isinstance(refusal, str)
+        assert len(refusal) <= 300
+
+
+def test_a_flood_of_keys_that_are_none_is_counted_and_told_of_a_bounded_number(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    inbox = Inbox("test")
+    for number in range(10 * COMPLAINTS):
+        inbox.turn_away("drive", f"tandem/*/{number}/{'x' * 1000}", session.NO_KEY)
+    assert inbox.next(0.0) is NOTHING
+    assert inbox.refused == {"drive": 10 * COMPLAINTS}
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) <= COMPLAINTS
+    assert max(map(len, said)) < 500
+
+
+def test_what_comes_under_a_wildcard_is_delivered_to_nobody(capsys: pytest.CaptureFixture[str]) -> None:
+    inbox = Inbox("test")
+    with session.open_router(listening("tcp/127.0.0.1:0")) as link:
+        session.subscribe(link, keys.drive(RUN, "*"), inbox, "drive")
+        session.watch_liveliness(link, keys.robot_alive(RUN, "*"), inbox)
+        link.put("tandem/**", FRAMES[2])
+        link.delete(keys.drive(RUN, "a"))
+        token: Any = link.liveliness().declare_token("**")
+        link.put(keys.drive(RUN, "a"), FRAMES[2])
+        arrival = inbox.next(BOUND_S)
+        assert (arrival.topic, arrival.source, arrival.frame) == (
+            "drive",
+            keys.Key(keys.drive, RUN, "a"),
+            FRAMES[2],
+        )
+        token.undeclare()
+        until(
+            lambda: inbox.next(0.0) is NOTHING and inbox.refused == {"drive": 2, "alive": 1, "gone": 1},
+            "all told",
+        )
+    assert "tandem/**: not a key of one mission and robot" in capsys.readouterr().err

@@ -1,0 +1,150 @@
+"""The versions that a journal names, and what a replay says where only they explain a difference."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from agent.memory import remember
+from compose import inline
+from compose.scenario import load
+from protocol import environment, journal
+from protocol.journal import CorruptJournal
+from protocol.messages import Drive, Environment, Estimate
+from protocol.retrace import Retrace
+from protocol.wire import MalformedFrame, decode, encode
+from tests.commands import Ended, tandem
+
+A, WORLD = "agent-a.journal", "world.journal"
+OLDER = "0.0.9"
+
+
+@pytest.fixture
+def record(tmp_path: Path) -> Path:
+    inline.play(load("paper-1"), tmp_path)
+    return tmp_path
+
+
+def changed(path: Path, kind: type, change: Callable[..., object | None], first: int = 0) -> None:
+    """Write the journal anew, the first message of `kind` from tick `first` on as `change` makes it."""
+    frames: list[bytes] = []
+    done = False
+    for frame in journal.read(path):
+        message: object
+        try:
+            message = decode(frame, kind)
+        except MalformedFrame:
+            message = None
+        if done or message is None or getattr(message, "tick", first) < first:
+            frames.append(frame)
+            continue
+        done = True
+        new = change(message)
+        frames += [] if new is None else [encode(new)]
+    path.write_bytes(journal.packed(frames))
+
+
+def elsewhere(path: Path) -> None:
+    changed(path, Environment, lambda one: replace(one, tandem=OLDER))
+
+
+def turned(by: float) -> Callable[[Estimate], Estimate]:
+    """An estimate of the first pose that is off `by` a part."""
+
+    def turn(one: Estimate) -> Estimate:
+        first, *others = one.local
+        return replace(one, local=(replace(first, y=first.y * (1.0 + by)), *others))
+
+    return turn
+
+
+def test_a_journals_first_frame_names_versions_and_instruction_set(record: Path) -> None:
+    import numpy as np  # noqa: PLC0415
+
+    told = decode(next(journal.read(record / A)), Environment)
+    assert told.numpy is not None
+    assert told.numpy.startswith(np.__version__)
+    assert told.linear_algebra
+    assert told.c_library
+    assert told.instruction_set
+    assert told == environment.of_robot()
+    world = decode(next(journal.read(record / WORLD)), Environment)
+    assert world == replace(told, numpy=None, linear_algebra=None)
+
+
+def test_a_robot_names_the_instructions_that_numpy_and_linear_algebra_really_use() -> None:
+    told = [
+        subprocess.run(
+            [sys.executable, "-c", "from protocol import environment; print(environment.of_robot())"],
+            env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), **more},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for more in ({}, {"OPENBLAS_CORETYPE": "Prescott"})
+    ]
+    if "OpenBLAS" not in told[0] or "(one kernel)" in told[0]:
+        pytest.skip("numpy has no OpenBLAS that chooses its kernels")
+    assert told[0] != told[1]
+
+
+@pytest.mark.parametrize("command", ["replay", "audit"])
+def test_last_bits_under_other_versions_are_told_as_such(command: str, record: Path) -> None:
+    elsewhere(record / A)
+    changed(record / A, Estimate, turned(1e-13), first=20)
+    ended = tandem(command, record)
+    assert ended.status == 0, ended
+    assert f"recorded with tandem {OLDER}; here is tandem {environment.of_robot().tandem}" in ended.out
+    assert "by rounding alone" in ended.out
+    assert "not as recorded" not in ended.out
+
+
+@pytest.mark.parametrize("command", ["replay", "audit"])
+def test_last_bits_under_the_same_versions_are_a_difference(command: str, record: Path) -> None:
+    changed(record / A, Estimate, turned(1e-13), first=20)
+    ended = tandem(command, record)
+    assert ended.status == 1
+    assert "rounding" not in ended.out
+
+
+@pytest.mark.parametrize("command", ["replay", "audit"])
+def test_more_than_last_bits_is_a_difference_whatever_the_versions(command: str, record: Path) -> None:
+    elsewhere(record / A)
+    changed(record / A, Estimate, turned(1e-3), first=20)
+    ended = tandem(command, record)
+    assert ended.status == 1
+    assert f"recorded with tandem {OLDER}" in ended.out
+    assert "can lead to other decisions" in ended.out
+
+
+@pytest.mark.parametrize("command", ["replay", "audit", "figures", "export"])
+def test_older_recordings_that_name_no_versions_are_read(command: str, record: Path) -> None:
+    def read() -> Ended:
+        return tandem(command, record, *(["--only", "ranges"] if command == "figures" else []))
+
+    for path in record.glob("*.journal"):
+        changed(path, Environment, lambda _: None)
+    ended = read()
+    assert ended.status == 0, ended
+
+
+def test_a_robot_goes_on_elsewhere_where_it_decides_the_same_and_says_why_where_not(record: Path) -> None:
+    path = record / A
+    elsewhere(path)
+    before = path.read_bytes()
+    with closing(Retrace(path)) as retrace:
+        memory = remember(retrace)
+        assert memory is not None
+        assert memory.end is not None
+    assert path.read_bytes() == before
+    changed(path, Drive, lambda one: replace(one, omega=one.omega + 1e-15), first=20)
+    again = f"at tick 20: recorded with tandem {OLDER}; here is tandem"
+    with closing(Retrace(path)) as retrace, pytest.raises(CorruptJournal, match=again):
+        remember(retrace)

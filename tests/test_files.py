@@ -1,0 +1,244 @@
+"""Files that a user names, or Tandem writes: of the right kind, whole or absent, and never through a link."""
+
+from __future__ import annotations
+
+import os
+import re
+import resource
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from compose import inline, summary
+from compose.export import folder as export
+from compose.scenario import load
+from compose.status import UserError
+from protocol import files
+from tests.commands import PAPER_1, Command, Ended, processes_of
+
+
+def fifo(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def listening(path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as one:
+        here = Path.cwd()
+        os.chdir(path.parent)  # a socket's path is short
+        try:
+            one.bind(path.name)
+        finally:
+            os.chdir(here)
+
+
+def device(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+OTHERS: dict[str, Callable[[Path], None]] = {
+    "fifo": fifo,
+    "socket": listening,
+    "device": device,
+    "directory": Path.mkdir,
+}
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recording")
+    inline.play(load("paper-1"), folder)
+    return folder
+
+
+def one_line(ended: Ended, *words: str) -> None:
+    assert ended.status == 2, ended
+    assert ended.err.count("\n") == 1, ended.err
+    assert all(word in ended.err for word in words), ended.err
+
+
+@pytest.mark.parametrize("kind", OTHERS)
+def test_only_a_regular_file_is_opened(kind: str, tmp_path: Path) -> None:
+    OTHERS[kind](tmp_path / "it")
+    with pytest.raises(files.NotRegular) as caught:
+        files.open_file(tmp_path / "it")
+    assert caught.value.strerror == (
+        "it is a directory" if kind == "directory" else "it is not a regular file"
+    )
+
+
+@pytest.mark.parametrize("command", [["run"], ["sweep"], ["run", "paper-1", "--in-process", "--out"]])
+def test_a_fifo_in_place_of_a_users_file_is_one_line(command: list[str], tmp_path: Path) -> None:
+    fifo(tmp_path / "it")
+    with Command(*command, "it", cwd=tmp_path) as tandem:
+        one_line(tandem.ended(), "it")
+
+
+@pytest.mark.parametrize("command", ["audit", "replay", "export", "figures"])
+def test_a_fifo_in_place_of_a_journal_is_one_line(command: str, recording: Path, tmp_path: Path) -> None:
+    for journal in recording.glob("*.journal"):
+        (tmp_path / journal.name).write_bytes(journal.read_bytes())
+    (tmp_path / "world.journal").unlink()
+    fifo(tmp_path / "world.journal")
+    with Command(command, tmp_path) as tandem:
+        one_line(tandem.ended(), "not a regular file")
+
+
+def test_a_fifo_or_a_link_in_place_of_a_journal_is_not_resumed(recording: Path, tmp_path: Path) -> None:
+    (tmp_path / "agent-a.journal").symlink_to(recording / "agent-a.journal")
+    fifo(tmp_path / "agent-b.journal")
+    before = (recording / "agent-a.journal").read_bytes()
+    for robot in "ab":
+        with Command("agent", robot, "--connect", "tcp/127.0.0.1:9", "--out", tmp_path) as tandem:
+            one_line(tandem.ended(), f"agent-{robot}.journal cannot be opened")
+    assert (recording / "agent-a.journal").read_bytes() == before
+
+
+def test_a_byte_order_mark_is_accepted_in_scenarios_and_sweeps(tmp_path: Path) -> None:
+    (tmp_path / "it.toml").write_text(PAPER_1, encoding="utf-8-sig")
+    spec = 'name = "small"\nscenario = "it.toml"\ntrials = 1\n[[axis]]\nfield = "v"\nvalues = [1]\n'
+    (tmp_path / "small.toml").write_text(spec, encoding="utf-8-sig")
+    with Command("run", "it.toml", "--in-process", "-q", cwd=tmp_path) as tandem:
+        assert tandem.ended() == (0, "localised after 48 ticks\n", "")
+    with Command("sweep", "small.toml", cwd=tmp_path) as tandem:
+        one_line(tandem.ended(), "small.toml: axis[0].field: 'v'")
+
+
+# --- what is written --------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def no_room() -> Iterator[Callable[[int], None]]:
+    """Sets how many bytes a file of this process can have, as a full disk does."""
+    before, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.getsignal(signal.SIGXFSZ)
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    yield lambda room: resource.setrlimit(resource.RLIMIT_FSIZE, (room, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    signal.signal(signal.SIGXFSZ, handler)
+
+
+def test_a_file_without_room_is_as_it_was(tmp_path: Path, no_room: Callable[[int], None]) -> None:
+    (tmp_path / "old").write_text("before")
+    no_room(1000)
+    for name in ("old", "new"):
+        with pytest.raises(OSError, match="too large") as caught:
+            files.write(tmp_path / name, "x" * 1001)
+        assert caught.value.filename == str(tmp_path / name)
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("old", "before")]
+
+
+def test_every_file_of_a_run_and_an_export_is_whole_or_absent_however_little_room_there_is(
+    recording: Path, tmp_path: Path, no_room: Callable[[int], None]
+) -> None:
+    pytest.importorskip("foxglove")
+    record = inline.play(load("paper-1"))
+    told = summary.summary(record, "in-process", None)
+    whole = tmp_path / "whole"
+    whole.mkdir()
+    summary.leave(record, told, whole)
+    export.export(recording, whole)
+    wanted = {path.name: path.read_bytes() for path in whole.iterdir()}
+    for room in (0, 5_000, 12_000):
+        out = tmp_path / str(room)
+        out.mkdir()
+        no_room(room)
+        with suppress(OSError):
+            summary.leave(record, told, out)
+        with pytest.raises(UserError, match="too large"):
+            export.export(recording, out)
+        left = {path.name: path.read_bytes() for path in out.iterdir()}
+        assert left == {name: wanted[name] for name in left}
+        assert len(left) < len(wanted)
+
+
+FILLED = """
+import resource, signal, sys
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (9_500, resource.RLIM_INFINITY))
+from compose.cli import main
+main(sys.argv[1:])
+"""
+"""journals fit, ticks.csv does not"""
+
+
+@pytest.mark.parametrize("how", [["--in-process"], []])
+def test_the_outcome_is_printed_where_a_full_disk_takes_no_summary(how: list[str], tmp_path: Path) -> None:
+    (tmp_path / "it.toml").write_text(PAPER_1)
+    ended = subprocess.run(
+        [sys.executable, "-c", FILLED, "run", "it.toml", "-q", *how, "--out", "full", "--no-export"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert ended.stdout == "localised after 48 ticks\n"
+    assert ended.stderr == "tandem run: --out: full cannot be written: File too large\n"
+    assert ended.returncode == 2
+    assert not (tmp_path / "full" / "ticks.csv").exists()
+
+
+def test_what_is_written_replaces_a_link_and_leaves_what_it_led_to(recording: Path, tmp_path: Path) -> None:
+    pytest.importorskip("foxglove")
+    kept = tmp_path / "kept"
+    kept.write_text("kept")
+    out = tmp_path / "out"
+    out.mkdir()
+    names = ("summary.json", *export.FILES)
+    for name in names:
+        (out / name).symlink_to(kept)
+    record = inline.play(load("paper-1"))
+    summary.leave(record, summary.summary(record, "in-process", None), out)
+    export.export(recording, out)
+    assert kept.read_text() == "kept"
+    assert not [name for name in names if (out / name).is_symlink()]
+
+
+def test_the_draft_of_a_process_that_was_killed_is_removed_and_that_of_a_live_one_is_not(
+    tmp_path: Path,
+) -> None:
+    begun = "import sys, time; from pathlib import Path; from protocol import files\n" + (
+        "with files.draft(Path(sys.argv[1])): print('begun', flush=True); time.sleep(600)"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", begun, tmp_path / "it"],
+        stdout=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])},
+    ) as other:
+        try:
+            assert other.stdout is not None
+            assert other.stdout.readline() == b"begun\n"
+            (draft,) = tmp_path.iterdir()
+            files.write(tmp_path / "it", "mine")
+            assert draft.exists()
+        finally:
+            other.kill()
+    files.write(tmp_path / "it", "mine")
+    assert [path.name for path in tmp_path.iterdir()] == ["it"]
+
+
+# --- limits -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("limit", "words"),
+    [
+        ("-n 12", "a run as processes takes .* open files, and the limit is 12"),
+        ("-n 20", "a world with a link to each robot takes .* open files, and the limit is 20"),
+        ("-v 100000", "Tandem takes .* MB of memory, and the limit is 97"),
+        ("-v 500000", "a Zenoh session takes .* MB of memory, and the limit is 488"),
+    ],
+)
+def test_too_few_descriptors_or_too_little_memory_is_one_line(limit: str, words: str, tmp_path: Path) -> None:
+    through = ("sh", "-c", f'ulimit {limit} && exec "$@"', "sh")
+    with Command("run", "paper-1", "-q", "--out", tmp_path / "out", through=through) as tandem:
+        status, out, err = tandem.ended()
+    assert (status, out, err.count("\n")) == (3, "", 1), err
+    assert re.search(words, err), err
+    assert not processes_of(tmp_path)

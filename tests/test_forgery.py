@@ -1,0 +1,182 @@
+"""Whoever has one robot's certificate cannot make a viewer believe what only others may say."""
+
+from __future__ import annotations
+
+import json
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import Any
+from urllib.error import HTTPError
+from urllib.request import urlopen
+
+import pytest
+
+from compose.local import free_endpoint
+from compose.reach import KEYED
+from compose.scenario import load
+from compose.watch.network import AHEAD, LEAP, Heard, Refused
+from protocol import keys, session
+from protocol.endpoints import configured
+from protocol.keys import Key
+from protocol.messages import (
+    Drive,
+    End,
+    Estimate,
+    Localised,
+    Message,
+    Report,
+    Sense,
+    Truth,
+    Undecided,
+)
+from protocol.motion import ORIGIN, Pose
+from protocol.wire import MalformedFrame, encode
+from tests.commands import PAPER_1, Command, Ended, tandem, until
+
+RUN = "mine"
+LAST = 2**31
+HERE = Pose(99.0, 99.0, 0.0)
+
+
+def drive(tick: int, robot: str, verdict: Localised | Undecided | None = None) -> Drive:
+    return Drive(tick, robot, 1.0, 0.0, 1, "forged", verdict)
+
+
+def report(tick: int, robot: str) -> Report:
+    return Report(tick, robot, 1, "forged", None, 0, 0, (), 0, (), 0, 0)
+
+
+FORGED: dict[str, Message] = {
+    "the end": End(0, "localised", "forged"),
+    "an end to come": End(LAST, "failed", "forged"),
+    "the truth": Truth(0, {"a": HERE, "b": HERE}),
+    "b's verdict": drive(0, "b", Localised(HERE)),
+    "b's manoeuvre": drive(0, "b"),
+    "b's report": report(0, "b"),
+    "b's belief": Estimate(0, "b", (HERE,), (HERE,), localised=True),
+    "b's sense": Sense(0, "b", None, 1.0),
+    "a's own sense": Sense(0, "a", None, 1.0),
+    "a tick to come": drive(LAST, "a"),
+    "a report to come": report(LAST, "a"),
+    "a belief to come": Estimate(LAST, "a", (HERE,), (HERE,), localised=True),
+}
+OF_A = (Key(keys.drive, RUN, "a"), Key(keys.report, RUN, "a", "b"), Key(keys.estimate, RUN, "a"))
+"""keys that its certificate lets robot a put frames under"""
+
+
+def told(heard: Heard) -> dict[str, Any]:
+    """All that is known, as text."""
+    known = heard.known
+    return {"ticks": repr(known.ticks), "end": known.end, "last": known.last, "farewells": known.farewells}
+
+
+@pytest.fixture
+def heard() -> Heard:
+    """A mission in tick 0, of which the world has spoken."""
+    one = Heard(RUN)
+    for robot in "ab":
+        one.take(Key(keys.briefing, RUN, robot), encode(load("paper-1").briefing(robot)))
+        one.take(Key(keys.sense, RUN, robot), encode(Sense(0, robot, None, 1.0)))
+    return one
+
+
+@pytest.mark.parametrize("what", FORGED)
+@pytest.mark.parametrize("source", OF_A, ids=lambda source: str(source.kind.__name__))
+def test_a_viewer_takes_nothing_of_that_from_a_robot_by_its_keys(
+    what: str, source: Key, heard: Heard
+) -> None:
+    before = told(heard)
+    with pytest.raises((Refused, MalformedFrame)):
+        heard.take(source, encode(FORGED[what]))
+    assert told(heard) == before
+
+
+def test_a_viewer_takes_what_a_key_carries(heard: Heard) -> None:
+    for source, message in zip(
+        OF_A, (drive(0, "a"), report(0, "a"), Estimate(0, "a", (ORIGIN,), (), localised=False)), strict=True
+    ):
+        before = told(heard)
+        heard.take(source, encode(message))
+        assert told(heard) != before
+    heard.take(Key(keys.truth, RUN), encode(FORGED["the truth"]))
+    heard.take(Key(keys.sense, RUN, "a"), encode(FORGED["the end"]))
+    assert heard.known.end == FORGED["the end"]
+
+
+def test_a_tick_is_none_before_the_world_has_said_it(heard: Heard) -> None:
+    """A robot may be a little ahead of the world, which may come by another way; the world makes no leap."""
+    unheard, own, sense = Heard(RUN), OF_A[0], Key(keys.sense, RUN, "a")
+    unheard.take(own, encode(drive(LAST, "a")))
+    assert unheard.known.last == -1
+    heard.take(own, encode(drive(AHEAD, "a")))
+    with pytest.raises(Refused):
+        heard.take(own, encode(drive(AHEAD + 1, "a")))
+    with pytest.raises(Refused):
+        heard.take(sense, encode(Sense(LEAP + 1, "a", None, 1.0)))
+    heard.take(sense, encode(Sense(LEAP, "a", None, 1.0)))
+    heard.take(own, encode(drive(LEAP + AHEAD, "a")))
+    assert heard.known.last == LEAP + AHEAD
+
+
+def shown(address: str) -> dict[str, Any]:
+    try:
+        with urlopen(f"{address}/api/shows/{RUN}") as answer:
+            found: dict[str, Any] = json.load(answer)
+            return found
+    except HTTPError:
+        return {}
+
+
+def test_with_one_robots_certificate_nobody_forges_end_truth_ticks_or_another_robot(tmp_path: Path) -> None:
+    """While b is not there yet, the mission stands in tick 0; then it goes on, and is shown as it is."""
+    scenario, folder, endpoint = tmp_path / "paper.toml", tmp_path / "keys", free_endpoint("tls")
+    scenario.write_text(PAPER_1)
+    assert tandem("keys", folder, "--robots", "a,b").status == 0
+
+    def keyed(name: str) -> tuple[str | Path, ...]:
+        return "--keys", folder / name
+
+    with ExitStack() as stack:
+
+        def start(*arguments: str | Path) -> Command:
+            return stack.enter_context(Command(*arguments))
+
+        clock = start("world", scenario, "--run", RUN, "--listen", endpoint, *keyed("world"))
+        clock.until_says("waiting for")
+        watch = start("watch", "--connect", endpoint, *keyed("viewer"))
+        watch.until_says("http://")
+        address = watch.out.split()[0].rstrip("/")
+        a = start("agent", "a", "--connect", endpoint, *keyed("agent-a"))
+        watch.until(lambda: shown(address).get("last") == 0, "it shows tick 0")
+        link = stack.enter_context(
+            session.open_client(configured(folder / "agent-a" / KEYED, connect=[endpoint]), lambda: None)
+        )
+        for source in OF_A:
+            assert source.kind is not None
+            named = [name for name in source[1:] if name]
+            publisher = session.publisher(link, source.kind(*named))
+            heeded: list[bool] = []
+            session.on_matching(publisher, heeded.append)
+            until(partial(any, heeded), "the viewer listens")
+            for message in FORGED.values():
+                publisher.put(encode(message))
+        for source in OF_A:
+            assert source.kind is not None
+            key = source.kind(*[name for name in source[1:] if name])
+            for why in ("it says it is from 'b'", "it is of a tick to come"):
+                watch.until_says(f"refused a frame on {key}: {why}")
+        found = shown(address)
+        assert (found["last"], found["end"], found["live"]) == (0, None, True)
+        listed = tandem("ps", "--connect", endpoint, *keyed("viewer"), "--json", "--wait", "2")
+        [mission] = json.loads(listed.out)["missions"]
+        assert (mission["tick"], mission["outcome"]) == (0, None)
+        assert all(robot["tick"] in (0, None) for robot in mission["robots"])
+        b = start("agent", "b", "--connect", endpoint, *keyed("agent-b"))
+        ended: list[Ended] = [one.ended() for one in (clock, a, b)]
+        assert [one.status for one in ended] == [0, 0, 0], clock.err
+        watch.until(lambda: shown(address)["end"] is not None, "it shows the end")
+        found = shown(address)
+        assert found["end"][2] == "localised"
+        assert found["last"] == found["end"][1] == 48
+        assert "forged" not in json.dumps(found)

@@ -1,0 +1,261 @@
+"""Robots and worlds are forked from one process, and are processes of their own all the same."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+from collections import Counter
+from pathlib import Path
+from signal import SIGKILL, SIGSTOP
+
+import pytest
+
+from compose.forked import ForkServer
+from compose.local import free_endpoint
+from protocol import keys, session
+from protocol.endpoints import at, listening
+from protocol.inbox import Inbox
+from tests.commands import (
+    ENDLESS,
+    Command,
+    journals,
+    process_of,
+    processes_of,
+    several_pairs,
+    tandem,
+    until,
+    world,
+)
+
+FAR_PAIR = (("c", "d", 0.0), ("d", "c", 400.0))
+NAMES = ("world", "agent a", "agent b")
+
+
+@pytest.fixture
+def endless(tmp_path: Path) -> Path:
+    """A scenario that does not end by itself."""
+    path = tmp_path / "endless.toml"
+    path.write_text(ENDLESS)
+    return path
+
+
+def parent_of(pid: int) -> int:
+    stat = Path(f"/proc/{pid}/stat").read_text()
+    return int(stat.rpartition(")")[2].split()[1])
+
+
+def fork_servers_of(launcher: int) -> list[int]:
+    """Those that import yet, too."""
+    found = []
+    for pid in map(int, filter(str.isdigit, os.listdir("/proc"))):
+        try:
+            words = Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace")
+            if re.search("fork.server", words) and parent_of(pid) == launcher:
+                found.append(pid)
+        except OSError:  # ended meanwhile
+            continue
+    return found
+
+
+def gone(pid: int) -> bool:
+    return not Path(f"/proc/{pid}").exists()
+
+
+# --- processes of their own -----------------------------------------------------------------------------
+
+
+def test_each_has_its_own_session_and_group_and_is_named_in_ps(endless: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with Command("run", endless, "--out", out, "-q") as run:
+        run.until_written(out / "world.journal", 5_000)
+        (server,) = fork_servers_of(run.pid)
+        for name in NAMES:
+            pid = process_of(out, "tandem", *name.split())
+            assert pid == os.getpgid(pid) == os.getsid(pid)
+            assert parent_of(pid) == server
+            assert os.readlink(f"/proc/{pid}/fd/1") == os.devnull
+            assert not [
+                link
+                for link in Path(f"/proc/{pid}/fd").iterdir()
+                if link.name == "0" and not os.readlink(link).startswith("pipe:")
+            ]
+    assert not processes_of(out)
+
+
+def test_its_status_and_what_it_says_are_its_own(tmp_path: Path) -> None:
+    server = ForkServer("compose.warm_up:missions")
+    try:
+        ended = []
+        with (tmp_path / "first").open("wb+") as first, (tmp_path / "second").open("wb+") as second:
+            wrong = server.start(
+                "compose.cli:main",
+                "tandem",
+                "agent",
+                "?",
+                errors=first.fileno(),
+                on_end=lambda: ended.append(1),
+            )
+            mute = server.start(
+                *("compose.cli:main", "tandem", "agent", "a", "--connect", free_endpoint(), "--launched"),
+                errors=second.fileno(),
+            )
+            assert wrong.status == 2
+            until(lambda: ended, "its end is told")
+            mute.signal(SIGKILL)
+            assert mute.status == -SIGKILL
+            assert not mute.running
+            assert (tmp_path / "first").read_text().startswith("tandem agent: argument ID: '?'")
+            assert (tmp_path / "second").read_text() == ""
+            assert (wrong.end(), mute.end()) == (2, -SIGKILL)
+    finally:
+        server.close()
+
+
+def test_it_ends_with_its_standard_input() -> None:
+    server = ForkServer("compose.warm_up:missions")
+    with open(os.devnull, "wb") as nowhere:
+        words = ("tandem", "agent", "a", "--connect", free_endpoint(), "--launched")
+        agent = server.start("compose.cli:main", *words, errors=nowhere.fileno())
+    agent.hang_up()
+    assert agent.status == 130
+    server.close()
+
+
+# --- nobody is left behind ------------------------------------------------------------------------------
+
+
+def test_a_run_whose_fork_server_is_killed_says_so_and_leaves_no_process(
+    endless: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    with Command("run", endless, "--out", out, "-q") as run:
+        run.until_written(out / "world.journal", 5_000)
+        (server,) = fork_servers_of(run.pid)
+        os.kill(server, SIGKILL)
+        ended = run.ended()
+    assert ended.status == 3
+    said = r"tandem run: failed: (world|agent [ab]) was killed: the fork server was killed by signal 9\n"
+    assert re.fullmatch(said, ended.err), ended
+    assert not processes_of(out)
+
+
+def test_a_run_whose_fork_server_is_stopped_can_be_stopped_all_the_same(
+    endless: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    with Command("run", endless, "--out", out, "-q") as run:
+        run.until_written(out / "world.journal", 5_000)
+        (server,) = fork_servers_of(run.pid)
+        os.kill(server, SIGSTOP)
+        run.tell(signal.SIGINT)
+        assert run.ended().status == 130
+    assert not processes_of(out)
+
+
+def test_the_more_robots_a_run_starts_the_longer_each_looks_for_its_world(
+    endless: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    others = (f'[[robot]]\nid = "{one}"\npeer = "{two}"\nanchor = [{x}, 90.0]\n' for one, two, x in FAR_PAIR)
+    mission = endless.read_text()
+    for one, two in (("a", "b"), ("b", "a")):
+        mission = mission.replace(f'id = "{one}"', f'id = "{one}"\npeer = "{two}"')
+    endless.write_text(mission + "".join(others))
+    with Command("run", endless, "--out", out, "-q") as run:
+        run.until_written(out / "agent-c.journal", 1)
+        words = processes_of(out)[process_of(out, "agent", "c")]
+    assert words[words.index("--wait") + 1] == "62.0"
+
+
+def test_processes_that_are_stopped_end_too_when_their_launcher_is_killed(
+    endless: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    with Command("run", endless, "--out", out, "-q") as run:
+        run.until_written(out / "world.journal", 5_000)
+        (server,) = fork_servers_of(run.pid)
+        for name in NAMES:
+            os.kill(process_of(out, *name.split()), SIGSTOP)
+        os.kill(run.pid, SIGKILL)
+        until(lambda: not processes_of(out) and gone(server), "all have ended")
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM], ids=["SIGKILL", "SIGTERM"])
+def test_a_fork_server_that_still_imports_ends_with_its_launcher(
+    number: signal.Signals, endless: Path, tmp_path: Path
+) -> None:
+    with Command("run", endless, "--out", tmp_path / "out", "-q") as run:
+        run.until(lambda: fork_servers_of(run.pid), "it has a fork server")
+        servers = fork_servers_of(run.pid)
+        os.kill(run.pid, number)
+        until(lambda: all(map(gone, servers)), "the fork server has ended")
+    assert not processes_of(tmp_path / "out")
+
+
+def test_no_fork_server_outlasts_a_run() -> None:
+    with Command("run", "paper-1", "-q") as run:
+        run.until(lambda: fork_servers_of(run.pid), "it has a fork server")
+        servers = fork_servers_of(run.pid)
+        assert run.ended().status == 0
+        assert all(map(gone, servers))
+
+
+def test_a_fork_server_that_cannot_start_says_why_in_one_line() -> None:
+    server = ForkServer("nowhere:nothing")
+    with open(os.devnull, "wb") as nowhere:
+        process = server.start("compose.cli:main", "tandem", errors=nowhere.fileno())
+        assert process.status == -SIGKILL
+    assert server.gone
+    assert server.why_gone() == (
+        "the fork server ended with status 1: ModuleNotFoundError: No module named 'nowhere'"
+    )
+    server.close()
+
+
+# --- many -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("pairs", [10, pytest.param(100, marks=pytest.mark.long)])
+def test_as_many_robots_as_you_like_localise_as_processes_as_they_do_in_one(
+    pairs: int, tmp_path: Path
+) -> None:
+    path = tmp_path / "pairs.toml"
+    path.write_text(several_pairs(pairs))
+    assert tandem("run", path, "-q", "--out", tmp_path / "processes").status == 0
+    assert tandem("run", path, "-q", "--out", tmp_path / "one", "--in-process").status == 0
+    assert len(journals(tmp_path / "one")) == 2 * pairs + 1
+    assert journals(tmp_path / "processes") == journals(tmp_path / "one")
+
+
+def test_who_has_answered_is_not_told_again_as_often_as_who_has_not(tmp_path: Path) -> None:
+    path = tmp_path / "pairs.toml"
+    path.write_text(several_pairs(2))
+    heard: Counter[str] = Counter()
+    with (
+        world(path, "--run", "mine") as (_, endpoint),
+        session.open_client(at(endpoint), lambda: None) as link,
+        Command("agent", "c", "--connect", endpoint, "--out", tmp_path / "c") as c,
+        Command("agent", "d", "--connect", endpoint, "--out", tmp_path / "d") as d,
+    ):
+        c.until_answered("c", tmp_path / "c")
+        d.until_answered("d", tmp_path / "d")
+        inbox = Inbox("a bystander")
+        session.subscribe(link, keys.sense("mine", "*"), inbox, "sense")
+        while heard["a"] < 12:
+            heard[inbox.next(10.0).source.robot] += 1
+    assert heard["b"] >= 11
+    assert 1 <= heard["c"] <= 5
+    assert 1 <= heard["d"] <= 5
+
+
+def test_a_question_that_nobody_answers_in_time_is_not_refused() -> None:
+    endpoint = free_endpoint()
+    asked: list[object] = []
+    with (
+        session.open_router(listening(endpoint)) as router,
+        session.open_client(at(endpoint), lambda: None) as link,
+    ):
+        router.declare_queryable("tandem/slow", asked.append)
+        until(lambda: session.ask(link, "tandem/slow", 0.2) is None and asked, "it is asked, in vain")
+        assert session.ask(link, "tandem/slow", 0.2) is None

@@ -1,0 +1,80 @@
+"""What a distribution holds: the sources, and no key or recording that lies in the tree beside them."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import tarfile
+import zipfile
+from pathlib import Path, PurePath
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SECRET = "not to be packed"
+FOREIGN = (
+    "keys/ca-key.pem",
+    "keys/world/key.pem",
+    "compose/keys/ca-key.pem",
+    "compose/deploy/key.txt",
+    "record/world.journal",
+    "docs/record/summary.json",
+    "tests/agent-a.journal",
+    "notes.md",
+)
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What is in the repository, and what a user has left in it."""
+    folder = tmp_path_factory.mktemp("tree")
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=False)
+    if listed.returncode:
+        pytest.skip("the tests do not run in a repository")
+    for name in filter(None, listed.stdout.split("\0")):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(ROOT / name, folder / name)
+    (folder / ".gitignore").unlink()  # the list of what is packed is enough
+    for name in FOREIGN:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(SECRET)
+    return folder
+
+
+def built(tree: Path, kind: str, out: Path) -> Path:
+    """The file that `uv build` leaves."""
+    uv = shutil.which("uv")
+    if uv is None:
+        pytest.skip("uv is not installed")
+    made = subprocess.run(
+        [uv, "build", "-q", f"--{kind}", "--out-dir", out, tree],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if made.returncode and "hatchling" in made.stderr:
+        pytest.skip("the build back end is not to be had: there is no package index")
+    assert made.returncode == 0, made.stderr
+    (file,) = (path for path in out.iterdir() if path.name != ".gitignore")
+    return file
+
+
+def tracked(tree: Path, *folders: str) -> set[str]:
+    """What belongs to the project in these folders."""
+    files = [path for folder in folders for path in (tree / folder).rglob("*") if path.is_file()]
+    names = {str(PurePath(path).relative_to(tree)) for path in files}
+    return {name for name in names if name not in FOREIGN}
+
+
+def test_an_sdist_holds_the_sources_and_nothing_that_lies_beside_them(tree: Path, tmp_path: Path) -> None:
+    with tarfile.open(built(tree, "sdist", tmp_path)) as packed:
+        names = {name.partition("/")[2] for name in packed.getnames()}
+    assert not names & set(FOREIGN)
+    wanted = tracked(tree, "agent", "world", "protocol", "compose", "docs", "tests")
+    assert names == wanted | {"LICENSE", "README.md", "pyproject.toml", "PKG-INFO"}
+
+
+def test_a_wheel_holds_the_packages_their_data_and_nothing_else(tree: Path, tmp_path: Path) -> None:
+    with zipfile.ZipFile(built(tree, "wheel", tmp_path)) as packed:
+        names = {name for name in packed.namelist() if ".dist-info/" not in name}
+    assert names == tracked(tree, "agent", "world", "protocol", "compose")

@@ -1,0 +1,297 @@
+"""The page in a browser, where it once told what was not so.
+
+Tests that ask for `opened` need a browser, and skip where there is none (tests/browser.py).
+"""
+
+from __future__ import annotations
+
+import re
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from signal import SIGKILL
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from compose.record import WORLD_JOURNAL, estimates, read
+from protocol import journal
+from protocol.journal import Journal
+from protocol.messages import OfRobot, Sense
+from protocol.wire import MAX_FRAME_BYTES, decode
+from tests.browser import Open, inks, picture, shot, until_shown, watching
+from tests.commands import ENDLESS, Command, until, world
+from world.referee import errors
+
+# --- live -------------------------------------------------------------------------------------------
+
+
+def frames_to(path: Path, tick: int) -> int:
+    """How many frames an agent had journaled before it heard of `tick`."""
+    for place, frame in enumerate(journal.read(path)):
+        message = decode(frame, OfRobot, MAX_FRAME_BYTES)
+        if isinstance(message, Sense) and message.tick == tick:
+            return place
+    raise AssertionError(f"{path} has no tick {tick}")
+
+
+def test_what_becomes_known_of_a_tick_later_is_on_the_time_line_and_in_the_log(
+    opened: Open, paper_1: Path, tmp_path: Path
+) -> None:
+    whole = {path.name: list(journal.read(path)) for path in paper_1.glob("*.journal")}
+    told = dict.fromkeys(whole, 0)
+    with ExitStack() as stack:
+        growing = {name: stack.enter_context(Journal(tmp_path / name)) for name in whole}
+
+        def grow(robots: int, drives: int) -> None:
+            """The robots have journaled what comes before that tick, the world all Drives before that."""
+            goals = {name: frames_to(paper_1 / name, robots) for name in whole if name != WORLD_JOURNAL}
+            for name, goal in (goals | {WORLD_JOURNAL: 1 + 2 * drives}).items():
+                growing[name].write(*whole[name][told[name] : goal])
+                told[name] = goal
+
+        grow(46, 47)
+        _, where = stack.enter_context(watching(tmp_path))
+        page = opened(where)
+        expect(page.locator("#status")).to_have_text("● runs, tick 46")
+        until_shown(page, 46)  # where the two are and what they do, and nothing of what they sense
+        expect(page.locator("#log")).not_to_contain_text("in range of each other")
+        page.keyboard.press("Home")
+        until_shown(page, 0)
+        assert marks(page) == 0
+        grow(47, 47)
+        expect(page.locator("#log")).to_contain_text("a and b are in range of each other: 2.95 m")
+        assert marks(page) > 20  # of the contact
+        grow(48, 48)
+        expect(page.locator("#log")).to_contain_text("for b, 4 placements of the two are possible")
+        expect(page.locator("#log")).to_contain_text("a and b are in range of each other: 2.95 m")
+
+
+MARKS = """() => {
+  const canvas = document.getElementById('bands');
+  const data = canvas.getContext('2d').getImageData(0, 0, canvas.width, 12).data;
+  let found = 0;
+  for (let i = 3; i < data.length; i += 4) if (data[i] > 100 && (i >> 2) % canvas.width > 60) found += 1;
+  return found;
+}"""
+
+
+def marks(page: Page) -> int:
+    """How many pixels of the time line belong to marks, and to its hand, but where that is at tick 0."""
+    picture(page)
+    return int(page.evaluate(MARKS))
+
+
+def test_a_killed_robot_keeps_its_phase_and_is_shown_as_down_until_it_is_back(
+    opened: Open, tmp_path: Path
+) -> None:
+    scenario, record = tmp_path / "endless.toml", tmp_path / "record"
+    scenario.write_text(ENDLESS)
+    patient = ("--patience", "600")
+    with (
+        world(scenario, "--out", record, *patient) as (_, endpoint),
+        Command("agent", "b", "--connect", endpoint, "--out", record, *patient),
+        watching(record) as (_, of_journals),
+        watching("--connect", endpoint) as (_, of_network),
+    ):
+        a = ("agent", "a", "--connect", endpoint, "--out", record, *patient)
+        with Command(*a) as killed:
+            pages = [opened(of_journals), opened(of_network, dark=True)]
+            for page in pages:
+                expect(page.locator(".card[data-robot=a]")).to_have_attribute("data-phase", "2")
+                expect(page.locator("#log")).not_to_contain_text("is down")
+            killed.tell(SIGKILL)
+            killed.ended()
+        for i, page in enumerate(pages):
+            card = page.locator(".card[data-robot=a]")
+            expect(card.locator(".doing")).to_have_text("a is down: its process is gone")
+            expect(card.locator(".phase")).to_have_text("phase 2: the search; down")
+            expect(card).to_have_attribute("data-phase", "2")
+            expect(page.locator("#log .now").last).to_contain_text("a is down: its process is gone")
+            assert inks(page)["fault"] > 0  # crossed out
+            shot(page, f"down-{i}")
+            page.keyboard.press("Home")
+            until_shown(page, 0)
+            assert marks(page) > 20
+            page.keyboard.press("End")
+        with Command(*a):
+            for page in pages:
+                expect(page.locator("#log")).to_contain_text("a is back: its process runs again")
+                expect(page.locator(".card[data-robot=a] .doing")).not_to_contain_text("down")
+                expect(page.locator(".card[data-robot=b] .doing")).not_to_contain_text("down")
+
+
+# --- what is shown ----------------------------------------------------------------------------------
+
+CENTRE = """() => {
+  const canvas = document.getElementById('canvas'), style = getComputedStyle(document.documentElement);
+  const hex = style.getPropertyValue('--ghost').trim();
+  const ink = [1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16));
+  const data = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
+  let x = 0, y = 0, n = 0;
+  for (let i = 0; i < data.length; i += 4) {
+    if (data[i + 3] > 100 && ink.every((part, k) => Math.abs(data[i + k] - part) < 12)) {
+      x += (i / 4) % canvas.width; y += Math.floor(i / 4 / canvas.width); n += 1;
+    }
+  }
+  return [Number(document.body.dataset.tick), x / n, y / n];
+}"""
+
+
+def test_what_a_robot_believes_moves_between_ticks_as_it_does(opened: Open, address: str) -> None:
+    page = opened(f"{address}#tick=20&truth=0&robot=a")
+    until_shown(page, 20)
+    page.locator("#speed").select_option("0.5")
+    page.keyboard.press("Space")
+    at: dict[int, list[tuple[float, float]]] = {}
+
+    def moved() -> bool:
+        tick, x, y = page.evaluate(CENTRE)
+        seen = at.setdefault(tick, [])
+        seen.append((x, y))
+        return bool(max(abs(x - seen[0][0]), abs(y - seen[0][1])) > 1.0)
+
+    until(moved, "what is drawn of a's belief moves within a tick")
+
+
+HELD = """async ([now, next, share]) => {
+  const { held_now } = await import('/page/held.js');
+  const held = (one) => ({ local: [], odds: [], covariance: null, ...one });
+  const scenes = [now, next].map((one) => ({ players: [{ held: held(one), executed: one.executed }] }));
+  const store = {
+    places: new Map([['a', 0]]), stage: { mission: { period: 1, sensing_range: 3 } },
+    player: (tick) => scenes[tick]?.players[0],
+  };
+  const robot = { id: 'a', anchor: [0, 0], frame: null };
+  return held_now({ store, scene: scenes[0], truth: true, tick: 0, share, moving: true }, robot);
+}"""
+
+
+def test_a_hypothesis_that_goes_on_moves_to_where_it_is_next_and_others_as_driven(
+    opened: Open, address: str
+) -> None:
+    """The order is by odds, and differs from tick to tick."""
+    page = opened(address)
+    now = {"world": [[0, 0, 0], [5, 5, 0]], "odds": [0.7, 0.3], "covariance": [4, 0, 0, 4, 0, 0]}
+    next_ = {"world": [[6.1, 5, 0], [1, 0.1, 0]], "odds": [0.9, 0.1], "covariance": [2, 0, 0, 2, 0, 0]}
+    found = page.evaluate(HELD, [now, next_ | {"executed": [1, 0]}, 0.5])
+    assert found["poses"] == [[0.5, pytest.approx(0.05), 0], [pytest.approx(5.55), 5, 0]]
+    assert found["covariance"] == now["covariance"]  # its hypothesis is not the first any more
+    kept = {"world": [[1.1, 0, 0]], "covariance": [2, 0, 0, 2, 0, 0], "executed": [1, 0]}
+    found = page.evaluate(HELD, [now, kept, 0.5])
+    assert found["poses"] == [[pytest.approx(0.55), 0, 0], [5.5, 5, 0]]  # the other is ruled out then
+    assert found["covariance"] == [3, 0, 0, 3, 0, 0]
+    far = {"world": [[1.5, 0, 0]], "executed": [1, 0]}
+    assert page.evaluate(HELD, [now, far, 0.5])["poses"][0] == [0.5, 0, 0]  # it jumps at the tick
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_without_the_truth_the_page_opens_with_what_the_robots_believe(
+    dark: bool, opened: Open, paper_1: Path, tmp_path: Path
+) -> None:
+    for path in paper_1.glob("agent-*.journal"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    with watching(tmp_path) as (_, where):
+        page = opened(where, height=720, dark=dark)
+        until_shown(page, 0)
+        page.keyboard.press("End")
+        until_shown(page, 48)
+        expect(page.locator("#truth")).not_to_be_checked()
+        expect(page.locator("#truth")).to_be_disabled()
+        expect(page.locator("#seen")).to_have_text("the truth is not on record: only what each robot knows")
+        expect(page.locator("#canvas")).to_have_attribute(
+            "aria-label", re.compile(r"The plane at tick 48: a at .*; b at ")
+        )
+        drawn = inks(page)
+        assert min(drawn[f"phase-{phase}"] for phase in (2, 3)) > 100  # trails
+        page.keyboard.press("t")
+        assert inks(page) == drawn
+        assert "truth=0" not in page.url
+        shot(page, f"no-truth-{dark}")
+
+
+def test_an_error_is_told_of_a_pose_that_leads_and_else_as_a_range(
+    opened: Open, paper_1: Path, address: str
+) -> None:
+    page = opened(f"{address}#tick=47", height=720)
+    until_shown(page, 47)
+    truth = read(paper_1).moments[47].truth.poses[1]
+    off = sorted(errors(pose, truth)[0] for pose in estimates(paper_1, "b")[47].world)
+    assert len(off) == 4
+    assert off[3] > 1.0
+    error = page.locator(".card[data-robot=b] .error")
+    expect(error).to_have_text(f"up to {off[3]:.2f} m off")
+    expect(error).to_have_attribute("title", re.compile(rf"^\S+ m to {off[3]:.2f} m: 4 poses are possible"))
+    shot(page, "equally-likely")
+    page.locator("#truth").uncheck()
+    expect(page.locator("#canvas")).to_have_attribute("aria-label", re.compile("b at one of 4 places"))
+    shot(page, "equally-likely-believed")
+    page.locator("#truth").check()
+    page.keyboard.press("End")
+    expect(error).to_have_text(re.compile(r"^\S+ \S*m off$"))
+
+
+# --- keys -------------------------------------------------------------------------------------------
+
+
+def test_space_after_a_click_plays_and_pauses_and_does_nothing_else(opened: Open, address: str) -> None:
+    for click in (
+        "#back",
+        "#on",
+        "#truth",
+        "#near",
+        ".card[data-robot=a] .name",
+        "#log li:first-child button",
+    ):
+        page = opened(f"{address}#tick=20")
+        until_shown(page, 20)
+        page.keyboard.press("[")
+        page.keyboard.press("[")
+        page.keyboard.press("[")
+        page.locator(click).click()
+        tick = page.locator("body").get_attribute("data-tick")
+        before = state(page)
+        page.keyboard.press("Space")
+        expect(page.locator("#play")).to_have_attribute("aria-label", "Pause")
+        page.keyboard.press("Space")
+        expect(page.locator("#play")).to_have_attribute("aria-label", "Play")
+        assert state(page) == before
+        assert page.locator("body").get_attribute("data-tick") == tick
+        page.close()
+
+
+def state(page: Page) -> list[object]:
+    found: list[object] = page.evaluate(
+        "[document.getElementById('truth').checked, document.getElementById('robot').value,"
+        " document.getElementById('speed').value]"
+    )
+    return found
+
+
+def test_who_goes_by_keyboard_presses_a_button_with_space(opened: Open, address: str) -> None:
+    page = opened(f"{address}#tick=20")
+    until_shown(page, 20)
+    page.locator("#back").focus()
+    page.keyboard.press("Space")
+    until_shown(page, 19)
+    expect(page.locator("#play")).to_have_attribute("aria-label", "Play")
+
+
+def test_the_speed_box_takes_only_the_keys_that_choose_a_speed(opened: Open, address: str) -> None:
+    page = opened(f"{address}#tick=20")
+    until_shown(page, 20)
+    speed = page.locator("#speed")
+    speed.focus()
+    for key, tick in (("ArrowRight", 21), ("ArrowLeft", 20), ("Shift+ArrowRight", 30), ("Home", 0), (".", 1)):
+        page.keyboard.press(key)
+        with suppress(AssertionError):
+            until_shown(page, tick)
+        assert page.locator("body").get_attribute("data-tick") == str(tick), key
+        expect(speed).to_have_value("5")
+        expect(speed).to_be_focused()
+    page.keyboard.press("ArrowDown")
+    expect(speed).to_have_value("10")
+    page.keyboard.press("t")
+    expect(page.locator("#truth")).not_to_be_checked()
+    page.keyboard.press("Space")
+    expect(page.locator("#play")).to_have_attribute("aria-label", "Pause")
+    expect(speed).to_have_value("10")

@@ -1,0 +1,218 @@
+"""Text of any length is within its bound in a message, and a journal holds nothing that cannot be read."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from msgspec.inspect import StrType, StructType, type_info
+from msgspec.structs import replace
+
+from agent.mind import WORDS
+from agent.past import past
+from agent.robot import Robot
+from compose.scenario import load
+from protocol import keys, session
+from protocol.endpoints import at
+from protocol.inbox import Inbox
+from protocol.journal import Journal, read
+from protocol.messages import (
+    MAX_TEXT,
+    Alarm,
+    Drive,
+    End,
+    Farewell,
+    Message,
+    OfRobot,
+    Sense,
+    Undecided,
+    Verdict,
+)
+from protocol.retrace import Retrace
+from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode, encode
+from tests.commands import BOUND_S, PAPER_1, tandem, world
+from tests.examples import EXAMPLES
+from tests.test_wire import changed, framed, packed, parts, plain
+from world.course import Course, again
+from world.history import history
+from world.referee import Judgement
+
+RUN = "mine"
+LONG_TEXTS = {
+    "ascii": "x" * (MAX_TEXT + 1),
+    "long": "no way " * 1000,
+    "wide": "\U0001f600" * (MAX_TEXT + 1),
+    "combined": "e\u0301" * MAX_TEXT,
+    "surrogates": "\udc80" * MAX_TEXT,
+    "mixed": "\x00\x1b[2J\ud83d" + "\u202e" * MAX_TEXT,
+}
+
+
+def structs_in(value: object) -> Iterator[msgspec.Struct]:
+    """`value` and every struct in it."""
+    if isinstance(value, msgspec.Struct):
+        yield value
+        for name in value.__struct_fields__:
+            yield from structs_in(getattr(value, name))
+    elif isinstance(value, tuple | list):
+        for one in value:
+            yield from structs_in(one)
+
+
+def text_fields() -> set[tuple[type[msgspec.Struct], str]]:
+    """Every field of a message, and of what is in one, that holds a text of any length."""
+    found: set[tuple[type[msgspec.Struct], str]] = set()
+    seen: set[type] = set()
+
+    def visit(info: Any) -> None:
+        if isinstance(info, StructType):
+            if info.cls in seen:
+                return
+            seen.add(info.cls)
+            for field in info.fields:
+                alternatives = getattr(field.type, "types", (field.type,))
+                if any(isinstance(one, StrType) and one.max_length == MAX_TEXT for one in alternatives):
+                    found.add((info.cls, field.name))
+                visit(field.type)
+        for name in ("types", "item_types"):
+            for one in getattr(info, name, ()):
+                visit(one)
+        if (item := getattr(info, "item_type", None)) is not None:
+            visit(item)
+
+    for message in Message.__subclasses__():
+        visit(type_info(message))
+    return found
+
+
+FIELDS = sorted(text_fields(), key=str)
+
+
+def example_of(kind: type[msgspec.Struct]) -> msgspec.Struct:
+    return next(one for message in EXAMPLES for one in structs_in(message) if type(one) is kind)
+
+
+def test_the_text_fields_are_these() -> None:
+    assert set(FIELDS) == {(Undecided, "reason"), (Alarm, "claim"), (End, "reason"), (Farewell, "missing")}
+
+
+@pytest.mark.parametrize(("kind", "field"), FIELDS)
+@pytest.mark.parametrize("words", LONG_TEXTS.values(), ids=LONG_TEXTS)
+def test_what_is_encoded_is_within_its_bound(kind: type[msgspec.Struct], field: str, words: str) -> None:
+    made = replace(example_of(kind), **{field: words})
+    assert len(getattr(made, field)) == MAX_TEXT
+    told: Message = made if isinstance(made, Message) else Drive(0, "a", 0.0, 0.0, 1, "done", _verdict(made))
+    assert decode(encode(told), type(told)) == told
+
+
+def _verdict(value: object) -> Verdict:
+    assert isinstance(value, Undecided | Alarm)
+    return value
+
+
+@pytest.mark.parametrize(("kind", "field"), FIELDS)
+@pytest.mark.parametrize("char", ["x", "\xe9", "\U0001f600", "\n"])
+def test_a_text_at_its_bound_is_kept_whole(kind: type[msgspec.Struct], field: str, char: str) -> None:
+    words = char * MAX_TEXT
+    assert getattr(replace(example_of(kind), **{field: words}), field) == words
+
+
+@pytest.mark.parametrize(
+    "message", EXAMPLES, ids=[f"{i}-{type(message).__name__}" for i, message in enumerate(EXAMPLES)]
+)
+def test_a_decoder_takes_text_up_to_its_bound_in_characters_and_refuses_more(message: Message) -> None:
+    """Whoever sends it; the bound is that of the field: of a text, of a word, of a robot."""
+    tree = plain(message)
+    for path, value in parts(tree):
+        if isinstance(value, str):
+            bounds = [bound for bound in (16, 31, 32, MAX_TEXT) if _taken(message, path, "a" * bound)]
+            if not bounds:
+                continue  # one of a few words
+            bound = max(bounds)
+            assert bound in (32, MAX_TEXT)
+            assert not _taken(message, path, "a" * (bound + 1))
+            assert _taken(message, path, "\U0001f600" * bound) or bound == 32
+            assert not _taken(message, path, "\U0001f600" * (bound + 1))
+
+
+def _taken(message: Message, path: tuple[object, ...], value: str) -> bool:
+    try:
+        decode(framed(packed(changed(plain(message), path, value))), type(message))
+    except MalformedFrame:
+        return False
+    return True
+
+
+def test_every_word_for_a_state_is_within_its_bound() -> None:
+    for word in (*WORDS.values(), "localised", "undecided", "alarm"):
+        drive = Drive(0, "a", 0.0, 0.0, 1, word)
+        assert decode(encode(drive), Drive) == drive
+
+
+# --- journals -----------------------------------------------------------------------------------------
+
+
+def test_a_world_whose_reason_is_too_long_leaves_a_journal_that_is_read_and_taken_up(tmp_path: Path) -> None:
+    scenario, path = load("paper-1"), tmp_path / "world.journal"
+    with Journal(path) as journal:
+        end = Course(scenario, journal).end(Judgement("failed", "no answer from " + "robot, " * 200))
+    assert history(read(path), path).end == end
+    record = Retrace(path)
+    assert again(scenario, record).over == end
+    record.close()
+
+
+def test_an_agent_that_gives_up_at_length_leaves_a_journal_that_is_read(tmp_path: Path) -> None:
+    scenario, path = load("paper-1"), tmp_path / "agent-a.journal"
+    with Journal(path) as journal:
+        robot = Robot(scenario.briefing("a"), journal)
+        robot.sense(Sense(0, "a", None, 1.0))
+        robot.mind = robot.mind.undecided("\U0001f600" * 1000)
+        drive = robot.decide()
+        robot.estimate()
+        robot.farewell(End(1, "undecided", f"a: {'x' * 1000}"))
+    assert drive.verdict == Undecided("\U0001f600" * MAX_TEXT)
+    assert past(read(path), path).farewell is not None
+    for frame in read(path):
+        decode(frame, OfRobot, MAX_FRAME_BYTES)
+
+
+def test_a_verdict_of_as_many_words_as_there_may_be_ends_a_run_whose_record_is_read(tmp_path: Path) -> None:
+    """Both robots are played here, and give up at once."""
+    scenario, out = tmp_path / "paper.toml", tmp_path / "out"
+    scenario.write_text(PAPER_1)
+    gives_up = Undecided("\U0001f600" * MAX_TEXT)
+    heard = Inbox("test")
+    with (
+        world(scenario, "--run", RUN, "--out", out) as (clock, endpoint),
+        session.open_client(at(endpoint), lambda: None) as link,
+    ):
+        drives = {robot: session.publisher(link, keys.drive(RUN, robot)) for robot in "ab"}
+        session.subscribe(link, keys.sense(RUN, "*"), heard, "sense")
+        tokens = [session.show_alive(link, keys.robot_alive(RUN, robot)) for robot in "ab"]
+        parted = set[str]()
+        while len(parted) < 2:
+            arrival = heard.next(BOUND_S)
+            assert arrival.topic == "sense", clock.err
+            robot = arrival.source.robot
+            message: Sense | End | Farewell = decode(arrival.frame, Sense | End | Farewell)
+            match message:
+                case Sense(tick):
+                    drives[robot].put(encode(Drive(tick, robot, 0.0, 0.0, 1, "undecided", gives_up)))
+                case End(_, outcome, reason):
+                    assert (outcome, reason) == ("undecided", f"a: {gives_up.reason}"[:MAX_TEXT])
+                    said = replace(example_of(Farewell), robot=robot)
+                    assert isinstance(said, Farewell)
+                    drives[robot].put(encode(said))
+                case Farewell():
+                    parted.add(robot)
+        assert clock.ended().status == 1, clock.err
+        del tokens
+    assert history(read(out / "world.journal"), out).end is not None
+    replayed, audited = tandem("replay", out), tandem("audit", out)
+    assert (replayed.status, audited.status) == (0, 1), replayed.err + audited.err
+    assert re.search(r"^claim +1 +0$", audited.out, re.MULTILINE), audited.out  # what is missing are journals
