@@ -188,12 +188,13 @@ def turn_error(placement: Placement, sightings: Sequence[Sighting], floor: float
     and all of them together by the two anchors, which are off by `anchors` m in all. Infinite where they
     leave a turn open, next to a double root of eq. (7).
     """
-    pp, pq, qq = information(placement, sightings)
+    slopes = tuple(_slopes(placement, sightings))
+    pp, pq, qq = _information(slopes)
     determinant = pp * qq - pq * pq
     if determinant <= SINGULAR * pp * qq:
         return math.inf
     alone_a = alone_b = ax = ay = bx = by = 0.0
-    for p, q, ux, uy in _slopes(placement, sightings):
+    for p, q, ux, uy in slopes:
         of_psi = pp * q - pq * p
         of_a = qq * p - pq * q - of_psi  # in <W>, b is turned by -psi and a by phi - psi
         alone_a, alone_b = alone_a + abs(of_a), alone_b + abs(of_psi)
@@ -208,8 +209,12 @@ def information(placement: Placement, sightings: Sequence[Sighting]) -> tuple[fl
 
     The Fisher information for ranges of 1 m standard deviation, in 1 / rad^2: of phi, mixed, of psi.
     """
+    return _information(_slopes(placement, sightings))
+
+
+def _information(slopes: Iterable[tuple[float, float, float, float]]) -> tuple[float, float, float]:
     pp = pq = qq = 0.0
-    for by_phi, by_psi, _, _ in _slopes(placement, sightings):
+    for by_phi, by_psi, _, _ in slopes:
         pp += by_phi * by_phi
         pq += by_phi * by_psi
         qq += by_psi * by_psi
@@ -240,20 +245,20 @@ def _polished_placement(placement: Placement, sightings: Sequence[Sighting]) -> 
     The unknowns are phi and the bearing psi of M1 in <b(M2)>. Two ranges determine them exactly; more
     of them tell apart what eq. (7) alone gives as a double root.
     """
-    ranged = [(s.a, s.b, s.range) for s in sightings if s.range is not None]
+    distance = math.hypot(placement.x, placement.y)
+    closest = CLOSEST * distance
+    ranged = [(s.a, s.b, s.range, 0.5 / max(s.range, closest)) for s in sightings if s.range is not None]
     if len(ranged) < 3:
         return placement
-    distance = math.hypot(placement.x, placement.y)
     phi, psi = placement.phi, math.atan2(placement.y, placement.x)
     best, fitted = math.inf, placement
     for _ in range(POLISHING_STEPS):
         c, s = math.cos(phi), math.sin(phi)
         tx, ty = distance * math.cos(psi), distance * math.sin(psi)
         cost = pp = pq = qq = gp = gq = 0.0
-        for a, b, rho in ranged:
+        for a, b, rho, weight in ranged:
             ax, ay = c * a.x - s * a.y, s * a.x + c * a.y
             x, y = tx + ax - b.x, ty + ay - b.y
-            weight = 0.5 / max(rho, CLOSEST * distance)
             error = weight * (x * x + y * y - rho * rho)
             by_phi = weight * 2.0 * (y * ax - x * ay)
             by_psi = weight * 2.0 * (y * tx - x * ty)

@@ -8,7 +8,7 @@ from itertools import pairwise
 import msgspec
 
 from protocol.messages import MAX_REPORT_RANGES, MAX_REPORT_RUNS, Ranged
-from protocol.motion import Pose, Run, follow, step
+from protocol.motion import Pose, Run, arc, follow
 
 
 class Logbook(msgspec.Struct, frozen=True):
@@ -30,11 +30,9 @@ class Logbook(msgspec.Struct, frozen=True):
             at_rest += run.ticks
         return self.through - at_rest
 
-    def travelled(self, through: int) -> tuple[int, float, float]:
-        """Return the number of runs in [0, through], and the sums of |v| and |omega| over its ticks."""
-        runs = _between(self.runs, 0, through)
-        v = sum([abs(run.v) * run.ticks for run in runs])
-        return len(runs), v, sum([abs(run.omega) * run.ticks for run in runs])
+    def until(self, tick: int) -> tuple[Run, ...]:
+        """Return what was driven over [0, tick]."""
+        return self.runs if tick >= self.through else _between(self.runs, 0, tick)
 
     def drove(self, v: float, omega: float, ticks: int = 1) -> Logbook:
         """The log after `ticks` more of one manoeuvre."""
@@ -79,15 +77,14 @@ class Logbook(msgspec.Struct, frozen=True):
 
     def pose(self, start: Pose, tick: int, period: float) -> Pose:
         """Where the robot was at `tick`, if it was at `start` at tick 0."""
-        return follow(start, _between(self.runs, 0, tick), period)
+        return follow(start, self.until(tick), period)
 
     def track(self, start: Pose, first: int, last: int, period: float) -> list[Pose]:
         """Where the robot was at each tick in [first, last], if it was at `start` at tick 0."""
         pose = self.pose(start, first, period)
         track = [pose]
         for run in _between(self.runs, first, last):
-            pose = track[-1]
-            track += [step(pose, run.v, run.omega, k * period) for k in range(1, run.ticks + 1)]
+            track += arc(track[-1], run, period)
         return track
 
 

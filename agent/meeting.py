@@ -83,7 +83,9 @@ def _settled(mind: Mind) -> Mind:
     if base is None:  # yet; or, where a report was missed, b was still driving as a went straight
         again = isinstance(mind.state, Waiting) and mind.radio.state == WORDS[Standing]
         return met(mind) if again and variant == "assured" else mind
-    off = precision.anchors(mind)
+    if mind.findings.anchors is None:
+        mind = replace(mind, findings=replace(mind.findings, anchors=precision.anchors(mind)))
+    off = precision.apart(mind)
     mind = _weighed(mind, sightings, base, off)
     left = mind.findings.placements
     checked = encounter.redundant(sightings, base)

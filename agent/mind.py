@@ -80,6 +80,8 @@ class Findings(msgspec.Struct, frozen=True):
     candidates: tuple[int, int] | None = None
     """how many there were at first: all of them, and what silence left"""
     plan: Plan | None = None
+    anchors: float | None = None
+    """where sensors are exact: how far off, in m, both anchors may be together, as phase 1 left them"""
     own: tuple[Hypothesis, ...] = ()
     """under noise: of where its anchor is"""
     branches: tuple[Branch, ...] = ()

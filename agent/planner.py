@@ -206,9 +206,8 @@ def _released(mind: Mind, rho0: float | None) -> Mind:
         return mind  # and listens
     if rho0 is None:
         return mind.undecided("the anchor is out of range at the start")
-    if (
-        rho0 <= SAME * precision.drifted(mind, mind.log, mind.tick) and mind.briefing.mission.noise.exact
-    ):  # it is on its anchor: the heading is radial by definition, and nothing is left to find out
+    if mind.briefing.mission.noise.exact and rho0 <= SAME * precision.drifted(mind, mind.log, mind.tick):
+        # it is on its anchor: the heading is radial by definition, and nothing is left to find out
         return _located(mind, Branch(0.0, ORIGIN), "on-anchor")
     return replace(mind, state=Straight("anchor", mind.odometry, rho0))
 
@@ -223,13 +222,17 @@ def _second_range(mind: Mind) -> Mind:
     rho0, rho = mind.log.ranges[0].range, mind.log.ranges[-1].range
     possible = branches(rho0, mind.odometry, rho)
     mind = replace(mind, findings=replace(mind.findings, possible=possible))
-    floor = precision.drifted(mind, mind.log, mind.tick)
-    left = weigh_branches(
-        possible, mind.seen(), mind.briefing.mission.sensing_range, floor, precision.margin(mind)
-    )
+    left = _weighed(mind, possible)
     if isinstance(mind.state, Circling) and len(left) == 1 and _sure(mind, left[0]):
         return _located(mind, left[0], "circle")
     return _to_third_point(mind, left)
+
+
+def _weighed(mind: Mind, candidates: tuple[Branch, ...]) -> tuple[Branch, ...]:
+    """Return those of `candidates` that explain every tick of phase 1."""
+    mission, floor = mind.briefing.mission, precision.drifted(mind, mind.log, mind.tick)
+    margin = precision.margin(mission, floor)
+    return weigh_branches(candidates, mind.seen(), mission.sensing_range, floor, margin)
 
 
 def _sure(mind: Mind, branch: Branch) -> bool:
@@ -242,9 +245,9 @@ def _to_third_point(mind: Mind, left: tuple[Branch, ...]) -> Mind:
         return mind.undecided("no pose explains the anchor ranges")
     mission, variant = mind.briefing.mission, mind.briefing.variant
     pinning = variant == "assured" and len(left) == 1 and mission.noise.exact
-    controls = anchor.third_point(
-        anchor.local(left, mind.odometry), mission, variant, margin=precision.margin(mind), pinning=pinning
-    )
+    margin = precision.margin(mission, precision.drifted(mind, mind.log, mind.tick))
+    places = anchor.local(left, mind.odometry)
+    controls = anchor.third_point(places, mission, variant, margin=margin, pinning=pinning)
     if controls is None:
         return mind.undecided("eq. (5) leaves no way to a third range")
     return replace(mind, state=ThirdPoint(left, mind.odometry, controls))
@@ -257,10 +260,7 @@ def _third_range(mind: Mind, state: ThirdPoint) -> Mind:
     if not mind.briefing.mission.noise.exact:
         mind, likely = letter.with_branches(mind)
         return _located(mind, likely[0], kind) if likely else _to_third_point(mind, likely)
-    floor = precision.drifted(mind, mind.log, mind.tick)
-    left = weigh_branches(
-        state.branches, mind.seen(), mind.briefing.mission.sensing_range, floor, precision.margin(mind)
-    )
+    left = _weighed(mind, state.branches)
     if len(left) == 1 and _sure(mind, left[0]):
         return _located(mind, left[0], kind)
     if len(left) > 1 and mind.briefing.variant == "paper":

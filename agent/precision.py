@@ -12,8 +12,8 @@ from agent.belief import Sighting, anchor_error, turn_error
 from agent.geometry import Placement
 from agent.logbook import Logbook
 from agent.mind import Mind
-from protocol.mission import RANGE_MARGIN
-from protocol.motion import ORIGIN, Pose
+from protocol.mission import RANGE_MARGIN, Mission
+from protocol.motion import ORIGIN, Pose, Run, follow
 from protocol.rounding import BETTER, SURE, WELL, foothold, rounding
 
 
@@ -24,19 +24,24 @@ def size(mind: Mind) -> float:
 
 def drifted(mind: Mind, log: Logbook, tick: int) -> float:
     """Return how far, in m, rounding may have put the odometry of `log` off by `tick`."""
-    period = mind.briefing.mission.period
-    runs, v, omega = log.travelled(tick)
-    return rounding(size(mind), runs, v * period, omega * period)
+    return _rounded(size(mind), log.until(tick), mind.briefing.mission.period)
 
 
-def margin(mind: Mind) -> float:
+def _rounded(extent: float, runs: Sequence[Run], period: float) -> float:
+    """Return by how much, in m, driving `runs` may put a range off; `extent` is `size`."""
+    path = turned = 0.0
+    for run in runs:
+        path += abs(run.v) * run.ticks
+        turned += abs(run.omega) * run.ticks
+    return rounding(extent, len(runs), path * period, turned * period)
+
+
+def margin(mission: Mission, floor: float) -> float:
     """Return how far inside R, in m, a point must lie in phase 1 to count on its range.
 
     Two ranges on a radius, A_0 apart and off by a floor, leave a heading open to sqrt(2 floor / A_0), so the
     range of a point anywhere to R times that.
     """
-    mission = mind.briefing.mission
-    floor = drifted(mind, mind.log, mind.tick)
     return max(RANGE_MARGIN, mission.sensing_range * math.sqrt(2.0 * floor / mission.first_straight))
 
 
@@ -46,14 +51,16 @@ def own_anchor(mind: Mind, start: Pose, log: Logbook) -> tuple[float, bool]:
     It may once the anchor is known well; or well enough, and the last range made it hardly any better. Later
     ranges are not looked at: both robots of a pair, which know the same ranges, find the same.
     """
-    mission = mind.briefing.mission
-    enough = foothold(size(mind), mind.briefing.anchor_distance, mission.sensing_range)
-    error, ranged = math.inf, []
+    mission, extent = mind.briefing.mission, size(mind)
+    enough = foothold(extent, mind.briefing.anchor_distance, mission.sensing_range)
+    error = math.inf
+    ranged: list[tuple[Pose, float]] = []
     for one in log.ranges:
         if one.tick > log.through:
             break
-        ranged.append((log.pose(ORIGIN, one.tick, mission.period), one.range))
-        before, error = error, anchor_error(start, ranged, drifted(mind, log, one.tick))
+        runs = log.until(one.tick)
+        ranged.append((follow(ORIGIN, runs, mission.period), one.range))
+        before, error = error, anchor_error(start, ranged, _rounded(extent, runs, mission.period))
         stalled = len(ranged) > 2 and error > BETTER * before
         if error <= (enough if stalled else WELL * enough):
             return error, True
@@ -61,23 +68,29 @@ def own_anchor(mind: Mind, start: Pose, log: Logbook) -> tuple[float, bool]:
 
 
 def anchors(mind: Mind) -> float:
-    """Return how far off, in m, the anchors of both may be together, relative to where the robots are now."""
+    """Return how far off, in m, the anchors of both may be together, by the ranges of phase 1."""
     assert mind.radio.start is not None
+    own, _ = own_anchor(mind, mind.start, mind.log)
+    peers, _ = own_anchor(mind, mind.radio.start, mind.radio.peer)
+    return own + peers
+
+
+def apart(mind: Mind) -> float:
+    """Return how far off, in m, the anchors may be together, relative to where the robots are now."""
+    assert mind.findings.anchors is not None
     last = min(mind.tick, mind.radio.peer.through)
-    robots = ((mind.start, mind.log), (mind.radio.start, mind.radio.peer))
-    return sum([own_anchor(mind, start, log)[0] + drifted(mind, log, last) for start, log in robots])
+    return mind.findings.anchors + drifted(mind, mind.log, last) + drifted(mind, mind.radio.peer, last)
 
 
 def pinned_down(mind: Mind, placement: Placement, sightings: Sequence[Sighting], off: float) -> bool:
-    """Whether the ranges in `sightings` fix `placement` as exactly as a claim has to be; `off` is `anchors`.
+    """Whether the ranges in `sightings` fix `placement` as exactly as a claim has to be; `off` is `apart`.
 
     What was driven between the first and the last of them is all that puts one range off against another;
     what was driven before moves all of them alike, with the anchors.
     """
     ticks = [sighting.tick for sighting in sightings if sighting.range is not None]
-    period = mind.briefing.mission.period
+    period, extent = mind.briefing.mission.period, size(mind)
     floor = 0.0
     for log in (mind.log, mind.radio.peer):
-        (runs, v, omega), before = log.travelled(ticks[-1]), log.travelled(ticks[0])
-        floor += 0.5 * rounding(size(mind), runs - before[0] + 1, (v - before[1]) * period, omega * period)
-    return off + turn_error(placement, sightings, floor, off) * max(1.0, size(mind)) <= SURE
+        floor += 0.5 * _rounded(extent, log.between(ticks[0], ticks[-1]), period)
+    return off + turn_error(placement, sightings, floor, off) * max(1.0, extent) <= SURE

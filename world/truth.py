@@ -30,7 +30,7 @@ class Truth(msgspec.Struct, frozen=True):
     local: tuple[Pose, ...]
     """relative to `origins`; the axes are the world's"""
     origins: tuple[Anchor, ...]
-    legs: tuple[Leg | None, ...] = ()
+    legs: tuple[Leg, ...] = ()
     """what led each robot there: equal manoeuvres are one arc, so rounding does not grow with their number"""
 
     @property
@@ -43,16 +43,14 @@ class Truth(msgspec.Struct, frozen=True):
 
     def moved(self, controls: Sequence[Controls], period: float) -> Truth:
         """Where everyone is one tick later, having driven `controls`."""
-        legs = tuple(map(_onward, self.legs or (None,) * len(self.local), self.local, controls))
-        local = [step(leg.begin, leg.controls.v, leg.controls.omega, leg.ticks * period) for leg in legs]
-        return Truth(self.tick + 1, tuple(local), self.origins, legs)
-
-
-def _onward(leg: Leg | None, pose: Pose, controls: Controls) -> Leg:
-    """Return the leg of a robot that is at `pose` after `leg`, and drives `controls` for a tick."""
-    if leg is not None and leg.controls == controls:
-        return Leg(leg.begin, leg.ticks + 1, controls)
-    return Leg(pose, 1, controls)
+        legs: list[Leg] = []
+        local: list[Pose] = []
+        before = self.legs or [Leg(pose, 0, c) for pose, c in zip(self.local, controls, strict=True)]
+        for leg, pose, c in zip(before, self.local, controls, strict=True):
+            begin, ticks = (leg.begin, leg.ticks + 1) if leg.controls == c else (pose, 1)
+            legs.append(Leg(begin, ticks, c))
+            local.append(step(begin, c.v, c.omega, ticks * period))
+        return Truth(self.tick + 1, tuple(local), self.origins, tuple(legs))
 
 
 def asked(drive: Drive | None, mission: Mission) -> Controls:
