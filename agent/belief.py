@@ -148,6 +148,10 @@ class Sighting(msgspec.Struct, frozen=True):
     range: float | None
 
 
+RangedPair = tuple[Pose, Pose, float]
+"""where a and b were, each in its anchor's frame, and the range (m) between them"""
+
+
 def weigh_placements(
     candidates: Iterable[Placement], sightings: Sequence[Sighting], sensing_range: float, floor: float
 ) -> tuple[Placement, ...]:
@@ -156,27 +160,36 @@ def weigh_placements(
     `floor` is by how much (m) rounding, that of phase 1 included, may put a predicted range off.
     """
     left: list[Placement] = []
+    ranged = [(seen.a, seen.b, seen.range) for seen in sightings if seen.range is not None]
+    silent = [(seen.a, seen.b) for seen in sightings if seen.range is None]
     for candidate in candidates:
-        placement = _polished_placement(candidate, sightings)
+        placement = _polished_placement(candidate, ranged) if len(ranged) > 2 else candidate
         same = same_turn(math.hypot(placement.x, placement.y) + sensing_range)
-        if _explains(placement, sightings, sensing_range, floor) and not any(
-            same_placement(placement, other, same) for other in left
+        if (
+            _explains_ranges(placement, ranged, floor)
+            and _explains_silence(placement, silent, sensing_range - floor)
+            and not any(same_placement(placement, other, same) for other in left)
         ):
             left.append(placement)
     return tuple(left)
 
 
-def _explains(
-    placement: Placement, sightings: Sequence[Sighting], sensing_range: float, floor: float
-) -> bool:
+def _explains_ranges(placement: Placement, ranged: Iterable[RangedPair], floor: float) -> bool:
+    x, y = placement.x, placement.y
     c, s = math.cos(placement.phi), math.sin(placement.phi)
-    for sighting in sightings:
-        a, b = sighting.a, sighting.b
-        apart = math.hypot(placement.x + c * a.x - s * a.y - b.x, placement.y + s * a.x + c * a.y - b.y)
-        if sighting.range is None:
-            if apart <= sensing_range - floor:
-                return False
-        elif abs(apart - sighting.range) > floor:
+    for a, b, rho in ranged:
+        if abs(math.hypot(x + c * a.x - s * a.y - b.x, y + s * a.x + c * a.y - b.y) - rho) > floor:
+            return False
+    return True
+
+
+def _explains_silence(placement: Placement, silent: Iterable[tuple[Pose, Pose]], reach: float) -> bool:
+    x, y = placement.x, placement.y
+    c, s = math.cos(placement.phi), math.sin(placement.phi)
+    hypot = math.hypot
+    for a, b in silent:
+        ax, ay = a.x, a.y
+        if hypot(x + c * ax - s * ay - b.x, y + s * ax + c * ay - b.y) <= reach:
             return False
     return True
 
@@ -237,7 +250,7 @@ def _slopes(
             yield uy * (there.x - tx) - ux * (there.y - ty), uy * tx - ux * ty, ux, uy
 
 
-def _polished_placement(placement: Placement, sightings: Sequence[Sighting]) -> Placement:
+def _polished_placement(placement: Placement, measured: Sequence[RangedPair]) -> Placement:
     """The placement nearby that fits all ranges best; M1 stays D from M2 (Gauss-Newton).
 
     The squares are weighed so that an error is one of the range: a tiny one would not count beside others.
@@ -247,9 +260,7 @@ def _polished_placement(placement: Placement, sightings: Sequence[Sighting]) -> 
     """
     distance = math.hypot(placement.x, placement.y)
     closest = CLOSEST * distance
-    ranged = [(s.a, s.b, s.range, 0.5 / max(s.range, closest)) for s in sightings if s.range is not None]
-    if len(ranged) < 3:
-        return placement
+    ranged = [(a, b, rho, 0.5 / max(rho, closest)) for a, b, rho in measured]
     phi, psi = placement.phi, math.atan2(placement.y, placement.x)
     best, fitted = math.inf, placement
     for _ in range(POLISHING_STEPS):

@@ -48,6 +48,8 @@ def third_point(
     """
     best: Controls | None = None
     best_value = 0.0
+    shortest = ARRIVED * mission.first_straight
+    rim = mission.sensing_range - max(margin, SIGMAS * mission.noise.anchor_sigma)
     turn_rate = third_point_turn_rate(mission)
     turn_rates = [turn_rate] if variant == "paper" else [turn_rate, -turn_rate]
     if len(places) > 1:  # one branch was found on a radius: there, straight ahead checks nothing
@@ -58,7 +60,7 @@ def third_point(
         half = 0.5 * mission.period * omega
         for forward in (1.0,) if variant == "paper" else (1.0, -1.0):
             outward = [_outward(place, half, forward) for place in places]
-            reach = max(_reach(along, across, mission, margin) for along, across in outward)
+            reach = max(_reach(along, across, rim) for along, across in outward)
             length = min(longest, reach)
             if pinning:
                 value = max(
@@ -66,9 +68,7 @@ def third_point(
                 )
             else:
                 value = _separation(length, [along for along, _ in outward])
-            if length > ARRIVED * mission.first_straight and (
-                best is None or value > best_value * (1.0 + PREFERENCE)
-            ):
+            if length > shortest and (best is None or value > best_value * (1.0 + PREFERENCE)):
                 best, best_value = Controls(forward * min(length / unit, mission.max_speed), omega), value
     return best
 
@@ -80,9 +80,8 @@ def _outward(place: Pose, half_turn: float, forward: float) -> tuple[float, floa
     return place.x * c + place.y * s, place.y * c - place.x * s
 
 
-def _reach(along: float, across: float, mission: Mission, margin: float) -> float:
-    """m: how far a robot can go before it is out of range, eq. (5); negative where it is already."""
-    rim = mission.sensing_range - max(margin, SIGMAS * mission.noise.anchor_sigma)
+def _reach(along: float, across: float, rim: float) -> float:
+    """m: how far a robot can go before it is out of `rim`, eq. (5); negative where it is already."""
     inside = rim * rim - across * across
     return math.sqrt(inside) - along if inside >= 0.0 else -math.inf
 
