@@ -79,19 +79,20 @@ def _settled(mind: Mind) -> Mind:
     mission, variant, began = mind.briefing.mission, mind.briefing.variant, mind.findings.met
     assert began is not None
     sightings = mind.sightings(began if variant == "paper" else 0)
-    base = encounter.base([at for at in sightings if off_anchor(at.b, mind.briefing.rendezvous.b)])
+    ranged = [at for at in sightings if at.range is not None]
+    base = encounter.base([at for at in ranged if off_anchor(at.b, mind.briefing.rendezvous.b)])
     if base is None:  # yet; or, where a report was missed, b was still driving as a went straight
         again = isinstance(mind.state, Waiting) and mind.radio.state == WORDS[Standing]
         return met(mind) if again and variant == "assured" else mind
-    if mind.findings.anchors is None:
-        mind = replace(mind, findings=replace(mind.findings, anchors=precision.anchors(mind)))
+    if mind.findings.peer_anchor is None:
+        mind = replace(mind, findings=replace(mind.findings, peer_anchor=precision.peer_anchor(mind)))
     off = precision.apart(mind)
     mind = _weighed(mind, sightings, base, off)
     left = mind.findings.placements
-    checked = encounter.redundant(sightings, base)
+    checked = encounter.redundant(ranged, base)
     if not left:
         return mind.alarmed(Alarm("a path that no placement brings together with the mutual ranges"))
-    if checked and len(left) == 1 and precision.pinned_down(mind, left[0], sightings, off):
+    if checked and len(left) == 1 and precision.pinned_down(mind, left[0], ranged, off):
         return replace(mind, state=Done(3, Localised(mind.world_pose(left[0]))))
     mover = mind.briefing.role
     alone = variant == "assured" and isinstance(mind.radio.verdict, Localised)  # the peer stands for good

@@ -80,8 +80,10 @@ class Findings(msgspec.Struct, frozen=True):
     candidates: tuple[int, int] | None = None
     """how many there were at first: all of them, and what silence left"""
     plan: Plan | None = None
-    anchors: float | None = None
-    """where sensors are exact: how far off, in m, both anchors may be together, as phase 1 left them"""
+    own_anchor: float = 0.0
+    """where sensors are exact: how far off, in m, its anchor may be, by the ranges of phase 1"""
+    peer_anchor: float | None = None
+    """the same of its peer's"""
     own: tuple[Hypothesis, ...] = ()
     """under noise: of where its anchor is"""
     branches: tuple[Branch, ...] = ()

@@ -45,7 +45,7 @@ def margin(mission: Mission, floor: float) -> float:
     return max(RANGE_MARGIN, mission.sensing_range * math.sqrt(2.0 * floor / mission.first_straight))
 
 
-def own_anchor(mind: Mind, start: Pose, log: Logbook) -> tuple[float, bool]:
+def anchor(mind: Mind, start: Pose, log: Logbook) -> tuple[float, bool]:
     """Return how far, in m, the anchor may be off for the robot of `log`, and whether phase 1 may end.
 
     It may once the anchor is known well; or well enough, and the last range made it hardly any better. Later
@@ -60,6 +60,8 @@ def own_anchor(mind: Mind, start: Pose, log: Logbook) -> tuple[float, bool]:
             break
         runs = log.until(one.tick)
         ranged.append((follow(ORIGIN, runs, mission.period), one.range))
+        if len(ranged) == 1 and start.x > enough:
+            continue  # a range from the start alone tells nothing of the heading
         before, error = error, anchor_error(start, ranged, _rounded(extent, runs, mission.period))
         stalled = len(ranged) > 2 and error > BETTER * before
         if error <= (enough if stalled else WELL * enough):
@@ -67,30 +69,29 @@ def own_anchor(mind: Mind, start: Pose, log: Logbook) -> tuple[float, bool]:
     return error, False
 
 
-def anchors(mind: Mind) -> float:
-    """Return how far off, in m, the anchors of both may be together, by the ranges of phase 1."""
+def peer_anchor(mind: Mind) -> float:
+    """Return `anchor` of the peer, in m."""
     assert mind.radio.start is not None
-    own, _ = own_anchor(mind, mind.start, mind.log)
-    peers, _ = own_anchor(mind, mind.radio.start, mind.radio.peer)
-    return own + peers
+    return anchor(mind, mind.radio.start, mind.radio.peer)[0]
 
 
 def apart(mind: Mind) -> float:
     """Return how far off, in m, the anchors may be together, relative to where the robots are now."""
-    assert mind.findings.anchors is not None
+    own, peers = mind.findings.own_anchor, mind.findings.peer_anchor
+    assert peers is not None
     last = min(mind.tick, mind.radio.peer.through)
-    return mind.findings.anchors + drifted(mind, mind.log, last) + drifted(mind, mind.radio.peer, last)
+    return own + peers + drifted(mind, mind.log, last) + drifted(mind, mind.radio.peer, last)
 
 
-def pinned_down(mind: Mind, placement: Placement, sightings: Sequence[Sighting], off: float) -> bool:
-    """Whether the ranges in `sightings` fix `placement` as exactly as a claim has to be; `off` is `apart`.
+def pinned_down(mind: Mind, placement: Placement, ranged: Sequence[Sighting], off: float) -> bool:
+    """Whether the sightings in `ranged` fix `placement` as exactly as a claim has to be; `off` is `apart`.
 
     What was driven between the first and the last of them is all that puts one range off against another;
     what was driven before moves all of them alike, with the anchors.
     """
-    ticks = [sighting.tick for sighting in sightings if sighting.range is not None]
+    first, last = ranged[0].tick, ranged[-1].tick
     period, extent = mind.briefing.mission.period, size(mind)
     floor = 0.0
     for log in (mind.log, mind.radio.peer):
-        floor += 0.5 * _rounded(extent, log.between(ticks[0], ticks[-1]), period)
-    return off + turn_error(placement, sightings, floor, off) * max(1.0, extent) <= SURE
+        floor += 0.5 * _rounded(extent, log.between(first, last), period)
+    return off + turn_error(placement, ranged, floor, off) * max(1.0, extent) <= SURE
