@@ -116,7 +116,7 @@ class Compared(NamedTuple):
 def base(sightings: Sequence[Sighting]) -> tuple[Sighting, Sighting] | None:
     """The two ranges that eq. (7) is solved from: the first two between which only a has moved.
 
-    Others go before two by which b may stand on M1: there any turn of a about it would do.
+    Not two by which b may stand on M1: there any turn of a about it would do.
     """
     ranged: list[Sighting] = []
     for sighting in sightings:
@@ -124,7 +124,6 @@ def base(sightings: Sequence[Sighting]) -> tuple[Sighting, Sighting] | None:
             ranged and (ranged[-1].a, ranged[-1].b) == (sighting.a, sighting.b)  # both have stood since
         ):
             ranged.append(sighting)
-    found: tuple[Sighting, Sighting] | None = None
     for first in ranged:
         for second in ranged:
             if first.tick < second.tick and travelled(first.b, second.b) < ELSEWHERE < travelled(
@@ -133,8 +132,7 @@ def base(sightings: Sequence[Sighting]) -> tuple[Sighting, Sighting] | None:
                 near = ON_THE_OTHER * travelled(first.a, second.a)
                 if not (_as_far(first, near) and _as_far(second, near)):
                     return first, second
-                found = found or (first, second)
-    return found
+    return None
 
 
 def _as_far(sighting: Sighting, near: float) -> bool:
