@@ -77,10 +77,13 @@ def peer_anchor(mind: Mind) -> float:
 
 def apart(mind: Mind) -> float:
     """Return how far off, in m, the anchors may be together, relative to where the robots are now."""
+    return _apart(mind, min(mind.tick, mind.radio.peer.through))
+
+
+def _apart(mind: Mind, tick: int) -> float:
     own, peers = mind.findings.own_anchor, mind.findings.peer_anchor
     assert peers is not None
-    last = min(mind.tick, mind.radio.peer.through)
-    return own + peers + drifted(mind, mind.log, last) + drifted(mind, mind.radio.peer, last)
+    return own + peers + drifted(mind, mind.log, tick) + drifted(mind, mind.radio.peer, tick)
 
 
 def pinned_down(mind: Mind, placement: Placement, ranged: Sequence[Sighting], off: float) -> bool:
@@ -94,4 +97,5 @@ def pinned_down(mind: Mind, placement: Placement, ranged: Sequence[Sighting], of
     floor = 0.0
     for log in (mind.log, mind.radio.peer):
         floor += 0.5 * _rounded(extent, log.between(first, last), period)
-    return off + turn_error(placement, ranged, floor, off) * max(1.0, extent) <= SURE
+    turned = turn_error(placement, ranged, floor, _apart(mind, first))
+    return off + turned * max(1.0, extent) <= SURE
