@@ -93,24 +93,24 @@ def weigh_branches(
     return tuple(left)
 
 
-def anchor_error(start: Pose, ranged: Sequence[tuple[Pose, float]], floor: float) -> float:
+def anchor_error(start: Pose, ranged: Sequence[tuple[Pose, float, float]]) -> float:
     """Return how far (m) the anchor may be from where the branch that begins at `start` puts it.
 
-    To first order, by the ranges in `ranged`, each of which rounding may put off by `floor`. They are
-    fitted in squares: at a point that lies y off the line from the anchor through p_0, the slope of the
-    squared range by the heading is 2 rho_0 y, and its error 2 floor (rho + rho_0), with that of rho_0.
-    Whatever the heading, the anchor is rho_0 away: no more than 2 rho_0 of error is left, on the anchor
-    none. What `weigh_branches` merges, it puts off, too.
+    To first order, by the odometry and the range of each in `ranged`, and by how much (m) rounding may
+    put that range off, its floor. They are fitted in squares: at a point that lies y off the line from
+    the anchor through p_0, the slope of the squared range by the heading is 2 rho_0 y, and its error 2
+    floor (rho + rho_0), with that of rho_0. Whatever the heading, the anchor is rho_0 away: no more than
+    2 rho_0 of error is left, on the anchor none. What `weigh_branches` merges, it puts off, too.
     """
     rho0 = start.x
     c, s = math.cos(start.heading), math.sin(start.heading)
     moment = across = 0.0
-    for pose, rho in ranged:
+    for pose, rho, floor in ranged:
         y = abs(s * pose.x + c * pose.y)
         moment += y * y
-        across += y * (rho + rho0)
-    turned = floor * across / moment if moment > 0.0 else math.inf
-    return (1.0 + SAME) * floor + min(2.0 * rho0, turned)
+        across += floor * y * (rho + rho0)
+    turned = across / moment if moment > 0.0 else math.inf
+    return (1.0 + SAME) * ranged[-1][2] + min(2.0 * rho0, turned)
 
 
 def _polished(branch: Branch, ranged: Sequence[tuple[Pose, float]]) -> Branch:

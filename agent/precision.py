@@ -54,17 +54,18 @@ def anchor(mind: Mind, start: Pose, log: Logbook) -> tuple[float, bool]:
     mission, extent = mind.briefing.mission, size(mind)
     enough = foothold(extent, mind.briefing.anchor_distance, mission.sensing_range)
     error = math.inf
-    ranged: list[tuple[Pose, float]] = []
+    ranged: list[tuple[Pose, float, float]] = []
     for one in log.ranges:
         if one.tick > log.through:
             break
         runs = log.until(one.tick)
-        ranged.append((follow(ORIGIN, runs, mission.period), one.range))
+        floor = _rounded(extent, runs, mission.period)
+        ranged.append((follow(ORIGIN, runs, mission.period), one.range, floor))
         if len(ranged) == 1 and start.x > enough:
             continue  # a range from the start alone tells nothing of the heading
-        before, error = error, anchor_error(start, ranged, _rounded(extent, runs, mission.period))
+        before, error = error, anchor_error(start, ranged)
         stalled = len(ranged) > 2 and error > BETTER * before
-        if error <= (enough if stalled else WELL * enough):
+        if error <= WELL * enough or (stalled and min(before, error) <= enough):
             return error, True
     return error, False
 

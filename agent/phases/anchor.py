@@ -52,7 +52,7 @@ def third_point(
     rim = mission.sensing_range - max(margin, SIGMAS * mission.noise.anchor_sigma)
     turn_rate = third_point_turn_rate(mission)
     turn_rates = [turn_rate] if variant == "paper" else [turn_rate, -turn_rate]
-    if len(places) > 1:  # one branch was found on a radius: there, straight ahead checks nothing
+    if len(places) > 1 or pinning:  # one branch was found on a radius: there, straight ahead checks nothing
         turn_rates.append(0.0)
     for omega in turn_rates:
         unit = chord(1.0, omega, mission.period)
