@@ -85,7 +85,7 @@ def weigh_branches(
     for candidate in candidates:
         branch = _polished(candidate, ranged)
         if (
-            all(abs(branch.distance(pose) - rho) <= floor for pose, rho in ranged)
+            all(_meets(branch.distance(pose), rho, branch.start.x, floor) for pose, rho in ranged)
             and all(branch.distance(pose) > sensing_range - 0.5 * margin for pose in silent)
             and not any(math.dist(branch.anchor, other.anchor) < SAME * floor for other in left)
         ):
@@ -111,6 +111,11 @@ def anchor_error(start: Pose, ranged: Sequence[tuple[Pose, float, float]]) -> fl
         across += floor * y * (rho + rho0)
     turned = across / moment if moment > 0.0 else math.inf
     return (1.0 + SAME) * ranged[-1][2] + min(2.0 * rho0, turned)
+
+
+def _meets(predicted: float, rho: float, rho0: float, floor: float) -> bool:
+    """Whether the range `rho` may be what is `predicted`; nearer than rho_0 in squares, as it is fitted."""
+    return abs(predicted - rho) * (predicted + rho) <= 2.0 * floor * max(rho, rho0)
 
 
 def _polished(branch: Branch, ranged: Sequence[tuple[Pose, float]]) -> Branch:
@@ -282,8 +287,7 @@ def _polished_placement(placement: Placement, measured: Sequence[RangedPair]) ->
         if cost >= best:
             break
         best, fitted = cost, Placement(wrap(phi), tx, ty)
-        damping = DAMPING * (pp + qq)
-        pp, qq = pp + damping, qq + damping
+        pp, qq = pp * (1.0 + DAMPING), qq * (1.0 + DAMPING)
         determinant = pp * qq - pq * pq
         if determinant == 0.0:
             break

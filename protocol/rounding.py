@@ -59,7 +59,8 @@ BETTER = 0.9
 def foothold(size: float, distance: float, sensing_range: float) -> float:
     """Return how exactly, in m, a robot must know where its anchor is when phase 1 ends.
 
-    An anchor that is off by e turns the line between the anchors by e / D, and b, whose place is R / 8 from
-    its own, by 8 e / R; either puts a pose off by `size` times that, and two robots err.
+    An anchor that is off by e turns the line between the anchors by e / D, and a fit to ranges from places
+    that are not the best by up to twice that; and b, whose place is R / 8 from its own, by 8 e / R. Either
+    puts a pose off by `size` times that, and two robots err.
     """
-    return 0.5 * SURE * min(distance, 0.125 * sensing_range) / max(1.0, size)
+    return 0.5 * SURE * min(0.5 * distance, 0.125 * sensing_range) / max(1.0, size)
