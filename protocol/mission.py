@@ -100,15 +100,17 @@ def obstacle(mission: Mission, distance: float) -> str | None:
             "nothing for sure: raise max_speed or period"
         )
     size = distance + reach
-    if AMPLIFIED * EPSILON * size * max(1.0, reach / distance) * max(
-        1.0, size
-    ) / step > SURE or MARGIN * _anchor_error(mission, size) > foothold(size, distance, reach):
-        return (
-            f"with {distance:.6g} m between the anchors and ranges up to {reach:.6g} m, manoeuvres of "
-            f"{step:.3g} m are too short for a pose to be sure to a micrometre in double precision: "
-            "raise max_speed or period"
-        )
-    return None
+    if AMPLIFIED * EPSILON * size * max(1.0, reach / distance) * max(1.0, size) / step > SURE:
+        which = "mutual"
+    elif MARGIN * _anchor_error(mission, size) > foothold(size, distance, reach):
+        which = "anchor"
+    else:
+        return None
+    return (
+        f"with {distance:.6g} m between the anchors and ranges up to {reach:.6g} m, manoeuvres of "
+        f"{step:.3g} m are too short for a pose to be sure to a micrometre in double precision, by the "
+        f"{which} ranges: raise max_speed or period"
+    )
 
 
 MARGIN = 1.2

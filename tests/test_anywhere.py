@@ -88,6 +88,21 @@ def test_a_mission_that_rounding_once_misled_localises(case: str) -> None:
     assert_localised(released(*CASES[case]).scenario)
 
 
+ONCE_LOST = {
+    "b stood where a's anchor is, and eq. (7) was solved from there": 22897,
+    "b stood a little beside a's anchor, and eq. (7) was solved from there": 24366,
+    "a range nearly nothing beside the others": 30968,
+    "the same, with anchors close to each other": 45622,
+    "a third point out of range left one branch, not known well enough": 6593,
+    "two placements nearly one, with anchors close to each other": 38287,
+}
+
+
+@pytest.mark.parametrize("case", ONCE_LOST)
+def test_a_trial_that_was_once_lost_localises(case: str) -> None:
+    assert played(ONCE_LOST[case]) == "localised"
+
+
 def test_the_paper_is_never_wrong_either() -> None:
     """It may give up, with a reason."""
     for trial in range(60):
