@@ -18,7 +18,7 @@ from protocol.messages import Briefing, OfRobot, Sense
 from protocol.retrace import Retrace
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode, encode
 from world.driver import Driver
-from world.driver_journal import DriverPast, driver_journal, driver_past
+from world.driver_journal import DriverPast, Start, boot, driver_journal, driver_past
 from world.field import Field
 
 RELEASE_S = 10.0
@@ -35,6 +35,8 @@ class DriverRecord(msgspec.Struct, frozen=True):
     """the latest tick in the agent's; -1 where there is none"""
     again: bool
     """whether they were there before"""
+    start: Start
+    """of this process"""
 
     def take_up(self, driver: Driver, name: str, field: Field) -> None:
         """Go on where they end, by the driver of that name. Raises UserError if it cannot."""
@@ -42,14 +44,18 @@ class DriverRecord(msgspec.Struct, frozen=True):
             again(driver, name, self.past)
         if self.again:
             field.resume(self.past, self.known)
+        if self.past.end is None and self.past.start != self.start:
+            self.journal.write(encode(self.start))
 
 
 @contextmanager
 def recorded(folder: Path, briefing: Briefing, inbox: Inbox, *, fsync: bool) -> Iterator[DriverRecord]:
     """The recording in `folder` of the robot that was told `briefing`; a new one, if there is none.
 
-    Raises CannotRecord; CorruptJournal where the two journals are not of one robot in one run.
+    Raises CannotRecord; CorruptJournal where the two journals are not of one robot in one run, or may lack
+    what the robot has told.
     """
+    start = Start(boot(), fsync)
     path = folder / driver_journal(briefing.robot)
     agents = folder / agent_journal(briefing.robot)
     if not path.exists():
@@ -57,18 +63,23 @@ def recorded(folder: Path, briefing: Briefing, inbox: Inbox, *, fsync: bool) -> 
             raise CannotRecord(f"{agents} is there already, and {path.name} is not; choose another folder")
         with Journal(path, fsync=fsync) as journal:
             journal.write(encode(briefing))
-            yield DriverRecord(journal, DriverPast(), -1, again=False)
+            yield DriverRecord(journal, DriverPast(), -1, again=False, start=start)
         return
     old = Retrace(path, fsync=fsync)
     try:
         past = driver_past(old.frames, briefing, path)
+        if past.may_lack:
+            raise CorruptJournal(
+                f"{path} was written without --fsync, and this computer has been started again since: "
+                "what the robot has told its peer may be missing in it"
+            )
         known = _known(_frames(agents, inbox), past, agents)
         old.write(*(old.frames or [encode(briefing)]))
     except BaseException:
         old.close()
         raise
     with going_on(old, inbox) as journal:
-        yield DriverRecord(journal, past, known, again=True)
+        yield DriverRecord(journal, past, known, again=True, start=start)
 
 
 def _frames(path: Path, inbox: Inbox) -> list[bytes]:

@@ -8,6 +8,7 @@ environment, working directory and limits.
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import socket
@@ -15,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from itertools import count
@@ -49,6 +51,9 @@ class Signal(msgspec.Struct, frozen=True, tag=True):
 
 KILL_S = 5.0
 """how long a process that is killed may take to end; then its fork server does not answer, and is killed"""
+TAKE_S = 60.0
+"""how long a fork server may take to accept descriptors while too many are under way; it may still import"""
+TRY_AGAIN_S = 0.01
 ENDED_BYTES = 8
 
 
@@ -152,6 +157,7 @@ class ForkServer:
             start_new_session=True,
         )
         its.close()
+        self.pid = self._process.pid
         self._numbers = count()
         self._running: dict[int, Process] = {}
         self._lock = threading.Lock()
@@ -214,9 +220,26 @@ class ForkServer:
     def _ask(self, request: Start | Signal, streams: list[int]) -> None:
         body = msgspec.msgpack.encode(request)
         frame = len(body).to_bytes(LENGTH_BYTES, "big") + body
-        with suppress(OSError):  # it has ended: `_listen` sees it, too
-            sent = socket.send_fds(self._socket, [frame], streams) if streams else 0
+        try:
+            sent = self._send_streams(frame, streams) if streams else 0
             self._socket.sendall(frame[sent:])
+        except OSError:  # no request is lost in silence: `_listen` sees the end of the server
+            self._process.kill()
+
+    def _send_streams(self, frame: bytes, streams: list[int]) -> int:
+        """Send `streams` with the beginning of `frame`, whose size is returned. Raises OSError.
+
+        A user may have no more descriptors under way between all processes than one may have open; so the
+        server has TAKE_S to take those of earlier requests.
+        """
+        give_up = time.monotonic() + TAKE_S
+        while True:
+            try:
+                return socket.send_fds(self._socket, [frame], streams)
+            except OSError as error:
+                if error.errno != errno.ETOOMANYREFS or time.monotonic() >= give_up:
+                    raise
+            time.sleep(TRY_AGAIN_S)
 
     def _listen(self) -> None:
         news = b""

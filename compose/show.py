@@ -10,7 +10,7 @@ from typing import Any
 from rich.live import Live
 from rich.table import Table
 
-from compose import layout
+from compose import layout, tables
 from compose.record import WORLD_JOURNAL
 from compose.summary import outcome_line
 from protocol.journal import Tail
@@ -74,7 +74,7 @@ def live(scenario: Scenario, folder: Path) -> Iterator[None]:
 
     with Live(
         get_renderable=table,
-        console=layout.console(),
+        console=tables.console(),
         auto_refresh=True,
         transient=True,
         refresh_per_second=10,
@@ -92,9 +92,9 @@ def result(summary: Mapping[str, Any], rate: float | None = None) -> None:
         columns = [column for column in choice if column not in left_out]
         cells = {name: _cells(robot, columns) for name, robot in robots.items()}
         rows = [(name, *of_robot.values()) for name, of_robot in cells.items()]
-        made = layout.table(["robot"], columns, rows)
-        lines = layout.lines(made)
-        if layout.fits(lines):
+        made = tables.table(["robot"], columns, rows)
+        lines = tables.lines(made)
+        if tables.fits(lines):
             break
         if len(robots) <= LISTED:
             lines = [
@@ -104,7 +104,7 @@ def result(summary: Mapping[str, Any], rate: float | None = None) -> None:
             ]
             break
     else:
-        lines = layout.lines(made, layout.room())
+        lines = tables.lines(made, layout.room())
     say(f"{summary['scenario']}: {outcome_line(summary)}", "", *lines, "", *layout.notes(NOTES, columns))
     if late:
         say(*layout.wrapped(_missed(late, summary["ticks"], rate)))

@@ -17,6 +17,7 @@ import json
 import math
 import socket
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import msgspec
@@ -143,7 +144,10 @@ class Rover:
             self._tell(tick)
             try:
                 said = json.loads(self._radio.recv(1024))
-            except (TimeoutError, ConnectionRefusedError):
+            except TimeoutError:
+                continue
+            except ConnectionRefusedError:  # there is no beacon; to be told so takes no time
+                time.sleep(ASK_AGAIN_S)
                 continue
             if said["tick"] == tick:
                 return said["range"] if said["range"] is None else float(said["range"])
@@ -154,7 +158,8 @@ class Rover:
     def _tell(self, tick: int, *, parked: bool = False) -> None:
         where = {"robot": self._briefing.robot, "peer": self._briefing.peer, "tick": tick, "parked": parked}
         if self._radio is not None:
-            self._radio.send(json.dumps(where | {"x": self.pose.x, "y": self.pose.y}).encode())
+            with suppress(ConnectionRefusedError):  # what was sent before found no beacon
+                self._radio.send(json.dumps(where | {"x": self.pose.x, "y": self.pose.y}).encode())
 
 
 def main() -> None:

@@ -74,6 +74,8 @@ class Journal:
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             file = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
+            if self._fsync:
+                _sync_folder(self.path.parent)
         except OSError as error:
             if self.path.exists():
                 raise RecordExists(f"{self.path} is there already; choose another folder") from None
@@ -109,6 +111,15 @@ class Journal:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _sync_folder(folder: Path) -> None:
+    """Have the disk know the files that are in `folder` by now."""
+    opened = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(opened)
+    finally:
+        os.close(opened)
 
 
 def lock(file: int, path: Path) -> None:

@@ -38,12 +38,6 @@ MSGPACK = zenoh.Encoding("application/msgpack")
 REFUSAL = zenoh.Encoding.TEXT_PLAIN
 """of an answer that says why there is none"""
 
-RUNTIME = (
-    "(app: (worker_threads: 1), net: (handover: app), acc: (handover: app), "
-    "rx: (handover: app), tx: (handover: app))"
-)
-"""Zenoh's thread pools: one with one thread, instead of five between which each message is handed on"""
-os.environ.setdefault("ZENOH_RUNTIME", RUNTIME)
 zenoh.init_log_from_env_or("off")
 
 

@@ -34,6 +34,8 @@ Sigma = Annotated[float, Meta(ge=0.0, le=1e4)]
 """m, a standard deviation"""
 Moment = Annotated[float, Meta(ge=-1e15, le=1e15)]
 """of second order, of m and rad"""
+Finite = Annotated[float, Meta(ge=-1e18, le=1e18)]
+"""a number of a user's own, such as a count of an encoder or a time"""
 Probability = Annotated[float, Meta(ge=0.0, le=0.5)]
 Fraction = Annotated[float, Meta(ge=0.0, le=0.5)]
 Tick = Annotated[int, Meta(ge=0, le=2**31)]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
 import time
+from signal import SIGKILL
 
 from msgspec.structs import replace
 
@@ -139,3 +141,18 @@ class CannotResume(Rover):
     """One that has no memory of what its wheels did."""
 
     resume = None  # type: ignore[assignment]
+
+
+class LosesAReading(Rover):
+    """One whose process is killed once, when it has taken the reading of a tick."""
+
+    TICK = 8
+
+    def sense(self, tick: int) -> Reading:
+        reading = super().sense(tick)
+        assert self._state is not None
+        killed = self._state.with_suffix(".killed")
+        if tick == self.TICK and not killed.exists():
+            killed.touch()
+            os.kill(os.getpid(), SIGKILL)
+        return reading

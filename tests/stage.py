@@ -51,7 +51,14 @@ class Stage(Inbox):
 
     def comes(self, topic: Topic, key: str, frame: bytes = b"", after: float = TRANSPORT_S) -> None:
         """That arrives `after` so many seconds from now."""
-        heapq.heappush(self._coming, (self.now + after, len(self._coming), Arrival(topic, key, frame)))
+        heapq.heappush(
+            self._coming,
+            (
+                self.now + after,
+                len(self._coming),
+                Arrival(topic, key, frame, keys.parse(key) or keys.NOWHERE),
+            ),
+        )
 
     def next(self, timeout: float | None) -> Arrival:
         """The next arrival, once it is time for it; NOTHING after `timeout` seconds without."""

@@ -383,8 +383,8 @@ def test_every_pair_has_figures_of_its_own(records: Path) -> None:
 @pytest.mark.parametrize("ticks", [0, 1, 30, 47])
 def test_a_torn_record_is_drawn_to_the_tear(ticks: int, records: Path, tmp_path: Path) -> None:
     folder = copied(recorded("paper-1", records), tmp_path)
-    cut(folder / "world.journal", 1 + 2 * ticks)
-    cut(folder / "agent-b.journal", 1 + 3 * min(ticks, 20))
+    cut(folder / "world.journal", 2 + 2 * ticks)
+    cut(folder / "agent-b.journal", 2 + 3 * min(ticks, 20))
     told = pair(folder)
     figures = {name: one for kind in PICTURES[:-1] for name, one in album.pictures(told, kind)}
     path = drawn(figures["trajectory-a-b"])

@@ -185,7 +185,7 @@ def test_an_answer_of_a_stranger_under_a_wildcard_is_no_briefing() -> None:
         asked = keys.briefing(RUN, "a")
         assert answers("tandem/**", lambda query: query.reply("tandem/**", encode(briefing))) is None
         assert answers(asked, lambda query: query.reply(asked, encode(briefing))) == encode(briefing)
-        refusal = answers(asked, lambda query: query.reply_err(b"\xff\xfe" * 1000))
+        refusal = answers(asked, lambda query: query.reply_err(b"\xff\xfe" * 1000, encoding=session.REFUSAL))
         assert isinstance(refusal, str)
         assert len(refusal) <= 300
 

@@ -813,7 +813,7 @@ def test_what_befell_the_reports_is_listed_and_another_plan_is_found(tmp_path: P
     assert to_a.lost > 0 < to_a.damaged
     assert to_a.heard + to_a.damaged + to_a.lost - to_a.twice == to_a.sent
     told = tandem("audit", tmp_path).out
-    assert re.search(r"^b->a +\d+ +\d+", told, re.MULTILINE)
+    assert re.search(r"^ ?b->a +\d+ +\d+", told, re.MULTILINE)
 
     lost = next(
         one

@@ -326,7 +326,7 @@ def test_robots_that_do_not_make_a_mission_are_refused(text: str, field: str, tm
     [
         ("paper-3", "paper-3: neither a file nor a scenario that ships"),
         ("missing.toml", "missing.toml: neither a file"),
-        ("folder", "folder: cannot be read: Is a directory"),
+        ("folder", "folder: cannot be read: it is a directory"),
         ("two\nlines", "neither a file"),
         ("x" * 5000, "x: "),
         ("\udcff", "neither a file"),

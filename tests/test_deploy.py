@@ -130,7 +130,7 @@ def test_what_the_wheel_is_made_of_goes_into_the_image() -> None:
         "pyproject.toml",
         project["project"]["readme"],
         *project["project"]["license-files"],
-        *project["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"],
+        *{path.split("/")[1] for path in project["tool"]["hatch"]["build"]["targets"]["wheel"]["include"]},
     }
     let_in = {line[1:] for line in (HOUSE / ".dockerignore").read_text().splitlines() if line.startswith("!")}
     assert let_in == needed

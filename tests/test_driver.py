@@ -200,6 +200,19 @@ def test_an_agent_that_never_answers_ends_the_mission_after_the_patience(played:
     assert end.reason.startswith("no answer from a's agent for 1.")
 
 
+def test_an_agent_that_only_appears_over_and_over_ends_the_mission_after_the_patience(
+    stage: Stage, played: Play
+) -> None:
+    """One that dies at once is started again each time, and has answered nothing."""
+    for second in range(1000):
+        stage.comes("alive", keys.robot_alive("r", "a"), after=float(second))
+    _, end, _ = played(Recorded(), lambda _: [], ticks=1000, patience=3.0)
+    assert end.outcome == "failed"
+    assert end.reason is not None
+    assert end.reason.startswith("no answer from a's agent for ")
+    assert stage.now < 20.0
+
+
 # --- the end ------------------------------------------------------------------------------------------
 
 

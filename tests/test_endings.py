@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from random import Random
 from signal import SIGINT, SIGKILL, SIGSTOP, SIGTERM
@@ -36,10 +37,12 @@ from tests.commands import (
 )
 from tests.series import series
 
-AT_ONCE_S = 4.0
-"""less than the 5 s after which a process that was told to stop is killed"""
-SOON_S = 15.0
-"""for what has a patience of 2 s"""
+AT_ONCE_S = 15.0
+"""half the patience of 30 s: who ends within it was told to, or saw why, and did not wait for an answer"""
+SOON_S = 25.0
+"""for what has a patience of PATIENCE seconds; less than the 30 s of who was not told of it"""
+PATIENCE = "5"
+"""s; longer than a busy machine takes to connect a process"""
 
 draw = Random(7).random
 Moment = Callable[[Command, Path], bool]
@@ -188,40 +191,46 @@ def test_a_process_that_dies_ends_the_run_at_once_and_is_named(
 
 def test_a_robot_that_falls_silent_fails_the_run_within_the_patience(endless: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    with Command("run", endless, "--out", out, "--patience", "2", "-q") as run:
+    with Command("run", endless, "--out", out, "--patience", PATIENCE, "-q") as run:
         run.until_written(out / "world.journal", 10_000)
         os.kill(process_of(out, "agent", "b"), SIGSTOP)
-        ended = run.ended(30.0)
+        ended = run.ended(SOON_S)
     assert ended.status != 0
     assert re.search(r"no answer from b( \(not there\))? at tick ", ended.out + ended.err)
-    assert "for 2 s" in ended.out + ended.err
+    assert f"for {PATIENCE} s" in ended.out + ended.err
     assert not processes_of(out)
 
 
 def test_an_agent_whose_world_dies_ends_within_its_patience(tmp_path: Path) -> None:
     with world("paper-1", "--run", "mine") as (clock, endpoint):
-        patience = ("--patience", "2", "--out", tmp_path)
+        patience = ("--patience", PATIENCE, "--out", tmp_path)
         with Command("agent", "a", "--connect", endpoint, *patience) as agent:
             agent.until_answered("a", tmp_path)
             clock.tell(SIGKILL)
             ended = agent.ended(SOON_S)
     assert ended.status == 3
     assert ended.err.splitlines() == [
-        "tandem agent a: the world has gone; waiting 2 s for it",
-        "tandem agent a: nothing heard from the world for 2 s",
+        f"tandem agent a: the world has gone; waiting {PATIENCE} s for it",
+        f"tandem agent a: nothing heard from the world for {PATIENCE} s",
     ]
 
 
 @pytest.mark.parametrize("comes", ["nobody", "a"])
 def test_a_world_whose_robot_never_comes_fails_and_says_who_was_missing(comes: str, tmp_path: Path) -> None:
     missing = {"nobody": "a (not there), b (not there)", "a": "b (not there)"}[comes]
-    reason = f"no answer from {missing} at tick 0 for 2 s"
-    with world("paper-1", "--patience", "2", "--out", tmp_path) as (clock, endpoint):
+    reason = f"no answer from {missing} at tick 0 for {PATIENCE} s"
+    endpoint = free_endpoint()
+    with ExitStack() as stack:
         if comes == "a":
-            agent = tandem("agent", "a", "--connect", endpoint)
-            assert agent.status == 3
-            assert f"a: failed after 0 ticks ({reason})" in agent.out
+            agent = stack.enter_context(Command("agent", "a", "--connect", endpoint))
+            agent.until(lambda: agent.catches(SIGTERM), "it looks for its world")
+        arguments = ("--listen", endpoint, "--patience", PATIENCE, "--out", tmp_path)
+        clock = stack.enter_context(Command("world", "paper-1", *arguments))
         ended = clock.ended(SOON_S)
+        if comes == "a":
+            parted = agent.ended(SOON_S)
+            assert parted.status == 3
+            assert f"a: failed after 0 ticks ({reason})" in parted.out
     assert ended.status == 3
     assert reason in " ".join(ended.out.split())
     summary = json.loads((tmp_path / "summary.json").read_text())

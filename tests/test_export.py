@@ -41,6 +41,7 @@ from compose.audit.replay import replay
 from compose.cli import parser
 from compose.commands import run
 from compose.export.folder import export
+from compose.export.gate import GUESTS, GUESTS_FILES
 from compose.export.views import LEAST
 from compose.local import free_endpoint
 from compose.record import WORLD_JOURNAL, agent_journal, estimates, read
@@ -49,7 +50,7 @@ from protocol import journal
 from protocol.messages import Estimate, Sense
 from protocol.motion import wrap
 from protocol.wire import decode
-from tests.commands import BOUND_S, OVER, REAL_TIME, Command, processes_of, tandem
+from tests.commands import BOUND_S, OVER, REAL_TIME, Command, processes_of, tandem, until
 from tests.doctor import complaints
 from tests.replays import journals_of, killed
 from world.referee import errors
@@ -554,8 +555,32 @@ def test_of_web_pages_only_foxglove_s_app_and_those_named_see_a_run() -> None:
         assert len(listening) == 1
 
 
+def test_a_crowd_of_viewers_is_turned_away_and_leaves_room_for_those_that_come_after_it() -> None:
+    port = int(free_endpoint().rsplit(":", 1)[1])
+    files = GUESTS_FILES + 50
+    limited = ("sh", "-c", f'ulimit -n {files}; exec "$@"', "sh")
+    heads = {"Host": f"127.0.0.1:{port}"}
+    with Command("run", "paper-1", "-q", "--foxglove", str(port), through=limited) as played:
+        played.until_says("until Ctrl-C")
+        crowd = [asking(port, heads) for _ in range(GUESTS)]
+        assert {connection.getresponse().status for connection in crowd} == {101}
+        crowd += [asking(port, {}) for _ in range(files)]
+        assert crowd[GUESTS].getresponse().status == 503
+        for connection in crowd:
+            connection.close()
+        until(lambda: asked(port, heads) == 101, "there is room again")
+
+
 def asked(port: int, heads: dict[str, str]) -> int:
     """The status with which a WebSocket handshake with `heads` is answered."""
+    connection = asking(port, heads)
+    status = connection.getresponse().status
+    connection.close()
+    return status
+
+
+def asking(port: int, heads: dict[str, str]) -> http.client.HTTPConnection:
+    """A connection that has asked for a WebSocket handshake with `heads`."""
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=BOUND_S)
     usual = {
         "Connection": "Upgrade",
@@ -565,9 +590,7 @@ def asked(port: int, heads: dict[str, str]) -> int:
         "Sec-WebSocket-Protocol": "foxglove.sdk.v1",
     }
     connection.request("GET", "/", headers=usual | heads)
-    status = connection.getresponse().status
-    connection.close()
-    return status
+    return connection
 
 
 def listened_by(pids: Iterable[int]) -> set[tuple[str, int]]:

@@ -205,4 +205,4 @@ def test_a_plan_in_which_nothing_happens_is_no_plan_to_the_byte(base: str, tmp_p
     without, with_it = journals(tmp_path / "without"), journals(tmp_path / "with")
     for robot in "ab":
         assert without[f"agent-{robot}.journal"] == with_it[f"agent-{robot}.journal"]
-    assert frames(tmp_path / "without", "world.journal")[1:] == frames(tmp_path / "with", "world.journal")[1:]
+    assert frames(tmp_path / "without", "world.journal")[2:] == frames(tmp_path / "with", "world.journal")[2:]

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import shutil
+import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,15 +19,17 @@ from msgspec.structs import replace
 from agent.past import Past, past
 from compose.local import free_endpoint
 from compose.scenario import load
+from docs.rover import Rover
 from protocol import journal
 from protocol.messages import Drive, OfRobot
 from protocol.motion import REST
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
-from tests.commands import PAPER_1, Command, Ended, process_of, processes_of, tandem
+from tests.commands import OVER, PAPER_1, Command, Ended, process_of, processes_of, tandem
+from tests.series import series
 
 STARTS = {"a": "2.4,-1.2,4.8", "b": "11.3,-0.4,3.6"}
-ASSURED = "max_ticks = 1_000_000\n" + PAPER_1.replace('"paper"', '"assured"').replace('"paper-1"', '"field"')
-"""of the variant for which standing still is no harm, however long a busy machine makes robots stand"""
+ASSURED = "max_ticks = 120\n" + PAPER_1.replace('"paper"', '"assured"').replace('"paper-1"', '"field"')
+"""of the variant for which standing still is no harm; at `--rate 4` it is over after 38 s in any case"""
 
 
 @contextmanager
@@ -74,14 +78,19 @@ def pose(ended: Ended, robot: str, word: str) -> tuple[float, ...]:
     return tuple(float(number) for number in line.removeprefix(f"{robot}: {word}").split()[:3])
 
 
-def both_localised(out: Path, robots: dict[str, Command]) -> None:
-    """Each is where it says, by its own kinematics, and its record follows from what came in."""
-    for name, robot in robots.items():
-        ended = robot.ended()
-        assert ended.status == 0, ended.out + ended.err
-        assert f"{name}: localised after" in ended.out
-        claimed, truly = pose(ended, name, "claims"), pose(ended, name, "truly at")
-        assert claimed == pytest.approx(truly, abs=1e-6)
+def both_have_ended(out: Path, robots: dict[str, Command]) -> None:
+    """Neither is accused, each record follows from what came in, and each claim is true.
+
+    In real time nobody promises more; but robots that had every Drive in time localise.
+    """
+    ends = {name: robot.ended() for name, robot in robots.items()}
+    late = any(f"{name}: stood 0 of" not in ended.out for name, ended in ends.items())
+    for name, ended in ends.items():
+        assert ended.status in OVER, ended.out + ended.err
+        assert f"{name}: localised after" in ended.out or (late and f"{name}: undecided after" in ended.out)
+        if f"{name}: claims" in ended.out:
+            claimed, truly = pose(ended, name, "claims"), pose(ended, name, "truly at")
+            assert claimed == pytest.approx(truly, abs=1e-6)
         assert not (out / name / "world.journal").exists()
         replayed = tandem("replay", out / name)
         assert replayed.status == 0, replayed.out
@@ -90,7 +99,7 @@ def both_localised(out: Path, robots: dict[str, Command]) -> None:
 
 def test_two_robots_find_out_where_they_are_without_a_world(tmp_path: Path) -> None:
     with pair(tmp_path) as robots:
-        both_localised(tmp_path, robots)
+        both_have_ended(tmp_path, robots)
     a, b = told(tmp_path, "a"), told(tmp_path, "b")
     for one, other in ((a, b), (b, a)):
         sent = {step.sense.tick for step in other.steps if step.report is not None}
@@ -114,12 +123,12 @@ def test_two_robots_find_out_where_they_are_without_a_world(tmp_path: Path) -> N
 def test_they_do_so_over_links_that_are_encrypted(tmp_path: Path) -> None:
     assert tandem("keys", tmp_path / "keys", "--robots", "a,b").status == 0
     with pair(tmp_path, "--keys", tmp_path / "keys" / "world", protocol="tls") as robots:
-        both_localised(tmp_path, robots)
+        both_have_ended(tmp_path, robots)
 
 
 def test_a_decision_that_does_not_follow_is_found_without_a_world(tmp_path: Path) -> None:
     with pair(tmp_path) as robots:
-        both_localised(tmp_path, robots)
+        both_have_ended(tmp_path, robots)
     path = tmp_path / "a" / "agent-a.journal"
     frames = list(journal.read(path))
     place, drive = next(
@@ -134,7 +143,7 @@ def test_a_decision_that_does_not_follow_is_found_without_a_world(tmp_path: Path
     assert f"tick {drive.tick}, a, Drive v: recorded {0.5 * drive.v}, recomputed {drive.v}" in replayed.out
 
 
-@pytest.mark.parametrize("killed", ["a", "b"])
+@pytest.mark.parametrize("killed", series(["b", "a"]))
 def test_a_robot_whose_agent_is_killed_stands_still_and_goes_on_from_its_record(
     tmp_path: Path, killed: str
 ) -> None:
@@ -143,7 +152,7 @@ def test_a_robot_whose_agent_is_killed_stands_still_and_goes_on_from_its_record(
         robots[killed].until_written(path, 2500)
         os.kill(process_of(tmp_path / killed, "agent", killed), SIGKILL)
         robots[killed].until_says("was killed by signal 9, and is started again")
-        both_localised(tmp_path, robots)
+        both_have_ended(tmp_path, robots)
     stood = [step for step in told(tmp_path, killed).steps if step.sense.executed == REST and step.sense.tick]
     assert stood
     assert [step.sense.tick for step in told(tmp_path, killed).steps] == list(
@@ -164,7 +173,7 @@ def test_a_robot_whose_agent_is_stopped_stands_still_within_a_period_and_the_mis
         robots["b"].until(lambda: len(told(tmp_path, "b").steps) > before + 6, "b's mission goes on")
         assert other.exists()
         os.kill(agent, SIGCONT)
-        both_localised(tmp_path, robots)
+        both_have_ended(tmp_path, robots)
     steps = told(tmp_path, "a").steps
     assert all(step.sense.executed == REST for step in steps[before + 2 : before + 6])
 
@@ -180,6 +189,19 @@ def test_ctrl_c_ends_a_robot_and_leaves_nobody_behind(tmp_path: Path) -> None:
             assert "stopped by SIGINT" in ended.err
             assert "Traceback" not in ended.err
             assert processes_of((tmp_path / name).resolve()) == {}
+
+
+def test_a_robot_without_a_beacon_waits_for_it_idle_and_gives_up() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as nobody:
+        nobody.bind(("127.0.0.1", 0))
+        where = f"127.0.0.1:{nobody.getsockname()[1]}"
+    rover = Rover(load("paper-1").briefing("a"), 0.25, beacon=where, patience="1")
+    busy = time.process_time()
+    with pytest.raises(TimeoutError, match="no answer of the beacon for 1 s"):
+        rover.sense(0)
+    assert time.process_time() - busy < 0.1
+    rover.stop()
+    rover.close()
 
 
 def test_a_robot_whose_peer_does_not_come_has_not_moved(tmp_path: Path) -> None:

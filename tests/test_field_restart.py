@@ -8,22 +8,33 @@ from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
 from signal import SIGKILL
+from types import SimpleNamespace
+from typing import Any
 
 import msgpack
 import pytest
 
+from compose.driver_record import recorded
 from compose.local import free_endpoint
-from protocol import journal
+from compose.scenario import load
+from protocol.inbox import Inbox
+from protocol.journal import CorruptJournal
 from protocol.messages import Sense
-from protocol.wire import MalformedFrame, decode
+from protocol.motion import REST
+from protocol.wire import encode
+from tests.broken_drivers import LosesAReading
 from tests.commands import Command, processes_of, size, tandem, until
-from tests.test_field import ASSURED, STARTS, beacon, both_localised, messages, told
+from tests.series import series
+from tests.test_field import ASSURED, STARTS, beacon, both_have_ended, told
+from world import driver_journal
+from world.driver_journal import DriverPast
 
 
 class Pair:
     """Both robots, and how to start one of them again by the same command."""
 
-    def __init__(self, out: Path, open_ones: ExitStack) -> None:
+    def __init__(self, out: Path, open_ones: ExitStack, driver_of_a: str = "docs.rover:Rover") -> None:
+        self._drivers = {"a": driver_of_a, "b": "docs.rover:Rover"}
         self._out = out
         self._open = open_ones
         self._endpoint = free_endpoint()
@@ -34,7 +45,7 @@ class Pair:
     def _started(self, name: str) -> Command:
         return self._open.enter_context(
             Command(
-                *("robot", name, "--mission", self._out / "field.toml", "--driver", "docs.rover:Rover"),
+                *("robot", name, "--mission", self._out / "field.toml", "--driver", self._drivers[name]),
                 *("--rate", "4", "--listen" if name == "a" else "--connect", self._endpoint),
                 *("--out", self._out / name, "--option", f"state={self._out / f'body-{name}'}"),
                 *("--option", f"start={STARTS[name]}", "--option", f"beacon={self._air}"),
@@ -66,24 +77,9 @@ def pair(tmp_path: Path) -> Iterator[Pair]:
         yield Pair(tmp_path, open_ones)
 
 
-def is_sense(frame: bytes) -> bool:
-    try:
-        decode(frame, Sense)
-    except MalformedFrame:
-        return False
-    return True
-
-
-def cut_agent(path: Path, tick: int) -> None:
-    """Leave nothing of `tick`, nor after it, in an agent's journal."""
-    frames = list(journal.read(path))
-    place = next(i for i, one in enumerate(messages(frames)) if isinstance(one, Sense) and one.tick == tick)
-    path.write_bytes(journal.packed(frames[:place]))
-
-
 def all_is_well(out: Path, pair: Pair) -> None:
-    """Both localise, each tick is on record once, and neither the audit nor a replay finds anything."""
-    both_localised(out, pair.robots)
+    """Both come to their end; each tick is on record once; neither audit nor replay finds anything."""
+    both_have_ended(out, pair.robots)
     for name in "ab":
         assert [step.sense.tick for step in told(out, name).steps] == list(range(len(told(out, name).steps)))
     both = out / "both"
@@ -94,7 +90,7 @@ def all_is_well(out: Path, pair: Pair) -> None:
     assert audited.status == 0, audited.out
 
 
-@pytest.mark.parametrize("killed", ["a", "b"])
+@pytest.mark.parametrize("killed", series(["a", "b"]))
 def test_a_robot_that_is_killed_goes_on_from_its_record(pair: Pair, killed: str, tmp_path: Path) -> None:
     pair.robots[killed].until_written(pair.path(killed), 2500)
     pair.kill(killed)
@@ -125,21 +121,45 @@ def test_both_robots_that_lose_power_at_once_go_on_from_what_is_left_of_their_re
         assert "bytes were torn, and are cut off" in pair.robots[name].err
 
 
-def test_a_robot_whose_last_sense_was_lost_with_the_power_takes_it_again(pair: Pair, tmp_path: Path) -> None:
-    """The reading was taken, and neither journal has it: what was driven before it is told once."""
-    pair.robots["a"].until_written(pair.path("a"), 2500)
-    pair.kill("a")
-    pair.nobody_is_left("a")
-    known = len(told(tmp_path, "a").steps)
-    frames = list(journal.read(pair.path("a", "driver")))
-    while frames and not is_sense(frames[-1]):
-        frames.pop()
-    latest = decode(frames[-1], Sense).tick
-    if latest == known - 1:  # the agent had it
-        cut_agent(pair.path("a"), latest)
-    pair.path("a", "driver").write_bytes(journal.packed(frames[:-1]))
-    pair.again("a")
-    all_is_well(tmp_path, pair)
+def test_a_reading_that_is_lost_with_the_process_is_taken_again(tmp_path: Path) -> None:
+    """Neither journal has it, so nobody was told: what was driven before it is told once."""
+    with ExitStack() as open_ones:
+        pair = Pair(tmp_path, open_ones, "tests.broken_drivers:LosesAReading")
+        assert pair.robots["a"].ended().status == -SIGKILL
+        pair.nobody_is_left("a")
+        assert len(told(tmp_path, "a").steps) == LosesAReading.TICK
+        pair.again("a")
+        all_is_well(tmp_path, pair)
+        assert len(told(tmp_path, "a").steps) > LosesAReading.TICK
+
+
+@pytest.mark.parametrize("fsync", [False, True])
+def test_a_recording_that_a_power_cut_may_have_shortened_is_refused(
+    fsync: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was told may be missing, unless each write was synced; a kill takes nothing along."""
+    briefing, inbox = load("paper-1").briefing("a"), Inbox("robot")
+    path = tmp_path / "driver-a.journal"
+    driver: Any = SimpleNamespace(stop=lambda: None, resume=lambda *_: None)
+    field: Any = SimpleNamespace(resume=lambda *_: None)
+
+    def taken_up() -> DriverPast:
+        with recorded(tmp_path, briefing, inbox, fsync=fsync) as record:
+            record.take_up(driver, "any", field)
+            sense = Sense(record.past.tick + 1, "a", REST if record.again else None, 1.0, ())
+            record.journal.write(encode(sense))
+            return record.past
+
+    assert [taken_up().tick for _ in range(3)] == [-1, 0, 1]
+    monkeypatch.setattr(driver_journal, "BOOT", tmp_path / "boot")
+    (tmp_path / "boot").write_text("another\n")
+    before = path.read_bytes()
+    if fsync:
+        assert taken_up().tick == 2
+    else:
+        with pytest.raises(CorruptJournal, match=r"written without --fsync, and this computer has been"):
+            taken_up()
+        assert path.read_bytes() == before
 
 
 def test_a_robot_that_has_ended_says_so_again(pair: Pair, tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ from protocol.journal import CorruptJournal
 from protocol.journal import read as frames
 from protocol.messages import Estimate
 from tests.commands import PAPER_1, Ended, several_pairs, tandem
+from tests.series import series
 from world.scenario import Scenario
 
 NOISE = "[mission.noise]\nanchor_sigma = 0.05\nmutual_sigma = 0.05\n"
@@ -241,7 +242,7 @@ def test_odds_are_said_in_as_many_digits_as_they_have(odds: float, said: str) ->
 
 
 @pytest.mark.parametrize("noise", ["", NOISE])
-@pytest.mark.parametrize("variant", ["assured", "paper"])
+@pytest.mark.parametrize("variant", series(["assured", "paper"]))
 def test_a_mission_that_ends_undecided_is_drawn(noise: str, variant: str, tmp_path: Path) -> None:
     text = BRIEF.replace("assured", variant).replace("[planner]", f"{noise}[planner]")
     record = play(parse(text, "brief"), tmp_path)
@@ -254,11 +255,11 @@ def test_a_mission_that_ends_undecided_is_drawn(noise: str, variant: str, tmp_pa
     assert not {"met", "claim"} & ids(svg)
 
 
-@pytest.mark.parametrize("ticks", [0, 1, 17])
+@pytest.mark.parametrize("ticks", series([17, 0, 1]))
 def test_a_record_that_breaks_off_is_drawn_as_far_as_it_goes(ticks: int, noisy: Path, tmp_path: Path) -> None:
     folder = copied(noisy, tmp_path)
-    cut(folder / "world.journal", 1 + 2 * ticks)
-    cut(folder / "agent-b.journal", 1 + ticks)
+    cut(folder / "world.journal", 2 + 2 * ticks)
+    cut(folder / "agent-b.journal", 2 + ticks)
     assert len(read(folder).moments) == ticks
     for robot in "ab":
         words = texts(picture(folder, robot))
@@ -282,6 +283,7 @@ def test_a_robot_of_which_nothing_is_on_record_is_drawn_without_a_warning(tmp_pa
     assert "tolerance" in ids(tmp_path / "figures" / "robot-a.svg")
 
 
+@pytest.mark.long
 def test_each_robot_of_several_pairs_has_a_picture_of_its_own_pair(tmp_path: Path) -> None:
     recorded(parse(several_pairs(2), "pairs"), tmp_path)
     assert draw(tmp_path).status == 0

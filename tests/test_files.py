@@ -230,7 +230,7 @@ def test_the_draft_of_a_process_that_was_killed_is_removed_and_that_of_a_live_on
     ("limit", "words"),
     [
         ("-n 12", "a run as processes takes .* open files, and the limit is 12"),
-        ("-n 20", "a world with a link to each robot takes .* open files, and the limit is 20"),
+        ("-n 20", "takes .* open files, and the limit is 20"),
         ("-v 100000", "Tandem takes .* MB of memory, and the limit is 97"),
         ("-v 500000", "a Zenoh session takes .* MB of memory, and the limit is 488"),
     ],

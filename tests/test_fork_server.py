@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import re
 import signal
+import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
 from signal import SIGKILL, SIGSTOP
@@ -28,6 +31,10 @@ from tests.commands import (
     world,
 )
 
+CAP_SYS_ADMIN, CAP_SYS_RESOURCE = 21, 24
+"""<linux/capability.h>"""
+PR_CAPBSET_DROP = 24
+"""<sys/prctl.h>"""
 FAR_PAIR = (("c", "d", 0.0), ("d", "c", 400.0))
 NAMES = ("world", "agent a", "agent b")
 
@@ -211,6 +218,40 @@ def test_a_fork_server_that_cannot_start_says_why_in_one_line() -> None:
         "the fork server ended with status 1: ModuleNotFoundError: No module named 'nowhere'"
     )
     server.close()
+
+
+CROWD = """
+import os, resource, signal, threading
+from compose.forked import ForkServer
+
+server = ForkServer("os:getpid")
+nowhere = os.open(os.devnull, os.O_RDWR)
+resource.setrlimit(resource.RLIMIT_NOFILE, (70, 70))
+os.kill(server.pid, signal.SIGSTOP)
+threading.Timer(0.5, os.kill, (server.pid, signal.SIGCONT)).start()
+crowd = [server.start("os:getpid", "one of a crowd", errors=nowhere) for _ in range(40)]
+print({process.end(30.0) for process in crowd})
+server.close()
+"""
+
+
+def without_privileges() -> None:
+    """Whoever has these two is not held to the limit of descriptors under way."""
+    for capability in (CAP_SYS_ADMIN, CAP_SYS_RESOURCE):
+        ctypes.CDLL(None).prctl(PR_CAPBSET_DROP, capability, 0, 0, 0)  # fails where there is none to drop
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a limit of Linux")
+def test_no_process_is_forgotten_where_its_user_may_have_no_more_descriptors_under_way() -> None:
+    ran = subprocess.run(
+        [sys.executable, "-c", CROWD],
+        preexec_fn=without_privileges,
+        capture_output=True,
+        text=True,
+        timeout=100.0,
+        check=False,
+    )
+    assert (ran.stdout, ran.stderr) == ("{0}\n", "")
 
 
 # --- many -----------------------------------------------------------------------------------------------

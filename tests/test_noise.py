@@ -151,8 +151,8 @@ def test_without_noise_nothing_is_drawn_and_every_tick_is_the_same_to_the_bit(
 
 
 def frames(folder: Path, robot: str) -> list[bytes]:
-    """What a robot sensed, heard and said; not its Briefing, which names the noise."""
-    return list(journal.read(folder / f"agent-{robot}.journal"))[1:]
+    """What a robot sensed, heard and said: not its Briefing, which names the noise, nor what precedes it."""
+    return list(journal.read(folder / f"agent-{robot}.journal"))[2:]
 
 
 @pytest.mark.parametrize("draw", [uniform, gaussian])

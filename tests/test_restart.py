@@ -131,16 +131,16 @@ def test_a_process_that_is_never_started_again_ends_the_run_at_once(who: str, tm
 
 
 def test_a_robot_that_comes_back_too_late_fails_the_run_by_the_patience(tmp_path: Path) -> None:
-    kill = ("--kill", "a@17+600s", "--patience", "10")
+    kill = ("--kill", "a@17+600s", "--patience", "5")
     ended = tandem("run", "paper-1", "-q", "--out", tmp_path / "out", *kill)
-    assert ended[:2] == (3, "failed after 16 ticks (no answer from a (not there) at tick 17 for 10 s)\n")
+    assert ended[:2] == (3, "failed after 16 ticks (no answer from a (not there) at tick 17 for 5 s)\n")
     assert not processes_of(tmp_path / "out")
 
 
 def test_in_real_time_whoever_is_away_stands_still_and_is_told_what_it_missed(tmp_path: Path) -> None:
     out = tmp_path / "out"
     (tmp_path / "assured.toml").write_text(REAL_TIME)
-    kills = options("a@20 world@60:report")
+    kills = options("a@20+0.5s world@60:report")  # ten periods: a process is back in less than one
     ended = tandem("run", tmp_path / "assured.toml", "--rate", "20", "-q", "--out", out, *kills)
     assert ended.status in OVER, ended
     with (out / "ticks.csv").open(newline="") as file:

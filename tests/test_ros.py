@@ -153,6 +153,7 @@ def test_a_base_behind_a_bridge_keeps_the_contract(tmp_path: Path) -> None:
         assert base.pose.heading != wrap(base.pose.heading) or abs(base.pose.heading) < math.pi
 
 
+@pytest.mark.long
 def test_a_bridge_that_is_not_there_is_one_line() -> None:
     endpoint = free_endpoint()
     ended = tandem("conform", "world.ros:Ros2", "--option", f"connect={endpoint}")

@@ -269,7 +269,7 @@ def test_output_that_nobody_takes_is_one_line_and_no_traceback() -> None:
     with Path("/dev/full").open("wb") as full, Command("run", "paper-1", "-q", terminal=full.fileno()) as run:
         ended = run.ended()
     assert ended.status == 3
-    assert ended.err == "tandem run: cannot go on: [Errno 28] No space left on device\n"
+    assert ended.err == "tandem run: cannot go on: No space left on device\n"
 
 
 def test_a_world_whose_output_nobody_takes_does_not_blame_its_record(tmp_path: Path) -> None:
@@ -280,7 +280,7 @@ def test_a_world_whose_output_nobody_takes_does_not_blame_its_record(tmp_path: P
     ):
         ended = run.ended()
     assert ended.status == 3
-    assert ended.err == "tandem world: cannot go on: [Errno 28] No space left on device\n"
+    assert ended.err == "tandem world: cannot go on: No space left on device\n"
 
 
 def test_a_terminal_shows_each_robots_phase_and_state_while_it_runs() -> None:

@@ -30,6 +30,7 @@ from tests.commands import (
     tandem,
     until,
 )
+from tests.series import series
 from world.scenario import Scenario
 
 NAMES = ("agent a", "agent b", "world")
@@ -115,7 +116,7 @@ def test_stopped_for_a_moment_each_in_turn_a_run_goes_on(undisturbed: Path, tmp_
     assert not processes_of(out)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", series(NAMES))
 def test_stopped_until_its_link_is_given_up_a_process_goes_on(
     name: str, undisturbed: Path, tmp_path: Path
 ) -> None:
@@ -135,7 +136,7 @@ def test_stopped_until_its_link_is_given_up_a_process_goes_on(
     assert not processes_of(out)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", series(NAMES))
 def test_stopped_for_longer_than_the_patience_a_process_fails_the_run(
     name: str, undisturbed: Path, tmp_path: Path
 ) -> None:

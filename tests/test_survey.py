@@ -24,6 +24,7 @@ from protocol.messages import Undecided
 from protocol.motion import Pose
 from protocol.noise import Noise
 from protocol.wire import encode
+from tests.series import series
 from tests.surveys import ODOMETRY, SIGMA, WHEELS, assert_localised, scenario_of, states, survey
 from world.scenario import Scenario
 from world.sensors import anchor_ranges, mutual_ranges
@@ -37,7 +38,7 @@ NOISES = {
     "wheels": WHEELS,
     "everything": f"{SIGMA}\noutliers = 0.05\ndrop_outs = 0.1\n{WHEELS}\n{ODOMETRY}",
 }
-by_noise = pytest.mark.parametrize("noise", NOISES.values(), ids=NOISES)
+by_noise = pytest.mark.parametrize("noise", series(NOISES.values(), 3), ids=NOISES)
 SEEDS = range(4, 7)
 
 
@@ -91,6 +92,7 @@ def test_both_localise_in_other_settings(scenario: Callable[[int], Scenario]) ->
         assert_localised(play(scenario(seed)))
 
 
+@pytest.mark.long
 def test_who_asks_for_more_waits_longer_and_gets_it() -> None:
     """In the mean: what a robot asks for changes where it drives, too."""
     waited = {0.1: 0, 0.04: 0}
@@ -216,6 +218,7 @@ def ticks(scenario: Scenario) -> Iterator[tuple[World, dict[str, Mind], dict[str
         world = onward
 
 
+@pytest.mark.long
 def test_the_same_mind_takes_the_same_step_and_is_left_as_it_was() -> None:
     for world, before, observed in ticks(scenario_of(NOISES["everything"], SHORT)):
         told = {robot: planner.report(mind) for robot, mind in observed.items()}

@@ -15,8 +15,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from compose.layout import console
 from compose.local import free_endpoint
+from compose.tables import console
 from protocol import keys, session
 from protocol.endpoints import at
 from protocol.inbox import Inbox

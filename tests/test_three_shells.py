@@ -13,6 +13,7 @@ from compose.local import free_endpoint
 from protocol import keys, session
 from protocol.endpoints import at
 from tests.commands import Command, journals, processes_of, several_pairs, tandem, world
+from tests.series import series
 
 NOBODY = "nobody listens there; check the address, and that the router runs"
 
@@ -32,7 +33,7 @@ def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # --- any order ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("order", list(permutations(["world", "a", "b"])), ids="-".join)
+@pytest.mark.parametrize("order", series(permutations(["world", "a", "b"]), 2), ids="-".join)
 def test_any_order_of_starting_gives_the_same_record(
     order: tuple[str, ...], paper_1: Path, tmp_path: Path
 ) -> None:
@@ -72,7 +73,7 @@ def test_each_shell_may_keep_its_record_in_a_folder_of_its_own(paper_1: Path, tm
     assert found == journals(paper_1)
 
 
-@pytest.mark.parametrize("pairs", [2, 3])
+@pytest.mark.parametrize("pairs", series([2, 3]))
 def test_several_pairs_localise_side_by_side_in_one_world(pairs: int, tmp_path: Path) -> None:
     scenario, out = tmp_path / "pairs.toml", tmp_path / "out"
     scenario.write_text(several_pairs(pairs))

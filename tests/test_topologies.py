@@ -17,6 +17,7 @@ from compose.reach import KEYED
 from protocol import session
 from protocol.endpoints import listening
 from tests.commands import BOUND_S, LONG, LONG_JOURNAL_BYTES, PAPER_1, Command, journals, tandem
+from tests.series import series
 
 ROUTER = [sys.executable, "-m", "tests.router"]
 
@@ -101,7 +102,7 @@ TOPOLOGIES = (
 )
 
 
-@pytest.mark.parametrize("topology", TOPOLOGIES)
+@pytest.mark.parametrize("topology", series(TOPOLOGIES, 2))
 def test_a_mission_through_routers_leaves_the_record_of_one_without_network(
     topology: str, tmp_path: Path
 ) -> None:
@@ -136,7 +137,9 @@ def test_a_mission_through_routers_leaves_the_record_of_one_without_network(
         same(parts(tmp_path / "scenario.toml", out, flags, stack), out, expected)
 
 
-@pytest.mark.parametrize("topology", ["a router between", "a router on each robot, by the robot's keys"])
+@pytest.mark.parametrize(
+    "topology", series(["a router between", "a router on each robot, by the robot's keys"])
+)
 def test_a_mission_through_routers_that_enforce_the_rules_leaves_the_same_record(
     topology: str, tmp_path: Path
 ) -> None:

@@ -92,7 +92,7 @@ class Field:
         self._unanswered: deque[tuple[int, bytes]] = deque()
         """Senses that the agent has not answered"""
         self._answered = 0.0
-        """when it last did, or appeared"""
+        """when it last did; one that only appears, be it over and over, has not"""
         self._tick = -1
         self._next = UNKNOWN
         """when the tick after this one begins"""
@@ -263,7 +263,6 @@ class Field:
             case "alive":
                 self._alive.add(arrival.source.robot)
                 if arrival.source.robot == self._id:
-                    self._answered = time.monotonic()
                     for _, frame in self._unanswered:  # while it was away
                         self._sense.put(frame)
             case "gone":

@@ -11,7 +11,7 @@ from rich import progress as bars
 from rich.table import Table
 from rich.text import Text
 
-from compose import layout
+from compose import layout, tables
 from compose.campaign.cells import Cell
 from compose.campaign.folder import CELLS
 from compose.campaign.run import SUMMARY, Progress, Results
@@ -123,10 +123,10 @@ def _lines(results: Results) -> tuple[list[str], Sequence[str]]:
     """The table, as wide as there is room, and its columns."""
     columns: Sequence[str] = ()
     for columns in _choices(results):
-        lines = layout.lines(_table(results, columns))
-        if layout.fits(lines):
+        lines = tables.lines(_table(results, columns))
+        if tables.fits(lines):
             return lines, columns
-    return layout.lines(_table(results, columns), layout.room()), columns
+    return tables.lines(_table(results, columns), layout.room()), columns
 
 
 def _shown(results: Results) -> list[Cell]:
@@ -160,7 +160,7 @@ def _table(results: Results, columns: Sequence[str]) -> Table:
     for cell in _shown(results):
         said = _figures(results.figures[cell.index])
         rows.append([*_axes(results, cell), *[said[column] for column in columns]])
-    return layout.table(["cell", *axes], columns, rows)
+    return tables.table(["cell", *axes], columns, rows)
 
 
 def _axes(results: Results, cell: Cell) -> list[str]:

@@ -31,9 +31,11 @@ def _show(findings: Findings) -> None:
     for one in findings.counts:
         say(f"{one.rule:10}{one.checks:>8}{one.violations:>12}")
     if findings.radio:
+        from compose import tables  # noqa: PLC0415  # rich takes time to import
+
         rows = [[str(value) for value in astuple(link)] for link in findings.radio]
-        made = layout.table(["link"], Befallen.__struct_fields__[1:], rows)
-        say("", *layout.lines(made, layout.room()))
+        made = tables.table(["link"], Befallen.__struct_fields__[1:], rows)
+        say("", *tables.lines(made, layout.room()))
     if findings.rounding:
         say("", f"{len(findings.rounding)} checks differ by rounding alone: {findings.versions}")
     elif findings.violations and findings.versions is not None:

@@ -24,6 +24,10 @@ HEAD_BYTES = 1 << 14
 HEAD_S = 10.0
 """a request may take until its head is there"""
 PIECE_BYTES = 1 << 16
+GUESTS = 64
+"""connections at once; more are turned away, or the SDK's server, short of descriptors, accepts no more"""
+GUESTS_FILES = 3 * GUESTS + 120
+"""descriptors for them: of each, both of the gate's and the SDK's; and those that are being turned away"""
 
 Place = tuple[str, int]
 
@@ -41,6 +45,7 @@ class Gate:
         self._taken = taken
         self._behind = behind
         self._origins = (*FOXGLOVE, *origins)
+        self._guests = 0
 
     def open(self) -> None:
         """Begin; it ends with the process."""
@@ -52,15 +57,22 @@ class Gate:
 
     async def _admit(self, reader: StreamReader, writer: StreamWriter) -> None:
         with closing(writer), suppress(OSError, EOFError, LimitOverrunError):
-            head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), HEAD_S)
-            why = self._refusal(head)
-            if why is not None:
-                said = why.encode()
-                writer.write(b"HTTP/1.1 403 Forbidden\r\nConnection: close\r\nContent-Type: text/plain\r\n")
-                writer.write(b"Content-Length: %d\r\n\r\n%s\n" % (len(said) + 1, said))
-                await writer.drain()
+            if self._guests >= GUESTS:
+                await _refuse(writer, "503 Service Unavailable", "too many look already")
                 return
-            await self._hand_on(head, reader, writer)
+            self._guests += 1
+            try:
+                await self._look_at(reader, writer)
+            finally:
+                self._guests -= 1
+
+    async def _look_at(self, reader: StreamReader, writer: StreamWriter) -> None:
+        head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), HEAD_S)
+        why = self._refusal(head)
+        if why is not None:
+            await _refuse(writer, "403 Forbidden", why)
+            return
+        await self._hand_on(head, reader, writer)
 
     def _refusal(self, head: bytes) -> str | None:
         lines = [line.partition(":") for line in head.decode("latin-1").split("\r\n")[1:]]
@@ -82,6 +94,13 @@ class Gate:
             for way in ways:
                 way.cancel()
             await asyncio.gather(*ways, return_exceptions=True)
+
+
+async def _refuse(writer: StreamWriter, status: str, why: str) -> None:
+    said = f"{why}\n".encode()
+    writer.write(f"HTTP/1.1 {status}\r\nConnection: close\r\nContent-Type: text/plain\r\n".encode())
+    writer.write(b"Content-Length: %d\r\n\r\n%s" % (len(said), said))
+    await writer.drain()
 
 
 async def _copy(reader: StreamReader, writer: StreamWriter) -> None:

@@ -22,7 +22,7 @@ from foxglove import Context
 from foxglove.websocket import Capability, ChannelView, Client, ServerListener, WebSocketServer
 
 from compose.export.frames import Telling
-from compose.export.gate import Gate, private_host
+from compose.export.gate import GUESTS_FILES, Gate, private_host
 from compose.export.recording import Channels
 from compose.export.views import Views, nanoseconds
 from compose.record import WORLD_JOURNAL, agent_journal
@@ -30,6 +30,7 @@ from compose.scene.recorded import Journals, scenes
 from compose.scene.scene import Scene
 from compose.scene.stage import Stage
 from compose.stop import stop_with_launcher
+from protocol import limits
 from protocol.inbox import Inbox, Interrupted
 from protocol.journal import CorruptJournal, Tail
 from protocol.terminal import say
@@ -145,6 +146,7 @@ def main(port: int, origins: Sequence[str], folder: Path, robots: Sequence[str])
     live = Live(folder, channels)
     behind = private_host()
     try:
+        limits.need_files(GUESTS_FILES, "Foxglove's viewers")
         taken = socket.create_server((HOST, port))
         server = foxglove.start_server(
             name="tandem",

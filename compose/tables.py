@@ -1,0 +1,44 @@
+"""Tables as wide as the terminal that they are printed on."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.cells import cell_len
+from rich.console import Console
+from rich.table import Table
+
+from compose.layout import UNLIMITED, room
+
+
+def console(**options: Any) -> Console:
+    """A console that takes text as it is: `[red]` and `:smile:` are what somebody said, and no markup."""
+    return Console(markup=False, emoji=False, highlight=False, **options)
+
+
+def table(left: Sequence[str], right: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
+    """A table whose columns `left` hold text, and `right` numbers, which are never broken."""
+    made = Table(box=SIMPLE_HEAD, pad_edge=False)
+    for heading in left:
+        made.add_column(heading, overflow="fold")
+    for heading in right:
+        made.add_column(heading, justify="right", no_wrap=True)
+    for row in rows:
+        made.add_row(*row)
+    return made
+
+
+def fits(lines: Iterable[str]) -> bool:
+    """Whether none of `lines` is broken by the terminal."""
+    return max(map(cell_len, lines), default=0) <= room()
+
+
+def lines(made: Table, width: int = UNLIMITED) -> list[str]:
+    """The lines of a table, no wider than `width`: text that is too long is folded within its column."""
+    page = console(width=width, file=io.StringIO())
+    with page.capture() as capture:
+        page.print(made)
+    return [line.rstrip() for line in capture.get().splitlines() if line.strip()]
