@@ -11,11 +11,12 @@ from typing import NamedTuple
 
 from protocol.motion import Pose, compose, wrap
 
-SLACK = 1e-6
-"""m: by so much may rounding break a triangle's inequality; what that lets in, residuals weigh later"""
+SLACK = 1e-7
+"""of a triangle's three sides: by so much may rounding break its inequality; residuals weigh later what that
+lets in. Sides are sums of some thousand numbers up to a thousand times as long: 1e-16 of 1e6 is less"""
 
 SAME = 1e-9
-"""m and rad: placements nearer than this are one (a double root)"""
+"""rad, and of the lengths at hand: placements nearer than this are one (a double root)"""
 
 
 def included_angle(near: float, far: float, moved: float) -> float | None:
@@ -27,7 +28,8 @@ def included_angle(near: float, far: float, moved: float) -> float | None:
     """
     if near == 0.0:
         return 0.0
-    if not abs(far - near) - SLACK <= moved <= far + near + SLACK:
+    slack = SLACK * (near + far + moved)
+    if not abs(far - near) - slack <= moved <= far + near + slack:
         return None
     long, short = max(near, moved), min(near, moved)
     excess = far - (long - short) if far <= short else short - (long - far)
@@ -92,11 +94,10 @@ def placements(
 
 
 def same_placement(one: Placement, other: Placement, tolerance: float) -> bool:
-    """Whether they differ by less than `tolerance`, in rad and in m."""
-    return (
-        abs(wrap(one.phi - other.phi)) < tolerance
-        and math.hypot(one.x - other.x, one.y - other.y) < tolerance
-    )
+    """Whether both angles, phi and the bearing of M1 in <b(M2)>, differ by less than `tolerance`, in rad."""
+    return abs(wrap(one.phi - other.phi)) < tolerance and math.hypot(
+        one.x - other.x, one.y - other.y
+    ) < tolerance * math.hypot(one.x, one.y)
 
 
 def circle_intersections(x: float, y: float, radius: float, distance: float) -> list[tuple[float, float]]:
@@ -106,7 +107,7 @@ def circle_intersections(x: float, y: float, radius: float, distance: float) -> 
     a point, to rounding.
     """
     apart = math.hypot(x, y)
-    if min(apart, radius) < SAME:
+    if min(apart, radius) < SAME * (apart + radius + distance):
         return []
     away = included_angle(apart, radius, distance)
     if away is None:

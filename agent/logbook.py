@@ -8,7 +8,7 @@ from itertools import pairwise
 import msgspec
 
 from protocol.messages import MAX_REPORT_RANGES, MAX_REPORT_RUNS, Ranged
-from protocol.motion import Pose, Run, follow, step
+from protocol.motion import Pose, Run, arc, follow
 
 
 class Logbook(msgspec.Struct, frozen=True):
@@ -29,6 +29,10 @@ class Logbook(msgspec.Struct, frozen=True):
                 break
             at_rest += run.ticks
         return self.through - at_rest
+
+    def until(self, tick: int) -> tuple[Run, ...]:
+        """Return what was driven over [0, tick]."""
+        return self.runs if tick >= self.through else _between(self.runs, 0, tick)
 
     def drove(self, v: float, omega: float, ticks: int = 1) -> Logbook:
         """The log after `ticks` more of one manoeuvre."""
@@ -73,16 +77,14 @@ class Logbook(msgspec.Struct, frozen=True):
 
     def pose(self, start: Pose, tick: int, period: float) -> Pose:
         """Where the robot was at `tick`, if it was at `start` at tick 0."""
-        return follow(start, _between(self.runs, 0, tick), period)
+        return follow(start, self.until(tick), period)
 
     def track(self, start: Pose, first: int, last: int, period: float) -> list[Pose]:
         """Where the robot was at each tick in [first, last], if it was at `start` at tick 0."""
         pose = self.pose(start, first, period)
         track = [pose]
         for run in _between(self.runs, first, last):
-            for _ in range(run.ticks):
-                pose = step(pose, run.v, run.omega, period)
-                track.append(pose)
+            track += arc(track[-1], run, period)
         return track
 
 

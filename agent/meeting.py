@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from agent import letter
+from agent import letter, precision
 from agent.belief import Sighting, weigh_placements
 from agent.mind import WORDS, Done, Mind
 from agent.phases import encounter
@@ -76,26 +76,29 @@ def _settled(mind: Mind) -> Mind:
 
     The letter looks at the encounter alone; `assured` also at what was ranged, and what was silent, before.
     """
-    mission, distance = mind.briefing.mission, mind.briefing.anchor_distance
-    variant, began = mind.briefing.variant, mind.findings.met
+    mission, variant, began = mind.briefing.mission, mind.briefing.variant, mind.findings.met
     assert began is not None
     sightings = mind.sightings(began if variant == "paper" else 0)
-    base = encounter.base([at for at in sightings if off_anchor(at.b, mind.briefing.rendezvous.b)])
+    ranged = [at for at in sightings if at.range is not None]
+    base = encounter.base([at for at in ranged if off_anchor(at.b, mind.briefing.rendezvous.b)])
     if base is None:  # yet; or, where a report was missed, b was still driving as a went straight
         again = isinstance(mind.state, Waiting) and mind.radio.state == WORDS[Standing]
         return met(mind) if again and variant == "assured" else mind
-    mind = _weighed(mind, sightings, base)
+    if mind.findings.peer_anchor is None:
+        mind = replace(mind, findings=replace(mind.findings, peer_anchor=precision.peer_anchor(mind)))
+    off = precision.apart(mind)
+    mind = _weighed(mind, sightings, base, off)
     left = mind.findings.placements
-    checked = encounter.redundant(sightings, base)
+    checked = encounter.redundant(ranged, base)
     if not left:
         return mind.alarmed(Alarm("a path that no placement brings together with the mutual ranges"))
-    starts = [start for start in (mind.start, mind.radio.start) if start is not None]
-    if checked and len(left) == 1 and encounter.pinned_down(left[0], sightings, starts, mission, distance):
+    if checked and len(left) == 1 and precision.pinned_down(mind, left[0], ranged, off):
         return replace(mind, state=Done(3, Localised(mind.world_pose(left[0]))))
     mover = mind.briefing.role
-    if mover != (encounter.turn(sightings) if checked and variant == "assured" else "b"):
+    alone = variant == "assured" and isinstance(mind.radio.verdict, Localised)  # the peer stands for good
+    if not alone and mover != (encounter.turn(sightings) if checked and variant == "assured" else "b"):
         return mind
-    if variant == "assured" and mind.radio.state not in PEER_RESTS:
+    if variant == "assured" and not alone and mind.radio.state not in PEER_RESTS:
         return mind
     if variant == "paper" and mind.findings.plan is not None:
         failure = "does not settle where they are" if checked else "could not be taken: b left a's range"
@@ -114,13 +117,15 @@ def _settled(mind: Mind) -> Mind:
     )
 
 
-def _weighed(mind: Mind, sightings: Sequence[Sighting], base: tuple[Sighting, Sighting]) -> Mind:
+def _weighed(
+    mind: Mind, sightings: Sequence[Sighting], base: tuple[Sighting, Sighting], floor: float
+) -> Mind:
     """The placements of eq. (7) that every range and every silent tick in `sightings` leave."""
     reach, findings = mind.briefing.mission.sensing_range, mind.findings
     if findings.candidates is None:
         solutions = encounter.solve(mind.briefing.anchor_distance, base)
         silence = [sighting for sighting in sightings if sighting.range is None]
-        unheard = weigh_placements(solutions, silence, reach)
+        unheard = weigh_placements(solutions, silence, reach, floor)
         findings = replace(findings, placements=tuple(solutions), candidates=(len(solutions), len(unheard)))
-    left = weigh_placements(findings.placements, sightings, reach)
+    left = weigh_placements(findings.placements, sightings, reach, floor)
     return replace(mind, findings=replace(findings, placements=left))

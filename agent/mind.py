@@ -80,6 +80,10 @@ class Findings(msgspec.Struct, frozen=True):
     candidates: tuple[int, int] | None = None
     """how many there were at first: all of them, and what silence left"""
     plan: Plan | None = None
+    own_anchor: float = 0.0
+    """where sensors are exact: how far off, in m, its anchor may be, by the ranges of phase 1"""
+    peer_anchor: float | None = None
+    """the same of its peer's"""
     own: tuple[Hypothesis, ...] = ()
     """under noise: of where its anchor is"""
     branches: tuple[Branch, ...] = ()
@@ -118,6 +122,8 @@ class Mind(msgspec.Struct, frozen=True):
     radio: Radio = Radio()
     in_contact: bool = False
     """whether the peer is in range in this tick"""
+    leg: Pose = ORIGIN
+    """the odometry when the last run of the log began"""
 
     @property
     def orbit(self) -> Orbit:

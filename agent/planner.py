@@ -15,8 +15,8 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from agent import apart, letter, lying, meeting, radio, survey, trust
-from agent.belief import ON_ANCHOR, Branch, branches, weigh_branches
+from agent import apart, letter, lying, meeting, precision, radio, survey, trust
+from agent.belief import Branch, branches, weigh_branches
 from agent.mind import Asleep, Done, Mind
 from agent.phases import anchor, encounter, rendezvous, seeking
 from agent.phases.anchor import ThirdPoint
@@ -26,18 +26,23 @@ from agent.phases.seeking import Backing, Circling, Homing, Straight, Turning
 from agent.phases.surveying import Retreating, Surveying
 from protocol import messages
 from protocol.messages import Alarm, Drive, Estimate, Localised, Ranged, Report, Sense, Undecided
+from protocol.mission import RANGE_MARGIN
 from protocol.motion import ORIGIN, REST, Controls, Pose, step
+from protocol.rounding import SAME
 
 # --- a tick -----------------------------------------------------------------------------------------
 
 
 def observe(mind: Mind, sense: Sense) -> Mind:
     """What the robot knows once it has sensed: where it drove, what was in range and what was silent."""
-    log, odometry = mind.log, mind.odometry
+    log, odometry, leg = mind.log, mind.odometry, mind.leg
     if sense.executed is not None:
         v, omega = sense.executed.v, sense.executed.omega
         log = log.drove(v, omega)
-        odometry = step(odometry, v, omega, mind.briefing.mission.period)
+        ticks = log.runs[-1].ticks
+        if ticks == 1:
+            leg = odometry
+        odometry = step(leg, v, omega, ticks * mind.briefing.mission.period)
     if sense.anchor_range is not None and not _again(mind, sense):
         log = log.ranged(sense.anchor_range)
     mutual, near = mind.mutual, False
@@ -47,7 +52,7 @@ def observe(mind: Mind, sense: Sense) -> Mind:
             if contact.range is not None:
                 mutual = (*mutual, Ranged(sense.tick, contact.range))
     sensed = Mind(
-        mind.briefing, mind.state, sense.tick, odometry, log, mutual, mind.findings, mind.radio, near
+        mind.briefing, mind.state, sense.tick, odometry, log, mutual, mind.findings, mind.radio, near, leg
     )
     return _advanced(sensed, sense.anchor_range)
 
@@ -202,10 +207,9 @@ def _released(mind: Mind, rho0: float | None) -> Mind:
         return mind  # and listens
     if rho0 is None:
         return mind.undecided("the anchor is out of range at the start")
-    if (
-        rho0 <= ON_ANCHOR and mind.briefing.mission.noise.exact
-    ):  # the heading is radial by definition, and nothing is left to find out
-        return _located(mind, Branch(0.0, ORIGIN), "on-anchor")
+    if mind.briefing.mission.noise.exact and rho0 <= SAME * precision.drifted(mind, mind.log, mind.tick):
+        # it is on its anchor: the heading is radial by definition, and nothing is left to find out
+        return _located(mind, Branch(0.0, ORIGIN), "on-anchor", precision.anchor(mind, ORIGIN, mind.log)[0])
     return replace(mind, state=Straight("anchor", mind.odometry, rho0))
 
 
@@ -215,24 +219,11 @@ def _second_range(mind: Mind) -> Mind:
         mind, likely = letter.with_branches(mind)
         if isinstance(mind.state, Circling) and len(likely) == 1:
             return _located(mind, likely[0], "circle")
-        return _to_third_point(mind, likely)
+        return _to_third_point(mind, likely, RANGE_MARGIN)
     rho0, rho = mind.log.ranges[0].range, mind.log.ranges[-1].range
     possible = branches(rho0, mind.odometry, rho)
     mind = replace(mind, findings=replace(mind.findings, possible=possible))
-    left = weigh_branches(possible, mind.seen(), mind.briefing.mission.sensing_range)
-    if isinstance(mind.state, Circling) and len(left) == 1:
-        return _located(mind, left[0], "circle")
-    return _to_third_point(mind, left)
-
-
-def _to_third_point(mind: Mind, left: tuple[Branch, ...]) -> Mind:
-    if not left:
-        return mind.undecided("no pose explains the anchor ranges")
-    mission, variant = mind.briefing.mission, mind.briefing.variant
-    controls = anchor.third_point(anchor.local(left, mind.odometry), mission, variant)
-    if controls is None:
-        return mind.undecided("eq. (5) leaves no way to a third range")
-    return replace(mind, state=ThirdPoint(left, mind.odometry, controls))
+    return _weighed(mind, possible, "circle" if isinstance(mind.state, Circling) else None)
 
 
 def _third_range(mind: Mind, state: ThirdPoint) -> Mind:
@@ -241,18 +232,45 @@ def _third_range(mind: Mind, state: ThirdPoint) -> Mind:
     kind: messages.BranchKind = "three-ranges" if measured else "three-ranges-virtual"
     if not mind.briefing.mission.noise.exact:
         mind, likely = letter.with_branches(mind)
-        return _located(mind, likely[0], kind) if likely else _to_third_point(mind, likely)
-    left = weigh_branches(state.branches, mind.seen(), mind.briefing.mission.sensing_range)
-    if len(left) == 1:
-        return _located(mind, left[0], kind)
-    if len(left) > 1 and mind.briefing.variant == "paper":
+        return _located(mind, likely[0], kind) if likely else _to_third_point(mind, likely, RANGE_MARGIN)
+    return _weighed(mind, state.branches, kind)
+
+
+def _weighed(mind: Mind, candidates: tuple[Branch, ...], kind: messages.BranchKind | None) -> Mind:
+    """Phase 1 goes on with those of `candidates` that explain all its ticks; it ends if one may be known.
+
+    That takes ranges that fix the anchor as exactly as the claim needs; the letter takes no more of them.
+    `kind` is how it ends; None where it goes on for another range in any case.
+    """
+    mission, paper = mind.briefing.mission, mind.briefing.variant == "paper"
+    floor = precision.drifted(mind, mind.log, mind.tick)
+    margin = precision.margin(mission, floor)
+    left = weigh_branches(candidates, mind.seen(), mission.sensing_range, floor, margin)
+    if kind is not None and len(left) == 1:
+        off, enough = precision.anchor(mind, left[0].start, mind.log)
+        if enough or paper:
+            return _located(mind, left[0], kind, off)
+    if len(left) > 1 and paper and isinstance(mind.state, ThirdPoint):
         return mind.undecided("the third range does not tell +alpha from -alpha")
-    return _to_third_point(mind, left)
+    return _to_third_point(mind, left, margin)
 
 
-def _located(mind: Mind, branch: Branch, kind: messages.BranchKind) -> Mind:
-    """Phase 1 is done: its pose relative to the anchor is known."""
-    mind = replace(mind, findings=replace(mind.findings, branch=branch, branch_kind=kind, parted=mind.tick))
+def _to_third_point(mind: Mind, left: tuple[Branch, ...], margin: float) -> Mind:
+    if not left:
+        return mind.undecided("no pose explains the anchor ranges")
+    mission, variant = mind.briefing.mission, mind.briefing.variant
+    pinning = variant == "assured" and len(left) == 1 and mission.noise.exact
+    places = anchor.local(left, mind.odometry)
+    controls = anchor.third_point(places, mission, variant, margin=margin, pinning=pinning)
+    if controls is None:
+        return mind.undecided("eq. (5) leaves no way to a third range")
+    return replace(mind, state=ThirdPoint(left, mind.odometry, controls))
+
+
+def _located(mind: Mind, branch: Branch, kind: messages.BranchKind, off: float = 0.0) -> Mind:
+    """Phase 1 is done: its pose relative to the anchor is known, and that it may be `off` m elsewhere."""
+    findings = replace(mind.findings, branch=branch, branch_kind=kind, parted=mind.tick, own_anchor=off)
+    mind = replace(mind, findings=findings)
     mu = rendezvous.orientation(mind.local_pose)
     return _on_to_orbit(mind, Aligning(mind.odometry.heading - mu))
 

@@ -40,6 +40,12 @@ def natural(text: str) -> int:
     return int(text)
 
 
+def cell_and_trial(text: str) -> tuple[int, int]:
+    """A cell, 0 where it is left out, and one of its trials, such as 3:17."""
+    cell, _, trial = text.rpartition(":")
+    return natural(cell) if cell else 0, natural(trial)
+
+
 def up_to(most: int, text: str) -> int:
     """A whole number from 1 to `most`."""
     value = natural(text)

@@ -6,7 +6,8 @@ import msgspec
 
 from protocol.messages import Localised
 from protocol.motion import Covariance, Pose, wrap
-from world.referee import TOLERANCE, errors
+from protocol.rounding import TOLERANCE
+from world.referee import errors
 
 DEGREES_OF_FREEDOM = 3
 """of a pose: what its NEES is in the mean, where covariances are true"""

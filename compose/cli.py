@@ -14,6 +14,7 @@ from typing import NoReturn, TextIO
 
 from compose.arguments import (
     address,
+    cell_and_trial,
     count,
     days,
     folder,
@@ -342,4 +343,7 @@ def _add_sweep(parser: argparse.ArgumentParser) -> None:
         help="judge every trial's journals, as `tandem audit` does (it takes most of the time)",
     )
     parser.add_argument("--retry", action="store_true", help="play again what was lost before")
+    parser.add_argument(
+        "--print-trial", type=cell_and_trial, metavar="[CELL:]N", help="only print that trial's scenario file"
+    )
     parser.add_argument("-q", "--quiet", action="store_true", help="print only the counts")

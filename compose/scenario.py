@@ -23,8 +23,9 @@ from compose.toml import field_first, read_text, table_in
 from protocol.lie import OF_THE_START, Kind, Lie, Part
 from protocol.messages import Briefing
 from protocol.mission import Anchor, Mission, Role, Variant, noise_obstacle, obstacle, safety_obstacle
-from protocol.motion import TAU, Pose
+from protocol.motion import TAU, Pose, wrap
 from protocol.rendezvous import Rendezvous, rendezvous, tick_budget
+from protocol.rounding import TOLERANCE
 from protocol.spelling import did_you_mean
 from protocol.units import NAME, RobotId
 from protocol.wire import MalformedFrame, decode, encode
@@ -38,8 +39,8 @@ Place = Annotated[float, Meta(ge=-1e6, le=1e6)]
 """m: nobody gets so far from there that `units.Coordinate` would not hold it"""
 EXCHANGES = 20
 """reports for which a mission may have to wait as long as they hardly ever take"""
-NEAREST_ANCHORS = 1e-3
-"""m: that is one anchor, not two"""
+NEAREST_ANCHORS = TOLERANCE
+"""m: two that are nearer are in one place, as exactly as poses are claimed"""
 TICK_S = (5e-4, 3600.0)
 """s of wall time that a tick in real time may last"""
 WITHIN = 1.0 - 1e-9
@@ -339,7 +340,8 @@ def _peers(robots: list[RobotTable], source: str) -> dict[str, str]:
 def _start(robot: RobotTable, sensing_range: float, seed: int) -> Pose:
     """Where the robot is released: as the file says, or uniform in its anchor's range, any heading."""
     if robot.start is not None:
-        return Pose(*robot.start)
+        x, y, heading = robot.start
+        return Pose(x, y, heading if abs(heading) <= TAU else wrap(heading))  # many turns would cost digits
     draw = random.Random(f"{seed}/start/{robot.id}").random
     radius = WITHIN * sensing_range * math.sqrt(draw())
     bearing, heading = TAU * draw(), TAU * draw()

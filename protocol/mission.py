@@ -8,7 +8,9 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from protocol.motion import TAU
 from protocol.noise import Noise
+from protocol.rounding import EPSILON, SAME, SURE, foothold, rounding
 from protocol.units import Clearance, Coordinate, Duration, Length, Speed, TurnRate
 
 Variant = Literal["assured", "paper"]
@@ -28,11 +30,12 @@ FIRST_STRAIGHT_LIMIT = 0.9
 
 
 SHORTEST_STEP = 1e-4
-"""m: with manoeuvres A_0 that are shorter, too many ranges differ by no more than rounding"""
+"""m: with manoeuvres A_0 that are shorter, places would be no farther apart than RANGE_MARGIN leaves of
+them"""
 
-COARSEST = 2e6
-"""(D + R)^2 / A_0, times R / D where that is more than 1, in m: what rounding does to a range, times what
-that does to a pose. Up to here every start tried is localised; far beyond, some never are."""
+AMPLIFIED = 500.0
+"""EPSILON of the size, in a range of the encounter, that A_0 (D + R) / max(1, R / D) must be able to bear:
+found on random settings, where `assured` gets on with any that it allows"""
 
 MOST_RANGES = 1e4
 """(sigma / accuracy)^2 at most: so many ranges it takes to average sigma down to the accuracy, each of them
@@ -91,18 +94,50 @@ FOOTHOLD = 0.05
 def obstacle(mission: Mission, distance: float) -> str | None:
     """Why robots with anchors `distance` m (D) apart could not be sure of their poses; None if they can."""
     step, reach = mission.first_straight, mission.sensing_range
-    if step < SHORTEST_STEP:
+    if step < SHORTEST_STEP * (1.0 - EPSILON):
         return (
             f"a tick moves a robot by {step:.3g} m at most; from less than {SHORTEST_STEP:g} m, ranges tell "
             "nothing for sure: raise max_speed or period"
         )
-    if max(1.0, reach / distance) * (distance + reach) ** 2 / step > COARSEST:
-        return (
-            f"with {distance:.6g} m between the anchors and ranges up to {reach:.6g} m, manoeuvres of "
-            f"{step:.3g} m are too short for a pose to be sure to a micrometre in double precision: "
-            "raise max_speed or period"
-        )
-    return None
+    size = distance + reach
+    if AMPLIFIED * EPSILON * size * max(1.0, reach / distance) * max(1.0, size) / step > SURE:
+        which = "mutual"
+    elif MARGIN * _anchor_error(mission, size) > foothold(size, distance, reach):
+        which = "anchor"
+    else:
+        return None
+    return (
+        f"with {distance:.6g} m between the anchors and ranges up to {reach:.6g} m, manoeuvres of "
+        f"{step:.3g} m are too short for a pose to be sure to a micrometre in double precision, by the "
+        f"{which} ranges: raise max_speed or period"
+    )
+
+
+MARGIN = 1.2
+"""by which phase 1 must be able to find an anchor better than it has to: its manoeuvres are not the best
+ones"""
+
+
+def _anchor_error(mission: Mission, size: float) -> float:
+    """Return how exactly (m) phase 1 finds the anchor from the worst starts, both on the rim.
+
+    The ranges are off by `rounding`, and the fit of the heading (`belief.anchor_error`) by that over the
+    way off the radius. Heading along the radius, the first two ranges tell nothing of it, and each further
+    tick leads A_0 on and turns by as much as it can. Heading along the tangent, the second range is that at
+    the end of a circle of radius A_0, after a quarter turn on the spot and at most two thirds of the way
+    round.
+    """
+    step, reach = mission.first_straight, mission.sensing_range
+    turn = min(third_point_turn_rate(mission) * mission.period, math.pi)
+    radial, y, across, moment = math.inf, 0.0, 0.0, 0.0
+    for k in range(1, math.ceil(math.pi / turn) + 1):
+        y = min(y + step * math.sin((k - 0.5) * turn) * math.sin(0.5 * turn) / (0.5 * turn), 0.5 * reach)
+        across, moment = across + 2.0 * reach * y, moment + y * y
+        floor = rounding(size, k + 2, (k + 2) * step, k * turn)
+        radial = min(radial, floor * (1.0 + SAME + across / moment))
+    round_it = 0.5 * math.pi + 2.0 * TAU / 3.0
+    floor = rounding(size, 6, (TAU + 4.0) * step, round_it)
+    return max(radial, floor * (1.0 + SAME + 2.0 * reach / step))
 
 
 def safety_obstacle(mission: Mission) -> str | None:

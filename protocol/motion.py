@@ -83,6 +83,21 @@ def step(pose: Pose, v: float, omega: float, period: float) -> Pose:
     )
 
 
+def arc(start: Pose, run: Run, period: float) -> list[Pose]:
+    """Return the pose after each tick of `run`: what `step` gives from `start`, over k times `period`."""
+    v, omega = run.v, run.omega
+    x, y, heading = start.x, start.y, start.heading
+    sin, cos = math.sin, math.cos
+    poses: list[Pose] = []
+    for k in range(1, run.ticks + 1):
+        lasting = k * period
+        half = 0.5 * lasting * omega
+        length = v * lasting if half == 0.0 else v * lasting * (sin(half) / half)
+        course = heading + half
+        poses.append(Pose(x + length * cos(course), y + length * sin(course), heading + lasting * omega))
+    return poses
+
+
 def follow(start: Pose, runs: Iterable[Run], period: float) -> Pose:
     """The pose at the end of `runs`. Equal manoeuvres are one arc, so each run costs one step."""
     pose = start

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import shutil
@@ -445,12 +446,14 @@ def test_a_scenario_that_no_run_accepts_is_found(
 
 
 def test_a_sense_that_is_off_in_its_last_bit_is_found(folder: Path) -> None:
-    off = 2.1064680198465729
+    (sensed,) = [one for one in messages(folder / A) if of(Sense, 47)(one)]
+    measured = sensed.contacts[0].range
+    off = math.nextafter(measured, 0.0)
     plant(folder / A, (of(Sense, 47), to(contacts=(Contact("b", off, (47,)),))))
     findings = audit(folder)
     assert found(findings) == [(47, "a", "sense")]
     assert what(findings, "sense") == [
-        'contacts is [["b",2.106468019846573,[47],[]]], expected [["b",2.1064680198465724,[47],[]]]'
+        f'contacts is [["b",{off},[47],[]]], expected [["b",{measured},[47],[]]]'
     ]
 
 

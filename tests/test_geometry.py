@@ -14,6 +14,8 @@ from agent.geometry import Placement, circle_intersections, included_angle, plac
 from protocol.motion import TAU, Pose, Run, chord, compose, follow, step, wrap
 
 EXACT = 1e-9
+FLOOR = 1e-7
+"""m: what rounding may do to ranges of up to 1000 m, and to what they are computed from"""
 ROUNDING = 1e-7
 """m: residuals of any solution, however ill-conditioned"""
 DOUBLE_ROOT = 1e-1
@@ -222,7 +224,7 @@ def test_a_third_range_leaves_the_true_branch_as_it_was(rho0: float, alpha: floa
     second = Pose(1.0, 0.0, 0.0)
     third = step(second, 1.0, omega, 1.0)
     seen = [(pose, local(truth, pose)) for pose in (Pose(0.0, 0.0, 0.0), second, third)]
-    left = weigh_branches(branches(rho0, second, local(truth, second)), seen, 100.0)
+    left = weigh_branches(branches(rho0, second, local(truth, second)), seen, 100.0, FLOOR, FLOOR)
     assert len(left) == 1
     assert turned(left[0].start.heading, alpha) < EXACT
     assert left[0].alpha == pytest.approx(alpha, abs=EXACT)
@@ -242,7 +244,9 @@ def test_silence_where_a_branch_would_have_been_heard_rules_it_out(
     far = max(true, mirrored)
     assume(far - min(true, mirrored) > 1e-3)
     seen = [(second, local(truth, second)), (third, None)]
-    left = weigh_branches(branches(rho0, second, local(truth, second)), seen, 0.5 * (true + mirrored))
+    left = weigh_branches(
+        branches(rho0, second, local(truth, second)), seen, 0.5 * (true + mirrored), FLOOR, FLOOR
+    )
     assert len(left) == 1
     assert left[0].distance(third) == pytest.approx(far, abs=ROUNDING)
 
@@ -460,10 +464,10 @@ def test_a_third_range_leaves_the_true_placement_as_it_was(
     third = step(Pose(encounter.p1b.x, encounter.p1b.y, course), way, 0.0, 1.0)
     assume(separation(encounter.truth, encounter.p2a, third) > 0.3)
     sightings = sightings_of(encounter, third)
-    left = weigh_placements([encounter.truth], sightings, 1000.0)
+    left = weigh_placements([encounter.truth], sightings, 1000.0, FLOOR)
     assert len(left) == 1
     assert nearest(left, encounter.truth) < EXACT
-    for placement in weigh_placements(encounter.solutions(), sightings, 1000.0):
+    for placement in weigh_placements(encounter.solutions(), sightings, 1000.0, FLOOR):
         assert encounter.residual(placement) < 2e-7
         assert separation(placement, encounter.p2a, third) == pytest.approx(sightings[2].range, abs=2e-7)
 
@@ -473,7 +477,7 @@ def test_two_ranges_leave_every_placement_as_it_was(encounter: Encounter) -> Non
     assume(encounter.is_tame)
     found = encounter.solutions()
     sightings = sightings_of(encounter, encounter.p1b)[:2]
-    assert weigh_placements(found, sightings, 1000.0) == tuple(found)
+    assert weigh_placements(found, sightings, 1000.0, FLOOR) == tuple(found)
 
 
 @given(encounters(), st.floats(0.5, 2.0), angles)
@@ -485,11 +489,11 @@ def test_a_third_range_drops_the_placements_that_predict_another(
     sightings = sightings_of(encounter, third)
     wrong = [p for p in encounter.solutions() if nearest([p], encounter.truth) > 0.1]
     told = [p for p in wrong if abs(separation(p, encounter.p2a, third) - (sightings[2].range or 0.0)) > 0.1]
-    left = weigh_placements(told, sightings, 1000.0)
+    left = weigh_placements(told, sightings, 1000.0, FLOOR)
     assert all(nearest([placement], encounter.truth) < 1e-3 for placement in left) or all(
         encounter.residual(placement) < 2e-7 for placement in left
     )
-    assert weigh_placements(told, [*sightings[:2], Sighting(2, encounter.p2a, third, 5e3)], 1e4) == ()
+    assert weigh_placements(told, [*sightings[:2], Sighting(2, encounter.p2a, third, 5e3)], 1e4, FLOOR) == ()
 
 
 @given(encounters(), st.floats(0.5, 2.0), angles)
@@ -501,7 +505,7 @@ def test_silence_drops_the_placements_that_would_have_been_heard(
     true = separation(encounter.truth, encounter.p2a, third)
     silent = [*sightings_of(encounter, third)[:2], Sighting(2, encounter.p2a, third, None)]
     found = encounter.solutions()
-    left = weigh_placements(found, silent, true - 1e-3)
+    left = weigh_placements(found, silent, true - 1e-3, FLOOR)
     assert nearest(left, encounter.truth) < EXACT
     assert left == tuple(p for p in found if separation(p, encounter.p2a, third) > true - 1e-3)
 

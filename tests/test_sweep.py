@@ -697,3 +697,28 @@ def test_a_spec_that_is_not_there_is_named() -> None:
     assert ended.err.startswith(
         "tandem sweep: nowhere: neither a file nor a campaign that ships (any-start, "
     )
+
+
+def test_a_sweep_of_draws_counts_what_it_refused_and_resumes(folder: Path) -> None:
+    words = ("anywhere", "--trials", "80", "--workers", "1", "--no-audit")
+    with Command("sweep", *words, "--out", "out", cwd=folder) as command:
+        command.until(lambda: parts(folder / "out"), "a chunk is done")
+        command.tell(SIGINT)
+        assert command.ended().status == 130
+    found = rows(folder / "out")
+    assert 0 < len(found) < 80
+    ended = tandem("sweep", *words, "--out", "out", cwd=folder)
+    assert ended.status == 0, ended.err
+    straight = tandem("sweep", *words, "--out", "straight", cwd=folder)
+    finished = rows(folder / "out")
+    assert finished == rows(folder / "straight")
+    assert all(row in finished for row in found)
+    refused = [row for row in finished if row["outcome"] == "refused"]
+    assert 0 < len(refused) < 20
+    assert all("in double precision, by the" in row["reason"] for row in refused)
+    assert all(row["ticks"] is None for row in refused)
+    counts = f"{80 - len(refused)} localised, {len(refused)} refused of 80 trials"
+    assert counts in ended.out
+    assert counts in straight.out
+    (summary,) = summary_rows(folder / "out")
+    assert (summary["trials"], summary["refused_trials"]) == (str(80 - len(refused)), str(len(refused)))

@@ -10,11 +10,9 @@ import msgspec
 from protocol.messages import Alarm, Localised, Outcome, Undecided, Verdict
 from protocol.mission import HEADING_ACCURACY, Mission
 from protocol.motion import Pose, wrap
+from protocol.rounding import TOLERANCE
 from world.scenario import Scenario
 from world.truth import Truth
-
-TOLERANCE = 1e-6
-"""m and rad: a claim farther off than this is wrong where sensors are exact"""
 
 SIGMAS = 5.0
 """of those that it claims: farther off than this it is wrong where they are not"""

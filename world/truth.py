@@ -11,6 +11,14 @@ from protocol.mission import Anchor, Mission
 from protocol.motion import REST, Controls, Pose, step
 
 
+class Leg(msgspec.Struct, frozen=True, gc=False):
+    """Equal manoeuvres of one robot, so far."""
+
+    begin: Pose
+    ticks: int
+    controls: Controls
+
+
 class Truth(msgspec.Struct, frozen=True):
     """The true state at one tick.
 
@@ -22,6 +30,8 @@ class Truth(msgspec.Struct, frozen=True):
     local: tuple[Pose, ...]
     """relative to `origins`; the axes are the world's"""
     origins: tuple[Anchor, ...]
+    legs: tuple[Leg, ...] = ()
+    """what led each robot there: equal manoeuvres are one arc, so rounding does not grow with their number"""
 
     @property
     def poses(self) -> tuple[Pose, ...]:
@@ -33,11 +43,14 @@ class Truth(msgspec.Struct, frozen=True):
 
     def moved(self, controls: Sequence[Controls], period: float) -> Truth:
         """Where everyone is one tick later, having driven `controls`."""
-        return Truth(
-            self.tick + 1,
-            tuple([step(pose, c.v, c.omega, period) for pose, c in zip(self.local, controls, strict=True)]),
-            self.origins,
-        )
+        legs: list[Leg] = []
+        local: list[Pose] = []
+        before = self.legs or [Leg(pose, 0, c) for pose, c in zip(self.local, controls, strict=True)]
+        for leg, pose, c in zip(before, self.local, controls, strict=True):
+            begin, ticks = (leg.begin, leg.ticks + 1) if leg.controls == c else (pose, 1)
+            legs.append(Leg(begin, ticks, c))
+            local.append(step(begin, c.v, c.omega, ticks * period))
+        return Truth(self.tick + 1, tuple(local), self.origins, tuple(legs))
 
 
 def asked(drive: Drive | None, mission: Mission) -> Controls:

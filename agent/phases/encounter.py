@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.apart import nearest
-from agent.belief import ON_ANCHOR, Sighting, dilution, information
+from agent.belief import Sighting, information
 from agent.geometry import Placement, placements
 from agent.phases.seeking import travelled
 from protocol.mission import RANGE_MARGIN, Mission, Role, Variant
@@ -30,14 +30,13 @@ SPEEDS = (1.0, -1.0, 0.75, -0.75, 0.5, -0.5, 0.25, -0.25, 0.1, -0.1)
 ELSEWHERE = 1e-6
 """m: a range taken nearer than this to where another was says nothing new"""
 
-FAINT = 1e-6
-"""1 / rad^2: added to the information there is, so that the first of two missing ranges counts"""
+ON_THE_OTHER = 1e-6
+"""of a's way between two ranges: nearer to M1 than this, b may be on it, and eq. (7) has a's turn about M1 by
+1e-16 over this at the best"""
 
-ROUNDING = 64 * 2.0**-52
-"""of D + R: how far rounding may put a range off its prediction"""
-
-SURE = 5e-7
-"""rad, and m at the distance D + R: how exact a pose must be to be claimed; half of what is tolerated"""
+FAINT = 1e-8
+"""of (D + R)^2 for phi and of D^2 for psi, the most that a range tells: added to the information there is, so
+that the first of two missing ranges counts"""
 
 
 class Standing(msgspec.Struct, frozen=True):
@@ -115,7 +114,10 @@ class Compared(NamedTuple):
 
 
 def base(sightings: Sequence[Sighting]) -> tuple[Sighting, Sighting] | None:
-    """The two ranges that eq. (7) is solved from: the first two between which only a has moved."""
+    """The two ranges that eq. (7) is solved from: the first two between which only a has moved.
+
+    Not two by which b may stand on M1: there any turn of a about it would do.
+    """
     ranged: list[Sighting] = []
     for sighting in sightings:
         if sighting.range is not None and not (
@@ -127,8 +129,16 @@ def base(sightings: Sequence[Sighting]) -> tuple[Sighting, Sighting] | None:
             if first.tick < second.tick and travelled(first.b, second.b) < ELSEWHERE < travelled(
                 first.a, second.a
             ):
-                return first, second
+                near = ON_THE_OTHER * travelled(first.a, second.a)
+                if not (_as_far(first, near) and _as_far(second, near)):
+                    return first, second
     return None
+
+
+def _as_far(sighting: Sighting, near: float) -> bool:
+    """Whether a is as far from its own anchor as from b, to `near` m."""
+    assert sighting.range is not None
+    return abs(math.hypot(sighting.a.x, sighting.a.y) - sighting.range) <= near
 
 
 def solve(distance: float, base: tuple[Sighting, Sighting]) -> list[Placement]:
@@ -159,23 +169,6 @@ def turn(sightings: Sequence[Sighting]) -> Role:
         if travelled(before.a, now.a) > 0.0:
             return "b"
     return "b"
-
-
-def pinned_down(
-    placement: Placement,
-    sightings: Sequence[Sighting],
-    starts: Sequence[Pose],
-    mission: Mission,
-    distance: float,
-) -> bool:
-    """Whether the ranges in `sightings` fix `placement` as exactly as a claim has to be.
-
-    `starts` are the robots', in the frames of their anchors: a robot that began on its anchor may have been
-    that little beside it.
-    """
-    size = distance + mission.sensing_range
-    off = max([ROUNDING * size, *[ON_ANCHOR for start in starts if start.x == 0.0]])
-    return dilution(placement, sightings) * off * max(1.0, size) <= SURE
 
 
 def advanced(state: LastManoeuvre | Returning, pose: Pose, in_contact: bool, rest: Resting) -> State:
@@ -247,7 +240,9 @@ def survey(
     by_phi = (dy * (ax - placement.x) - dx * (ay - placement.y)) / apart
     by_psi = (dy * placement.x - dx * placement.y) / apart
     pp, pq, qq = information(placement, sightings)
-    value = (pp + by_phi**2 + FAINT) * (qq + by_psi**2 + FAINT) - (pq + by_phi * by_psi) ** 2
+    distance = math.hypot(placement.x, placement.y)
+    faint_p, faint_q = FAINT * (distance + mission.sensing_range) ** 2, FAINT * distance**2
+    value = (pp + by_phi**2 + faint_p) * (qq + by_psi**2 + faint_q) - (pq + by_phi * by_psi) ** 2
     value = np.where(apart <= mission.sensing_range - RANGE_MARGIN, value, -np.inf)
     value = np.where(_keeps_apart(question, reach, mission), value, -np.inf)
     row, column = _best(value)

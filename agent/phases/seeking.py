@@ -17,7 +17,7 @@ from protocol.mission import Mission, Variant
 from protocol.motion import REST, TAU, Controls, Pose, wrap
 
 ARRIVED = 1e-9
-"""m and rad: nearer than this is there; the odometry knows the rest"""
+"""rad, and of A_0: nearer than this is there; the odometry knows the rest"""
 
 CLOSE = 0.05
 """rad, and of A_0: nearer than this is there, where wheels are noisy"""
@@ -76,7 +76,8 @@ def stretch(beacon: Beacon, rho0: float, mission: Mission) -> float:
 
 def arrived(mission: Mission) -> tuple[float, float]:
     """m and rad: how near is there."""
-    return (ARRIVED, ARRIVED) if mission.noise.exact else (CLOSE * mission.first_straight, CLOSE)
+    share = ARRIVED if mission.noise.exact else CLOSE
+    return share * mission.first_straight, share
 
 
 def travelled(origin: Pose, pose: Pose) -> float:

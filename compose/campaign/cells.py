@@ -69,6 +69,12 @@ def setting_of(campaign: Campaign, cell: Cell) -> Setting | Refused:
         return Refused(str(error).removeprefix(f"{source}: "))
 
 
+def trial_table(campaign: Campaign, cell: Cell, trial: int) -> dict[str, Any]:
+    """Return the table of a trial's scenario file, complete but for starts that follow from its seed."""
+    seed = trial_seed(campaign.seed, cell.key, trial)
+    return {**campaign.draws.table(cell.table, seed), "seed": seed}
+
+
 def trial_seed(campaign_seed: int, key: str, trial: int) -> int:
     """The seed of a trial's scenario: of 63 bits, whoever plays it and whatever else is played."""
     digest = hashlib.sha256(f"{campaign_seed}/{key}/{trial}".encode()).digest()

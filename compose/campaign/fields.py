@@ -74,6 +74,14 @@ def with_value(table: Mapping[str, Any], way: Steps, value: Any) -> dict[str, An
     return changed
 
 
+def value_at(table: Mapping[str, Any], way: Steps) -> Any:
+    """Return the value of the field at `way`. Raises KeyError or IndexError where `table` leaves it out."""
+    value: Any = table
+    for step in way:
+        value = value[step]
+    return value
+
+
 def _split(path: str) -> list[str | int]:
     found: list[str | int] = []
     at = 0

@@ -161,6 +161,7 @@ def _identity(campaign: Campaign) -> dict[str, Any]:
         "seed": campaign.seed,
         "scenario": campaign.base,
         "axis": [msgspec.to_builtins(axis) for axis in campaign.axes],
+        "draws": msgspec.to_builtins(campaign.draws),
     }
 
 

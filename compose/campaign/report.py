@@ -15,7 +15,7 @@ from compose import layout, tables
 from compose.campaign.cells import Cell
 from compose.campaign.folder import CELLS
 from compose.campaign.run import SUMMARY, Progress, Results
-from compose.campaign.summary import Counted, noted
+from compose.campaign.summary import Counted, noted, refusals
 from protocol.terminal import say
 
 RATE_OVER_S = 10.0
@@ -77,6 +77,7 @@ def progress(name: str, say: Callable[[str], None], visible: bool) -> Iterator[P
 def show(results: Results, out: Path, *, quiet: bool) -> None:
     """The table, and how to see one of its trials; or only the counts."""
     total = {name: sum([getattr(one, name) for one in results.figures.values()]) for name in OUTCOMES}
+    total["refused"] = sum([one.refused_trials for one in results.figures.values()])
     counts = ", ".join([f"{count} {name}" for name, count in total.items() if count])
     say(f"{results.campaign.name}: {counts} of {len(results.table)} trials in {_cells(len(results.cells))}")
     if any(one.audited for one in results.figures.values()):
@@ -92,12 +93,18 @@ def show(results: Results, out: Path, *, quiet: bool) -> None:
     for index, figures in results.figures.items():
         if figures.refused is not None:
             say(f"cell {index} cannot be played: {figures.refused}")
+    for reason, count in refusals(results.table):
+        say(f"refused: {count}: {reason}")
     note = noted(results.table)
     if note is not None:
         why = f" ({note.why})" if note.why else ""
         how = f"{note.outcome} after {note.ticks} ticks" if note.ticks is not None else note.outcome
         file = shlex.quote(str(out / CELLS / f"{note.cell:03d}.toml"))
         say(f"to look at first: trial {note.trial} of cell {note.cell}, {how}{why}; any trial again:")
+        if results.campaign.draws:
+            source = shlex.quote(results.campaign.source)
+            say(f"  tandem sweep {source} --print-trial {note.cell}:{note.trial} > trial.toml")
+            file = "trial.toml"
         say(f"  tandem run {file} --seed {note.seed} --out record")
     say(f"results: {out}")
 
@@ -108,7 +115,8 @@ def _audited(results: Results) -> str:
     audited, clean = sum([one.audited for one in figures]), sum([one.clean for one in figures])
     note = noted(results.table) if clean < audited else None
     first = f"; trial {note.trial} of cell {note.cell}: {note.why}" if note is not None else ""
-    return f"audited: {audited} of {len(results.table)} trials, {clean} clean{first}"
+    played = sum([one.trials for one in figures])
+    return f"audited: {audited} of {played} trials, {clean} clean{first}"
 
 
 def _lines(results: Results) -> tuple[list[str], Sequence[str]]:

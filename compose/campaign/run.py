@@ -135,7 +135,7 @@ def _left(folder: Folder, progress: Progress) -> list[Work]:
             refused[cell.index] = setting.reason
             count -= campaign.trials
         else:
-            work.append(Work(cell.index, cell.key, setting, left))
+            work.append(Work(cell.index, cell.key, setting, left, cell.table))
     if len(refused) == len(folder.cells):
         first, reason = next(iter(refused.items()))
         raise BadSpec(f"{campaign.source}: no cell can be played; cell {first}: {reason}")
@@ -148,7 +148,9 @@ def _left(folder: Folder, progress: Progress) -> list[Work]:
 
 def _play(folder: Folder, work: list[Work], means: Means, inbox: Inbox, progress: Progress) -> None:
     campaign = folder.campaign
-    orders = Orders(campaign.seed, means.processes, campaign.trial_timeout, means.play, means.audit)
+    orders = Orders(
+        campaign.seed, means.processes, campaign.trial_timeout, means.play, means.audit, campaign.draws
+    )
 
     def keep(rows: list[Row]) -> None:
         folder.add(rows)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,7 +12,8 @@ import msgspec
 from msgspec import Meta
 
 from compose import scenario
-from compose.campaign.fields import NoSuchField, Steps, canonical, jsonable, steps
+from compose.campaign.draws import Draw, Draws, DrawTable, StartsTable
+from compose.campaign.fields import NoSuchField, Steps, canonical, jsonable, steps, value_at
 from compose.status import UserError
 from compose.toml import NotToml, field_first, read_text, table_in
 from protocol.units import NAME
@@ -53,6 +54,10 @@ class SpecFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     trial_timeout: Annotated[float, Meta(gt=0.0, le=1e6)] = TRIAL_TIMEOUT_S
     """s of wall time, after which a trial counts as hung"""
     axis: list[AxisTable] = []
+    draw: list[DrawTable] = []
+    """fields that every trial draws anew, in this order"""
+    starts: StartsTable | None = None
+    """kinds of start that every trial draws from"""
 
 
 class Axis(msgspec.Struct, frozen=True):
@@ -92,6 +97,8 @@ class Campaign(msgspec.Struct, frozen=True):
     seed: int
     trial_timeout: float
     """s"""
+    draws: Draws = Draws()
+    """what each trial draws beside the starts that the scenario leaves open"""
 
 
 def shipped() -> dict[str, Path]:
@@ -116,7 +123,8 @@ def load(source: str, *, trials: int | None = None, seed: int | None = None) -> 
         raise BadSpec(f"{source}: {error}") from None
     base = _base(spec, path, source)
     axes = tuple(_axis(axis, f"{source}: axis[{i}]", base) for i, axis in enumerate(spec.axis))
-    _check_together(axes, source)
+    draws = Draws(_draws(spec, axes, base, source), spec.starts)
+    _check_together(axes, draws, source)
     return Campaign(
         source=source,
         name=spec.name,
@@ -125,6 +133,7 @@ def load(source: str, *, trials: int | None = None, seed: int | None = None) -> 
         trials=trials if trials is not None else spec.trials,
         seed=seed if seed is not None else spec.seed,
         trial_timeout=spec.trial_timeout,
+        draws=draws,
     )
 
 
@@ -194,8 +203,63 @@ def _value(value: Any, where: str, fields: Sequence[str] | None) -> tuple[Any, .
     return tuple(value)
 
 
-def _check_together(axes: Sequence[Axis], source: str) -> None:
-    """Raises BadSpec where two axes get into each other's way."""
+def _draws(spec: SpecFile, axes: Sequence[Axis], base: dict[str, Any], source: str) -> tuple[Draw, ...]:
+    """Return the fields that every trial draws. Raises BadSpec."""
+    known = {way for axis in axes for way in axis.ways}
+    draws: list[Draw] = []
+    for i, table in enumerate(spec.draw):
+        where = f"{source}: draw[{i}]"
+        if (table.uniform is None) == (table.log_uniform is None):
+            raise BadSpec(f"{where}: has one of 'uniform' and 'log_uniform'")
+        interval = table.uniform or table.log_uniform
+        assert interval is not None
+        low, high = interval
+        if not -math.inf < low < high < math.inf or (table.log_uniform is not None and low <= 0.0):
+            above = " above 0" if table.log_uniform is not None else ""
+            raise BadSpec(f"{where}: from {low:g} to {high:g} is no interval{above}")
+        (way,) = _numbers([table.field], f"{where}.field", base)
+        draws.append(
+            Draw(
+                table.field,
+                way,
+                interval,
+                table.log_uniform is not None,
+                _known(table.times, f"{where}.times", base, known),
+                _known(table.over, f"{where}.over", base, known),
+            )
+        )
+        known.add(way)
+    return tuple(draws)
+
+
+def _numbers(fields: Sequence[str], where: str, base: dict[str, Any]) -> tuple[Steps, ...]:
+    """Return the ways to `fields`. Raises BadSpec where there is no such field."""
+    found = []
+    for field in fields:
+        try:
+            found.append(steps(field, base))
+        except NoSuchField as error:
+            raise BadSpec(f"{where}: '{field}': {error}") from None
+    return tuple(found)
+
+
+def _known(
+    fields: Sequence[str], where: str, base: dict[str, Any], varied: Collection[Steps]
+) -> tuple[Steps, ...]:
+    """Return the ways to `fields`, whose values are known when they are needed. Raises BadSpec."""
+    ways = _numbers(fields, where, base)
+    for field, way in zip(fields, ways, strict=True):
+        try:
+            value = 1.0 if way in varied else value_at(base, way)
+        except (KeyError, IndexError):
+            raise BadSpec(f"{where}: '{field}' is neither in the scenario nor drawn before") from None
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise BadSpec(f"{where}: '{field}' is not a number")
+    return ways
+
+
+def _check_together(axes: Sequence[Axis], draws: Draws, source: str) -> None:
+    """Raises BadSpec where two axes, or draws, get into each other's way."""
     names: set[str] = set()
     for i, axis in enumerate(axes):
         if axis.name in names:
@@ -206,6 +270,7 @@ def _check_together(axes: Sequence[Axis], source: str) -> None:
         for i, axis in enumerate(axes)
         for field, way in zip(axis.fields, axis.ways, strict=True)
     ]
+    placed += [(f"draw[{i}]", draw.field, draw.way) for i, draw in enumerate(draws.fields)]
     for (one, field, way), (other, another, further) in combinations(placed, 2):
         shorter = min(len(way), len(further))
         if way[:shorter] == further[:shorter]:

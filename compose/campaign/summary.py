@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import math
+import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from statistics import NormalDist
 from typing import Any, get_args
@@ -18,9 +20,11 @@ from scipy.special import gammainccinv, gammaincinv  # type: ignore[import-untyp
 from compose.campaign.cells import Cell
 from compose.campaign.fields import canonical
 from compose.campaign.spec import Campaign
+from compose.campaign.trial import TrialOutcome
 from compose.claim import DEGREES_OF_FREEDOM
 from protocol.messages import Outcome
 
+_NUMBER = re.compile(r"[-+]?\d[\d.]*(e[-+]?\d+)?")
 Floats = NDArray[np.float64]
 CONFIDENCE = 0.95
 """of an interval"""
@@ -84,6 +88,8 @@ class Counted(msgspec.Struct, frozen=True):
     reports_lost: int
     """of all trials"""
     reports_refused: int
+    refused_trials: int
+    """trials in whose drawn setting no mission can be played; no other figure counts them"""
     refused: str | None
     """why no mission can be played in this setting"""
 
@@ -94,13 +100,15 @@ class Noted(msgspec.Struct, frozen=True):
     cell: int
     trial: int
     seed: int
-    outcome: Outcome
+    outcome: TrialOutcome
     ticks: int | None
     why: str | None
 
 
 def counted(table: pa.Table, refused: str | None = None) -> Counted:
     """The figures of these trials."""
+    everything = len(table)
+    table = _played(table)
     outcomes = table["outcome"].to_pylist()
     counts = {outcome: outcomes.count(outcome) for outcome in get_args(Outcome)}
     k, n = counts["localised"], len(outcomes)
@@ -141,6 +149,7 @@ def counted(table: pa.Table, refused: str | None = None) -> Counted:
         violations=int(violations.sum()),
         reports_lost=int(_known(column(table, "reports_lost")).sum()),
         reports_refused=int(_known(column(table, "reports_refused")).sum()),
+        refused_trials=everything - n,
         refused=refused,
     )
 
@@ -220,8 +229,29 @@ def header(campaign: Campaign) -> list[str]:
     return ["cell", *axes, *Counted.__struct_fields__]
 
 
+def _played(table: pa.Table) -> pa.Table:
+    """Return the trials that were not refused."""
+    return table.filter(
+        pa.array([outcome != "refused" for outcome in table["outcome"].to_pylist()], pa.bool_())
+    )
+
+
+def refusals(table: pa.Table) -> list[tuple[str, int]]:
+    """Return why trials were refused, and how many; of reasons that differ in numbers only, the first."""
+    first: dict[str, str] = {}
+    counts: Counter[str] = Counter()
+    for outcome, reason in zip(table["outcome"].to_pylist(), table["reason"].to_pylist(), strict=True):
+        if outcome != "refused":
+            continue
+        kind = _NUMBER.sub("", reason)
+        counts[kind] += 1
+        first.setdefault(kind, reason)
+    return [(first[kind], count) for kind, count in counts.most_common()]
+
+
 def noted(table: pa.Table) -> Noted | None:
-    """The trial to look at first, if there is any."""
+    """The trial to look at first, if any was played."""
+    table = _played(table)
     if not len(table):
         return None
     outcomes = table["outcome"].to_pylist()

@@ -34,7 +34,7 @@ _KINDS: dict[str, pa.DataType] = {
     ),
     **dict.fromkeys([f"cov_{name}" for name in Covariance.__struct_fields__], pa.float64()),
 }
-_OF_ALL = [field for field in Row.__struct_fields__ if field not in ("cell", "trial", "robots")]
+_OF_ALL = [field for field in Row.__struct_fields__ if field not in ("cell", "trial", "robots", "drawn")]
 
 
 def schema_of(campaign: Campaign, cells: Sequence[Cell]) -> pa.Schema:
@@ -45,6 +45,7 @@ def schema_of(campaign: Campaign, cells: Sequence[Cell]) -> pa.Schema:
             fields.append(pa.field(axis.name, pa.string()))
         for i, field in enumerate(axis.fields):
             fields.append(pa.field(field, _kind([values[i] for values in axis.values])))
+    fields += [pa.field(draw.field, pa.float64()) for draw in campaign.draws.fields]
     fields.append(pa.field("trial", _KINDS["trial"]))
     fields += [pa.field(name, _KINDS[name]) for name in _OF_ALL]
     for robot in _robots(cells):
@@ -93,6 +94,8 @@ def of_rows(
         for field in axis.fields:
             kind = schema.field(field).type
             columns[field] = [_held(cells[row.cell].fields[field], kind) for row in rows]
+    for draw in campaign.draws.fields:
+        columns[draw.field] = [row.drawn.get(draw.field) for row in rows]
     columns["trial"] = [row.trial for row in rows]
     for name in _OF_ALL:
         columns[name] = [getattr(row, name) for row in rows]

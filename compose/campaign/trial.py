@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import msgspec
 from msgspec.structs import replace
@@ -15,10 +15,12 @@ from compose.kill import Kill
 from compose.record import Record
 from compose.separation import nearest
 from compose.summary import first_claim, first_contact
-from protocol.messages import Farewell, Outcome
+from protocol.messages import Farewell
 from protocol.motion import Covariance
 from world.scenario import Scenario
 
+TrialOutcome = Literal["localised", "undecided", "alarm", "wrong", "failed", "refused"]
+"""a mission's, or `refused`: no mission can be played in the setting that the trial has drawn"""
 N = TypeVar("N", int, float)
 WITHIN = 3.0
 """times mission.accuracy"""
@@ -79,7 +81,7 @@ class Row(msgspec.Struct, frozen=True, array_like=True):
     trial: int
     seed: int
     """of the scenario"""
-    outcome: Outcome
+    outcome: TrialOutcome
     reason: str | None = None
     """why the outcome is no better"""
     error: str | None = None
@@ -129,6 +131,13 @@ class Row(msgspec.Struct, frozen=True, array_like=True):
     """whether the record is, to the byte, that of the same in one process without kills"""
     wall_s: float | None = None
     robots: dict[str, RobotRow] = {}
+    drawn: dict[str, float] = {}
+    """fields that the trial drew, by their paths"""
+
+
+def refused(cell: int, trial: int, seed: int, reason: str, drawn: dict[str, float]) -> Row:
+    """Return the row of a trial in whose setting no mission can be played."""
+    return Row(cell, trial, seed, "refused", reason, drawn=drawn)
 
 
 def lost(cell: int, trial: int, seed: int, error: str, wall_s: float | None) -> Row:

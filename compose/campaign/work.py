@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import msgspec
 
 from compose.campaign.cells import trial_seed
+from compose.campaign.draws import Draws
 from compose.campaign.worker import Chunk
 from compose.scenario import Setting
 
@@ -34,6 +36,8 @@ class Work(msgspec.Struct):
     """of its seeds"""
     setting: Setting
     trials: list[int]
+    table: dict[str, Any]
+    """of its scenario's file"""
     given: int = 0
     """how many have been handed out"""
     played: int = 0
@@ -58,6 +62,7 @@ class Orders(msgspec.Struct, frozen=True):
     """s"""
     play: str
     audit: bool
+    draws: Draws = Draws()
 
 
 def chunks_of(
@@ -81,6 +86,8 @@ def chunks_of(
                     orders.timeout,
                     orders.play,
                     orders.audit,
+                    orders.draws,
+                    source.table if orders.draws else {},
                 ),
                 source,
             )

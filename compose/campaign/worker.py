@@ -16,12 +16,14 @@ from collections.abc import Callable
 from functools import cache
 from importlib import import_module
 from queue import Empty, SimpleQueue
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import msgspec
+from msgspec.structs import replace
 
 from compose.campaign import trial
-from compose.scenario import Setting
+from compose.campaign.draws import Draws
+from compose.scenario import Setting, Unworkable, validate
 from protocol.terminal import one_line
 
 PLAY = "compose.campaign.trial:play"
@@ -50,6 +52,10 @@ class Chunk(msgspec.Struct, frozen=True):
     """module:function, from a trial to its row"""
     audit: bool = False
     """each of them"""
+    draws: Draws = Draws()
+    """what each of them draws in its scenario's file"""
+    table: dict[str, Any] = {}
+    """that file, where there are draws"""
 
     def after(self, done: int) -> Chunk:
         """What is left of it after so many trials."""
@@ -110,9 +116,18 @@ def _played(chunk: Chunk, number: int, seed: int) -> trial.Row:
     began = time.perf_counter()
     try:
         player = _function(chunk.play)
-        scenario = chunk.setting.seeded(seed)
-        kills = chunk.setting.kills(seed) if chunk.setting.file.kill else None
-        return player(trial.Trial(chunk.cell, number, scenario, chunk.processes, chunk.audit, kills))
+        setting, drawn = chunk.setting, {}
+        if chunk.draws:
+            table = chunk.draws.table(chunk.table, seed)
+            drawn = chunk.draws.values(table)
+            try:
+                setting = validate(table, "its draws")
+            except Unworkable as error:
+                return trial.refused(chunk.cell, number, seed, str(error).removeprefix("its draws: "), drawn)
+        scenario = setting.seeded(seed)
+        kills = setting.kills(seed) if setting.file.kill else None
+        row = player(trial.Trial(chunk.cell, number, scenario, chunk.processes, chunk.audit, kills))
+        return replace(row, drawn=drawn) if drawn else row
     except BaseException as error:  # noqa: BLE001  # a trial that tries to end the process is lost, too
         said = one_line(f"{type(error).__name__}: {error}")[:MAX_ERROR]
         return trial.lost(chunk.cell, number, seed, said, time.perf_counter() - began)

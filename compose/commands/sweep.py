@@ -8,10 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from compose.campaign import spec
+from compose.campaign.cells import cells, trial_table
+from compose.campaign.spec import Campaign
 from compose.lab import need
-from compose.status import FAILED, LOCALISED, NOT_LOCALISED, STOPPED
+from compose.status import FAILED, LOCALISED, NOT_LOCALISED, STOPPED, UserError
 from compose.stop import stop_by_signal
 from protocol.inbox import Inbox
+from protocol.terminal import say
 
 if TYPE_CHECKING:
     from compose.campaign.run import Results
@@ -21,6 +24,8 @@ def main(options: argparse.Namespace) -> int:
     """Play the campaign, or what is left of it."""
     campaign = spec.load(options.spec, trials=options.trials, seed=options.seed)
     need("distributed", "matplotlib", "pyarrow", "tomli_w")
+    if options.print_trial is not None:
+        return print_trial(campaign, *options.print_trial)
     inbox = Inbox("tandem sweep")
     stop_by_signal(inbox)
     from compose.campaign import figures, report, run  # noqa: PLC0415  # slow, and there may be no extra
@@ -51,10 +56,22 @@ def main(options: argparse.Namespace) -> int:
     return status_of(results)
 
 
+def print_trial(campaign: Campaign, cell: int, trial: int) -> int:
+    """Print the scenario file of a trial."""
+    import tomli_w  # noqa: PLC0415  # there may be no extra
+
+    found = next((one for one in cells(campaign) if one.index == cell), None)
+    if found is None:
+        raise UserError(f"--print-trial: {campaign.source} has no cell {cell}")
+    say(*tomli_w.dumps(trial_table(campaign, found, trial)).splitlines())
+    return LOCALISED
+
+
 def status_of(results: Results) -> int:
     """As of a mission: localised only where all are; failed where any is, or breaks a rule."""
     counts = [figures.failed + figures.violations for figures in results.figures.values()]
     if any(counts):
         return FAILED
     localised = sum([figures.localised for figures in results.figures.values()])
-    return LOCALISED if localised == len(results.table) else NOT_LOCALISED
+    played = sum([figures.trials for figures in results.figures.values()])
+    return LOCALISED if localised == played else NOT_LOCALISED

@@ -13,7 +13,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocato
 from compose.figures.plane import AGES, GHOST, SIGMAS, name_of_others
 from compose.figures.story import Story, error
 from compose.figures.timeline import name_phases, over_time
-from world.referee import TOLERANCE
+from protocol.rounding import TOLERANCE
 
 LEAST = 1e-16
 """m: what an error is drawn as that is less"""

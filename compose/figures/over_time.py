@@ -18,7 +18,7 @@ from compose.figures.style import COLOURS, INK, MARKS, PALE, SHADE
 from protocol.messages import Estimate
 from protocol.mission import Role
 from protocol.motion import Pose, wrap
-from world.referee import TOLERANCE
+from protocol.rounding import TOLERANCE
 
 WHOLE, NEAR = 4.4, 2.2
 """inches: of all the mission, and of its encounter"""

@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from agent.belief import FLOOR, Branch
+from agent.belief import Branch
 from agent.mind import Mind
 from agent.phases.seeking import travelled
 from compose.figures.pair import Pair
@@ -24,6 +24,8 @@ FEW = 4
 """ranges of which each ring is named"""
 SAME = 0.03
 """of the longest range: places nearer than this share a name"""
+EXPLAINED = 1e-9
+"""of R: ranges and silence that differ by less are drawn as explained"""
 Seen = list[tuple[Pose, float | None]]
 
 
@@ -201,9 +203,9 @@ def contradicted(branch: Branch, seen: Seen, reach: float) -> list[int]:
         tick
         for tick, (pose, rho) in enumerate(seen)
         if (
-            branch.distance(pose) <= reach - FLOOR
+            branch.distance(pose) <= reach * (1.0 - EXPLAINED)
             if rho is None
-            else abs(branch.distance(pose) - rho) > FLOOR
+            else abs(branch.distance(pose) - rho) > EXPLAINED * reach
         )
     ]
 

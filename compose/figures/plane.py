@@ -15,7 +15,7 @@ from compose.figures.story import Story, error
 from compose.figures.style import COLOURS
 from protocol.messages import Estimate
 from protocol.motion import ORIGIN, Pose
-from world.referee import TOLERANCE
+from protocol.rounding import TOLERANCE
 from world.scenario import Placed
 
 Window = tuple[float, float, float, float]
