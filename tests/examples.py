@@ -22,7 +22,7 @@ from protocol.messages import (
     Undecided,
 )
 from protocol.motion import Controls, Covariance, Pose, Run
-from world.driver_journal import Mark
+from world.driver_journal import Mark, Start
 
 POSE = Pose(1.5, -2.5, 0.75)
 
@@ -62,6 +62,7 @@ EXAMPLES: tuple[Message, ...] = (
     Sense(8, "a", Controls(1.0, -0.5), None, (Contact("b", 1.25, None),)),
     Environment("0.1.0", "glibc 2.36", "x86-64-v3", "2.4.1 (AVX2)", "OpenBLAS 0.3.31 (Haswell)"),
     Mark(4, "a", (0.5, -1.0)),
+    Start("6f1c2a", synced=True),
     Beat(7, "a"),
     Drive(4, "b", 0.0, 0.0, 3, "alarm", Alarm("a start that it told otherwise before", 0.5, 0.25)),
 )
