@@ -37,6 +37,7 @@ PURE = {
     "agent.apart",
     "agent.mind",
     "agent.meeting",
+    "agent.precision",
     "agent.belief",
     "agent.geometry",
     "agent.inference",
@@ -65,6 +66,7 @@ PURE = {
     "protocol.motion",
     "protocol.noise",
     "protocol.rendezvous",
+    "protocol.rounding",
     "protocol.units",
 }
 ALLOWED = {
