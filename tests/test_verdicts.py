@@ -59,7 +59,7 @@ def test_a_wrong_claim_cannot_be_taken_back() -> None:
 def test_the_letter_gives_up_where_the_third_mutual_range_settles_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """b drove its one last manoeuvre; a, which the paper has stand, stands. No placement is known well here."""
+    """b drove its last manoeuvre; a, which the paper has stand, stands. No placement is known well here."""
     monkeypatch.setattr(precision, "pinned_down", lambda *_: False)
     text = f'{shipped()["random"].read_text()}\n[planner]\nvariant = "paper"\n'
     record = play(parse(text, "random", seed=441))
