@@ -20,6 +20,9 @@ from protocol.rounding import SAME, same_turn
 POLISHING_STEPS = 12
 """Gauss-Newton steps at the most; they end when the fit gets no better, mostly after one"""
 
+FITTED = 3
+"""anchor ranges from which on the heading is fitted to all of them; two are met exactly"""
+
 DAMPING = 1e-9
 """of a fit's curvature, added to it: so a step goes only where the ranges tell something"""
 
@@ -83,7 +86,7 @@ def weigh_branches(
     silent = [pose for pose, rho in seen if rho is None]
     left: list[Branch] = []
     for candidate in candidates:
-        branch = _polished(candidate, ranged)
+        branch = polished(candidate, ranged)
         if (
             all(_meets(branch.distance(pose), rho, branch.start.x, floor) for pose, rho in ranged)
             and all(branch.distance(pose) > sensing_range - 0.5 * margin for pose in silent)
@@ -118,12 +121,12 @@ def _meets(predicted: float, rho: float, rho0: float, floor: float) -> bool:
     return abs(predicted - rho) * (predicted + rho) <= 2.0 * floor * max(rho, rho0)
 
 
-def _polished(branch: Branch, ranged: Sequence[tuple[Pose, float]]) -> Branch:
+def polished(branch: Branch, ranged: Sequence[tuple[Pose, float]]) -> Branch:
     """The same branch with the heading that fits all ranges best, in squares (Gauss-Newton).
 
     Two ranges are met exactly by construction, and near a radial heading they say nothing more.
     """
-    if len(ranged) < 3:
+    if len(ranged) < FITTED:
         return branch
     rho0, heading = branch.start.x, branch.start.heading
     best, fitted = math.inf, heading

@@ -209,7 +209,9 @@ def _released(mind: Mind, rho0: float | None) -> Mind:
         return mind.undecided("the anchor is out of range at the start")
     if mind.briefing.mission.noise.exact and rho0 <= SAME * precision.drifted(mind, mind.log, mind.tick):
         # it is on its anchor: the heading is radial by definition, and nothing is left to find out
-        return _located(mind, Branch(0.0, ORIGIN), "on-anchor", precision.anchor(mind, ORIGIN, mind.log)[0])
+        return _located(
+            mind, Branch(0.0, ORIGIN), "on-anchor", precision.anchor(mind, ORIGIN, mind.log).error
+        )
     return replace(mind, state=Straight("anchor", mind.odometry, rho0))
 
 
@@ -247,9 +249,9 @@ def _weighed(mind: Mind, candidates: tuple[Branch, ...], kind: messages.BranchKi
     margin = precision.margin(mission, floor)
     left = weigh_branches(candidates, mind.seen(), mission.sensing_range, floor, margin)
     if kind is not None and len(left) == 1:
-        off, enough = precision.anchor(mind, left[0].start, mind.log)
-        if enough or paper:
-            return _located(mind, left[0], kind, off)
+        branch, known = precision.fitted(mind, left[0])
+        if known.enough or paper:
+            return _located(mind, branch, kind, known.error)
     if len(left) > 1 and paper and isinstance(mind.state, ThirdPoint):
         return mind.undecided("the third range does not tell +alpha from -alpha")
     return _to_third_point(mind, left, margin)

@@ -8,13 +8,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from agent.belief import Sighting, anchor_error, turn_error
+import msgspec
+from msgspec.structs import replace
+
+from agent.belief import FITTED, Branch, Sighting, anchor_error, polished, turn_error
 from agent.geometry import Placement
 from agent.logbook import Logbook
 from agent.mind import Mind
 from protocol.mission import RANGE_MARGIN, Mission
 from protocol.motion import ORIGIN, Pose, Run, follow
-from protocol.rounding import BETTER, SURE, WELL, foothold, rounding
+from protocol.rounding import BETTER, OUT_AND_BACK, SAME, SURE, WELL, foothold, rounding
 
 
 def size(mind: Mind) -> float:
@@ -45,15 +48,29 @@ def margin(mission: Mission, floor: float) -> float:
     return max(RANGE_MARGIN, mission.sensing_range * math.sqrt(2.0 * floor / mission.first_straight))
 
 
-def anchor(mind: Mind, start: Pose, log: Logbook) -> tuple[float, bool]:
-    """Return how far, in m, the anchor may be off for the robot of `log`, and whether phase 1 may end.
+class Known(msgspec.Struct, frozen=True):
+    """How well the first of its anchor ranges tell a robot where its anchor is."""
 
-    It may once the anchor is known well; or well enough, and the last range made it hardly any better. Later
-    ranges are not looked at: both robots of a pair, which know the same ranges, find the same.
+    error: float
+    """m: how far off it may be"""
+    ranges: int
+    """by how many of them it is known so well"""
+    enough: bool = False
+    """whether phase 1 may end"""
+
+
+def anchor(mind: Mind, start: Pose, log: Logbook) -> Known:
+    """Return how well the robot of `log` knows its anchor, by those ranges that tell it best.
+
+    Phase 1 may end once that is well; or well enough, and the last range made it hardly any better. It must
+    once a way out and back made it no better: rounding then grows faster than what ranges tell, and whether
+    it will do is found where the robots meet, by `pinned_down`. Later ranges are not looked at: both robots
+    of a pair, which know the same ranges, find the same.
     """
     mission, extent = mind.briefing.mission, size(mind)
     enough = foothold(extent, mind.briefing.anchor_distance, mission.sensing_range)
-    error = math.inf
+    known = least = error = math.inf
+    ranges = 0
     ranged: list[tuple[Pose, float, float]] = []
     for one in log.ranges:
         if one.tick > log.through:
@@ -64,16 +81,31 @@ def anchor(mind: Mind, start: Pose, log: Logbook) -> tuple[float, bool]:
         if len(ranged) == 1 and start.x > enough:
             continue  # a range from the start alone tells nothing of the heading
         before, error = error, anchor_error(start, ranged)
-        stalled = len(ranged) > 2 and error > BETTER * before
-        if error <= WELL * enough or (stalled and min(before, error) <= enough):
-            return error, True
-    return error, False
+        if error < least or len(ranged) <= FITTED:
+            least, ranges = error, len(ranged)
+        # what `weigh_branches` merged after them, it put off farther
+        known = least + SAME * (floor - ranged[ranges - 1][2])
+        stalled = len(ranged) >= FITTED and error > BETTER * before
+        spent = len(ranged) - ranges == OUT_AND_BACK
+        if known <= WELL * enough or (stalled and known <= enough) or spent:
+            return Known(known, ranges, enough=True)
+    return Known(known, ranges)
+
+
+def fitted(mind: Mind, branch: Branch) -> tuple[Branch, Known]:
+    """Return `branch` as those ranges have it that tell it best, and how well they do."""
+    known = anchor(mind, branch.start, mind.log)
+    if known.ranges == len(mind.log.ranges):
+        return branch, known
+    ranged = [(pose, rho) for pose, rho in mind.seen() if rho is not None]
+    branch = polished(branch, ranged[: known.ranges])
+    return branch, replace(known, error=anchor(mind, branch.start, mind.log).error)
 
 
 def peer_anchor(mind: Mind) -> float:
-    """Return `anchor` of the peer, in m."""
+    """Return the error of `anchor` of the peer, in m."""
     assert mind.radio.start is not None
-    return anchor(mind, mind.radio.start, mind.radio.peer)[0]
+    return anchor(mind, mind.radio.start, mind.radio.peer).error
 
 
 def apart(mind: Mind) -> float:

@@ -55,6 +55,10 @@ WELL = 0.125
 BETTER = 0.9
 """by which another range must better what is known of an anchor, for one more to be worth it"""
 
+OUT_AND_BACK = 2
+"""ranges running, one of a way out and one of the way back, that made an anchor no better known; rounding
+grows with the way, so no further one will"""
+
 
 def foothold(size: float, distance: float, sensing_range: float) -> float:
     """Return how exactly, in m, a robot must know where its anchor is when phase 1 ends.

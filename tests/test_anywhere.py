@@ -95,6 +95,8 @@ ONCE_LOST = {
     "the same, with anchors close to each other": 45622,
     "a third point out of range left one branch, not known well enough": 6593,
     "two placements nearly one, with anchors close to each other": 38287,
+    "ranges told less of b's anchor than the way to them cost, before it was known well": 67711,
+    "the same of both anchors, close to each other": 56289,
 }
 
 
