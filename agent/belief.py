@@ -117,7 +117,7 @@ def anchor_error(start: Pose, ranged: Sequence[tuple[Pose, float, float]]) -> fl
 
 
 def _meets(predicted: float, rho: float, rho0: float, floor: float) -> bool:
-    """Whether the range `rho` may be what is `predicted`; nearer than rho_0 in squares, as it is fitted."""
+    """Return whether `rho` may be `predicted`; nearer than rho_0 in squares, as it is fitted."""
     return abs(predicted - rho) * (predicted + rho) <= 2.0 * floor * max(rho, rho0)
 
 
@@ -163,7 +163,7 @@ RangedPair = tuple[Pose, Pose, float]
 def weigh_placements(
     candidates: Iterable[Placement], sightings: Sequence[Sighting], sensing_range: float, floor: float
 ) -> tuple[Placement, ...]:
-    """Those of `candidates` that explain every sighting, be it a range or silence.
+    """Return those of `candidates` that explain every sighting, be it a range or silence.
 
     `floor` is by how much (m) rounding, that of phase 1 included, may put a predicted range off.
     """

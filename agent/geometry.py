@@ -94,7 +94,7 @@ def placements(
 
 
 def same_placement(one: Placement, other: Placement, tolerance: float) -> bool:
-    """Whether both angles, phi and the bearing of M1 in <b(M2)>, differ by less than `tolerance`, in rad."""
+    """Return whether phi and the bearing of M1 in <b(M2)> each differ by less than `tolerance`, in rad."""
     return abs(wrap(one.phi - other.phi)) < tolerance and math.hypot(
         one.x - other.x, one.y - other.y
     ) < tolerance * math.hypot(one.x, one.y)

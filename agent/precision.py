@@ -120,7 +120,7 @@ def _apart(mind: Mind, tick: int) -> float:
 
 
 def pinned_down(mind: Mind, placement: Placement, ranged: Sequence[Sighting], off: float) -> bool:
-    """Whether the sightings in `ranged` fix `placement` as exactly as a claim has to be; `off` is `apart`.
+    """Return whether the sightings in `ranged` fix `placement` well enough for a claim; `off` is `apart`.
 
     What was driven between the first and the last of them is all that puts one range off against another;
     what was driven before moves all of them alike, with the anchors.

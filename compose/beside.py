@@ -104,7 +104,7 @@ def page(folder: Path, port: int) -> tuple[str, ...]:
 
 
 def viewers(folder: Path, port: int, origins: Sequence[str], robots: Sequence[str]) -> tuple[str, ...]:
-    """The same for Foxglove's viewers, of a run of `robots`; web pages of `origins` may look, too."""
+    """Return what `beside` is told to serve a run of `robots` to Foxglove, and to web pages of `origins`."""
     words = (str(port), ",".join(origins), str(folder), *robots)
     return ("what Foxglove's viewers show", "compose.export.live", *words)
 

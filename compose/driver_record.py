@@ -83,7 +83,7 @@ def recorded(folder: Path, briefing: Briefing, inbox: Inbox, *, fsync: bool) -> 
 
 
 def _frames(path: Path, inbox: Inbox) -> list[bytes]:
-    """What is in the agent's journal, once its process has ended. Raises CannotRecord or CorruptJournal."""
+    """Return the agent's journal once its process has ended. Raises CannotRecord or CorruptJournal."""
     give_up = time.monotonic() + RELEASE_S
     while path.exists():
         try:

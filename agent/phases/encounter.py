@@ -136,7 +136,7 @@ def base(sightings: Sequence[Sighting]) -> tuple[Sighting, Sighting] | None:
 
 
 def _as_far(sighting: Sighting, near: float) -> bool:
-    """Whether a is as far from its own anchor as from b, to `near` m."""
+    """Return whether a is as far from its own anchor as from b, to `near` m."""
     assert sighting.range is not None
     return abs(math.hypot(sighting.a.x, sighting.a.y) - sighting.range) <= near
 

@@ -108,16 +108,18 @@ def findings_of(
     ticks: int,
     radio: tuple[Befallen, ...] = (),
 ) -> Findings:
-    """What each of `rules`, which goes by its name, finds in `case`; `versions` are those that are others."""
+    """Return what each of `rules`, counted by its name, finds in `case`; `versions` says which differ."""
     checks = {rule.__name__: list(rule(case)) for rule in rules}
     found = [one for some in checks.values() for one in some if one is not None]
     found.sort(key=lambda one: -1 if one.tick is None else one.tick)
-    rounding = tuple([one for one in found if versions is not None and _by_rounding(one)])
-    violations = tuple([one for one in found if one not in rounding])
+    rounding: list[Violation] = []
+    violations: list[Violation] = []
+    for one in found:
+        (rounding if versions is not None and _by_rounding(one) else violations).append(one)
     counts = [
         Count(rule, len(some), sum([one.rule == rule for one in violations])) for rule, some in checks.items()
     ]
-    return Findings(scenario, ticks, tuple(counts), violations, radio, rounding, versions)
+    return Findings(scenario, ticks, tuple(counts), tuple(violations), radio, tuple(rounding), versions)
 
 
 def _by_rounding(one: Violation) -> bool:
@@ -145,7 +147,7 @@ def between(found: msgspec.Struct, expected: msgspec.Struct) -> Difference:
 
 
 def _close(one: Any, other: Any) -> bool:
-    """Whether the two are the same but for rounding."""
+    """Return whether the two values are the same except for rounding."""
     if isinstance(one, float) and isinstance(other, float):
         return abs(one - other) <= ROUNDING * max(1.0, abs(one), abs(other))
     if type(one) is not type(other):
