@@ -8,7 +8,7 @@ import socket
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from compose import forked
@@ -133,8 +133,12 @@ def play(
     patience: float,
     kills: Sequence[Kill] = (),
     keys: Path | None = None,
+    agents_journal: bool = True,
 ) -> list[Kill]:
-    """Play `scenario`; journals go to `out`. A process takes its `kills` and is started again.
+    """Run `scenario`; journals go to `out`. A process takes its `kills` and is started again.
+
+    Without `agents_journal` only the world writes one: it holds all that the outcome follows from, and with
+    many robots the files take a noticeable part of the run.
 
     With `keys`, the folder that `tandem keys` makes, links are encrypted, and access rules enforced.
 
@@ -142,7 +146,8 @@ def play(
     then, either.
     """
     limits.need_files(CHILD_FILES * (1 + len(scenario.robots)) + SPARE_FILES, "a run as processes")
-    launched = _Run(scenario, out, inbox, run=run, rate=rate, patience=patience, keys=keys)
+    arguments = _arguments(scenario, out, run, rate, patience, keys, agents_journal=agents_journal)
+    launched = _Run(scenario, inbox, arguments)
     try:
         for name in launched.names:
             launched.start(name, [kill for kill in kills if kill.process == name])
@@ -152,49 +157,51 @@ def play(
     return [kill for child in launched.children.values() for kill in child.kills]
 
 
+def _arguments(
+    scenario: Scenario,
+    out: Path,
+    run: str,
+    rate: float | None,
+    patience: float,
+    keys: Path | None,
+    *,
+    agents_journal: bool,
+) -> dict[str, list[str]]:
+    """Return the command lines of the world and the agents, by the name of the process."""
+    endpoint = free_endpoint("tcp" if keys is None else "tls")
+    shared = ["--launched", "--run", run, "--patience", str(patience)]
+    journal = ["--out", str(out)]
+    real_time = ["--rate", str(rate)] if rate is not None else []
+
+    def keyed(who: str) -> list[str]:
+        return ["--keys", str(keys / who)] if keys is not None else []
+
+    wait = ["--wait", str(JOIN_S + JOIN_EACH_S * len(scenario.robots))]
+    world = ["world", scenario.name, "--listen", endpoint, *keyed("world"), *shared, *journal, *real_time]
+    return {WORLD: world} | {
+        f"agent {robot.id}": [
+            *("agent", robot.id, "--connect", endpoint),
+            *keyed(f"agent-{robot.id}"),
+            *shared,
+            *(journal if agents_journal else []),
+            *wait,
+        ]
+        for robot in scenario.robots
+    }
+
+
 class _Run:
     """The processes of one run, by name, and those that are to be started again."""
 
-    def __init__(
-        self,
-        scenario: Scenario,
-        out: Path,
-        inbox: Inbox,
-        *,
-        run: str,
-        rate: float | None,
-        patience: float,
-        keys: Path | None,
-    ) -> None:
+    def __init__(self, scenario: Scenario, inbox: Inbox, arguments: Mapping[str, list[str]]) -> None:
+        """`arguments` are the command lines, by the name of the process."""
         self._scenario = scenario
         self._inbox = inbox
-        self._arguments = self._named(out, run, rate, patience, keys)
-        self.names = list(self._arguments)
+        self._arguments = arguments
+        self.names = list(arguments)
         self.children: dict[str, Child] = {}
         self._due: dict[str, float] = {}
         """when to start again who has been killed"""
-
-    def _named(
-        self, out: Path, run: str, rate: float | None, patience: float, keys: Path | None
-    ) -> dict[str, list[str]]:
-        endpoint = free_endpoint("tcp" if keys is None else "tls")
-        shared = ["--launched", "--run", run, "--out", str(out), "--patience", str(patience)]
-        real_time = ["--rate", str(rate)] if rate is not None else []
-
-        def keyed(who: str) -> list[str]:
-            return ["--keys", str(keys / who)] if keys is not None else []
-
-        wait = ["--wait", str(JOIN_S + JOIN_EACH_S * len(self._scenario.robots))]
-        world = ["world", self._scenario.name, "--listen", endpoint, *keyed("world"), *shared, *real_time]
-        return {WORLD: world} | {
-            f"agent {robot.id}": [
-                *("agent", robot.id, "--connect", endpoint),
-                *keyed(f"agent-{robot.id}"),
-                *shared,
-                *wait,
-            ]
-            for robot in self._scenario.robots
-        }
 
     def start(self, name: str, kills: Sequence[Kill]) -> None:
         """Start it, for the first time or again."""

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from itertools import count
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 import zenoh
 
@@ -39,6 +39,9 @@ REFUSAL = zenoh.Encoding.TEXT_PLAIN
 """of an answer that says why there is none"""
 
 zenoh.init_log_from_env_or("off")
+
+
+T = TypeVar("T")
 
 
 class CannotListen(OSError):
@@ -110,10 +113,11 @@ def open_session(
 
 def subscribe(session: zenoh.Session, key: str, inbox: Inbox, topic: Topic) -> None:
     """Put into `inbox` everything that is put under `key`."""
-    session.declare_subscriber(key, _at_once(lambda sample: deliver(sample, inbox, topic)))
+    handler: zenoh.handlers.Callback[zenoh.Sample] = _at_once(lambda sample: deliver(sample, inbox, topic))
+    session.declare_subscriber(key, handler)
 
 
-def _at_once(hand_over: Callable[[zenoh.Sample], None]) -> zenoh.handlers.Callback[zenoh.Sample]:
+def _at_once(hand_over: Callable[[T], None]) -> zenoh.handlers.Callback[T]:
     """A callback that the thread which receives calls itself; it must be short, and never wait for Zenoh.
 
     Otherwise each subscriber has a thread of its own, to which every message is handed on.
@@ -193,7 +197,8 @@ def show_alive(session: zenoh.Session, key: str) -> zenoh.LivelinessToken:
 
 def on_matching(publisher: zenoh.Publisher, tell: Callable[[bool], None]) -> None:
     """Tell, now and on every change, whether anyone listens to `publisher`."""
-    publisher.declare_matching_listener(lambda status: tell(status.matching))
+    handler: zenoh.handlers.Callback[zenoh.MatchingStatus] = _at_once(lambda status: tell(status.matching))
+    publisher.declare_matching_listener(handler)
     status: Any = publisher.matching_status  # declared as bool, which it is not
     tell(status.matching)
 

@@ -17,7 +17,7 @@ MAX_FRAME_BYTES = 1 << 20
 
 _HEAD = struct.Struct(">BI")
 _encoder = msgspec.msgpack.Encoder()
-_decoders: dict[object, msgspec.msgpack.Decoder[object]] = {}
+_decoders: dict[object, msgspec.msgpack.Decoder[Any]] = {}
 
 M = TypeVar("M")
 
@@ -65,10 +65,13 @@ def decode(frame: bytes, kind: Any, limit: int = MAX_SENT_BYTES) -> Any:
     said = memoryview(frame)[_HEAD.size :]
     if zlib.crc32(said) != crc:
         raise MalformedFrame("damaged: the CRC does not match")
-    decoder = _decoders.get(kind)
-    if decoder is None:
-        decoder = _decoders[kind] = msgspec.msgpack.Decoder(kind)
     try:
-        return decoder.decode(said)
+        return (_decoders.get(kind) or prepare(kind)).decode(said)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise MalformedFrame(str(error)) from None
+
+
+def prepare(kind: Any) -> msgspec.msgpack.Decoder[Any]:
+    """Return the decoder of `kind`, which takes milliseconds to make and is made once."""
+    decoder = _decoders[kind] = msgspec.msgpack.Decoder(kind)
+    return decoder

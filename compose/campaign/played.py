@@ -64,6 +64,7 @@ def as_processes(scenario: Scenario, *, audit: bool, kills: Sequence[Kill] | Non
             rate=None,
             patience=PATIENCE_S,
             kills=kills or (),
+            agents_journal=audit or kills is not None,
         )
         record = read(out)
         findings = judge.audit(out) if audit else None

@@ -12,7 +12,6 @@ from agent.process import AgentProcess
 from agent.robot import Robot
 from compose import kill
 from compose.reach import beyond, reach
-from compose.record import make
 from compose.status import ENDED, FAILED, STOPPED, UserError, status_of
 from compose.stop import stop_by_signal, stop_with_launcher
 from compose.summary import ended
@@ -97,7 +96,7 @@ def _play(options: argparse.Namespace, inbox: Inbox) -> End:
                         say(f"{options.id}: in run {run}, with {briefing.peer}{where}")
                 else:
                     process.attach(link)
-                return process.play()
+                return _left(options, process.play())
         except LinkLost:
             continue
         except NoWorld:
@@ -105,6 +104,16 @@ def _play(options: argparse.Namespace, inbox: Inbox) -> End:
             if end is None:
                 raise
             return end
+
+
+def _left(options: argparse.Namespace, end: End) -> End:
+    """Return `end`; a process of a launcher ends here instead, with its link open.
+
+    The world has all of it on record, and where many robots end at once, closing takes a while.
+    """
+    if options.launched:
+        session.leave(ENDED)
+    return end
 
 
 def _endpoints(options: argparse.Namespace) -> Endpoints:
@@ -126,7 +135,6 @@ def _ready(
     if old is not None:
         journal = going_on(old, inbox)
     elif options.out is not None:
-        make(options.out)
         journal = Journal(options.out / f"agent-{options.id}.journal", fsync=options.fsync)
     if memory is None:
         return Memory(briefing, Robot(briefing, journal))

@@ -116,6 +116,7 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[
                     patience=options.patience,
                     kills=kills,
                     keys=keys,
+                    agents_journal=bool(options.out is not None or kills or shows),
                 )
         except local.ChildFailed as failure:
             inbox.say(f"failed: {failure}")
