@@ -22,6 +22,7 @@ import pytest
 
 from compose.local import free_endpoint
 from protocol import journal
+from tests import warm
 
 BOUND_S = 60.0
 """longer than anything takes that comes at all, on a busy machine too"""
@@ -112,9 +113,7 @@ class Command:
 
         A run leaves its record without an export of it, where nothing is said of that: it takes longer.
         """
-        words = list(map(str, arguments))
-        if words[:1] == ["run"] and "--out" in words and not {"--export", "--no-export"} & {*words}:
-            words.append("--no-export")
+        words = _words(arguments)
         self._out = tempfile.TemporaryFile()  # noqa: SIM115  # closed with the command
         self._err = tempfile.TemporaryFile()  # noqa: SIM115
         self._process = subprocess.Popen(
@@ -206,8 +205,16 @@ class Command:
 
 def tandem(*arguments: str | Path, cwd: Path | None = None) -> Ended:
     """The command, to its end."""
-    with Command(*arguments, cwd=cwd) as command:
-        return command.ended()
+    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+        status = warm.run(_words(arguments), cwd, out, err, BOUND_S)
+        return Ended(status, _read(out), _read(err))
+
+
+def _words(arguments: Sequence[str | Path]) -> list[str]:
+    words = list(map(str, arguments))
+    if words[:1] == ["run"] and "--out" in words and not {"--export", "--no-export"} & {*words}:
+        words.append("--no-export")
+    return words
 
 
 def on_a_terminal(*arguments: str | Path) -> tuple[int, str]:

@@ -120,13 +120,19 @@ FRAMES = [
 
 
 def attack(link: zenoh.Session) -> list[zenoh.LivelinessToken]:
-    """Put, delete, ask and show tokens under every wildcard and odd key; tokens come and go."""
+    """Put, delete, ask and show tokens under every wildcard and odd key; tokens come and go.
+
+    Everything is delivered: by default Zenoh drops what a busy receiver does not take at once.
+    """
+    all_of_it = zenoh.CongestionControl.BLOCK
     for key in (*WILD, *ODD):
         for frame in FRAMES:
-            link.put(key, frame, encoding="text/plain", attachment=b"\xff" * 100)
-        link.delete(key)
+            link.put(
+                key, frame, encoding="text/plain", attachment=b"\xff" * 100, congestion_control=all_of_it
+            )
+        link.delete(key, congestion_control=all_of_it)
     for key in KEYS.values():
-        link.delete(key)
+        link.delete(key, congestion_control=all_of_it)
     shown = [link.liveliness().declare_token(key) for key in (*WILD, *ODD)]
     gone: list[Any] = [link.liveliness().declare_token(key) for key in WILD]
     for token in gone:

@@ -78,7 +78,8 @@ def test_a_library_that_is_too_old_is_to_be_installed_anew(
     (tmp_path / "numpy-1.26.4.dist-info").mkdir()
     (tmp_path / "numpy-1.26.4.dist-info" / "METADATA").write_text("Name: numpy\nVersion: 1.26.4\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    only_fix(tandem("doctor"), "versions: numpy 1.26.4; tandem-ranging", "needs <3,>=2.2: install it anew")
+    with Command("doctor") as doctor:
+        only_fix(doctor.ended(), "versions: numpy 1.26.4; tandem-ranging", "needs <3,>=2.2: install it anew")
 
 
 @pytest.mark.parametrize(

@@ -234,6 +234,8 @@ def test_an_error_is_told_of_a_pose_that_leads_and_else_as_a_range(
 # --- keys -------------------------------------------------------------------------------------------
 
 
+DRAWN = "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
+"""waits until what was asked for so far has been drawn"""
 TIMELESS = """() => {
     const real = window.requestAnimationFrame.bind(window);
     window.requestAnimationFrame = (draw) => real(() => draw(1));
@@ -256,6 +258,7 @@ def test_space_after_a_click_plays_and_pauses_and_does_nothing_else(opened: Open
         page.keyboard.press("[")
         page.keyboard.press("[")
         page.locator(click).click()
+        page.evaluate(DRAWN)
         tick = page.locator("body").get_attribute("data-tick")
         before = state(page)
         page.evaluate(TIMELESS)
@@ -274,6 +277,14 @@ def state(page: Page) -> list[object]:
         " document.getElementById('speed').value]"
     )
     return found
+
+
+def test_space_plays_though_the_closed_help_still_has_the_focus(opened: Open, address: str) -> None:
+    """For a moment after it closes, which a slow machine makes longer, a key goes to its button."""
+    page = opened(f"{address}#tick=20")
+    until_shown(page, 20)
+    page.locator("#keys button").first.dispatch_event("keydown", {"key": " ", "bubbles": True})
+    until_shown(page, 48)
 
 
 def test_who_goes_by_keyboard_presses_a_button_with_space(opened: Open, address: str) -> None:

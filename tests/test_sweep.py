@@ -11,11 +11,12 @@ import shutil
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from itertools import product
 from pathlib import Path
-from signal import SIGINT, SIGKILL, SIGTERM
+from signal import SIGCONT, SIGINT, SIGKILL, SIGSTOP, SIGTERM
 from typing import Any
 
 import pyarrow.parquet as pq
@@ -324,6 +325,20 @@ def test_a_stopped_campaign_says_so_in_one_line_and_goes_on(folder: Path) -> Non
     finished = rows(folder / "out")
     assert len(finished) == 80
     assert all(row in finished for row in found)
+
+
+@pytest.mark.long
+def test_a_campaign_goes_on_after_its_machine_has_slept(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL", "1s")
+    with Command("sweep", "lengthy.toml", "--out", "out", "--workers", "1", cwd=folder) as command:
+        command.until(lambda: parts(folder / "out"), "a chunk is done")
+        command.tell(SIGSTOP)
+        time.sleep(12.0)  # longer than ten heartbeats of a worker
+        command.tell(SIGCONT)
+        assert command.ended().status == 1  # some of the missions are undecided
+    assert len(rows(folder / "out")) == 80
 
 
 def test_a_trial_that_hangs_does_not_outlive_whoever_ran_it(folder: Path) -> None:

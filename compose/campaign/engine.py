@@ -61,7 +61,8 @@ def connect(workers: int, scheduler: str | None) -> Iterator[Client]:
         return
     with (
         tempfile.TemporaryDirectory(prefix="tandem-dask-") as folder,
-        dask.config.set({"temporary-directory": folder}),
+        # a machine that sleeps suspends the scheduler and its worker alike: neither is lost
+        dask.config.set({"temporary-directory": folder, "distributed.scheduler.worker-ttl": None}),
         LocalCluster(
             n_workers=1,
             threads_per_worker=workers,
@@ -135,11 +136,14 @@ def play(
 
 def _rows(future: Future[Any], chunk: Chunk) -> list[Row]:
     """Of a chunk that has ended; where that was not as it should, each trial is a row that says so."""
-    if future.status == "finished":
-        return [msgspec.msgpack.decode(row, type=Row) for row in future.result()]
-    if future.status != "error":
+    try:
+        if future.status == "finished":
+            return [msgspec.msgpack.decode(row, type=Row) for row in future.result(CONNECT_S)]
+        error = future.exception(CONNECT_S) if future.status == "error" else None
+    except TimeoutError:  # whoever had the result has gone
+        error = None
+    if error is None:
         raise EngineFailed("the scheduler is lost")
-    error = future.exception()
     said = one_line(f"lost: {type(error).__name__}: {error}")[:MAX_ERROR]
     if not isinstance(error, KilledWorker | owner.Died | owner.Hung):  # not of these trials, but of any
         raise EngineFailed(f"a worker cannot play trials: {said}")

@@ -335,6 +335,7 @@ function fit() {
 /** Whether what has the keyboard needs that key for itself. */
 function needed({ target, key }) {
   const { tagName, type } = target;
+  if (target.closest("dialog")) return false; // closed a moment ago, and the browser has not moved the focus yet
   if (tagName === "SELECT") {
     return ["ArrowUp", "ArrowDown", "Enter"].includes(key) || (target === $("robot") ? /^[\w-]$/ : /^\d$/).test(key);
   }

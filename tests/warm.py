@@ -1,0 +1,74 @@
+"""Commands forked from a process that has imported everything: the hundreds that a test only waits for.
+
+What such a command does is what the same started by itself does; `tests/commands.py` starts some of each.
+"""
+
+from __future__ import annotations
+
+import os
+import pkgutil
+import sys
+import tempfile
+from importlib import import_module
+from pathlib import Path
+from typing import IO
+
+import msgspec
+
+import compose
+from compose import cli, forked
+from compose.warm_up import missions
+
+WARM_UP = "tests.warm:warm_up"
+MAIN = "tests.warm:main"
+DRAWING = ("matplotlib.backends.backend_pdf", "matplotlib.backends.backend_svg")
+"""what Matplotlib imports only when it writes a file"""
+
+
+class Command(msgspec.Struct, frozen=True):
+    """A command line, and where it runs."""
+
+    words: list[bytes]
+    """as the system passes them: they need not be text"""
+    folder: str
+    environment: dict[bytes, bytes]
+
+
+def warm_up() -> None:
+    """Import what commands need, in the process that they are forked from."""
+    missions()
+    for module in pkgutil.walk_packages(compose.__path__, "compose."):
+        if not module.name.endswith(".__main__"):
+            import_module(module.name)
+    for name in DRAWING:
+        import_module(name)
+
+
+def run(words: list[str], folder: Path | None, out: IO[bytes], err: IO[bytes], within: float) -> int:
+    """Return the exit status of `tandem WORDS` in `folder`; negative is the signal that killed it."""
+    command = Command([*map(os.fsencode, words)], str(folder or Path.cwd()), dict(os.environb))
+    with tempfile.NamedTemporaryFile() as file:
+        file.write(msgspec.msgpack.encode(command))
+        file.flush()
+        process = forked.fork_server(WARM_UP).start(
+            MAIN, "tandem", file.name, f"/proc/{os.getpid()}/fd/{out.fileno()}", errors=err.fileno()
+        )
+        if not process.wait(within):
+            process.end()
+            raise AssertionError(f"still running after {within:g} s: {words}")
+    return process.end()
+
+
+def main() -> None:
+    """In the forked process: become the command."""
+    with open(sys.argv[1], "rb") as file:
+        command = msgspec.msgpack.decode(file.read(), type=Command)
+    for path, stream, flags in ((sys.argv[2], 1, os.O_WRONLY), (os.devnull, 0, os.O_RDONLY)):
+        opened = os.open(path, flags)
+        os.dup2(opened, stream)
+        os.close(opened)
+    os.chdir(command.folder)
+    os.environb.clear()
+    os.environb.update(command.environment)
+    sys.argv = ["tandem", *map(os.fsdecode, command.words)]
+    cli.main()
