@@ -206,6 +206,7 @@ def test_the_units_command_plays_a_robot_with_its_keys(tmp_path: Path) -> None:
     assert (tmp_path / "state" / "tandem" / "a" / "agent-a.journal").exists()
 
 
+@pytest.mark.long
 def test_a_stop_is_none_of_the_failures_after_which_the_unit_starts_again(tmp_path: Path) -> None:
     service = unit()
     assert service["Restart"] == ["on-failure"]

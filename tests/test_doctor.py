@@ -443,6 +443,7 @@ def test_what_cannot_be_tried_without_a_mission_that_moves_is_not_said_to_be_wel
 # --- nobody is disturbed --------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_mission_beside_which_all_is_tried_leaves_the_record_of_one_alone(
     keys: Path, tmp_path: Path
 ) -> None:

@@ -555,6 +555,7 @@ def test_of_web_pages_only_foxglove_s_app_and_those_named_see_a_run() -> None:
         assert len(listening) == 1
 
 
+@pytest.mark.long
 def test_a_crowd_of_viewers_is_turned_away_and_leaves_room_for_those_that_come_after_it() -> None:
     port = int(free_endpoint().rsplit(":", 1)[1])
     files = GUESTS_FILES + 50

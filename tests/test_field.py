@@ -120,12 +120,14 @@ def test_two_robots_find_out_where_they_are_without_a_world(tmp_path: Path) -> N
     assert "a and b, without a world: as recorded, to the bit" in both.out
 
 
+@pytest.mark.long
 def test_they_do_so_over_links_that_are_encrypted(tmp_path: Path) -> None:
     assert tandem("keys", tmp_path / "keys", "--robots", "a,b").status == 0
     with pair(tmp_path, "--keys", tmp_path / "keys" / "world", protocol="tls") as robots:
         both_have_ended(tmp_path, robots)
 
 
+@pytest.mark.long
 def test_a_decision_that_does_not_follow_is_found_without_a_world(tmp_path: Path) -> None:
     with pair(tmp_path) as robots:
         both_have_ended(tmp_path, robots)
@@ -144,6 +146,7 @@ def test_a_decision_that_does_not_follow_is_found_without_a_world(tmp_path: Path
 
 
 @pytest.mark.parametrize("killed", series(["b", "a"]))
+@pytest.mark.long
 def test_a_robot_whose_agent_is_killed_stands_still_and_goes_on_from_its_record(
     tmp_path: Path, killed: str
 ) -> None:

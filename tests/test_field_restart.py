@@ -101,6 +101,7 @@ def test_a_robot_that_is_killed_goes_on_from_its_record(pair: Pair, killed: str,
     assert len(told(tmp_path, killed).steps) > before
 
 
+@pytest.mark.long
 def test_both_robots_that_lose_power_at_once_go_on_from_what_is_left_of_their_records(
     pair: Pair, tmp_path: Path
 ) -> None:
@@ -121,6 +122,7 @@ def test_both_robots_that_lose_power_at_once_go_on_from_what_is_left_of_their_re
         assert "bytes were torn, and are cut off" in pair.robots[name].err
 
 
+@pytest.mark.long
 def test_a_reading_that_is_lost_with_the_process_is_taken_again(tmp_path: Path) -> None:
     """Neither journal has it, so nobody was told: what was driven before it is told once."""
     with ExitStack() as open_ones:
@@ -162,6 +164,7 @@ def test_a_recording_that_a_power_cut_may_have_shortened_is_refused(
         assert path.read_bytes() == before
 
 
+@pytest.mark.long
 def test_a_robot_that_has_ended_says_so_again(pair: Pair, tmp_path: Path) -> None:
     all_is_well(tmp_path, pair)
     before = {path.name: path.read_bytes() for path in (tmp_path / "a").iterdir()}
@@ -172,6 +175,7 @@ def test_a_robot_that_has_ended_says_so_again(pair: Pair, tmp_path: Path) -> Non
     assert {path.name: path.read_bytes() for path in (tmp_path / "a").iterdir()} == before
 
 
+@pytest.mark.long
 def test_a_robot_that_is_killed_before_it_knows_its_mission_begins_it(pair: Pair, tmp_path: Path) -> None:
     pair.robots["b"].until(lambda: pair.path("b", "driver").exists(), "b has opened its journal")
     pair.kill("b")
@@ -179,6 +183,7 @@ def test_a_robot_that_is_killed_before_it_knows_its_mission_begins_it(pair: Pair
     all_is_well(tmp_path, pair)
 
 
+@pytest.mark.long
 def test_what_a_robot_drives_as_it_goes_down_is_told_and_no_more_than_was_asked_for(
     pair: Pair, tmp_path: Path
 ) -> None:

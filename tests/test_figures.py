@@ -103,6 +103,7 @@ def cut(journal: Path, count: int) -> None:
 # --- what is in them ------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_line_a_file_is_printed_and_the_files_are_there(noisy: Path, tmp_path: Path) -> None:
     folder = copied(noisy, tmp_path)
     ended = tandem("figures", folder, "--only", "robot")
@@ -196,6 +197,7 @@ def test_an_ellipse_holds_what_is_within_3_sigma(noisy: Path) -> None:
         assert point @ np.linalg.solve(sigma, point) == pytest.approx(9.0)
 
 
+@pytest.mark.long
 def test_the_same_record_gives_the_same_picture(noisy: Path, drawn: Path, tmp_path: Path) -> None:
     again = copied(noisy, tmp_path)
     for _ in range(2):  # over what is there, too
@@ -256,6 +258,7 @@ def test_a_mission_that_ends_undecided_is_drawn(noise: str, variant: str, tmp_pa
 
 
 @pytest.mark.parametrize("ticks", series([17, 0, 1]))
+@pytest.mark.long
 def test_a_record_that_breaks_off_is_drawn_as_far_as_it_goes(ticks: int, noisy: Path, tmp_path: Path) -> None:
     folder = copied(noisy, tmp_path)
     cut(folder / "world.journal", 2 + 2 * ticks)

@@ -128,6 +128,7 @@ def shown(address: str) -> dict[str, Any]:
         return {}
 
 
+@pytest.mark.long
 def test_with_one_robots_certificate_nobody_forges_end_truth_ticks_or_another_robot(tmp_path: Path) -> None:
     """While b is not there yet, the mission stands in tick 0; then it goes on, and is shown as it is."""
     scenario, folder, endpoint = tmp_path / "paper.toml", tmp_path / "keys", free_endpoint("tls")

@@ -148,6 +148,7 @@ def test_a_run_whose_fork_server_is_killed_says_so_and_leaves_no_process(
     assert not processes_of(out)
 
 
+@pytest.mark.long
 def test_a_run_whose_fork_server_is_stopped_can_be_stopped_all_the_same(
     endless: Path, tmp_path: Path
 ) -> None:
@@ -177,6 +178,7 @@ def test_the_more_robots_a_run_starts_the_longer_each_looks_for_its_world(
 
 
 @pytest.mark.parametrize("server_too", [False, pytest.param(True, marks=ON_LINUX)])
+@pytest.mark.long
 def test_processes_that_are_stopped_end_too_when_their_launcher_is_killed(
     server_too: bool, endless: Path, tmp_path: Path
 ) -> None:

@@ -307,6 +307,7 @@ def test_who_speaks_without_tls_is_told_to(keys: Path) -> None:
     assert "check that it is a Zenoh router, user and password, and tls/" in ended.err
 
 
+@pytest.mark.long
 def test_who_speaks_tls_where_nobody_does_is_told_so(mine: Path) -> None:
     endpoint = free_endpoint()
     with session.open_router(listening(endpoint)):
@@ -316,6 +317,7 @@ def test_who_speaks_tls_where_nobody_does_is_told_so(mine: Path) -> None:
     assert "check that it listens at tls/" in ended.err
 
 
+@pytest.mark.long
 def test_a_wrong_password_is_told_to_be_checked(tmp_path: Path) -> None:
     (tmp_path / "users").write_text("a:secret\n")
     accounts = {"auth": {"usrpwd": {"user": "r", "password": "r", "dictionary_file": "users"}}}
@@ -332,6 +334,7 @@ def test_a_wrong_password_is_told_to_be_checked(tmp_path: Path) -> None:
     assert wrong.err == f"tandem agent a: no world at {endpoint}; gave up after 2 s: {MUTE}\n"
 
 
+@pytest.mark.long
 def test_a_page_whose_certificate_is_refused_says_so(keys: Path, tmp_path: Path) -> None:
     own = shutil.copytree(keys / "viewer", tmp_path / "viewer")
     take_away(own, keys)

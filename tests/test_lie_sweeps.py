@@ -74,6 +74,7 @@ def test_honest_missions_localise_and_lies_are_alarms(results: run.Results) -> N
     assert outcomes == {(i, j): {"alarm" if i else "localised"} for i in range(3) for j in range(2)}
 
 
+@pytest.mark.long
 def test_the_pictures_show_what_became_of_each_lie(results: run.Results, tmp_path: Path) -> None:
     figures.draw(results, tmp_path)
     assert {f"{name}.{kind}" for name in ("lies", "roc") for kind in ("svg", "pdf", "png")} <= {

@@ -20,6 +20,7 @@ from protocol.messages import Drive, Sense
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 from tests.browser import Open, inks, picture, shot, until_shown, watching
 from tests.commands import ENDLESS, Command, until, world
+from tests.series import series
 from world.referee import errors
 
 # --- live -------------------------------------------------------------------------------------------
@@ -34,6 +35,7 @@ def frames_to(path: Path, tick: int, first: type[Sense | Drive] = Sense) -> int:
     raise AssertionError(f"{path} has no tick {tick}")
 
 
+@pytest.mark.long
 def test_what_becomes_known_of_a_tick_later_is_on_the_time_line_and_in_the_log(
     opened: Open, paper_1: Path, tmp_path: Path
 ) -> None:
@@ -82,6 +84,7 @@ def marks(page: Page) -> int:
     return int(page.evaluate(MARKS))
 
 
+@pytest.mark.long
 def test_a_killed_robot_keeps_its_phase_and_is_shown_as_down_until_it_is_back(
     opened: Open, tmp_path: Path
 ) -> None:
@@ -210,6 +213,7 @@ def test_without_the_truth_the_page_opens_with_what_the_robots_believe(
         shot(page, f"no-truth-{dark}")
 
 
+@pytest.mark.long
 def test_an_error_is_told_of_a_pose_that_leads_and_else_as_a_range(
     opened: Open, paper_1: Path, address: str
 ) -> None:
@@ -243,32 +247,29 @@ TIMELESS = """() => {
 """for a page that draws, and for which no time passes while it plays"""
 
 
-def test_space_after_a_click_plays_and_pauses_and_does_nothing_else(opened: Open, address: str) -> None:
-    for click in (
-        "#back",
-        "#on",
-        "#truth",
-        "#near",
-        ".card[data-robot=a] .name",
-        "#log li:first-child button",
-    ):
-        page = opened(f"{address}#tick=20")
-        until_shown(page, 20)
-        page.keyboard.press("[")
-        page.keyboard.press("[")
-        page.keyboard.press("[")
-        page.locator(click).click()
-        page.evaluate(DRAWN)
-        tick = page.locator("body").get_attribute("data-tick")
-        before = state(page)
-        page.evaluate(TIMELESS)
-        page.keyboard.press("Space")
-        expect(page.locator("#play")).to_have_attribute("aria-label", "Pause")
-        page.keyboard.press("Space")
-        expect(page.locator("#play")).to_have_attribute("aria-label", "Play")
-        assert state(page) == before
-        assert page.locator("body").get_attribute("data-tick") == tick
-        page.close()
+@pytest.mark.parametrize(
+    "click",
+    series(["#back", "#log li:first-child button", "#on", "#truth", "#near", ".card[data-robot=a] .name"], 2),
+)
+def test_space_after_a_click_plays_and_pauses_and_does_nothing_else(
+    opened: Open, address: str, click: str
+) -> None:
+    page = opened(f"{address}#tick=20")
+    until_shown(page, 20)
+    page.keyboard.press("[")
+    page.keyboard.press("[")
+    page.keyboard.press("[")
+    page.locator(click).click()
+    page.evaluate(DRAWN)
+    tick = page.locator("body").get_attribute("data-tick")
+    before = state(page)
+    page.evaluate(TIMELESS)
+    page.keyboard.press("Space")
+    expect(page.locator("#play")).to_have_attribute("aria-label", "Pause")
+    page.keyboard.press("Space")
+    expect(page.locator("#play")).to_have_attribute("aria-label", "Play")
+    assert state(page) == before
+    assert page.locator("body").get_attribute("data-tick") == tick
 
 
 def state(page: Page) -> list[object]:
@@ -296,6 +297,7 @@ def test_who_goes_by_keyboard_presses_a_button_with_space(opened: Open, address:
     expect(page.locator("#play")).to_have_attribute("aria-label", "Play")
 
 
+@pytest.mark.long
 def test_the_speed_box_takes_only_the_keys_that_choose_a_speed(opened: Open, address: str) -> None:
     page = opened(f"{address}#tick=20")
     until_shown(page, 20)

@@ -130,6 +130,7 @@ def test_a_process_that_is_never_started_again_ends_the_run_at_once(who: str, tm
     assert not processes_of(tmp_path / "out")
 
 
+@pytest.mark.long
 def test_a_robot_that_comes_back_too_late_fails_the_run_by_the_patience(tmp_path: Path) -> None:
     kill = ("--kill", "a@17+600s", "--patience", "5")
     ended = tandem("run", "paper-1", "-q", "--out", tmp_path / "out", *kill)
@@ -587,6 +588,7 @@ def test_a_mission_under_noise_is_folded_to_the_bit(tmp_path: Path) -> None:
         assert again(scenario, old).parted.keys() == {"a", "b"}
 
 
+@pytest.mark.long
 def test_who_has_ended_waits_for_no_world_that_has_gone_however_patient(
     undisturbed: Path, tmp_path: Path
 ) -> None:

@@ -130,6 +130,7 @@ anchor = [10.0, 0.0]
 """
 
 
+@pytest.mark.long
 def test_a_base_behind_a_bridge_keeps_the_contract(tmp_path: Path) -> None:
     """With another library's bytes, a watchdog of its own, and headings that wrap."""
     (tmp_path / "ros.toml").write_text(SCENARIO)

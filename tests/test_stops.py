@@ -137,6 +137,7 @@ def test_stopped_until_its_link_is_given_up_a_process_goes_on(
 
 
 @pytest.mark.parametrize("name", series(NAMES))
+@pytest.mark.long
 def test_stopped_for_longer_than_the_patience_a_process_fails_the_run(
     name: str, undisturbed: Path, tmp_path: Path
 ) -> None:
@@ -170,6 +171,7 @@ def test_a_link_over_which_nothing_comes_is_replaced_by_another() -> None:
 # --- in real time -------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_in_real_time_who_is_stopped_stands_still_from_the_next_period_on(
     assured: Path, tmp_path: Path
 ) -> None:

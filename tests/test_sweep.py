@@ -204,6 +204,7 @@ def test_rows_are_the_same_by_a_scheduler_and_workers_started_by_hand_even_if_on
     assert rows(folder / "there") == rows(folder / "here")
 
 
+@pytest.mark.long
 def test_a_scheduler_that_is_not_there_is_one_line(folder: Path) -> None:
     for address in ("tcp://127.0.0.1:9", "nonsense://x", "nonsense", "ucx://127.0.0.1:9", "inproc://x"):
         ended = sweep(folder, "both.toml", "out", "--scheduler", address)
@@ -211,6 +212,7 @@ def test_a_scheduler_that_is_not_there_is_one_line(folder: Path) -> None:
         assert re.fullmatch(rf"tandem sweep: --scheduler: {address} cannot be reached: [^\n]+\n", ended.err)
 
 
+@pytest.mark.long
 def test_a_scheduler_that_accepts_and_says_nothing_is_waited_for_with_a_bound(folder: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as mute:
         address = f"tcp://127.0.0.1:{mute.getsockname()[1]}"
@@ -301,6 +303,7 @@ def test_a_campaign_that_is_killed_twice_goes_on_where_it_was(folder: Path) -> N
     assert rows(out) == rows(folder / "straight")
 
 
+@pytest.mark.long
 def test_a_campaign_whose_trials_hang_can_be_stopped(folder: Path) -> None:
     with misbehaving("endless", "both.toml", folder) as process:
         until(lambda: len(list(folder.glob("tmp/*/playing"))) == 2, "trials are played")
@@ -309,6 +312,7 @@ def test_a_campaign_whose_trials_hang_can_be_stopped(folder: Path) -> None:
     assert said == ("0 rows, stopped by SIGTERM\n", "")
 
 
+@pytest.mark.long
 def test_a_stopped_campaign_says_so_in_one_line_and_goes_on(folder: Path) -> None:
     with Command("sweep", "lengthy.toml", "--out", "out", "--workers", "1", cwd=folder) as command:
         command.until(lambda: parts(folder / "out"), "a chunk is done")
@@ -341,6 +345,7 @@ def test_a_campaign_goes_on_after_its_machine_has_slept(
     assert len(rows(folder / "out")) == 80
 
 
+@pytest.mark.long
 def test_a_trial_that_hangs_does_not_outlive_whoever_ran_it(folder: Path) -> None:
     with misbehaving("endless", "both.toml", folder) as process:
         until(lambda: len(list(folder.glob("tmp/*/playing"))) == 2, "trials are played")
@@ -350,6 +355,7 @@ def test_a_trial_that_hangs_does_not_outlive_whoever_ran_it(folder: Path) -> Non
     sweep_up(folder)
 
 
+@pytest.mark.long
 def test_a_folder_may_be_called_anything_and_a_label_stands_as_it_is_written(folder: Path) -> None:
     name = "two words: 12:30"
     (folder / "both.toml").write_text(
@@ -366,6 +372,7 @@ def test_a_folder_may_be_called_anything_and_a_label_stands_as_it_is_written(fol
 # --- a campaign's folder ------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_more_trials_extend_a_campaign_and_fewer_leave_it(folder: Path) -> None:
     played(folder, "both.toml", "grown", trials=3)
     more: list[int] = []
@@ -392,6 +399,7 @@ def test_a_folder_of_another_campaign_is_refused(folder: Path) -> None:
     assert rows(folder / "out") == before
 
 
+@pytest.mark.long
 def test_a_folder_in_use_is_refused(folder: Path) -> None:
     with misbehaving("endless", "both.toml", folder) as process:
         until(lambda: list(folder.glob("tmp/*/playing")), "trials are played")
@@ -401,6 +409,7 @@ def test_a_folder_in_use_is_refused(folder: Path) -> None:
         process.communicate(timeout=30.0)
 
 
+@pytest.mark.long
 def test_results_are_left_in_a_folder_named_for_the_campaign(folder: Path) -> None:
     ended = tandem("sweep", "both.toml", "--trials", "2", cwd=folder)
     out = folder / "sweep-both"
@@ -491,6 +500,7 @@ def test_a_trial_that_breaks_a_rule_fails_the_campaign_and_is_named(
     assert line[heading.index("clean")] == "3"
 
 
+@pytest.mark.long
 def test_a_campaign_without_audit_says_nothing_of_it(folder: Path) -> None:
     ended = sweep(folder, "both.toml", "out", "--trials", "1", "--no-audit")
     assert "audited" not in ended.out
@@ -500,6 +510,7 @@ def test_a_campaign_without_audit_says_nothing_of_it(folder: Path) -> None:
     ] * 4
 
 
+@pytest.mark.long
 def test_a_setting_in_which_nobody_can_meet_is_a_refused_cell(folder: Path) -> None:
     slow = '[[axis]]\nname = "pace"\nfields = ["mission.max_speed", "mission.period"]\nvalues = '
     start = 'name = "slow"\nscenario = "base.toml"\ntrials = 2\n' + slow
@@ -714,6 +725,7 @@ def test_a_spec_that_is_not_there_is_named() -> None:
     )
 
 
+@pytest.mark.long
 def test_a_sweep_of_draws_counts_what_it_refused_and_resumes(folder: Path) -> None:
     words = ("anywhere", "--trials", "80", "--workers", "1", "--no-audit")
     with Command("sweep", *words, "--out", "out", cwd=folder) as command:

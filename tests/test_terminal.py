@@ -115,6 +115,7 @@ def test_what_a_robot_says_is_escaped_by_world_agent_audit_and_replay(tmp_path: 
     assert all(map(harmless, said))
 
 
+@pytest.mark.long
 def test_what_a_robot_says_is_escaped_by_ps_and_is_json_where_that_is_asked_for(tmp_path: Path) -> None:
     scenario, found = tmp_path / "paper.toml", list[Ended]()
     scenario.write_text(PAPER_1)

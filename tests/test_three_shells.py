@@ -137,6 +137,7 @@ def test_a_second_agent_of_the_same_robot_is_refused(waiting: str) -> None:
     assert ended == (2, "", "tandem agent: robot 'a' is in run 'mine' already\n")
 
 
+@pytest.mark.long
 def test_an_agent_that_is_refused_leaves_the_mission_alone(paper_1: Path, tmp_path: Path) -> None:
     with world("paper-1", "--out", tmp_path) as (clock, endpoint):
         with Command("agent", "a", "--connect", endpoint, "--out", tmp_path) as a:

@@ -160,6 +160,7 @@ def test_a_mission_through_routers_that_enforce_the_rules_leaves_the_same_record
         same(parts(tmp_path / "scenario.toml", out, whole, stack), out, expected)
 
 
+@pytest.mark.long
 def test_a_router_that_is_killed_and_started_again_changes_nothing(tmp_path: Path) -> None:
     expected, out, x = record_of(LONG, tmp_path), tmp_path / "out", free_endpoint()
     with ExitStack() as stack:
@@ -172,6 +173,7 @@ def test_a_router_that_is_killed_and_started_again_changes_nothing(tmp_path: Pat
             same(mission, out, expected)
 
 
+@pytest.mark.long
 def test_a_router_may_come_last(tmp_path: Path) -> None:
     expected, out, x = record_of(PAPER_1, tmp_path), tmp_path / "out", free_endpoint()
     flags = {"world": connect(x), "a": connect(x), "b": [*listen(free_endpoint()), *connect(x)]}

@@ -73,6 +73,7 @@ def test_a_record_scrubbed_to_tick_46_shows_the_first_contact(opened: Open, addr
     shot(page, "tick-46")
 
 
+@pytest.mark.long
 def test_the_plane_is_drawn_in_the_colours_of_what_happens(opened: Open, address: str) -> None:
     page = opened(address)
     seen = {}
@@ -98,6 +99,7 @@ def test_the_plane_is_drawn_in_the_colours_of_what_happens(opened: Open, address
     assert inks(page)["phase-3"] < 50 < seen[47]["phase-3"]  # where it truly is, nothing is drawn
 
 
+@pytest.mark.long
 def test_what_becomes_of_reports_is_drawn_on_their_way(opened: Open, tmp_path: Path) -> None:
     seen = {}
     for fault in ("loss=0", "loss=1", "corrupt=1"):
@@ -111,6 +113,7 @@ def test_what_becomes_of_reports_is_drawn_on_their_way(opened: Open, tmp_path: P
     assert seen["loss=0"] == 0 < 1.7 * seen["loss=1"] < seen["corrupt=1"]  # dashed; whole, and crossed out
 
 
+@pytest.mark.long
 def test_with_the_truth_hidden_only_what_a_robot_knows_is_there(opened: Open, address: str) -> None:
     page = opened(f"{address}#tick=20")
     until_shown(page, 20)
@@ -205,6 +208,7 @@ def as_a_driver_tells(message: Message) -> Message:
     return replace(message, contacts=tuple([replace(one, heard=None) for one in message.contacts]))
 
 
+@pytest.mark.long
 def test_it_can_be_read_on_360_pixels(opened: Open, address: str) -> None:
     page = opened(f"{address}#tick=48", width=360, height=740)
     until_shown(page, 48)
@@ -216,6 +220,7 @@ def test_it_can_be_read_on_360_pixels(opened: Open, address: str) -> None:
     expect(page.locator("#log")).to_contain_text("The mission ends: localised")
 
 
+@pytest.mark.long
 def test_it_is_dark_where_the_system_is(opened: Open, address: str) -> None:
     page = opened(f"{address}#tick=47", dark=True)
     until_shown(page, 47)
@@ -227,6 +232,7 @@ def test_it_is_dark_where_the_system_is(opened: Open, address: str) -> None:
     assert picture(light) != picture(page)
 
 
+@pytest.mark.long
 def test_fifty_robots_are_shown(opened: Open, tmp_path: Path) -> None:
     scenario = tmp_path / "fifty.toml"
     robots = [
@@ -251,6 +257,7 @@ def test_fifty_robots_are_shown(opened: Open, tmp_path: Path) -> None:
         shot(page, "fifty-b7")
 
 
+@pytest.mark.long
 def test_lost_late_and_damaged_reports_are_told(opened: Open, tmp_path: Path) -> None:
     record = tmp_path / "record"
     record.mkdir()
@@ -267,6 +274,7 @@ def test_lost_late_and_damaged_reports_are_told(opened: Open, tmp_path: Path) ->
         expect(page.locator("#log")).not_to_contain_text("is lost")
 
 
+@pytest.mark.long
 def test_the_records_in_a_folder_are_listed(opened: Open, paper_1: Path, tmp_path: Path) -> None:
     shutil.copytree(paper_1, tmp_path / "whole")
     shutil.copytree(paper_1, tmp_path / "torn")
@@ -284,6 +292,7 @@ def test_the_records_in_a_folder_are_listed(opened: Open, paper_1: Path, tmp_pat
         expect(links).to_have_count(2)
 
 
+@pytest.mark.long
 def test_a_campaign_shows_its_cells_and_its_figures(opened: Open, tmp_path: Path) -> None:
     spec = tmp_path / "speeds.toml"
     spec.write_text(
@@ -342,6 +351,7 @@ def test_a_mission_is_followed_to_its_end_from_its_journals_and_from_the_network
             assert b.ended().status == 0
 
 
+@pytest.mark.long
 def test_a_page_keeps_up_with_a_mission_as_fast_as_it_goes(opened: Open, tmp_path: Path) -> None:
     """By leaving out frames: thousands of ticks are past, and it is never far behind for long."""
     scenario, out = tmp_path / "endless.toml", tmp_path / "out"
