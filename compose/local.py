@@ -137,7 +137,7 @@ def play(
 ) -> list[Kill]:
     """Run `scenario`, write its journals to `out`, and return the kills that did not happen.
 
-    `rate` is in ticks per second, None for as fast as possible; `patience` is a timeout in s. A process is
+    `rate` is the speed relative to real time, None for lockstep; `patience` is a timeout in s. A process is
     killed at its points in `kills`, and started again.
 
     Without `agents_journal`, only the world writes a journal. The outcome follows from that one alone, and
