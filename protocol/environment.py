@@ -112,7 +112,7 @@ def _instructions() -> str:
 
 
 def _kernels(folder: Path) -> str | None:
-    """Return numpy's bundled library and its kernels, such as "OpenBLAS 0.3.31 (Haswell)", if there is one."""
+    """Return numpy's bundled library and its kernels, such as "OpenBLAS 0.3.31 (Haswell)", or None."""
     import ctypes  # noqa: PLC0415  # a world does not import it
 
     for file in folder.glob("libscipy_openblas*"):
