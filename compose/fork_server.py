@@ -3,7 +3,7 @@
 It calls WARM_UP (module:function), which imports what the processes need. It opens no session and starts no
 thread. Its standard input is a socket to the launcher (`compose/forked.py`). The launcher sends requests for
 processes and signals on it, and receives the exit status of each process. The server ends when the launcher
-does, and kills the processes that still run.
+does, and no process outlasts the server.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def main() -> None:
     _call(sys.argv[1])
     setproctitle(f"tandem fork-server of {os.getppid()}")
     gc.collect()
-    gc.freeze()  # garbage collection in a child would copy the pages of imported modules
+    gc.freeze()  # else garbage collection in a child would copy the pages of imported modules
     server = _Server(socket.socket(fileno=0))
     start = server.serve()
     if start is None:

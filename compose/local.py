@@ -32,7 +32,7 @@ JOIN_EACH_S = 0.5
 CHILD_FILES, SPARE_FILES = 2, 12
 """descriptors that the launcher needs for each process of a run, and for starting one"""
 LISTENING_PORTS = range(20_000, 32_000)
-"""Below the ephemeral ports, because an outgoing connection could be given a port before it is used."""
+"""Below the ephemeral ports: one of those could go to an outgoing connection before it is used."""
 
 
 class ChildFailed(RuntimeError):

@@ -35,7 +35,7 @@ TOLERANCE = 1e-6
 """m and rad: the largest error of a correct claim, with exact sensors"""
 
 SURE = 0.5 * TOLERANCE
-"""m and rad: the largest error from rounding with which a claim is made
+"""m and rad: the largest error from rounding with which a claim is made.
 
 The other half of TOLERANCE is left for the placements that are merged (`same_turn`).
 """
@@ -61,8 +61,11 @@ BETTER = 0.9
 """The ratio to which a range must reduce the anchor error for another range to be worthwhile."""
 
 OUT_AND_BACK = 2
-"""The number of consecutive ranges that do not reduce the anchor error, one on the way out and one on the way
-back, after which no range will: rounding grows with the path."""
+"""The number of consecutive ranges without a smaller anchor error after which phase 1 takes no more.
+
+One is measured on the way out, and one on the way back. Rounding grows with the path, so no later range
+reduces the error.
+"""
 
 
 def foothold(size: float, distance: float, sensing_range: float) -> float:

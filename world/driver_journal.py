@@ -2,7 +2,7 @@
 
 A Sense is written before it is sent to the agent, and a Drive before it is executed. After a kill, the
 journal therefore contains everything that was sent or executed, and at most the reading of one tick has to
-be repeated. After a power cut this holds only if each write was synced (`--fsync`). Without it the robot
+be repeated. After a power cut this holds only if each write was synced (`--fsync`). If not, the robot
 refuses to resume: its Reports could contradict earlier ones, and its peer would find them inconsistent.
 """
 

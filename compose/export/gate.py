@@ -36,7 +36,7 @@ Place = tuple[str, int]
 
 
 def private_host() -> str:
-    """Return a random loopback address."""
+    """Return a random loopback address, which a web page cannot guess."""
     return "127." + ".".join([str(1 + secrets.randbelow(254)) for _ in range(3)])
 
 
