@@ -1,6 +1,6 @@
-"""How exactly a robot knows poses where sensors are exact: by the bounds of `protocol.rounding`.
+"""Bounds on the errors of anchors and placements with exact sensors, from `protocol.rounding`.
 
-Both robots of a pair compute the same from the same logs.
+Both robots of a pair compute the same bounds from the same logs.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from protocol.rounding import BETTER, OUT_AND_BACK, SAME, SURE, WELL, foothold, 
 
 
 def size(mind: Mind) -> float:
-    """Return D + R in m: the largest coordinate that either robot, or the world, computes with."""
+    """Return D + R in m: the largest coordinate in the computations of the robots and the world."""
     return mind.briefing.anchor_distance + mind.briefing.mission.sensing_range
 
 
 def drifted(mind: Mind, log: Logbook, tick: int) -> float:
-    """Return how far, in m, rounding may have put the odometry of `log` off by `tick`."""
+    """Return the bound in m on the rounding error of a range at `tick`, from the odometry of `log`."""
     return _rounded(size(mind), log.until(tick), mind.briefing.mission.period)
 
 
 def _rounded(extent: float, runs: Sequence[Run], period: float) -> float:
-    """Return by how much, in m, driving `runs` may put a range off; `extent` is `size`."""
+    """Return the bound in m on the rounding error of a range after `runs`; `extent` is `size`."""
     path = turned = 0.0
     for run in runs:
         path += abs(run.v) * run.ticks
@@ -40,32 +40,33 @@ def _rounded(extent: float, runs: Sequence[Run], period: float) -> float:
 
 
 def margin(mission: Mission, floor: float) -> float:
-    """Return how far inside R, in m, a point must lie in phase 1 to count on its range.
+    """Return how far inside R, in m, a point of phase 1 must lie to be certainly in range.
 
-    Two ranges on a radius, A_0 apart and off by a floor, leave a heading open to sqrt(2 floor / A_0), so the
-    range of a point anywhere to R times that.
+    Two ranges A_0 apart on a radius, each with an error of `floor`, determine a heading to sqrt(2 floor /
+    A_0) rad, and therefore the range of a point to R times that.
     """
     return max(RANGE_MARGIN, mission.sensing_range * math.sqrt(2.0 * floor / mission.first_straight))
 
 
 class Known(msgspec.Struct, frozen=True):
-    """How well the first of its anchor ranges tell a robot where its anchor is."""
+    """The anchor error after the first of a robot's anchor ranges."""
 
     error: float
-    """m: how far off it may be"""
+    """m: the bound on the error of the anchor's position"""
     ranges: int
-    """by how many of them it is known so well"""
+    """the number of ranges that give this error"""
     enough: bool = False
     """whether phase 1 may end"""
 
 
 def anchor(mind: Mind, start: Pose, log: Logbook) -> Known:
-    """Return how well the robot of `log` knows its anchor, by those ranges that tell it best.
+    """Return the smallest anchor error of the robot of `log`, whose branch begins at `start`.
 
-    Phase 1 may end once that is well; or well enough, and the last range made it hardly any better. It must
-    once a way out and back made it no better: rounding then grows faster than what ranges tell, and whether
-    it will do is found where the robots meet, by `pinned_down`. Later ranges are not looked at: both robots
-    of a pair, which know the same ranges, find the same.
+    Phase 1 may end in three cases. Either the error is at most WELL of `foothold`; or it is at most
+    `foothold`, and the last range hardly reduced it (BETTER); or OUT_AND_BACK ranges did not reduce it. In
+    the last case rounding grows faster than the ranges inform, and `pinned_down` decides in the encounter
+    whether the error is small enough. Later ranges are ignored, so that both robots of a pair, which have
+    the same ranges, compute the same result.
     """
     mission, extent = mind.briefing.mission, size(mind)
     enough = foothold(extent, mind.briefing.anchor_distance, mission.sensing_range)
@@ -79,11 +80,11 @@ def anchor(mind: Mind, start: Pose, log: Logbook) -> Known:
         floor = _rounded(extent, runs, mission.period)
         ranged.append((follow(ORIGIN, runs, mission.period), one.range, floor))
         if len(ranged) == 1 and start.x > enough:
-            continue  # a range from the start alone tells nothing of the heading
+            continue  # the range at the start does not depend on the heading
         before, error = error, anchor_error(start, ranged)
         if error < least or len(ranged) <= FITTED:
             least, ranges = error, len(ranged)
-        # what `weigh_branches` merged after them, it put off farther
+        # branches that `weigh_branches` merged later differ by its larger floor
         known = least + SAME * (floor - ranged[ranges - 1][2])
         stalled = len(ranged) >= FITTED and error > BETTER * before
         spent = len(ranged) - ranges == OUT_AND_BACK
@@ -93,7 +94,7 @@ def anchor(mind: Mind, start: Pose, log: Logbook) -> Known:
 
 
 def fitted(mind: Mind, branch: Branch) -> tuple[Branch, Known]:
-    """Return `branch` as those ranges have it that tell it best, and how well they do."""
+    """Return `branch` fitted to the ranges with the smallest anchor error, and that error."""
     known = anchor(mind, branch.start, mind.log)
     if known.ranges == len(mind.log.ranges):
         return branch, known
@@ -103,13 +104,13 @@ def fitted(mind: Mind, branch: Branch) -> tuple[Branch, Known]:
 
 
 def peer_anchor(mind: Mind) -> float:
-    """Return the error of `anchor` of the peer, in m."""
+    """Return the anchor error of the peer in m."""
     assert mind.radio.start is not None
     return anchor(mind, mind.radio.start, mind.radio.peer).error
 
 
 def apart(mind: Mind) -> float:
-    """Return how far off, in m, the anchors may be together, relative to where the robots are now."""
+    """Return the bound in m on both anchors' errors and both odometries' rounding, added up until now."""
     return _apart(mind, min(mind.tick, mind.radio.peer.through))
 
 
@@ -120,10 +121,10 @@ def _apart(mind: Mind, tick: int) -> float:
 
 
 def pinned_down(mind: Mind, placement: Placement, ranged: Sequence[Sighting], off: float) -> bool:
-    """Return whether the sightings in `ranged` fix `placement` well enough for a claim; `off` is `apart`.
+    """Return whether the sightings in `ranged` determine `placement` to SURE; `off` is `apart`.
 
-    What was driven between the first and the last of them is all that puts one range off against another;
-    what was driven before moves all of them alike, with the anchors.
+    Only rounding between the first and the last sighting makes the errors of their ranges differ. Rounding
+    before the first one shifts all ranges alike, as an anchor error does.
     """
     first, last = ranged[0].tick, ranged[-1].tick
     period, extent = mind.briefing.mission.period, size(mind)

@@ -1,4 +1,4 @@
-"""The recording of one robot without a world, as it is found: its agent's journal, and its driver's."""
+"""The recording of one robot in hardware mode: the journals of its agent and its driver, for a resume."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ from world.driver_journal import DriverPast, Start, boot, driver_journal, driver
 from world.field import Field
 
 RELEASE_S = 10.0
-"""how long the agent of a launcher that has just been killed may take to end: it has its journal locked"""
+"""s that the agent of a killed launcher has to end, which unlocks its journal"""
 LOOK_AGAIN_S = 0.02
 
 
 class DriverRecord(msgspec.Struct, frozen=True):
-    """Both journals, read; that of the driver is open."""
+    """The content of both journals; that of the driver is open for writing."""
 
     journal: Journal
     past: DriverPast
     known: int
-    """the latest tick in the agent's; -1 where there is none"""
+    """the latest tick in the agent's journal; -1 if there is none"""
     again: bool
-    """whether they were there before"""
+    """whether the journals existed before"""
     start: Start
-    """of this process"""
+    """the start of this process"""
 
     def take_up(self, driver: Driver, name: str, field: Field) -> None:
-        """Go on where they end, by the driver of that name. Raises UserError if it cannot."""
+        """Resume the mission with `driver`, called `name` in errors. Raises UserError if it cannot."""
         if self.past.ticks:
             again(driver, name, self.past)
         if self.again:
@@ -50,10 +50,10 @@ class DriverRecord(msgspec.Struct, frozen=True):
 
 @contextmanager
 def recorded(folder: Path, briefing: Briefing, inbox: Inbox, *, fsync: bool) -> Iterator[DriverRecord]:
-    """The recording in `folder` of the robot that was told `briefing`; a new one, if there is none.
+    """Yield the recording in `folder` of the robot with `briefing`; a new one if there is none.
 
-    Raises CannotRecord; CorruptJournal where the two journals are not of one robot in one run, or may lack
-    what the robot has told.
+    Raises CannotRecord, and CorruptJournal if the journals are not of the same robot and run, or if Reports
+    that the robot has sent may be missing in them.
     """
     start = Start(boot(), fsync)
     path = folder / driver_journal(briefing.robot)
@@ -83,7 +83,7 @@ def recorded(folder: Path, briefing: Briefing, inbox: Inbox, *, fsync: bool) -> 
 
 
 def _frames(path: Path, inbox: Inbox) -> list[bytes]:
-    """Return the agent's journal once its process has ended. Raises CannotRecord or CorruptJournal."""
+    """Return the frames of the agent's journal once it is unlocked. Raises CannotRecord or CorruptJournal."""
     give_up = time.monotonic() + RELEASE_S
     while path.exists():
         try:
@@ -99,7 +99,10 @@ def _frames(path: Path, inbox: Inbox) -> list[bytes]:
 
 
 def _known(frames: list[bytes], past: DriverPast, path: Path) -> int:
-    """The latest tick of the agent, whose Senses are all of the driver. Raises CorruptJournal."""
+    """Return the latest tick in the agent's `frames`, -1 if there is none.
+
+    Raises CorruptJournal unless each Sense in them is that of the same tick in the driver's journal.
+    """
     known = -1
     for frame in frames:
         try:

@@ -1,8 +1,9 @@
 """The process that a launcher's processes are forked from: `python -P -m compose.fork_server WARM_UP`.
 
-It has called WARM_UP (module:function), which imports what they need, and has opened nothing: no session, no
-thread. Its standard input is a socket to the launcher (`compose/forked.py`), which asks on it for processes
-and signals, and is told how each process ended. It ends with the launcher, and no process outlasts it.
+It calls WARM_UP (module:function), which imports what the processes need. It opens no session and starts no
+thread. Its standard input is a socket to the launcher (`compose/forked.py`). The launcher sends requests for
+processes and signals on it, and receives the exit status of each process. The server ends when the launcher
+does, and no process outlasts the server.
 """
 
 from __future__ import annotations
@@ -24,16 +25,16 @@ from compose.forked import LENGTH_BYTES, STREAMS, Ended, Signal, Start
 from protocol.terminal import one_line
 
 NOT_FORKED = 71
-"""exit status told of a process that could not be forked: EX_OSERR"""
+"""The exit status reported for a process that could not be forked (EX_OSERR)."""
 LINGER_S = 5.0
-"""how long processes may outlast their launcher, whose end each of them sees; then they are killed"""
+"""s that processes have to end by themselves after their launcher has ended; then they are killed"""
 LOOK_AGAIN_S = 0.01
 PR_SET_PDEATHSIG = 1
 """<sys/prctl.h>"""
 
 
 class _Server:
-    """The children that run, by process id."""
+    """The request loop of the fork server, and the children that run, by process id."""
 
     def __init__(self, launcher: socket.socket) -> None:
         self._launcher = launcher
@@ -41,14 +42,14 @@ class _Server:
         self._decoder = msgspec.msgpack.Decoder(Start | Signal)
 
     def serve(self) -> Start | None:
-        """Do what the launcher asks for.
+        """Handle the launcher's requests until the launcher has ended, then return None.
 
-        Returns twice: in each forked process with what it is to be, and here None when the launcher has gone.
+        It also returns in each forked process: there, the request for that process.
         """
         signal.signal(signal.SIGCHLD, self._reap)
         while (received := self._request()) is not None:
             request, streams = received
-            # a child that ends meanwhile is reaped afterwards
+            # a child that ends during the request is reaped after it
             signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGCHLD])
             if isinstance(request, Signal):
                 self._send(request)
@@ -58,7 +59,7 @@ class _Server:
         return None
 
     def linger(self) -> None:
-        """Wait until all children have ended, for LINGER_S at the most."""
+        """Wait at most LINGER_S until all children have ended."""
         give_up = time.monotonic() + LINGER_S
         while self._numbers and time.monotonic() < give_up:
             time.sleep(LOOK_AGAIN_S)
@@ -77,7 +78,7 @@ class _Server:
         return body
 
     def _fork(self, start: Start, streams: list[int]) -> bool:
-        """Whether this is the forked process."""
+        """Fork a process, and return whether this is the child."""
         parent = os.getpid()
         try:
             pid = os.fork()
@@ -99,7 +100,7 @@ class _Server:
             if number == request.number:
                 try:
                     os.killpg(pid, request.signal)
-                except ProcessLookupError:  # it is about to make its group
+                except ProcessLookupError:  # it has not created its process group yet
                     os.kill(pid, request.signal)
 
     def _reap(self, _number: int, _frame: object) -> None:
@@ -109,12 +110,12 @@ class _Server:
                 self._tell(Ended(self._numbers.pop(pid), os.waitstatus_to_exitcode(status)))
 
     def _tell(self, news: Ended) -> None:
-        with suppress(OSError):  # the launcher has gone
+        with suppress(OSError):  # the launcher has ended
             self._launcher.sendall(news.frame())
 
 
 def _become(start: Start, streams: list[int], parent: int) -> None:
-    """Make this forked process what it would be had it been started by itself."""
+    """Give this forked process its own session, default signals, standard streams, arguments and title."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGCHLD])
     os.setsid()
@@ -139,14 +140,14 @@ def _call(name: str) -> None:
 
 
 def main() -> None:
-    """Get ready, and fork processes until the launcher has gone."""
+    """Call WARM_UP, and fork processes until the launcher has ended."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
-    _signal_when_parent_ends(signal.SIGCONT)  # should it be suspended then, it would never end
+    _signal_when_parent_ends(signal.SIGCONT)  # a suspended server must notice the end, too
     _call(sys.argv[1])
     setproctitle(f"tandem fork-server of {os.getppid()}")
     gc.collect()
-    gc.freeze()  # a collection in a child does not touch, and so copy, what was imported
+    gc.freeze()  # else garbage collection in a child would copy the pages of imported modules
     server = _Server(socket.socket(fileno=0))
     start = server.serve()
     if start is None:

@@ -1,9 +1,8 @@
-"""Processes forked from a fork server, as their launcher sees them.
+"""The launcher's side of a fork server, and of the processes forked from it.
 
 A fork server (`compose/fork_server.py`) imports what its processes need once, so that each of them starts in
-milliseconds. Each is a process of its own in every other respect: it has its own session and process group,
-standard streams, signals and exit status. It is as the launcher was when the server began: the same
-environment, working directory and limits.
+milliseconds. Each process has its own session, process group, standard streams, signals and exit status. It
+inherits the environment, working directory and limits that the launcher had when it started the server.
 """
 
 from __future__ import annotations
@@ -25,18 +24,18 @@ from typing import NamedTuple
 import msgspec
 
 LENGTH_BYTES = 4
-"""in front of each request"""
+"""The size of the length that precedes each request."""
 STREAMS = 3
-"""descriptors that come with a request for a process: its standard input, output and error"""
+"""The number of descriptors sent with a request for a process: its standard input, output and error."""
 
 
 class Start(msgspec.Struct, frozen=True, tag=True):
-    """A request for a process."""
+    """A request to fork a process."""
 
     number: int
-    """by which the launcher knows it"""
+    """chosen by the launcher, which identifies the process by it"""
     main: str
-    """module:function that it calls"""
+    """the function that the process calls, as module:function"""
     title: str
     """its name in `ps`, before the arguments"""
     arguments: tuple[str, ...]
@@ -50,41 +49,41 @@ class Signal(msgspec.Struct, frozen=True, tag=True):
 
 
 KILL_S = 5.0
-"""how long a process that is killed may take to end; then its fork server does not answer, and is killed"""
+"""s that a killed process has to end; after that its fork server is considered hung, and is killed"""
 TAKE_S = 60.0
-"""how long a fork server may take to accept descriptors while too many are under way; it may still import"""
+"""s to retry sending descriptors while too many are in flight: the fork server may still be importing"""
 TRY_AGAIN_S = 0.01
 ENDED_BYTES = 8
 
 
 class Ended(NamedTuple):
-    """What the launcher is told of a process."""
+    """The report to the launcher that a process has ended."""
 
     number: int
     status: int
-    """negative is the signal that killed it"""
+    """exit status; negative is the signal that killed it"""
 
     def frame(self) -> bytes:
-        """The same in ENDED_BYTES."""
+        """Return the report as ENDED_BYTES bytes."""
         return self.number.to_bytes(4, "big") + self.status.to_bytes(4, "big", signed=True)
 
     @classmethod
     def read(cls, frame: bytes) -> Ended:
-        """Return what `frame` made a frame of."""
+        """Return the report that `frame` encodes."""
         return cls(int.from_bytes(frame[:4], "big"), int.from_bytes(frame[4:], "big", signed=True))
 
 
 class Process:
-    """A forked process. It ends when its standard input does, which its launcher holds open."""
+    """A forked process. It ends when its standard input is closed, which its launcher holds open."""
 
     def __init__(
         self, server: ForkServer, number: int, stdin: int, stdout: int | None, on_end: Callable[[], None]
     ) -> None:
         self._stdin = stdin
         self.stdout = stdout
-        """where what it says is read, if that is wanted"""
+        """descriptor from which its standard output is read; None if it goes nowhere"""
         self._streams = [stream for stream in (stdin, stdout) if stream is not None]
-        """of the launcher's; closed once it has ended"""
+        """the launcher's descriptors, closed once the process has ended"""
         self._server = server
         self._number = number
         self._on_end = on_end
@@ -93,26 +92,26 @@ class Process:
 
     @property
     def running(self) -> bool:
-        """Whether it has not ended yet."""
+        """Whether the process has not ended yet."""
         return not self._over.is_set()
 
     @property
     def status(self) -> int:
-        """Its exit status, once it has ended; negative is the signal that killed it."""
+        """Wait for the process to end, and return its exit status; negative is the signal that killed it."""
         self._over.wait()
         return self._status
 
     def wait(self, timeout: float) -> bool:
-        """Whether it has ended, within `timeout` seconds."""
+        """Wait at most `timeout` seconds, and return whether the process has ended."""
         return self._over.wait(max(timeout, 0.0))
 
     def signal(self, number: int) -> None:
-        """Send a signal to it and its process group, if it has not ended."""
+        """Send a signal to the process and its group, unless it has ended."""
         if self.running:
             self._server.signal(self._number, number)
 
     def end(self, timeout: float = 0.0) -> int:
-        """Return its exit status; it is killed after `timeout` seconds."""
+        """Wait `timeout` seconds, then kill the process; return its exit status."""
         if not self.wait(timeout):
             self.signal(signal.SIGKILL)
             if not self.wait(KILL_S):
@@ -122,33 +121,33 @@ class Process:
         return status
 
     def hang_up(self) -> None:
-        """Close the launcher's ends of its streams."""
+        """Close the launcher's ends of the process's streams."""
         streams, self._streams = self._streams, []
         for stream in streams:
             os.close(stream)
 
     def hand(self, data: bytes) -> None:
-        """Write `data` to its standard input, if it has not ended."""
+        """Write `data` to the standard input of the process, unless it has ended."""
         left = memoryview(data)
         with suppress(BrokenPipeError):
             while left:
                 left = left[os.write(self._stdin, left) :]
 
     def ended(self, status: int) -> None:
-        """It has."""
+        """Store the exit status; called by the server when the process has ended."""
         self._status = status
         self._over.set()
         self._on_end()
 
 
 class ForkServer:
-    """A fork server of this process, its launcher."""
+    """A fork server whose launcher is this process."""
 
     def __init__(self, warm_up: str) -> None:
-        """`warm_up` is what it calls first, module:function."""
+        """Start the server; it first calls `warm_up`, a module:function."""
         self._socket, its = socket.socketpair()
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # closed with the server
-        # -P: the user's directory may hold a folder called world, or agent
+        # -P: the working directory may contain a folder named world or agent
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "compose.fork_server", warm_up],
             stdin=its.fileno(),
@@ -162,7 +161,7 @@ class ForkServer:
         self._running: dict[int, Process] = {}
         self._lock = threading.Lock()
         self.gone = False
-        """whether it has ended, and all its processes with it"""
+        """whether the server has ended, and all its processes with it"""
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
 
@@ -175,10 +174,10 @@ class ForkServer:
         answers: bool = False,
         on_end: Callable[[], None] = lambda: None,
     ) -> Process:
-        """A process that calls `main`, module:function, with `arguments` in sys.argv.
+        """Fork a process that calls `main`, a module:function, with `arguments` in sys.argv.
 
-        Its standard error goes to `errors`; its standard output to a pipe if it `answers`, else nowhere.
-        `on_end` is called in another thread when it has ended.
+        Its standard error goes to the descriptor `errors`. Its standard output goes to a pipe if `answers`
+        is set, otherwise to /dev/null. `on_end` is called in another thread when the process has ended.
         """
         its_input, our_input = os.pipe()
         our_output, its_output = os.pipe() if answers else (None, os.open(os.devnull, os.O_WRONLY))
@@ -193,12 +192,12 @@ class ForkServer:
         return process
 
     def signal(self, process: int, number: int) -> None:
-        """Send a signal to a process of that number, if it has not ended."""
+        """Send signal `number` to the process numbered `process`, unless it has ended."""
         with self._lock:
             self._ask(Signal(process, number), [])
 
     def why_gone(self) -> str:
-        """Say how the server ended, once it is gone."""
+        """Wait for the server to end, and return how it did, in a line."""
         status = self._process.wait()
         self._errors.seek(0)
         said = self._errors.read().decode(errors="replace").strip().splitlines()
@@ -206,12 +205,12 @@ class ForkServer:
         return f"the fork server {how}{f': {said[-1]}' if said else ''}"
 
     def kill(self) -> None:
-        """End it, and any process of it that still runs."""
+        """Kill the server and all its processes."""
         self._process.kill()
         self._process.wait()
 
     def close(self) -> None:
-        """The same, and free what it takes in the launcher."""
+        """Kill the server and its processes, and free its thread, socket and file in the launcher."""
         self.kill()
         self._listener.join()
         self._socket.close()
@@ -223,14 +222,15 @@ class ForkServer:
         try:
             sent = self._send_streams(frame, streams) if streams else 0
             self._socket.sendall(frame[sent:])
-        except OSError:  # no request is lost in silence: `_listen` sees the end of the server
+        except OSError:  # a request must not be lost unnoticed: `_listen` sees that the server has ended
             self._process.kill()
 
     def _send_streams(self, frame: bytes, streams: list[int]) -> int:
-        """Send `streams` with the beginning of `frame`, whose size is returned. Raises OSError.
+        """Send `streams` with the beginning of `frame`, and return how many bytes of it were sent.
 
-        A user may have no more descriptors under way between all processes than one may have open; so the
-        server has TAKE_S to take those of earlier requests.
+        The kernel limits the descriptors in flight of all processes of a user to the number that one process
+        may have open (ETOOMANYREFS). Sending is therefore retried for TAKE_S, until the server has received
+        those of earlier requests. Raises OSError.
         """
         give_up = time.monotonic() + TAKE_S
         while True:
@@ -265,7 +265,7 @@ _lock = threading.Lock()
 
 
 def fork_server(warm_up: str) -> ForkServer:
-    """Return this process's fork server that has called `warm_up`; it is started if there is none."""
+    """Return this process's fork server that has called `warm_up`; start it if none runs."""
     with _lock:
         server = _servers.get(warm_up)
         if server is None or server.gone:
@@ -274,7 +274,7 @@ def fork_server(warm_up: str) -> ForkServer:
 
 
 def close() -> None:
-    """End the fork servers of this process."""
+    """Kill the fork servers of this process, and their processes."""
     with _lock:
         while _servers:
             _servers.popitem()[1].close()

@@ -1,4 +1,4 @@
-"""Text as wide as the terminal that it is printed on."""
+"""Text wrapped to the width of the terminal."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ import textwrap
 from collections.abc import Iterable
 
 UNLIMITED = 1000
-"""columns, of what is not a terminal"""
+"""the width in columns of an output that is not a terminal"""
 LEAST = 20
-"""columns beside an indent"""
+"""the minimum number of columns beside an indent"""
 
 
 def room() -> int:
-    """The columns that there are."""
+    """Return the width of standard output in columns."""
     return shutil.get_terminal_size().columns if sys.stdout.isatty() else UNLIMITED
 
 
 def notes(wanted: Iterable[tuple[str, str]], columns: Iterable[str]) -> list[str]:
-    """The footnotes, each `wanted` for a column, of those columns that are shown."""
+    """Return the lines of the footnotes; `wanted` are pairs of a column and its note, `columns` are shown."""
     shown = {*columns}
     return wrapped("; ".join([note for column, note in wanted if column in shown]))
 
 
 def wrapped(text: str, indent: int = 0) -> list[str]:
-    """`text`, broken between words where the terminal ends, with all lines but the first indented."""
+    """Return the lines of `text`, wrapped at the terminal's width; all but the first are indented."""
     if not sys.stdout.isatty():
         return [text]
     width = max(room(), indent + LEAST)

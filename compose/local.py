@@ -1,4 +1,4 @@
-"""A mission as OS processes on this machine: one world, one agent per robot, and who watches over them."""
+"""A mission as OS processes on this machine: one world, one agent per robot, and their launcher."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from world.scenario import Scenario
 
 FOLLOW_S = 2.0
-"""how long the agents may outlast the world"""
+"""s that the agents have to end after the world has ended"""
 STOP_S = 3.0
-"""how long a process may take to end when told to; then it is killed"""
+"""s that a process has to end after SIGTERM; then it is killed"""
 JOIN_S = 60.0
-"""how long an agent may look for its world,"""
+"""s that an agent looks for its world, before JOIN_EACH_S is added"""
 JOIN_EACH_S = 0.5
-"""and how much longer for each robot of the run, all of which start at once"""
+"""s added for each robot of the run, because all start at once"""
 CHILD_FILES, SPARE_FILES = 2, 12
-"""descriptors that the launcher takes for each process of a run, and for starting one"""
+"""descriptors that the launcher needs for each process of a run, and for starting one"""
 LISTENING_PORTS = range(20_000, 32_000)
-"""below those that the system gives to outgoing connections, which could take one in between"""
+"""Below the ephemeral ports: one of those could go to an outgoing connection before it is used."""
 
 
 class ChildFailed(RuntimeError):
-    """A process of the run ended before the run did; says which, and how."""
+    """A process ended before the run did; the text says which one, and how."""
 
 
 def free_endpoint(protocol: str = "tcp") -> str:
-    """An endpoint on loopback on which nobody listens."""
+    """Return a loopback endpoint on which no process listens."""
     ports = random.SystemRandom()
     while True:
         port = ports.choice(LISTENING_PORTS)
@@ -58,13 +58,13 @@ def fork_server() -> ForkServer:
 
 
 class Child:
-    """A process of the run. It is in a session of its own: Ctrl-C reaches it only through the launcher."""
+    """A process of the run. It has its own session, so Ctrl-C reaches it only through the launcher."""
 
     def __init__(self, name: str, arguments: list[str], inbox: Inbox, kills: Sequence[Kill]) -> None:
         self.name = name
         self.kills = list(kills)
-        """those that it is to take"""
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # gone with the child
+        """the scheduled kills that have not happened yet"""
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # closed by `forget`
         self._server = fork_server()
         self._process = self._server.start(
             "compose.cli:main",
@@ -77,21 +77,21 @@ class Child:
 
     @property
     def running(self) -> bool:
-        """Whether it has not ended yet."""
+        """Whether the process has not ended yet."""
         return self._process.running
 
     @property
     def status(self) -> int:
-        """Its exit status, once it has ended; negative is the signal that killed it."""
+        """Wait for the process to end, and return its exit status; negative is the signal that killed it."""
         return self._process.status
 
     def said(self) -> str:
-        """What it wrote to its standard error."""
+        """Return what the process has written to its standard error."""
         self._errors.seek(0)
         return self._errors.read().decode(errors="replace").strip()
 
     def how(self) -> str:
-        """How it ended, for people."""
+        """Return how the process ended, as part of an error message."""
         if self._server.gone:
             return f"was killed: {self._server.why_gone()}"
         how = (
@@ -100,25 +100,25 @@ class Child:
         return f"{how}: {said}" if (said := self.said()) else how
 
     def hand(self, frame: bytes) -> None:
-        """Give it `frame` to start from."""
+        """Send `frame`, preceded by its length, to the standard input of the process."""
         self._process.hand(len(frame).to_bytes(4, "big") + frame)
 
     def stop(self) -> None:
-        """Tell it to end, even if it has been suspended."""
+        """Send SIGTERM, and SIGCONT in case the process is suspended."""
         self._process.signal(signal.SIGTERM)
         self._process.signal(signal.SIGCONT)
 
     def end(self, timeout: float) -> None:
-        """Wait `timeout` seconds for it to end; then kill it."""
+        """Wait `timeout` seconds for the process to end, then kill it."""
         self._process.end(timeout)
 
     def forget(self) -> None:
-        """What it said is of no more use."""
+        """Close the file that stores its standard error."""
         self._errors.close()
 
 
 def handed() -> Scenario:
-    """In a child: the scenario that its launcher has handed it."""
+    """Return the scenario that the launcher sent to the standard input of this child process."""
     size = int.from_bytes(sys.stdin.buffer.read(4), "big")
     return decode(sys.stdin.buffer.read(size), Scenario, MAX_FRAME_BYTES)
 
@@ -135,15 +135,17 @@ def play(
     keys: Path | None = None,
     agents_journal: bool = True,
 ) -> list[Kill]:
-    """Run `scenario`; journals go to `out`. A process takes its `kills` and is started again.
+    """Run `scenario`, write its journals to `out`, and return the kills that did not happen.
 
-    Without `agents_journal` only the world writes one: it holds all that the outcome follows from, and with
-    many robots the files take a noticeable part of the run.
+    `rate` is the speed relative to real time, None for lockstep; `patience` is a timeout in s. A process is
+    killed at its points in `kills`, and started again.
 
-    With `keys`, the folder that `tandem keys` makes, links are encrypted, and access rules enforced.
+    Without `agents_journal`, only the world writes a journal. The outcome follows from that one alone, and
+    with many robots the other files take a noticeable part of the run time.
 
-    Returns those that never came. Raises ChildFailed, or Interrupted when `inbox` says so; no process is left
-    then, either.
+    `keys` is the folder that `tandem keys` writes. With it, links are encrypted and access rules enforced.
+
+    Raises ChildFailed, or Interrupted if `inbox` receives a signal. No process is left running in any case.
     """
     limits.need_files(CHILD_FILES * (1 + len(scenario.robots)) + SPARE_FILES, "a run as processes")
     arguments = _arguments(scenario, out, run, rate, patience, keys, agents_journal=agents_journal)
@@ -167,7 +169,7 @@ def _arguments(
     *,
     agents_journal: bool,
 ) -> dict[str, list[str]]:
-    """Return the command lines of the world and the agents, by the name of the process."""
+    """Return the command lines of the world and the agents, by process name."""
     endpoint = free_endpoint("tcp" if keys is None else "tls")
     shared = ["--launched", "--run", run, "--patience", str(patience)]
     journal = ["--out", str(out)]
@@ -191,20 +193,20 @@ def _arguments(
 
 
 class _Run:
-    """The processes of one run, by name, and those that are to be started again."""
+    """The processes of one run, by name, and when to restart those that were killed."""
 
     def __init__(self, scenario: Scenario, inbox: Inbox, arguments: Mapping[str, list[str]]) -> None:
-        """`arguments` are the command lines, by the name of the process."""
+        """`arguments` are the command lines, by process name."""
         self._scenario = scenario
         self._inbox = inbox
         self._arguments = arguments
         self.names = list(arguments)
         self.children: dict[str, Child] = {}
         self._due: dict[str, float] = {}
-        """when to start again who has been killed"""
+        """monotonic time in s at which a killed process is restarted, by its name"""
 
     def start(self, name: str, kills: Sequence[Kill]) -> None:
-        """Start it, for the first time or again."""
+        """Start or restart the process `name`, which will be killed at `kills`."""
         if name in self.children:
             self.children[name].forget()
         self.children[name] = Child(name, self._arguments[name], self._inbox, kills)
@@ -212,7 +214,7 @@ class _Run:
             self.children[name].hand(encode(self._scenario))
 
     def watch(self) -> None:
-        """Until all have ended; the agents have FOLLOW_S to follow the world. Raises ChildFailed."""
+        """Wait until all have ended, the agents at most FOLLOW_S after the world. Raises ChildFailed."""
         running = set(self.names)
         while running:
             arrival = self._inbox.next(self._patience(WORLD in running))
@@ -231,13 +233,16 @@ class _Run:
                 self.start(name, self.children[name].kills)
 
     def _patience(self, world_runs: bool) -> float | None:
-        """How long to wait for what comes next."""
+        """Return the timeout in s for the next message of the inbox; None is no timeout."""
         if self._due:
             return min(self._due.values()) - time.monotonic()
         return None if world_runs else FOLLOW_S
 
     def _bury(self, child: Child) -> None:
-        """It is to be started again if it took a kill. Raises ChildFailed if not, or if it is never to be."""
+        """Schedule the restart of a killed child.
+
+        Raises ChildFailed if the child did not end by one of its kills, or by a kill without a restart.
+        """
         kill = taken(child.kills, child.said()) if child.status == -signal.SIGKILL else None
         if kill is None:
             raise ChildFailed(f"{child.name} {child.how()}")
@@ -250,7 +255,7 @@ class _Run:
         self._due[child.name] = time.monotonic() + kill.after
 
     def stop(self) -> None:
-        """Leave nobody behind."""
+        """End all processes, and print what those that ended well wrote to standard error."""
         _stop(self.children.values())
         for child in self.children.values():
             if child.status == ENDED and (said := child.said()):

@@ -1,4 +1,4 @@
-"""Tables as wide as the terminal that they are printed on."""
+"""Tables for the terminal, as lists of lines."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from compose.layout import UNLIMITED, room
 
 
 def console(**options: Any) -> Console:
-    """A console that takes text as it is: `[red]` and `:smile:` are what somebody said, and no markup."""
+    """Return a console that prints text literally: `[red]` and `:smile:` are not markup."""
     return Console(markup=False, emoji=False, highlight=False, **options)
 
 
 def table(left: Sequence[str], right: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
-    """A table whose columns `left` hold text, and `right` numbers, which are never broken."""
+    """Return a table with text in the columns `left`, and numbers, which are never broken, in `right`."""
     made = Table(box=SIMPLE_HEAD, pad_edge=False)
     for heading in left:
         made.add_column(heading, overflow="fold")
@@ -32,12 +32,12 @@ def table(left: Sequence[str], right: Sequence[str], rows: Iterable[Sequence[str
 
 
 def fits(lines: Iterable[str]) -> bool:
-    """Whether none of `lines` is broken by the terminal."""
+    """Return whether all `lines` fit the width of the terminal."""
     return max(map(cell_len, lines), default=0) <= room()
 
 
 def lines(made: Table, width: int = UNLIMITED) -> list[str]:
-    """The lines of a table, no wider than `width`: text that is too long is folded within its column."""
+    """Return the lines of a table at most `width` columns wide; longer text is folded within its column."""
     page = console(width=width, file=io.StringIO())
     with page.capture() as capture:
         page.print(made)

@@ -1,9 +1,9 @@
-"""Work that a fork server does once, so that none of the processes forked from it has to."""
+"""The work that a fork server does once for all worlds and agents that are forked from it."""
 
 from __future__ import annotations
 
 import compose.commands.agent
-import compose.commands.world  # noqa: F401  # imported to be there
+import compose.commands.world  # noqa: F401  # for its import only
 from compose import inline
 from compose.cli import parser
 from compose.scenario import load
@@ -13,11 +13,11 @@ from world.scenario import Scenario
 
 MISSION = "paper-1"
 RECEIVED = (Briefing, Scenario, Sense | End, Report, Drive, Drive | Farewell)
-"""what worlds and agents decode"""
+"""The types that worlds and agents decode."""
 
 
 def missions() -> None:
-    """Get ready for worlds and agents: imports, the command line, decoders, and code that has run."""
+    """Prepare worlds and agents: import modules, build the command line and decoders, and run a mission."""
     parser()
     inline.play(load(MISSION))
     for kind in RECEIVED:

@@ -1,7 +1,7 @@
-"""What the last bits of a computation depend on beside its inputs: versions of libraries, and the processor.
+"""The environment that the last bits of a computation depend on: library versions and the processor.
 
-The same planner decides the same to the bit only where these are the same: the C library and numpy choose
-other instructions for another processor, and other versions of them and of linear algebra round otherwise.
+A planner computes bit-identical results only in the same environment. The C library and numpy choose
+instructions by processor, and other versions of them or of the linear algebra library round differently.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 
 PACKAGE = "tandem-ranging"
 LONGEST = 64
-"""characters of a version"""
+"""the maximum number of characters of a version"""
 LEVELS = (
     ("x86-64-v4", {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}),
     ("x86-64-v3", {"avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "movbe"}),
     ("x86-64-v2", {"sse4_1", "sse4_2", "ssse3", "popcnt"}),
 )
-"""of the processors of that family, the highest first, and what each has beside the next"""
+"""The microarchitecture levels of x86-64, highest first, with the features that each adds to the next."""
 
 
 @cache
 def of_world() -> Environment:
-    """That of a world's journal: what is true follows from the C library's functions alone."""
+    """Return the environment of a world's journal: its numbers depend only on the C library's functions."""
     return Environment(_version(), _c_library(), _instructions())
 
 
 @cache
 def of_robot() -> Environment:
-    """That of an agent's journal."""
-    import numpy as np  # noqa: PLC0415  # a world does without
+    """Return the environment of an agent's journal, with numpy and its linear algebra library."""
+    import numpy as np  # noqa: PLC0415  # a world does not import it
 
     built: Mapping[str, Any] = np.show_config(mode="dicts") or {}
     used = built.get("SIMD Extensions", {}).get("found") or ["baseline"]
@@ -51,7 +51,7 @@ def of_robot() -> Environment:
 
 
 def named_in(frames: Sequence[bytes]) -> Environment | None:
-    """The environment that a journal's first frame names; older journals name none."""
+    """Return the environment in a journal's first frame; None for older journals, which have none."""
     try:
         return decode(frames[0], Environment, MAX_FRAME_BYTES) if frames else None
     except MalformedFrame:
@@ -59,12 +59,12 @@ def named_in(frames: Sequence[bytes]) -> Environment | None:
 
 
 def is_blank(frames: Sequence[bytes]) -> bool:
-    """Whether a journal of `frames` tells nothing but its environment."""
+    """Return whether a journal of `frames` contains at most its environment."""
     return len(frames) <= (named_in(frames) is not None)
 
 
 def otherwise(recorded: Environment | None, here: Environment) -> str | None:
-    """In what the two environments differ, if they do."""
+    """Return how the two environments differ, in a line; None if they are equal."""
     if recorded is None:
         return "the recording does not name the versions that it was made with"
     fields = [name for name in here.__struct_fields__ if getattr(recorded, name) != getattr(here, name)]
@@ -85,7 +85,7 @@ def _version() -> str:
 
 
 def _c_library() -> str:
-    """Such as "glibc 2.36"."""
+    """Return the name and version, such as "glibc 2.36"."""
     try:
         return os.confstr("CS_GNU_LIBC_VERSION") or _system()
     except (AttributeError, OSError, ValueError):
@@ -97,7 +97,7 @@ def _system() -> str:
 
 
 def _instructions() -> str:
-    """The instruction set of the processor, such as "x86-64-v3"."""
+    """Return the instruction set of the processor, such as "x86-64-v3"."""
     try:
         with Path("/proc/cpuinfo").open(encoding="ascii", errors="replace") as file:
             flags = next((set(line.split()) for line in file if line.startswith("flags")), set[str]())
@@ -112,8 +112,8 @@ def _instructions() -> str:
 
 
 def _kernels(folder: Path) -> str | None:
-    """The library that numpy has brought along, and the kernels it chose: "OpenBLAS 0.3.31 (Haswell)"."""
-    import ctypes  # noqa: PLC0415  # a world does without, as above
+    """Return numpy's bundled library and its kernels, such as "OpenBLAS 0.3.31 (Haswell)", or None."""
+    import ctypes  # noqa: PLC0415  # a world does not import it
 
     for file in folder.glob("libscipy_openblas*"):
         for ending in ("64_", ""):
@@ -129,6 +129,6 @@ def _kernels(folder: Path) -> str | None:
 
 
 def _library(built: Mapping[str, Any]) -> str:
-    """The one that numpy was built with."""
+    """Return the linear algebra library that numpy was built with, such as "lapack 3.12.0"."""
     said = built.get("Build Dependencies", {}).get("lapack", {})
     return f"{said.get('name', 'unknown')} {said.get('version', '')}".strip()

@@ -1,6 +1,6 @@
-"""The key-expression tree, one function a key, and who may do what. `run` and robot ids are single chunks.
+"""The tree of Zenoh key expressions, one function per key, and the access rules for each key.
 
-`parse` is the one reader of keys that arrive.
+`run` and the robot ids are single chunks of a key. All received keys are read by `parse`.
 """
 
 from __future__ import annotations
@@ -18,62 +18,66 @@ ROOT = "tandem"
 
 
 def truth(run: str) -> str:
-    """World to viewers: true poses."""
+    """Return the key on which the world sends true poses to viewers."""
     return f"{ROOT}/{run}/world/truth"
 
 
 def briefing(run: str, robot: str) -> str:
-    """Queryable at the world: what that robot needs to start. The world answers under "*"."""
+    """Return the key of the world's queryable for that robot's Briefing; the world declares it for "*"."""
     return f"{ROOT}/{run}/world/briefing/{robot}"
 
 
 def sense(run: str, robot: str) -> str:
-    """World to that robot: Sense; End when it is over; then its own Farewell, which is on record."""
+    """Return the key on which the world sends each Sense to that robot, and End after the last.
+
+    The world then sends the robot's Farewell back, once it is in the recording.
+    """
     return f"{ROOT}/{run}/robot/{robot}/sense"
 
 
 def drive(run: str, robot: str) -> str:
-    """That robot to the world: Drive, and Farewell when it is over."""
+    """Return the key on which that robot sends each Drive to the world, and Farewell after the mission."""
     return f"{ROOT}/{run}/robot/{robot}/drive"
 
 
 def report(run: str, robot: str, peer: str) -> str:
-    """That robot to its peer, only in contact."""
+    """Return the key on which that robot sends Reports to its peer while they are in contact."""
     return f"{ROOT}/{run}/robot/{robot}/to/{peer}"
 
 
 def beat(run: str, robot: str) -> str:
-    """Without a world, from that robot's driver to its peer's: a tick has begun."""
+    """Return the key on which a robot's driver sends the start of a tick to its peer's, in hardware mode."""
     return f"{ROOT}/{run}/robot/{robot}/beat"
 
 
 def estimate(run: str, robot: str) -> str:
-    """That robot to viewers: what it holds possible."""
+    """Return the key on which that robot sends its Estimate to viewers."""
     return f"{ROOT}/{run}/robot/{robot}/estimate"
 
 
 def world_alive(run: str) -> str:
-    """Liveliness token of the world; "*" for those of all runs."""
+    """Return the key of the world's liveliness token; a run of "*" matches all runs."""
     return f"{ROOT}/{run}/alive/world"
 
 
 def robot_alive(run: str, robot: str) -> str:
-    """Liveliness token of a robot; "*" for those of all robots of the run."""
+    """Return the key of a robot's liveliness token; a robot of "*" matches all robots of the run."""
     return f"{ROOT}/{run}/alive/robot/{robot}"
 
 
 class Rule(NamedTuple):
-    """Who may do what under a key.
+    """The access rule of a key: which participants may do what with it.
 
-    They are "world", "viewer", "robots" (any), or a parameter of the key's function: the robot that it names.
+    A participant is "world", "viewer", "robots" (any robot), or the name of a parameter of the key's
+    function, which stands for the robot that the key names there.
     """
 
     way: Literal["put", "answer", "show"]
-    """what is done: frames are put, questions answered, a liveliness token is shown"""
+    """the operation: put frames, answer queries, or declare a liveliness token"""
     by: str
-    """who does it"""
+    """the participant that may do it"""
     to: tuple[str, ...]
-    """who hears it, asks, or looks for it"""
+    """the participants that may subscribe, query, or look for the token"""
 
 
 RULES: Mapping[Callable[..., str], Rule] = MappingProxyType(
@@ -89,25 +93,26 @@ RULES: Mapping[Callable[..., str], Rule] = MappingProxyType(
         robot_alive: Rule("show", "robot", ("robot", "world", "viewer")),
     }
 )
-"""of every key; what no rule allows a robot or a viewer, no router lets pass"""
+"""The rule of every key. Routers block all other operations of robots and viewers."""
 
 
 class Key(NamedTuple):
-    """A key under which something arrived."""
+    """The parsed key of a received message."""
 
     kind: Callable[..., str] | None
-    """the function above that makes such keys"""
+    """the function above that returns such keys; None for NOWHERE"""
     run: str
     robot: str = ""
-    """the robot whose drive, estimate or liveliness it is, and whose report; the peer is not it"""
+    """the robot of the key; for a report, its sender"""
     peer: str = ""
+    """for a report, its receiver"""
 
 
 NOWHERE = Key(None, "")
-"""the key of what did not come over the network"""
+"""The key of messages that did not come over the network."""
 
 _LONGEST = 256
-"""characters of a key that is looked at"""
+"""the maximum number of characters of a key that is parsed"""
 _NAME = re.compile(NAME)
 _PATTERNS = {
     kind: re.compile(kind(**{name: f"(?P<{name}>[^/]+)" for name in signature(kind).parameters}))
@@ -116,10 +121,10 @@ _PATTERNS = {
 
 
 def parse(key: str) -> Key | None:
-    """Return what `key` names, or None if it is not one of the keys above, or is a wildcard.
+    """Return the parsed `key`; None if it is not one of the keys above, or is a wildcard.
 
-    Anybody may put, ask or show a token under any key expression, and a wildcard reaches whoever listens to
-    one of the keys that it covers.
+    Any participant can use any key expression, and a message on a wildcard reaches the subscribers of
+    all keys that it matches.
     """
     return _parsed(key) if len(key) <= _LONGEST else None
 

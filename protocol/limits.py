@@ -1,6 +1,6 @@
-"""The limits of a process (ulimit), asked before what would fail halfway, or hang, for want of more.
+"""Checks of the process's limits (ulimit), before an operation that would fail halfway or hang at a limit.
 
-Zenoh's threads panic where they get no descriptor or no memory, and its session then waits for them.
+Zenoh's threads panic if they get no descriptor or no memory, and its session then waits for them for ever.
 """
 
 from __future__ import annotations
@@ -11,15 +11,18 @@ import resource
 from pathlib import Path
 
 SESSION_FILES = 20
-"""descriptors that a Zenoh session takes beside one for each link: 14 to 16 measured on two cores"""
+"""descriptors that a Zenoh session needs besides one per link: 14 to 16 measured on two cores"""
 SESSION_BYTES = 900 << 20
-"""address space that its threads take, little of which they use: 830 MB measured on two cores"""
+"""bytes of address space that its threads reserve, and mostly do not use: 830 MB measured on two cores"""
 START_BYTES = 240 << 20
-"""the same for the interpreter and the libraries: 150 MB measured, more where there are more cores"""
+"""the same for the interpreter and the libraries: 150 MB measured on two cores, more on more cores"""
 
 
 def need_files(more: int, what: str) -> None:
-    """See to it that this process can open so many files `more`, by its hard limit. Raises OSError."""
+    """Raise the soft limit so that this process can open `more` further files for `what`.
+
+    Raises OSError, which names `what`, if the hard limit does not allow it.
+    """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = _open() + more
     if soft == resource.RLIM_INFINITY or wanted <= soft:
@@ -30,7 +33,7 @@ def need_files(more: int, what: str) -> None:
 
 
 def need_memory(more: int, what: str) -> None:
-    """Raises OSError unless this process may have so many bytes `more` of address space."""
+    """Raise OSError, which names `what`, unless this process may map `more` further bytes of memory."""
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if limit == resource.RLIM_INFINITY:
         return
@@ -43,29 +46,29 @@ def need_memory(more: int, what: str) -> None:
 
 
 def shortage(error: BaseException) -> str | None:
-    """What this process has run out of, if that is what `error` says."""
+    """Return the message if `error` says that this process has reached a limit, or None otherwise."""
     if isinstance(error, MemoryError):
         return "there is no more memory"
     if isinstance(error, RuntimeError) and "start new thread" in str(error):
         return "no more threads can be started (ulimit -u, ulimit -v)"
     if (
         type(error).__name__ == "PanicException"
-    ):  # of a library in Rust; no Exception, and of no type of its own
+    ):  # raised by a Rust library: a BaseException that cannot be imported
         return f"Zenoh has given up: {error}"
     return None
 
 
 def _open() -> int:
-    """How many descriptors are open."""
+    """Return the number of open descriptors; the soft limit if there are too many to count them."""
     try:
         return len(os.listdir("/dev/fd")) - 1
-    except OSError:  # there may be none left to look with
+    except OSError:  # listing needs a descriptor, and none may be left
         return resource.getrlimit(resource.RLIMIT_NOFILE)[0]
 
 
 def _size() -> int:
-    """Bytes of address space that this process has."""
+    """Return the bytes of address space of this process; 0 where there is no /proc."""
     try:
         return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
-    except OSError:  # no Linux
+    except OSError:  # not Linux
         return 0

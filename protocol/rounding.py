@@ -1,17 +1,18 @@
-"""Bounds on what double precision does to poses and ranges: every floor of a test with exact sensors.
+"""Bounds on the rounding errors of poses and ranges: the floors of all tests with exact sensors.
 
-The world moves the robots, and a robot its odometry, along the same arcs: equal manoeuvres, a run of them,
-are one arc from where the run began. Let `size` (D + R) be the largest coordinate, `path` the length driven
-in `runs` runs, `turned` the sum of |omega T_s| over all ticks, u = 2^-53.
+The world moves the robots, and a robot its odometry, along the same arcs. A run, a sequence of equal
+manoeuvres, is computed as one arc from the pose where it begins. Let `size` (D + R) be the largest
+coordinate, `path` the length driven in `runs` runs, `turned` the sum of |omega T_s| over all ticks, and
+u = 2^-53.
 
-- A coordinate is rounded by u `size` in each run; a chord, its sine and its cosine by less than that.
-- A heading grows to TAU + `turned`, TAU being that of the start or the branch, and is rounded by u of that
-  in each run. The errors may add up, and they swing what was driven: a place by at most themselves times
-  `path`, or times 2 `size` where that is less.
-- A range is the hypotenuse of two differences of such coordinates, in frames that lead to each other:
-  RANGED u `size`.
+- Each run rounds a coordinate by u `size`, and a chord, its sine and its cosine by less than that.
+- A heading is at most TAU + `turned`, where TAU bounds the heading of the start or the branch. Each run
+  rounds it by u times that. The errors may add up. They rotate the path, and move a position by at most the
+  error of the heading times `path`, or times 2 `size` where that is less.
+- A range is the hypotenuse of two differences of such coordinates, after a transformation between frames.
+  It is rounded by RANGED u `size`.
 
-Both sides err alike, the world and whoever recomputes it: twice u.
+The world and the robot that recomputes its numbers have the same errors, so the bounds use 2 u.
 """
 
 from __future__ import annotations
@@ -22,49 +23,56 @@ EPSILON = 2.0**-52
 """2 u"""
 
 RANGED = 4.0
-"""u of the size: two differences, the hypotenuse, and the turn of a frame"""
+"""The rounding of a range, in u `size`: two differences, the hypotenuse, and the rotation of a frame."""
 
 SAME = 2.0
-"""floors: two anchors so near each other predict ranges that differ by a floor each at the most, on either
-side of what is measured; so nothing tells them apart"""
+"""The distance, in floors, below which no range distinguishes two anchors.
+
+A measured range differs from the two that they predict by at most one floor each, on either side.
+"""
 
 TOLERANCE = 1e-6
-"""m and rad: a claim that is farther off than this is wrong, where sensors are exact"""
+"""m and rad: the largest error of a correct claim, with exact sensors"""
 
 SURE = 0.5 * TOLERANCE
-"""m and rad: what all roundings together may put a claim off, for it to be made; the other half is left for
-placements that are merged (`same_turn`)"""
+"""m and rad: the largest error from rounding with which a claim is made.
+
+The other half of TOLERANCE is left for the placements that are merged (`same_turn`).
+"""
 
 
 def rounding(size: float, runs: int, path: float, turned: float) -> float:
-    """Return the bound in m, derived above, on how far a computed range may be from the measured one."""
+    """Return the bound in m, derived above, on the difference between a computed and a measured range."""
     return EPSILON * (size * (RANGED + runs) + min(path, 2.0 * size) * runs * (TAU + turned))
 
 
 def same_turn(size: float) -> float:
-    """Return the angle in rad below which two turns of a robot about its anchor give one claim.
+    """Return the angle in rad below which two rotations of a robot about its anchor are merged into one.
 
-    The poses that follow, `size` m from the anchors at the most, then differ by less than SURE.
+    The resulting poses are at most `size` m from the anchors, so they differ by less than SURE.
     """
     return SURE / max(1.0, size)
 
 
 WELL = 0.125
-"""of `foothold`: an anchor that is known so well is known well enough from whatever places the robots meet"""
+"""The fraction of `foothold` at which an anchor error suffices wherever the robots meet."""
 
 BETTER = 0.9
-"""by which another range must better what is known of an anchor, for one more to be worth it"""
+"""The ratio to which a range must reduce the anchor error for another range to be worthwhile."""
 
 OUT_AND_BACK = 2
-"""ranges running, one of a way out and one of the way back, that made an anchor no better known; rounding
-grows with the way, so no further one will"""
+"""The number of consecutive ranges without a smaller anchor error after which phase 1 takes no more.
+
+One is measured on the way out, and one on the way back. Rounding grows with the path, so no later range
+reduces the error.
+"""
 
 
 def foothold(size: float, distance: float, sensing_range: float) -> float:
-    """Return how exactly, in m, a robot must know where its anchor is when phase 1 ends.
+    """Return the anchor error in m that a robot may have when phase 1 ends.
 
-    An anchor that is off by e turns the line between the anchors by e / D, and a fit to ranges from places
-    that are not the best by up to twice that; and b, whose place is R / 8 from its own, by 8 e / R. Either
-    puts a pose off by `size` times that, and two robots err.
+    An anchor error e rotates the line between the anchors by e / D, or by up to twice that if the ranges were
+    measured at unfavourable positions. It rotates b, which waits R / 8 from its own anchor, by up to 8 e / R.
+    Either rotation moves a pose by `size` times the angle, and the errors of both robots add up.
     """
     return 0.5 * SURE * min(0.5 * distance, 0.125 * sensing_range) / max(1.0, size)

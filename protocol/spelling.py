@@ -1,4 +1,4 @@
-"""The known name that a mistyped one is close to."""
+"""Suggestions for mistyped names."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from collections.abc import Iterable
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """Return "; did you mean 'name'?" for the name in `known` that is most like `word`, or nothing."""
-    from difflib import get_close_matches  # noqa: PLC0415  # only where there is a mistake to be told
+    """Return "; did you mean 'name'?" for the name in `known` that is most like `word`, or ""."""
+    from difflib import get_close_matches  # noqa: PLC0415  # needed only for an error message
 
-    names = {name.lstrip("-"): name for name in known}  # dashes are no likeness
+    names = {name.lstrip("-"): name for name in known}  # leading dashes do not count as similarity
     close = get_close_matches(word.lstrip("-"), names, n=1)
     return f"; did you mean '{names[close[0]]}'?" if close else ""

@@ -1,4 +1,4 @@
-"""The one way to a terminal. What is printed may hold text that came over the network, from anybody."""
+"""Output to the terminal. All output goes through here: it may contain untrusted text from the network."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import sys
 
 
 def say(*lines: str, error: bool = False) -> None:
-    """Print each of `lines` as one line, on standard output or error, in characters that it takes."""
+    """Print each of `lines` as one line on standard output or error; escape what its encoding lacks."""
     stream = sys.stderr if error else sys.stdout
     encoding = getattr(stream, "encoding", None) or "utf-8"
     text = "\n".join(map(one_line, lines))
@@ -14,5 +14,5 @@ def say(*lines: str, error: bool = False) -> None:
 
 
 def one_line(text: str) -> str:
-    """`text` with whatever would break or garble a line, or command a terminal, escaped."""
+    """Return `text` with unprintable characters escaped, line breaks and terminal commands included."""
     return "".join([char if char.isprintable() else repr(char)[1:-1] for char in text])

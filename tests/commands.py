@@ -1,4 +1,4 @@
-"""The command `tandem` as people start it: real processes, a bound on every wait, nobody left behind."""
+"""The command `tandem` as a user starts it: real processes, bounded waits, no process left running."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from protocol import journal
 from tests import warm
 
 BOUND_S = 60.0
-"""longer than anything takes that comes at all, on a busy machine too"""
+"""s: longer than any wait that succeeds takes, even on a busy machine"""
 LOOK_AGAIN_S = 0.002
 
 SECTION_IV = """
@@ -63,25 +63,25 @@ anchor = [0.0, 0.0]
 id = "b"
 anchor = [60.0, 0.0]
 """
-"""1874 ticks: time enough to interfere with it"""
+"""A scenario of LONG_TICKS ticks: long enough for a test to interfere with the run."""
 LONG_TICKS = 1874
 ASSURED = "max_ticks = 1_000_000\n" + PAPER_1.replace('"paper"', '"assured"').replace(
     "10.0, 0.0", "60.0, 0.0"
 ).replace("11.3", "61.3")
-"""of the variant for which standing still is no harm, however long a busy machine makes robots stand"""
+"""A scenario of the variant that tolerates missed deadlines, however many a busy machine causes."""
 REAL_TIME = ASSURED.replace("1_000_000", "600")
-"""the same for `--rate 20`: it is over after half a minute, whatever the robots come to by then"""
+"""The same for `--rate 20`: it is over after half a minute, with any outcome."""
 OVER = (0, 1)
-"""statuses of a mission that has come to its end; in real time nobody promises which"""
+"""The exit statuses of a mission that has ended; in real time, either is possible."""
 ENDLESS = (
     LONG.replace("60.0", "400.0").replace("max_speed = 1.0", "max_speed = 0.1").replace('"long"', '"endless"')
 )
-"""so long that it does not end while a test runs"""
+"""A scenario so long that it does not end during a test."""
 LONG_JOURNAL_BYTES = 180_000
 
 
 def several_pairs(pairs: int) -> str:
-    """A scenario of as many pairs, each on a line of its own; robots a and b are peers, c and d, ..."""
+    """Return a scenario of `pairs` pairs on lines 40 m apart: a and b are peers, c and d, ..."""
     ids = "abcdefgh" if pairs <= 4 else [f"r{i}" for i in range(2 * pairs)]
     robots = [
         f'[[robot]]\nid = "{ids[i]}"\npeer = "{ids[i ^ 1]}"\nanchor = [{10.0 * (i % 2)}, {40.0 * (i // 2)}]\n'
@@ -91,16 +91,16 @@ def several_pairs(pairs: int) -> str:
 
 
 class Ended(NamedTuple):
-    """A command that has come to its end."""
+    """The result of a command that has ended."""
 
     status: int
-    """negative is the signal that killed it"""
+    """exit status; negative is the signal that killed it"""
     out: str
     err: str
 
 
 class Command:
-    """A process of `tandem`, in a session of its own; told to stop, then killed, where its `with` ends."""
+    """A process of `tandem` in its own session. When its `with` ends, it is terminated, then killed."""
 
     def __init__(
         self,
@@ -109,9 +109,9 @@ class Command:
         terminal: int | None = None,
         through: Sequence[str] = (),
     ) -> None:
-        """`terminal` takes its standard output, if given; `through` is a command that becomes it.
+        """Start the command; `terminal` receives its standard output, `through` is a command that execs it.
 
-        A run leaves its record without an export of it, where nothing is said of that: it takes longer.
+        `run` gets `--no-export` unless the arguments say otherwise, because an export takes longer.
         """
         words = _words(arguments)
         self._out = tempfile.TemporaryFile()  # noqa: SIM115  # closed with the command
@@ -128,21 +128,21 @@ class Command:
 
     @property
     def out(self) -> str:
-        """Its standard output so far."""
+        """The standard output so far."""
         return _read(self._out)
 
     @property
     def err(self) -> str:
-        """Its standard error so far."""
+        """The standard error so far."""
         return _read(self._err)
 
     @property
     def running(self) -> bool:
-        """Whether it has not ended."""
+        """Whether the process has not ended yet."""
         return self._process.poll() is None
 
     def until(self, condition: Callable[[], object], what: str) -> None:
-        """Wait for `condition`, which the command must bring about before it ends."""
+        """Wait until `condition` holds, which must be before the command ends."""
 
         met = False
 
@@ -155,20 +155,20 @@ class Command:
         assert met or condition(), f"ended before {what}: {self.out}{self.err}"
 
     def until_says(self, words: str) -> None:
-        """Wait until it has said `words`, on either stream."""
+        """Wait until the command has printed `words` on either stream."""
         self.until(lambda: words in self.out + self.err, f"it says '{words}'")
 
     def until_written(self, path: Path, amount: int) -> None:
-        """Wait until `path` holds so many bytes."""
+        """Wait until the file at `path` has at least `amount` bytes."""
         self.until(lambda: size(path) >= amount, f"{path.name} holds {amount} bytes")
 
     def until_answered(self, robot: str, record: Path) -> None:
-        """Wait until `robot` has answered tick 0: its Sense, Drive and Estimate are on record."""
+        """Wait until `robot` has answered tick 0: its Sense, Drive and Estimate are in the recording."""
         path = record / f"agent-{robot}.journal"
         self.until(lambda: path.exists() and len(list(journal.read(path))) >= 5, f"{robot} answers tick 0")
 
     def ended(self, within: float = BOUND_S) -> Ended:
-        """Its end, which must come `within` seconds."""
+        """Return the result of the command, which must end `within` seconds."""
         try:
             status = self._process.wait(within)
         except subprocess.TimeoutExpired:
@@ -176,14 +176,14 @@ class Command:
         return Ended(status, self.out, self.err)
 
     def tell(self, number: Signals) -> bool:
-        """Send a signal to its process group, as a terminal does on Ctrl-C; whether it was still there."""
+        """Send a signal to the process group, as Ctrl-C does, and return whether the process still ran."""
         if self.running:
             os.killpg(self.pid, number)
             return True
         return False
 
     def catches(self, number: Signals) -> bool:
-        """Whether it handles that signal by now."""
+        """Return whether the process has a handler for that signal by now."""
         return bool(_signals_caught(self.pid) >> (number - 1) & 1)
 
     def __enter__(self) -> Command:
@@ -204,7 +204,7 @@ class Command:
 
 
 def tandem(*arguments: str | Path, cwd: Path | None = None) -> Ended:
-    """The command, to its end."""
+    """Run the command to its end in a forked process, and return its result."""
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         status = warm.run(_words(arguments), cwd, out, err, BOUND_S)
         return Ended(status, _read(out), _read(err))
@@ -218,7 +218,7 @@ def _words(arguments: Sequence[str | Path]) -> list[str]:
 
 
 def on_a_terminal(*arguments: str | Path) -> tuple[int, str]:
-    """The command, to its end, on a terminal of 80 columns: its status, and all that was written there."""
+    """Run the command on a terminal of 80 columns, and return its exit status and all of its output there."""
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))  # the last two are pixels
     shown = b""
@@ -235,7 +235,7 @@ def on_a_terminal(*arguments: str | Path) -> tuple[int, str]:
 
 @contextmanager
 def world(scenario: str | Path, *arguments: str | Path) -> Iterator[tuple[Command, str]]:
-    """A world that waits for its robots, and the endpoint where it does."""
+    """Yield a world that waits for its robots, and its endpoint."""
     endpoint = free_endpoint()
     with Command("world", scenario, "--listen", endpoint, *arguments) as command:
         command.until_says("waiting for")
@@ -251,16 +251,16 @@ def until(condition: Callable[[], object], what: str, bound: float = BOUND_S) ->
 
 
 def processes_of(mark: str | Path) -> dict[int, list[str]]:
-    """The processes whose command line names `mark`: their words, by process id.
+    """Return the words of all command lines that contain the word `mark`, by process id.
 
-    A forked process shows its command line as one text.
+    The command line of a forked process is one string, so words are split at spaces, too.
     """
     found = {}
     for process in Path("/proc").iterdir():
         if process.name.isdigit():
             try:
                 words = (process / "cmdline").read_bytes().decode(errors="replace").replace("\0", " ").split()
-            except OSError:  # ended meanwhile
+            except OSError:  # it has ended meanwhile
                 continue
             if str(mark) in words:
                 found[int(process.name)] = words
@@ -268,7 +268,7 @@ def processes_of(mark: str | Path) -> dict[int, list[str]]:
 
 
 def process_of(mark: str | Path, *words: str) -> int:
-    """The one process whose command line names `mark` and has `words` in a row."""
+    """Return the id of the one process whose command line contains `mark`, and `words` in a row."""
     wanted = " ".join(words)
     found = [pid for pid, said in processes_of(mark).items() if f" {wanted} " in f" {' '.join(said)} "]
     assert len(found) == 1, f"{wanted}: {found}"
@@ -276,7 +276,7 @@ def process_of(mark: str | Path, *words: str) -> int:
 
 
 def temporary_in(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder there in which all temporary ones are from now on, so that what is left of them is known."""
+    """Return a new folder in `folder` for all temporary files, so that a test sees what is left of them."""
     found = folder / "tmp"
     found.mkdir()
     monkeypatch.setenv("TMPDIR", str(found))
@@ -285,17 +285,17 @@ def temporary_in(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def size(path: Path) -> int:
-    """In bytes; 0 where there is no such file."""
+    """Return the size of a file in bytes; 0 if there is none."""
     return path.stat().st_size if path.exists() else 0
 
 
 def journals(folder: Path) -> dict[str, bytes]:
-    """Every journal in `folder`, by name."""
+    """Return the content of every journal in `folder`, by name."""
     return {path.name: path.read_bytes() for path in sorted(folder.glob("*.journal"))}
 
 
 def _read(file: IO[bytes]) -> str:
-    """All of it. Not through its position, which the process that writes it shares."""
+    """Return the content of `file`, without moving the file position that the writing process shares."""
     return os.pread(file.fileno(), 1 << 24, 0).decode(errors="replace")
 
 

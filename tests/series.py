@@ -1,4 +1,4 @@
-"""Long series of cases: the first few run by default, the rest with `pytest -m long`."""
+"""Series of test cases: the first few run by default, the rest with `pytest -m long`."""
 
 from __future__ import annotations
 
@@ -9,6 +9,6 @@ import pytest
 
 
 def series(cases: Iterable[Any], short: int = 1) -> list[Any]:
-    """Return `cases` for `parametrize` or a fixture's `params`; all but the first `short` are long."""
+    """Return `cases` for `parametrize` or a fixture's `params`, all but the first `short` marked long."""
     listed = list(cases)
     return listed[:short] + [pytest.param(case, marks=pytest.mark.long) for case in listed[short:]]

@@ -1,4 +1,4 @@
-"""Whatever the setting and the start: localised, or refused before anything moves."""
+"""Missions with random settings and starts: each localises, or is refused before any robot moves."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ANYWHERE = spec.load("anywhere")
 
 
 def played(trial: int) -> str:
-    """The outcome of a trial of the sweep, or `refused`."""
+    """Return the outcome of a trial of the sweep, with the reason if there is one, or "refused"."""
     table = trial_table(ANYWHERE, CELL, trial)
     try:
         setting = validate(table, "anywhere")
@@ -106,7 +106,7 @@ def test_a_trial_that_was_once_lost_localises(case: str) -> None:
 
 
 def test_the_paper_is_never_wrong_either() -> None:
-    """It may give up, with a reason."""
+    """The planner `paper` may also end undecided."""
     for trial in range(60):
         table = trial_table(ANYWHERE, CELL, trial)
         try:

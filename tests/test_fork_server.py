@@ -1,4 +1,4 @@
-"""Robots and worlds are forked from one process, and are processes of their own all the same."""
+"""Robots and worlds are forked from one process, and behave like processes that are started separately."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ NAMES = ("world", "agent a", "agent b")
 
 @pytest.fixture
 def endless(tmp_path: Path) -> Path:
-    """A scenario that does not end by itself."""
+    """Return the file of a scenario that does not end during a test."""
     path = tmp_path / "endless.toml"
     path.write_text(ENDLESS)
     return path
@@ -54,14 +54,14 @@ def parent_of(pid: int) -> int:
 
 
 def fork_servers_of(launcher: int) -> list[int]:
-    """Those that import yet, too."""
+    """Return the ids of the launcher's fork servers, including those that are still importing."""
     found = []
     for pid in map(int, filter(str.isdigit, os.listdir("/proc"))):
         try:
             words = Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace")
             if re.search("fork.server", words) and parent_of(pid) == launcher:
                 found.append(pid)
-        except OSError:  # ended meanwhile
+        except OSError:  # it has ended meanwhile
             continue
     return found
 
@@ -70,7 +70,7 @@ def gone(pid: int) -> bool:
     return not Path(f"/proc/{pid}").exists()
 
 
-# --- processes of their own -----------------------------------------------------------------------------
+# --- separate processes ---------------------------------------------------------------------------------
 
 
 def test_each_has_its_own_session_and_group_and_is_named_in_ps(endless: Path, tmp_path: Path) -> None:
@@ -130,7 +130,7 @@ def test_it_ends_with_its_standard_input() -> None:
     server.close()
 
 
-# --- nobody is left behind ------------------------------------------------------------------------------
+# --- no process is left running -------------------------------------------------------------------------
 
 
 def test_a_run_whose_fork_server_is_killed_says_so_and_leaves_no_process(
@@ -242,9 +242,9 @@ server.close()
 
 
 def without_privileges() -> None:
-    """Whoever has these two is not held to the limit of descriptors under way."""
+    """Drop the two capabilities that exempt a process from the limit of descriptors in flight."""
     for capability in (CAP_SYS_ADMIN, CAP_SYS_RESOURCE):
-        ctypes.CDLL(None).prctl(PR_CAPBSET_DROP, capability, 0, 0, 0)  # fails where there is none to drop
+        ctypes.CDLL(None).prctl(PR_CAPBSET_DROP, capability, 0, 0, 0)  # fails if there is none to drop
 
 
 @ON_LINUX
@@ -260,7 +260,7 @@ def test_no_process_is_forgotten_where_its_user_may_have_no_more_descriptors_und
     assert (ran.stdout, ran.stderr) == ("{0}\n", "")
 
 
-# --- many -----------------------------------------------------------------------------------------------
+# --- many robots ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("pairs", [10, pytest.param(100, marks=pytest.mark.long)])

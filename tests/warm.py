@@ -1,6 +1,6 @@
-"""Commands forked from a process that has imported everything: the hundreds that a test only waits for.
+"""Commands forked from a process that has imported everything, for tests that only wait for the result.
 
-What such a command does is what the same started by itself does; `tests/commands.py` starts some of each.
+A forked command behaves like one that is started by itself. `tests/commands.py` starts commands both ways.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from compose.warm_up import missions
 WARM_UP = "tests.warm:warm_up"
 MAIN = "tests.warm:main"
 DRAWING = ("matplotlib.backends.backend_pdf", "matplotlib.backends.backend_svg")
-"""what Matplotlib imports only when it writes a file"""
+"""modules that Matplotlib imports only when it writes a file"""
 
 
 class Command(msgspec.Struct, frozen=True):
-    """A command line, and where it runs."""
+    """A command line, its working directory and its environment."""
 
     words: list[bytes]
-    """as the system passes them: they need not be text"""
+    """bytes, as the system passes them: they need not be valid text"""
     folder: str
     environment: dict[bytes, bytes]
 
 
 def warm_up() -> None:
-    """Import what commands need, in the process that they are forked from."""
+    """Import all modules that commands need, in the process that they are forked from."""
     missions()
     for module in pkgutil.walk_packages(compose.__path__, "compose."):
         if not module.name.endswith(".__main__"):
@@ -45,7 +45,10 @@ def warm_up() -> None:
 
 
 def run(words: list[str], folder: Path | None, out: IO[bytes], err: IO[bytes], within: float) -> int:
-    """Return the exit status of `tandem WORDS` in `folder`; negative is the signal that killed it."""
+    """Run `tandem WORDS` in `folder`, and return its exit status; negative is the signal that killed it.
+
+    Raises AssertionError if it runs for longer than `within` seconds.
+    """
     command = Command([*map(os.fsencode, words)], str(folder or Path.cwd()), dict(os.environb))
     with tempfile.NamedTemporaryFile() as file:
         file.write(msgspec.msgpack.encode(command))
@@ -60,7 +63,7 @@ def run(words: list[str], folder: Path | None, out: IO[bytes], err: IO[bytes], w
 
 
 def main() -> None:
-    """In the forked process: become the command."""
+    """Run the command whose file sys.argv names, in this forked process."""
     with open(sys.argv[1], "rb") as file:
         command = msgspec.msgpack.decode(file.read(), type=Command)
     for path, stream, flags in ((sys.argv[2], 1, os.O_WRONLY), (os.devnull, 0, os.O_RDONLY)):

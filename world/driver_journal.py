@@ -1,9 +1,9 @@
-"""The journal of a robot's hardware: what its driver measured and drove, as far as a restart needs it.
+"""The journal of a robot's driver: the measurements and commands that a resume needs.
 
-A Sense stands here before the agent gets it, and a Drive before the wheels do. So after a kill nothing has
-been told or driven that is not on record, and at most the reading of one tick has to be taken again. After a
-power cut that holds if each write was synced (`--fsync`); if not, the robot does not go on: what it would
-tell could contradict what it has told, and its peer would raise an alarm.
+A Sense is written before it is sent to the agent, and a Drive before it is executed. After a kill, the
+journal therefore contains everything that was sent or executed, and at most the reading of one tick has to
+be repeated. After a power cut this holds only if each write was synced (`--fsync`). If not, the robot
+refuses to resume: its Reports could contradict earlier ones, and its peer would find them inconsistent.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from protocol.units import Finite, RobotId, Tick
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 
 MAX_MARK = 64
-"""numbers of a mark"""
+"""the maximum number of values of a mark"""
 
 
 def driver_journal(robot: str) -> str:
-    """The name of the file."""
+    """Return the name of the journal's file."""
     return f"driver-{robot}.journal"
 
 
 class Mark(Message, frozen=True):
-    """The mark of a reading (see `driver.Reading`); it stands before the Sense that the reading makes."""
+    """The mark of a reading (see `driver.Reading`), written before the Sense made from that reading."""
 
     tick: Tick
     robot: RobotId
@@ -37,16 +37,16 @@ class Mark(Message, frozen=True):
 
 
 class Start(Message, frozen=True):
-    """The start of the process that writes from here on."""
+    """The start of the process that writes the frames after it."""
 
     boot: Annotated[str, msgspec.Meta(max_length=64)]
-    """of the computer, since it was switched on; empty where that is not to be had"""
+    """identifies the boot of the computer; empty if the system does not tell"""
     synced: bool
-    """whether each write is on the disk before anything follows from it"""
+    """whether each write is synced to the disk before the process continues"""
 
 
 def boot() -> str:
-    """Return what names the time since this computer was switched on; "" where the system does not tell."""
+    """Return the identifier of this computer's current boot; "" if the system does not tell."""
     try:
         return BOOT.read_text(encoding="ascii").strip()
     except OSError:
@@ -57,40 +57,44 @@ BOOT = Path("/proc/sys/kernel/random/boot_id")
 
 
 class DrivenTick(msgspec.Struct, frozen=True):
-    """One tick on record."""
+    """One tick of a driver's journal."""
 
     sense: Sense
     frame: bytes
+    """the encoded Sense"""
     drive: Drive | None = None
-    """none if none came in time"""
+    """None if the agent missed the deadline"""
     reports: tuple[Report, ...] = ()
-    """of the peer, as far as they bear on when the mission is over"""
+    """the peer's Reports that affect when the mission is over"""
 
 
 class DriverPast(msgspec.Struct, frozen=True):
-    """A driver's journal, whole or up to where it breaks off."""
+    """The content of a driver's journal, complete or up to where it breaks off."""
 
     ticks: tuple[DrivenTick, ...] = ()
     mark: tuple[float, ...] = ()
-    """of the latest reading"""
+    """the mark of the latest reading; empty if it has none"""
     end: End | None = None
     start: Start | None = None
-    """the latest"""
+    """the latest Start"""
 
     @property
     def tick(self) -> int:
-        """The latest."""
+        """The latest tick; -1 if there is none."""
         return len(self.ticks) - 1
 
     @property
     def may_lack(self) -> bool:
-        """Whether the computer has been started again since, which may have taken what had been told."""
+        """Whether frames may be missing: writes were not synced, and the computer has been rebooted since."""
         start = self.start
         return self.end is None and start is not None and not start.synced and start.boot != boot()
 
 
 def driver_past(frames: Sequence[bytes], briefing: Briefing, path: Path) -> DriverPast:
-    """What `frames` tell of the mission of `briefing`. Raises CorruptJournal."""
+    """Return the content of the journal at `path` from its `frames`.
+
+    Raises CorruptJournal if a frame is malformed or out of order, or if it is not the mission of `briefing`.
+    """
     ticks: list[DrivenTick] = []
     mark: tuple[float, ...] = ()
     marked: Mark | None = None

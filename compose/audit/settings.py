@@ -1,4 +1,4 @@
-"""The part of a scenario that follows from the rest of it: recomputed, not believed."""
+"""Audit rules for the part of a scenario that follows from the rest of it: the audit recomputes it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from world.scenario import Placed
 
 
 def scenario(case: Case) -> Checks:
-    """The scenario is one that `tandem run` accepts, and its orbits are those of its mission and anchors."""
+    """Check that `tandem run` accepts the scenario, and that its orbits follow from the rest of it."""
     told = case.history.scenario
     for why in (noise_obstacle(told.mission), safety_obstacle(told.mission)):
         yield _violation(None, why and f"mission.{why}")
@@ -31,9 +31,9 @@ def scenario(case: Case) -> Checks:
 
 
 def briefing(case: Testified) -> Checks:
-    """The orbits that a robot was told follow from the mission and the anchors that it was told.
+    """Check that the orbits in each robot's briefing follow from the mission and the anchors in it.
 
-    Where there is a world, `journals.briefing` compares the whole briefing with the scenario instead.
+    This is for hardware mode. With a world, `journals.briefing` compares the briefing with the scenario.
     """
     for robot, past in case.pasts.items():
         told = past.briefing
@@ -59,7 +59,7 @@ def _off_lie(robot: Placed) -> str | None:
 def _off_plan(
     found: Rendezvous, mission: Mission, variant: Variant, anchor: Anchor, peer: Anchor
 ) -> str | None:
-    """Why `found` is not the plan for these anchors; None if it is."""
+    """Return why `found` is not the plan for these anchors; None if it is."""
     distance = math.dist((anchor.x, anchor.y), (peer.x, peer.y))
     if distance < NEAREST_ANCHORS:
         return f"its anchor is {distance:.3g} m from its peer's, expected {NEAREST_ANCHORS:g} m at the least"

@@ -1,6 +1,6 @@
-"""Values that every trial of a sweep draws anew: fields of the scenario, and the robots' starts.
+"""Values drawn at random for every trial of a sweep: fields of the scenario, and the robots' starts.
 
-Every draw has a stream of its own, keyed by the trial's seed and the field: it depends on nothing else.
+Every draw has its own random stream. It depends only on the trial's seed and the name of the field.
 """
 
 from __future__ import annotations
@@ -23,13 +23,16 @@ Heading = Literal["any", "radial", "tangential", "collinear"]
 Start = tuple[float, float, float]
 
 NEAR = (1e-12, 1e-6)
-"""m: how far off its anchor a robot that starts near it is; log-uniform"""
+"""m: the interval of the distance between anchor and start for `near-anchor`; log-uniform"""
 OFF = (1e-16, 1e-3)
-"""rad, and of R: how far from exact a special heading or rim is; log-uniform, in half of the draws"""
+"""rad, or fraction of R: the interval of the deviation from a special heading or from the rim.
+
+Half of the draws have no deviation; in the other half it is log-uniform.
+"""
 
 
 class DrawTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """[[draw]]: a `field`, drawn from one of two distributions; times and over the values of other fields."""
+    """[[draw]]: a `field` drawn from one of two distributions, times and divided by other fields' values."""
 
     field: str
     uniform: Interval | None = None
@@ -39,14 +42,14 @@ class DrawTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class StartsTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """[starts]: the kinds of start that each robot draws from, all equally probable."""
+    """[starts]: the kinds of place and heading that each robot draws from, with equal probability."""
 
     places: Annotated[tuple[Place, ...], Meta(min_length=1)] = ("inside",)
     headings: Annotated[tuple[Heading, ...], Meta(min_length=1)] = ("any",)
 
 
 class Draw(msgspec.Struct, frozen=True):
-    """A field that every trial draws."""
+    """The distribution of a field that every trial draws: the validated form of a DrawTable."""
 
     field: str
     way: Steps
@@ -57,7 +60,7 @@ class Draw(msgspec.Struct, frozen=True):
 
 
 class Draws(msgspec.Struct, frozen=True):
-    """Everything that every trial of a sweep draws, in this order."""
+    """All draws of a trial of a sweep: first the fields, in order, then the starts."""
 
     fields: tuple[Draw, ...] = ()
     starts: StartsTable | None = None
@@ -66,7 +69,7 @@ class Draws(msgspec.Struct, frozen=True):
         return bool(self.fields) or self.starts is not None
 
     def table(self, base: Mapping[str, Any], seed: int) -> dict[str, Any]:
-        """Return the scenario table `base` with what the trial of that `seed` draws."""
+        """Return the scenario table `base` with the values drawn for the trial with `seed`."""
         table = dict(base)
         for draw in self.fields:
             value = _between(_stream(seed, draw.field), draw.interval, logarithmic=draw.logarithmic)
@@ -79,12 +82,12 @@ class Draws(msgspec.Struct, frozen=True):
         return table
 
     def values(self, table: Mapping[str, Any]) -> dict[str, float]:
-        """Return what `table` holds of the fields that are drawn."""
+        """Return the values in `table` of the fields that are drawn, by field."""
         return {draw.field: value_at(table, draw.way) for draw in self.fields}
 
 
 def _stream(seed: int, name: str) -> Callable[[], float]:
-    """Return a source of numbers uniform in [0, 1)."""
+    """Return a function that draws numbers uniform in [0, 1); its stream is keyed by `seed` and `name`."""
     return random.Random(f"{seed}/draw/{name}").random
 
 
@@ -98,12 +101,12 @@ def _one_of(draw: Callable[[], float], kinds: Sequence[T]) -> T:
 
 
 def _off(draw: Callable[[], float]) -> float:
-    """Return zero, or a little more or less."""
+    """Draw a deviation: zero with probability 1/2, else log-uniform in OFF with either sign."""
     return _one_of(draw, (0.0, 0.0, 1.0, -1.0)) * _between(draw, OFF)
 
 
 def _starts(kinds: StartsTable, table: Mapping[str, Any], seed: int) -> list[Start]:
-    """Return every robot's start; of a pair, the second may depend on the first."""
+    """Return the start of every robot; that of the second of a pair may depend on that of the first."""
     reach = float(table["mission"]["sensing_range"])
     robots = table["robot"]
     ids = [robot["id"] for robot in robots]
@@ -124,9 +127,9 @@ def _start(
     reach: float,
     first: Start | None,
 ) -> Start:
-    """Return a start at most `reach` from `anchor`.
+    """Return a start (x, y in m, heading in rad) at most `reach` m from `anchor`.
 
-    `other` is the peer's anchor, and `first` the peer's start, where that is drawn already.
+    `other` is the peer's anchor. `first` is the peer's start if it is drawn already, else None.
     """
     line = math.atan2(other[1] - anchor[1], other[0] - anchor[0])
     place, heading_kind = _one_of(draw, kinds.places), _one_of(draw, kinds.headings)
@@ -152,8 +155,10 @@ def _start(
 
 
 def _polar(place: Place, draw: Callable[[], float], line: float, reach: float) -> tuple[float, float]:
-    """Return the distance and the bearing of a start from its anchor; `line` is the bearing of the other
-    one."""
+    """Return the distance in m and the bearing in rad of a start from its anchor.
+
+    `line` is the bearing of the peer's anchor, and `reach` is R.
+    """
     rho, bearing = reach * math.sqrt(draw()), TAU * draw()
     match place:
         case "on-anchor":
@@ -169,7 +174,10 @@ def _polar(place: Place, draw: Callable[[], float], line: float, reach: float) -
 
 
 def _within(anchor: Sequence[float], rho: float, bearing: float, heading: float, reach: float) -> Start:
-    """Return the pose at `rho` and `bearing` from `anchor`, drawn in by rounding where that is outside."""
+    """Return the pose at `rho` and `bearing` from `anchor`.
+
+    If rounding puts it outside `reach`, `rho` is reduced until it is inside.
+    """
     less = 2.0**-53
     while True:
         x, y = anchor[0] + rho * math.cos(bearing), anchor[1] + rho * math.sin(bearing)

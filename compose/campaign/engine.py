@@ -1,4 +1,4 @@
-"""Where chunks are played: on a cluster in this process, or wherever a scheduler of Dask's has workers."""
+"""The execution of a sweep's chunks by Dask: on a cluster in this process, or on a scheduler's workers."""
 
 from __future__ import annotations
 
@@ -31,24 +31,24 @@ from protocol.terminal import one_line
 T = TypeVar("T")
 
 AHEAD = 2
-"""chunks for each thread that plays them: one that it plays, one that waits"""
+"""chunks submitted per worker thread: one that runs, and one that waits"""
 SCHEMES = ("tcp", "tls", "ws", "wss")
-"""of addresses of schedulers"""
+"""The schemes that the address of a scheduler may have."""
 CONNECT_S = 5.0
 LOOK_S = 1.0
-"""how often to look how many threads there are"""
+"""s between two counts of the worker threads"""
 RETRIES = 2
-"""of a chunk on whose worker no process for trials came up"""
+"""retries of a chunk whose worker could not start a process for trials"""
 LOOPBACK = "127.0.0.1:0"
 
 
 @contextmanager
 def connect(workers: int, scheduler: str | None) -> Iterator[Client]:
-    """Whoever plays chunks: so many threads here, or those at the address. Raises UserError."""
+    """Yield a client of `workers` threads in this process, or of a `scheduler`. Raises UserError."""
     dask.config.set({"distributed.comm.timeouts.connect": CONNECT_S, "distributed.admin.tick.limit": "1h"})
     for name in ["distributed", *logging.root.manager.loggerDict]:
         if name.partition(".")[0] == "distributed":
-            logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # what is to be said, we say
+            logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # this program reports errors itself
     if scheduler is not None:
         try:
             asyncio.run(_look_for(scheduler))
@@ -61,7 +61,7 @@ def connect(workers: int, scheduler: str | None) -> Iterator[Client]:
         return
     with (
         tempfile.TemporaryDirectory(prefix="tandem-dask-") as folder,
-        # a machine that sleeps suspends the scheduler and its worker alike: neither is lost
+        # no time to live for the worker: when the machine sleeps, scheduler and worker are both suspended
         dask.config.set({"temporary-directory": folder, "distributed.scheduler.worker-ttl": None}),
         LocalCluster(
             n_workers=1,
@@ -78,7 +78,7 @@ def connect(workers: int, scheduler: str | None) -> Iterator[Client]:
 
 
 async def _look_for(address: str) -> None:
-    """Raises an error unless a scheduler answers within CONNECT_S: a Client would wait for it without end."""
+    """Raise an error unless a scheduler answers within CONNECT_S: a Client would wait for it for ever."""
     scheme, location = parse_address(address)
     if scheme not in SCHEMES:
         raise ValueError(f"'{scheme}' is none of {', '.join(SCHEMES)}")
@@ -97,10 +97,10 @@ async def _look_for(address: str) -> None:
 def play(
     client: Client, work: Sequence[Work], orders: Orders, inbox: Inbox, done: Callable[[list[Row]], None]
 ) -> None:
-    """Have all of `work` played; `done` is given the rows of each chunk as it comes.
+    """Run all of `work`, and call `done` with the rows of each chunk as it completes.
 
-    Raises Interrupted when `inbox` says so, and EngineFailed where the scheduler is lost. Whichever way it
-    ends, nothing of it goes on anywhere.
+    Raises Interrupted if `inbox` receives a signal, and EngineFailed if the connection to the scheduler is
+    lost. In any case, all chunks are cancelled and their processes ended.
     """
     campaign = secrets.token_hex(8)
     flying: dict[str, tuple[Future[Any], Chunk, Work]] = {}
@@ -135,17 +135,20 @@ def play(
 
 
 def _rows(future: Future[Any], chunk: Chunk) -> list[Row]:
-    """Of a chunk that has ended; where that was not as it should, each trial is a row that says so."""
+    """Return the rows of a chunk that has ended; if its worker or process died, each row is a lost trial.
+
+    Raises EngineFailed if the result is lost, or if the worker failed for another reason.
+    """
     try:
         if future.status == "finished":
             return [msgspec.msgpack.decode(row, type=Row) for row in future.result(CONNECT_S)]
         error = future.exception(CONNECT_S) if future.status == "error" else None
-    except TimeoutError:  # whoever had the result has gone
+    except TimeoutError:  # the worker with the result is lost
         error = None
     if error is None:
         raise EngineFailed("the scheduler is lost")
     said = one_line(f"lost: {type(error).__name__}: {error}")[:MAX_ERROR]
-    if not isinstance(error, KilledWorker | owner.Died | owner.Hung):  # not of these trials, but of any
+    if not isinstance(error, KilledWorker | owner.Died | owner.Hung):  # every chunk would fail like this one
         raise EngineFailed(f"a worker cannot play trials: {said}")
     return [
         lost(chunk.cell, trial, seed, said, None)
@@ -154,7 +157,7 @@ def _rows(future: Future[Any], chunk: Chunk) -> list[Row]:
 
 
 def _threads(client: Client) -> int:
-    """How many play chunks now. Raises EngineFailed where the scheduler does not say."""
+    """Return the number of worker threads. Raises EngineFailed if the scheduler does not answer."""
     known = _within(CONNECT_S, client.nthreads)
     if known is None:
         raise EngineFailed(f"the scheduler has not answered for {CONNECT_S:g} s")
@@ -162,11 +165,11 @@ def _threads(client: Client) -> int:
 
 
 def _within(seconds: float, ask: Callable[[], T]) -> T | None:
-    """What it answers, if that comes in time: a host that is frozen would be waited for without end."""
+    """Return the result of `ask`; None if it fails, or takes longer than `seconds` (a frozen host)."""
     answers: SimpleQueue[T] = SimpleQueue()
 
     def wait() -> None:
-        with suppress(Exception):  # no answer, either
+        with suppress(Exception):  # a failure counts as no answer
             answers.put(ask())
 
     threading.Thread(target=wait, daemon=True).start()
@@ -176,11 +179,11 @@ def _within(seconds: float, ask: Callable[[], T]) -> T | None:
 
 
 def _leave(client: Client, campaign: str, flying: Sequence[Future[Any]]) -> None:
-    """Nobody waits for `flying` any more, and no process of the campaign stays."""
+    """Cancel the futures `flying`, and end all processes of the sweep."""
 
     def dismiss() -> None:
         client.cancel(flying, force=True)
         client.run(owner.dismiss, campaign)
 
-    _within(CONNECT_S, dismiss)  # where the scheduler is lost, its workers' processes end by themselves
+    _within(CONNECT_S, dismiss)  # if the scheduler is lost, its workers' processes end by themselves
     owner.dismiss(campaign)

@@ -1,7 +1,7 @@
-"""Who owns the processes in which trials run: one for each thread that plays chunks, kept between chunks.
+"""The pool of processes in which trials run: one per worker thread, reused from chunk to chunk.
 
-A trial that hangs or dies takes its process along, and nothing else: its row says how, and a fresh process
-goes on with the rest. So whoever hands out chunks sees only chunks that are done.
+If a trial hangs or its process dies, only that process is lost. The row of the trial contains the error, and
+a new process runs the remaining trials. Dask therefore sees only completed chunks.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from compose.forked import fork_server
 from protocol.terminal import one_line
 
 START_S = 60.0
-"""how long a process may take to import what it needs"""
+"""s that a new process has to import its modules"""
 READ_BYTES = 1 << 16
 
 
 class Died(Exception):
-    """A process has ended; the text says how."""
+    """A process has ended unexpectedly; the text says how."""
 
 
 class Hung(Exception):
-    """A process has not answered in time."""
+    """A process has not answered within its timeout."""
 
 
 class Child:
-    """A process in which trials run, in a session of its own: Ctrl-C reaches only who owns it."""
+    """A process in which trials run. It has its own session, so Ctrl-C reaches only its owner."""
 
     def __init__(self) -> None:
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # gone with the child
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # closed by `close`
         self._folder = tempfile.TemporaryDirectory(prefix="tandem-trials-", ignore_cleanup_errors=True)
         self._process = fork_server("compose.campaign.worker:warm_up").start(
             "compose.campaign.worker:main",
@@ -53,11 +53,11 @@ class Child:
         self._read = b""
 
     def ask(self, chunk: Chunk) -> None:
-        """Have it play the trials of `chunk`."""
+        """Send the trials of `chunk` to the process, which runs them."""
         self._process.hand(framed(msgspec.msgpack.encode(chunk)))
 
     def answer(self, timeout: float) -> bytes:
-        """The next frame. Raises Hung after `timeout` seconds without one, and Died."""
+        """Return the next frame. Raises Hung after `timeout` seconds, and Died if the process has ended."""
         give_up = time.monotonic() + timeout
         while (body := self._frame()) is None:
             if not self._poll.poll(max(0.0, 1e3 * (give_up - time.monotonic()))):
@@ -69,7 +69,7 @@ class Child:
         return body
 
     def _frame(self) -> bytes | None:
-        """The first of what has been read, if it is whole."""
+        """Remove and return the first frame that has been read; None if it is incomplete."""
         end = LENGTH_BYTES + int.from_bytes(self._read[:LENGTH_BYTES], "big")
         if len(self._read) < max(end, LENGTH_BYTES):
             return None
@@ -77,7 +77,7 @@ class Child:
         return body
 
     def _how(self) -> str:
-        if not self._process.wait(1.0):  # it has closed its standard output, and goes on
+        if not self._process.wait(1.0):  # it has closed its standard output, but still runs
             self.kill()
             return "it closed its standard output"
         status = self._process.status
@@ -88,18 +88,18 @@ class Child:
         return f"{how}: {last}" if last else how
 
     def kill(self) -> None:
-        """End it now. What its trials started ends with it."""
+        """Kill the process. Processes that its trials started end with it."""
         self._process.signal(signal.SIGKILL)
 
     def close(self) -> None:
-        """End it, and leave nothing of it behind."""
+        """Kill the process, and remove its files."""
         self._process.end()
         self._errors.close()
         self._folder.cleanup()
 
 
 class _Children:
-    """The processes that this one owns, by campaign and thread."""
+    """The processes of this pool, by sweep and thread."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -108,9 +108,9 @@ class _Children:
         self._over: set[str] = set()
 
     def take(self, campaign: str) -> tuple[Child, bool] | None:
-        """This thread's, and whether it has served before; None where the campaign is over.
+        """Return this thread's process and whether it is reused; None if the sweep is over.
 
-        Raises Died or Hung where a new one does not get ready.
+        Raises Died or Hung if a new process does not become ready.
         """
         key = campaign, threading.get_ident()
         with self._lock:
@@ -128,7 +128,7 @@ class _Children:
         return child, kept is not None
 
     def keep(self, campaign: str) -> None:
-        """This thread has no more use for its process, for now."""
+        """Store this thread's process for its next chunk; close it if the sweep is over."""
         key = campaign, threading.get_ident()
         with self._lock:
             child = self._working.pop(key)
@@ -138,7 +138,7 @@ class _Children:
         child.close()
 
     def drop(self, campaign: str) -> bool:
-        """This thread's process is of no more use; whether the campaign goes on."""
+        """Close this thread's process, and return whether the sweep is still running."""
         with self._lock:
             child = self._working.pop((campaign, threading.get_ident()))
             goes_on = campaign not in self._over
@@ -146,12 +146,12 @@ class _Children:
         return goes_on
 
     def dismiss(self, campaign: str) -> None:
-        """The campaign is over: no process of it stays, and none will start."""
+        """End all processes of the sweep, and start no more of them."""
         with self._lock:
             self._over.add(campaign)
             for key, child in self._working.items():
                 if key[0] == campaign:
-                    child.kill()  # its thread sees it die, and closes it
+                    child.kill()  # its thread sees that it has ended, and closes it
             idle = [self._resting.pop(key) for key in list(self._resting) if key[0] == campaign]
         for child in idle:
             child.close()
@@ -161,14 +161,14 @@ _children = _Children()
 
 
 def dismiss(campaign: str) -> None:
-    """End every process of the campaign that this process owns, now and for good."""
+    """End all processes of the sweep in this pool, and start no more of them."""
     _children.dismiss(campaign)
 
 
 def run(campaign: str, encoded: bytes) -> list[bytes]:
-    """The rows, encoded, of an encoded chunk of the campaign; not all of them where the campaign is over.
+    """Run an encoded chunk of the sweep, and return its encoded rows; fewer if the sweep is over.
 
-    Raises Died or Hung where no process comes up that could play trials.
+    Raises Died or Hung if no new process for trials becomes ready.
     """
     chunk = msgspec.msgpack.decode(encoded, type=Chunk)
     rows: list[bytes] = []
@@ -184,7 +184,7 @@ def run(campaign: str, encoded: bytes) -> list[bytes]:
         except Hung:
             error = f"hung: no answer within {chunk.timeout:g} s"
         except Died as death:
-            if kept and len(rows) == asked:  # perhaps it had ended by itself before: only a fresh one tells
+            if kept and len(rows) == asked:  # a reused process may have ended earlier: try a new one
                 _children.drop(campaign)
                 continue
             error = f"died: {death}"

@@ -1,8 +1,8 @@
-"""The gate before the SDK's server, which accepts whoever connects, web pages of any origin included.
+"""A proxy in front of the Foxglove SDK's server, which itself accepts web pages of any origin.
 
-The gate reads the head of each request, refuses what a foreign page asks, and hands on the rest to the SDK's
-server. That one listens on an address of 127.0.0.0/8 and a port that are drawn at random: some 2^38 places,
-too many for a page to try. Other programs of this machine may look, with or without a gate.
+The gate reads the head of each request, refuses requests of foreign web pages, and forwards all others to
+the SDK's server. That server listens on a random address of 127.0.0.0/8 and a random port: about 2^38
+combinations, too many for a page to try. The gate does not restrict other programs on this machine.
 """
 
 from __future__ import annotations
@@ -18,37 +18,40 @@ from contextlib import closing, suppress
 from compose.origin import refusal
 
 FOXGLOVE = ("https://app.foxglove.dev", "file://")
-"""origins of Foxglove's own app, in a browser and installed; not `null`, which any page can have"""
+"""The origins of Foxglove's app, in a browser and installed; not `null`, which any page can have."""
 HEAD_BYTES = 1 << 14
-"""a request may have before its body"""
+"""the maximum size in bytes of the head of a request"""
 HEAD_S = 10.0
-"""a request may take until its head is there"""
+"""s that the head of a request may take to arrive"""
 PIECE_BYTES = 1 << 16
 GUESTS = 64
-"""connections at once; more are turned away, or the SDK's server, short of descriptors, accepts no more"""
+"""The maximum number of connections; more are refused.
+
+Without a limit, the SDK's server would run out of descriptors, and accept no more.
+"""
 GUESTS_FILES = 3 * GUESTS + 120
-"""descriptors for them: of each, both of the gate's and the SDK's; and those that are being turned away"""
+"""descriptors for GUESTS: two in the gate and one in the SDK for each, and some for refused connections"""
 
 Place = tuple[str, int]
 
 
 def private_host() -> str:
-    """Return an address of loopback that nobody can guess."""
+    """Return a random loopback address, which a web page cannot guess."""
     return "127." + ".".join([str(1 + secrets.randbelow(254)) for _ in range(3)])
 
 
 class Gate:
-    """A port that hands on what may pass, in a thread of its own."""
+    """A listening port whose thread forwards the allowed connections to the SDK's server."""
 
     def __init__(self, taken: socket.socket, behind: Place, origins: Sequence[str]) -> None:
-        """`taken` listens; `behind` is where the SDK's server does; `origins` may ask beside FOXGLOVE."""
+        """`taken` is the listening socket, `behind` the SDK's server; `origins` are allowed like FOXGLOVE."""
         self._taken = taken
         self._behind = behind
         self._origins = (*FOXGLOVE, *origins)
         self._guests = 0
 
     def open(self) -> None:
-        """Begin; it ends with the process."""
+        """Start the thread, which ends with the process."""
         threading.Thread(target=lambda: asyncio.run(self._serve()), daemon=True).start()
 
     async def _serve(self) -> None:
@@ -85,7 +88,7 @@ class Gate:
         return refusal(values("host"), values("origin"), self._origins)
 
     async def _hand_on(self, head: bytes, reader: StreamReader, writer: StreamWriter) -> None:
-        """Both ways, until one end closes; who reads slowly holds up the SDK's server, not the gate."""
+        """Forward both ways until one end closes. A slow reader delays the SDK's server, not the gate."""
         there, back = await asyncio.open_connection(*self._behind)
         with closing(back):
             back.write(head)
