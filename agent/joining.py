@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import zenoh
 
@@ -19,6 +21,12 @@ SESSION_S = 3.0
 """how long to look for a world through one session, or to wait for a robot's former process to be gone"""
 ASK_AGAIN_S = 0.05
 """how long to wait before looking for a world again"""
+
+
+REFUSED_S = 1.0
+"""how long a refusal must last, with no briefing beside it, to be believed"""
+MOST_WORLDS = 8
+"""worlds that are asked for a briefing; anybody may show any number of them"""
 
 
 class Unwelcome(Exception):
@@ -40,17 +48,19 @@ class Search:
         self._began = time.monotonic()
         self._told = False
 
-    def go_on(self, *, linked: bool = False) -> None:
+    def go_on(self, *, linked: bool = False, why: str | None = None) -> None:
         """Wait a moment. Raises NoWorld when that has been too long, Interrupted when told to stop.
 
-        `linked`: there is a link to a router, and nothing of a world to be seen over it.
+        `linked`: there is a link to a router. `why` says what is wrong with what is seen over it.
         """
         waited = time.monotonic() - self._began
         if waited >= self._wait:
-            raise NoWorld(f"no {self._what}; gave up after {self._wait:g} s: {self._why(linked)}")
+            raise NoWorld(f"no {self._what}; gave up after {self._wait:g} s: {why or self._why(linked)}")
         if waited >= FIRST_WORD_S and not self._told:
             self._told = True
-            self._inbox.say(f"no {self._what} yet; looking for one for {self._wait:g} s: {self._why(linked)}")
+            self._inbox.say(
+                f"no {self._what} yet; looking for one for {self._wait:g} s: {why or self._why(linked)}"
+            )
         self.pause()
 
     def _why(self, linked: bool) -> str:
@@ -63,31 +73,46 @@ class Search:
         self._inbox.next(ASK_AGAIN_S)
 
 
-def join(link: zenoh.Session, run: str | None, robot: str, search: Search) -> tuple[str, Briefing] | None:
-    """The run that `robot` belongs to, and its briefing; `run` may name it. None after SESSION_S without.
+class _Offers(NamedTuple):
+    """What the worlds that are alive answer to a robot."""
 
-    A robot's former process may have ended just now, and seem to be there for a moment. Raises Unwelcome
-    if there are several runs, if the world has no such robot, or if somebody plays it all the time; whatever
-    `search` raises while there is no world.
+    briefings: dict[str, Briefing]
+    """by run"""
+    played: str | None
+    """a run in which the robot is there already"""
+    refusal: str | None
+    strange: str | None
+    """why an answer is not understood"""
+
+
+def join(link: zenoh.Session, run: str | None, robot: str, search: Search) -> tuple[str, Briefing] | None:
+    """Return the run that `robot` belongs to, and its briefing; None after SESSION_S without.
+
+    `run` may name it. A robot's former process may have ended just now, and seem to be there for a moment.
+    Strangers may show and answer anything, so a refusal is believed once it lasts for REFUSED_S.
+
+    Raises Unwelcome if there are several runs, if the world has no such robot, or if somebody plays it all the
+    time; whatever `search` raises while there is no world.
     """
     until = time.monotonic() + SESSION_S
+    refused: float | None = None
     played: str | None = None
     while time.monotonic() < until:
         worlds = [key.run for key in session.alive(link, keys.world_alive(run or "*"), QUERY_S)]
-        if len(worlds) > 1:
-            raise Unwelcome(f"several runs are alive: {', '.join(worlds)}; choose one with --run")
-        played = None
-        for world in worlds:
-            if session.alive(link, keys.robot_alive(world, robot), QUERY_S):
-                played = world
-                continue
-            answer = session.ask(link, keys.briefing(world, robot), QUERY_S)
-            if isinstance(answer, str):
-                raise Unwelcome(answer)
-            if answer is not None:
-                return world, _briefing(answer, robot)
-        if played is None:
-            search.go_on(linked=session.linked(link))
+        offers = _offers(link, worlds[:MOST_WORLDS], robot)
+        if len(offers.briefings) > 1:
+            raise Unwelcome(f"several runs are alive: {', '.join(offers.briefings)}; choose one with --run")
+        for found, briefing in offers.briefings.items():
+            return found, briefing
+        played = offers.played
+        if offers.refusal is None:
+            refused = None
+        elif refused is None:
+            refused = time.monotonic()
+        elif time.monotonic() > refused + REFUSED_S:
+            raise Unwelcome(offers.refusal)
+        if played is None and offers.refusal is None:
+            search.go_on(linked=session.linked(link), why=offers.strange)
         else:
             search.pause()
     if played is not None:
@@ -95,12 +120,32 @@ def join(link: zenoh.Session, run: str | None, robot: str, search: Search) -> tu
     return None
 
 
-def _briefing(answer: bytes, robot: str) -> Briefing:
-    """The briefing of `robot` in what the world answered. Raises Unwelcome."""
+def _offers(link: zenoh.Session, worlds: Sequence[str], robot: str) -> _Offers:
+    briefings: dict[str, Briefing] = {}
+    played = refusal = strange = None
+    for world in worlds:
+        if session.alive(link, keys.robot_alive(world, robot), QUERY_S):
+            played = world
+            continue
+        key = keys.briefing(world, robot)
+        answer = session.ask(link, key, QUERY_S, lambda frame: isinstance(_briefing(frame, robot), Briefing))
+        if isinstance(answer, str):
+            refusal = answer
+        elif answer is not None:
+            found = _briefing(answer, robot)
+            if isinstance(found, Briefing):
+                briefings[world] = found
+            else:
+                strange = found
+    return _Offers(briefings, played, refusal, strange)
+
+
+def _briefing(answer: bytes, robot: str) -> Briefing | str:
+    """Return the briefing of `robot` in a world's answer, or why there is none in it."""
     try:
         briefing = decode(answer, Briefing)
     except MalformedFrame as error:
-        raise Unwelcome(f"the world's briefing is not understood: {error}") from None
+        return f"the world's briefing is not understood: {error}"
     if briefing.robot != robot:
-        raise Unwelcome(f"the world's briefing is for '{briefing.robot}', not for '{robot}'")
+        return f"the world's briefing is for '{briefing.robot}', not for '{robot}'"
     return briefing

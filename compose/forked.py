@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import os
+import select
 import signal
 import socket
 import subprocess
@@ -52,6 +53,8 @@ KILL_S = 5.0
 """s that a killed process has to end; after that its fork server is considered hung, and is killed"""
 TAKE_S = 60.0
 """s to retry sending descriptors while too many are in flight: the fork server may still be importing"""
+LOOK_S = 1.0
+"""interval at which processes are looked at of which the fork server says nothing"""
 TRY_AGAIN_S = 0.01
 ENDED_BYTES = 8
 
@@ -100,6 +103,13 @@ class Process:
         """Wait for the process to end, and return its exit status; negative is the signal that killed it."""
         self._over.wait()
         return self._status
+
+    @property
+    def hung_up(self) -> bool:
+        """Whether it has closed its standard input, as it does by ending."""
+        poll = select.poll()
+        poll.register(self._stdin, 0)
+        return not self.running or bool(poll.poll(0))
 
     def wait(self, timeout: float) -> bool:
         """Wait at most `timeout` seconds, and return whether the process has ended."""
@@ -244,13 +254,32 @@ class ForkServer:
     def _listen(self) -> None:
         news = b""
         with suppress(OSError):
-            while received := self._socket.recv(4096):
+            while received := self._received():
                 news += received
                 while len(news) >= ENDED_BYTES:
                     one, news = Ended.read(news[:ENDED_BYTES]), news[ENDED_BYTES:]
                     self._running.pop(one.number).ended(one.status)
         self.gone = True
         self._end_all()
+
+    def _received(self) -> bytes:
+        """Return the next bytes from the server; none once it has ended.
+
+        A server that is suspended would not tell of ended processes: it is continued, then killed.
+        """
+        overdue: float | None = None
+        news = select.poll()
+        news.register(self._socket, select.POLLIN)
+        while not news.poll(1e3 * LOOK_S):
+            if not any(process.hung_up for process in tuple(self._running.values())):
+                overdue = None
+            elif overdue is None:
+                overdue = time.monotonic()
+            else:
+                self._process.send_signal(signal.SIGCONT)
+                if time.monotonic() > overdue + KILL_S:
+                    self._process.kill()
+        return self._socket.recv(4096)
 
     def _end_all(self) -> None:
         """No process outlasts the server."""

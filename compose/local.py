@@ -97,7 +97,7 @@ class Child:
         how = (
             f"was killed by signal {-self.status}" if self.status < 0 else f"ended with status {self.status}"
         )
-        return f"{how}: {said}" if (said := self.said()) else how
+        return f"{how}: {'; '.join(said.splitlines())}" if (said := self.said()) else how
 
     def hand(self, frame: bytes) -> None:
         """Send `frame`, preceded by its length, to the standard input of the process."""

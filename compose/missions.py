@@ -171,7 +171,9 @@ def _briefings(link: zenoh.Session, run: str, robots: set[str]) -> dict[str, byt
     until = time.monotonic() + ASK_S
     for robot in sorted(robots):
         if robot not in paired and time.monotonic() < until:
-            answer = session.ask(link, keys.briefing(run, robot), ASK_S)
+            answer = session.ask(
+                link, keys.briefing(run, robot), ASK_S, lambda frame: _said(frame, Briefing) is not None
+            )
             if isinstance(answer, bytes):
                 found[robot] = answer
                 briefing = _said(answer, Briefing)

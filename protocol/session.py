@@ -164,16 +164,27 @@ def linked(session: zenoh.Session) -> bool:
     return bool(session.info.routers_zid())
 
 
-def ask(session: zenoh.Session, key: str, timeout: float) -> bytes | str | None:
-    """What the queryable at `key` answers: a frame, or its refusal in words, or None if nobody is there."""
-    for reply in session.get(key, timeout=timeout):
+def ask(
+    session: zenoh.Session, key: str, timeout: float, is_understood: Callable[[bytes], bool] = lambda _: True
+) -> bytes | str | None:
+    """Return the answer at `key`: a frame that `is_understood`, else a refusal in words, else any frame.
+
+    None if nobody answers. Strangers may answer, too: whoever is understood is preferred.
+    """
+    refusal: str | None = None
+    strange: bytes | None = None
+    everyone, everything = zenoh.QueryTarget.ALL, zenoh.ConsolidationMode.NONE
+    for reply in session.get(key, timeout=timeout, target=everyone, consolidation=everything):
         if reply.ok is not None and str(reply.ok.key_expr) == key:
-            return reply.ok.payload.to_bytes()
-        if (
+            frame = reply.ok.payload.to_bytes()
+            if is_understood(frame):
+                return frame
+            strange = strange or frame
+        elif (
             reply.err is not None and reply.err.encoding == REFUSAL
         ):  # Zenoh's own is that nobody answered in time
-            return reply.err.payload.to_bytes()[:COMPLAINT].decode(errors="replace")
-    return None
+            refusal = refusal or reply.err.payload.to_bytes()[:COMPLAINT].decode(errors="replace")
+    return refusal if refusal is not None else strange
 
 
 def answer(session: zenoh.Session, key: str, reply: Callable[[str], Message | str]) -> None:

@@ -186,6 +186,16 @@ def test_what_is_drawn_is_within_its_interval_and_starts_are_within_range() -> N
     ("draw", "says"),
     [
         ('field = "mission.period"', "draw[0]: has one of 'uniform' and 'log_uniform'"),
+        ('field = "mission"\nuniform = [1, 2]', "draw[0].field: 'mission' is not a floating-point number"),
+        ('field = "robot"\nuniform = [1, 2]', "draw[0].field: 'robot' is not a floating-point number"),
+        ('field = "name"\nuniform = [1, 2]', "draw[0].field: 'name' is not a floating-point number"),
+        ('field = "max_ticks"\nuniform = [1, 2]', "draw[0].field: 'max_ticks' is not a floating-point"),
+        (
+            'field = "mission.period"\nuniform = [1, 2]\nover = ["robot.a.anchor[0]"]',
+            "draw[0].over: 'robot.a.anchor[0]' is 0",
+        ),
+        ('field = "mission.period"\nuniform = [-1e308, 1e308]', "draw[0]: from -1e+308 to 1e+308 is no"),
+        ('field = "mission.period"\nlog_uniform = [1e-308, 1e308]', "draw[0]: from 1e-308 to 1e+308 is too"),
         ('field = "mission.period"\nuniform = [2, 1]', "draw[0]: from 2 to 1 is no interval"),
         ('field = "mission.period"\nlog_uniform = [0, 1]', "draw[0]: from 0 to 1 is no interval above 0"),
         (

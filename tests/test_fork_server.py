@@ -21,6 +21,7 @@ from protocol.endpoints import at, listening
 from protocol.inbox import Inbox
 from tests.commands import (
     ENDLESS,
+    OVER,
     Command,
     journals,
     process_of,
@@ -46,6 +47,10 @@ def endless(tmp_path: Path) -> Path:
     path = tmp_path / "endless.toml"
     path.write_text(ENDLESS)
     return path
+
+
+def children_of(process: int) -> list[str]:
+    return Path(f"/proc/{process}/task/{process}/children").read_text().split()
 
 
 def parent_of(pid: int) -> int:
@@ -160,6 +165,17 @@ def test_a_run_whose_fork_server_is_stopped_can_be_stopped_all_the_same(
         run.tell(signal.SIGINT)
         assert run.ended().status == 130
     assert not processes_of(out)
+
+
+def test_a_run_whose_fork_server_is_suspended_comes_to_its_end() -> None:
+    with Command("run", "paper-1", "--rate", "20") as run:
+        until(lambda: fork_servers_of(run.pid), "there is a fork server")
+        (server,) = fork_servers_of(run.pid)
+        until(lambda: len(children_of(server)) == 3, "all processes run")
+        os.kill(server, SIGSTOP)
+        ended = run.ended()
+    assert ended.status in OVER
+    assert "paper-1: " in ended.out
 
 
 def test_the_more_robots_a_run_starts_the_longer_each_looks_for_its_world(

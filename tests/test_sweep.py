@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import json
 import os
 import re
@@ -24,7 +25,7 @@ import pytest
 from matplotlib.figure import Figure
 from scipy.stats import binomtest  # type: ignore[import-untyped]
 
-from compose.campaign import figures, report, run, spec
+from compose.campaign import engine, figures, report, run, spec
 from compose.campaign.cells import Refused, cells, setting_of, trial_seed
 from compose.campaign.summary import wilson
 from compose.campaign.table import schema_of
@@ -525,6 +526,22 @@ def test_a_setting_in_which_nobody_can_meet_is_a_refused_cell(folder: Path) -> N
     with pytest.raises(UserError, match="no cell can be played; cell 0: mission: a tick moves a robot by"):
         played(folder, "slow.toml", "none")
     assert not (folder / "none").exists()
+
+
+def test_a_campaign_in_which_none_localises_has_its_figures(folder: Path) -> None:
+    (folder / "short.toml").write_text(
+        'name = "short"\nscenario = "base.toml"\ntrials = 1\n[[axis]]\nfield = "max_ticks"\nvalues = [1, 2]\n'
+    )
+    ended = sweep(folder, "short.toml", "out", "--workers", "1")
+    assert (ended.status, ended.err) == (1, "")
+    assert (folder / "out" / "figures" / "ticks-max_ticks.svg").exists()
+
+
+def test_what_the_system_refuses_dask_is_told_as_such() -> None:
+    said = RuntimeError("Cluster failed to start")
+    said.__cause__ = OSError(errno.ENOSPC, "No space left on device")
+    with pytest.raises(OSError, match="No space left"), engine._system_errors():
+        raise said
 
 
 @pytest.mark.parametrize(("k", "n"), [(0, 1), (1, 1), (3, 10), (9990, 10_000), (0, 500), (500, 500)])

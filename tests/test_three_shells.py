@@ -8,10 +8,13 @@ from itertools import permutations
 from pathlib import Path
 
 import pytest
+import zenoh
 
 from compose.local import free_endpoint
+from compose.scenario import load
 from protocol import keys, session
-from protocol.endpoints import at
+from protocol.endpoints import at, listening
+from protocol.wire import encode
 from tests.commands import Command, journals, processes_of, several_pairs, tandem, world
 from tests.series import series
 
@@ -149,12 +152,45 @@ def test_an_agent_that_is_refused_leaves_the_mission_alone(paper_1: Path, tmp_pa
     assert journals(tmp_path) == journals(paper_1)
 
 
+@pytest.mark.parametrize("stranger", ["shows a world", "answers nonsense", "refuses", "answers for another"])
+def test_whatever_a_stranger_answers_an_agent_finds_its_world(stranger: str) -> None:
+    with (
+        world("paper-1", "--run", "mine") as (_, endpoint),
+        session.open_client(at(endpoint), unanswered) as link,
+    ):
+        key = keys.briefing("*", "*")
+
+        def reply(query: zenoh.Query) -> None:
+            if stranger == "refuses":
+                query.reply_err(b"go away", encoding=session.REFUSAL)
+            else:
+                frame = b"junk" if stranger == "answers nonsense" else encode(load("paper-1").briefing("b"))
+                query.reply(query.key_expr, frame)
+
+        if stranger == "shows a world":
+            _tokens = [session.show_alive(link, keys.world_alive(run)) for run in ("a", "yours", "z")]
+        else:
+            link.declare_queryable(key, reply)
+        with Command("agent", "a", "--connect", endpoint) as agent:
+            agent.until_says("a: in run mine, with b")
+
+
+def test_an_agent_that_is_answered_nonsense_alone_looks_on_and_says_why() -> None:
+    with session.open_router(listening(endpoint := free_endpoint())) as link:
+        _token = session.show_alive(link, keys.world_alive("mine"))
+        link.declare_queryable(keys.briefing("mine", "*"), lambda query: query.reply(query.key_expr, b"junk"))
+        ended = tandem("agent", "a", "--connect", endpoint, "--wait", "1")
+    assert ended.status == 3
+    assert "gave up after 1 s: the world's briefing is not understood: 4 bytes" in ended.err
+
+
 def test_an_agent_that_meets_several_runs_must_be_told_which() -> None:
     with (
         world("paper-1", "--run", "mine") as (_, endpoint),
         session.open_client(at(endpoint), unanswered) as link,
     ):
-        _token = session.show_alive(link, keys.world_alive("yours"))  # all that tells a world from afar
+        _token = session.show_alive(link, keys.world_alive("yours"))
+        session.answer(link, keys.briefing("yours", "a"), lambda _: load("paper-1").briefing("a"))
         ended = tandem("agent", "a", "--connect", endpoint)
         says = "tandem agent: several runs are alive: mine, yours; choose one with --run\n"
         assert ended == (2, "", says)

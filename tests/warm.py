@@ -66,6 +66,7 @@ def main() -> None:
     """Run the command whose file sys.argv names, in this forked process."""
     with open(sys.argv[1], "rb") as file:
         command = msgspec.msgpack.decode(file.read(), type=Command)
+    os.dup(0)  # that stays open: a fork server takes a process that closes it for one that has ended
     for path, stream, flags in ((sys.argv[2], 1, os.O_WRONLY), (os.devnull, 0, os.O_RDONLY)):
         opened = os.open(path, flags)
         os.dup2(opened, stream)

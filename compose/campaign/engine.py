@@ -60,6 +60,7 @@ def connect(workers: int, scheduler: str | None) -> Iterator[Client]:
             yield client
         return
     with (
+        _system_errors(),
         tempfile.TemporaryDirectory(prefix="tandem-dask-") as folder,
         # no time to live for the worker: when the machine sleeps, scheduler and worker are both suspended
         dask.config.set({"temporary-directory": folder, "distributed.scheduler.worker-ttl": None}),
@@ -75,6 +76,20 @@ def connect(workers: int, scheduler: str | None) -> Iterator[Client]:
         Client(cluster, set_as_default=False) as client,
     ):
         yield client
+
+
+@contextmanager
+def _system_errors() -> Iterator[None]:
+    """Raise what the system refused as the OSError that it is: Dask makes a RuntimeError of it."""
+    try:
+        yield
+    except RuntimeError as error:
+        cause: BaseException | None = error
+        while cause is not None and not isinstance(cause, OSError):
+            cause = cause.__cause__
+        if cause is None:
+            raise
+        raise cause from None
 
 
 async def _look_for(address: str) -> None:

@@ -130,6 +130,9 @@ def ticks_against(results: Results, place: int) -> Figure:
         axes.plot([], [], color="0.3", ls="", marker="|", ms=8, label="up to 95 %")
     axes.plot([], [], color="0.3", ls="", marker="o", ms=4, mfc="white", label="maximum")
     axes.set_ylabel("ticks until localised (median)")
+    if not any(counted(table).ticks_p50 is not None for _, tables in lines for table in tables):
+        axes.annotate("none localised", (0.5, 0.5), xycoords="axes fraction", ha="center")
+        return figure
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter("{x:.0f}")
     axes.yaxis.set_minor_formatter(LogFormatter(labelOnlyBase=False, minor_thresholds=(1.0, 0.4)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,7 +13,7 @@ from msgspec import Meta
 
 from compose import scenario
 from compose.campaign.draws import Draw, Draws, DrawTable, StartsTable
-from compose.campaign.fields import NoSuchField, Steps, canonical, jsonable, steps, value_at
+from compose.campaign.fields import NoSuchField, Steps, canonical, jsonable, steps, value_at, with_value
 from compose.status import UserError
 from compose.toml import NotToml, field_first, read_text, table_in
 from protocol.units import NAME
@@ -205,7 +205,9 @@ def _value(value: Any, where: str, fields: Sequence[str] | None) -> tuple[Any, .
 
 def _draws(spec: SpecFile, axes: Sequence[Axis], base: dict[str, Any], source: str) -> tuple[Draw, ...]:
     """Return the fields that every trial draws. Raises BadSpec."""
-    known = {way for axis in axes for way in axis.ways}
+    known: dict[Steps, tuple[Any, ...]] = {
+        way: tuple(value[i] for value in axis.values) for axis in axes for i, way in enumerate(axis.ways)
+    }
     draws: list[Draw] = []
     for i, table in enumerate(spec.draw):
         where = f"{source}: draw[{i}]"
@@ -214,10 +216,13 @@ def _draws(spec: SpecFile, axes: Sequence[Axis], base: dict[str, Any], source: s
         interval = table.uniform or table.log_uniform
         assert interval is not None
         low, high = interval
-        if not -math.inf < low < high < math.inf or (table.log_uniform is not None and low <= 0.0):
+        if not low < high or not math.isfinite(high - low) or (table.log_uniform is not None and low <= 0.0):
             above = " above 0" if table.log_uniform is not None else ""
             raise BadSpec(f"{where}: from {low:g} to {high:g} is no interval{above}")
+        if table.log_uniform is not None and not math.isfinite(high / low):
+            raise BadSpec(f"{where}: from {low:g} to {high:g} is too wide")
         (way,) = _numbers([table.field], f"{where}.field", base)
+        _check_takes_float(table.field, way, low, base, f"{where}.field")
         draws.append(
             Draw(
                 table.field,
@@ -225,11 +230,20 @@ def _draws(spec: SpecFile, axes: Sequence[Axis], base: dict[str, Any], source: s
                 interval,
                 table.log_uniform is not None,
                 _known(table.times, f"{where}.times", base, known),
-                _known(table.over, f"{where}.over", base, known),
+                _known(table.over, f"{where}.over", base, known, zero=False),
             )
         )
-        known.add(way)
+        known[way] = ()
     return tuple(draws)
+
+
+def _check_takes_float(field: str, way: Steps, value: float, base: dict[str, Any], where: str) -> None:
+    """Raises BadSpec where the field at `way` is not a float; other bounds are each trial's."""
+    try:
+        msgspec.convert(with_value(base, way, value + 0.5), scenario.ScenarioFile)
+    except msgspec.ValidationError as error:
+        if "got `float`" in str(error):
+            raise BadSpec(f"{where}: '{field}' is not a floating-point number, and cannot be drawn") from None
 
 
 def _numbers(fields: Sequence[str], where: str, base: dict[str, Any]) -> tuple[Steps, ...]:
@@ -244,17 +258,27 @@ def _numbers(fields: Sequence[str], where: str, base: dict[str, Any]) -> tuple[S
 
 
 def _known(
-    fields: Sequence[str], where: str, base: dict[str, Any], varied: Collection[Steps]
+    fields: Sequence[str],
+    where: str,
+    base: dict[str, Any],
+    varied: Mapping[Steps, tuple[Any, ...]],
+    *,
+    zero: bool = True,
 ) -> tuple[Steps, ...]:
-    """Return the ways to `fields`, whose values are known when they are needed. Raises BadSpec."""
+    """Return the ways to `fields`, whose values are known when they are needed. Raises BadSpec.
+
+    `varied` are the values of the fields that axes set, none of those that are drawn; `zero`: one may be 0.
+    """
     ways = _numbers(fields, where, base)
     for field, way in zip(fields, ways, strict=True):
         try:
-            value = 1.0 if way in varied else value_at(base, way)
+            values = varied[way] if way in varied else (value_at(base, way),)
         except (KeyError, IndexError):
             raise BadSpec(f"{where}: '{field}' is neither in the scenario nor drawn before") from None
-        if isinstance(value, bool) or not isinstance(value, int | float):
+        if any(isinstance(value, bool) or not isinstance(value, int | float) for value in values):
             raise BadSpec(f"{where}: '{field}' is not a number")
+        if 0 in values and not zero:
+            raise BadSpec(f"{where}: '{field}' is 0, by which nothing can be divided")
     return ways
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import ipaddress
+import logging
 import signal
 import socket
 from collections.abc import AsyncIterator, Callable
@@ -238,6 +239,9 @@ Ready = Callable[[Callable[[], None]], None]
 def serve(site: Site, taken: socket.socket, ready: Ready) -> None:
     """Serve `site` until SIGINT, SIGTERM or SIGHUP, or until what `ready` is given is called."""
     asyncio.run(_serve(site, taken, ready))
+
+
+logging.getLogger("uvicorn").addHandler(logging.NullHandler())  # what is to be said, we say
 
 
 async def _serve(site: Site, taken: socket.socket, ready: Ready) -> None:
