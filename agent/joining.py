@@ -91,8 +91,8 @@ def join(link: zenoh.Session, run: str | None, robot: str, search: Search) -> tu
     `run` may name it. A robot's former process may have ended just now, and seem to be there for a moment.
     Strangers may show and answer anything, so a refusal is believed once it lasts for REFUSED_S.
 
-    Raises Unwelcome if there are several runs, if the world has no such robot, or if somebody plays it all the
-    time; whatever `search` raises while there is no world.
+    Raises Unwelcome if there are several runs, if the world has no such robot, or if somebody plays it all
+    the time; whatever `search` raises while there is no world.
     """
     until = time.monotonic() + SESSION_S
     refused: float | None = None
