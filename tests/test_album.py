@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Sequence
 from itertools import combinations
@@ -357,7 +358,7 @@ def test_each_kind_is_drawn_of_each_run_or_says_why_not(
     told = pair(recorded(name, records))
     kinds = [kind for kind in PICTURES if kind != "robot"]
     done: list[None] = []
-    draw_all(told, kinds, ["svg"], tmp_path, lambda: done.append(None))
+    draw_all(told, kinds, ["svg"], tmp_path, lambda: done.append(None), torn=False)
     assert len(done) == len(kinds)
     out, err = capsys.readouterr()
     made = {path.stem for path in tmp_path.iterdir()}
@@ -476,6 +477,19 @@ def test_a_terminal_shows_how_far_it_is_and_each_file_on_a_line_of_its_own(
     percentages = [int(percentage) for percentage in re.findall(r"(\d+)%", shown)]
     assert percentages == sorted(percentages)
     assert (percentages[0], percentages[-1]) == (0, 100)
+
+
+@pytest.mark.parametrize(("journal", "torn"), [("world.journal", "the world"), ("agent-b.journal", "b")])
+def test_of_a_record_that_breaks_off_nothing_is_said_to_be_absent(
+    paper_1: Path, journal: str, torn: str, tmp_path: Path
+) -> None:
+    copied(paper_1, tmp_path)
+    os.truncate(tmp_path / journal, 1000)
+    ended = tandem("figures", tmp_path, "--only", "plan", "--only", "encounter", "--format", "svg")
+    assert f"tandem figures: the record of {torn} breaks off before the mission's end\n" in ended.err
+    reasons = re.findall(r"no [\w-]+: (.*)", ended.err)
+    assert reasons
+    assert all(reason.startswith("as far as the record goes, ") for reason in reasons)
 
 
 @pytest.mark.parametrize("words", [("--only", "plans"), ("--format", "jpg")])

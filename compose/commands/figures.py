@@ -40,13 +40,17 @@ def main(options: argparse.Namespace) -> int:
                 if account is None or account.broken is not None:
                     status = FAILED
                 done()
+            torn = [name for name, one in accounts.items() if one.past is not None and one.past.end is None]
+            torn += ["the world"] if record is not None and record.end is None else []
+            if torn:
+                _say(f"the record of {' and '.join(torn)} breaks off before the mission's end")
             pair = _pair(record, robots, accounts)
             if pair is None:
                 _say(f"no picture of {' and '.join(robots)}: nothing is on record")
                 status = FAILED
                 continue
             try:
-                draw(pair, kinds, formats, folder, done)
+                draw(pair, kinds, formats, folder, done, torn=bool(torn))
             except BrokenPipeError:
                 raise
             except OSError as error:
@@ -74,10 +78,17 @@ def _pair(record: Record | None, robots: Sequence[str], accounts: Mapping[str, A
 
 
 def draw(
-    pair: Pair, kinds: Sequence[str], formats: Sequence[str], folder: Path, done: Callable[[], None]
+    pair: Pair,
+    kinds: Sequence[str],
+    formats: Sequence[str],
+    folder: Path,
+    done: Callable[[], None],
+    *,
+    torn: bool,
 ) -> None:
-    """A line for each file that is written, and for each picture that does not apply; `done` after a kind.
+    """Print a line for each file that is written, and for each picture that does not apply.
 
+    `done` is called after each kind. `torn`: the record breaks off, and what it lacks may have happened.
     Raises OSError.
     """
     from compose.figures import album, style  # noqa: PLC0415
@@ -88,7 +99,7 @@ def draw(
         with album.settings(kind):
             for name, figure in album.pictures(pair, kind):
                 if isinstance(figure, Absent):
-                    _say(f"no {name}: {figure.why}")
+                    _say(f"no {name}: {'as far as the record goes, ' if torn else ''}{figure.why}")
                     continue
                 for path in style.save(figure, folder / name, formats):
                     say(str(path))
