@@ -33,7 +33,7 @@ from tests.stage import Stage
 from world.driver import THINKING, Reading
 from world.driver_journal import DrivenTick, DriverPast
 from world.ending import LAST_WORDS, Ending
-from world.field import UNANSWERED_S, UNHEARD, Field
+from world.field import UNHEARD, Field
 
 Answer = Callable[[int], Iterable[bytes]]
 """what somebody says to the Sense of a tick"""
@@ -390,31 +390,3 @@ def test_a_robot_that_was_killed_waits_for_its_agent_however_long_its_peer_is_th
     tick, began = driver.ticks[0]
     assert tick == 20
     assert began == pytest.approx(3.0)
-
-
-def test_an_agent_that_is_not_heard_is_sent_nothing_more_until_it_is_back(stage: Stage) -> None:
-    """It then replaces its link, over which what it said was lost."""
-    driver = Recorded()
-    driver.clock = stage.monotonic
-    field = Field(driver, BRIEFING, "r", stage, max_ticks=100, manoeuvre_s=MANOEUVRE_S)
-    back = UNANSWERED_S + 4.0
-    sent: list[tuple[float, int]] = []
-
-    def answer(key: str, frame: bytes) -> None:
-        if key != keys.sense("r", "a"):
-            return
-        message = decode(frame, Sense | End | Farewell)
-        if isinstance(message, Sense):
-            sent.append((stage.now, message.tick))
-            if stage.now >= back:
-                drive = Drive(message.tick, "a", 0.0, 0.0, 1, "straight")
-                stage.comes("drive", keys.drive("r", "a"), encode(drive), 0.001)
-
-    stage.answer = answer
-    stage.alive("a", "b")
-    stage.comes("alive", keys.robot_alive("r", "a"), after=back)
-    field.attach(LINK)
-    end = field.play(10.0, lambda: None)
-    assert (end.outcome, end.tick) == ("undecided", 100)
-    assert not [tick for now, tick in sent if UNANSWERED_S + 0.01 < now < back]
-    assert {tick for now, tick in sent if now >= back} == {*range(101)}

@@ -36,10 +36,6 @@ ASTRAY = 64
 UNKNOWN = -math.inf
 """a time; clocks may begin at 0, and what is late lies before that"""
 
-UNANSWERED_S = 3.0
-"""an agent that is there and has answered nothing for so long is sent no new Sense: a link can carry frames
-one way only, and an agent that hears nothing replaces its link; once it is back, it is sent what it missed"""
-
 UNHEARD = 4.0
 """ticks within which a robot that goes on tells that it does"""
 
@@ -95,8 +91,6 @@ class Field:
         self._alive: set[str] = set()
         self._unanswered: deque[tuple[int, bytes]] = deque()
         """Senses that the agent has not answered"""
-        self._held_back = False
-        """whether some of them have not been sent"""
         self._answered = 0.0
         """when it last did; one that only appears, be it over and over, has not"""
         self._tick = -1
@@ -207,10 +201,7 @@ class Field:
         sense = _sense(reading, tick, self._briefing)
         self._write(*_mark(reading, tick, self._id), sense)
         self._unanswered.append((tick, sense))
-        if len(self._unanswered) == 1 or time.monotonic() < self._answered + UNANSWERED_S:
-            self._sense.put(sense)
-        else:
-            self._held_back = True
+        self._sense.put(sense)
         drive = self._awaited(tick)
         until = time.monotonic()
         if drive is not None:
@@ -272,7 +263,8 @@ class Field:
             case "alive":
                 self._alive.add(arrival.source.robot)
                 if arrival.source.robot == self._id:
-                    self._send_unanswered()
+                    for _, frame in self._unanswered:  # while it was away
+                        self._sense.put(frame)
             case "gone":
                 self._alive.discard(arrival.source.robot)
             case "ended":
@@ -302,15 +294,7 @@ class Field:
         while self._unanswered and self._unanswered[0][0] <= drive.tick:
             self._unanswered.popleft()
             self._answered = time.monotonic()
-        if self._held_back:
-            self._send_unanswered()
         return drive
-
-    def _send_unanswered(self) -> None:
-        """Send the Senses again that the agent missed while it was away, or was not heard."""
-        self._held_back = False
-        for _, frame in self._unanswered:
-            self._sense.put(frame)
 
     def _on_beat(self, arrival: Arrival) -> None:
         """b's next tick begins as many ticks after that of a's as it is farther on: at once, if it is not.

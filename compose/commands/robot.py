@@ -126,7 +126,6 @@ def _play(options: argparse.Namespace, field: Field, reached: Endpoints, folder:
     own = free_endpoint("tls" if keys else "tcp")
     endpoints = Endpoints(reached.connect, (own, *reached.listen), reached.settings, reached.folder)
     with session.open_router(endpoints, RELISTEN_S) as link:
-        field.attach(link)  # before anybody can come
         agent = Agent(
             [
                 *("agent", options.id, "--connect", own, "--launched", "--run", field.run, *keys),
@@ -136,6 +135,7 @@ def _play(options: argparse.Namespace, field: Field, reached: Endpoints, folder:
             inbox,
         )
         try:
+            field.attach(link)
             if not options.quiet:
                 where = f", again, from tick {field.tick} on" if field.tick >= 0 else ", waiting for its peer"
                 say(f"{options.id}: in run {field.run}{where}")
