@@ -76,10 +76,12 @@ def draft(path: Path, mode: int = 0o666) -> Iterator[Path]:
     The file is locked while the block runs. Files of earlier processes that were killed have no lock, and
     are removed. The umask applies to `mode`. Raises OSError, which names `path`.
     """
-    for left in path.parent.glob(f".{_literal(path.name)}.*{DRAFT}"):
-        _remove_abandoned(left)
-    place = path.with_name(f".{path.name}.{os.getpid()}{DRAFT}")
-    file = os.open(place, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
+    try:
+        place, file = _new(path, 0, mode)
+    except FileExistsError:  # a process was killed, or writes the same file now
+        for left in path.parent.glob(f".{_literal(path.name)}.*{DRAFT}"):
+            _remove_abandoned(left)
+        place, file = _new(path, os.getpid(), mode)
     try:
         _lock(file)
         yield place
@@ -90,6 +92,12 @@ def draft(path: Path, mode: int = 0o666) -> Iterator[Path]:
     finally:
         os.close(file)
         place.unlink(missing_ok=True)
+
+
+def _new(path: Path, owner: int, mode: int) -> tuple[Path, int]:
+    """Return a new draft of `path` and its descriptor; `owner` tells drafts apart. Raises FileExistsError."""
+    place = path.with_name(f".{path.name}.{owner}{DRAFT}")
+    return place, os.open(place, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
 
 
 def _literal(name: str) -> str:

@@ -390,3 +390,27 @@ def test_a_robot_that_was_killed_waits_for_its_agent_however_long_its_peer_is_th
     tick, began = driver.ticks[0]
     assert tick == 20
     assert began == pytest.approx(3.0)
+
+
+def test_a_robot_whose_driver_takes_a_whole_tick_to_sense_hears_its_agent(stage: Stage) -> None:
+    class Slow(Recorded):
+        def sense(self, tick: int) -> Reading:
+            stage.now += 2.0 * MANOEUVRE_S
+            return super().sense(tick)
+
+    driver = Slow()
+    driver.clock = stage.monotonic
+    field = Field(driver, BRIEFING, "r", stage, max_ticks=100, manoeuvre_s=MANOEUVRE_S, patience=1.0)
+
+    def answer(key: str, frame: bytes) -> None:
+        if key == keys.sense("r", "a"):
+            message = decode(frame, Sense | End | Farewell)
+            if isinstance(message, Sense):
+                drive = Drive(message.tick, "a", 1.0, 0.0, 1, "straight")
+                stage.comes("drive", keys.drive("r", "a"), encode(drive), 0.001)
+
+    stage.answer = answer
+    stage.alive("a", "b")
+    field.attach(LINK)
+    end = field.play(10.0, lambda: None)
+    assert (end.outcome, end.tick) == ("undecided", 100)

@@ -18,7 +18,7 @@ import msgspec
 import zenoh
 
 from protocol import keys, session
-from protocol.inbox import Arrival, Inbox
+from protocol.inbox import NOTHING, Arrival, Inbox
 from protocol.journal import Sink
 from protocol.messages import Beat, Briefing, Contact, Drive, End, Farewell, Report, Sense, Verdict
 from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode, encode
@@ -33,6 +33,8 @@ FAREWELL_S = 2.0
 ASTRAY = 64
 """ticks that a's beat may be ahead of b; a beat of long ago is of an a that was started again, and lost"""
 
+AT_ONCE = 1000
+"""messages that are taken without a look at the clock"""
 UNKNOWN = -math.inf
 """a time; clocks may begin at 0, and what is late lies before that"""
 
@@ -212,6 +214,7 @@ class Field:
             self.missed += 1
         while (now := time.monotonic()) < max(until, self._next):
             self._take(self._inbox.next(max(until, self._next) - now))
+        self._take_waiting()
         if self._unanswered and now - self._answered > self._patience:
             return End(tick, "failed", f"no answer from {self._id}'s agent for {self._patience:g} s")
         return self._ending.after(tick, drive, peer_there=self._peer in self._alive)
@@ -250,6 +253,14 @@ class Field:
         return None
 
     # --- what arrives ---
+
+    def _take_waiting(self) -> None:
+        """Take what has arrived by now: with a driver whose `sense` lasts for a tick, nobody else looks."""
+        for _ in range(AT_ONCE):
+            arrival = self._inbox.next(0.0)
+            if arrival is NOTHING:
+                return
+            self._take(arrival)
 
     def _take(self, arrival: Arrival) -> Drive | None:
         """Do what is to be done about it; the agent's Drive, if it is one, of whichever tick."""

@@ -138,8 +138,8 @@ def play(
             if arrival.key in flying:
                 future, chunk, source = flying.pop(arrival.key)
                 rows = _rows(future, chunk)
-                source.played += len(rows)
-                source.played_s += sum([orders.timeout if row.wall_s is None else row.wall_s for row in rows])
+                took_s = sum([orders.timeout if row.wall_s is None else row.wall_s for row in rows])
+                source.took(len(rows), took_s)
                 done(rows)
             if time.monotonic() - looked > LOOK_S:
                 if client.status not in ("running", "connecting"):

@@ -24,6 +24,10 @@ FIRST_CHUNK = 8
 """trials, while nobody knows how long one takes; as processes one, which takes most of a second"""
 
 
+FADES = 0.8
+"""weight of what was known of the time that trials take, beside that of a chunk that has just ended"""
+
+
 class EngineFailed(Exception):
     """The campaign cannot go on; the text says why."""
 
@@ -40,9 +44,15 @@ class Work(msgspec.Struct):
     """of its scenario's file"""
     given: int = 0
     """how many have been handed out"""
-    played: int = 0
+    played: float = 0.0
+    """trials that have ended; the older, the less they count"""
     played_s: float = 0.0
     """s of wall time that those took"""
+
+    def took(self, trials: int, wall_s: float) -> None:
+        """Count `trials` that took `wall_s` in all: what comes next will take about as long."""
+        self.played = FADES * self.played + trials
+        self.played_s = FADES * self.played_s + wall_s
 
     def size(self, threads: int, first: int) -> int:
         """How many trials to hand out at once, so that near the end all threads have some."""
