@@ -177,12 +177,17 @@ def main() -> None:
     print(f"ranging at 127.0.0.1:{air.getsockname()[1]}", flush=True)
     told: dict[tuple[str, str], tuple[float, float]] = {}
     senders: dict[str, tuple[str, int]] = {}
+    latest: dict[str, int] = {}
     while True:
         message, sender = air.recvfrom(1024)
         one = json.loads(message)
         robot, peer, tick = one["robot"], one["peer"], one["tick"]
         senders[robot] = sender
         told.pop((robot, "parked"), None)  # it goes on, or is parked elsewhere
+        for again in range(tick, latest.get(robot, tick)):  # it begins anew
+            told.pop((robot, str(again + 1)), None)
+            told.pop((robot, str(again)), None)
+        latest[robot] = tick
         place = told.setdefault((robot, "parked" if one["parked"] else str(tick)), (one["x"], one["y"]))
         other = told.get((peer, str(tick)), told.get((peer, "parked")))
         if other is not None and not one["parked"]:
@@ -190,6 +195,8 @@ def main() -> None:
             answer = json.dumps({"tick": tick, "range": rho if rho <= options.reach else None}).encode()
             for name in {robot, peer} & senders.keys():
                 air.sendto(answer, senders[name])
+        elif latest.get(peer, tick) > tick:  # and will not stand in this one any more
+            air.sendto(json.dumps({"tick": tick, "range": None}).encode(), sender)
 
 
 if __name__ == "__main__":

@@ -208,8 +208,8 @@ class Field:
         until = time.monotonic()
         if drive is not None:
             self._write(encode(drive))
-            until = time.monotonic() + self._manoeuvre_s
             self._set_off(drive)
+            until = time.monotonic() + self._manoeuvre_s
         else:
             self.missed += 1
         while (now := time.monotonic()) < max(until, self._next):
