@@ -69,6 +69,8 @@ class AgentProcess:
         self._link = Link(briefing, run, inbox)
         self._disorder = Disorder(self._id, inbox, self._link.appear, real_time=real_time)
         self._post = Post(inbox, memory.heard, real_time=real_time)
+        self._gone = False
+        """whether it has been told that the world has gone"""
         self._said_again = 0.0
         """when all was last said again"""
         self._again: float | None = None
@@ -97,8 +99,7 @@ class AgentProcess:
                     self._post.take(arrival, self._known)
                 case "gone" | "alive":
                     self._disorder.world(there=arrival.topic == "alive")
-                    if arrival.topic == "gone":
-                        self._inbox.say(f"the world has gone; waiting {self._silence:g} s for it")
+                    self._notice(gone=arrival.topic == "gone")
                 case _:
                     pass
             if self.end is None:
@@ -108,8 +109,15 @@ class AgentProcess:
 
     def unanswered(self) -> None:
         """Wait a moment for another link. Raises NoWorld when that has been too long, or Interrupted."""
+        self._notice(gone=True)
         self._inbox.next(ASK_AGAIN_S)
         self._check_patience()
+
+    def _notice(self, *, gone: bool) -> None:
+        """Tell once that the world has gone: its sign of life may have ended before it was seen."""
+        if gone and not self._gone:
+            self._inbox.say(f"the world has gone; waiting {self._silence:g} s for it")
+        self._gone = gone
 
     def attach(self, link: zenoh.Session) -> None:
         """From now on, this is the session over which it hears and is heard."""

@@ -99,7 +99,7 @@ def draw(
         with album.settings(kind):
             for name, figure in album.pictures(pair, kind):
                 if isinstance(figure, Absent):
-                    _say(f"no {name}: {'as far as the record goes, ' if torn else ''}{figure.why}")
+                    _say(f"no {name}: {figure.why}{' (as far as the record goes)' if torn else ''}")
                     continue
                 for path in style.save(figure, folder / name, formats):
                     say(str(path))
