@@ -74,7 +74,7 @@ class Search:
 
 
 class _Offers(NamedTuple):
-    """What the worlds that are alive answer to a robot."""
+    """The answers to a robot of the worlds that are alive."""
 
     briefings: dict[str, Briefing]
     """by run"""

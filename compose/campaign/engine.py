@@ -35,6 +35,8 @@ AHEAD = 2
 SCHEMES = ("tcp", "tls", "ws", "wss")
 """The schemes that the address of a scheduler may have."""
 CONNECT_S = 5.0
+RESULT_S = 60.0
+"""how long a result may take to come from a worker that has it, on a machine that is busy, too"""
 LOOK_S = 1.0
 """s between two counts of the worker threads"""
 RETRIES = 2
@@ -156,8 +158,8 @@ def _rows(future: Future[Any], chunk: Chunk) -> list[Row]:
     """
     try:
         if future.status == "finished":
-            return [msgspec.msgpack.decode(row, type=Row) for row in future.result(CONNECT_S)]
-        error = future.exception(CONNECT_S) if future.status == "error" else None
+            return [msgspec.msgpack.decode(row, type=Row) for row in future.result(RESULT_S)]
+        error = future.exception(RESULT_S) if future.status == "error" else None
     except TimeoutError:  # the worker with the result is lost
         error = None
     if error is None:
