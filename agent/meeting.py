@@ -80,7 +80,8 @@ def _settled(mind: Mind) -> Mind:
     assert began is not None
     sightings = mind.sightings(began if variant == "paper" else 0)
     ranged = [at for at in sightings if at.range is not None]
-    base = encounter.base([at for at in ranged if off_anchor(at.b, mind.briefing.rendezvous.b)])
+    away = [at for at in ranged if off_anchor(at.b, mind.briefing.rendezvous.b)]
+    base = encounter.base(away, precision.drift(mind))
     if base is None:  # yet; or, where a report was missed, b was still driving as a went straight
         again = isinstance(mind.state, Waiting) and mind.radio.state == WORDS[Standing]
         return met(mind) if again and variant == "assured" else mind

@@ -109,6 +109,15 @@ def peer_anchor(mind: Mind) -> float:
     return anchor(mind, mind.radio.start, mind.radio.peer).error
 
 
+def drift(mind: Mind) -> float:
+    """Return the bound in m on both odometries' rounding, added up until now."""
+    return _drift(mind, min(mind.tick, mind.radio.peer.through))
+
+
+def _drift(mind: Mind, tick: int) -> float:
+    return drifted(mind, mind.log, tick) + drifted(mind, mind.radio.peer, tick)
+
+
 def apart(mind: Mind) -> float:
     """Return the bound in m on both anchors' errors and both odometries' rounding, added up until now."""
     return _apart(mind, min(mind.tick, mind.radio.peer.through))
@@ -117,7 +126,7 @@ def apart(mind: Mind) -> float:
 def _apart(mind: Mind, tick: int) -> float:
     own, peers = mind.findings.own_anchor, mind.findings.peer_anchor
     assert peers is not None
-    return own + peers + drifted(mind, mind.log, tick) + drifted(mind, mind.radio.peer, tick)
+    return own + peers + _drift(mind, tick)
 
 
 def pinned_down(mind: Mind, placement: Placement, ranged: Sequence[Sighting], off: float) -> bool:

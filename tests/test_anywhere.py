@@ -97,6 +97,8 @@ ONCE_LOST = {
     "two placements nearly one, with anchors close to each other": 38287,
     "ranges told less of b's anchor than the way to them cost, before it was known well": 67711,
     "the same of both anchors, close to each other": 56289,
+    "b drove past where it had been ranged, a micrometre aside, and eq. (7) took it to have stood": 4540,
+    "two branches that no range could distinguish were followed to and fro on the rim": 82152,
 }
 
 

@@ -113,10 +113,11 @@ class Compared(NamedTuple):
     """the same; -inf for manoeuvres that are not to be taken"""
 
 
-def base(sightings: Sequence[Sighting]) -> tuple[Sighting, Sighting] | None:
+def base(sightings: Sequence[Sighting], floor: float) -> tuple[Sighting, Sighting] | None:
     """The two ranges that eq. (7) is solved from: the first two between which only a has moved.
 
-    Not two by which b may stand on M1: there any turn of a about it would do.
+    b has not moved if it is where it was to `floor` m, the rounding of both odometries. Not two ranges by
+    which b may stand on M1: there any turn of a about it would do.
     """
     ranged: list[Sighting] = []
     for sighting in sightings:
@@ -126,9 +127,8 @@ def base(sightings: Sequence[Sighting]) -> tuple[Sighting, Sighting] | None:
             ranged.append(sighting)
     for first in ranged:
         for second in ranged:
-            if first.tick < second.tick and travelled(first.b, second.b) < ELSEWHERE < travelled(
-                first.a, second.a
-            ):
+            stood, moved = travelled(first.b, second.b) <= floor, travelled(first.a, second.a) > ELSEWHERE
+            if first.tick < second.tick and stood and moved:
                 near = ON_THE_OTHER * travelled(first.a, second.a)
                 if not (_as_far(first, near) and _as_far(second, near)):
                     return first, second
