@@ -26,8 +26,8 @@ settings.load_profile("tandem")
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:  # noqa: ARG001  # the hook's own name
-    """One more than there are cores: a test that starts processes waits for a good part of its time."""
-    return (os.cpu_count() or 1) + 1
+    """Two for each core: a test that starts processes waits for a good part of its time."""
+    return 2 * (os.cpu_count() or 1)
 
 
 @pytest.fixture(scope="module")

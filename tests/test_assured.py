@@ -20,7 +20,7 @@ from agent.belief import Sighting, turn_error, weigh_placements
 from agent.geometry import Placement, same_placement
 from agent.mind import Mind
 from agent.phases.encounter import SPEEDS, TURN_RATES, LastManoeuvre, base, solve
-from agent.precision import apart
+from agent.precision import apart, drift
 from compose.inline import play
 from compose.record import Moment, Record
 from compose.scenario import parse
@@ -279,7 +279,7 @@ def test_without_what_was_sensed_before_phase_3_more_placements_would_be_left(tm
         mind = planner.decide(claim.observed["b"], claim.heard["b"])
         assert mind.findings.met is not None
         late = mind.sightings(mind.findings.met)
-        pair = base(late)
+        pair = base(late, drift(mind))
         assert pair is not None
         left = weigh_placements(solve(CLOSE.distance, pair), late, CLOSE.reach, apart(mind))
         (known,) = mind.findings.placements
