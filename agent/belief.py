@@ -80,21 +80,17 @@ def weigh_branches(
     point must lie to count on it: half of that is left for what two ranges leave open of a heading.
 
     Two that put the anchor in the same place are one: so near the anchor, or so nearly radial, they are.
-    The same place is one that no range can distinguish: to SAME floors after two ranges, which both branches
-    meet exactly, and to `anchor_error` once both are fitted to more.
     """
     seen = tuple(seen)
     ranged = [(pose, rho) for pose, rho in seen if rho is not None]
-    floored = [(pose, rho, floor) for pose, rho in ranged]
     silent = [pose for pose, rho in seen if rho is None]
     left: list[Branch] = []
     for candidate in candidates:
         branch = polished(candidate, ranged)
-        same = anchor_error(branch.start, floored) if len(ranged) >= FITTED else SAME * floor
         if (
             all(_meets(branch.distance(pose), rho, branch.start.x, floor) for pose, rho in ranged)
             and all(branch.distance(pose) > sensing_range - 0.5 * margin for pose in silent)
-            and not any(math.dist(branch.anchor, other.anchor) < same for other in left)
+            and not any(math.dist(branch.anchor, other.anchor) < SAME * floor for other in left)
         ):
             left.append(branch)
     return tuple(left)

@@ -248,6 +248,7 @@ def _weighed(mind: Mind, candidates: tuple[Branch, ...], kind: messages.BranchKi
     floor = precision.drifted(mind, mind.log, mind.tick)
     margin = precision.margin(mission, floor)
     left = weigh_branches(candidates, mind.seen(), mission.sensing_range, floor, margin)
+    left = precision.merged(mind, left)
     if kind is not None and len(left) == 1:
         branch, known = precision.fitted(mind, left[0])
         if known.enough or paper:

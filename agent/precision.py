@@ -93,6 +93,22 @@ def anchor(mind: Mind, start: Pose, log: Logbook) -> Known:
     return Known(known, ranges)
 
 
+NEXT_TO = 0.25
+"""The fraction of the anchor error within which two branches that are fitted to all ranges are one.
+
+Next to a double root, rounding may end the two fits on either side of it.
+"""
+
+
+def merged(mind: Mind, branches: tuple[Branch, ...]) -> tuple[Branch, ...]:
+    """Return `branches` without those that no range distinguishes from the first (see NEXT_TO)."""
+    if len(branches) < 2 or len(mind.log.ranges) < FITTED:
+        return branches
+    first = branches[0]
+    near = NEXT_TO * anchor(mind, first.start, mind.log).error
+    return (first, *(other for other in branches[1:] if math.dist(other.anchor, first.anchor) >= near))
+
+
 def fitted(mind: Mind, branch: Branch) -> tuple[Branch, Known]:
     """Return `branch` fitted to the ranges with the smallest anchor error, and that error."""
     known = anchor(mind, branch.start, mind.log)
