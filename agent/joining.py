@@ -80,7 +80,7 @@ class _Offers(NamedTuple):
     """by run"""
     played: str | None
     """a run in which the robot is there already"""
-    refusal: str | None
+    refused: str | None
     strange: str | None
     """why an answer is not understood"""
 
@@ -105,13 +105,13 @@ def join(link: zenoh.Session, run: str | None, robot: str, search: Search) -> tu
         for found, briefing in offers.briefings.items():
             return found, briefing
         played = offers.played
-        if offers.refusal is None:
+        if offers.refused is None:
             refused = None
         elif refused is None:
             refused = time.monotonic()
         elif time.monotonic() > refused + REFUSED_S:
-            raise Unwelcome(offers.refusal)
-        if played is None and offers.refusal is None:
+            raise Unwelcome(offers.refused)
+        if played is None and offers.refused is None:
             search.go_on(linked=session.linked(link), why=offers.strange)
         else:
             search.pause()
@@ -122,7 +122,7 @@ def join(link: zenoh.Session, run: str | None, robot: str, search: Search) -> tu
 
 def _offers(link: zenoh.Session, worlds: Sequence[str], robot: str) -> _Offers:
     briefings: dict[str, Briefing] = {}
-    played = refusal = strange = None
+    played = refused = strange = None
     for world in worlds:
         if session.alive(link, keys.robot_alive(world, robot), QUERY_S):
             played = world
@@ -130,14 +130,14 @@ def _offers(link: zenoh.Session, worlds: Sequence[str], robot: str) -> _Offers:
         key = keys.briefing(world, robot)
         answer = session.ask(link, key, QUERY_S, lambda frame: isinstance(_briefing(frame, robot), Briefing))
         if isinstance(answer, str):
-            refusal = answer
+            refused = answer
         elif answer is not None:
             found = _briefing(answer, robot)
             if isinstance(found, Briefing):
                 briefings[world] = found
             else:
                 strange = found
-    return _Offers(briefings, played, refusal, strange)
+    return _Offers(briefings, played, refused, strange)
 
 
 def _briefing(answer: bytes, robot: str) -> Briefing | str:

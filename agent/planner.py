@@ -244,16 +244,16 @@ def _weighed(mind: Mind, candidates: tuple[Branch, ...], kind: messages.BranchKi
     That takes ranges that fix the anchor as exactly as the claim needs; the letter takes no more of them.
     `kind` is how it ends; None where it goes on for another range in any case.
     """
-    mission, paper = mind.briefing.mission, mind.briefing.variant == "paper"
+    mission, as_published = mind.briefing.mission, mind.briefing.variant == "paper"
     floor = precision.drifted(mind, mind.log, mind.tick)
     margin = precision.margin(mission, floor)
     left = weigh_branches(candidates, mind.seen(), mission.sensing_range, floor, margin)
     left = precision.merged(mind, left)
     if kind is not None and len(left) == 1:
         branch, known = precision.fitted(mind, left[0])
-        if known.enough or paper:
+        if known.enough or as_published:
             return _located(mind, branch, kind, known.error)
-    if len(left) > 1 and paper and isinstance(mind.state, ThirdPoint):
+    if len(left) > 1 and as_published and isinstance(mind.state, ThirdPoint):
         return mind.undecided("the third range does not tell +alpha from -alpha")
     return _to_third_point(mind, left, margin)
 

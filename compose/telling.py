@@ -20,7 +20,7 @@ from world.scenario import Scenario
 
 
 @contextmanager
-def progress(options: argparse.Namespace, scenario: Scenario, folder: Path) -> Iterator[None]:
+def shown_live(options: argparse.Namespace, scenario: Scenario, folder: Path) -> Iterator[None]:
     """Show the run while it runs, where somebody can see it."""
     if options.quiet or not sys.stdout.isatty():
         yield

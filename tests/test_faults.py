@@ -167,7 +167,7 @@ class Played(NamedTuple):
     """A mission as processes, and in one process: their records."""
 
     processes: Path
-    inline: Path
+    in_one: Path
 
 
 @pytest.fixture(
@@ -192,7 +192,7 @@ def both(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 
 
 def test_the_journals_are_the_same_bytes(both: Played) -> None:
-    assert journals(both.processes) == journals(both.inline)
+    assert journals(both.processes) == journals(both.in_one)
 
 
 @pytest.mark.parametrize("base", ["random", "paper-1", "noise"])

@@ -414,8 +414,8 @@ def test_a_folder_in_use_is_refused(folder: Path) -> None:
 def test_results_are_left_in_a_folder_named_for_the_campaign(folder: Path) -> None:
     ended = tandem("sweep", "both.toml", "--trials", "2", cwd=folder)
     out = folder / "sweep-both"
-    figures = {path.name: path.stat().st_size for path in (out / "figures").iterdir()}
-    assert set(figures) == {
+    drawn = {path.name: path.stat().st_size for path in (out / "figures").iterdir()}
+    assert set(drawn) == {
         f"{name}.{kind}"
         for kind in ("svg", "pdf", "png")
         for name in (
@@ -423,7 +423,7 @@ def test_results_are_left_in_a_folder_named_for_the_campaign(folder: Path) -> No
             *("ticks-robot-b-anchor-0", "ticks-planner-variant"),
         )
     }
-    assert min(figures.values()) > 5_000
+    assert min(drawn.values()) > 5_000
     assert {path.name for path in out.iterdir()} == {
         *("campaign.json", "cells", "figures", "summary.csv", "trials.parquet")
     }

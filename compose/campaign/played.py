@@ -38,7 +38,7 @@ class Played(msgspec.Struct, frozen=True):
     """the files of its record that are not, to the byte, those of the same in one process"""
 
 
-def in_process(scenario: Scenario, *, audit: bool) -> Played:
+def run_in_process(scenario: Scenario, *, audit: bool) -> Played:
     """Its run in this process; its journals are kept only to be judged."""
     began = time.perf_counter()
     if not audit:

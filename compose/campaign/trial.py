@@ -9,7 +9,7 @@ import msgspec
 from msgspec.structs import replace
 
 from compose.audit.findings import Findings
-from compose.campaign.played import as_processes, in_process
+from compose.campaign.played import as_processes, run_in_process
 from compose.claim import Claim
 from compose.kill import Kill
 from compose.record import Record
@@ -150,7 +150,7 @@ def play(trial: Trial) -> Row:
     if trial.processes or trial.kills is not None:
         played = as_processes(trial.scenario, audit=trial.audit, kills=trial.kills)
     else:
-        played = in_process(trial.scenario, audit=trial.audit)
+        played = run_in_process(trial.scenario, audit=trial.audit)
     found = row(trial, played.record, played.wall_s, played.findings)
     if played.kills is None:
         return found

@@ -26,7 +26,7 @@ from agent.robot import Robot
 from compose import barrier, inline, local, record, scenario
 from compose.beside import beside
 from compose.beside import page as page_on
-from compose.campaign.played import in_process
+from compose.campaign.played import run_in_process
 from compose.lab import need
 from compose.reach import KEYED
 from compose.status import LOCALISED
@@ -106,7 +106,7 @@ def _ticks(rounds: int, done: Callable[[], None]) -> Table:
     _row(table, "the same, and somebody watches the page", watched, "ticks/s")
     _row(table, "the same, over TLS with access control", secured, "ticks/s")
     _row(table, f"the bare barrier, frames of {sizes[0]} and {sizes[1]} bytes", barriers, "ticks/s")
-    ratios = [mission / barrier for mission, barrier in zip(missions, barriers, strict=True)]
+    ratios = [mission / one for mission, one in zip(missions, barriers, strict=True)]
     _row(table, "mission / barrier (at least 0.5)", ratios, "")
     ratios = [mission / without for mission, without in zip(missions, bare, strict=True)]
     _row(table, "with journals / without (at least 0.85)", ratios, "")
@@ -209,7 +209,7 @@ def _missions(rounds: int, done: Callable[[], None]) -> Table:
         world_part.append(sum(_world_alone(inline.play(one)) for one in scenarios))
         began = time.perf_counter()
         for one in scenarios:
-            in_process(one, audit=True)
+            run_in_process(one, audit=True)
         audited.append(time.perf_counter() - began)
         done()
     table = _table("In-process, one core")
@@ -288,12 +288,12 @@ def _parts(scenarios: Sequence[Scenario]) -> tuple[float, float, float]:
 
 def _start(rounds: int, done: Callable[[], None]) -> Table:
     """The whole of `tandem run paper-1 -q`, against a process that only imports what it stands on."""
-    run = [sys.executable, "-P", "-m", "compose", "run", "paper-1", "-q"]
+    command = [sys.executable, "-P", "-m", "compose", "run", "paper-1", "-q"]
     bare = [sys.executable, "-c", BARE_IMPORTS]
     runs: list[float] = []
     imports: list[float] = []
     for _ in range(rounds):
-        runs.append(_wall(run))
+        runs.append(_wall(command))
         imports.append(_wall(bare))
         done()
     table = _table("Wall time of a whole command")
@@ -314,7 +314,7 @@ def _wall(command: Sequence[str]) -> float:
 
 def _many(rounds: int, done: Callable[[], None]) -> Table:
     """The whole of `tandem run` with ROBOTS robots, against one process; and what a robot's start costs."""
-    processes: list[float] = []
+    many_processes: list[float] = []
     one: list[float] = []
     starts: list[float] = []
     with tempfile.TemporaryDirectory() as folder:
@@ -323,15 +323,15 @@ def _many(rounds: int, done: Callable[[], None]) -> Table:
         some.write_text(f"max_ticks = 1\n{_pairs(STARTED)}")
         two.write_text(f"max_ticks = 1\n{_pairs(2)}")
         for _ in range(rounds):
-            processes.append(_used(["run", str(many), "-q"])[0])
+            many_processes.append(_used(["run", str(many), "-q"])[0])
             one.append(_used(["run", str(many), "-q", "--in-process"])[0])
             more_s = _used(["run", str(some), "-q"])[1] - _used(["run", str(two), "-q"])[1]
             starts.append(1e3 * more_s / (STARTED - 2))
             done()
     table = _table(f"Wall time of a whole command, {ROBOTS} robots")
-    _row(table, "tandem run, as processes (at most 6)", processes, "s")
+    _row(table, "tandem run, as processes (at most 6)", many_processes, "s")
     _row(table, "the same with --in-process", one, "s")
-    _row(table, "as processes / in-process", [a / b for a, b in zip(processes, one, strict=True)], "")
+    _row(table, "as processes / in-process", [a / b for a, b in zip(many_processes, one, strict=True)], "")
     _row(table, "CPU of a robot's start, first tick and end", starts, "ms")
     return table
 

@@ -18,7 +18,7 @@ from compose.record import folder_for, read
 from compose.scenario import Setting, check_rate, run_name, setting
 from compose.status import FAILED, STOPPED, UserError
 from compose.stop import stop_by_signal
-from compose.telling import break_off, conclude, progress
+from compose.telling import break_off, conclude, shown_live
 from protocol.inbox import Inbox, Interrupted
 from protocol.journal import CannotRecord
 from protocol.spelling import did_you_mean
@@ -106,7 +106,7 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[
     ):
         began = time.perf_counter()
         try:
-            with progress(options, scenario, folder):
+            with shown_live(options, scenario, folder):
                 spared = local.play(
                     scenario,
                     folder,

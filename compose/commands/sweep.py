@@ -69,9 +69,9 @@ def print_trial(campaign: Campaign, cell: int, trial: int) -> int:
 
 def status_of(results: Results) -> int:
     """As of a mission: localised only where all are; failed where any is, or breaks a rule."""
-    counts = [figures.failed + figures.violations for figures in results.figures.values()]
+    counts = [cell.failed + cell.violations for cell in results.figures.values()]
     if any(counts):
         return FAILED
-    localised = sum([figures.localised for figures in results.figures.values()])
-    played = sum([figures.trials for figures in results.figures.values()])
+    localised = sum([cell.localised for cell in results.figures.values()])
+    played = sum([cell.trials for cell in results.figures.values()])
     return LOCALISED if localised == played else NOT_LOCALISED

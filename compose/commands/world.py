@@ -17,7 +17,7 @@ from compose.record import WORLD_JOURNAL, folder_for, read
 from compose.scenario import check_rate, run_name, setting
 from compose.status import ENDED, FAILED, STOPPED, UserError
 from compose.stop import stop_by_signal, stop_with_launcher
-from compose.telling import break_off, conclude, going_on, progress
+from compose.telling import break_off, conclude, going_on, shown_live
 from protocol import limits, refusal, session
 from protocol.endpoints import Endpoints
 from protocol.inbox import Inbox, Interrupted
@@ -172,7 +172,7 @@ def _play(options: argparse.Namespace, course: Course, way: _Way, folder: Path, 
         at = " and ".join(way.endpoints.listen) or way.endpoints
         say(f"run {run} at {at}{where}: waiting for {robots}")
     try:
-        with progress(options, scenario, folder):
+        with shown_live(options, scenario, folder):
             way.play(process)
     except (Interrupted, NoRouter) as stop:
         if not options.launched:

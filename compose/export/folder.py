@@ -60,11 +60,11 @@ def export(
     check()
     robots, told = _of_world(folder, books) if WORLD_JOURNAL in books else _of_robots(folder)
     check()
-    run = recorded.read(folder)
+    shown = recorded.read(folder)
     record.make(out)
     mcap, frames, ticks, parquet = paths = tuple([out / name for name in FILES])
     writers: dict[Path, Callable[[Path], object]] = {
-        mcap: lambda path: write_mcap(books, run, path, check),
+        mcap: lambda path: write_mcap(books, shown, path, check),
         frames: lambda path: path.write_text(frames_csv(in_time(books), check), encoding="utf-8"),
         ticks: lambda path: path.write_text(table(told.rows), encoding="utf-8"),
         parquet: lambda path: write_ticks(told.rows, told.drives, told.held, told.period, path),
