@@ -20,7 +20,7 @@ from compose import cli, forked
 from compose.warm_up import missions
 
 WARM_UP = "tests.warm:warm_up"
-MAIN = "tests.warm:main"
+MAIN = "tests.warm:run_command"
 DRAWING = ("matplotlib.backends.backend_pdf", "matplotlib.backends.backend_svg")
 """modules that Matplotlib imports only when it writes a file"""
 
@@ -62,7 +62,7 @@ def run(words: list[str], folder: Path | None, out: IO[bytes], err: IO[bytes], w
     return process.end()
 
 
-def main() -> None:
+def run_command() -> None:
     """Run the command whose file sys.argv names, in this forked process."""
     with open(sys.argv[1], "rb") as file:
         command = msgspec.msgpack.decode(file.read(), type=Command)
