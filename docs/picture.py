@@ -7,12 +7,13 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
-from compose import inline, scenario
-from compose.figures import PICTURES, album
+from compose.figures import PICTURES, catalogue
 from compose.figures.account import account
 from compose.figures.pair import of_record
 from compose.figures.sheet import Absent
 from compose.figures.style import save
+from compose.launch import in_process
+from compose.scenario import scenario_file
 
 DOCS = Path(__file__).parent
 SHOWN: dict[str, dict[str, str]] = {
@@ -42,12 +43,12 @@ def main() -> None:
 
 def draw(name: str, shown: Mapping[str, str], folder: Path) -> None:
     """Play the scenario, and take those pictures of it that are `shown`."""
-    record = inline.play(scenario.load(name), folder)
+    record = in_process.play(scenario_file.load(name), folder)
     robots = [robot.id for robot in record.scenario.robots]
     pair = of_record(record, (0, 1), {robot: account(folder, robot) for robot in robots})
     for kind in PICTURES:
-        with album.settings(kind):
-            for title, figure in album.pictures(pair, kind):
+        with catalogue.settings(kind):
+            for title, figure in catalogue.pictures(pair, kind):
                 if title in shown and not isinstance(figure, Absent):
                     (svg,) = save(figure, folder / title, ["svg"])
                     shutil.copyfile(svg, DOCS / f"{shown[title]}.svg")

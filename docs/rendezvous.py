@@ -16,7 +16,7 @@ import numpy as np
 
 from protocol.mission import Mission
 from protocol.motion import TAU
-from protocol.rendezvous import Orbit, half_arc, rendezvous
+from protocol.orbits import Orbit, half_arc, rendezvous
 
 SECTION_IV = (10.0, Mission(3.0, 1.0, 1.0, math.pi))
 SETTINGS = [

@@ -24,7 +24,7 @@ import msgspec
 
 from protocol.messages import Briefing
 from protocol.motion import REST, Controls, Pose, step, wrap
-from world.driver import Reading
+from world.hardware.driver import Reading
 
 ASK_AGAIN_S = 0.05
 """a datagram may be lost"""

@@ -13,10 +13,10 @@ import msgspec
 from msgspec import Meta
 from msgspec.structs import force_setattr
 
-from protocol.lie import Lie
+from protocol.attack import Lie
 from protocol.mission import Anchor, Mission, Role, Variant
 from protocol.motion import Controls, Covariance, Pose, Run
-from protocol.rendezvous import Rendezvous
+from protocol.orbits import Rendezvous
 from protocol.units import (
     Angle,
     AngularVelocity,

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from docs.rover import Rover
 from protocol.messages import Briefing
 from protocol.motion import REST, Controls
-from world.driver import Reading
+from world.hardware.driver import Reading
 
 
 class TellsWhatWasAsked(Rover):

@@ -20,8 +20,8 @@ from typing import IO, NamedTuple
 
 import pytest
 
-from compose.local import free_endpoint
-from protocol import journal
+from compose.launch.processes import free_endpoint
+from protocol.journal import journal_file
 from tests import warm
 
 BOUND_S = 60.0
@@ -117,7 +117,7 @@ class Command:
         self._out = tempfile.TemporaryFile()  # noqa: SIM115  # closed with the command
         self._err = tempfile.TemporaryFile()  # noqa: SIM115
         self._process = subprocess.Popen(
-            [*through, sys.executable, "-P", "-m", "compose", *words],
+            [*through, sys.executable, "-P", "-m", "compose.cli", *words],
             stdin=subprocess.DEVNULL,
             stdout=self._out if terminal is None else terminal,
             stderr=self._err,
@@ -165,7 +165,9 @@ class Command:
     def until_answered(self, robot: str, record: Path) -> None:
         """Wait until `robot` has answered tick 0: its Sense, Drive and Estimate are in the recording."""
         path = record / f"agent-{robot}.journal"
-        self.until(lambda: path.exists() and len(list(journal.read(path))) >= 5, f"{robot} answers tick 0")
+        self.until(
+            lambda: path.exists() and len(list(journal_file.read(path))) >= 5, f"{robot} answers tick 0"
+        )
 
     def ended(self, within: float = BOUND_S) -> Ended:
         """Return the result of the command, which must end `within` seconds."""

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import settings
 from playwright.sync_api import Browser
 
-from compose import inline
-from compose.scenario import load
+from compose.launch import in_process
+from compose.scenario.scenario_file import load
 from tests.browser import Open, chromium, pages, watching
 from tests.commands import tandem
 
@@ -64,7 +64,7 @@ def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The record of paper-1; nobody changes anything in it."""
     folder = tmp_path_factory.mktemp("recorded") / "paper-1"
     folder.mkdir()
-    inline.play(load("paper-1"), folder)
+    in_process.play(load("paper-1"), folder)
     return folder
 
 

@@ -26,7 +26,7 @@ from pathlib import Path
 from urllib.error import URLError
 from urllib.request import urlopen
 
-from compose.local import free_endpoint
+from compose.launch.processes import free_endpoint
 from tests.commands import Command, tandem, until
 from tests.podman import DEPLOY, HOUSE, Podman, Unable
 

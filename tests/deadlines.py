@@ -18,7 +18,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from compose.record import Record, read
+from compose.recording.run import Record, read
 from tests.commands import ENDLESS, Command, process_of
 
 RATES = (1, 10, 100)

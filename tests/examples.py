@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from compose.scenario import load
+from compose.scenario.scenario_file import load
 from protocol.messages import (
     Alarm,
     Beat,
@@ -22,7 +22,7 @@ from protocol.messages import (
     Undecided,
 )
 from protocol.motion import Controls, Covariance, Pose, Run
-from world.driver_journal import Mark, Start
+from world.hardware.driver_journal import Mark, Start
 
 POSE = Pose(1.5, -2.5, 0.75)
 

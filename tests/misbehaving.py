@@ -11,19 +11,19 @@ from unittest.mock import patch
 
 from msgspec.structs import replace
 
-from agent import planner
-from agent.robot import Robot
-from compose import inline
-from compose.campaign import owner, run, spec, trial
-from compose.stop import stop_by_signal
-from protocol.inbox import Inbox
+from agent.planning import planner
+from agent.process.robot import Robot
+from compose.launch import in_process
+from compose.launch.signals import stop_by_signal
+from compose.sweep import execution, spec, trial, worker_pool
+from protocol.network.inbox import Inbox
 from protocol.wire import encode
 
 HANGS = "hangs"
 """a file that a trial leaves which hangs, and no other"""
 
 
-class Owned(owner.Child):
+class Owned(worker_pool.Child):
     """Is given up only where a trial hangs, however long another takes."""
 
     def answer(self, timeout: float) -> bytes:
@@ -31,7 +31,7 @@ class Owned(owner.Child):
         while True:
             try:
                 return super().answer(timeout)
-            except owner.Hung:
+            except worker_pool.Hung:
                 if Path(self._folder.name, HANGS).exists():
                     raise
 
@@ -53,7 +53,7 @@ def boastful(one: trial.Trial) -> trial.Row:
     """In the third trial of a cell robots say that they know where they are before they do."""
     if one.number != 2:
         return trial.play(one)
-    with patch.object(inline, "Robot", Boaster):
+    with patch.object(in_process, "Robot", Boaster):
         return trial.play(one)
 
 
@@ -79,10 +79,10 @@ def main(function: str, source: str, out: str) -> None:
     """Play the campaign so on two workers, as `tandem sweep` does."""
     inbox = Inbox("misbehaving")
     stop_by_signal(inbox)
-    means = run.Means(workers=2, play=f"tests.misbehaving:{function}")
-    silent = run.Progress(say=print, begin=lambda *_: None, done=lambda _: None)
-    with patch.object(owner, "Child", Owned):
-        results = run.sweep(spec.load(source), Path(out), means, inbox, silent)
+    means = execution.Means(workers=2, play=f"tests.misbehaving:{function}")
+    silent = execution.Progress(say=print, begin=lambda *_: None, done=lambda _: None)
+    with patch.object(worker_pool, "Child", Owned):
+        results = execution.sweep(spec.load(source), Path(out), means, inbox, silent)
     print(f"{len(results.table)} rows, {results.stopped}")
 
 

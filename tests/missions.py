@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from compose.inline import play
-from compose.record import Record
-from compose.scenario import parse
+from compose.launch.in_process import play
+from compose.recording.run import Record
+from compose.scenario.scenario_file import parse
 
 
 def mission_of(

@@ -21,10 +21,11 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from compose.reach import KEYED
-from protocol import journal, session
-from protocol.endpoints import Endpoints, configured
+from compose.network import KEYED
+from protocol.journal import journal_file
 from protocol.messages import Drive, End, Environment, Farewell, Missed
+from protocol.network import session
+from protocol.network.endpoints import Endpoints, configured
 from protocol.wire import MAX_FRAME_BYTES, decode
 from tests.commands import LONG, PAPER_1, Command, Ended, journals, size, tandem, until
 from world.scenario import Scenario
@@ -142,7 +143,7 @@ class Run:
         """The latest tick in which both answered."""
         kinds = Environment | Scenario | Drive | Missed | End | Farewell
         both: dict[int, int] = {}
-        for frame in journal.read(self.out / "world.journal"):
+        for frame in journal_file.read(self.out / "world.journal"):
             message = decode(frame, kinds, MAX_FRAME_BYTES)
             if isinstance(message, Drive):
                 both[message.tick] = both.get(message.tick, 0) + 1

@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 HOUSE = Path(__file__).parents[1]
-DEPLOY = HOUSE / "compose" / "deploy"
+DEPLOY = HOUSE / "compose" / "hardware" / "deploy"
 RUNTIMES: tuple[dict[str, str], ...] = (
     {},
     {"runtime": "crun", "cgroup_manager": "cgroupfs"},

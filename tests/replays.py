@@ -24,9 +24,9 @@ import msgpack
 from mcap.reader import make_reader
 
 from compose.audit.replay import Replay, replay
-from compose.export.folder import export
-from compose.record import WORLD_JOURNAL, agent_journal
-from protocol import journal
+from compose.recording.run import WORLD_JOURNAL, agent_journal
+from compose.view.export.folder import export
+from protocol.journal import journal_file
 from tests.commands import LONG, Command, journals, process_of, processes_of, tandem, until
 from tests.same_plans import played, said, scenario
 
@@ -85,7 +85,7 @@ def killed(draw: random.Random, folder: Path) -> tuple[str, bool]:
     until(lambda: not processes_of(out), "nobody writes any more")
     told, torn = replay(out)
     export(out, folder / "exported")
-    there = {name: journal.packed(journal.read(out / name)) for name in torn}
+    there = {name: journal_file.packed(journal_file.read(out / name)) for name in torn}
     whole = all(len(there[name]) + torn[name] == (out / name).stat().st_size for name in torn)
     exported = journals_of(folder / "exported" / "run.mcap") == {k: v for k, v in there.items() if v}
     what = f"{who} after {moment} bytes: {told.ticks} ticks, {sum(torn.values())} bytes torn"
@@ -103,7 +103,7 @@ def journals_of(path: Path) -> dict[str, bytes]:
             assert (channel.message_encoding, msgpack.unpackb(message.data)[0]) == ("msgpack", kind)
             head = struct.pack(">BI", int(channel.metadata["version"]), zlib.crc32(message.data))
             frames[f"{name}.journal"].append(head + message.data)
-    return {name: journal.packed(ones) for name, ones in frames.items()}
+    return {name: journal_file.packed(ones) for name, ones in frames.items()}
 
 
 if __name__ == "__main__":

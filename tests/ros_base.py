@@ -16,9 +16,9 @@ import zenoh
 from pycdr2 import IdlStruct
 from pycdr2.types import array, float32, float64, int32, uint8, uint32
 
-from protocol import session
-from protocol.endpoints import listening
 from protocol.motion import Pose, step
+from protocol.network import session
+from protocol.network.endpoints import listening
 
 Covariance: Any = array[float64, 36]  # type: ignore[misc]
 PERIOD_S = 0.01

@@ -13,7 +13,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from compose.scenario import parse
+from compose.scenario.scenario_file import parse
 from tests.commands import SECTION_IV, journals, tandem
 from tests.surveys import ODOMETRY, SIGMA, WHEELS
 

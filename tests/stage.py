@@ -8,9 +8,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from protocol import keys
-from protocol.inbox import NOTHING, Arrival, Inbox, Topic
-from world import ending, field
+from protocol.network import keys
+from protocol.network.inbox import NOTHING, Arrival, Inbox, Topic
+from world.hardware import bridge, termination
 
 TRANSPORT_S = 1e-4
 """how long whatever is said is on its way"""
@@ -26,10 +26,10 @@ class Stage(Inbox):
         """what the field has said: key and frame"""
         self.answer: Callable[[str, bytes], None] = lambda _key, _frame: None
         self._coming: list[tuple[float, int, Arrival]] = []
-        for module in (field, ending):
+        for module in (bridge, termination):
             monkeypatch.setattr(module, "time", self)
         monkeypatch.setattr(
-            field,
+            bridge,
             "session",
             SimpleNamespace(
                 publisher=lambda _link, key: SimpleNamespace(put=lambda frame: self._said(key, frame)),

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from agent import planner
-from agent.mind import Mind
-from compose.scenario import load
+from agent.planning import planner
+from agent.planning.state import Mind
+from compose.scenario.scenario_file import load
 from protocol.messages import Drive, Report, Sense
 from world.tick import World, advance, release, senses
 

@@ -28,15 +28,15 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from compose import inline
-from compose.scenario import load
-from compose.summary import leave, summary
-from protocol import keys, session
-from protocol.endpoints import at
-from protocol.inbox import Inbox
-from protocol.journal import read
+from compose.launch import in_process
+from compose.recording.summary_json import leave, summary
+from compose.scenario.scenario_file import load
+from protocol.journal.journal_file import read
 from protocol.messages import Briefing, Drive, End, Environment, Estimate, Farewell, Report, Sense
 from protocol.motion import Controls
+from protocol.network import keys, session
+from protocol.network.endpoints import at
+from protocol.network.inbox import Inbox
 from protocol.wire import MAX_SENT_BYTES, decode, encode
 from tests.commands import BOUND_S, SECTION_IV, Command, until, world
 from world.scenario import Scenario
@@ -102,7 +102,7 @@ class Genuine:
     """Every frame of a mission, by key and tick, as it was played undisturbed in one process."""
 
     def __init__(self, played: Scenario, folder: Path) -> None:
-        record = inline.play(played, folder)
+        record = in_process.play(played, folder)
         leave(record, summary(record, "in-process", None), folder)
         self.ticks = record.moments[-1].truth.tick
         self.farewells = {robot: encode(farewell) for robot, farewell in record.farewells.items()}

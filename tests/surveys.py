@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from functools import cache
 
-from compose.inline import play
-from compose.record import Record
-from compose.scenario import parse
-from compose.summary import summary
+from compose.launch.in_process import play
+from compose.recording.run import Record
+from compose.recording.summary_json import summary
+from compose.scenario.scenario_file import parse
 from world.scenario import Scenario
 
 SIGMA = "anchor_sigma = 0.1\nmutual_sigma = 0.1"

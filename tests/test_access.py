@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import pytest
 import zenoh
 
-from compose.local import free_endpoint
-from compose.reach import KEYED
-from protocol import keys, session
-from protocol.endpoints import configured
+from compose.launch.processes import free_endpoint
+from compose.network import KEYED
+from protocol.network import keys, session
+from protocol.network.endpoints import configured
 from tests.commands import BOUND_S, tandem, until
 
 KEYS = {

@@ -20,19 +20,19 @@ from matplotlib.patches import Circle
 from matplotlib.text import Annotation
 from msgspec.structs import replace
 
-from agent.phases.encounter import compared
-from agent.phases.surveying import stride
-from compose.commands.figures import draw as draw_all
-from compose.figures import PICTURES, album, hypotheses, manoeuvre, over_time, phase_one, steps, trajectory
+from agent.planning.active_sensing import stride
+from agent.planning.phase3_last_manoeuvre import compared
+from compose.cli.figures import draw as draw_all
+from compose.figures import PICTURES, catalogue, decisions, manoeuvre, over_time, phase_one, steps, trajectory
 from compose.figures.account import account
 from compose.figures.pair import Pair, of_record
 from compose.figures.sheet import Absent
 from compose.figures.style import look
-from compose.inline import play
-from compose.record import estimates, read
-from compose.scenario import load, parse
-from compose.summary import first_claim
-from protocol.journal import read as frames
+from compose.launch.in_process import play
+from compose.recording.run import estimates, read
+from compose.recording.summary_json import first_claim
+from compose.scenario.scenario_file import load, parse
+from protocol.journal.journal_file import read as frames
 from protocol.messages import Drive
 from protocol.mission import Role
 from protocol.motion import step, wrap
@@ -318,7 +318,7 @@ def test_in_grey_no_line_of_errors_looks_like_one_of_the_other_robot_or_of_somet
 def test_under_noise_a_panel_has_each_hypothesis_that_the_journal_tells_of(records: Path) -> None:
     folder = recorded("noisy", records)
     told = pair(folder)
-    figure = drawn(hypotheses.draw(told))
+    figure = drawn(decisions.draw(told))
     shown = {int(one.get_gid().split("-")[1]) for one in found(figure, r"truth-.*")}  # type: ignore[union-attr]
     assert len(shown) == len(figure.axes) > 1
     for role in ("a", "b"):
@@ -376,8 +376,8 @@ def test_every_pair_has_figures_of_its_own(records: Path) -> None:
     names = []
     with look(symbols=True):
         for number in range(2):
-            names += [name for name, _ in album.pictures(pair(folder, number), "trajectory")]
-            names += [name for name, _ in album.pictures(pair(folder, number), "phase-1")]
+            names += [name for name, _ in catalogue.pictures(pair(folder, number), "trajectory")]
+            names += [name for name, _ in catalogue.pictures(pair(folder, number), "phase-1")]
     assert names == ["trajectory-a-b", "phase-1-a", "phase-1-b", "trajectory-c-d", "phase-1-c", "phase-1-d"]
 
 
@@ -387,7 +387,7 @@ def test_a_torn_record_is_drawn_to_the_tear(ticks: int, records: Path, tmp_path:
     cut(folder / "world.journal", 2 + 2 * ticks)
     cut(folder / "agent-b.journal", 2 + 3 * min(ticks, 20))
     told = pair(folder)
-    figures = {name: one for kind in PICTURES[:-1] for name, one in album.pictures(told, kind)}
+    figures = {name: one for kind in PICTURES[:-1] for name, one in catalogue.pictures(told, kind)}
     path = drawn(figures["trajectory-a-b"])
     assert len(line(path, "path-a")) == max(1, ticks)
     assert any("the record breaks off" in text.get_text() for text in path.texts)

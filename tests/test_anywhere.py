@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from compose import inline
-from compose.campaign import spec
-from compose.campaign.cells import cells, trial_seed, trial_table
-from compose.campaign.spec import BadSpec
-from compose.scenario import Setting, Unworkable, validate
-from compose.toml import table_in
+from compose.launch import in_process
+from compose.scenario.scenario_file import Setting, Unworkable, validate
+from compose.scenario.toml_file import table_in
+from compose.sweep import spec
+from compose.sweep.cells import cells, trial_seed, trial_table
+from compose.sweep.spec import BadSpec
 from protocol.mission import Mission, obstacle
 from protocol.rounding import TOLERANCE
 from tests.test_hard_starts import assert_localised
@@ -29,7 +29,7 @@ def played(trial: int) -> str:
         setting = validate(table, "anywhere")
     except Unworkable:
         return "refused"
-    end = inline.play(setting.seeded(table["seed"])).end
+    end = in_process.play(setting.seeded(table["seed"])).end
     assert end is not None
     return end.outcome if end.reason is None else f"trial {trial}: {end.outcome}: {end.reason}"
 
@@ -116,7 +116,7 @@ def test_the_paper_is_never_wrong_either() -> None:
         except Unworkable:
             continue
         if setting.scenario.max_ticks < 3000:
-            end = inline.play(setting.seeded(table["seed"])).end
+            end = in_process.play(setting.seeded(table["seed"])).end
             assert end is not None
             assert end.outcome in ("localised", "undecided"), (trial, end)
 

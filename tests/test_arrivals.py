@@ -14,12 +14,12 @@ import zenoh
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from compose.scenario import load
-from protocol import keys, session
-from protocol.endpoints import listening
-from protocol.inbox import COMPLAINTS, NOTHING, Inbox
+from compose.scenario.scenario_file import load
 from protocol.messages import Drive, Report, Sense
 from protocol.motion import ORIGIN
+from protocol.network import keys, session
+from protocol.network.endpoints import listening
+from protocol.network.inbox import COMPLAINTS, NOTHING, Inbox
 from protocol.wire import encode
 from tests.commands import BOUND_S, Command, several_pairs, tandem, until, world
 from tests.storm import stranger_at

@@ -15,15 +15,15 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from agent import planner
-from agent.belief import Sighting, turn_error, weigh_placements
-from agent.geometry import Placement, same_placement
-from agent.mind import Mind
-from agent.phases.encounter import SPEEDS, TURN_RATES, LastManoeuvre, base, solve
-from agent.precision import apart, drift
-from compose.inline import play
-from compose.record import Moment, Record
-from compose.scenario import parse
+from agent.estimation.closed_forms import Placement, same_placement
+from agent.estimation.exact import Sighting, turn_error, weigh_placements
+from agent.planning import planner
+from agent.planning.phase3_last_manoeuvre import SPEEDS, TURN_RATES, LastManoeuvre, base, solve
+from agent.planning.precision import apart, drift
+from agent.planning.state import Mind
+from compose.launch.in_process import play
+from compose.recording.run import Moment, Record
+from compose.scenario.scenario_file import parse
 from protocol.messages import Localised
 from protocol.mission import Mission, obstacle
 from protocol.motion import ORIGIN, Pose, compose, step

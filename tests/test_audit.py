@@ -15,18 +15,18 @@ import msgpack
 import pytest
 from msgspec.structs import replace
 
-from agent import planner
-from agent.mind import Mind
-from agent.robot import Robot
-from compose import inline
+from agent.planning import planner
+from agent.planning.state import Mind
+from agent.process.robot import Robot
 from compose.audit.findings import Findings, Violation
-from compose.audit.judge import RULES, audit, judge
-from compose.export.frames import KINDS
-from compose.record import WORLD_JOURNAL, agent_journal, read
-from compose.scenario import load, parse, shipped
-from protocol import journal
-from protocol.journal import CorruptJournal, Kept
-from protocol.lie import Lie
+from compose.audit.rules import RULES, audit, judge
+from compose.launch import in_process
+from compose.recording.frames import KINDS
+from compose.recording.run import WORLD_JOURNAL, agent_journal, read
+from compose.scenario.scenario_file import load, parse, shipped
+from protocol.attack import Lie
+from protocol.journal import journal_file
+from protocol.journal.journal_file import CorruptJournal, Kept
 from protocol.messages import (
     Briefing,
     Contact,
@@ -45,9 +45,9 @@ from protocol.motion import Covariance, Run
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from tests.commands import OVER, REAL_TIME, SECTION_IV, Command, Ended, process_of, several_pairs, tandem
 from tests.test_real_time import missed
-from world.course import Course
 from world.referee import Judgement
 from world.scenario import Scenario
+from world.simulation import Course
 
 Found = tuple[int | None, str | None, str]
 """tick, robot and rule of a violation"""
@@ -81,8 +81,8 @@ def noise(seed: int, variant: str) -> Scenario:
 
 def kept(scenario: Scenario) -> dict[str, list[bytes]]:
     """The journals of its run in this process."""
-    books = {name: Kept() for name in inline.journals(scenario)}
-    inline.played(scenario, books)
+    books = {name: Kept() for name in in_process.journals(scenario)}
+    in_process.played(scenario, books)
     return {name: book.frames for name, book in books.items()}
 
 
@@ -126,9 +126,9 @@ def test_an_honest_run_keeps_every_rule(scenario: Scenario) -> None:
 
 def test_journals_in_memory_are_those_on_disk(tmp_path: Path) -> None:
     scenario = load("paper-1")
-    inline.play(scenario, tmp_path)
+    in_process.play(scenario, tmp_path)
     journals = kept(scenario)
-    assert {path.name: list(journal.read(path)) for path in tmp_path.iterdir()} == journals
+    assert {path.name: list(journal_file.read(path)) for path in tmp_path.iterdir()} == journals
     assert audit(tmp_path) == judge(journals)
 
 
@@ -162,7 +162,7 @@ def test_a_run_in_real_time_in_which_drives_were_missed_keeps_every_rule(tmp_pat
 def test_a_run_that_failed_was_failed_by_nobody_on_record() -> None:
     """The world ends it when nobody answers any more; a robot that did answers the End."""
     scenario = load("paper-1")
-    books = {name: Kept() for name in inline.journals(scenario)}
+    books = {name: Kept() for name in in_process.journals(scenario)}
     course = Course(scenario, books[WORLD_JOURNAL])
     robots = {robot: Robot(scenario.briefing(robot), books[agent_journal(robot)]) for robot in "ab"}
     for _ in range(5):
@@ -226,7 +226,7 @@ def test_a_robot_that_has_left_no_journal_is_named(paper_1: dict[str, list[bytes
 
 
 def messages(path: Path) -> list[Any]:
-    return [decode(frame, KINDS, MAX_FRAME_BYTES) for frame in journal.read(path)]
+    return [decode(frame, KINDS, MAX_FRAME_BYTES) for frame in journal_file.read(path)]
 
 
 def written(path: Path, told: Iterable[Any]) -> None:
@@ -238,7 +238,7 @@ def written(path: Path, told: Iterable[Any]) -> None:
 def honest(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The record of paper-1."""
     folder = tmp_path_factory.mktemp("honest")
-    inline.play(load("paper-1"), folder)
+    in_process.play(load("paper-1"), folder)
     return folder
 
 
@@ -422,7 +422,7 @@ def test_a_robot_that_starts_outside_the_range_of_its_anchor_is_found(tmp_path: 
     a, b = scenario.robots
     reach = scenario.mission.sensing_range
     outside = replace(a, start=replace(a.start, x=a.anchor.x + reach * (1.0 + 1e-9), y=a.anchor.y))
-    inline.play(replace(scenario, robots=(outside, b), max_ticks=5), tmp_path)
+    in_process.play(replace(scenario, robots=(outside, b), max_ticks=5), tmp_path)
     findings = audit(tmp_path)
     assert found(findings) == [(None, "a", "scenario")]
     assert what(findings, "scenario") == ["it starts 3.000000003 m from its anchor, outside R = 3 m"]
@@ -690,7 +690,7 @@ def test_ranges_taken_twice_in_the_same_place_are_not_redundant(folder: Path) ->
     ],
 )
 def test_a_claim_by_too_few_noisy_ranges_is_found(variant: str, says: str, tmp_path: Path) -> None:
-    inline.play(noise(1, variant), tmp_path)
+    in_process.play(noise(1, variant), tmp_path)
     record = read(tmp_path)
     first = next(one.tick for one in messages(tmp_path / A) if isinstance(one, Sense) and one.contacts)
     pose = record.moments[first].truth.poses[0]
@@ -729,7 +729,7 @@ def test_a_robot_that_gave_up_and_a_run_that_is_said_to_be_localised_are_found(f
 
 
 def test_nothing_is_claimed_of_another_pair(tmp_path: Path) -> None:
-    inline.play(parse(several_pairs(3), "pairs"), tmp_path)
+    in_process.play(parse(several_pairs(3), "pairs"), tmp_path)
     plant(tmp_path / agent_journal("d"), (of(Estimate, 3), to(localised=True)))
     assert found(audit(tmp_path)) == [(3, "d", "decision")]
 
@@ -784,8 +784,8 @@ def spoilt(folder: Path, name: str, frames: Sequence[bytes]) -> str:
 
 
 def test_journals_that_are_none_are_refused(honest: Path, folder: Path) -> None:
-    world, a = list(journal.read(honest / WORLD_JOURNAL)), list(journal.read(honest / A))
-    assert f"{A} is the journal of b" in spoilt(folder, A, list(journal.read(honest / B)))
+    world, a = list(journal_file.read(honest / WORLD_JOURNAL)), list(journal_file.read(honest / A))
+    assert f"{A} is the journal of b" in spoilt(folder, A, list(journal_file.read(honest / B)))
     assert f"{A}: " in spoilt(folder, A, [*a[:5], encode(load("paper-1"))])
     assert f"{A}: an agent's journal begins with its Briefing" in spoilt(folder, A, [*a[:1], *a[2:]])
     assert f"{WORLD_JOURNAL}: " in spoilt(folder, WORLD_JOURNAL, [])
@@ -806,7 +806,7 @@ def test_a_violation_is_one_line() -> None:
 
 def test_what_befell_the_reports_is_listed_and_another_plan_is_found(tmp_path: Path) -> None:
     text = shipped()["random"].read_text()
-    inline.play(parse(text, "random", faults=["b->a: loss=0.5, delay=0..2, corrupt=0.2"]), tmp_path)
+    in_process.play(parse(text, "random", faults=["b->a: loss=0.5, delay=0..2, corrupt=0.2"]), tmp_path)
     findings = audit(tmp_path)
     assert found(findings) == []
     to_a, to_b = findings.radio
@@ -830,5 +830,5 @@ def test_what_befell_the_reports_is_listed_and_another_plan_is_found(tmp_path: P
 
 def test_a_liar_that_tells_what_it_was_told_to_tell_breaks_no_rule(tmp_path: Path) -> None:
     text = shipped()["random"].read_text().replace('id = "b"', 'id = "b"\nlie = {kind = "scale", size = 0.5}')
-    inline.play(parse(text, "random"), tmp_path)
+    in_process.play(parse(text, "random"), tmp_path)
     assert found(audit(tmp_path)) == []

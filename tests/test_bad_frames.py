@@ -18,14 +18,14 @@ import pytest
 import zenoh
 from msgspec.structs import replace
 
-from compose.local import free_endpoint
-from compose.scenario import load
-from protocol import inbox, keys, session
-from protocol.endpoints import listening
-from protocol.inbox import Arrival, Inbox, Interrupted, Topic
-from protocol.journal import read
+from compose.launch.processes import free_endpoint
+from compose.scenario.scenario_file import load
+from protocol.journal.journal_file import read
 from protocol.messages import Contact, Drive, End, Farewell, Message, Report, Sense
 from protocol.motion import ORIGIN, REST
+from protocol.network import inbox, keys, session
+from protocol.network.endpoints import listening
+from protocol.network.inbox import Arrival, Inbox, Interrupted, Topic
 from protocol.wire import decode, encode
 from tests.commands import (
     BOUND_S,

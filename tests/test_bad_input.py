@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from compose.scenario import BadScenario, parse
+from compose.scenario.scenario_file import BadScenario, parse
 from tests.commands import PAPER_1, Ended, several_pairs, tandem, world
 
 LISTEN = ("--listen", "tcp/127.0.0.1:7447")

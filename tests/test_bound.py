@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from agent.estimation.odometry import Array
-from compose.bound import position_bounds
-from compose.record import Record
-from compose.summary import summary
+from agent.estimation.gaussian.odometry_noise import Array
+from compose.recording.cramer_rao import position_bounds
+from compose.recording.run import Record
+from compose.recording.summary_json import summary
 from protocol.motion import Controls, Pose, step
 from protocol.noise import Noise
 from tests.surveys import ODOMETRY, SIGMA, WHEELS, survey

@@ -15,16 +15,16 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 from scipy.stats import chi2  # type: ignore[import-untyped]
 
-from compose.campaign import report, run, spec, trial
-from compose.campaign.cells import cells
-from compose.campaign.summary import Counted, counted
-from compose.campaign.table import of_rows, schema_of
-from compose.claim import matrix, nees
-from compose.inline import play
-from compose.record import Moment, Record
-from compose.scenario import load, parse
-from compose.show import result
-from compose.summary import leave, summary
+from compose.launch.in_process import play
+from compose.recording.claim import matrix, nees
+from compose.recording.run import Moment, Record
+from compose.recording.summary_json import leave, summary
+from compose.scenario.scenario_file import load, parse
+from compose.sweep import execution, report, spec, trial
+from compose.sweep.cells import cells
+from compose.sweep.statistics import Counted, counted
+from compose.sweep.table import of_rows, schema_of
+from compose.terminal.progress import result
 from protocol.messages import Drive, End, Farewell, Localised
 from protocol.motion import Covariance, Pose
 from tests.commands import SECTION_IV, tandem
@@ -208,14 +208,14 @@ def test_a_row_counts_the_claims_within_three_times_the_accuracy() -> None:
     assert row_of(claimed(generous, SURE, by=0.5)).claims_within == 1
 
 
-def results_of(rows: list[trial.Row], folder: Path) -> run.Results:
+def results_of(rows: list[trial.Row], folder: Path) -> execution.Results:
     """Of a campaign of one cell."""
     (folder / "noisy.toml").write_text(NOISY)
     (folder / "sweep.toml").write_text(SWEEP)
     campaign = spec.load(str(folder / "sweep.toml"))
     (cell,) = cells(campaign)
     table = of_rows(rows, campaign, {0: cell}, schema_of(campaign, [cell]))
-    return run.Results(campaign, (cell,), table, {0: counted(table)}, None, False, len(rows))
+    return execution.Results(campaign, (cell,), table, {0: counted(table)}, None, False, len(rows))
 
 
 def figures_of(rows: list[trial.Row], folder: Path) -> Counted:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from compose.conformance import judged
-from compose.driving import briefed
-from compose.exercise import Trial
-from compose.scenario import load
+from compose.hardware.conformance import judged
+from compose.hardware.exercise import Trial
+from compose.launch.driver_loader import briefed
+from compose.scenario.scenario_file import load
 from tests import broken_drivers, virtual_time
 from tests.commands import tandem
 

@@ -15,16 +15,16 @@ import pyarrow.parquet as pq
 import pytest
 from msgspec.structs import replace
 
-from compose import inline
-from compose.campaign import spec
-from compose.campaign.cells import cells
-from compose.campaign.trial import Trial, play
-from compose.kill import POINTS, WORLD, KillTable, drawn
-from compose.local import ChildFailed
-from compose.record import WORLD_JOURNAL, Record, agent_journal
-from compose.scenario import BadScenario, load, parse, validate
-from compose.toml import table_in
-from protocol.journal import Kept
+from compose.launch import in_process
+from compose.launch.processes import ChildFailed
+from compose.recording.run import WORLD_JOURNAL, Record, agent_journal
+from compose.scenario.kills import POINTS, WORLD, KillTable, drawn
+from compose.scenario.scenario_file import BadScenario, load, parse, validate
+from compose.scenario.toml_file import table_in
+from compose.sweep import spec
+from compose.sweep.cells import cells
+from compose.sweep.trial import Trial, play
+from protocol.journal.journal_file import Kept
 from tests.commands import ENDLESS, PAPER_1, Command, tandem, temporary_in, until
 from tests.test_bad_input import refused
 from world.scenario import Scenario
@@ -86,7 +86,7 @@ def test_whoever_is_killed_the_record_is_that_of_the_same_without_kills(tmp_path
 def test_a_trial_that_leaves_another_record_has_failed_and_says_where(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = inline.played
+    real = in_process.played
 
     def otherwise(scenario: Scenario, sinks: dict[str, Kept]) -> Record:
         record = real(scenario, sinks)
@@ -95,7 +95,7 @@ def test_a_trial_that_leaves_another_record_has_failed_and_says_where(
         sinks[name].frames[-1] += b"!"
         return record
 
-    monkeypatch.setattr(inline, "played", otherwise)
+    monkeypatch.setattr(in_process, "played", otherwise)
     found = play(Trial(0, 0, load("paper-1"), processes=False, kills=()))
     assert (found.outcome, found.ticks, found.same_record) == ("failed", 48, False)
     assert found.reason == f"another record than in one process: {name}"
@@ -202,7 +202,7 @@ def killed(name: str, seed: int) -> list[tuple[Any, ...]]:
 
 
 def test_the_campaign_of_crashes_kills_everyone_in_every_tick_at_every_point() -> None:
-    end = inline.play(load("paper-1")).end
+    end = in_process.play(load("paper-1")).end
     assert end is not None
     ticks = range(end.tick + 1)
     everything = {((who, tick, point),) for who in ("a", "b", WORLD) for tick in ticks for point in POINTS}
@@ -210,7 +210,7 @@ def test_the_campaign_of_crashes_kills_everyone_in_every_tick_at_every_point() -
 
 
 def test_the_campaign_of_two_kills_kills_any_two_or_both_robots_in_one_tick() -> None:
-    end = inline.play(load("paper-2")).end
+    end = in_process.play(load("paper-2")).end
     assert end is not None
     for seed in range(50):
         two, one = killed("crash-twice", seed)

@@ -16,9 +16,9 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
-from compose.cli import parser
-from compose.local import free_endpoint
-from protocol import journal
+from compose.cli.main import parser
+from compose.launch.processes import free_endpoint
+from protocol.journal import journal_file
 from tests.commands import Command, tandem
 
 HOUSE = Path(__file__).parents[1]
@@ -155,7 +155,7 @@ def test_the_services_commands_play_a_mission_though_one_is_killed_and_started_a
         for robot in ("a", "b"):
             playing[f"agent-{robot}"].until_answered(robot, tmp_path / f"agent-{robot}")
         record = tmp_path / "world" / "world.journal"
-        playing["world"].until(lambda: len(list(journal.read(record))) >= 4, "three ticks are on record")
+        playing["world"].until(lambda: len(list(journal_file.read(record))) >= 4, "three ticks are on record")
         playing[killed].tell(SIGKILL)
         playing[killed] = stack.enter_context(Command(*commands[killed]))
         ended = {name: command.ended() for name, command in playing.items()}

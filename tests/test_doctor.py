@@ -22,16 +22,16 @@ from cryptography.hazmat.primitives.serialization import (
     load_pem_private_key,
 )
 
-from compose import installed
-from compose.doctor.network import APART_S, compared
-from compose.doctor.papers import papers
-from compose.installed import Library
-from compose.local import free_endpoint
-from compose.reach import KEYED
-from protocol import keys as tree
-from protocol import session
-from protocol.endpoints import configured, listening
-from protocol.refusal import MUTE
+from compose import extras
+from compose.doctor.certificate_checks import papers
+from compose.doctor.network_checks import APART_S, compared
+from compose.extras import Library
+from compose.launch.processes import free_endpoint
+from compose.network import KEYED
+from protocol.network import keys as tree
+from protocol.network import session
+from protocol.network.diagnosis import MUTE
+from protocol.network.endpoints import configured, listening
 from protocol.wire import VERSION
 from tests.commands import ENDLESS, LONG, Command, Ended, tandem, world
 from tests.test_keys import expire, give_foreign, last, world_of
@@ -62,12 +62,12 @@ def test_versions_are_told(tmp_path: Path) -> None:
     (said,) = findings(ended, "ok")
     for name in ("python 3.", "eclipse-zenoh 1.", "numpy ", "scipy ", "msgpack ", "msgspec "):
         assert name in said
-    assert f"tandem-ranging {installed.version()}" in said
+    assert f"tandem-ranging {extras.version()}" in said
     assert said.endswith(f"protocol version {VERSION}")
     assert findings(ended, "--") == ["network: there is no --connect"]
     assert tandem("--version", cwd=tmp_path) == (
         0,
-        f"tandem {installed.version()}, protocol version {VERSION}\n",
+        f"tandem {extras.version()}, protocol version {VERSION}\n",
         "",
     )
 

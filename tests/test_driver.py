@@ -10,9 +10,8 @@ import pytest
 import zenoh
 from msgspec.structs import replace
 
-from compose.driving import briefed
-from compose.scenario import parse
-from protocol import keys
+from compose.launch.driver_loader import briefed
+from compose.scenario.scenario_file import parse
 from protocol.messages import (
     Alarm,
     Beat,
@@ -27,13 +26,14 @@ from protocol.messages import (
     Verdict,
 )
 from protocol.motion import ORIGIN, REST, Controls
+from protocol.network import keys
 from protocol.wire import decode, encode
 from tests.commands import ASSURED, PAPER_1
 from tests.stage import Stage
-from world.driver import THINKING, Reading
-from world.driver_journal import DrivenTick, DriverPast
-from world.ending import LAST_WORDS, Ending
-from world.field import UNHEARD, Field
+from world.hardware.bridge import UNHEARD, Field
+from world.hardware.driver import THINKING, Reading
+from world.hardware.driver_journal import DrivenTick, DriverPast
+from world.hardware.termination import LAST_WORDS, Ending
 
 Answer = Callable[[int], Iterable[bytes]]
 """what somebody says to the Sense of a tick"""

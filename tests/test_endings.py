@@ -18,10 +18,10 @@ from signal import SIGINT, SIGKILL, SIGSTOP, SIGTERM
 
 import pytest
 
-from compose.beside import Beside, stay
-from compose.local import free_endpoint
-from protocol.inbox import Arrival, Inbox
-from protocol.refusal import MUTE
+from compose.launch.processes import free_endpoint
+from compose.launch.viewers import Beside, stay
+from protocol.network.diagnosis import MUTE
+from protocol.network.inbox import Arrival, Inbox
 from tests.commands import (
     ENDLESS,
     LONG,

@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from agent.memory import remember
-from compose import inline
-from compose.scenario import load
-from protocol import environment, journal
-from protocol.journal import CorruptJournal
+from agent.process.recovery import remember
+from compose.launch import in_process
+from compose.scenario.scenario_file import load
+from protocol.journal import environment, journal_file
+from protocol.journal.journal_file import CorruptJournal
+from protocol.journal.resume import Retrace
 from protocol.messages import Drive, Environment, Estimate
-from protocol.retrace import Retrace
 from protocol.wire import MalformedFrame, decode, encode
 from tests.commands import Ended, tandem
 
@@ -28,7 +28,7 @@ OLDER = "0.0.9"
 
 @pytest.fixture
 def record(tmp_path: Path) -> Path:
-    inline.play(load("paper-1"), tmp_path)
+    in_process.play(load("paper-1"), tmp_path)
     return tmp_path
 
 
@@ -36,7 +36,7 @@ def changed(path: Path, kind: type, change: Callable[..., object | None], first:
     """Write the journal anew, the first message of `kind` from tick `first` on as `change` makes it."""
     frames: list[bytes] = []
     done = False
-    for frame in journal.read(path):
+    for frame in journal_file.read(path):
         message: object
         try:
             message = decode(frame, kind)
@@ -48,7 +48,7 @@ def changed(path: Path, kind: type, change: Callable[..., object | None], first:
         done = True
         new = change(message)
         frames += [] if new is None else [encode(new)]
-    path.write_bytes(journal.packed(frames))
+    path.write_bytes(journal_file.packed(frames))
 
 
 def elsewhere(path: Path) -> None:
@@ -68,14 +68,14 @@ def turned(by: float) -> Callable[[Estimate], Estimate]:
 def test_a_journals_first_frame_names_versions_and_instruction_set(record: Path) -> None:
     import numpy as np  # noqa: PLC0415
 
-    told = decode(next(journal.read(record / A)), Environment)
+    told = decode(next(journal_file.read(record / A)), Environment)
     assert told.numpy is not None
     assert told.numpy.startswith(np.__version__)
     assert told.linear_algebra
     assert told.c_library
     assert told.instruction_set
     assert told == environment.of_robot()
-    world = decode(next(journal.read(record / WORLD)), Environment)
+    world = decode(next(journal_file.read(record / WORLD)), Environment)
     assert world == replace(told, numpy=None, linear_algebra=None)
 
 

@@ -36,17 +36,17 @@ from mcap.records import Schema
 from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 
-from compose import exporting, inline
 from compose.audit.replay import replay
-from compose.cli import parser
-from compose.commands import run
-from compose.export.folder import export
-from compose.export.gate import GUESTS, GUESTS_FILES
-from compose.export.views import LEAST
-from compose.local import free_endpoint
-from compose.record import WORLD_JOURNAL, agent_journal, estimates, read
-from compose.scenario import load
-from protocol import journal
+from compose.cli import export_bar, run
+from compose.cli.main import parser
+from compose.launch import in_process
+from compose.launch.processes import free_endpoint
+from compose.recording.run import WORLD_JOURNAL, agent_journal, estimates, read
+from compose.scenario.scenario_file import load
+from compose.view.export.folder import export
+from compose.view.foxglove.gate import GUESTS, GUESTS_FILES
+from compose.view.foxglove.views import LEAST
+from protocol.journal import journal_file
 from protocol.messages import Estimate, Sense
 from protocol.motion import wrap
 from protocol.wire import decode
@@ -62,7 +62,7 @@ A, B = agent_journal("a"), agent_journal("b")
 
 def exported(scenario: Scenario, folder: Path) -> Path:
     """The record of its run, and what is exported of it."""
-    inline.play(scenario, folder)
+    in_process.play(scenario, folder)
     export(folder, folder)
     return folder
 
@@ -304,7 +304,7 @@ def test_ticks_as_a_table_are_those_of_ticks_csv_with_what_was_held_possible(noi
 
 
 def test_frames_are_rows_with_their_fields_by_name(faulty: Path) -> None:
-    frames = {path.name: list(journal.read(path)) for path in faulty.glob("*.journal")}
+    frames = {path.name: list(journal_file.read(path)) for path in faulty.glob("*.journal")}
     rows = rows_of(faulty / "frames.csv")
     assert Counter(row["journal"] for row in rows) == {name: len(ones) for name, ones in frames.items()}
     for row in rows:
@@ -338,7 +338,7 @@ def test_a_torn_journal_is_exported_to_the_tear(name: str, faulty: Path, tmp_pat
         (torn / path.name).write_bytes(path.read_bytes())
     size = (torn / name).stat().st_size * 2 // 3
     (torn / name).write_bytes((torn / name).read_bytes()[:size])
-    whole = journal.packed(journal.read(torn / name))
+    whole = journal_file.packed(journal_file.read(torn / name))
     ended = tandem("export", torn)
     assert (ended.status, ended.err) == (0, f"{name} ends with {size - len(whole)} bytes of a torn write\n")
     assert journals_of(torn / "run.mcap") == on_disk(faulty) | {name: whole}
@@ -398,7 +398,7 @@ def test_a_run_exports_its_record_at_its_end(mode: list[str], paper_1: Path, tmp
 def test_a_run_tells_its_outcome_though_it_cannot_export(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(exporting, "MODULES", ("no_such_module",))
+    monkeypatch.setattr(export_bar, "MODULES", ("no_such_module",))
     monkeypatch.setattr(run, "stop_by_signal", lambda _: None)  # of the tests' own process
     for quiet, said in ((True, ""), (False, "tandem run: not exported: needs no_such_module")):
         words = ["run", "paper-1", "--in-process", "--out", str(tmp_path / str(quiet)), *["-q"] * quiet]

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from compose import inline
-from compose.campaign import figures, run, spec
-from compose.campaign.cells import Refused, cells, setting_of
-from compose.campaign.fields import NoSuchField, steps, with_value
-from compose.campaign.trial import Trial, row
-from compose.scenario import load
-from protocol.inbox import Inbox
+from compose.launch import in_process
+from compose.scenario.scenario_file import load
+from compose.sweep import axis_figures, execution, spec
+from compose.sweep.cells import Refused, cells, setting_of
+from compose.sweep.field_paths import NoSuchField, steps, with_value
+from compose.sweep.trial import Trial, row
+from protocol.network.inbox import Inbox
 from world.faults import Fault
 from world.scenario import Scenario
 
@@ -86,7 +86,7 @@ def test_a_fault_may_be_varied_that_the_base_scenario_leaves_out() -> None:
 
 def test_a_row_counts_what_was_lost_and_refused() -> None:
     scenario = load("random", faults=["loss=0.5, corrupt=0.3"])
-    record = inline.play(scenario)
+    record = in_process.play(scenario)
     found = row(Trial(0, 0, scenario, processes=False), record, 0.1)
     said = record.farewells.values()
     assert found.reports_lost == sum([one.reports_lost for one in said]) > 0
@@ -111,9 +111,9 @@ values = [[0.0], [0.5]]
 def test_labels_that_are_numbers_make_a_curve_with_a_band(labels: str, curve: bool, tmp_path: Path) -> None:
     (tmp_path / "small.toml").write_text(SMALL.replace("LABELS", labels))
     campaign = spec.load(str(tmp_path / "small.toml"))
-    silent = run.Progress(say=print, begin=lambda *_: None, done=lambda _: None)
-    results = run.sweep(campaign, tmp_path / "out", run.Means(workers=1), Inbox("test"), silent)
-    (axes,) = figures.ticks_against(results, 0).axes
+    silent = execution.Progress(say=print, begin=lambda *_: None, done=lambda _: None)
+    results = execution.sweep(campaign, tmp_path / "out", execution.Means(workers=1), Inbox("test"), silent)
+    (axes,) = axis_figures.ticks_against(results, 0).axes
     median = axes.lines[0]
     assert median.get_linestyle() == ("-" if curve else "None")
     assert np.asarray(median.get_xdata()).tolist() == ([0.0, 0.5] if curve else [0.0, 1.0])

@@ -9,11 +9,11 @@ from typing import NamedTuple
 import pytest
 from msgspec.structs import replace
 
-from compose import inline
-from compose.record import Record
-from compose.scenario import load
-from compose.summary import summary
-from protocol import journal
+from compose.launch import in_process
+from compose.recording.run import Record
+from compose.recording.summary_json import summary
+from compose.scenario.scenario_file import load
+from protocol.journal import journal_file
 from protocol.messages import Briefing, Drive, End, Environment, Estimate, Farewell, Report, Sense
 from protocol.wire import decode
 from tests.commands import journals, several_pairs, tandem
@@ -57,7 +57,7 @@ def localises(record: Record) -> bool:
 @pytest.mark.parametrize("seed", series([1, 2, 3, 4]))
 @pytest.mark.parametrize("plan", PLANS)
 def test_a_mission_localises_whatever_befalls_its_reports(plan: str, seed: int) -> None:
-    assert localises(inline.play(load("random", seed=seed, faults=PLANS[plan])))
+    assert localises(in_process.play(load("random", seed=seed, faults=PLANS[plan])))
 
 
 @pytest.mark.parametrize("seed", series([1, 2]))
@@ -67,13 +67,13 @@ def test_a_mission_localises_whatever_befalls_its_reports(plan: str, seed: int) 
 def test_under_noise_too(plan: str, seed: int) -> None:
     quiet = scenario_of(NOISE, seed)
     faults = load("random", faults=PLANS[plan]).faults
-    assert localises(inline.play(replace(quiet, faults=faults, max_ticks=3000)))
+    assert localises(in_process.play(replace(quiet, faults=faults, max_ticks=3000)))
 
 
 def test_what_is_lost_costs_ticks() -> None:
     ticks = []
     for faults in ([], PLANS["loss"], ["loss=0.98"]):
-        found = [inline.play(load("random", seed=seed, faults=faults)).end for seed in range(8)]
+        found = [in_process.play(load("random", seed=seed, faults=faults)).end for seed in range(8)]
         ticks.append(sum([end.tick for end in found if end is not None]))
     assert ticks[0] < ticks[1] < ticks[2]
 
@@ -84,7 +84,7 @@ def test_a_partition_costs_what_it_lasts_since_nobody_goes_on_unanswered(begin: 
     cut = 30
     for seed in range(1, 9):
         whole, parted = (
-            inline.play(load("random", seed=seed, faults=faults))
+            in_process.play(load("random", seed=seed, faults=faults))
             for faults in ([], [f"{way}: partition, contact_ticks={begin}..{begin + cut}"])
         )
         assert localises(parted)
@@ -96,7 +96,7 @@ def test_a_delay_costs_three_times_what_it_lasts(delay: int) -> None:
     """Once before they can meet, once before the last manoeuvre, and once before the claim."""
     for seed in range(1, 9):
         prompt, late = (
-            inline.play(load("random", seed=seed, faults=faults)) for faults in ([], [f"delay={delay}"])
+            in_process.play(load("random", seed=seed, faults=faults)) for faults in ([], [f"delay={delay}"])
         )
         assert localises(late)
         assert late.moments[-1].truth.tick == prompt.moments[-1].truth.tick + 3 * delay
@@ -104,7 +104,7 @@ def test_a_delay_costs_three_times_what_it_lasts(delay: int) -> None:
 
 def test_under_noise_a_robot_that_has_not_been_answered_stands_and_listens() -> None:
     quiet = scenario_of(NOISE, 1)
-    record = inline.play(replace(quiet, faults=load("random", faults=["delay=6"]).faults, max_ticks=3000))
+    record = in_process.play(replace(quiet, faults=load("random", faults=["delay=6"]).faults, max_ticks=3000))
     assert localises(record)
     drives = [moment.drives[robot] for moment in record.moments for robot in "ab"]
     listening = [drive for drive in drives if drive.state == "listening"]
@@ -114,7 +114,7 @@ def test_under_noise_a_robot_that_has_not_been_answered_stands_and_listens() -> 
 
 def test_two_that_never_hear_each_other_claim_nothing() -> None:
     scenario = load("random", faults=["partition"])
-    record = inline.play(replace(scenario, max_ticks=300))
+    record = in_process.play(replace(scenario, max_ticks=300))
     assert record.end is not None
     assert record.end.outcome == "undecided"
     told = summary(record, "in-process", None)["robots"]
@@ -124,7 +124,7 @@ def test_two_that_never_hear_each_other_claim_nothing() -> None:
 
 def test_one_that_is_never_heard_keeps_both_from_a_claim() -> None:
     scenario = load("random", faults=["a->b: partition"])
-    record = inline.play(replace(scenario, max_ticks=300))
+    record = in_process.play(replace(scenario, max_ticks=300))
     assert record.end is not None
     assert record.end.outcome == "undecided"
     assert record.farewells["a"].reports_lost == 0 < record.farewells["a"].reports_heard
@@ -135,7 +135,7 @@ def test_one_that_is_never_heard_keeps_both_from_a_claim() -> None:
 def test_what_was_heard_refused_and_lost_adds_up_to_what_the_world_let_through(
     plan: str, tmp_path: Path
 ) -> None:
-    record = inline.play(load("random", seed=3, faults=PLANS[plan]), tmp_path)
+    record = in_process.play(load("random", seed=3, faults=PLANS[plan]), tmp_path)
     for robot, peer in (("a", "b"), ("b", "a")):
         contacts = [(sense.tick, contact) for sense in senses(tmp_path, robot) for contact in sense.contacts]
         came = {tick for _, contact in contacts for tick in (*(contact.heard or ()), *contact.damaged)}
@@ -157,7 +157,7 @@ def senses(folder: Path, robot: str) -> Iterator[Sense]:
 
 
 def frames(folder: Path, name: str) -> list[bytes]:
-    return list(journal.read(folder / name))
+    return list(journal_file.read(folder / name))
 
 
 # --- every mode makes the same of them ----------------------------------------------------------------
@@ -201,7 +201,7 @@ def test_a_plan_in_which_nothing_happens_is_no_plan_to_the_byte(base: str, tmp_p
     nothing = load("random", faults=["loss=0", "a->b: delay=0..0, duplicate=0", "partition, ticks=7..7"])
     for folder, faults in (("without", ()), ("with", nothing.faults)):
         (tmp_path / folder).mkdir()
-        inline.play(replace(scenario, faults=faults), tmp_path / folder)
+        in_process.play(replace(scenario, faults=faults), tmp_path / folder)
     without, with_it = journals(tmp_path / "without"), journals(tmp_path / "with")
     for robot in "ab":
         assert without[f"agent-{robot}.journal"] == with_it[f"agent-{robot}.journal"]

@@ -16,11 +16,11 @@ from signal import SIGCONT, SIGINT, SIGKILL, SIGSTOP
 import pytest
 from msgspec.structs import replace
 
-from agent.past import Past, past
-from compose.local import free_endpoint
-from compose.scenario import load
+from agent.process.agent_journal import Past, past
+from compose.launch.processes import free_endpoint
+from compose.scenario.scenario_file import load
 from docs.rover import Rover
-from protocol import journal
+from protocol.journal import journal_file
 from protocol.messages import Drive, OfRobot
 from protocol.motion import REST
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
@@ -66,7 +66,7 @@ def pair(out: Path, *more: str | Path, protocol: str = "tcp") -> Iterator[dict[s
 
 def told(out: Path, robot: str) -> Past:
     path = out / robot / f"agent-{robot}.journal"
-    return past(journal.read(path), path)
+    return past(journal_file.read(path), path)
 
 
 def messages(frames: list[bytes]) -> list[object]:
@@ -132,13 +132,13 @@ def test_a_decision_that_does_not_follow_is_found_without_a_world(tmp_path: Path
     with pair(tmp_path) as robots:
         both_have_ended(tmp_path, robots)
     path = tmp_path / "a" / "agent-a.journal"
-    frames = list(journal.read(path))
+    frames = list(journal_file.read(path))
     place, drive = next(
         (i, one) for i, one in enumerate(messages(frames)) if isinstance(one, Drive) and one.v
     )
     frames[place] = encode(replace(drive, v=0.5 * drive.v))
     path.unlink()
-    with journal.Journal(path) as changed:
+    with journal_file.Journal(path) as changed:
         changed.write(*frames)
     replayed = tandem("replay", tmp_path / "a")
     assert replayed.status == 1
@@ -235,7 +235,7 @@ def test_a_robot_whose_peer_does_not_come_has_not_moved(tmp_path: Path) -> None:
 )
 def test_a_mistake_is_one_line(tmp_path: Path, arguments: tuple[str, ...], said: str) -> None:
     (tmp_path / "faults.toml").write_text(f"{PAPER_1}\n[[fault]]\nloss = 0.5\n")
-    with journal.Journal(tmp_path / "agent-a.journal") as old:
+    with journal_file.Journal(tmp_path / "agent-a.journal") as old:
         old.write(encode(load("paper-1").briefing("a")))
     words = [word.format(faults=tmp_path / "faults.toml", record=tmp_path) for word in arguments]
     ended = tandem("robot", *words, "--driver", "docs.rover:Rover")

@@ -14,20 +14,20 @@ from typing import Any
 import msgpack
 import pytest
 
-from compose.driver_record import recorded
-from compose.local import free_endpoint
-from compose.scenario import load
-from protocol.inbox import Inbox
-from protocol.journal import CorruptJournal
+from compose.hardware.driver_recording import recorded
+from compose.launch.processes import free_endpoint
+from compose.scenario.scenario_file import load
+from protocol.journal.journal_file import CorruptJournal
 from protocol.messages import Sense
 from protocol.motion import REST
+from protocol.network.inbox import Inbox
 from protocol.wire import encode
 from tests.broken_drivers import LosesAReading
 from tests.commands import Command, processes_of, size, tandem, until
 from tests.series import series
 from tests.test_field import ASSURED, STARTS, beacon, both_have_ended, told
-from world import driver_journal
-from world.driver_journal import DriverPast
+from world.hardware import driver_journal
+from world.hardware.driver_journal import DriverPast
 
 
 class Pair:

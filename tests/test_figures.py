@@ -16,16 +16,16 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from compose.figures import belief, plane
-from compose.figures.robot import figure_of
+from compose.figures.one_robot import figure_of
 from compose.figures.story import Story
 from compose.figures.style import PLACES, look, save
-from compose.inline import play
-from compose.record import estimates, read
-from compose.scenario import load, parse
-from compose.scene.recorded import read as performed
-from compose.summary import first_claim
-from protocol.journal import CorruptJournal
-from protocol.journal import read as frames
+from compose.launch.in_process import play
+from compose.recording.run import estimates, read
+from compose.recording.summary_json import first_claim
+from compose.scenario.scenario_file import load, parse
+from compose.view.recorded import read as performed
+from protocol.journal.journal_file import CorruptJournal
+from protocol.journal.journal_file import read as frames
 from protocol.messages import Estimate
 from tests.commands import PAPER_1, Ended, several_pairs, tandem
 from tests.series import series

@@ -15,10 +15,11 @@ from pathlib import Path
 
 import pytest
 
-from compose import inline, summary
-from compose.export import folder as export
-from compose.scenario import load
-from compose.status import UserError
+from compose.errors import UserError
+from compose.launch import in_process
+from compose.recording import summary_json
+from compose.scenario.scenario_file import load
+from compose.view.export import folder as export
 from protocol import files
 from tests.commands import PAPER_1, Command, Ended, processes_of
 
@@ -52,7 +53,7 @@ OTHERS: dict[str, Callable[[Path], None]] = {
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recording")
-    inline.play(load("paper-1"), folder)
+    in_process.play(load("paper-1"), folder)
     return folder
 
 
@@ -136,11 +137,11 @@ def test_every_file_of_a_run_and_an_export_is_whole_or_absent_however_little_roo
     recording: Path, tmp_path: Path, no_room: Callable[[int], None]
 ) -> None:
     pytest.importorskip("foxglove")
-    record = inline.play(load("paper-1"))
-    told = summary.summary(record, "in-process", None)
+    record = in_process.play(load("paper-1"))
+    told = summary_json.summary(record, "in-process", None)
     whole = tmp_path / "whole"
     whole.mkdir()
-    summary.leave(record, told, whole)
+    summary_json.leave(record, told, whole)
     export.export(recording, whole)
     wanted = {path.name: path.read_bytes() for path in whole.iterdir()}
     for room in (0, 5_000, 12_000):
@@ -148,7 +149,7 @@ def test_every_file_of_a_run_and_an_export_is_whole_or_absent_however_little_roo
         out.mkdir()
         no_room(room)
         with suppress(OSError):
-            summary.leave(record, told, out)
+            summary_json.leave(record, told, out)
         with pytest.raises(UserError, match="too large"):
             export.export(recording, out)
         left = {path.name: path.read_bytes() for path in out.iterdir()}
@@ -160,7 +161,7 @@ FILLED = """
 import resource, signal, sys
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (9_500, resource.RLIM_INFINITY))
-from compose.cli import main
+from compose.cli.main import main
 main(sys.argv[1:])
 """
 """journals fit, ticks.csv does not"""
@@ -193,8 +194,8 @@ def test_what_is_written_replaces_a_link_and_leaves_what_it_led_to(recording: Pa
     names = ("summary.json", *export.FILES)
     for name in names:
         (out / name).symlink_to(kept)
-    record = inline.play(load("paper-1"))
-    summary.leave(record, summary.summary(record, "in-process", None), out)
+    record = in_process.play(load("paper-1"))
+    summary_json.leave(record, summary_json.summary(record, "in-process", None), out)
     export.export(recording, out)
     assert kept.read_text() == "kept"
     assert not [name for name in names if (out / name).is_symlink()]

@@ -12,13 +12,10 @@ from urllib.request import urlopen
 
 import pytest
 
-from compose.local import free_endpoint
-from compose.reach import KEYED
-from compose.scenario import load
-from compose.watch.network import AHEAD, LEAP, Heard, Refused
-from protocol import keys, session
-from protocol.endpoints import configured
-from protocol.keys import Key
+from compose.launch.processes import free_endpoint
+from compose.network import KEYED
+from compose.scenario.scenario_file import load
+from compose.view.web.live import AHEAD, LEAP, Heard, Refused
 from protocol.messages import (
     Drive,
     End,
@@ -31,6 +28,9 @@ from protocol.messages import (
     Undecided,
 )
 from protocol.motion import ORIGIN, Pose
+from protocol.network import keys, session
+from protocol.network.endpoints import configured
+from protocol.network.keys import Key
 from protocol.wire import MalformedFrame, encode
 from tests.commands import PAPER_1, Command, Ended, tandem, until
 

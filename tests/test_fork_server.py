@@ -14,11 +14,11 @@ from signal import SIGKILL, SIGSTOP
 
 import pytest
 
-from compose.forked import ForkServer
-from compose.local import free_endpoint
-from protocol import keys, session
-from protocol.endpoints import at, listening
-from protocol.inbox import Inbox
+from compose.launch.forked import ForkServer
+from compose.launch.processes import free_endpoint
+from protocol.network import keys, session
+from protocol.network.endpoints import at, listening
+from protocol.network.inbox import Inbox
 from tests.commands import (
     ENDLESS,
     OVER,
@@ -97,12 +97,12 @@ def test_each_has_its_own_session_and_group_and_is_named_in_ps(endless: Path, tm
 
 
 def test_its_status_and_what_it_says_are_its_own(tmp_path: Path) -> None:
-    server = ForkServer("compose.warm_up:missions")
+    server = ForkServer("compose.cli.warm_up:missions")
     try:
         ended = []
         with (tmp_path / "first").open("wb+") as first, (tmp_path / "second").open("wb+") as second:
             wrong = server.start(
-                "compose.cli:main",
+                "compose.cli.main:main",
                 "tandem",
                 "agent",
                 "?",
@@ -110,7 +110,15 @@ def test_its_status_and_what_it_says_are_its_own(tmp_path: Path) -> None:
                 on_end=lambda: ended.append(1),
             )
             mute = server.start(
-                *("compose.cli:main", "tandem", "agent", "a", "--connect", free_endpoint(), "--launched"),
+                *(
+                    "compose.cli.main:main",
+                    "tandem",
+                    "agent",
+                    "a",
+                    "--connect",
+                    free_endpoint(),
+                    "--launched",
+                ),
                 errors=second.fileno(),
             )
             assert wrong.status == 2
@@ -126,10 +134,10 @@ def test_its_status_and_what_it_says_are_its_own(tmp_path: Path) -> None:
 
 
 def test_it_ends_with_its_standard_input() -> None:
-    server = ForkServer("compose.warm_up:missions")
+    server = ForkServer("compose.cli.warm_up:missions")
     with open(os.devnull, "wb") as nowhere:
         words = ("tandem", "agent", "a", "--connect", free_endpoint(), "--launched")
-        agent = server.start("compose.cli:main", *words, errors=nowhere.fileno())
+        agent = server.start("compose.cli.main:main", *words, errors=nowhere.fileno())
     agent.hang_up()
     assert agent.status == 130
     server.close()
@@ -233,7 +241,7 @@ def test_no_fork_server_outlasts_a_run() -> None:
 def test_a_fork_server_that_cannot_start_says_why_in_one_line() -> None:
     server = ForkServer("nowhere:nothing")
     with open(os.devnull, "wb") as nowhere:
-        process = server.start("compose.cli:main", "tandem", errors=nowhere.fileno())
+        process = server.start("compose.cli.main:main", "tandem", errors=nowhere.fileno())
         assert process.status == -SIGKILL
     assert server.gone
     assert server.why_gone() == (
@@ -244,7 +252,7 @@ def test_a_fork_server_that_cannot_start_says_why_in_one_line() -> None:
 
 CROWD = """
 import os, resource, signal, threading
-from compose.forked import ForkServer
+from compose.launch.forked import ForkServer
 
 server = ForkServer("os:getpid")
 nowhere = os.open(os.devnull, os.O_RDWR)

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
-from agent.belief import Sighting, branches, weigh_branches, weigh_placements
-from agent.geometry import Placement, circle_intersections, included_angle, placements
+from agent.estimation.closed_forms import Placement, circle_intersections, included_angle, placements
+from agent.estimation.exact import Sighting, branches, weigh_branches, weigh_placements
 from protocol.motion import TAU, Pose, Run, chord, compose, follow, step, wrap
 
 EXACT = 1e-9

@@ -2,7 +2,7 @@
 
 Fifty missions are played and recorded. What both robots had measured when they claimed is read back from
 their journals, twice: into a mind, for the fit that the claim came of; and into a graph of every pose and
-every manoeuvre, which has nothing in common with `agent.estimation.smoothing` but the model.
+every manoeuvre, which has nothing in common with `agent.estimation.gaussian.least_squares` but the model.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ import pytest
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from agent import inference, planner
-from agent.estimation.hypotheses import Weighed, search
-from agent.estimation.ranging import Pair
-from agent.estimation.smoothing import Fit, poses
-from agent.mind import Done, Mind
-from compose.inline import play
-from compose.scenario import parse
-from protocol import journal
+from agent.estimation.gaussian.hypotheses import Weighed, search
+from agent.estimation.gaussian.least_squares import Fit, poses
+from agent.estimation.gaussian.range_model import Pair
+from agent.planning import inference, planner
+from agent.planning.state import Done, Mind
+from compose.launch.in_process import play
+from compose.scenario.scenario_file import parse
+from protocol.journal import journal_file
 from protocol.messages import Briefing, Drive, End, Estimate, Farewell, Localised, Report, Sense, Undecided
 from protocol.motion import Controls, Pose, compose, step
 from protocol.noise import Drift, Noise
@@ -107,7 +107,7 @@ def recorded(number: int, folder: Path) -> None:
 
 def said(folder: Path, robot: str) -> Iterator[Sense | Report | Drive]:
     """What the journal of `robot` has in and out, until it claims."""
-    frames = journal.read(folder / f"agent-{robot}.journal")
+    frames = journal_file.read(folder / f"agent-{robot}.journal")
     for frame in islice(frames, 2, None):
         match decode(frame, Sense | Report | Drive | Estimate | End | Farewell):
             case Sense() | Report() as message:
@@ -140,7 +140,7 @@ def remembered(folder: Path, robot: str) -> tuple[Mind, Localised]:
 
     It has come to a verdict before it began, so it decides nothing, and takes no time.
     """
-    briefing = decode(list(journal.read(folder / f"agent-{robot}.journal"))[1], Briefing)
+    briefing = decode(list(journal_file.read(folder / f"agent-{robot}.journal"))[1], Briefing)
     mind = Mind(briefing, Done(1, Undecided("was not asked")))
     heard: list[Report] = []
     for message in said(folder, robot):

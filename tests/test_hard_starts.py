@@ -8,8 +8,8 @@ from itertools import product
 import pytest
 from msgspec.structs import replace
 
-from compose import inline
-from compose.scenario import load, parse
+from compose.launch import in_process
+from compose.scenario.scenario_file import load, parse
 from protocol.messages import Localised
 from tests.commands import SECTION_IV
 from world.referee import errors
@@ -22,7 +22,7 @@ HEADINGS = {"outward": 0.0, "inward": math.pi, "tangent left": math.pi / 2, "tan
 
 
 def assert_localised(scenario: Scenario) -> None:
-    record = inline.play(scenario)
+    record = in_process.play(scenario)
     assert record.end is not None
     assert record.end.outcome == "localised", record.end
     last = record.moments[-1]

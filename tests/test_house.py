@@ -13,9 +13,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from agent import planner
-from agent.mind import Mind
-from compose.scenario import load
+from agent.planning import planner
+from agent.planning.state import Mind
+from compose.scenario.scenario_file import load
 from protocol.wire import encode
 from tests.steps import steps
 from world.tick import advance, release, senses
@@ -29,24 +29,29 @@ BELOW = {
 }
 """what each room may import of the house"""
 
-SHELL = {"protocol.session", "protocol.journal", "protocol.retrace", "protocol.inbox"}
+SHELL = {
+    "protocol.network.session",
+    "protocol.journal.journal_file",
+    "protocol.journal.resume",
+    "protocol.network.inbox",
+}
 """the rooms' windows: files, networks, clocks"""
 
 PURE = {
-    "agent.planner",
-    "agent.apart",
-    "agent.mind",
-    "agent.meeting",
-    "agent.precision",
-    "agent.belief",
-    "agent.geometry",
-    "agent.inference",
-    "agent.letter",
-    "agent.logbook",
-    "agent.lying",
-    "agent.survey",
-    "agent.trust",
-    "agent.radio",
+    "agent.planning.planner",
+    "agent.planning.separation",
+    "agent.planning.state",
+    "agent.planning.encounter",
+    "agent.planning.precision",
+    "agent.estimation.exact",
+    "agent.estimation.closed_forms",
+    "agent.planning.inference",
+    "agent.planning.paper",
+    "agent.peer.motion_log",
+    "agent.peer.false_reports",
+    "agent.planning.assured",
+    "agent.planning.plausibility",
+    "agent.peer.peer_state",
     *(
         ".".join(path.relative_to(HOUSE).with_suffix("").parts)
         for floor in ("phases", "estimation")
@@ -54,9 +59,9 @@ PURE = {
     ),
     "world.tick",
     "world.truth",
-    "world.driver",
+    "world.hardware.driver",
     "world.sensors",
-    "world.draws",
+    "world.random_streams",
     "world.faults",
     "world.channel",
     "world.referee",
@@ -65,7 +70,7 @@ PURE = {
     "protocol.mission",
     "protocol.motion",
     "protocol.noise",
-    "protocol.rendezvous",
+    "protocol.orbits",
     "protocol.rounding",
     "protocol.units",
 }
@@ -143,29 +148,29 @@ def test_no_module_hides_an_import(module: str) -> None:
 
 
 def test_every_module_of_the_house_is_looked_at() -> None:
-    assert {"agent.phases.anchor", "compose.cli", "protocol.wire", "world.process"} <= {
+    assert {"agent.planning.phase1_anchor", "compose.cli.main", "protocol.wire", "world.process"} <= {
         module for room in BELOW for module in modules(room)
     }
 
 
 def test_no_import_escapes_wherever_it_stands() -> None:
     source = """
-import agent.planner as p
+import agent.planning.planner as p
 from world import tick, referee as judge
 from world.tick import World
 if TYPE_CHECKING:
-    from compose.record import Record
+    from compose.recording.run import Record
 def f():
     class C:
         def g(self):
             from agent import geometry
-            import compose.cli, math
+            import compose.cli.main, math
 """
     assert sorted(imports(ast.parse(source))) == [
-        "agent.geometry",
-        "agent.planner",
-        "compose.cli",
-        "compose.record",
+        "agent.estimation.closed_forms",
+        "agent.planning.planner",
+        "compose.cli.main",
+        "compose.recording.run",
         "math",
         "world.referee",
         "world.tick",
@@ -268,30 +273,30 @@ def loaded_by(module: str) -> set[str]:
 @pytest.mark.parametrize(
     ("module", "absent"),
     [
-        ("compose.cli", {"zenoh", "numpy", "scipy", "rich"}),
-        ("agent.process", {"world", "compose", "scipy", "rich"}),
-        ("world.field", {"numpy", "scipy", "rich", "agent", "compose", "rosbags"}),
-        ("compose.commands.robot", {"numpy", "scipy", "rich", "agent", "rosbags"}),
+        ("compose.cli.main", {"zenoh", "numpy", "scipy", "rich"}),
+        ("agent.process.node", {"world", "compose", "scipy", "rich"}),
+        ("world.hardware.bridge", {"numpy", "scipy", "rich", "agent", "compose", "rosbags"}),
+        ("compose.cli.robot", {"numpy", "scipy", "rich", "agent", "rosbags"}),
         ("world.process", {"numpy", "scipy", "rich", "agent", "compose"}),
-        ("agent.planner", {"zenoh", "scipy", "rich", "world", "compose"}),
-        ("compose.inline", {"zenoh", "rich"}),
-        ("compose.campaign.worker", {"zenoh", "rich", "distributed", "dask", "pyarrow", "matplotlib"}),
-        ("compose.commands.audit", {"zenoh", "rich", "distributed", "matplotlib", "pyarrow"}),
-        ("compose.record", {"zenoh", "numpy", "scipy", "rich", "agent"}),
-        ("compose.commands.figures", {"zenoh", "numpy", "rich", "distributed", "matplotlib"}),
-        ("compose.commands.run", {"numpy", "scipy", "rich", "agent", "foxglove", "pyarrow"}),
-        ("compose.commands.replay", {"zenoh", "rich", "foxglove", "pyarrow", "matplotlib"}),
-        ("compose.commands.export", {"zenoh", "numpy", "rich", "agent", "foxglove", "pyarrow"}),
-        ("compose.commands.run", {"numpy", "scipy", "rich", "agent", "starlette", "uvicorn"}),
-        ("compose.commands.watch", {"zenoh", "numpy", "scipy", "rich", "agent", "starlette", "uvicorn"}),
-        ("compose.scene.recorded", {"zenoh", "numpy", "scipy", "rich", "agent", "starlette", "uvicorn"}),
-        ("compose.commands.keys", {"zenoh", "numpy", "rich", "agent", "world", "cryptography"}),
-        ("compose.commands.doctor", {"numpy", "scipy", "rich", "agent", "world", "cryptography"}),
-        ("compose.commands.ps", {"numpy", "scipy", "rich", "agent", "world", "cryptography"}),
-        ("compose.installed", {"zenoh", "numpy", "rich", "cryptography"}),
-        ("compose.commands.agent", {"rich", "cryptography"}),
-        ("compose.commands.world", {"numpy", "scipy", "rich", "cryptography"}),
-        ("compose.commands.sweep", {"zenoh", "rich", "distributed", "dask", "pyarrow", "matplotlib"}),
+        ("agent.planning.planner", {"zenoh", "scipy", "rich", "world", "compose"}),
+        ("compose.launch.in_process", {"zenoh", "rich"}),
+        ("compose.sweep.worker", {"zenoh", "rich", "distributed", "dask", "pyarrow", "matplotlib"}),
+        ("compose.cli.audit", {"zenoh", "rich", "distributed", "matplotlib", "pyarrow"}),
+        ("compose.recording.run", {"zenoh", "numpy", "scipy", "rich", "agent"}),
+        ("compose.cli.figures", {"zenoh", "numpy", "rich", "distributed", "matplotlib"}),
+        ("compose.cli.run", {"numpy", "scipy", "rich", "agent", "foxglove", "pyarrow"}),
+        ("compose.cli.replay", {"zenoh", "rich", "foxglove", "pyarrow", "matplotlib"}),
+        ("compose.cli.export", {"zenoh", "numpy", "rich", "agent", "foxglove", "pyarrow"}),
+        ("compose.cli.run", {"numpy", "scipy", "rich", "agent", "starlette", "uvicorn"}),
+        ("compose.cli.watch", {"zenoh", "numpy", "scipy", "rich", "agent", "starlette", "uvicorn"}),
+        ("compose.view.recorded", {"zenoh", "numpy", "scipy", "rich", "agent", "starlette", "uvicorn"}),
+        ("compose.cli.keys", {"zenoh", "numpy", "rich", "agent", "world", "cryptography"}),
+        ("compose.cli.doctor", {"numpy", "scipy", "rich", "agent", "world", "cryptography"}),
+        ("compose.cli.ps", {"numpy", "scipy", "rich", "agent", "world", "cryptography"}),
+        ("compose.extras", {"zenoh", "numpy", "rich", "cryptography"}),
+        ("compose.cli.agent", {"rich", "cryptography"}),
+        ("compose.cli.world", {"numpy", "scipy", "rich", "cryptography"}),
+        ("compose.cli.sweep", {"zenoh", "rich", "distributed", "dask", "pyarrow", "matplotlib"}),
     ],
 )
 def test_a_process_does_not_import_what_it_does_not_use(module: str, absent: set[str]) -> None:

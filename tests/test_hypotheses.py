@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agent import geometry
-from agent.estimation.hypotheses import Weighed, missing, of_anchor, search, silence
-from agent.estimation.odometry import Array, track
-from agent.estimation.ranging import Pair, Ranges
-from agent.estimation.smoothing import fit, poses
-from agent.geometry import Placement, same_placement
+from agent.estimation import closed_forms
+from agent.estimation.closed_forms import Placement, same_placement
+from agent.estimation.gaussian.hypotheses import Weighed, missing, of_anchor, search, silence
+from agent.estimation.gaussian.least_squares import fit, poses
+from agent.estimation.gaussian.odometry_noise import Array, track
+from agent.estimation.gaussian.range_model import Pair, Ranges
 from protocol.motion import Pose, step, wrap
 from protocol.noise import Drift, Noise
 
@@ -235,7 +235,7 @@ def met(corner: bool, start: Pose, standing: Pose) -> tuple[Pair, list[Placement
     pair = Pair((a.track, b.track), ranges, (NONE, NONE, NONE), (10.0, 0.0), REACH, noise)
     # <a(M1)> along <W>, so that <b(M2)>, too, is where it is but for M2: placements are T = -M2
     here = Pose(b.poses[-1].x - 10.0, b.poses[-1].y, b.poses[-1].heading)
-    found = geometry.placements(10.0, here, a.poses[13], a.poses[14], looks[0], looks[1])
+    found = closed_forms.placements(10.0, here, a.poses[13], a.poses[14], looks[0], looks[1])
     third = [one for one in found if abs(distance(one.place(a.poses[16]), here.x, here.y) - looks[2]) < 1e-9]
     assert any(same_placement(one, Placement(0.0, -10.0, 0.0), 1e-6) for one in third), "the truth is one"
     return pair, [seen(one.place(a.poses[16]), here) for one in third]

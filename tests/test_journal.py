@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from compose.inline import play
-from compose.scenario import load
-from protocol import journal
-from protocol.environment import of_world
-from protocol.journal import CorruptJournal, Journal, RecordExists, Tail
+from compose.launch.in_process import play
+from compose.scenario.scenario_file import load
+from protocol.journal import journal_file
+from protocol.journal.environment import of_world
+from protocol.journal.journal_file import CorruptJournal, Journal, RecordExists, Tail
 from protocol.messages import Drive, End, Environment, Farewell
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from tests.examples import EXAMPLES
@@ -34,7 +34,7 @@ def written(path: Path, frames: list[bytes]) -> bytes:
 
 def test_frames_come_back_in_order(tmp_path: Path) -> None:
     written(tmp_path / "deep" / "down" / "a.journal", FRAMES)
-    assert list(journal.read(tmp_path / "deep" / "down" / "a.journal")) == FRAMES
+    assert list(journal_file.read(tmp_path / "deep" / "down" / "a.journal")) == FRAMES
 
 
 def test_one_write_of_many_is_the_same_as_many_of_one(tmp_path: Path) -> None:
@@ -62,7 +62,7 @@ def test_a_journal_cut_anywhere_reads_back_every_whole_frame(tmp_path: Path) -> 
     cut = tmp_path / "cut"
     for length in range(len(data) + 1):
         cut.write_bytes(data[:length])
-        assert list(journal.read(cut)) == FRAMES[: sum(end <= length for end in ends) - 1]
+        assert list(journal_file.read(cut)) == FRAMES[: sum(end <= length for end in ends) - 1]
 
 
 @settings(max_examples=50)
@@ -106,7 +106,7 @@ def test_garbage_in_the_middle_is_found_and_the_file_is_named(
     damaged = tmp_path / "damaged.journal"
     damaged.write_bytes(first + GARBAGE[garbage] + rest)
     with pytest.raises(CorruptJournal, match=r"damaged\.journal"):
-        list(journal.read(damaged))
+        list(journal_file.read(damaged))
 
 
 def test_an_existing_journal_is_not_overwritten(tmp_path: Path) -> None:
@@ -119,13 +119,13 @@ def test_an_existing_journal_is_not_overwritten(tmp_path: Path) -> None:
 
 def test_a_journal_that_is_not_there_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
-        list(journal.read(tmp_path / "none"))
+        list(journal_file.read(tmp_path / "none"))
 
 
 WRITER = """
 import sys
 from pathlib import Path
-from protocol.journal import Journal
+from protocol.journal.journal_file import Journal
 
 book = Journal(Path(sys.argv[1]))
 number = 0
@@ -147,7 +147,7 @@ def test_a_killed_process_has_lost_nothing_of_what_it_journaled(tmp_path: Path) 
         process.kill()
         told = 200 + len(process.stdout.read().splitlines())
     assert process.returncode == -9
-    frames = list(journal.read(path))
+    frames = list(journal_file.read(path))
     numbers = [int(frame) for frame in frames[::2]]
     assert numbers == list(range(len(numbers)))
     assert len(numbers) >= told - 1  # the last line may be torn

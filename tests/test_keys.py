@@ -17,13 +17,13 @@ from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding, load_pem_private_key
 
-from compose import certificates
-from compose.local import free_endpoint
-from compose.reach import KEYED
-from protocol import keys as tree
-from protocol import session
-from protocol.endpoints import BadConfiguration, Endpoints, configured, listening
-from protocol.refusal import MUTE
+from compose.launch.processes import free_endpoint
+from compose.network import KEYED
+from compose.security import certificates
+from protocol.network import keys as tree
+from protocol.network import session
+from protocol.network.diagnosis import MUTE
+from protocol.network.endpoints import BadConfiguration, Endpoints, configured, listening
 from tests.commands import Command, Ended, journals, tandem
 
 EVERYBODY = ("agent-a", "agent-b", "router", "viewer", "world")

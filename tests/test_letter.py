@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from compose.inline import play
-from compose.summary import summary
+from compose.launch.in_process import play
+from compose.recording.summary_json import summary
 from tests.surveys import SIGMA, scenario_of, states, survey
 
 FINE = "anchor_sigma = 0.001\nmutual_sigma = 0.001"

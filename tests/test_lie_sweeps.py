@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compose.campaign import figures, lies, run, spec
-from compose.campaign.cells import Refused, cells, setting_of
-from protocol.inbox import Inbox
-from protocol.lie import Lie
+from compose.sweep import attack_figures, axis_figures, execution, spec
+from compose.sweep.cells import Refused, cells, setting_of
+from protocol.attack import Lie
+from protocol.network.inbox import Inbox
 
 SPEC = """
 name = "few-lies"
@@ -40,13 +40,13 @@ values = [[0.0, 0.0], [0.01, 0.01]]
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> run.Results:
+def results(tmp_path_factory: pytest.TempPathFactory) -> execution.Results:
     """A few missions with a few lies, played."""
     folder = tmp_path_factory.mktemp("lies")
     (folder / "few.toml").write_text(SPEC)
-    progress = run.Progress(say=lambda _: None, begin=lambda *_: None, done=lambda _: None)
+    progress = execution.Progress(say=lambda _: None, begin=lambda *_: None, done=lambda _: None)
     campaign = spec.load(str(folder / "few.toml"))
-    return run.sweep(campaign, folder / "out", run.Means(workers=1), Inbox("test"), progress)
+    return execution.sweep(campaign, folder / "out", execution.Means(workers=1), Inbox("test"), progress)
 
 
 def test_the_campaign_that_ships_tells_the_lies_of_its_labels() -> None:
@@ -66,7 +66,7 @@ def test_the_campaign_that_ships_tells_the_lies_of_its_labels() -> None:
         assert lie.size == pytest.approx(math.radians(float(size)) if "deg" in label else float(size))
 
 
-def test_honest_missions_localise_and_lies_are_alarms(results: run.Results) -> None:
+def test_honest_missions_localise_and_lies_are_alarms(results: execution.Results) -> None:
     outcomes: dict[tuple[int, ...], set[str]] = {cell.place: set() for cell in results.cells}
     places = {cell.index: cell.place for cell in results.cells}
     for row in results.table.to_pylist():
@@ -75,18 +75,18 @@ def test_honest_missions_localise_and_lies_are_alarms(results: run.Results) -> N
 
 
 @pytest.mark.long
-def test_the_pictures_show_what_became_of_each_lie(results: run.Results, tmp_path: Path) -> None:
-    figures.draw(results, tmp_path)
+def test_the_pictures_show_what_became_of_each_lie(results: execution.Results, tmp_path: Path) -> None:
+    axis_figures.draw(results, tmp_path)
     assert {f"{name}.{kind}" for name in ("lies", "roc") for kind in ("svg", "pdf", "png")} <= {
         path.name for path in tmp_path.iterdir()
     }
-    place = lies.axis_of_lies(results)
+    place = attack_figures.axis_of_lies(results)
     assert place == 0
-    exact, noisy = lies.outcomes(results, place).axes
+    exact, noisy = attack_figures.outcomes(results, place).axes
     for panel in (exact, noisy):
         widths = [[bar.get_width() for bar in bars] for bars in panel.containers]
         assert np.allclose(widths, [[0.0, 1.0, 1.0], [0.0] * 3, [1.0, 0.0, 0.0], [0.0] * 3])
-    roc = lies.roc(results, place)
+    roc = attack_figures.roc(results, place)
     assert roc is not None
     (panel,) = roc.axes
     assert [line.get_label() for line in panel.lines] == ["scale orbit", "rotate encounter"]
@@ -95,9 +95,9 @@ def test_the_pictures_show_what_became_of_each_lie(results: run.Results, tmp_pat
 
 def test_a_campaign_without_lies_has_no_such_pictures(tmp_path: Path) -> None:
     (tmp_path / "few.toml").write_text('name = "few"\nscenario = "random"\ntrials = 2\nseed = 1\n')
-    progress = run.Progress(say=lambda _: None, begin=lambda *_: None, done=lambda _: None)
+    progress = execution.Progress(say=lambda _: None, begin=lambda *_: None, done=lambda _: None)
     campaign = spec.load(str(tmp_path / "few.toml"))
-    results = run.sweep(campaign, tmp_path / "out", run.Means(workers=1), Inbox("test"), progress)
-    assert lies.axis_of_lies(results) is None
-    figures.draw(results, tmp_path / "figures")
+    results = execution.sweep(campaign, tmp_path / "out", execution.Means(workers=1), Inbox("test"), progress)
+    assert attack_figures.axis_of_lies(results) is None
+    axis_figures.draw(results, tmp_path / "figures")
     assert not (tmp_path / "figures" / "roc.svg").exists()

@@ -9,13 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from agent import lying, planner, radio, trust
-from agent.logbook import Logbook
-from compose.inline import play
-from compose.record import Record
-from compose.scenario import BadScenario, parse, shipped
-from compose.summary import summary
-from protocol.lie import Kind, Lie, Part
+from agent.peer import false_reports, peer_state
+from agent.peer.motion_log import Logbook
+from agent.planning import planner, plausibility
+from compose.launch.in_process import play
+from compose.recording.run import Record
+from compose.recording.summary_json import summary
+from compose.scenario.scenario_file import BadScenario, parse, shipped
+from protocol.attack import Kind, Lie, Part
 from protocol.messages import Alarm, Ranged, Report, Undecided
 from protocol.motion import ORIGIN, Pose, Run, follow
 from tests.steps import Step, steps
@@ -141,8 +142,10 @@ def objection(step: Step, *reports: Report) -> Alarm | None:
     """Of a, to the last of `reports`, after it has heard the others."""
     mind = step.observed["a"]
     for report in reports[:-1]:
-        mind = replace(mind, radio=radio.hear(mind.radio, report))
-    return trust.objection(mind.radio, radio.hear(mind.radio, reports[-1]), reports[-1], mind.briefing)
+        mind = replace(mind, radio=peer_state.hear(mind.radio, report))
+    return plausibility.objection(
+        mind.radio, peer_state.hear(mind.radio, reports[-1]), reports[-1], mind.briefing
+    )
 
 
 def test_what_an_honest_peer_tells_is_believed_and_so_is_what_it_tells_again() -> None:
@@ -215,9 +218,9 @@ def test_a_liar_tells_the_same_story_as_it_grows(
     seen = min(seen, log.through)
     young = Logbook(seen, log.between(0, seen))
     known = [tick if tick is not None and tick <= seen else None for tick in (parted, met)]
-    whole = lying.told(log, lie, parted, met, 1.0)
+    whole = false_reports.told(log, lie, parted, met, 1.0)
     assert whole.through == log.through
-    assert lying.told(young, lie, known[0], known[1], 1.0).between(0, seen) == whole.between(0, seen)
+    assert false_reports.told(young, lie, known[0], known[1], 1.0).between(0, seen) == whole.between(0, seen)
 
 
 @settings(max_examples=50)
@@ -225,7 +228,7 @@ def test_a_liar_tells_the_same_story_as_it_grows(
 def test_a_rotation_turns_what_was_driven_in_its_part_and_nothing_after(
     log: Logbook, parted: int, orbit: int, angle: float
 ) -> None:
-    told = lying.told(log, Lie("rotate", angle, "orbit"), parted, parted + orbit, 1.0)
+    told = false_reports.told(log, Lie("rotate", angle, "orbit"), parted, parted + orbit, 1.0)
     true_end = follow(ORIGIN, log.between(0, log.through), 1.0)
     told_end = follow(ORIGIN, told.between(0, log.through), 1.0)
     over = orbit > 0 and parted + orbit < log.through
@@ -236,8 +239,8 @@ def test_a_rotation_turns_what_was_driven_in_its_part_and_nothing_after(
 def test_a_false_radius_goes_with_false_ranges_and_moves_the_start_only() -> None:
     log = Logbook(3, (Run(3, 1.0, 0.0),), (Ranged(0, 1.0), Ranged(1, 0.2)))
     lie = Lie("radius", -0.5)
-    assert lying.told(log, lie, None, None, 1.0).ranges == (Ranged(0, 0.5), Ranged(1, 0.0))
-    assert lying.start(Pose(1.0, 0.0, 2.0), lie) == Pose(0.5, 0.0, 2.0)
+    assert false_reports.told(log, lie, None, None, 1.0).ranges == (Ranged(0, 0.5), Ranged(1, 0.0))
+    assert false_reports.start(Pose(1.0, 0.0, 2.0), lie) == Pose(0.5, 0.0, 2.0)
 
 
 # --- the scenario -------------------------------------------------------------------------------------

@@ -10,11 +10,11 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from agent import planner
-from agent.logbook import Logbook
-from agent.mind import Done, Mind
-from agent.radio import Radio, contradiction, hear
-from compose.scenario import load
+from agent.peer.motion_log import Logbook
+from agent.peer.peer_state import Radio, contradiction, hear
+from agent.planning import planner
+from agent.planning.state import Done, Mind
+from compose.scenario.scenario_file import load
 from protocol.messages import MAX_REPORT_RANGES, MAX_REPORT_RUNS, Localised, Ranged, Report, Undecided
 from protocol.motion import ORIGIN, Pose, Run, step
 from protocol.wire import MAX_REPORT_BYTES, decode, encode

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from protocol.mission import RANGE_MARGIN, Mission
 from protocol.motion import TAU
-from protocol.rendezvous import WAITING_PLACE, Orbit, half_passage, rendezvous
+from protocol.orbits import WAITING_PLACE, Orbit, half_passage, rendezvous
 
 Setting = tuple[float, float, float, float, float]
 """D, R, T_s, v_max, omega_max"""

@@ -10,17 +10,17 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from agent import planner
-from agent.geometry import Placement
-from agent.phases.anchor import third_point
-from agent.phases.encounter import SPEEDS, TURN_RATES, last_manoeuvre
-from compose.inline import play
-from compose.record import Moment, Record
-from compose.scenario import load, parse
+from agent.estimation.closed_forms import Placement
+from agent.planning import planner
+from agent.planning.phase1_anchor import third_point
+from agent.planning.phase3_last_manoeuvre import SPEEDS, TURN_RATES, last_manoeuvre
+from compose.launch.in_process import play
+from compose.recording.run import Moment, Record
+from compose.scenario.scenario_file import load, parse
 from protocol.messages import Localised
 from protocol.mission import OPTIMAL_TURN, Mission, Variant, third_point_turn_rate
 from protocol.motion import Pose, compose, step
-from protocol.rendezvous import rendezvous, tick_budget
+from protocol.orbits import rendezvous, tick_budget
 from tests.missions import mission_of
 from tests.steps import steps
 from world.sensors import anchor_ranges, mutual_ranges

@@ -15,11 +15,11 @@ import pytest
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from compose import inline
-from compose.record import WORLD_JOURNAL, Moment, Record, read
-from compose.scenario import load, parse
-from compose.ticks import ticks_csv
-from protocol import journal
+from compose.launch import in_process
+from compose.recording.run import WORLD_JOURNAL, Moment, Record, read
+from compose.recording.ticks_csv import ticks_csv
+from compose.scenario.scenario_file import load, parse
+from protocol.journal import journal_file
 from protocol.messages import Drive, Localised, Sense, Undecided
 from protocol.motion import REST, Controls, Covariance, Pose, step
 from protocol.noise import Drift, Noise
@@ -27,11 +27,11 @@ from protocol.wire import decode, encode
 from tests.commands import SECTION_IV, journals, tandem
 from tests.series import series
 from world import sensors
-from world.course import Course
-from world.draws import gaussian, uniform
+from world.random_streams import gaussian, uniform
 from world.referee import Judgement
 from world.scenario import Scenario
 from world.sensors import Mutual, anchor_ranges, executed, mutual_ranges, odometry
+from world.simulation import Course
 from world.tick import World, advance, release, senses
 from world.truth import Truth
 
@@ -136,23 +136,23 @@ def test_without_noise_nothing_is_drawn_and_every_tick_is_the_same_to_the_bit(
     without, zero = tmp_path / "without", tmp_path / "zero"
     for folder in (without, zero):
         folder.mkdir()
-    table = ticks_csv(inline.play(exact, without))
+    table = ticks_csv(in_process.play(exact, without))
     for name in ("gaussian", "uniform"):
         monkeypatch.setattr(sensors, name, drawn)
     zeros = Noise(outlier_bias=(0.1, 0.2), actuation=Drift(0.0, 0.0, 0.0, 0.0))
     assert zeros.exact
     scenario = replace(exact, mission=replace(exact.mission, noise=zeros))
-    assert ticks_csv(inline.play(scenario, zero)) == table
+    assert ticks_csv(in_process.play(scenario, zero)) == table
     assert len(table.splitlines()) == 1 + 2 * 49
     for robot in ("a", "b"):
         assert frames(zero, robot) == frames(without, robot)
     with pytest.raises(AssertionError, match="something is drawn"):
-        inline.play(near("anchor_sigma = 0.1"))
+        in_process.play(near("anchor_sigma = 0.1"))
 
 
 def frames(folder: Path, robot: str) -> list[bytes]:
     """What a robot sensed, heard and said: not its Briefing, which names the noise, nor what precedes it."""
-    return list(journal.read(folder / f"agent-{robot}.journal"))[2:]
+    return list(journal_file.read(folder / f"agent-{robot}.journal"))[2:]
 
 
 @pytest.mark.parametrize("draw", [uniform, gaussian])
@@ -314,7 +314,7 @@ def test_reports_are_heard_where_the_range_was_dropped(tmp_path: Path) -> None:
     dropping = next(
         seed for seed in range(1000) if mutual(near("drop_outs = 0.5", seed=seed), 4) == [None] * 4
     )
-    record = inline.play(near("drop_outs = 0.5", seed=dropping, max_ticks=3), tmp_path)
+    record = in_process.play(near("drop_outs = 0.5", seed=dropping, max_ticks=3), tmp_path)
     said = record.farewells
     assert (said["a"].mutual_ranges, said["b"].mutual_ranges) == (0, 0)
     assert said["a"].reports_sent >= 1
@@ -524,7 +524,7 @@ def test_processes_leave_the_same_bytes_as_one_process(noise: str, seed: str, tm
 
 def driven(scenario: Scenario, folder: Path, ticks: int) -> tuple[list[Truth], list[list[Sense]]]:
     """The truth and the senses of robots that drive without a mind, with the world's journal in `folder`."""
-    with closing(journal.Journal(folder / WORLD_JOURNAL)) as kept:
+    with closing(journal_file.Journal(folder / WORLD_JOURNAL)) as kept:
         course = Course(scenario, kept)
         truths, told = [], []
         for tick in range(ticks):
@@ -546,7 +546,7 @@ def test_the_record_folds_to_the_same_truth(noise: str, tmp_path: Path) -> None:
 @by_noise
 @pytest.mark.parametrize("seed", [2, 10, 11])
 def test_the_record_of_a_mission_is_read_as_it_was_played(noise: str, seed: int, tmp_path: Path) -> None:
-    played = inline.play(load(str(noisy(noise, tmp_path)), seed=seed), tmp_path)
+    played = in_process.play(load(str(noisy(noise, tmp_path)), seed=seed), tmp_path)
     assert read(tmp_path) == played
 
 

@@ -16,7 +16,7 @@ FOREIGN = (
     "keys/ca-key.pem",
     "keys/world/key.pem",
     "compose/keys/ca-key.pem",
-    "compose/deploy/key.txt",
+    "compose/hardware/deploy/key.txt",
     "record/world.journal",
     "docs/record/summary.json",
     "tests/agent-a.journal",

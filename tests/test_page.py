@@ -13,9 +13,9 @@ from signal import SIGKILL
 import pytest
 from playwright.sync_api import Page, expect
 
-from compose.record import WORLD_JOURNAL, estimates, read
-from protocol import journal
-from protocol.journal import Journal
+from compose.recording.run import WORLD_JOURNAL, estimates, read
+from protocol.journal import journal_file
+from protocol.journal.journal_file import Journal
 from protocol.messages import Drive, Sense
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 from tests.browser import Open, inks, picture, shot, until_shown, watching
@@ -28,7 +28,7 @@ from world.referee import errors
 
 def frames_to(path: Path, tick: int, first: type[Sense | Drive] = Sense) -> int:
     """How many frames stand in a journal before those of `tick`, of which `first` is the first."""
-    for place, frame in enumerate(journal.read(path)):
+    for place, frame in enumerate(journal_file.read(path)):
         with suppress(MalformedFrame):
             if decode(frame, first, MAX_FRAME_BYTES).tick == tick:
                 return place
@@ -39,7 +39,7 @@ def frames_to(path: Path, tick: int, first: type[Sense | Drive] = Sense) -> int:
 def test_what_becomes_known_of_a_tick_later_is_on_the_time_line_and_in_the_log(
     opened: Open, paper_1: Path, tmp_path: Path
 ) -> None:
-    whole = {path.name: list(journal.read(path)) for path in paper_1.glob("*.journal")}
+    whole = {path.name: list(journal_file.read(path)) for path in paper_1.glob("*.journal")}
     told = dict.fromkeys(whole, 0)
     with ExitStack() as stack:
         growing = {name: stack.enter_context(Journal(tmp_path / name)) for name in whole}

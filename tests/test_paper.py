@@ -11,17 +11,17 @@ from typing import NamedTuple
 
 import pytest
 
-from agent.geometry import Placement, placements
-from compose.inline import play
-from compose.record import Record
-from compose.scenario import load
-from compose.summary import summary
-from compose.ticks import ticks_csv
-from protocol import journal
+from agent.estimation.closed_forms import Placement, placements
+from compose.launch.in_process import play
+from compose.recording.run import Record
+from compose.recording.summary_json import summary
+from compose.recording.ticks_csv import ticks_csv
+from compose.scenario.scenario_file import load
+from protocol.journal import journal_file
 from protocol.messages import Briefing, Drive, End, Environment, Estimate, Farewell, Report, Sense
 from protocol.mission import Mission
 from protocol.motion import Pose, wrap
-from protocol.rendezvous import half_arc, longest_meeting, rendezvous
+from protocol.orbits import half_arc, longest_meeting, rendezvous
 from protocol.wire import decode
 from tests.missions import mission_of
 from tests.reference import REFERENCE, Equation7, Phase1, Simulation
@@ -84,7 +84,7 @@ def test_a_robot_senses_the_references_ranges_and_what_it_drove(
     reference = SIMULATIONS[name]
     play(load(name), tmp_path)
     kinds = Environment | Briefing | Sense | Report | Drive | Estimate | End | Farewell
-    frames = [decode(frame, kinds) for frame in journal.read(tmp_path / f"agent-{robot}.journal")]
+    frames = [decode(frame, kinds) for frame in journal_file.read(tmp_path / f"agent-{robot}.journal")]
     senses = [frame for frame in frames if isinstance(frame, Sense)]
     controls = reference.u_a if robot == "a" else reference.u_b
     ranges = reference.range_a if robot == "a" else reference.range_b

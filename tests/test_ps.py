@@ -13,11 +13,11 @@ from typing import Any
 import pytest
 import zenoh
 
-from compose.local import free_endpoint
-from compose.scenario import load
-from protocol import keys, session
-from protocol.endpoints import at, listening
+from compose.launch.processes import free_endpoint
+from compose.scenario.scenario_file import load
 from protocol.messages import Drive, End, Sense
+from protocol.network import keys, session
+from protocol.network.endpoints import at, listening
 from protocol.wire import VERSION, encode
 from tests.commands import BOUND_S, ENDLESS, Command, several_pairs, tandem, until, world
 from tests.test_topologies import Router, routing

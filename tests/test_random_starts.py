@@ -6,7 +6,8 @@ from collections import Counter
 
 import pytest
 
-from compose import inline, scenario
+from compose.launch import in_process
+from compose.scenario import scenario_file
 from protocol.messages import Localised
 from tests.series import series
 from world.referee import errors
@@ -18,8 +19,8 @@ SHARES = 10
 
 
 def started(seed: int, variant: str) -> Scenario:
-    text = scenario.shipped()["random"].read_text()
-    return scenario.parse(f'{text}\n[planner]\nvariant = "{variant}"\n', "random", seed=seed)
+    text = scenario_file.shipped()["random"].read_text()
+    return scenario_file.parse(f'{text}\n[planner]\nvariant = "{variant}"\n', "random", seed=seed)
 
 
 def share(number: int) -> range:
@@ -29,7 +30,7 @@ def share(number: int) -> range:
 @pytest.mark.parametrize("number", series(range(SHARES)))
 def test_assured_localises_every_random_start_to_a_micrometre(number: int) -> None:
     for seed in share(number):
-        record = inline.play(started(seed, "assured"))
+        record = in_process.play(started(seed, "assured"))
         assert record.end is not None
         assert record.end.outcome == "localised", f"seed {seed}: {record.end}"
         last = record.moments[-1]
@@ -45,7 +46,7 @@ def test_assured_localises_every_random_start_to_a_micrometre(number: int) -> No
 def test_the_letter_localises_most_random_starts_and_guesses_at_none(number: int) -> None:
     outcomes = Counter[str]()
     for seed in share(number):
-        record = inline.play(started(seed, "paper"))
+        record = in_process.play(started(seed, "paper"))
         assert record.end is not None
         outcomes[record.end.outcome] += 1
     # 93 to 95 % of all 5000; a tenth of them spreads three standard deviations, 3.2 %, about 94 %

@@ -14,9 +14,10 @@ from signal import SIGCONT, SIGINT, SIGSTOP
 import pytest
 import zenoh
 
-from protocol import journal, keys, session
-from protocol.endpoints import at
+from protocol.journal import journal_file
 from protocol.messages import Drive, End, Environment, Farewell, Missed, Sense
+from protocol.network import keys, session
+from protocol.network.endpoints import at
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from tests.commands import (
     ASSURED,
@@ -36,7 +37,7 @@ from world.scenario import Scenario
 def missed(path: Path, robot: str) -> int:
     """In how many ticks the world went without `robot`'s Drive."""
     kinds = Environment | Scenario | Drive | Missed | End | Farewell
-    messages = [decode(frame, kinds, MAX_FRAME_BYTES) for frame in journal.read(path)]
+    messages = [decode(frame, kinds, MAX_FRAME_BYTES) for frame in journal_file.read(path)]
     return sum(isinstance(message, Missed) and message.robot == robot for message in messages)
 
 

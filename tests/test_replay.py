@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from compose import inline
 from compose.audit.replay import replayed
-from compose.export.frames import KINDS
-from compose.record import WORLD_JOURNAL, agent_journal
-from compose.scenario import load, parse
-from protocol import journal
+from compose.launch import in_process
+from compose.recording.frames import KINDS
+from compose.recording.run import WORLD_JOURNAL, agent_journal
+from compose.scenario.scenario_file import load, parse
+from protocol.journal import journal_file
 from protocol.messages import Drive, End, Report, Sense
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode, encode
 from tests.commands import journals, tandem
@@ -107,18 +107,18 @@ def test_one_flipped_bit_in_any_value_that_matters_is_found(name: str) -> None:
 
 def planted(folder: Path, name: str, kind: type, tick: int, **fields: Any) -> tuple[Any, Any]:
     """Change a message in the journal of that name; the message before and after."""
-    frames = list(journal.read(folder / name))
+    frames = list(journal_file.read(folder / name))
     told = [decode(frame, KINDS, MAX_FRAME_BYTES) for frame in frames]
     (place,) = (i for i, one in enumerate(told) if isinstance(one, kind) and getattr(one, "tick", 0) == tick)
     changed = replace(told[place], **fields)
     frames[place] = encode(changed)
-    (folder / name).write_bytes(journal.packed(frames))
+    (folder / name).write_bytes(journal_file.packed(frames))
     return told[place], changed
 
 
 @pytest.fixture
 def record(tmp_path: Path) -> Path:
-    inline.play(load("paper-1"), tmp_path / "record")
+    in_process.play(load("paper-1"), tmp_path / "record")
     return tmp_path / "record"
 
 
@@ -135,7 +135,7 @@ def test_the_first_difference_is_shown_with_tick_robot_field_and_both_values(rec
 
 
 def test_a_value_is_shown_however_deep_it_stands(record: Path) -> None:
-    told = [decode(frame, KINDS, MAX_FRAME_BYTES) for frame in journal.read(record / A)]
+    told = [decode(frame, KINDS, MAX_FRAME_BYTES) for frame in journal_file.read(record / A)]
     sense = next(one for one in told if isinstance(one, Sense) and one.contacts)
     (contact,) = sense.contacts
     assert contact.range is not None
@@ -148,11 +148,11 @@ def test_a_value_is_shown_however_deep_it_stands(record: Path) -> None:
 
 
 def test_a_record_whose_drives_the_world_has_otherwise_is_found_there(record: Path) -> None:
-    frames = list(journal.read(record / WORLD_JOURNAL))
+    frames = list(journal_file.read(record / WORLD_JOURNAL))
     drive = decode(frames[2 + 2 * 20 + 1], Drive)
     assert (drive.robot, drive.tick) == ("b", 20)
     frames[2 + 2 * 20 + 1] = encode(replace(drive, omega=drive.omega + 1e-9))
-    (record / WORLD_JOURNAL).write_bytes(journal.packed(frames))
+    (record / WORLD_JOURNAL).write_bytes(journal_file.packed(frames))
     ended = tandem("replay", record)
     assert ended.status == 1
     assert ended.out.splitlines()[1].startswith("tick 20, b, Drive omega: recorded ")
@@ -196,7 +196,7 @@ def test_an_end_that_does_not_follow_is_found_though_all_say_the_same(
 def cut(path: Path, size: int) -> int:
     """Leave so many bytes of a journal; how many of them are no whole frame."""
     path.write_bytes(path.read_bytes()[:size])
-    return size - len(journal.packed(journal.read(path)))
+    return size - len(journal_file.packed(journal_file.read(path)))
 
 
 @pytest.mark.parametrize("name", [WORLD_JOURNAL, A, B])
@@ -211,7 +211,7 @@ def test_a_record_that_is_torn_anywhere_is_replayed_to_the_tear(
 
 def test_where_it_tears_is_told(record: Path) -> None:
     rest = cut(record / A, 4000)
-    last = [decode(frame, KINDS, MAX_FRAME_BYTES) for frame in journal.read(record / A)][-1]
+    last = [decode(frame, KINDS, MAX_FRAME_BYTES) for frame in journal_file.read(record / A)][-1]
     (record / B).unlink()
     ended = tandem("replay", record)
     assert (ended.status, ended.err) == (0, "")
@@ -226,9 +226,9 @@ def test_where_it_tears_is_told(record: Path) -> None:
 
 
 def test_a_frame_of_a_wrong_length_is_no_tear(record: Path) -> None:
-    frames = list(journal.read(record / A))
+    frames = list(journal_file.read(record / A))
     data = bytearray((record / A).read_bytes())
-    data[len(journal.packed(frames[:20])) + 1] = 0xFF
+    data[len(journal_file.packed(frames[:20])) + 1] = 0xFF
     (record / A).write_bytes(data)
     ended = tandem("replay", record)
     assert (ended.status, ended.out) == (2, "")

@@ -17,19 +17,20 @@ import pytest
 import zenoh
 from msgspec.structs import replace
 
-from agent.memory import remember
-from agent.past import past
-from agent.robot import Robot
-from compose.inline import play
-from compose.kill import BadKill, parse
-from compose.local import free_endpoint
-from compose.scenario import load
-from protocol import journal, keys, session
-from protocol.endpoints import listening
-from protocol.inbox import Inbox
-from protocol.journal import CannotRecord, CorruptJournal, Journal
+from agent.process.agent_journal import past
+from agent.process.recovery import remember
+from agent.process.robot import Robot
+from compose.launch.in_process import play
+from compose.launch.processes import free_endpoint
+from compose.scenario.kills import BadKill, parse
+from compose.scenario.scenario_file import load
+from protocol.journal import journal_file
+from protocol.journal.journal_file import CannotRecord, CorruptJournal, Journal
+from protocol.journal.resume import Retrace
 from protocol.messages import Contact, Drive, End, Environment, Farewell, Missed, Report, Sense
-from protocol.retrace import Retrace
+from protocol.network import keys, session
+from protocol.network.endpoints import listening
+from protocol.network.inbox import Inbox
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from tests.commands import (
     BOUND_S,
@@ -43,9 +44,9 @@ from tests.commands import (
     tandem,
     world,
 )
-from world.course import Course, again
-from world.history import history
 from world.scenario import Scenario
+from world.simulation import Course, again
+from world.world_journal import history
 
 PARTS = ("agent-a", "agent-b", "world")
 LOCALISED = "localised after 48 ticks\n"
@@ -149,10 +150,10 @@ def test_in_real_time_whoever_is_away_stands_still_and_is_told_what_it_missed(tm
     assert "a" in {row["robot"] for row in away}
     assert {(row["v"], row["omega"]) for row in away} == {("0.0", "0.0")}
     kinds = Environment | Scenario | Drive | Missed | End | Farewell
-    messages = [decode(frame, kinds, MAX_FRAME_BYTES) for frame in journal.read(out / "world.journal")]
+    messages = [decode(frame, kinds, MAX_FRAME_BYTES) for frame in journal_file.read(out / "world.journal")]
     assert sum(isinstance(message, Missed) for message in messages) == len(away)
     for robot in ("a", "b"):
-        lived = past(journal.read(out / f"agent-{robot}.journal"), robot)
+        lived = past(journal_file.read(out / f"agent-{robot}.journal"), robot)
         assert [step.sense.tick for step in lived.steps] == list(range(len(lived.steps)))
 
 
@@ -217,7 +218,7 @@ def test_an_agents_journal_torn_anywhere_is_finished_with_the_same_bytes(
     robot: str, undisturbed: Path, tmp_path: Path
 ) -> None:
     data = (undisturbed / f"agent-{robot}.journal").read_bytes()
-    whole = past(journal.read(undisturbed / f"agent-{robot}.journal"), robot)
+    whole = past(journal_file.read(undisturbed / f"agent-{robot}.journal"), robot)
     assert whole.end is not None
     torn = tmp_path / "torn.journal"
     for cut in cuts(data):
@@ -246,7 +247,7 @@ def test_a_worlds_journal_torn_anywhere_is_finished_with_the_same_bytes(
     undisturbed: Path, tmp_path: Path
 ) -> None:
     data = (undisturbed / "world.journal").read_bytes()
-    whole = history(journal.read(undisturbed / "world.journal"), "world")
+    whole = history(journal_file.read(undisturbed / "world.journal"), "world")
     torn = tmp_path / "torn.journal"
     for cut in cuts(data):
         torn.write_bytes(data[:cut])
@@ -276,7 +277,7 @@ def at_tick(frames: list[bytes], tick: int) -> int:
     """How many bytes of a journal stand before the first frame that names `tick`, its head left out."""
     for place, frame in enumerate(frames):
         if place and msgpack.unpackb(frame[5:])[1] == tick:
-            return len(journal.packed(frames[:place]))
+            return len(journal_file.packed(frames[:place]))
     raise AssertionError(f"no tick {tick}")
 
 
@@ -286,7 +287,7 @@ def test_torn_tails_are_cut_off_told_and_survived(tick: int, undisturbed: Path, 
     out.mkdir()
     for name, more in zip(PARTS, (61, 9, 30), strict=True):
         path = undisturbed / f"{name}.journal"
-        keep = at_tick(list(journal.read(path)), tick) + more
+        keep = at_tick(list(journal_file.read(path)), tick) + more
         (out / path.name).write_bytes(path.read_bytes()[:keep])
     with ExitStack() as folder:
         ended = {name: shell.ended() for name, shell in shells(out, free_endpoint(), folder).items()}
@@ -341,10 +342,10 @@ def test_a_world_that_is_killed_after_its_end_collects_the_farewells(
 ) -> None:
     for name, data in journals(undisturbed).items():
         (tmp_path / name).write_bytes(data)
-    frames = list(journal.read(undisturbed / "world.journal"))
-    (tmp_path / "world.journal").write_bytes(journal.packed(frames[:-2]))
-    frames = list(journal.read(undisturbed / "agent-b.journal"))
-    (tmp_path / "agent-b.journal").write_bytes(journal.packed(frames[:-2]))
+    frames = list(journal_file.read(undisturbed / "world.journal"))
+    (tmp_path / "world.journal").write_bytes(journal_file.packed(frames[:-2]))
+    frames = list(journal_file.read(undisturbed / "agent-b.journal"))
+    (tmp_path / "agent-b.journal").write_bytes(journal_file.packed(frames[:-2]))
     with ExitStack() as folder:
         ended = {name: shell.ended() for name, shell in shells(tmp_path, free_endpoint(), folder).items()}
     assert {name: end.status for name, end in ended.items()} == {"world": 0, "a": 0, "b": 0}, ended
@@ -436,8 +437,8 @@ def next_of(queue: SimpleQueue[int]) -> int:
 def record(undisturbed: Path, tmp_path: Path) -> Path:
     """One to be spoilt: a copy of the undisturbed run's, without its end."""
     for name in PARTS:
-        frames = list(journal.read(undisturbed / f"{name}.journal"))
-        (tmp_path / f"{name}.journal").write_bytes(journal.packed(frames[:60]))
+        frames = list(journal_file.read(undisturbed / f"{name}.journal"))
+        (tmp_path / f"{name}.journal").write_bytes(journal_file.packed(frames[:60]))
     return tmp_path
 
 
@@ -478,8 +479,8 @@ def test_a_journal_that_is_damaged_anywhere_is_not_mistaken_for_a_torn_one(
     record: Path, tmp_path: Path
 ) -> None:
     good = (record / "agent-b.journal").read_bytes()
-    frames = list(journal.read(record / "agent-b.journal"))
-    last = len(journal.packed(frames[:-1]))
+    frames = list(journal_file.read(record / "agent-b.journal"))
+    last = len(journal_file.packed(frames[:-1]))
     path = tmp_path / "damaged.journal"
     for place in range(0, last, 11):
         for bit in (0, 1, 5, 7):
@@ -511,7 +512,7 @@ def test_an_agents_record_of_another_briefing_is_refused(record: Path, tmp_path:
 
 def test_an_agents_record_in_which_it_sensed_otherwise_is_no_use(record: Path, paper_2: str) -> None:
     path = record / "agent-a.journal"
-    path.write_bytes(journal.packed(list(journal.read(path))[:4]))
+    path.write_bytes(journal_file.packed(list(journal_file.read(path))[:4]))
     with Command("agent", "b", "--connect", paper_2):  # whose briefings are those of paper-1
         ended = tandem("agent", "a", "--connect", paper_2, "--out", record)
     said = "the record is another run's: in this one, a senses otherwise at tick 0"
@@ -520,12 +521,12 @@ def test_an_agents_record_in_which_it_sensed_otherwise_is_no_use(record: Path, p
 
 def test_a_record_on_which_it_decided_otherwise_is_refused(record: Path) -> None:
     path = record / "agent-a.journal"
-    frames = list(journal.read(path))
+    frames = list(journal_file.read(path))
     place = next(i for i, frame in enumerate(frames) if frame[5:].find(b"drive\x0c") > 0)
     drive = decode(frames[place], Drive)
     assert drive.tick == 12
     frames[place] = encode(replace(drive, v=drive.v / 2.0))
-    path.write_bytes(journal.packed(frames))
+    path.write_bytes(journal_file.packed(frames))
     says = f"{path}: on record it decided otherwise at tick 12: the journal is another version's"
     refuses(record, "agent", "a", "--connect", free_endpoint(), says=says)
 
@@ -551,7 +552,7 @@ def test_a_journal_is_locked_as_long_as_it_is_open(tmp_path: Path) -> None:
 def test_a_world_that_has_lost_its_record_is_told_so(record: Path, paper_1: str) -> None:
     with Command("agent", "b", "--connect", paper_1):
         ended = tandem("agent", "a", "--connect", paper_1, "--out", record)
-    tick = past(journal.read(record / "agent-a.journal"), "a").steps[-1].sense.tick
+    tick = past(journal_file.read(record / "agent-a.journal"), "a").steps[-1].sense.tick
     assert ended.status == 3
     said = f"started again without its record: the world is at tick 0, a knows it up to {tick}"
     assert ended.err.splitlines()[-1] == f"tandem agent a: {said}"  # it may have told of a torn write before

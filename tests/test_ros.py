@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from compose.local import free_endpoint
+from compose.launch.processes import free_endpoint
 from protocol.motion import Controls, Pose, step, wrap
 from tests import ros_base
 from tests.commands import tandem
-from world import ros
+from world.hardware import ros2
 
 LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 """CDR's encapsulation header (OMG DDSI-RTPS 10.5): CDR_LE, no options"""
@@ -46,13 +46,13 @@ ODOMETRY = (
 
 
 def test_a_twist_is_the_bytes_of_the_specification_and_of_another_library() -> None:
-    assert ros.twist(1.5, -0.25) == TWIST
+    assert ros2.twist(1.5, -0.25) == TWIST
     assert ros_base.twist(TWIST) == (1.5, -0.25)
 
 
 def test_a_range_and_an_odometry_are_read_from_the_bytes_of_the_specification() -> None:
-    assert ros.ranged(RANGE, 3.0) == 2.5
-    pose = ros.odometry(ODOMETRY)
+    assert ros2.ranged(RANGE, 3.0) == 2.5
+    pose = ros2.odometry(ODOMETRY)
     assert (pose.x, pose.y) == (3.0, -4.0)
     assert pose.heading == pytest.approx(0.8, abs=1e-15)
 
@@ -68,22 +68,22 @@ def test_another_library_makes_the_same_bytes() -> None:
     [(2.5, 3.0, 2.5), (2.5, 2.5, 2.5), (2.5, 2.4, None), (math.inf, 3.0, None), (200.0, 1000.0, None)],
 )
 def test_a_range_out_of_reach_is_none(rho: float, reach: float, found: float | None) -> None:
-    assert ros.ranged(ros_base.ranged(rho), reach) == found
+    assert ros2.ranged(ros_base.ranged(rho), reach) == found
 
 
 @pytest.mark.parametrize("payload", [b"", b"\0\1", RANGE[:-2], TWIST[:9], b"\xff" * 60])
 def test_bytes_that_are_no_message_are_refused(payload: bytes) -> None:
     with pytest.raises(ValueError, match=r"no sensor_msgs/msg/Range"):
-        ros.ranged(payload, 3.0)
+        ros2.ranged(payload, 3.0)
     with pytest.raises(ValueError, match=r"no nav_msgs/msg/Odometry"):
-        ros.odometry(payload)
+        ros2.odometry(payload)
 
 
 def test_what_is_no_number_is_refused() -> None:
     with pytest.raises(ValueError, match="no number"):
-        ros.ranged(ros_base.ranged(math.nan), 3.0)
+        ros2.ranged(ros_base.ranged(math.nan), 3.0)
     with pytest.raises(ValueError, match="no number"):
-        ros.odometry(ros_base.odometry(Pose(math.nan, 0.0, 0.0)))
+        ros2.odometry(ros_base.odometry(Pose(math.nan, 0.0, 0.0)))
 
 
 @given(
@@ -97,7 +97,7 @@ def test_what_was_executed_leads_from_one_pose_to_the_next(
 ) -> None:
     before = Pose(3.0, -4.0, heading)
     after = step(before, v, omega, period)
-    done = ros.executed(before, after, period)
+    done = ros2.executed(before, after, period)
     again = step(before, done.v, done.omega, period)
     assert math.dist((again.x, again.y), (after.x, after.y)) <= 1e-9 * (1.0 + abs(v))
     assert again.heading == pytest.approx(after.heading, abs=1e-12)
@@ -106,7 +106,7 @@ def test_what_was_executed_leads_from_one_pose_to_the_next(
 
 def test_standing_is_rest_to_the_bit() -> None:
     pose = Pose(3.0, -4.0, 0.8)
-    assert ros.executed(pose, pose, 1.0) == Controls(0.0, 0.0)
+    assert ros2.executed(pose, pose, 1.0) == Controls(0.0, 0.0)
 
 
 SCENARIO = """
@@ -137,7 +137,7 @@ def test_a_base_behind_a_bridge_keeps_the_contract(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     with ros_base.base(endpoint, (1.0, 0.5), 3.0) as base:
         ended = tandem(
-            *("conform", "world.ros:Ros2", "--mission", tmp_path / "ros.toml", "--rate", "2"),
+            *("conform", "world.hardware.ros2:Ros2", "--mission", tmp_path / "ros.toml", "--rate", "2"),
             *(
                 "--option",
                 f"connect={endpoint}",
@@ -157,9 +157,7 @@ def test_a_base_behind_a_bridge_keeps_the_contract(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_a_bridge_that_is_not_there_is_one_line() -> None:
     endpoint = free_endpoint()
-    ended = tandem("conform", "world.ros:Ros2", "--option", f"connect={endpoint}")
+    ended = tandem("conform", "world.hardware.ros2:Ros2", "--option", f"connect={endpoint}")
     assert ended.status == 2
-    assert (
-        ended.err
-        == f"tandem conform: world.ros:Ros2: cannot be made: TimeoutError: no bridge at {endpoint}\n"
-    )
+    why = f"cannot be made: TimeoutError: no bridge at {endpoint}"
+    assert ended.err == f"tandem conform: world.hardware.ros2:Ros2: {why}\n"

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from compose.local import free_endpoint
+from compose.launch.processes import free_endpoint
 from tests.commands import (
     OVER,
     PAPER_1,

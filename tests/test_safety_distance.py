@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from agent import apart
-from compose.inline import play
-from compose.scenario import load, validate
-from compose.separation import nearest
+from agent.planning import separation
+from compose.launch.in_process import play
+from compose.recording.closest_approach import nearest
+from compose.scenario.scenario_file import load, validate
 from protocol.motion import Controls, Pose, step
 from tests.commands import tandem
 from world.scenario import Scenario
@@ -43,7 +43,7 @@ def test_how_near_an_arc_comes_is_never_told_too_far_and_hardly_too_near(
     v: float, omega: float, heading: float, x: float, y: float
 ) -> None:
     pose = Pose(0.3, -0.2, heading)
-    told = float(apart.nearest(pose, np.array([v]), np.array([omega]), (x, y), 1.0)[0])
+    told = float(separation.nearest(pose, np.array([v]), np.array([omega]), (x, y), 1.0)[0])
     way = [step(pose, v, omega, i / 2000) for i in range(2001)]
     true = min(math.hypot(at.x - x, at.y - y) for at in way)
     assert told <= true + 1e-12
@@ -53,7 +53,7 @@ def test_how_near_an_arc_comes_is_never_told_too_far_and_hardly_too_near(
 @given(speeds, turns, st.floats(0.0, 2.0))
 def test_a_robot_goes_the_same_arc_only_not_so_far(v: float, omega: float, metres: float) -> None:
     mission = load("random").mission
-    slowed = apart.slowed(Controls(v, omega), metres, mission)
+    slowed = separation.slowed(Controls(v, omega), metres, mission)
     assert abs(slowed.v) * mission.period <= max(metres, 0.0) + 1e-12
     assert slowed.v * omega == pytest.approx(slowed.omega * v, abs=1e-12)
     if abs(v) * mission.period <= metres:
@@ -136,7 +136,7 @@ def test_the_letter_keeps_it_too_or_gives_up() -> None:
 
 def test_a_distance_of_which_nobody_would_be_warned_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "safe.toml"
-    text = (Path("compose/scenarios") / "random.toml").read_text()
+    text = (Path("compose/scenario/shipped") / "random.toml").read_text()
     file.write_text(text.replace("[mission]", "[mission]\nsafety_distance = 1.01"))
     ended = tandem("run", file)
     assert ended.status == 2

@@ -8,26 +8,26 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from agent.mind import WORDS
-from compose import inline
-from compose.record import read as read_record
-from compose.scenario import load
-from compose.scene.facts import Gathering
-from compose.scene.fates import fates
-from compose.scene.recorded import Journals, Performance, read, scenes
-from compose.scene.stage import of_scenario
-from compose.scene.words import DOING, SEEKING, doing
-from compose.watch.shows import writers_of
-from protocol import journal
-from protocol.journal import Journal
+from agent.planning.state import WORDS
+from compose.launch import in_process
+from compose.recording.run import read as read_record
+from compose.scenario.scenario_file import load
+from compose.view.cast import of_scenario
+from compose.view.facts import Gathering
+from compose.view.recorded import Journals, Performance, read, scenes
+from compose.view.report_outcomes import fates
+from compose.view.web.sources import writers_of
+from compose.view.words import DOING, SEEKING, doing
+from protocol.journal import journal_file
+from protocol.journal.journal_file import Journal
 from protocol.motion import compose, wrap
-from world.history import history
+from world.world_journal import history
 
 
 @pytest.fixture(scope="module")
 def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("paper-1")
-    inline.play(load("paper-1"), folder)
+    in_process.play(load("paper-1"), folder)
     return folder
 
 
@@ -113,8 +113,8 @@ def test_a_folder_without_a_journal_holds_nothing_to_see(tmp_path: Path) -> None
 def test_what_becomes_of_every_report_is_what_the_air_made_of_it(tmp_path: Path) -> None:
     faults = ["loss=0.3, delay=0..3, corrupt=0.2, duplicate=0.3, reorder=0.2", "a->b: reports_per_tick=0.7"]
     scenario = load("random", seed=3, faults=faults)
-    inline.play(scenario, tmp_path)
-    told = history(journal.read(tmp_path / "world.journal"), tmp_path)
+    in_process.play(scenario, tmp_path)
+    told = history(journal_file.read(tmp_path / "world.journal"), tmp_path)
     shown = {one.tick: one.passages for one in read(tmp_path).scenes}
     ever: set[str] = set()
     for place, sender in enumerate(("a", "b")):
@@ -136,11 +136,11 @@ def test_what_becomes_of_every_report_is_what_the_air_made_of_it(tmp_path: Path)
 def test_every_report_has_the_fate_that_the_air_gave_it(tmp_path: Path) -> None:
     faults = ["loss=0.3, delay=0..3, corrupt=0.2, duplicate=0.3, reorder=0.2", "a->b: reports_per_tick=0.7"]
     scenario = load("random", seed=3, faults=faults)
-    inline.play(scenario, tmp_path)
+    in_process.play(scenario, tmp_path)
     shown = read(tmp_path)
     flights = fates(shown.scenes, over=True)
     assert {flight.fate for flight in flights} == {"heard", "late", "damaged", "lost"}
-    told = history(journal.read(tmp_path / "world.journal"), tmp_path)
+    told = history(journal_file.read(tmp_path / "world.journal"), tmp_path)
     airs = {sender: [tick.world.air[place] for tick in told.ticks] for place, sender in enumerate(("a", "b"))}
     lost = {
         (passage.sender, passage.tick)

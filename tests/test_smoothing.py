@@ -12,9 +12,18 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from agent.estimation.odometry import Errors, Seen, Track, attributed, shifted, spread, track, wander
-from agent.estimation.ranging import Ranges, predict
-from agent.estimation.smoothing import STILL, Fit, deviation, fit, poses
+from agent.estimation.gaussian.least_squares import STILL, Fit, deviation, fit, poses
+from agent.estimation.gaussian.odometry_noise import (
+    Errors,
+    Seen,
+    Track,
+    attributed,
+    shifted,
+    spread,
+    track,
+    wander,
+)
+from agent.estimation.gaussian.range_model import Ranges, predict
 from protocol.motion import ORIGIN, Pose, compose, step
 from protocol.noise import Drift, Noise
 

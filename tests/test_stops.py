@@ -11,12 +11,13 @@ from signal import SIGCONT, SIGSTOP
 
 import pytest
 
-from compose.local import free_endpoint
-from compose.scenario import load
-from protocol import journal, keys, session
-from protocol.endpoints import at, listening
-from protocol.inbox import Inbox
+from compose.launch.processes import free_endpoint
+from compose.scenario.scenario_file import load
+from protocol.journal import journal_file
 from protocol.messages import Drive, End, Environment, Farewell, Missed
+from protocol.network import keys, session
+from protocol.network.endpoints import at, listening
+from protocol.network.inbox import Inbox
 from protocol.wire import MAX_FRAME_BYTES, decode
 from tests.commands import (
     LONG,
@@ -212,7 +213,7 @@ def test_in_real_time_a_world_that_is_stopped_goes_on(assured: Path, tmp_path: P
 
 def played(out: Path) -> list[Environment | Scenario | Drive | Missed | End | Farewell]:
     kinds = Environment | Scenario | Drive | Missed | End | Farewell
-    return [decode(frame, kinds, MAX_FRAME_BYTES) for frame in journal.read(out / "world.journal")]
+    return [decode(frame, kinds, MAX_FRAME_BYTES) for frame in journal_file.read(out / "world.journal")]
 
 
 def ticks(out: Path) -> int:

@@ -10,16 +10,16 @@ from functools import partial
 import pytest
 from msgspec.structs import replace
 
-import agent.survey
-from agent import planner
-from agent.estimation.hypotheses import Weighed, search
-from agent.estimation.ranging import Pair
-from agent.mind import Mind
-from agent.phases.rendezvous import Aligning, Radial, orientation
-from agent.survey import OFF_RADIUS
-from compose.inline import play
-from compose.record import Record
-from compose.summary import summary
+import agent.planning.assured
+from agent.estimation.gaussian.hypotheses import Weighed, search
+from agent.estimation.gaussian.range_model import Pair
+from agent.planning import planner
+from agent.planning.assured import OFF_RADIUS
+from agent.planning.phase2_orbit import Aligning, Radial, orientation
+from agent.planning.state import Mind
+from compose.launch.in_process import play
+from compose.recording.run import Record
+from compose.recording.summary_json import summary
 from protocol.messages import Undecided
 from protocol.motion import Pose
 from protocol.noise import Noise
@@ -318,7 +318,7 @@ def test_nothing_is_claimed_by_a_fit_that_still_moves(monkeypatch: pytest.Monkey
     def searched(pair: Pair) -> tuple[Weighed, ...]:
         return tuple([one._replace(fit=one.fit._replace(last_step=0.5)) for one in search(pair)])
 
-    monkeypatch.setattr(agent.survey, "search", searched)
+    monkeypatch.setattr(agent.planning.assured, "search", searched)
     record = play(scenario_of(SIGMA, SHORT, max_ticks=ticks + 2))
     assert summary(record, "in-process", None)["outcome"] == "undecided"
     assert all("still moves" in (farewell.missing or "") for farewell in record.farewells.values())

@@ -10,14 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from agent.estimation.odometry import Array
-from agent.phases.rendezvous import pursuit
-from agent.phases.seeking import Homing, arrived, homeward
-from agent.phases.surveying import AHEAD, Held, alone, choice, stride, together
+from agent.estimation.gaussian.odometry_noise import Array
+from agent.planning.active_sensing import AHEAD, Held, alone, choice, stride, together
+from agent.planning.phase2_orbit import pursuit
+from agent.planning.range_seeking import Homing, arrived, homeward
 from protocol.mission import Mission
 from protocol.motion import REST, Controls, Pose, step
 from protocol.noise import Drift, Noise
-from protocol.rendezvous import Orbit, clearance, rendezvous
+from protocol.orbits import Orbit, clearance, rendezvous
 
 SIGMA = 0.1
 MISSION = Mission(3.0, 1.0, 1.0, math.pi, noise=Noise(SIGMA, SIGMA))

@@ -25,15 +25,15 @@ import pytest
 from matplotlib.figure import Figure
 from scipy.stats import binomtest  # type: ignore[import-untyped]
 
-from compose.campaign import engine, figures, report, run, spec
-from compose.campaign.cells import Refused, cells, setting_of, trial_seed
-from compose.campaign.summary import wilson
-from compose.campaign.table import schema_of
-from compose.campaign.worker import PLAY
-from compose.commands.sweep import status_of
-from compose.scenario import load
-from compose.status import UserError
-from protocol.inbox import Inbox
+from compose.cli.sweep import status_of
+from compose.errors import UserError
+from compose.scenario.scenario_file import load
+from compose.sweep import axis_figures, cluster, execution, report, spec
+from compose.sweep.cells import Refused, cells, setting_of, trial_seed
+from compose.sweep.statistics import wilson
+from compose.sweep.table import schema_of
+from compose.sweep.worker import PLAY
+from protocol.network.inbox import Inbox
 from protocol.noise import Drift, Noise
 from tests.commands import PAPER_1, Command, Ended, tandem, temporary_in, until
 
@@ -121,12 +121,16 @@ def played(
     play: str = PLAY,
     audit: bool = True,
     done: Callable[[int], None] = lambda _: None,
-) -> run.Results:
+) -> execution.Results:
     """The campaign, as the command plays it, but for figures and what is said."""
-    silent = run.Progress(say=print, begin=lambda *_: None, done=done)
+    silent = execution.Progress(say=print, begin=lambda *_: None, done=done)
     campaign = spec.load(str(folder / source), trials=trials)
-    return run.sweep(
-        campaign, folder / out, run.Means(workers=workers, play=play, audit=audit), Inbox("test"), silent
+    return execution.sweep(
+        campaign,
+        folder / out,
+        execution.Means(workers=workers, play=play, audit=audit),
+        Inbox("test"),
+        silent,
     )
 
 
@@ -540,7 +544,7 @@ def test_a_campaign_in_which_none_localises_has_its_figures(folder: Path) -> Non
 def test_what_the_system_refuses_dask_is_told_as_such() -> None:
     said = RuntimeError("Cluster failed to start")
     said.__cause__ = OSError(errno.ENOSPC, "No space left on device")
-    with pytest.raises(OSError, match="No space left"), engine._system_errors():
+    with pytest.raises(OSError, match="No space left"), cluster._system_errors():
         raise said
 
 
@@ -585,11 +589,11 @@ def test_a_figure_tells_every_choice_of_the_other_axes_apart_while_they_are_few(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drawn: dict[str, Figure] = {}
-    monkeypatch.setattr(figures, "save", lambda figure, path: drawn.update({path.name: figure}))
+    monkeypatch.setattr(axis_figures, "save", lambda figure, path: drawn.update({path.name: figure}))
     third = '[[axis]]\nfield = "mission.noise.outliers"\nvalues = [0, 0.05]\n'
     third += '[[axis]]\nfield = "max_ticks"\nvalues = [1, 2, 3, 4]\n'
     (folder / "four.toml").write_text(BOTH + third)
-    figures.draw(played(folder, "four.toml", "out", trials=1), folder / "figures")
+    axis_figures.draw(played(folder, "four.toml", "out", trials=1), folder / "figures")
 
     def told_apart(name: str) -> list[str]:
         return [text.get_text() for text in drawn[name].legends[0].get_texts()]
@@ -605,7 +609,7 @@ def test_a_figure_tells_every_choice_of_the_other_axes_apart_while_they_are_few(
 @pytest.mark.parametrize("name", sorted(spec.shipped()))
 def test_a_campaign_that_ships_can_be_played(name: str) -> None:
     campaign = spec.load(name)
-    run.check_columns(campaign, schema_of(campaign, list(cells(campaign))))
+    execution.check_columns(campaign, schema_of(campaign, list(cells(campaign))))
     for cell in cells(campaign):
         setting = setting_of(campaign, cell)
         assert isinstance(setting, Refused) or setting.scenario.name == campaign.base["name"]

@@ -15,13 +15,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from compose.local import free_endpoint
-from compose.tables import console
-from protocol import keys, session
-from protocol.endpoints import at
-from protocol.inbox import Inbox
+from compose.launch.processes import free_endpoint
+from compose.terminal.tables import console
 from protocol.messages import Drive, End, Farewell, Sense, Undecided
-from protocol.terminal import one_line, say
+from protocol.network import keys, session
+from protocol.network.endpoints import at
+from protocol.network.inbox import Inbox
+from protocol.output import one_line, say
 from protocol.wire import decode, encode
 from tests.commands import BOUND_S, PAPER_1, Command, Ended, tandem, world
 from tests.examples import EXAMPLES

@@ -12,14 +12,12 @@ import pytest
 from msgspec.inspect import StrType, StructType, type_info
 from msgspec.structs import replace
 
-from agent.mind import WORDS
-from agent.past import past
-from agent.robot import Robot
-from compose.scenario import load
-from protocol import keys, session
-from protocol.endpoints import at
-from protocol.inbox import Inbox
-from protocol.journal import Journal, read
+from agent.planning.state import WORDS
+from agent.process.agent_journal import past
+from agent.process.robot import Robot
+from compose.scenario.scenario_file import load
+from protocol.journal.journal_file import Journal, read
+from protocol.journal.resume import Retrace
 from protocol.messages import (
     MAX_TEXT,
     Alarm,
@@ -32,14 +30,16 @@ from protocol.messages import (
     Undecided,
     Verdict,
 )
-from protocol.retrace import Retrace
+from protocol.network import keys, session
+from protocol.network.endpoints import at
+from protocol.network.inbox import Inbox
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode, encode
 from tests.commands import BOUND_S, PAPER_1, tandem, world
 from tests.examples import EXAMPLES
 from tests.test_wire import changed, framed, packed, parts, plain
-from world.course import Course, again
-from world.history import history
 from world.referee import Judgement
+from world.simulation import Course, again
+from world.world_journal import history
 
 RUN = "mine"
 LONG_TEXTS = {

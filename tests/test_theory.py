@@ -20,8 +20,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from agent.belief import branches
-from agent.geometry import placements
+from agent.estimation.closed_forms import placements
+from agent.estimation.exact import branches
 from protocol.motion import ORIGIN, TAU, Controls, Pose, compose, step, wrap
 
 Reals = NDArray[np.float64]

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from compose.local import free_endpoint
-from compose.scenario import load
-from protocol import keys, session
-from protocol.endpoints import at, listening
+from compose.launch.processes import free_endpoint
+from compose.scenario.scenario_file import load
+from protocol.network import keys, session
+from protocol.network.endpoints import at, listening
 from protocol.wire import encode
 from tests.commands import Command, journals, processes_of, several_pairs, tandem, world
 from tests.series import series

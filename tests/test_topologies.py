@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from compose.local import free_endpoint
-from compose.reach import KEYED
-from protocol import session
-from protocol.endpoints import listening
+from compose.launch.processes import free_endpoint
+from compose.network import KEYED
+from protocol.network import session
+from protocol.network.endpoints import listening
 from tests.commands import BOUND_S, LONG, LONG_JOURNAL_BYTES, PAPER_1, Command, journals, tandem
 from tests.series import series
 

@@ -7,15 +7,15 @@ from collections.abc import Sequence
 import pytest
 from msgspec.structs import replace
 
-from agent import planner, precision
-from compose.inline import play
-from compose.scenario import parse, shipped
+from agent.planning import planner, precision
+from compose.launch.in_process import play
+from compose.scenario.scenario_file import parse, shipped
 from protocol.messages import Drive, Localised, Report, Undecided
 from protocol.motion import ORIGIN, Covariance
 from tests.steps import steps
 from tests.surveys import scenario_of
 from tests.test_claims import EXACT, NOISY
-from world.ending import LAST_WORDS, Ending
+from world.hardware.termination import LAST_WORDS, Ending
 from world.referee import Judgement, inaccuracy, judge
 from world.tick import World, advance, release
 

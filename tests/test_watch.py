@@ -22,10 +22,10 @@ import pytest
 from msgspec.structs import replace
 from playwright.sync_api import expect
 
-from compose import inline
-from compose.record import read
-from compose.scenario import load
-from protocol import journal
+from compose.launch import in_process
+from compose.recording.run import read
+from compose.scenario.scenario_file import load
+from protocol.journal import journal_file
 from protocol.messages import Message, OfRobot, Sense
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from tests.browser import SCRUB, Open, address_of, inks, picture, shot, until_shown, watching
@@ -105,7 +105,7 @@ def test_what_becomes_of_reports_is_drawn_on_their_way(opened: Open, tmp_path: P
     for fault in ("loss=0", "loss=1", "corrupt=1"):
         record = tmp_path / fault
         record.mkdir()
-        inline.play(load("paper-1", faults=[f"{fault}, contact_ticks=0..1"]), record)
+        in_process.play(load("paper-1", faults=[f"{fault}, contact_ticks=0..1"]), record)
         with watching(record) as (_, where):
             page = opened(f"{where}#tick=46")
             until_shown(page, 46)
@@ -188,7 +188,7 @@ def test_robots_without_a_world_are_shown_by_what_they_know(
     opened: Open, paper_1: Path, tmp_path: Path
 ) -> None:
     for path in paper_1.glob("agent-*.journal"):
-        told = [decode(frame, OfRobot, MAX_FRAME_BYTES) for frame in journal.read(path)]
+        told = [decode(frame, OfRobot, MAX_FRAME_BYTES) for frame in journal_file.read(path)]
         frames = [encode(as_a_driver_tells(one)) for one in told]
         (tmp_path / path.name).write_bytes(b"".join([msgpack.packb(frame) for frame in frames]))
     with watching(tmp_path) as (_, where):
@@ -244,7 +244,7 @@ def test_fifty_robots_are_shown(opened: Open, tmp_path: Path) -> None:
     scenario.write_text(f'name = "fifty"\nseed = 5\n{SECTION_IV}' + "".join(robots))
     record = tmp_path / "record"
     record.mkdir()
-    inline.play(load(str(scenario)), record)
+    in_process.play(load(str(scenario)), record)
     with watching(record) as (_, where):
         page = opened(f"{where}#tick=20")
         until_shown(page, 20)
@@ -261,7 +261,7 @@ def test_fifty_robots_are_shown(opened: Open, tmp_path: Path) -> None:
 def test_lost_late_and_damaged_reports_are_told(opened: Open, tmp_path: Path) -> None:
     record = tmp_path / "record"
     record.mkdir()
-    inline.play(load("noisy", faults=["loss=0.3, delay=0..3, corrupt=0.1, duplicate=0.2"]), record)
+    in_process.play(load("noisy", faults=["loss=0.3, delay=0..3, corrupt=0.1, duplicate=0.2"]), record)
     with watching(record) as (_, where):
         page = opened(f"{where}#tick=26")
         until_shown(page, 26)

@@ -16,7 +16,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from compose.scenario import load
+from compose.scenario.scenario_file import load
 from protocol.messages import MAX_REPORT_RANGES, MAX_REPORT_RUNS, Drive, End, Farewell, Message, Report, Sense
 from protocol.mission import Mission
 from protocol.wire import MAX_FRAME_BYTES, VERSION, MalformedFrame, decode, encode

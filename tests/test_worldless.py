@@ -12,15 +12,15 @@ import pyarrow.parquet as pq
 import pytest
 from msgspec.structs import replace
 
-from compose.audit.alone import RULES, judge_alone
+from compose.audit.hardware_rules import RULES, judge_alone
 from compose.figures import over_time, phase_one, steps, trajectory
 from compose.figures.account import account
 from compose.figures.pair import Pair, of_record, of_robots
 from compose.figures.sheet import NO_PLACES, Absent
-from compose.inline import play
-from compose.record import past_of, read
-from compose.scenario import load, parse
-from protocol import journal
+from compose.launch.in_process import play
+from compose.recording.run import past_of, read
+from compose.scenario.scenario_file import load, parse
+from protocol.journal import journal_file
 from protocol.messages import Drive, Message, OfRobot, Report
 from protocol.mission import Role
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
@@ -175,7 +175,7 @@ def test_whose_journal_is_shorter_takes_nothing_from_its_peer(
 ) -> None:
     whole, alone = folders
     (tmp_path / "agent-a.journal").write_bytes((alone / "agent-a.journal").read_bytes())
-    frames = list(journal.read(alone / "agent-b.journal"))[:20]
+    frames = list(journal_file.read(alone / "agent-b.journal"))[:20]
     (tmp_path / "agent-b.journal").write_bytes(b"".join([msgpack.packb(frame) for frame in frames]))
     known, told = pair_of(whole), alone_of(tmp_path)
     assert told.a.anchor_ranges == known.a.anchor_ranges
@@ -222,7 +222,7 @@ def test_a_tick_that_is_left_out_is_no_record(folders: tuple[Path, Path], tmp_pa
     _, alone = folders
     frames = [
         frame
-        for frame in journal.read(alone / "agent-a.journal")
+        for frame in journal_file.read(alone / "agent-a.journal")
         if getattr(decode(frame, OfRobot, MAX_FRAME_BYTES), "tick", None) != 5
     ]
     (tmp_path / "agent-a.journal").write_bytes(b"".join([msgpack.packb(frame) for frame in frames]))
@@ -257,7 +257,7 @@ def test_without_a_world_the_audit_finds_what_breaks_a_rule(
     spoilt: Callable[[Message], Message], rules: set[str], folders: tuple[Path, Path]
 ) -> None:
     _, alone = folders
-    found = {path.name: list(journal.read(path)) for path in sorted(alone.glob("*.journal"))}
+    found = {path.name: list(journal_file.read(path)) for path in sorted(alone.glob("*.journal"))}
     frames = found["agent-a.journal"]
     for place, frame in enumerate(frames):
         message = decode(frame, OfRobot, MAX_FRAME_BYTES)

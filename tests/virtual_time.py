@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from types import ModuleType
 
-from compose import exercise
+from compose.hardware import exercise
 from docs import rover
 from docs.rover import Rover as RealRover
 from protocol.messages import Briefing

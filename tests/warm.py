@@ -16,8 +16,9 @@ from typing import IO
 import msgspec
 
 import compose
-from compose import cli, forked
-from compose.warm_up import missions
+from compose.cli import main
+from compose.cli.warm_up import missions
+from compose.launch import forked
 
 WARM_UP = "tests.warm:warm_up"
 MAIN = "tests.warm:run_command"
@@ -75,4 +76,4 @@ def run_command() -> None:
     os.environb.clear()
     os.environb.update(command.environment)
     sys.argv = ["tandem", *map(os.fsdecode, command.words)]
-    cli.main()
+    main.main()

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import msgspec
 
-from world.draws import uniform
 from world.faults import Fault
+from world.random_streams import uniform
 
 
 class Flying(NamedTuple):

@@ -17,13 +17,13 @@ from typing import Any
 
 import zenoh
 
-from protocol import keys, session
-from protocol.inbox import NOTHING, Arrival, Inbox
 from protocol.messages import Drive, End, Farewell, Message, Sense, Truth
+from protocol.network import keys, session
+from protocol.network.inbox import NOTHING, Arrival, Inbox
 from protocol.spelling import did_you_mean
 from protocol.wire import MalformedFrame, decode, encode
-from world.course import Course
 from world.referee import Judgement
+from world.simulation import Course
 
 SILENCE_S = 3.0
 """a replaceable link over which no robot has said anything for so long is replaced, as an agent's is"""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import msgspec
 
-from protocol.lie import Lie
+from protocol.attack import Lie
 from protocol.messages import Briefing
 from protocol.mission import Anchor, Mission, Role, Variant
 from protocol.motion import Pose
-from protocol.rendezvous import Rendezvous
+from protocol.orbits import Rendezvous
 from protocol.units import RobotId, Tick
 from world.faults import Fault
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from protocol.motion import Controls
 from protocol.noise import Drift
-from world.draws import gaussian, uniform
+from world.random_streams import gaussian, uniform
 from world.scenario import Scenario
 from world.truth import Truth
 

@@ -1,1 +1,1 @@
-"""What noisy ranges tell: the path and its drift, fits of it, hypotheses with odds, and doubt of a peer."""
+"""Estimation of poses from ranges: closed forms and exact tests, and Gaussian estimation in `gaussian`."""

@@ -1,1 +1,1 @@
-"""The judge: what a run's journals say, held against the scenario, the world and the planner."""
+"""The audit: rules that recompute a run from its recording."""

@@ -12,16 +12,16 @@ from pathlib import Path
 
 import msgspec
 
-from compose.audit.alone import Alone
-from compose.audit.alone import order as order_alone
-from compose.audit.case import Case
-from compose.audit.claims import outcome
-from compose.audit.conduct import decision
+from compose.audit.agent_rules import decision
+from compose.audit.claim_rules import outcome
+from compose.audit.delivery_rules import contact, report, sense
+from compose.audit.evidence import Case
 from compose.audit.findings import Checks, Violation
-from compose.audit.journals import briefing, order
-from compose.audit.judge import judged
-from compose.audit.wires import contact, report, sense
-from compose.record import books
+from compose.audit.hardware_rules import Alone
+from compose.audit.hardware_rules import order as order_alone
+from compose.audit.journal_rules import briefing, order
+from compose.audit.rules import judged
+from compose.recording.run import books
 
 RULES: tuple[Callable[[Case], Checks], ...] = (briefing, sense, contact, report, decision, order, outcome)
 """in the order of a tick: what differs first has caused what differs later"""

@@ -1,1 +1,1 @@
-"""What a mission needs of a machine, its keys and its network: one check a module."""
+"""Checks of a machine, its keys and its network, and a list of running missions."""

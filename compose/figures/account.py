@@ -6,10 +6,10 @@ from pathlib import Path
 
 import msgspec
 
-from agent.mind import Mind
-from agent.past import Past
-from agent.robot import Robot
-from compose.record import past_of
+from agent.planning.state import Mind
+from agent.process.agent_journal import Past
+from agent.process.robot import Robot
+from compose.recording.run import past_of
 from protocol.messages import Estimate
 from protocol.wire import encode
 

@@ -11,8 +11,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from agent.geometry import Placement
-from agent.phases.encounter import Array, Compared, LastManoeuvre, Plan, compared
+from agent.estimation.closed_forms import Placement
+from agent.planning.phase3_last_manoeuvre import Array, Compared, LastManoeuvre, Plan, compared
 from compose.figures.pair import ROLES, Pair
 from compose.figures.sheet import ANCHORS, NO_ENCOUNTER, ROW, SMALL, Absent, Sheet, circle, equal
 from compose.figures.style import COLOURS, INK, MARKS, PALE, PALER

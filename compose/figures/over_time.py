@@ -11,10 +11,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatterMathtext, LogLocator, MaxNLocator, NullLocator
 
-from compose.claim import Claim
 from compose.figures.pair import ROLES, Pair
 from compose.figures.sheet import ANCHORS, NO_TRUTH, ROW, SMALL, Absent, Sheet
 from compose.figures.style import COLOURS, INK, MARKS, PALE, SHADE
+from compose.recording.claim import Claim
 from protocol.messages import Estimate
 from protocol.mission import Role
 from protocol.motion import Pose, wrap

@@ -9,16 +9,16 @@ from functools import cached_property
 import msgspec
 from msgspec.structs import replace
 
-from agent.mind import Mind
-from compose.claim import Claim
+from agent.planning.state import Mind
 from compose.figures.account import Account
-from compose.record import Record
-from compose.robots import outcome
-from compose.summary import broken_off, ended, first_claim
+from compose.recording.claim import Claim
+from compose.recording.robots import outcome
+from compose.recording.run import Record
+from compose.recording.summary_json import broken_off, ended, first_claim
 from protocol.messages import Drive
 from protocol.mission import Anchor, Mission, Role, Variant
 from protocol.motion import Pose
-from protocol.rendezvous import Orbit
+from protocol.orbits import Orbit
 from world.sensors import anchor_ranges, mutual_ranges
 
 ROLES: tuple[Role, Role] = ("a", "b")

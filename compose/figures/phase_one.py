@@ -9,9 +9,9 @@ from typing import Literal, NamedTuple
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from agent.belief import Branch
-from agent.mind import Mind
-from agent.phases.seeking import travelled
+from agent.estimation.exact import Branch
+from agent.planning.range_seeking import travelled
+from agent.planning.state import Mind
 from compose.figures.pair import Pair
 from compose.figures.sheet import ANCHORS, Absent, Sheet, around, circle, equal, fitted
 from compose.figures.style import COLOURS, INK, MARKS, PALE, PALER

@@ -8,9 +8,9 @@ from itertools import groupby
 
 import msgspec
 
-from compose.claim import Claim
-from compose.record import Record
-from compose.summary import first_claim
+from compose.recording.claim import Claim
+from compose.recording.run import Record
+from compose.recording.summary_json import first_claim
 from protocol.messages import Estimate
 from protocol.motion import Pose
 from world.scenario import Placed

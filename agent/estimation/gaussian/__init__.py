@@ -1,0 +1,1 @@
+"""Estimation with noisy sensors: least squares, hypotheses with probabilities, and consistency tests."""

@@ -1,0 +1,84 @@
+"""A log as a robot tells it that was told to lie (see `protocol.attack`); its own stays true."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+from msgspec.structs import replace
+
+from agent.peer.motion_log import Logbook
+from protocol.attack import Lie
+from protocol.messages import Ranged
+from protocol.motion import Pose, Run
+
+STARTS = ("radius", "heading", "reframe")
+
+
+def told(log: Logbook, lie: Lie, parted: int | None, met: int | None, period: float) -> Logbook:
+    """`log`, as `lie` has it; phase 1 was over at the tick `parted`, and phase 3 began at `met`."""
+    if lie.kind == "radius":
+        ranges = tuple([Ranged(one.tick, max(0.0, one.range + lie.size)) for one in log.ranges])
+        return Logbook(log.through, log.runs, ranges)
+    if lie.kind in STARTS:
+        return log
+    first, last = _span(lie, log.through, parted, met)
+    book = Logbook(ranges=log.ranges)
+    tick = 0
+    for run in log.runs:
+        for begin, end in _cut(tick, tick + run.ticks, first, last):
+            part = _bent(Run(end - begin, run.v, run.omega), begin, lie, first, last, period)
+            book = book.drove(part.v, part.omega, part.ticks)
+        tick += run.ticks
+    return book
+
+
+def _span(lie: Lie, through: int, parted: int | None, met: int | None) -> tuple[int, int]:
+    """The ticks of the part: the first, and the one after the last; empty while it has not come."""
+    end = through + 1
+    parted = parted if parted is not None else end
+    met = met if met is not None else end
+    match lie.part:
+        case "phase-1":
+            return 0, parted
+        case "orbit":
+            return parted, max(parted, met)
+        case "encounter":
+            return met, end
+        case _:
+            return 0, end
+
+
+def _cut(begin: int, end: int, first: int, last: int) -> list[tuple[int, int]]:
+    """[begin, end), in pieces inside the part, or outside; its first tick, and the one after it, alone."""
+    marks = sorted({begin, end, *[mark for mark in (first, first + 1, last, last + 1) if begin < mark < end]})
+    return list(pairwise(marks))
+
+
+def _bent(run: Run, tick: int, lie: Lie, first: int, last: int, period: float) -> Run:
+    """What is told of a run that begins at `tick`."""
+    match lie.kind:
+        case "scale" if first <= tick < last:
+            return Run(run.ticks, run.v * lie.size, run.omega)
+        case "shift" if tick == first < last:
+            return Run(run.ticks, run.v + lie.size / period, run.omega)
+        case "rotate" if tick == first < last:
+            return Run(run.ticks, run.v, run.omega + lie.size / period)
+        case "rotate" if tick == last > first:
+            return Run(run.ticks, run.v, run.omega - lie.size / period)
+        case _:
+            return run
+
+
+def start(true: Pose, lie: Lie) -> Pose:
+    """Where tick 0 of its odometry lies in the frame of its anchor, as `lie` has it."""
+    match lie.kind:
+        case "radius":
+            return replace(true, x=true.x + lie.size)
+        case "heading":
+            return replace(true, heading=true.heading + lie.size)
+        case "reframe":
+            c, s = math.cos(lie.size), math.sin(lie.size)
+            return Pose(c * true.x - s * true.y, s * true.x + c * true.y, true.heading + lie.size)
+        case _:
+            return true

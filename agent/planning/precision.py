@@ -1,0 +1,160 @@
+"""Bounds on the errors of anchors and placements with exact sensors, from `protocol.rounding`.
+
+Both robots of a pair compute the same bounds from the same logs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import msgspec
+from msgspec.structs import replace
+
+from agent.estimation.closed_forms import Placement
+from agent.estimation.exact import FITTED, Branch, Sighting, anchor_error, polished, turn_error
+from agent.peer.motion_log import Logbook
+from agent.planning.state import Mind
+from protocol.mission import RANGE_MARGIN, Mission
+from protocol.motion import ORIGIN, Pose, Run, follow
+from protocol.rounding import BETTER, OUT_AND_BACK, SAME, SURE, WELL, foothold, rounding
+
+
+def size(mind: Mind) -> float:
+    """Return D + R in m: the largest coordinate in the computations of the robots and the world."""
+    return mind.briefing.anchor_distance + mind.briefing.mission.sensing_range
+
+
+def drifted(mind: Mind, log: Logbook, tick: int) -> float:
+    """Return the bound in m on the rounding error of a range at `tick`, from the odometry of `log`."""
+    return _rounded(size(mind), log.until(tick), mind.briefing.mission.period)
+
+
+def _rounded(extent: float, runs: Sequence[Run], period: float) -> float:
+    """Return the bound in m on the rounding error of a range after `runs`; `extent` is `size`."""
+    path = turned = 0.0
+    for run in runs:
+        path += abs(run.v) * run.ticks
+        turned += abs(run.omega) * run.ticks
+    return rounding(extent, len(runs), path * period, turned * period)
+
+
+def margin(mission: Mission, floor: float) -> float:
+    """Return how far inside R, in m, a point of phase 1 must lie to be certainly in range.
+
+    Two ranges A_0 apart on a radius, each with an error of `floor`, determine a heading to sqrt(2 floor /
+    A_0) rad, and therefore the range of a point to R times that.
+    """
+    return max(RANGE_MARGIN, mission.sensing_range * math.sqrt(2.0 * floor / mission.first_straight))
+
+
+class Known(msgspec.Struct, frozen=True):
+    """The anchor error after the first of a robot's anchor ranges."""
+
+    error: float
+    """m: the bound on the error of the anchor's position"""
+    ranges: int
+    """the number of ranges that give this error"""
+    enough: bool = False
+    """whether phase 1 may end"""
+
+
+def anchor(mind: Mind, start: Pose, log: Logbook) -> Known:
+    """Return the smallest anchor error of the robot of `log`, whose branch begins at `start`.
+
+    Phase 1 may end in three cases. Either the error is at most WELL of `foothold`; or it is at most
+    `foothold`, and the last range hardly reduced it (BETTER); or OUT_AND_BACK ranges did not reduce it. In
+    the last case rounding grows faster than the ranges inform, and `pinned_down` decides in the encounter
+    whether the error is small enough. Later ranges are ignored, so that both robots of a pair, which have
+    the same ranges, compute the same result.
+    """
+    mission, extent = mind.briefing.mission, size(mind)
+    enough = foothold(extent, mind.briefing.anchor_distance, mission.sensing_range)
+    known = least = error = math.inf
+    ranges = 0
+    ranged: list[tuple[Pose, float, float]] = []
+    for one in log.ranges:
+        if one.tick > log.through:
+            break
+        runs = log.until(one.tick)
+        floor = _rounded(extent, runs, mission.period)
+        ranged.append((follow(ORIGIN, runs, mission.period), one.range, floor))
+        if len(ranged) == 1 and start.x > enough:
+            continue  # the range at the start does not depend on the heading
+        before, error = error, anchor_error(start, ranged)
+        if error < least or len(ranged) <= FITTED:
+            least, ranges = error, len(ranged)
+        # branches that `weigh_branches` merged later differ by its larger floor
+        known = least + SAME * (floor - ranged[ranges - 1][2])
+        stalled = len(ranged) >= FITTED and error > BETTER * before
+        spent = len(ranged) - ranges == OUT_AND_BACK
+        if known <= WELL * enough or (stalled and known <= enough) or spent:
+            return Known(known, ranges, enough=True)
+    return Known(known, ranges)
+
+
+NEXT_TO = 0.25
+"""The fraction of the anchor error within which two branches that are fitted to all ranges are one.
+
+Next to a double root, rounding may end the two fits on either side of it.
+"""
+
+
+def merged(mind: Mind, branches: tuple[Branch, ...]) -> tuple[Branch, ...]:
+    """Return `branches` without those that no range distinguishes from the first (see NEXT_TO)."""
+    if len(branches) < 2 or len(mind.log.ranges) < FITTED:
+        return branches
+    first = branches[0]
+    near = NEXT_TO * anchor(mind, first.start, mind.log).error
+    return (first, *(other for other in branches[1:] if math.dist(other.anchor, first.anchor) >= near))
+
+
+def fitted(mind: Mind, branch: Branch) -> tuple[Branch, Known]:
+    """Return `branch` fitted to the ranges with the smallest anchor error, and that error."""
+    known = anchor(mind, branch.start, mind.log)
+    if known.ranges == len(mind.log.ranges):
+        return branch, known
+    ranged = [(pose, rho) for pose, rho in mind.seen() if rho is not None]
+    branch = polished(branch, ranged[: known.ranges])
+    return branch, replace(known, error=anchor(mind, branch.start, mind.log).error)
+
+
+def peer_anchor(mind: Mind) -> float:
+    """Return the anchor error of the peer in m."""
+    assert mind.radio.start is not None
+    return anchor(mind, mind.radio.start, mind.radio.peer).error
+
+
+def drift(mind: Mind) -> float:
+    """Return the bound in m on both odometries' rounding, added up until now."""
+    return _drift(mind, min(mind.tick, mind.radio.peer.through))
+
+
+def _drift(mind: Mind, tick: int) -> float:
+    return drifted(mind, mind.log, tick) + drifted(mind, mind.radio.peer, tick)
+
+
+def apart(mind: Mind) -> float:
+    """Return the bound in m on both anchors' errors and both odometries' rounding, added up until now."""
+    return _apart(mind, min(mind.tick, mind.radio.peer.through))
+
+
+def _apart(mind: Mind, tick: int) -> float:
+    own, peers = mind.findings.own_anchor, mind.findings.peer_anchor
+    assert peers is not None
+    return own + peers + _drift(mind, tick)
+
+
+def pinned_down(mind: Mind, placement: Placement, ranged: Sequence[Sighting], off: float) -> bool:
+    """Return whether the sightings in `ranged` determine `placement` to SURE; `off` is `apart`.
+
+    Only rounding between the first and the last sighting makes the errors of their ranges differ. Rounding
+    before the first one shifts all ranges alike, as an anchor error does.
+    """
+    first, last = ranged[0].tick, ranged[-1].tick
+    period, extent = mind.briefing.mission.period, size(mind)
+    floor = 0.0
+    for log in (mind.log, mind.radio.peer):
+        floor += 0.5 * _rounded(extent, log.between(first, last), period)
+    turned = turn_error(placement, ranged, floor, _apart(mind, first))
+    return off + turned * max(1.0, extent) <= SURE

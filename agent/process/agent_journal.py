@@ -1,0 +1,170 @@
+"""What an agent's journal tells: the briefing, then tick after tick what came in and what was answered."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import msgspec
+from msgspec.structs import replace
+
+from agent.process.robot import Told
+from protocol import motion
+from protocol.journal.environment import named_in
+from protocol.journal.journal_file import CorruptJournal
+from protocol.messages import (
+    Briefing,
+    Contact,
+    Drive,
+    End,
+    Environment,
+    Estimate,
+    Farewell,
+    Localised,
+    Missed,
+    OfRobot,
+    Report,
+    Sense,
+)
+from protocol.motion import ORIGIN, REST, Pose, compose, inverse
+from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
+
+
+class Step(msgspec.Struct, frozen=True):
+    """One tick, in the order of the journal; what is none or empty did not come, or not any more."""
+
+    sense: Sense
+    frame: bytes
+    """that the Sense came in"""
+    report: Told | None = None
+    """to the peer, in contact"""
+    heard: tuple[Told, ...] = ()
+    missed: tuple[str, ...] = ()
+    """peers whose report did not come in time"""
+    drive: Drive | None = None
+    estimate: Estimate | None = None
+
+
+class Past(msgspec.Struct, frozen=True):
+    """A journal, whole or up to where it breaks off."""
+
+    briefing: Briefing
+    steps: tuple[Step, ...]
+    end: End | None = None
+    farewell: Farewell | None = None
+    environment: Environment | None = None
+    """where it was written; none of an older recording"""
+
+    @property
+    def estimates(self) -> tuple[Estimate, ...]:
+        """What the robot held possible, tick by tick."""
+        return tuple([step.estimate for step in self.steps if step.estimate is not None])
+
+    @property
+    def claim(self) -> tuple[int, Localised] | None:
+        """The first that it made, and in which tick."""
+        for step in self.steps:
+            if step.drive is not None and isinstance(step.drive.verdict, Localised):
+                return step.sense.tick, step.drive.verdict
+        return None
+
+    @property
+    def odometry(self) -> tuple[Pose, ...]:
+        """Its poses in the frame of tick 0, dead-reckoned from what it measured itself to have driven."""
+        poses, period = [ORIGIN], self.briefing.mission.period
+        for step in self.steps[1:]:
+            done = step.sense.executed or REST
+            poses.append(motion.step(poses[-1], done.v, done.omega, period))
+        return tuple(poses[: len(self.steps)])
+
+    @property
+    def path(self) -> tuple[Pose, ...]:
+        """Where it was in the plane, by its claim: its odometry, laid through it. Empty, if it made none."""
+        claim, odometry = self.claim, self.odometry
+        if claim is None:
+            return ()
+        tick, said = claim
+        frame = compose(said.pose, inverse(odometry[tick]))
+        return tuple([compose(frame, pose) for pose in odometry])
+
+    def contact(self, tick: int) -> Contact | None:
+        """With its peer, as it sensed it at `tick`; none, too, where that is not on record."""
+        contacts = self.steps[tick].sense.contacts if tick < len(self.steps) else ()
+        return contacts[0] if contacts else None
+
+
+class OutOfOrder(CorruptJournal):
+    """A frame that is sound, and stands where none of its kind can."""
+
+    def __init__(self, message: msgspec.Struct, place: int, source: object) -> None:
+        self.place = place
+        """how many frames stand before it"""
+        self.tick: int | None = getattr(message, "tick", None)
+        at = f" of tick {self.tick}" if self.tick is not None else ""
+        kind = type(message).__name__
+        self.what = f"{'an' if kind[0] in 'AE' else 'a'} {kind}{at} is out of order"
+        super().__init__(f"{source}: {self.what}")
+
+
+def past(frames: Iterable[bytes], source: object) -> Past:
+    """What `frames` tell. Raises CorruptJournal, whose text begins with `source`."""
+    frames = list(frames)
+    environment = named_in(frames)
+    first = int(environment is not None)
+    briefing: Briefing | None = None
+    steps: list[Step] = []
+    end: End | None = None
+    farewell: Farewell | None = None
+    for place, frame in enumerate(frames[first:], first):
+        message = _message(frame, source)
+        if place == first and not isinstance(message, Briefing):
+            raise CorruptJournal(f"{source}: an agent's journal begins with its Briefing")
+        match message:
+            case Briefing() if place == first:
+                briefing = message
+            case End() if end is None:
+                end = message
+            case Farewell() if end is not None and farewell is None:
+                farewell = message
+            case Sense(tick) if end is None and tick == len(steps) and _answered(steps):
+                steps.append(Step(message, frame))
+            case Report() | Missed() | Drive() | Estimate() if steps and end is None:
+                assert briefing is not None
+                onward = _with(steps[-1], message, frame, briefing.robot)
+                if onward is None:
+                    raise OutOfOrder(message, place, source)
+                steps[-1] = onward
+            case _:
+                raise OutOfOrder(message, place, source)
+    if briefing is None:
+        raise CorruptJournal(f"{source}: there is no Briefing in it")
+    return Past(briefing, tuple(steps), end, farewell, environment)
+
+
+def _answered(steps: Sequence[Step]) -> bool:
+    """Whether the latest of them has come to its Drive, so that the next may come."""
+    return not steps or steps[-1].drive is not None
+
+
+def _message(frame: bytes, source: object) -> Any:
+    try:
+        return decode(frame, OfRobot, MAX_FRAME_BYTES)
+    except MalformedFrame as error:
+        raise CorruptJournal(f"{source}: {error}") from None
+
+
+def _with(step: Step, message: object, frame: bytes, robot: str) -> Step | None:
+    """`step`, and what came next in it; none where that cannot come next."""
+    match message:
+        case Estimate(tick=step.sense.tick) if step.drive is not None and step.estimate is None:
+            return replace(step, estimate=message)
+        case Drive(tick=step.sense.tick) if step.drive is None:
+            return replace(step, drive=message)
+        case Missed(tick=step.sense.tick) if step.drive is None:
+            return replace(step, missed=(*step.missed, message.robot))
+        case Report(tick=step.sense.tick) if message.robot == robot and step.report is None:
+            return replace(step, report=Told(message, frame))
+        case Report() if message.robot != robot and step.drive is None:
+            return replace(step, heard=(*step.heard, Told(message, frame)))
+        case _:
+            return None

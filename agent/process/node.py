@@ -1,0 +1,284 @@
+"""The agent's process: Zenoh in, journal, planner, Zenoh out. It knows nothing but what it is told.
+
+It reacts to what arrives and never steps twice: a Sense heard again makes it send again what it
+answered, so whatever is lost, late or doubled costs time and changes nothing. So does a process that is
+killed, its peer's or the world's: whoever is started again is told again what it must know. So do a process
+that is stopped, and a link that goes down: one over which nothing comes any more is replaced.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+
+import zenoh
+
+from agent.process.discovery import ASK_AGAIN_S, NoWorld
+from agent.process.link import Link
+from agent.process.out_of_step import Disorder
+from agent.process.recovery import REPORTS_KEPT, REPORTS_TOLD, Memory
+from agent.process.report_buffer import Post
+from agent.process.robot import Told
+from protocol.messages import End, Sense
+from protocol.network.inbox import Arrival, Inbox
+from protocol.wire import MalformedFrame, decode, encode
+
+REPORT_SHARE = 0.5
+"""of a tick in real time: how long to wait for the peer's report"""
+FIELD_SHARE = 0.1
+"""the same without a world, where the rest of the tick is for the manoeuvre"""
+LAST_WORD_S = 0.5
+"""how long what the world has said may outlast its sign of life"""
+ENDED_S = 1.0
+"""how long an End of another tick must be said; the world says its own for twice as long, or more"""
+AGAIN_S = 0.05
+"""how often to say again what was said: to one frame may answer as many as there are reports to tell"""
+
+
+class AgentProcess:
+    """One robot in one run, over one link after the other."""
+
+    def __init__(
+        self,
+        memory: Memory,
+        run: str,
+        inbox: Inbox,
+        *,
+        patience: float = 30.0,
+        reached: Callable[[str, int], None] | None = None,
+    ) -> None:
+        """`patience` (s) bounds the wait for the world; `reached` is told how far each tick has come."""
+        briefing = memory.briefing
+        self._id = briefing.robot
+        self._inbox = inbox
+        self._patience = patience
+        self._tick_s = briefing.tick_s
+        self._silence = patience + (self._tick_s or 0.0)
+        """how long to wait for something new from the world"""
+        self._give_up = time.monotonic() + self._silence
+        self._reached = reached
+        self._robot = memory.robot
+        self._sense = memory.sense
+        """the latest"""
+        self._due: float | None = None
+        """in real time: when to go on without the reports that it lists"""
+        if self._sense is not None and self._robot.drive is None:
+            self._set_due()
+        real_time = self._tick_s is not None
+        self._link = Link(briefing, run, inbox)
+        self._disorder = Disorder(self._id, inbox, self._link.appear, real_time=real_time)
+        self._post = Post(inbox, memory.heard, real_time=real_time)
+        self._gone = False
+        """whether it has been told that the world has gone"""
+        self._said_again = 0.0
+        """when all was last said again"""
+        self._again: float | None = None
+        """when to do so once more, if it was asked for too soon"""
+        self._told = deque(memory.told, maxlen=REPORTS_TOLD)
+        """its own latest reports"""
+        self.end: End | None = memory.end if memory.farewell is not None else None
+        """once the world has said it"""
+        self._farewell = memory.farewell
+
+    def play(self) -> End:
+        """The run over the link that it is attached to, to its End.
+
+        Raises LinkLost; NoWorld; or Interrupted when told to stop.
+        """
+        while self.end is None:
+            arrival = self._next(self._due)
+            match arrival.topic:
+                case "sense":
+                    message = self._accepted(arrival)
+                    if isinstance(message, End) and self._is_over(message):
+                        self._conclude(message)
+                    elif isinstance(message, Sense) and self._on_sense(message, arrival.frame):
+                        self._give_up = time.monotonic() + self._silence
+                case "report":
+                    self._post.take(arrival, self._known)
+                case "gone" | "alive":
+                    self._disorder.world(there=arrival.topic == "alive")
+                    self._notice(gone=arrival.topic == "gone")
+                case _:
+                    pass
+            if self.end is None:
+                self._decide_when_all_is_heard()
+                self._check_patience()
+        return self._part(self.end)
+
+    def unanswered(self) -> None:
+        """Wait a moment for another link. Raises NoWorld when that has been too long, or Interrupted."""
+        self._notice(gone=True)
+        self._inbox.next(ASK_AGAIN_S)
+        self._check_patience()
+
+    def _notice(self, *, gone: bool) -> None:
+        """Tell once that the world has gone: its sign of life may have ended before it was seen."""
+        if gone and not self._gone:
+            self._inbox.say(f"the world has gone; waiting {self._silence:g} s for it")
+        self._gone = gone
+
+    def attach(self, link: zenoh.Session) -> None:
+        """From now on, this is the session over which it hears and is heard."""
+        self._link.attach(link)
+
+    def _next(self, until: float | None) -> Arrival:
+        """What arrives next, NOTHING after `until`; says again what is asked for, once that is due.
+
+        Raises LinkLost if the world is silent for too long.
+        """
+        if self._again is not None and time.monotonic() >= self._again:
+            self._say_again()
+        return self._link.next(min(until or self._give_up, self._give_up, self._again or self._give_up))
+
+    def _check_patience(self) -> None:
+        if time.monotonic() > self._give_up:
+            raise NoWorld(f"nothing heard from the world for {self._silence:g} s")
+
+    @property
+    def _known(self) -> int:
+        """The tick of its latest Sense."""
+        return self._sense.tick if self._sense is not None else -1
+
+    # --- what arrives ---
+
+    def _accepted(self, arrival: Arrival) -> Sense | End | None:
+        try:
+            message: Sense | End = decode(arrival.frame, Sense | End)
+        except MalformedFrame as error:
+            self._inbox.refuse(arrival, error)
+            return None
+        if isinstance(message, Sense) and message.robot != self._id:
+            self._inbox.refuse(arrival, f"it is meant for '{message.robot}'")
+            return None
+        return message
+
+    def _is_over(self, end: End) -> bool:
+        return end.tick == self._known or self._disorder.persists(end, ENDED_S)
+
+    def _on_sense(self, sense: Sense, frame: bytes) -> bool:
+        """Whether it is in step. Raises NoWorld."""
+        if sense.tick == self._known + 1:
+            if self._reached is not None:
+                self._reached("sense", sense.tick)
+            if self._due is not None:  # the world goes on; what has not come is missed
+                self._due = 0.0
+                self._decide_when_all_is_heard()
+            self._disorder.over()
+            self._sense = sense
+            self._set_due()
+            told = self._robot.sense(sense, frame)
+            if told is not None:
+                self._told.append(told)
+                self._send_report(told)
+            return True
+        if sense == self._sense:
+            self._disorder.over()
+            self._say_again()
+            return True
+        self._disorder.sense(sense, self._known)
+        return False
+
+    def _set_due(self) -> None:
+        if self._tick_s is not None and self._sense is not None:
+            in_field = any(contact.heard is None for contact in self._sense.contacts)
+            self._due = time.monotonic() + (FIELD_SHARE if in_field else REPORT_SHARE) * self._tick_s
+
+    # --- what is done about it ---
+
+    def _decide_when_all_is_heard(self) -> None:
+        if self._sense is None or self._robot.drive is not None:
+            return
+        heard: list[Told] = []
+        missed: list[str] = []
+        for contact in self._sense.contacts:
+            listed = contact.heard
+            if listed is None:
+                heard += self._post.waiting(self._sense.tick)
+                listed = () if self._post.of(self._sense.tick) else (self._sense.tick,)
+            for tick in listed:
+                told = self._post.of(tick)
+                if told is not None:
+                    heard.append(told)
+                elif self._due is None or time.monotonic() < self._due:
+                    return
+                else:
+                    missed.append(contact.peer)
+        drive = self._robot.decide(heard, missed)
+        self._due = None
+        self._send_drive(drive.tick)
+        if self._robot.journaled or self._link.estimate_wanted:
+            estimate = self._robot.estimate()
+            if self._link.estimate_wanted:
+                self._link.estimate(estimate)
+        self._post.list(told.report.tick for told in heard)
+        for contact in self._sense.contacts:
+            self._post.list(contact.damaged)
+        self._post.forget(drive.tick - REPORTS_KEPT, self._robot.unheard)
+
+    def _send_report(self, told: Told) -> None:
+        self._link.report(told.frame)
+        if self._reached is not None:
+            self._reached("report", told.report.tick)
+
+    def _send_drive(self, tick: int) -> None:
+        if self._reached is not None:
+            self._reached("journal", tick)
+        self._link.drive(self._robot.drive_frame)
+        if self._reached is not None:
+            self._reached("drive", tick)
+
+    def _say_again(self) -> None:
+        """All that whoever was started again may have lost: earlier reports, too, if the peer is near."""
+        now = time.monotonic()
+        if now < self._said_again + AGAIN_S:
+            self._again = self._said_again + AGAIN_S
+            return
+        self._said_again, self._again = now, None
+        if self._robot.told is not None:
+            oldest = self._robot.told.report.tick - REPORTS_TOLD
+            for told in self._told:
+                if told.report.tick > oldest:
+                    self._send_report(told)
+        if self._robot.drive is not None:
+            self._send_drive(self._robot.drive.tick)
+
+    def _conclude(self, end: End) -> None:
+        self._post.forget(end.tick + REPORTS_KEPT + 1, self._robot.unheard)
+        self._farewell = self._robot.farewell(
+            end,
+            reports_refused=self._inbox.refused["report"],
+            reports_unheard=self._post.unheard,
+            frames_refused=self._inbox.refused.total(),
+        )
+        self.end = end
+        self._give_up = time.monotonic() + self._patience
+
+    def _part(self, end: End) -> End:
+        """Answer the End, as often as it is said, until the world says that it has the answer on record."""
+        assert self._farewell is not None
+        frame = encode(self._farewell)
+        self._link.drive(frame)
+        self._disorder.over()
+        gone = False
+        while (now := time.monotonic()) < self._give_up:
+            arrival = self._next(now + LAST_WORD_S if gone else None)
+            if arrival.topic == "sense":
+                if arrival.frame == frame:
+                    break
+                message = self._accepted(arrival)
+                if isinstance(message, Sense):
+                    self._disorder.sense(message, end.tick)
+                elif message is not None:
+                    self._disorder.over()
+                    self._link.drive(frame)
+            elif arrival.topic == "alive":
+                self._disorder.world(there=True)
+            elif arrival.topic == "gone":
+                self._disorder.world(there=False)
+                gone = True  # what it said before may be on its way
+            elif gone and arrival.topic == "nothing":
+                self._inbox.say(f"the world has gone after its End; waiting {self._patience:g} s for it")
+                gone = False
+        return end

@@ -1,0 +1,81 @@
+"""What a robot remembers when its process is started again: its journal, folded.
+
+The planner decides everything once more, and what it decides must be what is on record.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import msgspec
+
+from agent.process.agent_journal import past
+from agent.process.robot import Robot, Told
+from protocol.journal import environment
+from protocol.journal.journal_file import CorruptJournal
+from protocol.journal.resume import Otherwise, Retrace
+from protocol.messages import Briefing, End, Farewell, Sense
+from protocol.wire import encode
+
+REPORTS_KEPT = 64
+"""ticks for which a report of the peer is kept that no Sense has listed yet"""
+REPORTS_TOLD = REPORTS_KEPT - 4
+"""ticks for which a robot can say its own again; less, or the peer would count them twice"""
+
+
+class Memory(msgspec.Struct, frozen=True):
+    """A robot and what its process must know beside its mind; of a new robot, nothing."""
+
+    briefing: Briefing
+    robot: Robot
+    sense: Sense | None = None
+    """the latest"""
+    told: tuple[Told, ...] = ()
+    """its latest reports"""
+    heard: tuple[Told, ...] = ()
+    """the peer's latest"""
+    end: End | None = None
+    farewell: Farewell | None = None
+    """what it has answered to the End"""
+
+
+def remember(record: Retrace) -> Memory | None:
+    """What `record` tells; None if there is nothing in it.
+
+    Raises CorruptJournal if it tells no mission, or one in which other decisions were taken.
+    """
+    if environment.is_blank(record.frames):
+        return None
+    named = environment.named_in(record.frames)
+    lived = past(record.frames, record.path)
+    robot = Robot(lived.briefing)
+    robot.keep(record)
+    record.write(*[encode(one) for one in (named, lived.briefing) if one is not None])
+    told: deque[Told] = deque(maxlen=REPORTS_TOLD)
+    for step in lived.steps:
+        try:
+            report = robot.sense(step.sense, step.frame)
+            if report is not None:  # though it be torn on record
+                told.append(report)
+            if step.drive is not None:
+                robot.decide(step.heard, step.missed)
+                robot.estimate()
+        except Otherwise:
+            raise CorruptJournal(
+                f"{record.path}: on record it decided otherwise at tick {step.sense.tick}: "
+                + (environment.otherwise(named, environment.of_robot()) or "the journal is another version's")
+            ) from None
+    if lived.farewell is not None:  # counts what the wire brought, too, which no fold can
+        record.write(*record.frames[-2:])
+    sense = lived.steps[-1].sense if lived.steps else None
+    now = sense.tick if sense is not None else 0
+    latest = lived.steps[-REPORTS_KEPT:]
+    return Memory(
+        briefing=lived.briefing,
+        robot=robot,
+        sense=sense,
+        told=tuple(told),
+        heard=tuple([one for step in latest for one in step.heard if now - one.report.tick <= REPORTS_KEPT]),
+        end=lived.end if lived.farewell is not None else None,
+        farewell=lived.farewell,
+    )

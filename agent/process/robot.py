@@ -1,0 +1,140 @@
+"""A robot between its wires: planner, radio and journal, whatever carries the frames.
+
+The process over Zenoh and the in-process mission drive the same `Robot`, so they journal the same bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgspec
+
+from agent.planning import planner
+from agent.planning.state import Mind
+from protocol.journal import environment
+from protocol.journal.journal_file import Sink
+from protocol.messages import Briefing, Drive, End, Farewell, Missed, Report, Sense
+from protocol.wire import encode
+
+
+class Told(msgspec.Struct, frozen=True):
+    """A report and the frame that it came in, or goes out in."""
+
+    report: Report
+    frame: bytes
+
+
+class Robot:
+    """One robot's mind, and the record of what went in and came out of it."""
+
+    def __init__(self, briefing: Briefing, journal: Sink | None = None) -> None:
+        self.mind = Mind(briefing)
+        self.told: Told | None = None
+        """the report of this tick, if there was anyone to hear it"""
+        self.drive: Drive | None = None
+        """the Drive of this tick; none before it is decided"""
+        self.reports_sent = 0
+        self.damaged = 0
+        """reports that came damaged"""
+        self.unheard: set[int] = set()
+        """ticks in which the peer said a report that has not come yet"""
+        self.bytes_sent = 0
+        self._frame: bytes | None = None
+        self._unwritten: bytes | None = None
+        """a Sense that nothing has followed from yet; journaled with the Drive, before that is sent"""
+        self._journal = journal
+        if journal is not None:
+            journal.write(encode(environment.of_robot()), encode(briefing))
+
+    def keep(self, journal: Sink | None) -> None:
+        """Go on journaling there."""
+        self._journal = journal
+
+    @property
+    def journaled(self) -> bool:
+        """Whether there is a record to keep."""
+        return self._journal is not None
+
+    @property
+    def drive_frame(self) -> bytes:
+        """What to send of this tick's Drive, once there is one."""
+        if self._frame is None:
+            assert self.drive is not None
+            self._frame = encode(self.drive)
+        return self._frame
+
+    def sense(self, sense: Sense, frame: bytes | None = None) -> Told | None:
+        """Fold in what was sensed (it came in `frame`); the report to send, if anyone is there to hear it."""
+        self.mind = planner.observe(self.mind, sense)
+        self.told = self.drive = self._frame = None
+        for contact in sense.contacts:
+            self.unheard.add(sense.tick)
+            self.unheard.difference_update(contact.heard or (), contact.damaged)
+            self.damaged += len(contact.damaged)
+        if sense.contacts:
+            report = planner.report(self.mind)
+            self.told = Told(report, encode(report))
+            self.reports_sent += 1
+            self.bytes_sent += len(self.told.frame)
+            if self._journal is not None:
+                self._journal.write(frame or encode(sense), self.told.frame)
+        elif self._journal is not None:
+            self._unwritten = frame or encode(sense)
+        return self.told
+
+    def decide(self, heard: Sequence[Told] = (), missed: Sequence[str] = ()) -> Drive:
+        """Fold in what was heard; the drive for the tick. `missed` are peers whose report did not come."""
+        self.mind = planner.decide(self.mind, [told.report for told in heard])
+        self.unheard.difference_update([told.report.tick for told in heard])
+        self.drive = planner.drive(self.mind)
+        if self._journal is not None:
+            frames = [told.frame for told in heard]
+            frames += [encode(Missed(self.mind.tick, peer)) for peer in missed]
+            if self._unwritten is not None:
+                frames.insert(0, self._unwritten)
+                self._unwritten = None
+            self._journal.write(*frames, self.drive_frame)
+        return self.drive
+
+    def estimate(self) -> bytes:
+        """The frame of what the robot holds possible, for whoever watches; once a tick, after the Drive.
+
+        Nobody waits for it, so it is made and journaled when the Drive is on its way.
+        """
+        frame = encode(planner.estimate(self.mind))
+        if self._journal is not None:
+            self._journal.write(frame)
+        return frame
+
+    def farewell(
+        self, end: End, *, reports_refused: int = 0, reports_unheard: int = 0, frames_refused: int = 0
+    ) -> Farewell:
+        """The mission is over: how it went, seen from inside, and what the wire brought that was no use."""
+        mind, findings = self.mind, self.mind.findings
+        plan = findings.plan
+        farewell = Farewell(
+            robot=mind.briefing.robot,
+            anchor_ranges=len(mind.log.ranges),
+            mutual_ranges=len(mind.mutual),
+            branch=findings.branch_kind,
+            alpha=findings.branch.alpha if findings.branch is not None else None,
+            candidates=findings.candidates,
+            last_turn_rate=plan.drive.omega if plan is not None else None,
+            separation_m2=plan.separation_m2 if plan is not None else None,
+            hypotheses=(
+                len(findings.pair or findings.placements) if findings.candidates is not None else None
+            ),
+            odds=findings.pair[0].odds if findings.pair else None,
+            missing=findings.missing,
+            p_value=findings.p_value,
+            reports_sent=self.reports_sent,
+            reports_heard=mind.radio.heard,
+            reports_refused=reports_refused + self.damaged,
+            reports_unheard=reports_unheard,
+            reports_lost=len(self.unheard),
+            frames_refused=frames_refused,
+            bytes_sent=self.bytes_sent,
+        )
+        if self._journal is not None:
+            self._journal.write(encode(end), encode(farewell))
+        return farewell

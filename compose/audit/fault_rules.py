@@ -1,0 +1,49 @@
+"""What befell the reports on their way: whether it is what the fault plan says, and how much it was."""
+
+from __future__ import annotations
+
+from agent.process.agent_journal import Past
+from compose.audit.evidence import Case
+from compose.audit.findings import Befallen, Checks, Violation, said
+
+
+def faults(case: Case) -> Checks:
+    """What each Sense lists as heard, and as damaged, is what the fault plan does to the reports sent."""
+    if not case.history.scenario.faults:
+        return
+    for robot, past in case.pasts.items():
+        for step in past.steps[: len(case.senses)]:
+            expected = case.contact(robot, step.sense.tick)
+            if expected is None:
+                continue
+            for found in step.sense.contacts:
+                listed, planned = (found.heard, found.damaged), (expected.heard, expected.damaged)
+                if listed == planned:
+                    yield None
+                else:
+                    what = f"heard and damaged are {said(listed)}, expected {said(planned)}"
+                    yield Violation("faults", step.sense.tick, robot, what)
+
+
+def befallen(case: Case) -> tuple[Befallen, ...]:
+    """Of every link of the scenario's pairs whose receiver is on record; nothing without a fault plan."""
+    if not case.history.scenario.faults:
+        return ()
+    return tuple([_befallen(past) for past in case.pasts.values()])
+
+
+def _befallen(past: Past) -> Befallen:
+    """Of the link to this robot."""
+    contacts = [(step.sense.tick, contact) for step in past.steps for contact in step.sense.contacts]
+    heard = [(now, tick) for now, contact in contacts for tick in contact.heard or ()]
+    damaged = [tick for _, contact in contacts for tick in contact.damaged]
+    ticks = [tick for _, tick in heard]
+    return Befallen(
+        link=f"{past.briefing.peer}->{past.briefing.robot}",
+        sent=len(contacts),
+        heard=len(heard),
+        late=sum([tick < now for now, tick in heard]),
+        twice=len(ticks) - len(set(ticks)),
+        damaged=len(damaged),
+        lost=len({now for now, _ in contacts} - {*ticks, *damaged}),
+    )

@@ -1,1 +1,0 @@
-"""Campaigns: many trials of a scenario, over axes of its fields. What they import is the extra `lab`."""

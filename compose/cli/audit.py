@@ -1,0 +1,52 @@
+"""`tandem audit`: whether a record keeps the rules."""
+
+from __future__ import annotations
+
+import argparse
+
+from msgspec.structs import astuple
+
+from compose.audit.findings import Befallen, Findings
+from compose.audit.rules import audit
+from compose.errors import CLEAN, VIOLATED
+from compose.recording.run import legible
+from compose.terminal import text_width
+from protocol.output import say
+
+SHOWN = 20
+"""violations that are told in full"""
+
+
+def main(options: argparse.Namespace) -> int:
+    """Judge the record, and say what there is to find."""
+    with legible(options.record):
+        findings = audit(options.record)
+    _show(findings)
+    return VIOLATED if findings.violations else CLEAN
+
+
+def _show(findings: Findings) -> None:
+    say(f"{findings.scenario}: {_count(len(findings.violations))} in {findings.ticks} ticks", "")
+    say(f"{'rule':10}{'checks':>8}{'violations':>12}")
+    for one in findings.counts:
+        say(f"{one.rule:10}{one.checks:>8}{one.violations:>12}")
+    if findings.radio:
+        from compose.terminal import tables  # noqa: PLC0415  # rich takes time to import
+
+        rows = [[str(value) for value in astuple(link)] for link in findings.radio]
+        made = tables.table(["link"], Befallen.__struct_fields__[1:], rows)
+        say("", *tables.lines(made, text_width.room()))
+    if findings.rounding:
+        say("", f"{len(findings.rounding)} checks differ by rounding alone: {findings.versions}")
+    elif findings.violations and findings.versions is not None:
+        say("", f"{findings.versions}: that alone can lead to other decisions")
+    if findings.violations:
+        say("")
+    for violation in findings.violations[:SHOWN]:
+        say(violation.line)
+    if len(findings.violations) > SHOWN:
+        say(f"and {len(findings.violations) - SHOWN} more")
+
+
+def _count(violations: int) -> str:
+    return "one violation" if violations == 1 else f"{violations or 'no'} violations"

@@ -1,0 +1,26 @@
+"""`tandem doctor`: what a mission needs of this machine, its keys and its network, a line each."""
+
+from __future__ import annotations
+
+import argparse
+from itertools import chain
+
+from compose.doctor.certificate_checks import papers
+from compose.doctor.finding import FIX
+from compose.doctor.machine_checks import ports, versions
+from compose.doctor.network_checks import network
+from compose.errors import AMISS, CLEAN
+from compose.network import reach
+from compose.terminal import text_width
+from protocol.output import one_line, say
+
+
+def main(options: argparse.Namespace) -> int:
+    """Check everything, whatever of it fails."""
+    endpoints = reach(options, None)
+    status = CLEAN
+    checks = (versions(), ports(endpoints), papers(endpoints), network(endpoints, options.wait))
+    for finding in chain.from_iterable(checks):
+        say(*text_width.wrapped(one_line(str(finding)), len(finding.mark) + 2))
+        status = AMISS if finding.mark == FIX else status
+    return status

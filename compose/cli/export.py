@@ -1,0 +1,33 @@
+"""`tandem export`: a record in the formats of other people's tools."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from compose.cli.export_bar import MODULES, exported
+from compose.errors import ENDED, FAILED, STOPPED
+from compose.extras import need
+from compose.launch.signals import stop_by_signal
+from protocol.network.inbox import Inbox, Interrupted
+from protocol.output import say
+
+
+def main(options: argparse.Namespace) -> int:
+    """Write the files; FAILED if a robot's journal is missing: of that one there is only what others tell."""
+    need(*MODULES)
+    out: Path = options.out or options.record
+    inbox = Inbox("tandem export")
+    stop_by_signal(inbox)
+    try:
+        done = exported(options.record, out, inbox)
+    except Interrupted as signal_name:
+        inbox.say(f"stopped by {signal_name}")
+        return STOPPED
+    for path in done.files:
+        say(str(path))
+    for name, size in done.torn.items():
+        say(f"{name} ends with {size} bytes of a torn write", error=True)
+    for name in done.missing:
+        say(f"{name} is missing", error=True)
+    return FAILED if done.missing else ENDED

@@ -1,0 +1,150 @@
+"""`tandem robot`: one robot without a world: its driver here, and its agent, in a process of its own."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from contextlib import closing
+from pathlib import Path
+
+from compose.errors import ENDED, FAILED, STOPPED, UserError, status_of
+from compose.hardware.driver_recording import recorded
+from compose.launch.driver_loader import briefed, driver_class, made, mission, options_of
+from compose.launch.processes import STOP_S, Child, ChildFailed, free_endpoint
+from compose.launch.signals import stop_by_signal
+from compose.network import beyond, reach
+from compose.recording.run import folder_for
+from compose.recording.summary_json import ended
+from compose.scenario.scenario_file import check_rate
+from protocol.journal.journal_file import CannotRecord, CorruptJournal
+from protocol.messages import End, Localised
+from protocol.motion import wrap
+from protocol.network import access_control, session
+from protocol.network.endpoints import Endpoints
+from protocol.network.inbox import Inbox, Interrupted
+from protocol.output import say
+from world.hardware.bridge import Field, NoStart
+
+RELISTEN_S = 5.0
+"""how long the port of a robot that has just been killed may stay busy"""
+LEAST_S = 0.1
+"""between two starts of an agent: one that dies at once must not take the machine"""
+
+
+class Agent:
+    """The robot's agent, which is started again when it is killed."""
+
+    def __init__(self, arguments: list[str], inbox: Inbox) -> None:
+        self._arguments = arguments
+        self._inbox = inbox
+        self._child = self._start()
+
+    def _start(self) -> Child:
+        self._started, self._told = time.monotonic(), False
+        return Child(f"agent {self._arguments[1]}", self._arguments, self._inbox, ())
+
+    def again(self) -> None:
+        """It has ended: by a signal, and it goes on from its journal; or raises ChildFailed."""
+        status = self._child.status
+        if status == ENDED:
+            return
+        if status > 0:
+            raise ChildFailed(f"{self._child.name} {self._child.how()}")
+        self._inbox.say(f"{self._child.name} was killed by signal {-status}, and is started again")
+        self.end()
+        time.sleep(max(0.0, self._started + LEAST_S - time.monotonic()))
+        self._child = self._start()
+
+    def end(self, within: float = 0.0) -> None:
+        """Leave nobody behind."""
+        if self._child.running and not within:
+            self._child.stop()
+        self._child.end(within or STOP_S)
+        if not self._told and self._child.status == ENDED and (said := self._child.said()):
+            say(*said.splitlines(), error=True)
+        self._told = True
+        self._child.forget()
+
+
+def main(options: argparse.Namespace) -> int:
+    """Play one robot's part, with its own hardware in the world's place, from where a record ends."""
+    scenario = mission(options.mission, options.id)
+    rate = options.rate or 1.0
+    check_rate(scenario, rate)
+    manoeuvre_s = scenario.mission.period / rate
+    briefing = briefed(scenario, options.id, manoeuvre_s)
+    maker, given = driver_class(options.driver), options_of(options.option)
+    reached = reach(options, "world")
+    inbox = Inbox(f"tandem robot {options.id}")
+    stop_by_signal(inbox)
+    if (warning := beyond(reached)) is not None:
+        inbox.say(warning)
+    try:
+        with (
+            folder_for(options.out) as folder,
+            recorded(folder, briefing, inbox, fsync=options.fsync) as record,
+            closing(made(maker, options.driver, briefing, manoeuvre_s, given)) as driver,
+        ):
+            field = Field(
+                driver,
+                briefing,
+                options.run or scenario.name,
+                inbox,
+                max_ticks=scenario.max_ticks,
+                manoeuvre_s=manoeuvre_s,
+                patience=options.patience,
+                journal=record.journal,
+            )
+            record.take_up(driver, options.driver, field)
+            end = _play(options, field, reached, folder, inbox)
+    except session.CannotListen as error:
+        raise UserError(f"--listen: {error}") from None
+    except CannotRecord as error:
+        raise UserError(f"--out: {error}") from None
+    except CorruptJournal as error:
+        raise UserError(f"--out: {error}; choose another folder") from None
+    except (NoStart, ChildFailed) as error:
+        inbox.say(str(error))
+        return FAILED
+    except Interrupted as signal_name:
+        inbox.say(f"stopped by {signal_name}")
+        return STOPPED
+    if not options.quiet and isinstance(field.verdict, Localised):
+        pose = field.verdict.pose
+        say(f"{options.id}: claims {pose.x:.9f} {pose.y:.9f} {wrap(pose.heading):+.9f} (m, m, rad)")
+    if not options.quiet:
+        slower = f"; a lower --rate, such as {rate / 2:g}, leaves more time" if field.missed else ""
+        stood = f"stood {field.missed} of {end.tick + 1} ticks for want of a Drive in time"
+        say(f"{options.id}: {stood}{slower}")
+    say(f"{options.id}: {ended(end.outcome, end.tick, end.reason)}")
+    return status_of(end.outcome)
+
+
+def _play(options: argparse.Namespace, field: Field, reached: Endpoints, folder: Path, inbox: Inbox) -> End:
+    """The mission, and an agent for it, which leaves with it."""
+    keys = (
+        ["--keys", str(options.keys.resolve().parent / access_control.agent(options.id))]
+        if options.keys
+        else []
+    )
+    own = free_endpoint("tls" if keys else "tcp")
+    endpoints = Endpoints(reached.connect, (own, *reached.listen), reached.settings, reached.folder)
+    with session.open_router(endpoints, RELISTEN_S) as link:
+        agent = Agent(
+            [
+                *("agent", options.id, "--connect", own, "--launched", "--run", field.run, *keys),
+                *("--out", str(folder.resolve()), "--patience", str(options.patience)),
+                *(["--fsync"] if options.fsync else []),
+            ],
+            inbox,
+        )
+        try:
+            field.attach(link)
+            if not options.quiet:
+                where = f", again, from tick {field.tick} on" if field.tick >= 0 else ", waiting for its peer"
+                say(f"{options.id}: in run {field.run}{where}")
+            end = field.play(options.wait, agent.again)
+            agent.end(STOP_S)
+        finally:
+            agent.end()
+        return end

@@ -1,0 +1,37 @@
+"""`tandem scenarios`"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Mapping
+from itertools import takewhile
+from pathlib import Path
+
+from compose.errors import ENDED
+from compose.scenario.scenario_file import shipped
+from compose.terminal import text_width
+from protocol.output import say
+
+
+def main(_options: argparse.Namespace) -> int:
+    """List the scenarios and the campaigns that ship, with the first sentence of each."""
+    _list(shipped())
+    say("campaigns, for `tandem sweep`:")
+    _list(shipped("sweep"))
+    return ENDED
+
+
+def _list(files: Mapping[str, Path]) -> None:
+    width = max(map(len, files))
+    for name, path in files.items():
+        line = f"{name:{width}} {_sentence(path.read_text(encoding='utf-8'))}"
+        say(*text_width.wrapped(line, width + 1))
+
+
+def _sentence(text: str) -> str:
+    """The first of the comment that the file begins with, on however many lines it stands."""
+    comment = takewhile(lambda line: line.startswith("#"), text.splitlines())
+    return re.split(r"(?<=\.) ", " ".join([line.removeprefix("#").strip() for line in comment]), maxsplit=1)[
+        0
+    ]

@@ -1,0 +1,27 @@
+"""The work that a fork server does once for all worlds and agents that are forked from it."""
+
+from __future__ import annotations
+
+import compose.cli.agent
+import compose.cli.world  # noqa: F401  # for its import only
+from compose.cli.main import parser
+from compose.launch import in_process
+from compose.scenario.scenario_file import load
+from protocol import wire
+from protocol.journal import environment
+from protocol.messages import Briefing, Drive, End, Farewell, Report, Sense
+from world.scenario import Scenario
+
+MISSION = "paper-1"
+RECEIVED = (Briefing, Scenario, Sense | End, Report, Drive, Drive | Farewell)
+"""The types that worlds and agents decode."""
+
+
+def missions() -> None:
+    """Prepare worlds and agents: import modules, build the command line and decoders, and run a mission."""
+    parser()
+    in_process.play(load(MISSION))
+    for kind in RECEIVED:
+        wire.prepare(kind)
+    environment.of_world()
+    environment.of_robot()

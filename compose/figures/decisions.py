@@ -1,0 +1,173 @@
+"""Under noise, in place of Fig. 3(c): what was held possible at each decision, and what both then did."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from agent.planning.active_sensing import Surveying, stride
+from agent.planning.state import Mind
+from compose.figures.pair import ROLES, Pair
+from compose.figures.series import Series, some, square
+from compose.figures.sheet import NO_ENCOUNTER, Absent, Window, circle
+from compose.figures.style import COLOURS, INK, MARKS, PALE, PALER
+from protocol.mission import Role
+from protocol.motion import Pose, step
+
+WIDTH, NARROWEST = 2.3, 5.6
+"""inches: of a panel at the most, and of the whole at the least"""
+FINE = 12
+"""pieces that a manoeuvre is drawn in, a tick"""
+LIKELY = 1e-3
+"""odds from which on a hypothesis is within what is seen"""
+
+
+class Decision(NamedTuple):
+    """A tick in which a robot weighed what it holds possible of both, and chose a manoeuvre."""
+
+    tick: int
+    minds: dict[Role, Mind]
+    """of those robots that decided in it"""
+
+
+def decisions(pair: Pair) -> list[Decision]:
+    """Of phase 3, in order."""
+    found: dict[int, dict[Role, Mind]] = {}
+    for role in ROLES:
+        before: object = ()
+        for mind in pair.minds(role):
+            held, surveys = mind.findings.pair, isinstance(mind.state, Surveying) and mind.phase == 3
+            if held and held is not before and (surveys or mind.verdict is not None):
+                found.setdefault(mind.tick, {})[role] = mind
+            before = held
+    return [Decision(tick, found[tick]) for tick in sorted(found)]
+
+
+def draw(pair: Pair) -> Figure | Absent:
+    """A panel a decision; as many as have room."""
+    told = decisions(pair)
+    if not told:
+        why = pair.unknown or "they never weighed how both lie in the plane"
+        return Absent(NO_ENCOUNTER if pair.met is None else why)
+    shown = some(told)
+    many = (
+        f"{len(shown)} of {len(told)} decisions" if len(shown) < len(told) else f"all {len(told)} decisions"
+    )
+    title = f"Hypotheses of how both lie in the plane, and the manoeuvres chosen: {many}"
+    series = Series(len(shown), _window(pair, shown), WIDTH, NARROWEST, [pair.title, title])
+    for i, one in enumerate(shown):
+        axes = series.panel(i, _said(one, i + 1))
+        _panel(axes, pair, one)
+    _signs(axes, pair)
+    series.key(axes)
+    return series.figure
+
+
+def _window(pair: Pair, shown: list[Decision]) -> Window:
+    points = [
+        (pose.x, pose.y)
+        for one in shown
+        for mind in one.minds.values()
+        for pose, held in zip(mind.findings.poses, mind.findings.pair, strict=True)
+        if held.odds >= LIKELY
+    ]
+    for one in shown:
+        ends = list(_places(pair, one.tick).values())
+        ends += [end for mind in one.minds.values() for end in _ends(mind, pair)]
+        points += [(end.x, end.y) for end in ends]
+    return square(points, 0.16, 0.5 * pair.mission.sensing_range)
+
+
+def _said(one: Decision, number: int) -> str:
+    mind = next(iter(one.minds.values()))
+    count, odds = len(mind.findings.pair), mind.findings.pair[0].odds
+    held = f"{count} hypotheses" if count > 1 else "one hypothesis"
+    surest = f"{math.floor(1e4 * odds) / 100:g} %"
+    end = "; claims" if any(mind.verdict is not None for mind in one.minds.values()) else ""
+    return f"({number}) $k$ = {one.tick}, {len(mind.mutual)} mutual ranges\n{held}, first {surest}{end}"
+
+
+def _panel(axes: Axes, pair: Pair, one: Decision) -> None:
+    for role in ROLES:
+        anchor = pair.robot(role).anchor
+        axes.plot(anchor.x, anchor.y, "x", color="k", ms=6, mew=1.4, zorder=2)
+        circle(
+            axes,
+            (anchor.x, anchor.y),
+            pair.mission.sensing_range,
+            ls=(0, (4, 3)),
+            lw=0.8,
+            color=PALE,
+            zorder=1,
+        )
+    _ties(axes, one)
+    for role, mind in one.minds.items():
+        for i, (pose, held) in enumerate(zip(mind.findings.poses, mind.findings.pair, strict=True)):
+            axes.plot(
+                pose.x, pose.y, MARKS[role]["marker"], ms=3.0 + 5.0 * math.sqrt(held.odds),
+                mfc=COLOURS[role] if i == 0 else "white", mec=COLOURS[role], mew=0.9, zorder=4 + (i == 0),
+                gid=f"hypothesis-{one.tick}-{role}-{i + 1}",
+            )  # fmt: skip
+        _drive(axes, pair, role, mind)
+    for role, truth in _places(pair, one.tick).items():
+        axes.plot(truth.x, truth.y, "+", ms=9, mew=1.2, color=INK, zorder=6, gid=f"truth-{one.tick}-{role}")
+
+
+def _places(pair: Pair, tick: int) -> dict[Role, Pose]:
+    """Where each was; without a world, of those that have claimed to know."""
+    paths = {role: pair.robot(role).path for role in ROLES}
+    return {role: path[tick] for role, path in paths.items() if tick < len(path)}
+
+
+def _ties(axes: Axes, one: Decision) -> None:
+    """Between places of a and b that belong to one hypothesis, where both hold the same."""
+    if len(one.minds) < 2 or one.minds["a"].findings.pair != one.minds["b"].findings.pair:
+        return
+    for p, q in zip(one.minds["a"].findings.poses, one.minds["b"].findings.poses, strict=True):
+        axes.plot([p.x, q.x], [p.y, q.y], "-", lw=0.7, color=PALER, zorder=3)
+
+
+def _drive(axes: Axes, pair: Pair, role: Role, mind: Mind) -> None:
+    """Where the manoeuvre leads from the likeliest pose."""
+    ends = _ends(mind, pair)
+    if not ends:
+        return
+    axes.plot([p.x for p in ends], [p.y for p in ends], "-", lw=1.6, color=COLOURS[role], zorder=3)
+    axes.plot(
+        ends[-1].x,
+        ends[-1].y,
+        "x",
+        ms=6,
+        mew=1.5,
+        color=COLOURS[role],
+        zorder=5,
+        gid=f"chosen-{mind.tick}-{role}",
+    )
+
+
+def _ends(mind: Mind, pair: Pair) -> list[Pose]:
+    """Along the manoeuvre that was chosen, from the likeliest pose; none, where none was."""
+    if not isinstance(mind.state, Surveying) or not mind.findings.poses:
+        return []
+    drive, ticks = mind.state.drive, stride(pair.mission)
+    pieces = FINE * ticks
+    period = ticks * pair.mission.period
+    return [
+        step(mind.findings.poses[0], drive.v, drive.omega, period * i / pieces) for i in range(pieces + 1)
+    ]
+
+
+def _signs(axes: Axes, pair: Pair) -> None:
+    for role in ROLES:
+        axes.plot(
+            [], [], MARKS[role]["marker"], ls="", ms=7, color=COLOURS[role],
+            label=f"{pair.robot(role).id}, likeliest",
+        )  # fmt: skip
+    axes.plot([], [], "o", ls="", ms=4, mfc="white", mec=PALE, label="less likely")
+    axes.plot([], [], "x-", ms=6, mew=1.5, lw=1.6, color=PALE, label="manoeuvre chosen")
+    known = "true" if pair.true else "by the claim"
+    axes.plot([], [], "+", ls="", ms=9, mew=1.2, color=INK, label=known)
+    axes.plot([], [], "x", ls="", ms=6, mew=1.4, color="k", label="anchor")

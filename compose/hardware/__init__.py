@@ -1,0 +1,1 @@
+"""Recordings of hardware mode and the driver conformance check."""

@@ -1,0 +1,232 @@
+"""Whether a driver keeps the contract of world/hardware/driver.py, by what it did in an exercise.
+
+None of the checks knows where the robot truly was: odometry is held against what was asked, and ranges to the
+anchor against the path that the odometry tells of.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from statistics import median
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares  # type: ignore[import-untyped]
+
+from compose.hardware.exercise import Trial, Try
+from protocol.mission import Mission
+from protocol.motion import ORIGIN, REST, Controls, Pose, step
+from world.hardware.driver import SENSING
+
+PROMPT = 0.05
+"""of a manoeuvre: how long `drive` may take to return"""
+LIKE = 0.25
+"""of what was asked for: by how much what is measured may differ, where the wheels take time to turn"""
+STILL = 0.02
+"""of a manoeuvre at full speed: less is standing"""
+EXACT = 1e-6
+"""m: ranges of sensors without noise agree with the path so far"""
+SIGMAS = 6.0
+
+
+class Found(NamedTuple):
+    """What a check came to."""
+
+    check: str
+    wrong: str | None
+
+
+Check = Callable[[Mission, Sequence[Try]], str | None]
+
+
+def prompt(_: Mission, tries: Sequence[Try]) -> str | None:
+    """sense and drive come back in time to decide"""
+    sensing, driving = median(one.sensing_s for one in tries), median(one.driving_s for one in tries)
+    if sensing > SENSING:
+        return f"sense takes {sensing:.2g} of a manoeuvre, expected {SENSING:g} at the most"
+    if driving > PROMPT:
+        return f"drive takes {driving:.2g} of a manoeuvre, expected {PROMPT:g} at the most: it must not wait"
+    return None
+
+
+def stands(mission: Mission, tries: Sequence[Try]) -> str | None:
+    """who is told nothing stands still"""
+    for tick, one in enumerate(tries):
+        if one.asked == REST and tick > 0 and not _still(one.reading.executed, mission):
+            return f"tick {tick}, {one.what}: it drove {_said(one.reading.executed)}, expected rest"
+    return None
+
+
+def drives(mission: Mission, tries: Sequence[Try]) -> str | None:
+    """a manoeuvre is what was asked for, in m/s and rad/s, and told in its own tick"""
+    wrong: list[str] = []
+    for tick, one in enumerate(tries):
+        if one.asked == REST or one.share < 1.0 or one.what == "the rest of it":
+            continue
+        done, before = one.reading.executed, tries[tick - 1].asked
+        if _like(done, one.asked, mission):
+            continue
+        if before not in (one.asked, REST) and _like(done, before, mission):
+            return f"tick {tick}, {one.what}: it tells what was driven in tick {tick - 1}"
+        hint = ""
+        if one.asked.omega and abs(done.omega / one.asked.omega - math.degrees(1.0)) < 10.0:
+            hint = ": degrees?"
+        elif _still(done, mission):
+            hint = ": it has not moved"
+        wrong.append(f"tick {tick}, {one.what}: it drove {_said(done)}, asked was {_said(one.asked)}{hint}")
+    return wrong[0] if wrong else None
+
+
+def lasts(_: Mission, tries: Sequence[Try]) -> str | None:
+    """in half the time it drives half of it, and the other half then"""
+    for tick, one in enumerate(tries):
+        if one.what in ("half of a straight", "the rest of it"):
+            part = one.reading.executed.v / one.asked.v
+            if abs(part - one.share) > LIKE:
+                return (
+                    f"tick {tick}, {one.what}: {part:.2f} of the manoeuvre was driven in {one.share:.2f} of "
+                    "its time"
+                )
+    return None
+
+
+def stops(_: Mission, tries: Sequence[Try]) -> str | None:
+    """stop ends a manoeuvre, and odometry tells what was driven, not what was asked for"""
+    for tick, one in enumerate(tries):
+        if one.what == "stopped half-way":
+            part = one.reading.executed.v / one.asked.v
+            if abs(part - one.share) > LIKE:
+                return (
+                    f"tick {tick}: it tells {part:.2f} of a manoeuvre that was stopped after {one.share:.2f} "
+                    "of its time"
+                )
+    return None
+
+
+def fresh(mission: Mission, tries: Sequence[Try]) -> str | None:
+    """a range is of its own tick"""
+    for tick in range(1, len(tries)):
+        before, now = tries[tick - 1].reading, tries[tick].reading
+        if now.anchor_range is None or abs(now.executed.v) < 0.2 * mission.first_straight / mission.period:
+            continue
+        if now.anchor_range == before.anchor_range:
+            return f"tick {tick}: {now.anchor_range:.9g} m is the range of tick {tick - 1}, to the bit"
+    return None
+
+
+def ranges(mission: Mission, tries: Sequence[Try]) -> str | None:
+    """ranges to the anchor are in metres, and of the path that the odometry tells of"""
+    path, tolerance = _path(tries, mission)
+    ranged = [(pose, one.reading.anchor_range) for pose, one in zip(path, tries, strict=True)]
+    some = [(pose, rho) for pose, rho in ranged if rho is not None]
+    if len(some) < 6:
+        return f"{len(some)} ranges to the anchor, expected 6 or more: begin near it"
+    anchor, scale = _fit(some, scaled=False)
+    worst = _worst(some, anchor, scale, mission)
+    if worst <= tolerance:
+        return None
+    anchor, scale = _fit(some, scaled=True)
+    if _worst(some, anchor, scale, mission) <= tolerance:
+        return f"ranges are {scale:.4g} times as long as the path that the odometry tells of"
+    return f"no place of the anchor explains them: {worst:.3g} m off, expected {tolerance:.3g} m at the most"
+
+
+def reach(mission: Mission, tries: Sequence[Try]) -> str | None:
+    """beyond R there is no range, and within R there is one, but for drop-outs"""
+    path, tolerance = _path(tries, mission)
+    most = mission.sensing_range + tolerance
+    for tick, one in enumerate(tries):
+        for what, rho in (("anchor", one.reading.anchor_range), ("peer", one.reading.mutual_range)):
+            if rho is not None and rho > most and not mission.noise.outliers:
+                return f"tick {tick}: {rho:.6g} m to the {what}, beyond R = {mission.sensing_range:g} m"
+    some = [
+        (pose, one.reading.anchor_range)
+        for pose, one in zip(path, tries, strict=True)
+        if one.reading.anchor_range is not None
+    ]
+    if len(some) < 6:
+        return "too few ranges to tell"
+    anchor, _ = _fit(some, scaled=True)
+    for tick, (pose, one) in enumerate(zip(path, tries, strict=True)):
+        rho = math.dist((pose.x, pose.y), anchor)
+        silent, within = one.reading.anchor_range is None, rho < mission.sensing_range - tolerance
+        if silent and within and not mission.noise.drop_outs:
+            return f"tick {tick}: no range, {rho:.6g} m from the anchor, and the mission has no drop-outs"
+        if not silent and rho > most:
+            return (
+                f"tick {tick}: a range, {rho:.6g} m from the anchor, beyond R = {mission.sensing_range:g} m"
+            )
+    return None
+
+
+CHECKS: tuple[Check, ...] = (prompt, stands, drives, lasts, stops, fresh, ranges, reach)
+
+
+def judged(trial: Trial) -> list[Found]:
+    """What each check came to."""
+    return [Found(str(check.__doc__), check(trial.briefing.mission, trial.tries)) for check in CHECKS]
+
+
+def _said(controls: Controls) -> str:
+    return f"({controls.v:.4g} m/s, {controls.omega:.4g} rad/s)"
+
+
+def _slack(mission: Mission) -> tuple[float, float]:
+    """m/s and rad/s: what noise may make of rest."""
+    v, omega = mission.noise.unrest
+    return STILL * mission.max_speed + v, STILL * mission.max_turn_rate + omega
+
+
+def _still(done: Controls, mission: Mission) -> bool:
+    v, omega = _slack(mission)
+    return abs(done.v) <= v and abs(done.omega) <= omega
+
+
+def _like(done: Controls, asked: Controls, mission: Mission) -> bool:
+    v, omega = _slack(mission)
+    return (
+        abs(done.v - asked.v) <= LIKE * abs(asked.v) + v
+        and abs(done.omega - asked.omega) <= LIKE * abs(asked.omega) + omega
+    )
+
+
+def _path(tries: Sequence[Try], mission: Mission) -> tuple[list[Pose], float]:
+    """Dead reckoning, one pose a tick; and how far off a range may be from it, in m."""
+    path, along, across, far = [ORIGIN], 0.0, 0.0, 0.0
+    for one in tries[1:]:
+        done = one.reading.executed
+        path.append(step(path[-1], done.v, done.omega, mission.period))
+        v, omega = mission.noise.odometry.variances(done.v, done.omega)
+        along, across = along + v, across + omega
+        far = max(far, math.hypot(path[-1].x, path[-1].y))
+    drift = mission.period * math.sqrt(along + across * far * far)
+    return path, EXACT + SIGMAS * math.hypot(mission.noise.anchor_sigma, drift)
+
+
+def _fit(some: Sequence[tuple[Pose, float]], *, scaled: bool) -> tuple[tuple[float, float], float]:
+    """Where, in the frame of the odometry, the anchor explains the ranges best; and how many m each m is."""
+    xy = np.array([(pose.x, pose.y) for pose, _ in some])
+    rho = np.array([rho for _, rho in some])
+    span = float(np.max(rho)) or 1.0
+
+    def off(guess: NDArray[np.float64]) -> NDArray[np.float64]:
+        residuals: NDArray[np.float64] = np.hypot(*(xy - guess[:2]).T) * (guess[2] if scaled else 1.0) - rho
+        return residuals
+
+    guesses = [
+        np.array([xy[0, 0] + span * math.cos(t), xy[0, 1] + span * math.sin(t), 1.0])
+        for t in np.linspace(0.0, 2.0 * math.pi, 12, endpoint=False)
+    ]
+    fits = [least_squares(off, guess, xtol=1e-15, ftol=1e-15, gtol=1e-15) for guess in guesses]
+    x, y, scale = min(fits, key=lambda fit: float(fit.cost)).x
+    return (float(x), float(y)), float(scale) if scaled else 1.0
+
+
+def _worst(
+    some: Sequence[tuple[Pose, float]], anchor: tuple[float, float], scale: float, mission: Mission
+) -> float:
+    """m: the largest residual; of those that outliers leave."""
+    off = sorted([abs(scale * math.dist((pose.x, pose.y), anchor) - rho) for pose, rho in some])
+    return off[max(0, len(off) - 1 - math.ceil(3.0 * mission.noise.outliers * len(off)))]

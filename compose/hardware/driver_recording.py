@@ -1,0 +1,121 @@
+"""The recording of one robot in hardware mode: the journals of its agent and its driver, for a resume."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+
+from compose.launch.driver_loader import again
+from compose.recording.run import agent_journal
+from compose.terminal.outcome import going_on
+from protocol.journal.journal_file import CannotRecord, CorruptJournal, Journal
+from protocol.journal.resume import Retrace
+from protocol.messages import Briefing, OfRobot, Sense
+from protocol.network.inbox import Inbox
+from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode, encode
+from world.hardware.bridge import Field
+from world.hardware.driver import Driver
+from world.hardware.driver_journal import DriverPast, Start, boot, driver_journal, driver_past
+
+RELEASE_S = 10.0
+"""s that the agent of a killed launcher has to end, which unlocks its journal"""
+LOOK_AGAIN_S = 0.02
+
+
+class DriverRecord(msgspec.Struct, frozen=True):
+    """The content of both journals; that of the driver is open for writing."""
+
+    journal: Journal
+    past: DriverPast
+    known: int
+    """the latest tick in the agent's journal; -1 if there is none"""
+    again: bool
+    """whether the journals existed before"""
+    start: Start
+    """the start of this process"""
+
+    def take_up(self, driver: Driver, name: str, field: Field) -> None:
+        """Resume the mission with `driver`, called `name` in errors. Raises UserError if it cannot."""
+        if self.past.ticks:
+            again(driver, name, self.past)
+        if self.again:
+            field.resume(self.past, self.known)
+        if self.past.end is None and self.past.start != self.start:
+            self.journal.write(encode(self.start))
+
+
+@contextmanager
+def recorded(folder: Path, briefing: Briefing, inbox: Inbox, *, fsync: bool) -> Iterator[DriverRecord]:
+    """Yield the recording in `folder` of the robot with `briefing`; a new one if there is none.
+
+    Raises CannotRecord, and CorruptJournal if the journals are not of the same robot and run, or if Reports
+    that the robot has sent may be missing in them.
+    """
+    start = Start(boot(), fsync)
+    path = folder / driver_journal(briefing.robot)
+    agents = folder / agent_journal(briefing.robot)
+    if not path.exists():
+        if _frames(agents, inbox):
+            raise CannotRecord(f"{agents} is there already, and {path.name} is not; choose another folder")
+        with Journal(path, fsync=fsync) as journal:
+            journal.write(encode(briefing))
+            yield DriverRecord(journal, DriverPast(), -1, again=False, start=start)
+        return
+    old = Retrace(path, fsync=fsync)
+    try:
+        past = driver_past(old.frames, briefing, path)
+        if past.may_lack:
+            raise CorruptJournal(
+                f"{path} was written without --fsync, and this computer has been started again since: "
+                "what the robot has told its peer may be missing in it"
+            )
+        known = _known(_frames(agents, inbox), past, agents)
+        old.write(*(old.frames or [encode(briefing)]))
+    except BaseException:
+        old.close()
+        raise
+    with going_on(old, inbox) as journal:
+        yield DriverRecord(journal, past, known, again=True, start=start)
+
+
+def _frames(path: Path, inbox: Inbox) -> list[bytes]:
+    """Return the frames of the agent's journal once it is unlocked. Raises CannotRecord or CorruptJournal."""
+    give_up = time.monotonic() + RELEASE_S
+    while path.exists():
+        try:
+            old = Retrace(path)
+        except CannotRecord:
+            if time.monotonic() >= give_up:
+                raise
+            inbox.next(LOOK_AGAIN_S)
+        else:
+            old.close()
+            return old.frames
+    return []
+
+
+def _known(frames: list[bytes], past: DriverPast, path: Path) -> int:
+    """Return the latest tick in the agent's `frames`, -1 if there is none.
+
+    Raises CorruptJournal unless each Sense in them is that of the same tick in the driver's journal.
+    """
+    known = -1
+    for frame in frames:
+        try:
+            message = decode(frame, OfRobot, MAX_FRAME_BYTES)
+        except MalformedFrame as error:
+            raise CorruptJournal(f"{path}: {error}") from None
+        if isinstance(message, Sense):
+            known += 1
+            if known > past.tick:
+                raise CorruptJournal(
+                    f"{path} goes on after tick {past.tick}, where the driver's journal ends; "
+                    "only with --fsync both survive a power cut"
+                )
+            if frame != past.ticks[known].frame:
+                raise CorruptJournal(f"{path}: at tick {known} another Sense than the driver's journal has")
+    return known

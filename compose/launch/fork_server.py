@@ -1,0 +1,160 @@
+"""The process that a launcher's processes are forked from: `python -P -m compose.launch.fork_server WARM_UP`.
+
+It calls WARM_UP (module:function), which imports what the processes need. It opens no session and starts no
+thread. Its standard input is a socket to the launcher (`compose/launch/forked.py`). The launcher sends
+requests for processes and signals on it, and receives the exit status of each process. The server ends when
+the launcher does, and no process outlasts the server.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import signal
+import socket
+import sys
+import time
+from contextlib import suppress
+from importlib import import_module
+
+import msgspec
+from setproctitle import setproctitle
+
+from compose.launch.forked import LENGTH_BYTES, STREAMS, Ended, Signal, Start
+from protocol.output import one_line
+
+NOT_FORKED = 71
+"""The exit status reported for a process that could not be forked (EX_OSERR)."""
+LINGER_S = 5.0
+"""s that processes have to end by themselves after their launcher has ended; then they are killed"""
+LOOK_AGAIN_S = 0.01
+PR_SET_PDEATHSIG = 1
+"""<sys/prctl.h>"""
+
+
+class _Server:
+    """The request loop of the fork server, and the children that run, by process id."""
+
+    def __init__(self, launcher: socket.socket) -> None:
+        self._launcher = launcher
+        self._numbers: dict[int, int] = {}
+        self._decoder = msgspec.msgpack.Decoder(Start | Signal)
+
+    def serve(self) -> Start | None:
+        """Handle the launcher's requests until the launcher has ended, then return None.
+
+        It also returns in each forked process: there, the request for that process.
+        """
+        signal.signal(signal.SIGCHLD, self._reap)
+        while (received := self._request()) is not None:
+            request, streams = received
+            # a child that ends during the request is reaped after it
+            signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGCHLD])
+            if isinstance(request, Signal):
+                self._send(request)
+            elif self._fork(request, streams):
+                return request
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGCHLD])
+        return None
+
+    def linger(self) -> None:
+        """Wait at most LINGER_S until all children have ended."""
+        give_up = time.monotonic() + LINGER_S
+        while self._numbers and time.monotonic() < give_up:
+            time.sleep(LOOK_AGAIN_S)
+
+    def _request(self) -> tuple[Start | Signal, list[int]] | None:
+        head, streams, _, _ = socket.recv_fds(self._launcher, LENGTH_BYTES, STREAMS)
+        if not head:
+            return None
+        body = self._read(int.from_bytes(head + self._read(LENGTH_BYTES - len(head)), "big"))
+        return self._decoder.decode(body), streams
+
+    def _read(self, size: int) -> bytes:
+        body = b""
+        while len(body) < size:
+            body += self._launcher.recv(size - len(body)) or sys.exit(0)
+        return body
+
+    def _fork(self, start: Start, streams: list[int]) -> bool:
+        """Fork a process, and return whether this is the child."""
+        parent = os.getpid()
+        try:
+            pid = os.fork()
+        except OSError as error:
+            os.write(streams[2], f"cannot start a process: {error.strerror}\n".encode())
+            self._tell(Ended(start.number, NOT_FORKED))
+        else:
+            if not pid:
+                self._launcher.detach()  # its descriptor becomes the child's standard input
+                _become(start, streams, parent)
+                return True
+            self._numbers[pid] = start.number
+        for stream in streams:
+            os.close(stream)
+        return False
+
+    def _send(self, request: Signal) -> None:
+        for pid, number in self._numbers.items():
+            if number == request.number:
+                try:
+                    os.killpg(pid, request.signal)
+                except ProcessLookupError:  # it has not created its process group yet
+                    os.kill(pid, request.signal)
+
+    def _reap(self, _number: int, _frame: object) -> None:
+        with suppress(ChildProcessError):
+            while (found := os.waitpid(-1, os.WNOHANG))[0]:
+                pid, status = found
+                self._tell(Ended(self._numbers.pop(pid), os.waitstatus_to_exitcode(status)))
+
+    def _tell(self, news: Ended) -> None:
+        with suppress(OSError):  # the launcher has ended
+            self._launcher.sendall(news.frame())
+
+
+def _become(start: Start, streams: list[int], parent: int) -> None:
+    """Give this forked process its own session, default signals, standard streams, arguments and title."""
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGCHLD])
+    os.setsid()
+    _signal_when_parent_ends(signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(-signal.SIGKILL)
+    for number, stream in enumerate(streams):
+        os.dup2(stream, number)
+        os.close(stream)
+    sys.argv = [start.title, *start.arguments]
+    setproctitle(one_line(" ".join(sys.argv)))
+
+
+def _signal_when_parent_ends(number: signal.Signals) -> None:
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, number)
+
+
+def _call(name: str) -> None:
+    module, _, function = name.partition(":")
+    getattr(import_module(module), function)()
+
+
+def main() -> None:
+    """Call WARM_UP, and fork processes until the launcher has ended."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+    _signal_when_parent_ends(signal.SIGCONT)  # a suspended server must notice the end, too
+    _call(sys.argv[1])
+    setproctitle(f"tandem fork-server of {os.getppid()}")
+    gc.collect()
+    gc.freeze()  # else garbage collection in a child would copy the pages of imported modules
+    server = _Server(socket.socket(fileno=0))
+    start = server.serve()
+    if start is None:
+        server.linger()
+        os._exit(0)
+    _call(start.main)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,63 @@
+"""A whole mission in one process, without a network: the same planner, radio and world."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+
+from agent.process.robot import Robot, Told
+from compose.recording.run import WORLD_JOURNAL, Moment, Record, agent_journal
+from protocol.journal.journal_file import Journal, Sink
+from protocol.messages import Drive, End, Farewell
+from world.faults import LATEST
+from world.scenario import Scenario
+from world.simulation import Course
+
+
+def play(scenario: Scenario, out: Path | None = None) -> Record:
+    """The run of `scenario`. Journals go to `out`, byte for byte those of the run as processes.
+
+    Raises journal.CannotRecord if `out` holds a record, or cannot be written.
+    """
+    if out is None:
+        return played(scenario, {})
+    with ExitStack() as open_ones:
+        return played(
+            scenario, {name: open_ones.enter_context(Journal(out / name)) for name in journals(scenario)}
+        )
+
+
+def journals(scenario: Scenario) -> list[str]:
+    """What its journals are called."""
+    return [*[agent_journal(robot.id) for robot in scenario.robots], WORLD_JOURNAL]
+
+
+def played(scenario: Scenario, sinks: Mapping[str, Sink]) -> Record:
+    """The run of `scenario`, whose journals go to `sinks`, by name: all of them, or none."""
+    ids = [robot.id for robot in scenario.robots]
+    course = Course(scenario, sinks.get(WORLD_JOURNAL))
+    robots = {robot: Robot(scenario.briefing(robot), sinks.get(agent_journal(robot))) for robot in ids}
+    moments: list[Moment] = []
+    end: End | None = None
+    told: dict[tuple[str, int], Told] = {}
+    while end is None:
+        senses = course.senses()
+        for sense in senses:
+            report = robots[sense.robot].sense(sense)
+            if report is not None:
+                told[sense.robot, sense.tick] = report
+        drives: dict[str, Drive] = {}
+        for sense in senses:
+            heard = [told[contact.peer, tick] for contact in sense.contacts for tick in contact.heard or ()]
+            drives[sense.robot] = robots[sense.robot].decide(heard)
+            if robots[sense.robot].journaled:
+                robots[sense.robot].estimate()
+        if told:
+            for robot in ids:  # nobody hears it any more
+                told.pop((robot, course.tick - LATEST), None)
+        moments.append(Moment(course.world.truth, drives))
+        end = course.drive(drives)
+    farewells: dict[str, Farewell] = {robot: robots[robot].farewell(end) for robot in ids}
+    course.farewells(farewells.values())
+    return Record(scenario, tuple(moments), end, farewells)

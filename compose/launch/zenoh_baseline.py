@@ -1,0 +1,73 @@
+"""The bare barrier: what a tick costs over Zenoh with no mission in it. `tandem bench` measures against it.
+
+The same processes, topology and quality of service as a mission, and messages of the same size: one
+puts a frame to each robot and waits for a frame of each. Nothing is encoded, checked or kept.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from queue import SimpleQueue
+
+import zenoh
+
+from protocol.network import keys, session
+from protocol.network.endpoints import at
+from protocol.network.inbox import Inbox
+
+PATIENCE_S = 30.0
+RUN = "barrier"
+
+
+def drop(frames: SimpleQueue[bytes], sample: zenoh.Sample) -> None:
+    """What both ends do with what arrives."""
+    frames.put(sample.payload.to_bytes())
+
+
+def world(link: zenoh.Session, robots: Sequence[str], size: int, ticks: int) -> float:
+    """Seconds that `ticks` rounds take, once everybody is there; frames of `size` bytes.
+
+    Raises queue.Empty after PATIENCE_S without an answer.
+    """
+    frames: SimpleQueue[bytes] = SimpleQueue()
+    there = Inbox("barrier")
+    link.declare_subscriber(keys.drive(RUN, "*"), lambda sample: drop(frames, sample))
+    publishers = [session.publisher(link, keys.sense(RUN, robot)) for robot in robots]
+    session.watch_liveliness(link, keys.robot_alive(RUN, "*"), there)
+    for _ in robots:
+        there.next(PATIENCE_S)
+    frame = bytes(size)
+    began = time.perf_counter()
+    for _ in range(ticks):
+        for publisher in publishers:
+            publisher.put(frame)
+        for _ in publishers:
+            frames.get(timeout=PATIENCE_S)
+    return time.perf_counter() - began
+
+
+def robot(endpoint: str, name: str, size: int, ticks: int) -> None:
+    """Answer `ticks` frames with one of `size` bytes each."""
+    frames: SimpleQueue[bytes] = SimpleQueue()
+    give_up = time.monotonic() + PATIENCE_S
+
+    def unanswered() -> None:
+        if time.monotonic() > give_up:
+            sys.exit(1)
+
+    with session.open_client(at(endpoint), unanswered) as link:
+        link.declare_subscriber(keys.sense(RUN, name), lambda sample: drop(frames, sample))
+        publisher = session.publisher(link, keys.drive(RUN, name))
+        _token = session.show_alive(link, keys.robot_alive(RUN, name))
+        frame = bytes(size)
+        for _ in range(ticks):
+            frames.get(timeout=PATIENCE_S)
+            publisher.put(frame)
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    robot(sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4]))

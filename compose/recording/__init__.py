@@ -1,0 +1,1 @@
+"""The recording of a run and the files derived from it."""

@@ -1,0 +1,72 @@
+"""The Cramér-Rao bound of a pair's poses, for the trajectories that it drove.
+
+The fit that the robots make of their ranges, taken at the truth: true controls, true distances, no step. What
+is left then is the inverse of the Fisher information, odometry integrated out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from agent.estimation.gaussian.least_squares import deviation, fit, poses
+from agent.estimation.gaussian.odometry_noise import Track, track
+from agent.estimation.gaussian.range_model import Ranges
+from compose.recording.run import Record
+from protocol.motion import Controls, Pose
+from world.sensors import anchor_ranges, executed, mutual_ranges
+from world.truth import asked
+
+
+def position_bounds(record: Record, pair: tuple[int, int], tick: int) -> tuple[float, float] | None:
+    """m: the root of the trace of the bound on each one's position at `tick`.
+
+    None where sensors are exact, or ranges may be outliers: there the bound is not that of a Gaussian.
+    """
+    scenario = record.scenario
+    noise = scenario.mission.noise
+    if noise.exact or noise.outliers or noise.anchor_sigma == noise.mutual_sigma == 0.0:
+        return None
+    moments = record.moments[: tick + 1]
+    anchors = [scenario.robots[place].anchor for place in pair]
+    own: list[list[tuple[int, float]]] = [[], []]
+    mutual: list[tuple[int, float]] = []
+    for moment in moments:
+        truth = moment.truth
+        ranges = anchor_ranges(truth, scenario)
+        for k, (place, anchor) in enumerate(zip(pair, anchors, strict=True)):
+            if ranges[place] is not None:
+                own[k].append((truth.tick, _apart(truth.poses[place], Pose(anchor.x, anchor.y, 0.0))))
+        (met,) = mutual_ranges(truth, scenario, [pair])
+        if met is not None and met.range is not None:
+            mutual.append((truth.tick, _apart(truth.poses[pair[0]], truth.poses[pair[1]])))
+    tracks, guess = [], []
+    for place, anchor in zip(pair, anchors, strict=True):
+        tracks.append(_driven(record, place, tick))
+        start = moments[0].truth.poses[place]
+        c, s = math.cos(start.heading), math.sin(start.heading)
+        dx, dy = anchor.x - start.x, anchor.y - start.y
+        guess += [c * dx + s * dy, c * dy - s * dx, start.heading]
+    apart = (anchors[1].x - anchors[0].x, anchors[1].y - anchors[0].y)
+    at_truth = fit(np.array(guess), tracks, Ranges.of_lists(own[0], own[1], mutual, noise), noise, apart, 0)
+    covariance = poses(at_truth, apart)[1]
+    a, b = (deviation(covariance[i, i] + covariance[i + 1, i + 1]) for i in (0, 3))
+    return a, b
+
+
+def _apart(one: Pose, other: Pose) -> float:
+    return math.hypot(one.x - other.x, one.y - other.y)
+
+
+def _driven(record: Record, place: int, tick: int) -> Track:
+    """What a robot executed until `tick`."""
+    scenario = record.scenario
+    robot = scenario.robots[place].id
+    done: Sequence[Controls] = [
+        executed(asked(moment.drives.get(robot), scenario.mission), scenario, robot, moment.truth.tick)
+        for moment in record.moments[:tick]
+    ]
+    v, omega = np.array([one.v for one in done]), np.array([one.omega for one in done])
+    return track(v, omega, scenario.mission.period)

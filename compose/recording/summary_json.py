@@ -1,0 +1,147 @@
+"""`summary.json`: how a run ended, and how each robot found out where it is."""
+
+from __future__ import annotations
+
+import math
+import platform
+from collections.abc import Mapping
+from functools import cache
+from itertools import combinations
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+
+from compose.extras import version
+from compose.recording.claim import Claim, claim, matrix
+from compose.recording.run import Record
+from compose.recording.ticks_csv import ticks_csv
+from protocol import files
+from protocol.messages import Farewell, Localised, Outcome
+from protocol.motion import Pose, wrap
+from protocol.output import one_line
+from world.sensors import mutual_ranges
+
+Mode = Literal["processes", "in-process"]
+SUMMARY = "summary.json"
+
+
+def summary(record: Record, mode: Mode, wall_s: float | None) -> dict[str, Any]:
+    """What `summary.json` says; what does not apply is None."""
+    scenario, moments = record.scenario, record.moments
+    return {
+        "scenario": scenario.name,
+        "seed": scenario.seed,
+        "mode": mode,
+        "outcome": record.end.outcome if record.end is not None else "failed",
+        "reason": record.end.reason if record.end is not None else "the record breaks off",
+        "ticks": moments[-1].truth.tick if moments else 0,
+        "wall_s": wall_s,
+        "first_contact_tick": first_contact(record),
+        "t_max_s": max(robot.rendezvous.bound for robot in scenario.robots),
+        "min_separation_m": min(
+            (
+                math.hypot(one.x - other.x, one.y - other.y)
+                for moment in moments
+                for one, other in combinations(moment.truth.poses, 2)
+            ),
+            default=None,
+        ),
+        "parameters": {
+            **msgspec.to_builtins(scenario.mission),
+            "variant": scenario.variant,
+            "max_ticks": scenario.max_ticks,
+        },
+        "versions": versions(),
+        "robots": {robot.id: _robot_summary(record, i) for i, robot in enumerate(scenario.robots)},
+    }
+
+
+def first_contact(record: Record) -> int | None:
+    """The first tick at which two peers were in range of each other."""
+    pairs = record.scenario.pairs()
+    for moment in record.moments:
+        if any(mutual is not None for mutual in mutual_ranges(moment.truth, record.scenario, pairs)):
+            return moment.truth.tick
+    return None
+
+
+def first_claim(record: Record, place: int) -> Claim | None:
+    """The first claim to know its pose of the robot at that place in the scenario."""
+    robot = record.scenario.robots[place].id
+    for moment in record.moments:
+        drive = moment.drives.get(robot)
+        if drive is not None and isinstance(drive.verdict, Localised):
+            return claim(moment.truth.tick, drive.verdict, moment.truth.poses[place])
+    return None
+
+
+def _robot_summary(record: Record, place: int) -> dict[str, Any]:
+    robot = record.scenario.robots[place].id
+    farewell = record.farewells.get(robot)
+    claimed = first_claim(record, place)
+    covariance = claimed.covariance if claimed is not None else None
+    return {
+        "localised": claimed is not None,
+        "localised_tick": claimed.tick if claimed is not None else None,
+        "estimate": _listed(claimed.pose) if claimed is not None else None,
+        "covariance": matrix(covariance) if covariance is not None else None,
+        "truth": _listed(record.moments[-1].truth.poses[place]) if record.moments else None,
+        "position_error_m": claimed.position_error if claimed is not None else None,
+        "heading_error_rad": claimed.heading_error if claimed is not None else None,
+        "position_sigma_m": covariance.position_sigma if covariance is not None else None,
+        "heading_sigma_rad": covariance.heading_sigma if covariance is not None else None,
+        "nees": claimed.nees if claimed is not None else None,
+        **{field: getattr(farewell, field, None) for field in _SAID},
+        "no_farewell": None if farewell is not None else _why_none(record, robot),
+        "deadlines_missed": sum([robot not in moment.drives for moment in record.moments[:-1]]),
+    }
+
+
+def _why_none(record: Record, robot: str) -> str:
+    """Why there is no Farewell of `robot`, as far as the world's journal tells."""
+    if record.end is None:
+        return "the record breaks off"
+    latest = max([moment.truth.tick for moment in record.moments if robot in moment.drives], default=None)
+    if latest is None:
+        return "no Drive of it came in time"
+    if latest < record.end.tick:
+        return f"its last Drive in time was of tick {latest} of {record.end.tick}"
+    return "it did not answer the End"
+
+
+_SAID = [field for field in Farewell.__struct_fields__ if field != "robot"]
+
+
+def _listed(pose: Pose) -> list[float]:
+    return [pose.x, pose.y, wrap(pose.heading)]
+
+
+@cache
+def versions() -> dict[str, str | None]:
+    """Of everything that a run's figures may depend on."""
+    found: dict[str, str | None] = {"python": platform.python_version()}
+    for package in ("tandem-ranging", "eclipse-zenoh", "numpy", "scipy", "msgspec", "msgpack"):
+        found[package] = version(package)
+    return found
+
+
+def leave(record: Record, summary: Mapping[str, Any], folder: Path) -> None:
+    """Write `ticks.csv` and `summary.json` into `folder`."""
+    files.write(folder / "ticks.csv", ticks_csv(record))
+    files.write(folder / SUMMARY, msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n")
+
+
+def outcome_line(summary: Mapping[str, Any]) -> str:
+    """The outcome, in one line."""
+    return ended(summary["outcome"], summary["ticks"], summary["reason"])
+
+
+def broken_off(ticks: int) -> str:
+    """That it did not end, in one line."""
+    return f"the record breaks off after {max(0, ticks)} ticks"
+
+
+def ended(outcome: Outcome, ticks: int, reason: str | None) -> str:
+    """How a run ended, in one line."""
+    return f"{outcome} after {ticks} ticks{f' ({one_line(reason)})' if reason else ''}"

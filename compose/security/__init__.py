@@ -1,0 +1,1 @@
+"""Certificates and access rules for missions over networks that are not trusted."""

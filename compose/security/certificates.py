@@ -1,0 +1,233 @@
+"""Certificates for everybody who takes part in missions, and the Zenoh configurations that go with them.
+
+A folder for each: its certificate and key, the authority's certificate, and a configuration that names these,
+asks everybody else for theirs, and lets pass what protocol/network/access_control.py allows. The
+configuration serves Tandem (--keys) as well as a Zenoh router of any other make.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import json
+import re
+import shutil
+import tempfile
+from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import NamedTuple
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import (
+    Encoding,
+    NoEncryption,
+    PrivateFormat,
+    load_pem_private_key,
+)
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from compose.network import KEYED
+from protocol import files
+from protocol.network import access_control
+
+AUTHORITY_DAYS = 36_500
+"""as long as certificates may last"""
+SKEW = timedelta(days=1)
+"""by how much a robot's clock may be behind"""
+SECRET = 0o600
+"""only the owner reads such a file, from the first byte on"""
+GITIGNORE = ".gitignore"
+LOOPBACK = ("localhost", "127.0.0.1", "::1")
+"""names that everybody who may be a router has"""
+
+
+class BadKeys(ValueError):
+    """What is in the folder is none of ours, or cannot be written; says what."""
+
+
+class Authority(NamedTuple):
+    """Who signs."""
+
+    certificate: x509.Certificate
+    key: ec.EllipticCurvePrivateKey
+
+
+def make(folder: Path, robots: Sequence[str], hosts: Sequence[str], days: int) -> tuple[list[str], list[str]]:
+    """Who has got a certificate, and who had one, which is kept; `folder` has then a folder for each.
+
+    The robots are `robots`, and those that have a folder. Routers and the world are known by `hosts`, too.
+    Raises BadKeys or OSError.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    authority = _authority(folder)
+    if not (folder / GITIGNORE).exists():
+        files.write(folder / GITIGNORE, "# Keys do not belong into a repository.\n*\n")
+    known = {path.parent.name.removeprefix("agent-") for path in folder.glob(f"agent-*/{KEYED}")}
+    everyone = sorted(known | set(robots))
+    made, kept = [], []
+    for name in (
+        access_control.ROUTER,
+        access_control.WORLD,
+        access_control.VIEWER,
+        *(access_control.agent(robot) for robot in everyone),
+    ):
+        own = folder / name
+        if own.exists():
+            for file in ("cert.pem", "key.pem", "ca.pem"):
+                if not (own / file).is_file():
+                    raise BadKeys(f"{own} has no {file}; remove the folder, and it is made anew")
+            if files.read_bytes(own / "ca.pem") != files.read_bytes(folder / "ca.pem"):
+                raise BadKeys(f"{own} is of another authority than {folder / 'ca.pem'}")
+            kept.append(name)
+        else:
+            _participant(own, name, authority, hosts, days)
+            made.append(name)
+        files.write(own / KEYED, configuration(name, everyone))
+    return made, kept
+
+
+def configuration(name: str, robots: Sequence[str]) -> str:
+    """The Zenoh configuration of a participant, whose files lie beside it."""
+    settings = {
+        "metadata": {"participant": name},
+        "transport": {
+            "link": {
+                "tls": {
+                    "root_ca_certificate": "ca.pem",
+                    "enable_mtls": True,
+                    "listen_certificate": "cert.pem",
+                    "listen_private_key": "key.pem",
+                    "connect_certificate": "cert.pem",
+                    "connect_private_key": "key.pem",
+                    "verify_name_on_connect": True,
+                }
+            }
+        },
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "access_control": access_control.access_control(robots),
+    }
+    return f"// Made by `tandem keys`, and made anew each time.\n{json.dumps(settings, indent=1)}\n"
+
+
+def _authority(folder: Path) -> Authority:
+    """That of the folder, made if it has none."""
+    certificate, key = folder / "ca.pem", folder / "ca-key.pem"
+    if certificate.exists() and key.exists():
+        try:
+            private = load_pem_private_key(files.read_bytes(key), None)
+            found = x509.load_pem_x509_certificate(files.read_bytes(certificate))
+        except (TypeError, ValueError) as error:
+            raise BadKeys(f"{folder}: its authority cannot be read: {error}") from None
+        if not isinstance(private, ec.EllipticCurvePrivateKey) or private.public_key() != found.public_key():
+            raise BadKeys(f"{key} is not the key of {certificate}")
+        return Authority(found, private)
+    if any(path.name != GITIGNORE and path.suffix != files.DRAFT for path in folder.iterdir()):
+        raise BadKeys(f"{folder} is not empty, and holds no ca.pem with ca-key.pem; choose another folder")
+    private = ec.generate_private_key(ec.SECP256R1())
+    name = _name(f"Tandem {x509.random_serial_number() % 16**8:08x}")
+    now = datetime.now(UTC)
+    signed = (
+        x509.CertificateBuilder()
+        .subject_name(name)
+        .issuer_name(name)
+        .public_key(private.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - SKEW)
+        .not_valid_after(now + timedelta(days=AUTHORITY_DAYS))
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(_usage(signs=True), critical=True)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(private.public_key()), critical=False)
+        .sign(private, hashes.SHA256())
+    )
+    with files.draft(key, SECRET) as one, files.draft(certificate) as other:  # neither, if one has no room
+        one.write_bytes(_pem(private))
+        other.write_bytes(signed.public_bytes(Encoding.PEM))
+    return Authority(signed, private)
+
+
+def _participant(own: Path, name: str, authority: Authority, hosts: Sequence[str], days: int) -> None:
+    """A folder with all that one machine needs; it is there as a whole, or not at all."""
+    private = ec.generate_private_key(ec.SECP256R1())
+    names = (*LOOPBACK, *hosts) if name in access_control.CARRIERS else LOOPBACK
+    issued = issue(authority, name, private.public_key(), names, timedelta(days=days))
+    draft = Path(tempfile.mkdtemp(prefix=f".{name}-", dir=own.parent))
+    try:
+        files.write(draft / "key.pem", _pem(private), SECRET)
+        (draft / "cert.pem").write_bytes(issued.public_bytes(Encoding.PEM))
+        (draft / "ca.pem").write_bytes(authority.certificate.public_bytes(Encoding.PEM))
+        draft.rename(own)
+    except BaseException:
+        shutil.rmtree(draft, ignore_errors=True)
+        raise
+
+
+def issue(
+    authority: Authority,
+    name: str,
+    public: ec.EllipticCurvePublicKey,
+    hosts: Sequence[str],
+    lasts: timedelta,
+) -> x509.Certificate:
+    """A certificate of `name`, to connect with, and to listen with at `hosts`; it `lasts` from now on."""
+    now = datetime.now(UTC)
+    key_id = x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key())
+    uses = [ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH]
+    return (
+        x509.CertificateBuilder()
+        .subject_name(_name(name))
+        .issuer_name(authority.certificate.subject)
+        .public_key(public)
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(min(now, now + lasts) - SKEW)
+        .not_valid_after(now + lasts)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(_usage(signs=False), critical=True)
+        .add_extension(x509.ExtendedKeyUsage(uses), critical=False)
+        .add_extension(
+            x509.SubjectAlternativeName([_host(host) for host in dict.fromkeys(hosts)]), critical=False
+        )
+        .add_extension(key_id, critical=False)
+        .sign(authority.key, hashes.SHA256())
+    )
+
+
+def is_host(text: str) -> bool:
+    """Whether a certificate can bear it: an address, or a name of letters, digits, - and dots."""
+    try:
+        ipaddress.ip_address(text)
+    except ValueError:
+        return len(text) <= 253 and all(
+            re.fullmatch(r"(?!-)[A-Za-z0-9-]{1,63}(?<!-)", part) for part in text.split(".")
+        )
+    return True
+
+
+def _host(host: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(host))
+    except ValueError:
+        return x509.DNSName(host)
+
+
+def _name(name: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+
+
+def _usage(*, signs: bool) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=not signs,
+        key_cert_sign=signs,
+        crl_sign=signs,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        encipher_only=False,
+        decipher_only=False,
+    )
+
+
+def _pem(key: ec.EllipticCurvePrivateKey) -> bytes:
+    return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())

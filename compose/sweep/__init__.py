@@ -1,0 +1,1 @@
+"""Sweeps: many trials of a scenario over axes of its fields."""

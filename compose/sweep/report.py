@@ -1,0 +1,196 @@
+"""What a campaign shows on a terminal: how far it is, and in the end a table with a row a cell."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich import progress as bars
+from rich.table import Table
+from rich.text import Text
+
+from compose.sweep.cells import Cell
+from compose.sweep.execution import SUMMARY, Progress, Results
+from compose.sweep.results_folder import CELLS
+from compose.sweep.statistics import Counted, noted, refusals
+from compose.terminal import tables, text_width
+from protocol.output import say
+
+RATE_OVER_S = 10.0
+"""what the rate is averaged over"""
+OUTCOMES = ("localised", "undecided", "alarm", "wrong", "failed")
+NOTES = (
+    ("rate_low", "rate: 95 % interval (Wilson)"),
+    ("p50", "p50, p95, max: ticks of trials that localised"),
+    ("error p50", "error: m, of the worse robot"),
+    ("within", "within: claims within 3 x accuracy"),
+    ("nees low", "nees: in the mean, and the 99 % band of true covariances"),
+)
+"""each with the column that it is a footnote to"""
+WIDEST = (*OUTCOMES, "clean", "rate", "rate_low", "rate_high", "p50", "p95", "max", "error p50", "error max")
+CHOICES = (
+    ("trials", *WIDEST),
+    ("trials", *WIDEST[:-2]),
+    ("trials", "rate", "rate_low", "rate_high", "p50", "p95", "max"),
+    ("trials", "rate", "p50", "max"),
+    ("trials", "rate"),
+)
+"""of the columns; the first that fits"""
+OF_NOISE = ("within", "nees", "nees low", "nees high")
+"""more of them, where covariances are claimed"""
+MOST_ROWS = 100
+"""cells that are listed whether or not all was well"""
+
+
+class _Rate(bars.ProgressColumn):
+    """Trials a second."""
+
+    def render(self, task: bars.Task) -> Text:
+        """As rich asks for it."""
+        return Text(f"{task.speed:.3g}/s" if task.speed else "")
+
+
+@contextmanager
+def progress(name: str, say: Callable[[str], None], visible: bool) -> Iterator[Progress]:
+    """A bar with the rate and the time left, where somebody can see it."""
+    bar = bars.Progress(
+        bars.TextColumn("{task.description}"),
+        bars.BarColumn(),
+        bars.MofNCompleteColumn(),
+        _Rate(),
+        bars.TimeRemainingColumn(),
+        disable=not visible,
+        transient=True,
+        speed_estimate_period=RATE_OVER_S,
+    )
+    with bar:
+        task = bar.add_task(name, total=None)
+
+        def begin(done: int, total: int) -> None:
+            bar.reset(task, total=total, completed=done)
+
+        yield Progress(say, begin, lambda more: bar.advance(task, more))
+
+
+def show(results: Results, out: Path, *, quiet: bool) -> None:
+    """The table, and how to see one of its trials; or only the counts."""
+    total = {name: sum([getattr(one, name) for one in results.figures.values()]) for name in OUTCOMES}
+    total["refused"] = sum([one.refused_trials for one in results.figures.values()])
+    counts = ", ".join([f"{count} {name}" for name, count in total.items() if count])
+    say(f"{results.campaign.name}: {counts} of {len(results.table)} trials in {_cells(len(results.cells))}")
+    if any(one.audited for one in results.figures.values()):
+        say(_audited(results))
+    if quiet:
+        return
+    shown = len(_shown(results))
+    if shown:
+        lines, columns = _lines(results)
+        say("", *lines, "", *text_width.notes(NOTES, columns))
+    if shown < len(results.cells):
+        say(f"all is well in {len(results.cells) - shown} cells, not listed: {out / SUMMARY}")
+    for index, figures in results.figures.items():
+        if figures.refused is not None:
+            say(f"cell {index} cannot be played: {figures.refused}")
+    for reason, count in refusals(results.table):
+        say(f"refused: {count}: {reason}")
+    note = noted(results.table)
+    if note is not None:
+        why = f" ({note.why})" if note.why else ""
+        how = f"{note.outcome} after {note.ticks} ticks" if note.ticks is not None else note.outcome
+        file = shlex.quote(str(out / CELLS / f"{note.cell:03d}.toml"))
+        say(f"to look at first: trial {note.trial} of cell {note.cell}, {how}{why}; any trial again:")
+        if results.campaign.draws:
+            source = shlex.quote(results.campaign.source)
+            say(f"  tandem sweep {source} --print-trial {note.cell}:{note.trial} > trial.toml")
+            file = "trial.toml"
+        say(f"  tandem run {file} --seed {note.seed} --out record")
+    say(f"results: {out}")
+
+
+def _audited(results: Results) -> str:
+    """How many trials were judged, and the first violation."""
+    figures = results.figures.values()
+    audited, clean = sum([one.audited for one in figures]), sum([one.clean for one in figures])
+    note = noted(results.table) if clean < audited else None
+    first = f"; trial {note.trial} of cell {note.cell}: {note.why}" if note is not None else ""
+    played = sum([one.trials for one in figures])
+    return f"audited: {audited} of {played} trials, {clean} clean{first}"
+
+
+def _lines(results: Results) -> tuple[list[str], Sequence[str]]:
+    """The table, as wide as there is room, and its columns."""
+    columns: Sequence[str] = ()
+    for columns in _choices(results):
+        lines = tables.lines(_table(results, columns))
+        if tables.fits(lines):
+            return lines, columns
+    return tables.lines(_table(results, columns), text_width.room()), columns
+
+
+def _shown(results: Results) -> list[Cell]:
+    """All of them; of more than fit a screen or two, those in which something was not well."""
+    if len(results.cells) <= MOST_ROWS:
+        return list(results.cells)
+    return [cell for cell in results.cells if not _well(results.figures[cell.index])]
+
+
+def _well(figures: Counted) -> bool:
+    """All were played and localised, and nothing was found in those that were judged."""
+    return (
+        figures.refused is None and figures.trials == figures.localised and figures.audited == figures.clean
+    )
+
+
+def _noisy(results: Results) -> bool:
+    return any(one.nees_mean is not None for one in results.figures.values())
+
+
+def _choices(results: Results) -> tuple[tuple[str, ...], ...]:
+    """Of the columns, the widest first."""
+    if not _noisy(results):
+        return CHOICES
+    return tuple((*columns, *OF_NOISE) for columns in CHOICES) + CHOICES[-1:]
+
+
+def _table(results: Results, columns: Sequence[str]) -> Table:
+    axes = [axis.name.rpartition(".")[2] for axis in results.campaign.axes]
+    rows = []
+    for cell in _shown(results):
+        said = _figures(results.figures[cell.index])
+        rows.append([*_axes(results, cell), *[said[column] for column in columns]])
+    return tables.table(["cell", *axes], columns, rows)
+
+
+def _axes(results: Results, cell: Cell) -> list[str]:
+    places = zip(results.campaign.axes, cell.place, strict=True)
+    return [str(cell.index), *[axis.label(place) for axis, place in places]]
+
+
+def _figures(figures: Counted) -> dict[str, str]:
+    return {
+        "trials": str(figures.trials),
+        **{name: str(getattr(figures, name)) for name in OUTCOMES},
+        "clean": str(figures.clean) if figures.audited else "-",
+        "rate": _number(figures.rate, ".4f"),
+        "rate_low": _number(figures.rate_low, ".4f"),
+        "rate_high": _number(figures.rate_high, ".4f"),
+        "p50": _number(figures.ticks_p50, ".0f"),
+        "p95": _number(figures.ticks_p95, ".0f"),
+        "max": _number(figures.ticks_max, ".0f"),
+        "error p50": _number(figures.error_p50_m, ".1e"),
+        "error max": _number(figures.error_max_m, ".1e"),
+        "within": _number(figures.within_3_accuracy, ".4f"),
+        "nees": _number(figures.nees_mean, ".3g"),
+        "nees low": _number(figures.nees_low, ".3g"),
+        "nees high": _number(figures.nees_high, ".3g"),
+    }
+
+
+def _number(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)
+
+
+def _cells(count: int) -> str:
+    return "one cell" if count == 1 else f"{count} cells"

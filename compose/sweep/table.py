@@ -1,0 +1,130 @@
+"""Rows as a table: a column for each axis, then each field of a row, then those of each robot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from compose.sweep.cells import Cell
+from compose.sweep.field_paths import canonical
+from compose.sweep.spec import Campaign
+from compose.sweep.trial import RobotRow, Row
+from protocol.files import open_file
+from protocol.motion import Covariance
+
+_KINDS: dict[str, pa.DataType] = {
+    "cell": pa.int32(),
+    "trial": pa.int32(),
+    "seed": pa.int64(),
+    **dict.fromkeys(("outcome", "reason", "error", "branch", "first_violation"), pa.string()),
+    **dict.fromkeys(("ticks", "first_contact_tick", "orbiting_tick", "meeting_tick"), pa.int64()),
+    **dict.fromkeys(("t_max_ticks", "candidates", "candidates_left"), pa.int64()),
+    **dict.fromkeys(("hypotheses", "claims", "claims_within", "violations"), pa.int64()),
+    **dict.fromkeys(("reports_sent", "reports_heard", "reports_refused"), pa.int64()),
+    **dict.fromkeys(("reports_lost", "bytes_sent", "kills"), pa.int64()),
+    "same_record": pa.bool_(),
+    **dict.fromkeys(("period_s", "t_max_s", "wall_s", "position_error_m", "nearest_m"), pa.float64()),
+    **dict.fromkeys(
+        ("heading_error_rad", "alpha", "odds", "p_value", "position_sigma_m", "nees", "bound_m"), pa.float64()
+    ),
+    **dict.fromkeys([f"cov_{name}" for name in Covariance.__struct_fields__], pa.float64()),
+}
+_OF_ALL = [field for field in Row.__struct_fields__ if field not in ("cell", "trial", "robots", "drawn")]
+
+
+def schema_of(campaign: Campaign, cells: Sequence[Cell]) -> pa.Schema:
+    """Its columns; they follow from the campaign."""
+    fields = [pa.field("cell", _KINDS["cell"])]
+    for axis in campaign.axes:
+        if axis.labels is not None:
+            fields.append(pa.field(axis.name, pa.string()))
+        for i, field in enumerate(axis.fields):
+            fields.append(pa.field(field, _kind([values[i] for values in axis.values])))
+    fields += [pa.field(draw.field, pa.float64()) for draw in campaign.draws.fields]
+    fields.append(pa.field("trial", _KINDS["trial"]))
+    fields += [pa.field(name, _KINDS[name]) for name in _OF_ALL]
+    for robot in _robots(cells):
+        fields += [pa.field(f"{robot}_{name}", _KINDS[name]) for name in RobotRow.__struct_fields__]
+    return pa.schema(fields)
+
+
+def _robots(cells: Sequence[Cell]) -> list[str]:
+    """Everyone who is in a cell. A scenario may be badly wrong still; it will be refused."""
+    ids: dict[str, None] = {}
+    for cell in cells:
+        robots = cell.table.get("robot")
+        for robot in robots if isinstance(robots, list) else []:
+            if isinstance(robot, Mapping) and isinstance(robot.get("id"), str):
+                ids[robot["id"]] = None
+    return list(ids)
+
+
+def _kind(values: Sequence[Any]) -> pa.DataType:
+    """The column that holds them; JSON text where no other does."""
+    if all(isinstance(value, bool) for value in values):
+        return pa.bool_()
+    if any(isinstance(value, bool) for value in values):
+        return pa.string()
+    if all(isinstance(value, int) and abs(value) < 2**63 for value in values):
+        return pa.int64()
+    if all(isinstance(value, int | float) for value in values):
+        return pa.float64()
+    return pa.string()
+
+
+def _held(value: Any, kind: pa.DataType) -> Any:
+    if kind == pa.string() and not isinstance(value, str):
+        return canonical(value)
+    return float(value) if kind == pa.float64() else value
+
+
+def of_rows(
+    rows: Sequence[Row], campaign: Campaign, cells: Mapping[int, Cell], schema: pa.Schema
+) -> pa.Table:
+    """The table of `rows`; what the axes say belongs to the cell."""
+    columns: dict[str, list[Any]] = {"cell": [row.cell for row in rows]}
+    for where, axis in enumerate(campaign.axes):
+        if axis.labels is not None:
+            columns[axis.name] = [axis.labels[cells[row.cell].place[where]] for row in rows]
+        for field in axis.fields:
+            kind = schema.field(field).type
+            columns[field] = [_held(cells[row.cell].fields[field], kind) for row in rows]
+    for draw in campaign.draws.fields:
+        columns[draw.field] = [row.drawn.get(draw.field) for row in rows]
+    columns["trial"] = [row.trial for row in rows]
+    for name in _OF_ALL:
+        columns[name] = [getattr(row, name) for row in rows]
+    nothing = RobotRow()
+    for robot in _robots(list(cells.values())):
+        for name in RobotRow.__struct_fields__:
+            columns[f"{robot}_{name}"] = [getattr(row.robots.get(robot, nothing), name) for row in rows]
+    return pa.table(columns, schema=schema)
+
+
+def gathered(tables: Sequence[pa.Table]) -> pa.Table:
+    """All their rows, in order, each trial once."""
+    table = pa.concat_tables(tables).sort_by([("cell", "ascending"), ("trial", "ascending")])
+    cell, trial = table["cell"].to_numpy(), table["trial"].to_numpy()
+    first = np.ones(len(table), bool)
+    first[1:] = (np.diff(cell) != 0) | (np.diff(trial) != 0)
+    return table.filter(pa.array(first)).combine_chunks()
+
+
+def read(path: Path, schema: pa.Schema, columns: list[str]) -> pa.Table:
+    """Those columns of a file of the schema. Raises OSError or ValueError if it is none."""
+    with open_file(path) as opened, pq.ParquetFile(opened) as file:  # a path with a colon it takes for a URI
+        if not file.schema_arrow.equals(schema):
+            raise ValueError("its columns are others")
+        return file.read(columns)
+
+
+def encoded(table: pa.Table) -> bytes:
+    """What a file of it holds."""
+    file = pa.BufferOutputStream()
+    pq.write_table(table, file)
+    return bytes(file.getvalue().to_pybytes())

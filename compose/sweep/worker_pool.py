@@ -1,0 +1,199 @@
+"""The pool of processes in which trials run: one per worker thread, reused from chunk to chunk.
+
+If a trial hangs or its process dies, only that process is lost. The row of the trial contains the error, and
+a new process runs the remaining trials. Dask therefore sees only completed chunks.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import tempfile
+import threading
+import time
+
+import msgspec
+
+from compose.launch.forked import fork_server
+from compose.sweep.trial import lost
+from compose.sweep.worker import LENGTH_BYTES, MAX_ERROR, READY, Chunk, framed
+from protocol.output import one_line
+
+START_S = 60.0
+"""s that a new process has to import its modules"""
+READ_BYTES = 1 << 16
+
+
+class Died(Exception):
+    """A process has ended unexpectedly; the text says how."""
+
+
+class Hung(Exception):
+    """A process has not answered within its timeout."""
+
+
+class Child:
+    """A process in which trials run. It has its own session, so Ctrl-C reaches only its owner."""
+
+    def __init__(self) -> None:
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # closed by `close`
+        self._folder = tempfile.TemporaryDirectory(prefix="tandem-trials-", ignore_cleanup_errors=True)
+        self._process = fork_server("compose.sweep.worker:warm_up").start(
+            "compose.sweep.worker:main",
+            "tandem sweep worker",
+            self._folder.name,
+            errors=self._errors.fileno(),
+            answers=True,
+        )
+        assert self._process.stdout is not None
+        self._output = self._process.stdout
+        self._poll = select.poll()
+        self._poll.register(self._output, select.POLLIN)
+        self._read = b""
+
+    def ask(self, chunk: Chunk) -> None:
+        """Send the trials of `chunk` to the process, which runs them."""
+        self._process.hand(framed(msgspec.msgpack.encode(chunk)))
+
+    def answer(self, timeout: float) -> bytes:
+        """Return the next frame. Raises Hung after `timeout` seconds, and Died if the process has ended."""
+        give_up = time.monotonic() + timeout
+        while (body := self._frame()) is None:
+            if not self._poll.poll(max(0.0, 1e3 * (give_up - time.monotonic()))):
+                raise Hung
+            news = os.read(self._output, READ_BYTES)
+            if not news:
+                raise Died(self._how())
+            self._read += news
+        return body
+
+    def _frame(self) -> bytes | None:
+        """Remove and return the first frame that has been read; None if it is incomplete."""
+        end = LENGTH_BYTES + int.from_bytes(self._read[:LENGTH_BYTES], "big")
+        if len(self._read) < max(end, LENGTH_BYTES):
+            return None
+        body, self._read = self._read[LENGTH_BYTES:end], self._read[end:]
+        return body
+
+    def _how(self) -> str:
+        if not self._process.wait(1.0):  # it has closed its standard output, but still runs
+            self.kill()
+            return "it closed its standard output"
+        status = self._process.status
+        size = os.fstat(self._errors.fileno()).st_size
+        said = os.pread(self._errors.fileno(), MAX_ERROR, max(0, size - MAX_ERROR)).decode(errors="replace")
+        last = one_line(said.strip().splitlines()[-1]) if said.strip() else ""
+        how = f"killed by {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
+        return f"{how}: {last}" if last else how
+
+    def kill(self) -> None:
+        """Kill the process. Processes that its trials started end with it."""
+        self._process.signal(signal.SIGKILL)
+
+    def close(self) -> None:
+        """Kill the process, and remove its files."""
+        self._process.end()
+        self._errors.close()
+        self._folder.cleanup()
+
+
+class _Children:
+    """The processes of this pool, by sweep and thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._working: dict[tuple[str, int], Child] = {}
+        self._resting: dict[tuple[str, int], Child] = {}
+        self._over: set[str] = set()
+
+    def take(self, campaign: str) -> tuple[Child, bool] | None:
+        """Return this thread's process and whether it is reused; None if the sweep is over.
+
+        Raises Died or Hung if a new process does not become ready.
+        """
+        key = campaign, threading.get_ident()
+        with self._lock:
+            if campaign in self._over:
+                return None
+            kept = self._resting.pop(key, None)
+            child = self._working[key] = kept or Child()
+        if kept is None:
+            try:
+                ready = child.answer(START_S)
+                assert ready == READY
+            except (Died, Hung):
+                self.drop(campaign)
+                raise
+        return child, kept is not None
+
+    def keep(self, campaign: str) -> None:
+        """Store this thread's process for its next chunk; close it if the sweep is over."""
+        key = campaign, threading.get_ident()
+        with self._lock:
+            child = self._working.pop(key)
+            if campaign not in self._over:
+                self._resting[key] = child
+                return
+        child.close()
+
+    def drop(self, campaign: str) -> bool:
+        """Close this thread's process, and return whether the sweep is still running."""
+        with self._lock:
+            child = self._working.pop((campaign, threading.get_ident()))
+            goes_on = campaign not in self._over
+        child.close()
+        return goes_on
+
+    def dismiss(self, campaign: str) -> None:
+        """End all processes of the sweep, and start no more of them."""
+        with self._lock:
+            self._over.add(campaign)
+            for key, child in self._working.items():
+                if key[0] == campaign:
+                    child.kill()  # its thread sees that it has ended, and closes it
+            idle = [self._resting.pop(key) for key in list(self._resting) if key[0] == campaign]
+        for child in idle:
+            child.close()
+
+
+_children = _Children()
+
+
+def dismiss(campaign: str) -> None:
+    """End all processes of the sweep in this pool, and start no more of them."""
+    _children.dismiss(campaign)
+
+
+def run(campaign: str, encoded: bytes) -> list[bytes]:
+    """Run an encoded chunk of the sweep, and return its encoded rows; fewer if the sweep is over.
+
+    Raises Died or Hung if no new process for trials becomes ready.
+    """
+    chunk = msgspec.msgpack.decode(encoded, type=Chunk)
+    rows: list[bytes] = []
+    while len(rows) < len(chunk.trials) and (taken := _children.take(campaign)) is not None:
+        child, kept = taken
+        asked = len(rows)
+        began = time.perf_counter()
+        try:
+            child.ask(chunk.after(asked))
+            for _ in chunk.trials[asked:]:
+                rows.append(child.answer(chunk.timeout))
+                began = time.perf_counter()
+        except Hung:
+            error = f"hung: no answer within {chunk.timeout:g} s"
+        except Died as death:
+            if kept and len(rows) == asked:  # a reused process may have ended earlier: try a new one
+                _children.drop(campaign)
+                continue
+            error = f"died: {death}"
+        else:
+            _children.keep(campaign)
+            break
+        if not _children.drop(campaign):
+            break
+        i = len(rows)
+        took_s = time.perf_counter() - began
+        rows.append(msgspec.msgpack.encode(lost(chunk.cell, chunk.trials[i], chunk.seeds[i], error, took_s)))
+    return rows

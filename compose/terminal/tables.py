@@ -1,0 +1,44 @@
+"""Tables for the terminal, as lists of lines."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.cells import cell_len
+from rich.console import Console
+from rich.table import Table
+
+from compose.terminal.text_width import UNLIMITED, room
+
+
+def console(**options: Any) -> Console:
+    """Return a console that prints text literally: `[red]` and `:smile:` are not markup."""
+    return Console(markup=False, emoji=False, highlight=False, **options)
+
+
+def table(left: Sequence[str], right: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
+    """Return a table with text in the columns `left`, and numbers, which are never broken, in `right`."""
+    made = Table(box=SIMPLE_HEAD, pad_edge=False)
+    for heading in left:
+        made.add_column(heading, overflow="fold")
+    for heading in right:
+        made.add_column(heading, justify="right", no_wrap=True)
+    for row in rows:
+        made.add_row(*row)
+    return made
+
+
+def fits(lines: Iterable[str]) -> bool:
+    """Return whether all `lines` fit the width of the terminal."""
+    return max(map(cell_len, lines), default=0) <= room()
+
+
+def lines(made: Table, width: int = UNLIMITED) -> list[str]:
+    """Return the lines of a table at most `width` columns wide; longer text is folded within its column."""
+    page = console(width=width, file=io.StringIO())
+    with page.capture() as capture:
+        page.print(made)
+    return [line.rstrip() for line in capture.get().splitlines() if line.strip()]

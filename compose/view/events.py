@@ -1,0 +1,158 @@
+"""What happens in one tick, in sentences."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from typing import Literal
+
+import msgspec
+
+from compose.view.cast import Seat, Stage
+from compose.view.deliveries import Passage, contact_of
+from compose.view.facts import Facts
+from compose.view.words import doing
+from protocol.messages import Alarm, Drive, End, Localised
+from protocol.motion import wrap
+
+Kind = Literal[
+    "anchor", "anchor-lost", "contact", "contact-lost", "phase", "state", "branch", "candidates",
+    "claim", "undecided", "alarm", "report-lost", "report-damaged", "report-late", "report-doubled",
+    "late", "down", "back", "end",
+]  # fmt: skip
+
+
+class Event(msgspec.Struct, frozen=True):
+    """Something that happens in a tick, in a sentence."""
+
+    tick: int
+    kind: Kind
+    robot: str | None
+    """whom it concerns, first; none is the world, or all"""
+    text: str
+
+
+def events(
+    stage: Stage, before: Facts | None, now: Facts, passages: Sequence[Passage], end: End | None
+) -> Iterator[Event]:
+    """Robot by robot, then on the radio; `before` is the tick before, if it is known."""
+    for who in (None, *stage.ids):
+        yield from _presence(who, before, now)
+    for seat in stage.robots:
+        yield from _sensing(seat, before, now)
+        yield from _deciding(seat, before, now)
+        yield from _believing(seat, before, now)
+    yield from _radio(now.tick, passages)
+    if end is not None and end.tick == now.tick:
+        why = f" ({end.reason})" if end.reason else ""
+        yield Event(now.tick, "end", None, f"The mission ends: {end.outcome}{why}")
+
+
+def _presence(who: str | None, before: Facts | None, now: Facts) -> Iterator[Event]:
+    name = who or "The world"
+    if who in now.down and (before is None or who not in before.down - before.back):
+        yield Event(now.tick, "down", who, f"{name} is down: its process is gone")
+    if who in now.back:
+        yield Event(now.tick, "back", who, f"{name} is back: its process runs again")
+
+
+def _radio(tick: int, passages: Sequence[Passage]) -> Iterator[Event]:
+    came = Counter((one.receiver, one.tick) for one in passages if one.what == "heard")
+    for one in passages:
+        whose = f"{one.sender}'s report of tick {one.tick}"
+        match one.what:
+            case "lost":
+                yield Event(tick, "report-lost", one.sender, f"{whose} to {one.receiver} is lost")
+            case "damaged":
+                yield Event(tick, "report-damaged", one.receiver, f"{one.receiver} refuses {whose}: damaged")
+            case "heard" if one.tick < tick:
+                late = f"{tick - one.tick} tick{'s' if tick - one.tick > 1 else ''} late"
+                yield Event(tick, "report-late", one.receiver, f"{one.receiver} hears {whose}, {late}")
+    for (receiver, sent), times in came.items():
+        if times > 1:
+            text = f"{receiver} hears the report of tick {sent} {times} times"
+            yield Event(tick, "report-doubled", receiver, text)
+
+
+def _sensing(seat: Seat, before: Facts | None, now: Facts) -> Iterator[Event]:
+    robot, peer, tick = seat.id, seat.peer, now.tick
+    sense = now.senses.get(robot)
+    earlier = before.senses.get(robot) if before is not None else None
+    if sense is None or (before is not None and earlier is None):
+        return
+    was = earlier.anchor_range if earlier is not None else None
+    if was is None and sense.anchor_range is not None:
+        text = f"{robot} is in its anchor's range: {metres(sense.anchor_range)}"
+        yield Event(tick, "anchor", robot, text)
+    if was is not None and sense.anchor_range is None:
+        yield Event(tick, "anchor-lost", robot, f"{robot} has no range to its anchor any more")
+    if seat.role == "b" and peer in now.senses:  # of a pair, a tells it
+        return
+    contact = contact_of(now, robot, peer)
+    near = before is not None and contact_of(before, robot, peer) is not None
+    if contact is not None and not near:
+        far = f": {metres(contact.range)}" if contact.range is not None else ""
+        yield Event(tick, "contact", robot, f"{robot} and {peer} are in range of each other{far}")
+    if contact is None and near:
+        yield Event(tick, "contact-lost", robot, f"{robot} and {peer} have lost contact")
+
+
+def _deciding(seat: Seat, before: Facts | None, now: Facts) -> Iterator[Event]:
+    robot, tick = seat.id, now.tick
+    if robot in now.late:
+        yield Event(tick, "late", robot, f"{robot}'s answer did not come in time; it stands still")
+    if robot in now.without:
+        yield Event(
+            tick, "late", robot, f"{robot} goes without {seat.peer}'s report, which did not come in time"
+        )
+    drive = now.drives.get(robot)
+    earlier = before.drives.get(robot) if before is not None else None
+    if drive is None or (before is not None and earlier is None):
+        return
+    if earlier is None or drive.phase != earlier.phase:
+        yield Event(tick, "phase", robot, f"{robot} begins phase {drive.phase}: {PHASES[drive.phase]}")
+    if (earlier is None or drive.state != earlier.state) and drive.verdict is None:
+        yield Event(tick, "state", robot, doing(seat, drive.phase, drive.state, None))
+    if drive.verdict is not None and (earlier is None or earlier.verdict is None):
+        yield _verdict(seat, drive, now)
+
+
+def _verdict(seat: Seat, drive: Drive, now: Facts) -> Event:
+    robot = seat.id
+    match drive.verdict:
+        case Localised(pose):
+            x, y, heading = pose.x, pose.y, wrap(pose.heading)
+            text = f"{robot} claims to be at ({x:.2f}, {y:.2f}) m, heading {heading:+.2f} rad"
+            truth = now.truth.get(robot)
+            if truth is not None:
+                text += f"; it is {metres(math.hypot(x - truth.x, y - truth.y))} off"
+            return Event(now.tick, "claim", robot, text)
+        case verdict:
+            kind: Kind = "alarm" if isinstance(verdict, Alarm) else "undecided"
+            return Event(now.tick, kind, robot, doing(seat, drive.phase, drive.state, verdict))
+
+
+PHASES = {1: "its own anchor", 2: "the search for its peer", 3: "the encounter"}
+
+
+def _believing(seat: Seat, before: Facts | None, now: Facts) -> Iterator[Event]:
+    robot, tick = seat.id, now.tick
+    held = now.estimates.get(robot)
+    earlier = before.estimates.get(robot) if before is not None else None
+    if held is None or earlier is None:
+        return
+    if len(held.local) == 1 != len(earlier.local) and not held.world:
+        yield Event(tick, "branch", robot, f"{robot} has chosen its branch: it knows where its anchor is")
+    many, few = len(earlier.world), len(held.world)
+    if many == 0 < few:
+        ways = "one placement of the two is" if few == 1 else f"{few} placements of the two are"
+        yield Event(tick, "candidates", robot, f"for {robot}, {ways} possible")
+    elif many != few > 0:
+        change = "fall" if few < many else "rise"
+        yield Event(tick, "candidates", robot, f"{robot}'s candidates {change} from {many} to {few}")
+
+
+def metres(length: float) -> str:
+    """A length as one reads it."""
+    return f"{length:.2f} m" if 0.095 <= length < 1e5 else f"{length:.2g} m"

@@ -1,0 +1,1 @@
+"""Recordings exported to CSV and Parquet tables."""

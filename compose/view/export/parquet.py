@@ -1,0 +1,125 @@
+"""A record as tables: a row per tick and robot, with what it held possible; and a row per journaled frame."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pyarrow as pa
+import pyarrow.parquet as pq
+from msgspec.structs import asdict
+
+from compose.recording.claim import nees
+from compose.recording.frames import Journaled
+from compose.recording.ticks_csv import Row
+from protocol.messages import Drive, Estimate, Localised
+from protocol.motion import Covariance, Pose
+from world.referee import errors
+
+_POSE = pa.struct([(name, pa.float64()) for name in Pose.__struct_fields__])
+_KINDS: dict[str, pa.DataType] = {
+    "tick": pa.int32(),
+    "time_s": pa.float64(),
+    **dict.fromkeys(("robot", "state", "verdict"), pa.string()),
+    "phase": pa.int32(),
+    **dict.fromkeys(("local", "world"), pa.list_(_POSE)),
+    "odds": pa.list_(pa.float64()),
+}
+"""the rest are floats"""
+_MEASURES = ["position_error_m", "heading_error_rad", "position_sigma_m", "heading_sigma_rad", "nees"]
+_COVARIANCE = [f"cov_{name}" for name in Covariance.__struct_fields__]
+COLUMNS = [
+    *("tick", "time_s"),
+    *Row.__struct_fields__[1:],
+    *("verdict", "local", "world", "odds"),
+    *("estimate_x", "estimate_y", "estimate_heading"),
+    *_COVARIANCE,
+    *_MEASURES,
+]
+"""of `ticks.parquet`"""
+At = tuple[str, int]
+"""a robot, and a tick"""
+
+
+def write_ticks(
+    rows: Iterable[Row],
+    drives: Mapping[At, Drive],
+    held: Mapping[At, Estimate],
+    period: float,
+    path: Path,
+) -> None:
+    """`ticks.parquet`: `rows`, and what each robot held possible, against the truth where there is one.
+
+    `period` is T_s.
+    """
+    lines = []
+    for row in rows:
+        at = row.robot, row.tick
+        verdict = drives[at].verdict if at in drives else None
+        said = {"time_s": row.tick * period, "verdict": _tag(verdict)}
+        lines.append(asdict(row) | said | _estimate(held.get(at), row.pose))
+    schema = pa.schema([pa.field(name, _KINDS.get(name, pa.float64())) for name in COLUMNS])
+    pq.write_table(pa.Table.from_pylist(lines, schema=schema), path)
+
+
+def _tag(verdict: msgspec.Struct | None) -> str | None:
+    return str(verdict.__struct_config__.tag) if verdict is not None else None
+
+
+def _estimate(held: Estimate | None, truth: Pose | None) -> dict[str, Any]:
+    """All of it, and of the first in the world how far off it is, where that is known."""
+    if held is None:
+        return {}
+    told: dict[str, Any] = {
+        "local": [asdict(pose) for pose in held.local],
+        "world": [asdict(pose) for pose in held.world],
+        "odds": list(held.odds),
+    }
+    if not held.world:
+        return told
+    first = held.world[0]
+    told |= {f"estimate_{name}": value for name, value in asdict(first).items()}
+    if truth is not None:
+        told["position_error_m"], told["heading_error_rad"] = errors(first, truth)
+    if held.covariance is not None:
+        told |= {f"cov_{name}": value for name, value in asdict(held.covariance).items()}
+        told["position_sigma_m"] = held.covariance.position_sigma
+        told["heading_sigma_rad"] = held.covariance.heading_sigma
+        if truth is not None:
+            told["nees"] = nees(first, truth, held.covariance)
+    return told
+
+
+def frames_csv(frames: Iterable[Journaled], check: Callable[[], object] = lambda: None) -> str:
+    """One row per frame: where it stands, when it was journaled, and what it says, as JSON.
+
+    Calls `check` before each, which may raise.
+    """
+    out = io.StringIO()
+    written = csv.writer(out, lineterminator="\n")
+    written.writerow(["journal", "place", "tick", "kind", "bytes", "message"])
+    for one in frames:
+        check()
+        text = msgspec.json.encode(_named(one.message)).decode()
+        written.writerow([one.journal, one.place, one.tick, one.kind, len(one.frame), text])
+    return out.getvalue()
+
+
+def _named(value: Any) -> Any:
+    match value:
+        case Localised():
+            return {"verdict": "localised", **_named_fields(value)}
+        case msgspec.Struct():
+            return _named_fields(value)
+        case tuple():
+            return [_named(one) for one in value]
+        case _:
+            return value
+
+
+def _named_fields(value: msgspec.Struct) -> dict[str, Any]:
+    return {name: _named(getattr(value, name)) for name in value.__struct_fields__}

@@ -1,0 +1,1 @@
+"""Runs in Foxglove's formats: MCAP files and a live server."""

@@ -1,0 +1,112 @@
+"""A proxy in front of the Foxglove SDK's server, which itself accepts web pages of any origin.
+
+The gate reads the head of each request, refuses requests of foreign web pages, and forwards all others to
+the SDK's server. That server listens on a random address of 127.0.0.0/8 and a random port: about 2^38
+combinations, too many for a page to try. The gate does not restrict other programs on this machine.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+import socket
+import threading
+from asyncio import LimitOverrunError, StreamReader, StreamWriter
+from collections.abc import Sequence
+from contextlib import closing, suppress
+
+from compose.view.web.origin import refusal
+
+FOXGLOVE = ("https://app.foxglove.dev", "file://")
+"""The origins of Foxglove's app, in a browser and installed; not `null`, which any page can have."""
+HEAD_BYTES = 1 << 14
+"""the maximum size in bytes of the head of a request"""
+HEAD_S = 10.0
+"""s that the head of a request may take to arrive"""
+PIECE_BYTES = 1 << 16
+GUESTS = 64
+"""The maximum number of connections; more are refused.
+
+Without a limit, the SDK's server would run out of descriptors, and accept no more.
+"""
+GUESTS_FILES = 3 * GUESTS + 120
+"""descriptors for GUESTS: two in the gate and one in the SDK for each, and some for refused connections"""
+
+Place = tuple[str, int]
+
+
+def private_host() -> str:
+    """Return a random loopback address, which a web page cannot guess."""
+    return "127." + ".".join([str(1 + secrets.randbelow(254)) for _ in range(3)])
+
+
+class Gate:
+    """A listening port whose thread forwards the allowed connections to the SDK's server."""
+
+    def __init__(self, taken: socket.socket, behind: Place, origins: Sequence[str]) -> None:
+        """`taken` is the listening socket, `behind` the SDK's server; `origins` are allowed like FOXGLOVE."""
+        self._taken = taken
+        self._behind = behind
+        self._origins = (*FOXGLOVE, *origins)
+        self._guests = 0
+
+    def open(self) -> None:
+        """Start the thread, which ends with the process."""
+        threading.Thread(target=lambda: asyncio.run(self._serve()), daemon=True).start()
+
+    async def _serve(self) -> None:
+        server = await asyncio.start_server(self._admit, sock=self._taken, limit=HEAD_BYTES)
+        await server.serve_forever()
+
+    async def _admit(self, reader: StreamReader, writer: StreamWriter) -> None:
+        with closing(writer), suppress(OSError, EOFError, LimitOverrunError):
+            if self._guests >= GUESTS:
+                await _refuse(writer, "503 Service Unavailable", "too many look already")
+                return
+            self._guests += 1
+            try:
+                await self._look_at(reader, writer)
+            finally:
+                self._guests -= 1
+
+    async def _look_at(self, reader: StreamReader, writer: StreamWriter) -> None:
+        head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), HEAD_S)
+        why = self._refusal(head)
+        if why is not None:
+            await _refuse(writer, "403 Forbidden", why)
+            return
+        await self._hand_on(head, reader, writer)
+
+    def _refusal(self, head: bytes) -> str | None:
+        lines = [line.partition(":") for line in head.decode("latin-1").split("\r\n")[1:]]
+
+        def values(wanted: str) -> list[str]:
+            return [value.strip() for name, _, value in lines if name.strip().lower() == wanted]
+
+        if [value.lower() for value in values("upgrade")] != ["websocket"]:
+            return "only viewers are served here, over WebSocket"  # so a connection has one head
+        return refusal(values("host"), values("origin"), self._origins)
+
+    async def _hand_on(self, head: bytes, reader: StreamReader, writer: StreamWriter) -> None:
+        """Forward both ways until one end closes. A slow reader delays the SDK's server, not the gate."""
+        there, back = await asyncio.open_connection(*self._behind)
+        with closing(back):
+            back.write(head)
+            ways = [asyncio.create_task(_copy(reader, back)), asyncio.create_task(_copy(there, writer))]
+            await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
+            for way in ways:
+                way.cancel()
+            await asyncio.gather(*ways, return_exceptions=True)
+
+
+async def _refuse(writer: StreamWriter, status: str, why: str) -> None:
+    said = f"{why}\n".encode()
+    writer.write(f"HTTP/1.1 {status}\r\nConnection: close\r\nContent-Type: text/plain\r\n".encode())
+    writer.write(b"Content-Length: %d\r\n\r\n%s" % (len(said), said))
+    await writer.drain()
+
+
+async def _copy(reader: StreamReader, writer: StreamWriter) -> None:
+    while piece := await reader.read(PIECE_BYTES):
+        writer.write(piece)
+        await writer.drain()

@@ -1,0 +1,267 @@
+"""What there is to see of a run, in Foxglove's schemas: any viewer that knows these shows it as it is.
+
+Frames of reference: `world`; `ID`, where robot ID truly is; `ID/anchor`, that of its own anchor. Whatever
+stays on a topic is whole in its latest message, so one may look at any time of a record, or come late.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+from foxglove import messages as fox
+
+from compose.view.cast import Seat, Stage
+from compose.view.events import Event
+from compose.view.foxglove import shapes
+from compose.view.scene import Held, Player, Scene
+from protocol.mission import Role
+from protocol.motion import Pose
+
+WORLD = "world"
+TRAIL = 200
+"""poses, the latest, that a trail shows"""
+BODY = 0.12
+"""of R: how long a robot is drawn"""
+LEAST = 0.06
+"""of its full colour: a hypothesis that is all but ruled out"""
+COLOURS: dict[Role, tuple[float, float, float]] = {"a": (0.04, 0.38, 0.64), "b": (0.77, 0.27, 0.11)}
+GREY = (0.5, 0.5, 0.5)
+GREEN = (0.0, 0.5, 0.35)
+LEVELS = {
+    **dict.fromkeys(("report-lost", "report-damaged", "late", "undecided"), fox.LogLevel.Warning),
+    "alarm": fox.LogLevel.Error,
+}
+"""of an event's kind; of all others Info"""
+
+
+class Shown(NamedTuple):
+    """A message for viewers."""
+
+    topic: str
+    message: Any
+    """of Foxglove's"""
+
+
+def topics(robots: Iterable[str]) -> dict[str, Any]:
+    """The kind of message on each."""
+    found = {
+        "/tf": fox.FrameTransforms,
+        "/stage": fox.SceneUpdate,
+        "/contact": fox.SceneUpdate,
+        "/log": fox.Log,
+    }
+    for robot in robots:
+        found[f"/{robot}/pose"] = fox.PoseInFrame
+        found[f"/{robot}/trail"] = fox.PosesInFrame
+        found[f"/{robot}/body"] = fox.SceneUpdate
+        found[f"/{robot}/hypotheses"] = fox.PosesInFrame
+        found[f"/{robot}/belief"] = fox.SceneUpdate
+    return found
+
+
+def nanoseconds(stage: Stage, tick: int) -> int:
+    """When that tick is, of simulated time."""
+    return round(tick * stage.mission.period * 1e9)
+
+
+class Trail:
+    """Where a robot was, the latest TRAIL poses; each is made once for all the messages that it is in."""
+
+    def __init__(self) -> None:
+        self.poses: deque[fox.Pose] = deque(maxlen=TRAIL)
+        self.points: deque[fox.Point3] = deque(maxlen=TRAIL)
+
+    def add(self, pose: Pose) -> None:
+        """The next."""
+        self.poses.append(shapes.pose(pose))
+        self.points.append(shapes.point(pose.x, pose.y))
+
+
+class Views:
+    """A run, to be shown tick by tick, in the order of the ticks."""
+
+    def __init__(self, stage: Stage) -> None:
+        self.stage = stage
+        self._unit = BODY * stage.mission.sensing_range
+        self._trails = {robot: Trail() for robot in stage.ids}
+        self._latest: Scene | None = None
+
+    def standing(self) -> Shown:
+        """What is there before anything happens: anchors, their ranges, and the orbits."""
+        entities = [self._anchor(seat) for seat in self.stage.robots]
+        return Shown("/stage", fox.SceneUpdate(entities=entities))
+
+    def of(self, scene: Scene) -> Iterator[Shown]:
+        """One tick."""
+        yield from self.passing(scene)
+        yield from self._whole(scene)
+
+    def again(self) -> Iterator[Shown]:
+        """The latest tick, for who has come since."""
+        if self._latest is not None:
+            yield from self._lines(self._latest)
+            yield from self._whole(self._latest)
+
+    def passing(self, scene: Scene) -> Iterator[Shown]:
+        """One tick, of which nobody is to see more than what happens in it."""
+        self._latest = scene
+        for player in scene.players:
+            if player.pose is not None:
+                self._trails[player.robot].add(player.pose)
+        yield from self._lines(scene)
+
+    def _lines(self, scene: Scene) -> Iterator[Shown]:
+        at = shapes.timestamp(nanoseconds(self.stage, scene.tick))
+        for event in scene.events:
+            yield Shown("/log", _line(event, at))
+
+    def _whole(self, scene: Scene) -> Iterator[Shown]:
+        at = shapes.timestamp(nanoseconds(self.stage, scene.tick))
+        yield Shown("/tf", fox.FrameTransforms(transforms=list(self._transforms(scene, at))))
+        for player in scene.players:
+            yield from self._robot(player, at)
+        yield Shown("/contact", fox.SceneUpdate(entities=list(self._contacts(scene, at))))
+
+    # --- where everyone is ---
+
+    def _transforms(self, scene: Scene, at: fox.Timestamp) -> Iterator[fox.FrameTransform]:
+        for player in scene.players:
+            frames = {f"{player.robot}/anchor": _frame(self.stage.seat(player.robot))}
+            if player.pose is not None:
+                frames[player.robot] = player.pose
+            for child, pose in frames.items():
+                yield fox.FrameTransform(
+                    timestamp=at,
+                    parent_frame_id=WORLD,
+                    child_frame_id=child,
+                    translation=fox.Vector3(x=pose.x, y=pose.y, z=0.0),
+                    rotation=shapes.turned(pose.heading),
+                )
+
+    def _robot(self, player: Player, at: fox.Timestamp) -> Iterator[Shown]:
+        robot, seat = player.robot, self.stage.seat(player.robot)
+        if player.pose is not None:
+            pose = fox.PoseInFrame(timestamp=at, frame_id=WORLD, pose=shapes.pose(player.pose))
+            yield Shown(f"/{robot}/pose", pose)
+            poses = list(self._trails[robot].poses)
+            yield Shown(f"/{robot}/trail", fox.PosesInFrame(timestamp=at, frame_id=WORLD, poses=poses))
+            yield Shown(f"/{robot}/body", fox.SceneUpdate(entities=[self._body(seat, player, at)]))
+        if player.held is not None:
+            frame, held = _placed(robot, player.held)
+            poses = [shapes.pose(one) for one in held]
+            yield Shown(f"/{robot}/hypotheses", fox.PosesInFrame(timestamp=at, frame_id=frame, poses=poses))
+            belief = self._belief(seat, frame, held, player.held, at)
+            yield Shown(f"/{robot}/belief", fox.SceneUpdate(entities=[belief]))
+
+    def _body(self, seat: Seat, player: Player, at: fox.Timestamp) -> fox.SceneEntity:
+        """The robot, what it does in words, and its anchor's range while it has one."""
+        assert player.pose is not None
+        colour = shapes.colour(COLOURS[seat.role])
+        lines, texts = [], [shapes.words(f"{seat.id}: {player.doing}", player.pose, self._unit, colour)]
+        trail = self._trails[seat.id].points
+        if len(trail) > 1:
+            lines.append(shapes.line(trail, colour, 2.0))
+        if player.anchor_range is not None:
+            ends = [(player.pose.x, player.pose.y), (seat.anchor.x, seat.anchor.y)]
+            lines.append(shapes.strip(ends, shapes.colour(COLOURS[seat.role], 0.5), 1.5))
+            middle = Pose((ends[0][0] + ends[1][0]) / 2, (ends[0][1] + ends[1][1]) / 2, 0.0)
+            texts.append(shapes.words(f"{player.anchor_range:.3f} m", middle, self._unit, colour))
+        return fox.SceneEntity(
+            timestamp=at,
+            frame_id=WORLD,
+            id=seat.id,
+            arrows=[shapes.arrow(player.pose, self._unit, colour)],
+            lines=lines,
+            texts=texts,
+        )
+
+    # --- what stands ---
+
+    def _anchor(self, seat: Seat) -> fox.SceneEntity:
+        colour = COLOURS[seat.role]
+        centre = (seat.anchor.x, seat.anchor.y)
+        here = Pose(*centre, 0.0)
+        size = fox.Vector3(x=self._unit, y=self._unit, z=self._unit)
+        return fox.SceneEntity(
+            timestamp=shapes.timestamp(0),
+            frame_id=WORLD,
+            id=f"{seat.id}/anchor",
+            cubes=[fox.CubePrimitive(pose=shapes.pose(here), size=size, color=shapes.colour(colour))],
+            lines=[
+                shapes.strip(
+                    shapes.circle(centre, self.stage.mission.sensing_range), shapes.colour(colour, 0.6), 1.5
+                ),
+                shapes.strip(shapes.circle(centre, seat.orbit.radius), shapes.colour(GREY, 0.5), 1.0),
+            ],
+            texts=[shapes.words(f"{seat.id}'s anchor", here, self._unit, shapes.colour(colour))],
+        )
+
+    def _contacts(self, scene: Scene, at: fox.Timestamp) -> Iterator[fox.SceneEntity]:
+        """Of each pair, while both are in range of each other: the link, the range, and the reports on it."""
+        for one, other in self.stage.pairs():
+            a, b = scene.player(one.id), scene.player(other.id)
+            contact = next((contact for contact in a.contacts if contact.peer == other.id), None)
+            lines, texts = [], []
+            if contact is not None and a.pose is not None and b.pose is not None:
+                ends = [(a.pose.x, a.pose.y), (b.pose.x, b.pose.y)]
+                lines = [shapes.strip(ends, shapes.colour(GREEN), 3.0)]
+                words = [f"{contact.range:.3f} m"] if contact.range is not None else ["no range"]
+                words += [
+                    f"{passage.sender}'s report of tick {passage.tick}: {passage.what}"
+                    for passage in scene.passages
+                    if passage.sender in (one.id, other.id) and passage.what != "sent"
+                ]
+                middle = Pose((a.pose.x + b.pose.x) / 2, (a.pose.y + b.pose.y) / 2, 0.0)
+                texts = [shapes.words("\n".join(words), middle, self._unit, shapes.colour(GREEN))]
+            yield fox.SceneEntity(
+                timestamp=at, frame_id=WORLD, id=f"{one.id}-{other.id}", lines=lines, texts=texts
+            )
+
+    # --- what a robot holds possible ---
+
+    def _belief(
+        self, seat: Seat, frame: str, poses: Sequence[Pose], held: Held, at: fox.Timestamp
+    ) -> fox.SceneEntity:
+        """An arrow for each hypothesis, the paler the less probable, and the ellipse of the first."""
+        colour = COLOURS[seat.role]
+        odds = held.odds or (1.0 / max(1, len(poses)),) * len(poses)
+        lines = []
+        if held.covariance is not None and held.world:
+            lines.append(
+                shapes.strip(shapes.ellipse(held.world[0], held.covariance), shapes.colour(colour), 1.5)
+            )
+        shades = [shapes.colour(colour, max(LEAST, share)) for share in odds]
+        texts = [
+            shapes.words(f"{share:.3g}", pose, self._unit, shade)
+            for pose, share, shade in zip(poses, odds, shades, strict=False)
+            if len(poses) > 1
+        ]
+        return fox.SceneEntity(
+            timestamp=at,
+            frame_id=frame,
+            id=seat.id,
+            arrows=[
+                shapes.arrow(pose, self._unit, shade) for pose, shade in zip(poses, shades, strict=False)
+            ],
+            lines=lines,
+            texts=texts,
+        )
+
+
+def _placed(robot: str, held: Held) -> tuple[str, tuple[Pose, ...]]:
+    """The frame that its hypotheses are given in, and these."""
+    return (WORLD, held.world) if held.world else (f"{robot}/anchor", held.local)
+
+
+def _frame(seat: Seat) -> Pose:
+    """That of its anchor; one that nobody knows how it is turned is not."""
+    return seat.frame or Pose(seat.anchor.x, seat.anchor.y, 0.0)
+
+
+def _line(event: Event, at: fox.Timestamp) -> fox.Log:
+    level = LEVELS.get(event.kind, fox.LogLevel.Info)
+    return fox.Log(
+        timestamp=at, level=level, message=event.text, name=event.robot or "world", file=event.kind
+    )

@@ -1,0 +1,127 @@
+"""What one server shows: records, a campaign, or missions on a network."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from compose.errors import UserError
+from compose.recording.run import journals_in
+from compose.view.web import sweep_page
+from compose.view.web.live import Listener
+from compose.view.web.sources import Recorded, Show
+from protocol.network.endpoints import Endpoints
+
+
+class Site:
+    """All that one server shows."""
+
+    def __init__(
+        self,
+        shows: list[Recorded] | None = None,
+        listeners: list[Listener] | None = None,
+        folder: Path | None = None,
+    ) -> None:
+        """`folder` is that of a campaign, if it is one that is shown."""
+        self.folder = folder
+        self.recorded = shows or []
+        self.listeners = listeners or []
+        self.over = False
+        """whether the server is about to end"""
+
+    @property
+    def shows(self) -> dict[str, Show]:
+        """Every run of which enough is known to show it, by name."""
+        found: dict[str, Show] = {show.name: show for show in self.recorded}
+        for i, listener in enumerate(self.listeners):
+            for run, show in listener.shows.items():
+                found[run if run not in found else f"{run}.{i}"] = show
+        return {name: show for name, show in found.items() if show.stage is not None}
+
+    @property
+    def waiting(self) -> bool:
+        """Whether something may come."""
+        return bool(self.listeners) or any(show.live for show in self.recorded)
+
+    @property
+    def notes(self) -> list[str]:
+        """What could not be read, a line each."""
+        return [note for show in self.recorded for note in show.notes]
+
+    def start(self) -> None:
+        """Begin to listen."""
+        for listener in self.listeners:
+            listener.start()
+
+    def stop(self) -> None:
+        """Listen no more."""
+        for listener in self.listeners:
+            listener.stop()
+
+    def poll(self) -> None:
+        """Fold in what has come."""
+        for show in self.recorded:
+            with suppress(OSError):
+                show.poll()
+        for listener in self.listeners:
+            listener.poll()
+
+    def concluded(self) -> None:
+        """Whoever wrote has ended."""
+        for show in self.recorded:
+            show.concluded()
+
+    def listed(self) -> dict[str, Any]:
+        """What the page lists."""
+        return {
+            "campaign": self.folder is not None,
+            "network": [{"endpoint": one.endpoint, "reached": one.reached} for one in self.listeners],
+            "waiting": self.waiting,
+            "shows": [
+                {
+                    "name": name,
+                    "title": show.stage.name if show.stage is not None else name,
+                    "robots": len(show.stage.robots) if show.stage is not None else 0,
+                    "last": show.head,
+                    "live": show.live,
+                    "end": show.known.end,
+                }
+                for name, show in self.shows.items()
+            ],
+        }
+
+
+def of_record(folder: Path) -> Site:
+    """Of a record that is about to be written."""
+    return Site([Recorded(folder.name, folder, expected=True)])
+
+
+def of_network(places: Sequence[Endpoints]) -> Site:
+    """Of the missions that are heard there."""
+    return Site(listeners=[Listener(endpoints) for endpoints in places])
+
+
+def of_folder(folder: Path) -> Site:
+    """Of a record, of a campaign, or of the records in the folders in `folder`. Raises UserError."""
+    try:
+        if not folder.is_dir():
+            raise UserError(f"{folder} is no folder")
+        if sweep_page.is_campaign(folder):
+            sweep_page.told(folder)
+            return Site(folder=folder)
+        folders = [folder]
+        if not any(journals_in(folder)):
+            folders = sorted(one for one in folder.iterdir() if one.is_dir() and any(journals_in(one)))
+        shows = [Recorded(one.resolve().name, one) for one in folders]
+        for show in shows:
+            show.poll()
+    except OSError as error:
+        raise UserError(f"{folder} cannot be read: {error.strerror or error}") from None
+    if not shows:
+        raise UserError(f"{folder} holds neither a record, nor a campaign, nor folders with records")
+    if not any(show.live or show.stage is not None for show in shows):
+        why = "; ".join(note for show in shows for note in show.notes) or "its journals are empty"
+        raise UserError(f"there is nothing to see in {folder}: {why}")
+    return Site(shows)

@@ -1,0 +1,1 @@
+"""Zenoh keys, access rules, sessions and endpoints."""

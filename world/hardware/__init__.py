@@ -1,0 +1,1 @@
+"""Hardware mode: a robot's driver in place of the simulator."""

@@ -1,0 +1,131 @@
+"""The journal of a robot's driver: the measurements and commands that a resume needs.
+
+A Sense is written before it is sent to the agent, and a Drive before it is executed. After a kill, the
+journal therefore contains everything that was sent or executed, and at most the reading of one tick has to
+be repeated. After a power cut this holds only if each write was synced (`--fsync`). If not, the robot
+refuses to resume: its Reports could contradict earlier ones, and its peer would find them inconsistent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+
+from protocol.journal.journal_file import CorruptJournal
+from protocol.messages import Briefing, Drive, End, Message, Report, Sense
+from protocol.units import Finite, RobotId, Tick
+from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
+
+MAX_MARK = 64
+"""the maximum number of values of a mark"""
+
+
+def driver_journal(robot: str) -> str:
+    """Return the name of the journal's file."""
+    return f"driver-{robot}.journal"
+
+
+class Mark(Message, frozen=True):
+    """The mark of a reading (see `driver.Reading`), written before the Sense made from that reading."""
+
+    tick: Tick
+    robot: RobotId
+    mark: Annotated[tuple[Finite, ...], msgspec.Meta(max_length=MAX_MARK)]
+
+
+class Start(Message, frozen=True):
+    """The start of the process that writes the frames after it."""
+
+    boot: Annotated[str, msgspec.Meta(max_length=64)]
+    """identifies the boot of the computer; empty if the system does not tell"""
+    synced: bool
+    """whether each write is synced to the disk before the process continues"""
+
+
+def boot() -> str:
+    """Return the identifier of this computer's current boot; "" if the system does not tell."""
+    try:
+        return BOOT.read_text(encoding="ascii").strip()
+    except OSError:
+        return ""
+
+
+BOOT = Path("/proc/sys/kernel/random/boot_id")
+
+
+class DrivenTick(msgspec.Struct, frozen=True):
+    """One tick of a driver's journal."""
+
+    sense: Sense
+    frame: bytes
+    """the encoded Sense"""
+    drive: Drive | None = None
+    """None if the agent missed the deadline"""
+    reports: tuple[Report, ...] = ()
+    """the peer's Reports that affect when the mission is over"""
+
+
+class DriverPast(msgspec.Struct, frozen=True):
+    """The content of a driver's journal, complete or up to where it breaks off."""
+
+    ticks: tuple[DrivenTick, ...] = ()
+    mark: tuple[float, ...] = ()
+    """the mark of the latest reading; empty if it has none"""
+    end: End | None = None
+    start: Start | None = None
+    """the latest Start"""
+
+    @property
+    def tick(self) -> int:
+        """The latest tick; -1 if there is none."""
+        return len(self.ticks) - 1
+
+    @property
+    def may_lack(self) -> bool:
+        """Whether frames may be missing: writes were not synced, and the computer has been rebooted since."""
+        start = self.start
+        return self.end is None and start is not None and not start.synced and start.boot != boot()
+
+
+def driver_past(frames: Sequence[bytes], briefing: Briefing, path: Path) -> DriverPast:
+    """Return the content of the journal at `path` from its `frames`.
+
+    Raises CorruptJournal if a frame is malformed or out of order, or if it is not the mission of `briefing`.
+    """
+    ticks: list[DrivenTick] = []
+    mark: tuple[float, ...] = ()
+    marked: Mark | None = None
+    end: End | None = None
+    start: Start | None = None
+    for place, frame in enumerate(frames):
+        message = _message(frame, path)
+        match message:
+            case Briefing() if place == 0:
+                if message != briefing:
+                    raise CorruptJournal(f"{path}: another run's: its briefing is not this mission's")
+            case Start() if place > 0 and end is None:
+                start = message
+            case Mark(tick) if tick == len(ticks):
+                marked = message
+            case Sense(tick) if tick == len(ticks) and place > 0:
+                ticks.append(DrivenTick(message, frame))
+                mark = marked.mark if marked is not None and marked.tick == tick else ()
+            case Drive() if ticks and message.tick == ticks[-1].sense.tick and ticks[-1].drive is None:
+                ticks[-1] = msgspec.structs.replace(ticks[-1], drive=message)
+            case Report() if ticks:
+                ticks[-1] = msgspec.structs.replace(ticks[-1], reports=(*ticks[-1].reports, message))
+            case End() if end is None:
+                end = message
+            case _:
+                raise CorruptJournal(f"{path}: a {type(message).__name__} is out of order")
+    return DriverPast(tuple(ticks), mark, end, start)
+
+
+def _message(frame: bytes, path: Path) -> Briefing | Start | Mark | Sense | Drive | Report | End:
+    try:
+        return decode(frame, Briefing | Start | Mark | Sense | Drive | Report | End, MAX_FRAME_BYTES)
+    except MalformedFrame as error:
+        raise CorruptJournal(f"{path}: {error}") from None

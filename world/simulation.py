@@ -1,0 +1,134 @@
+"""The course of one run: the world's value, tick after tick, and its journal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from protocol.journal import environment
+from protocol.journal.journal_file import CorruptJournal, Sink
+from protocol.journal.resume import Otherwise, Retrace
+from protocol.messages import Drive, End, Environment, Farewell, Missed, Sense
+from protocol.wire import encode
+from world.referee import Judgement
+from world.scenario import Scenario
+from world.tick import advance, release, senses
+from world.world_journal import history
+
+
+class Course:
+    """Whatever carries the frames, the world goes through here, so every mode journals the same bytes.
+
+    The journal holds the scenario, every tick's Drives (in the scenario's order), End and the Farewells.
+    """
+
+    def __init__(self, scenario: Scenario, journal: Sink | None = None) -> None:
+        self.world = release(scenario)
+        self.over: End | None = None
+        """once the run is"""
+        self.witnesses: tuple[str, ...] = ()
+        """who answered in the tick that was the last, if they ended the run"""
+        self.parted: dict[str, Farewell] = {}
+        """what they said to that, as far as it is on record"""
+        self.missed: dict[str, list[Sense]] = {}
+        """what robots have sensed since they last answered in time; a process that comes back may not know"""
+        self._journal = journal
+        if journal is not None:
+            journal.write(encode(environment.of_world()), encode(scenario))
+
+    @property
+    def tick(self) -> int:
+        """k"""
+        return self.world.truth.tick
+
+    def senses(self) -> list[Sense]:
+        """What every robot senses now, in the order of the scenario."""
+        return senses(self.world)
+
+    def keep(self, journal: Sink) -> None:
+        """Go on journaling there."""
+        self._journal = journal
+
+    def drive(self, drives: Mapping[str, Drive]) -> End | None:
+        """One tick on; or the end. A robot that is not in `drives` stands still."""
+        self.record(drives)
+        return self.advance(drives)
+
+    def record(self, drives: Mapping[str, Drive]) -> None:
+        """First half of `drive`: the tick is on record."""
+        if self._journal is not None:
+            self._journal.write(
+                *[
+                    encode(drives[robot.id] if robot.id in drives else Missed(self.tick, robot.id))
+                    for robot in self.world.scenario.robots
+                ]
+            )
+
+    def advance(self, drives: Mapping[str, Drive]) -> End | None:
+        """Second half of `drive`: everyone has moved."""
+        if self.missed or len(drives) < len(self.world.scenario.robots):
+            self._note_missed(drives)
+        onward = advance(self.world, drives)
+        if isinstance(onward, Judgement):
+            self.witnesses = tuple(drives)
+            return self.end(onward)
+        self.world = onward
+        return None
+
+    def _note_missed(self, drives: Mapping[str, Drive]) -> None:
+        for sense in self.senses():
+            if sense.robot in drives:
+                self.missed.pop(sense.robot, None)
+            else:
+                self.missed.setdefault(sense.robot, []).append(sense)
+
+    def end(self, judgement: Judgement) -> End:
+        """The run is over."""
+        self.over = End(self.tick, judgement.outcome, judgement.reason)
+        if self._journal is not None:
+            self._journal.write(encode(self.over))
+        return self.over
+
+    def farewells(self, farewells: Iterable[Farewell]) -> None:
+        """What the robots answered to the End; those that answered."""
+        said = {farewell.robot: farewell for farewell in farewells}
+        ids = [robot.id for robot in self.world.scenario.robots]
+        latest = max([ids.index(robot) for robot in self.parted], default=-1)
+        new = [said[robot] for robot in ids[latest + 1 :] if robot in said]
+        self.parted |= {farewell.robot: farewell for farewell in new}
+        if self._journal is not None and new:
+            self._journal.write(*[encode(farewell) for farewell in new])
+
+
+def again(scenario: Scenario, record: Retrace) -> Course:
+    """The course of the run that `record` tells, as far as it has come; of none, if there is nothing in it.
+
+    Raises CorruptJournal, also if it is that of another scenario, or if the world once went on otherwise.
+    """
+    course = Course(scenario)
+    course.keep(record)
+    named = environment.named_in(record.frames)
+    if environment.is_blank(record.frames):
+        record.write(encode(named or environment.of_world()), encode(scenario))
+    else:
+        _retrace(course, record, named)
+    return course
+
+
+def _retrace(course: Course, record: Retrace, named: Environment | None) -> None:
+    lived = history(record.frames, record.path)
+    if lived.disorder is not None:
+        raise CorruptJournal(f"{record.path}: {lived.disorder.what}")
+    if lived.scenario != course.world.scenario:
+        raise CorruptJournal(f"{record.path}: the record of another scenario, {lived.scenario.name}")
+    try:
+        record.write(*[encode(one) for one in (named, lived.scenario) if one is not None])
+        for tick in lived.ticks:
+            course.drive(tick.drives)
+        if lived.end is not None and course.over is None:
+            course.end(Judgement(lived.end.outcome, lived.end.reason))
+        course.farewells(lived.farewells.values())
+    except Otherwise:
+        raise CorruptJournal(
+            f"{record.path}: on record the world went on otherwise at tick {course.tick}: "
+            + (environment.otherwise(named, environment.of_world()) or "the journal is another version's")
+        ) from None
