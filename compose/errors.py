@@ -4,7 +4,7 @@ from protocol.messages import Outcome
 
 LOCALISED = 0
 ENDED = 0
-"""of a process that `tandem run` launched: its mission came to an End, whichever"""
+"""of a process that `tandem run` launched: its mission came to an MissionEnd, whichever"""
 NOT_LOCALISED = 1
 """the mission came to its end, otherwise"""
 CLEAN = 0

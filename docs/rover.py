@@ -22,7 +22,7 @@ from pathlib import Path
 
 import msgspec
 
-from protocol.messages import Briefing
+from protocol.messages import RobotConfig
 from protocol.motion import REST, Controls, Pose, step, wrap
 from world.hardware.driver import Reading
 
@@ -35,7 +35,7 @@ class Rover:
 
     def __init__(
         self,
-        briefing: Briefing,
+        briefing: RobotConfig,
         manoeuvre_s: float,
         *,
         start: str = "",

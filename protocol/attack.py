@@ -17,7 +17,7 @@ Part = Literal["phase-1", "orbit", "encounter", "all"]
 """of its log, by phase; the last three kinds are of the beginning, and so of all"""
 
 
-class Lie(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Attack(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A robot that drives, measures and plans honestly, and tells its peer something else."""
 
     kind: Kind

@@ -7,15 +7,16 @@ so a frame explains itself wherever it is found.
 from __future__ import annotations
 
 import math
+import re
 from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
 from msgspec.structs import force_setattr
 
-from protocol.attack import Lie
+from protocol.attack import Attack
 from protocol.mission import Anchor, Mission, Role, Variant
-from protocol.motion import Controls, Covariance, Pose, Run
+from protocol.motion import Controls, Covariance, Pose, Segment
 from protocol.orbits import Rendezvous
 from protocol.units import (
     Angle,
@@ -33,7 +34,7 @@ Outcome = Literal["localised", "undecided", "alarm", "wrong", "failed"]
 BranchKind = Literal["three-ranges", "three-ranges-virtual", "circle", "on-anchor"]
 """How phase 1 told +alpha from -alpha."""
 
-Odds = Annotated[float, Meta(ge=0.0, le=1.0)]
+Probability = Annotated[float, Meta(ge=0.0, le=1.0)]
 """the probability of a hypothesis, given what has been measured"""
 
 MAX_TEXT = 300
@@ -55,7 +56,12 @@ def _cut(said: msgspec.Struct, field: str) -> None:
         force_setattr(said, field, words.encode("utf-8", "backslashreplace").decode()[:MAX_TEXT])
 
 
-class Message(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag=str.lower):
+def _tag(name: str) -> str:
+    """Return the tag of a message on the wire: "robot-config" for RobotConfig."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", "-", name).lower()
+
+
+class Message(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag=_tag):
     """A frame's content."""
 
 
@@ -95,21 +101,21 @@ class Undecided(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fie
         _cut(self, "reason")
 
 
-class Alarm(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="alarm"):
+class Inconsistent(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="alarm"):
     """The peer tells what cannot be so."""
 
     claim: Text
     """of the peer"""
     residual: Annotated[float, Meta(ge=0.0, le=1e15)] | None = None
     """by how much it cannot: m, m/s or rad; under noise sigmas; none where nothing comes near it"""
-    p_value: Odds = 0.0
+    p_value: Probability = 0.0
     """how probable that much is, if the peer is honest"""
 
     def __post_init__(self) -> None:
         _cut(self, "claim")
 
 
-Verdict = Localised | Undecided | Alarm
+Verdict = Localised | Undecided | Inconsistent
 
 
 Version = Annotated[str, Meta(max_length=64)]
@@ -126,7 +132,7 @@ class Environment(Message, frozen=True):
     linear_algebra: Version | None = None
 
 
-class Briefing(Message, frozen=True):
+class RobotConfig(Message, frozen=True):
     """Everything that a robot needs to start."""
 
     robot: RobotId
@@ -138,7 +144,7 @@ class Briefing(Message, frozen=True):
     mission: Mission
     variant: Variant
     rendezvous: Rendezvous
-    lie: Lie | None
+    lie: Attack | None
     """what it is told to tell its peer, instead of the truth"""
     tick_s: Annotated[float, Meta(gt=0.0, le=1e6)] | None
     """s of wall time that a tick lasts; none in lockstep, where no decision depends on a time-out"""
@@ -149,7 +155,7 @@ class Briefing(Message, frozen=True):
         return math.hypot(self.anchor.x - self.peer_anchor.x, self.anchor.y - self.peer_anchor.y)
 
 
-class Sense(Message, frozen=True):
+class Observation(Message, frozen=True):
     """World to one robot: what its sensors say at tick k."""
 
     tick: Tick
@@ -177,7 +183,7 @@ class Report(Message, frozen=True):
     since: Tick
     through: Tick
     """the log below covers the manoeuvres over [since, through]"""
-    runs: Annotated[tuple[Run, ...], Meta(max_length=MAX_REPORT_RUNS)]
+    runs: Annotated[tuple[Segment, ...], Meta(max_length=MAX_REPORT_RUNS)]
     ranges_since: Count
     """the log below has the ranges after the first so many"""
     ranges: Annotated[tuple[Ranged, ...], Meta(max_length=MAX_REPORT_RANGES)]
@@ -189,7 +195,7 @@ class Report(Message, frozen=True):
     verdict: Verdict | None = None
 
 
-class Drive(Message, frozen=True):
+class Command(Message, frozen=True):
     """Robot to world: what it does over [k, k + 1], and what it knows of itself."""
 
     tick: Tick
@@ -211,36 +217,36 @@ class Estimate(Message, frozen=True):
     world: tuple[Pose, ...]
     """its pose in the world frame, one for each placement that is left"""
     localised: bool
-    odds: tuple[Odds, ...] = ()
+    odds: tuple[Probability, ...] = ()
     """of each in `world`, or while there is none of each in `local`, the likeliest first; they sum to 1.
     None where sensors are exact: what is possible there is equally so"""
     covariance: Covariance | None = None
     """of the first in `world`"""
 
 
-class Truth(Message, frozen=True):
+class GroundTruth(Message, frozen=True):
     """World to viewers: where everyone really is at tick k."""
 
     tick: Tick
     poses: dict[RobotId, Pose]
 
 
-class Missed(Message, frozen=True):
+class DeadlineMissed(Message, frozen=True):
     """Only in journals, and only in real time: what tick k did without, for it did not come in time."""
 
     tick: Tick
     robot: RobotId
-    """whose Drive (in the world's journal) or Report (in an agent's)"""
+    """whose Command (in the world's journal) or Report (in an agent's)"""
 
 
-class Beat(Message, frozen=True):
+class TickStart(Message, frozen=True):
     """Without a world, one robot's driver to its peer's: tick k has begun."""
 
     tick: Tick
     robot: RobotId
 
 
-class End(Message, frozen=True):
+class MissionEnd(Message, frozen=True):
     """World to robots: the mission is over."""
 
     tick: Tick
@@ -251,8 +257,8 @@ class End(Message, frozen=True):
         _cut(self, "reason")
 
 
-class Farewell(Message, frozen=True):
-    """Robot to world, the answer to End: how it went, seen from inside."""
+class FinalReport(Message, frozen=True):
+    """Robot to world, the answer to MissionEnd: how it went, seen from inside."""
 
     robot: RobotId
     anchor_ranges: Count
@@ -268,11 +274,11 @@ class Farewell(Message, frozen=True):
     """J of eq. (8); none where one candidate was left, and nothing to be told apart"""
     hypotheses: Count | None
     """about the poses of both, that are left in the end"""
-    odds: Odds | None
+    odds: Probability | None
     """of the likeliest of them; none where sensors are exact"""
     missing: Text | None
     """under noise: what there was to know yet, before it could claim"""
-    p_value: Odds | None
+    p_value: Probability | None
     """under noise: the least with which the ranges spoke against what the peer told"""
     reports_sent: Count
     reports_heard: Count
@@ -291,5 +297,15 @@ class Farewell(Message, frozen=True):
         _cut(self, "missing")
 
 
-OfRobot = Environment | Briefing | Sense | Report | Drive | Estimate | Missed | End | Farewell
+OfRobot = (
+    Environment
+    | RobotConfig
+    | Observation
+    | Report
+    | Command
+    | Estimate
+    | DeadlineMissed
+    | MissionEnd
+    | FinalReport
+)
 """what stands in an agent's journal"""

@@ -49,7 +49,7 @@ class Covariance(msgspec.Struct, frozen=True, array_like=True, gc=False, forbid_
         return math.sqrt(max(0.0, self.hh))
 
 
-class Run(msgspec.Struct, frozen=True, array_like=True, gc=False, forbid_unknown_fields=True):
+class Segment(msgspec.Struct, frozen=True, array_like=True, gc=False, forbid_unknown_fields=True):
     """Equal manoeuvres, one after the other."""
 
     ticks: TickCount
@@ -83,7 +83,7 @@ def step(pose: Pose, v: float, omega: float, period: float) -> Pose:
     )
 
 
-def arc(start: Pose, run: Run, period: float) -> list[Pose]:
+def arc(start: Pose, run: Segment, period: float) -> list[Pose]:
     """Return the pose after each tick of `run`: what `step` gives from `start`, over k times `period`."""
     v, omega = run.v, run.omega
     x, y, heading = start.x, start.y, start.heading
@@ -98,7 +98,7 @@ def arc(start: Pose, run: Run, period: float) -> list[Pose]:
     return poses
 
 
-def follow(start: Pose, runs: Iterable[Run], period: float) -> Pose:
+def follow(start: Pose, runs: Iterable[Segment], period: float) -> Pose:
     """The pose at the end of `runs`. Equal manoeuvres are one arc, so each run costs one step."""
     pose = start
     for run in runs:

@@ -15,7 +15,7 @@ Floor = Annotated[float, Meta(ge=0.0, le=1e4)]
 Bias = Annotated[float, Meta(ge=0.0, le=1e6)]
 
 
-class Drift(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class VelocityNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """White noise on the v and omega of each tick: a fraction of each, and an absolute part."""
 
     v: Fraction = 0.0
@@ -48,16 +48,16 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
     """m: by how much then, uniform between these, the least and the most"""
     drop_outs: Probability = 0.0
     """that a range within R is not measured"""
-    actuation: Drift = Drift()
+    actuation: VelocityNoise = VelocityNoise()
     """how what is executed differs from what was asked for"""
-    odometry: Drift = Drift()
+    odometry: VelocityNoise = VelocityNoise()
     """how what the odometry measures differs from what was executed"""
 
     @cached_property
     def exact(self) -> bool:
         """Whether there is none: then a range is a fact, and so is silence."""
         ranges = self.anchor_sigma or self.mutual_sigma or self.outliers or self.drop_outs
-        return not ranges and self.actuation == self.odometry == Drift()
+        return not ranges and self.actuation == self.odometry == VelocityNoise()
 
     @property
     def unrest(self) -> tuple[float, float]:

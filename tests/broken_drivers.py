@@ -10,7 +10,7 @@ from signal import SIGKILL
 from msgspec.structs import replace
 
 from docs.rover import Rover
-from protocol.messages import Briefing
+from protocol.messages import RobotConfig
 from protocol.motion import REST, Controls
 from world.hardware.driver import Reading
 
@@ -101,7 +101,7 @@ class DrivesOnAfterStop(Rover):
 
 
 class DrivesForTwiceAsLong(Rover):
-    def __init__(self, briefing: Briefing, manoeuvre_s: float) -> None:
+    def __init__(self, briefing: RobotConfig, manoeuvre_s: float) -> None:
         super().__init__(briefing, manoeuvre_s)
         self._manoeuvre_s = 2.0 * manoeuvre_s
 
@@ -109,7 +109,7 @@ class DrivesForTwiceAsLong(Rover):
 class DrivesInHalfTheTime(Rover):
     """All of it, twice as fast."""
 
-    def __init__(self, briefing: Briefing, manoeuvre_s: float) -> None:
+    def __init__(self, briefing: RobotConfig, manoeuvre_s: float) -> None:
         super().__init__(briefing, manoeuvre_s)
         self._manoeuvre_s = 0.5 * manoeuvre_s
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
-from tests.commands import BOUND_S, Command
+from tests.commands import BOUND_S, TandemProcess
 
 BOUND_MS = 1000 * BOUND_S
 SERVER_GONE = "ERR_(CONNECTION_(REFUSED|RESET|CLOSED)|EMPTY_RESPONSE|INCOMPLETE_CHUNKED_ENCODING)"
@@ -70,13 +70,13 @@ def pages(browser: Browser) -> Iterator[Open]:
 
 
 @contextmanager
-def watching(*arguments: str | Path) -> Iterator[tuple[Command, str]]:
+def watching(*arguments: str | Path) -> Iterator[tuple[TandemProcess, str]]:
     """`tandem watch`, and the address of its page."""
-    with Command("watch", *arguments) as command:
+    with TandemProcess("watch", *arguments) as command:
         yield command, address_of(command)
 
 
-def address_of(command: Command) -> str:
+def address_of(command: TandemProcess) -> str:
     """Where its page is, once it has said so."""
     command.until_says("http://127.0.0.1:")
     found = re.search(r"http://\S+", command.out)

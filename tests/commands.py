@@ -99,7 +99,7 @@ class Ended(NamedTuple):
     err: str
 
 
-class Command:
+class TandemProcess:
     """A process of `tandem` in its own session. When its `with` ends, it is terminated, then killed."""
 
     def __init__(
@@ -163,7 +163,7 @@ class Command:
         self.until(lambda: size(path) >= amount, f"{path.name} holds {amount} bytes")
 
     def until_answered(self, robot: str, record: Path) -> None:
-        """Wait until `robot` has answered tick 0: its Sense, Drive and Estimate are in the recording."""
+        """Wait until `robot` has answered tick 0: its Observation, Command and Estimate are in the recording."""
         path = record / f"agent-{robot}.journal"
         self.until(
             lambda: path.exists() and len(list(journal_file.read(path))) >= 5, f"{robot} answers tick 0"
@@ -188,7 +188,7 @@ class Command:
         """Return whether the process has a handler for that signal by now."""
         return bool(_signals_caught(self.pid) >> (number - 1) & 1)
 
-    def __enter__(self) -> Command:
+    def __enter__(self) -> TandemProcess:
         return self
 
     def __exit__(
@@ -224,7 +224,7 @@ def on_a_terminal(*arguments: str | Path) -> tuple[int, str]:
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))  # the last two are pixels
     shown = b""
-    with Command(*arguments, terminal=theirs) as command:
+    with TandemProcess(*arguments, terminal=theirs) as command:
         os.close(theirs)
         while True:
             try:
@@ -236,10 +236,10 @@ def on_a_terminal(*arguments: str | Path) -> tuple[int, str]:
 
 
 @contextmanager
-def world(scenario: str | Path, *arguments: str | Path) -> Iterator[tuple[Command, str]]:
+def world(scenario: str | Path, *arguments: str | Path) -> Iterator[tuple[TandemProcess, str]]:
     """Yield a world that waits for its robots, and its endpoint."""
     endpoint = free_endpoint()
-    with Command("world", scenario, "--listen", endpoint, *arguments) as command:
+    with TandemProcess("world", scenario, "--listen", endpoint, *arguments) as command:
         command.until_says("waiting for")
         yield command, endpoint
 

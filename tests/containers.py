@@ -27,7 +27,7 @@ from urllib.error import URLError
 from urllib.request import urlopen
 
 from compose.launch.processes import free_endpoint
-from tests.commands import Command, tandem, until
+from tests.commands import TandemProcess, tandem, until
 from tests.podman import DEPLOY, HOUSE, Podman, Unable
 
 BASE, LEAN, LAB = (f"localhost/tandem-check{part}" for part in ("-base", "", "-lab"))
@@ -242,9 +242,9 @@ def on_a_robot(podman: Podman, folder: Path) -> bool:
         os.chown(path, 10001, 10001)
     with ExitStack() as stack:
         with_keys = ("--listen", endpoint, "--keys", keys / "world", "-q")
-        world = stack.enter_context(Command("world", "random", *with_keys))
+        world = stack.enter_context(TandemProcess("world", "random", *with_keys))
         peer = ("--connect", endpoint, "--keys", keys / "agent-b", "-q")
-        stack.enter_context(Command("agent", "b", *peer))
+        stack.enter_context(TandemProcess("agent", "b", *peer))
         said = podman(
             *("run", "--rm", "--network=host", "--read-only", "--cap-drop=all"),
             *("-v", f"{keys}/agent-a:/keys:ro", "-v", f"{journal}:/journal"),

@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 from compose.recording.run import Record, read
-from tests.commands import ENDLESS, Command, process_of
+from tests.commands import ENDLESS, TandemProcess, process_of
 
 RATES = (1, 10, 100)
 """Hz"""
@@ -52,7 +52,7 @@ def played(folder: Path, rate: int, stopped: float) -> Record:
     """The record of 10 s at that rate, with a's agent stopped in the middle."""
     scenario, out = folder / "mission.toml", folder / "out"
     scenario.write_text(f"max_ticks = {rate * LASTS_S}\n" + ENDLESS.replace("max_ticks", "# max_ticks"))
-    with Command("run", scenario, "--rate", str(rate), "--out", out, "-q") as run:
+    with TandemProcess("run", scenario, "--rate", str(rate), "--out", out, "-q") as run:
         if stopped:
             run.until_answered("a", out)
             agent = process_of(out, "agent", "a")

@@ -23,7 +23,7 @@ HANGS = "hangs"
 """a file that a trial leaves which hangs, and no other"""
 
 
-class Owned(worker_pool.Child):
+class Owned(worker_pool.WorkerProcess):
     """Is given up only where a trial hangs, however long another takes."""
 
     def answer(self, timeout: float) -> bytes:
@@ -36,7 +36,7 @@ class Owned(worker_pool.Child):
                     raise
 
 
-def astray(one: trial.Trial) -> trial.Row:
+def astray(one: trial.Trial) -> trial.TrialRow:
     """The second trial raises, the fourth ends its process, the sixth never ends; others are as they are."""
     match one.number:
         case 1:
@@ -49,7 +49,7 @@ def astray(one: trial.Trial) -> trial.Row:
     return trial.play(one)
 
 
-def boastful(one: trial.Trial) -> trial.Row:
+def boastful(one: trial.Trial) -> trial.TrialRow:
     """In the third trial of a cell robots say that they know where they are before they do."""
     if one.number != 2:
         return trial.play(one)
@@ -68,7 +68,7 @@ class Boaster(Robot):
         return frame
 
 
-def endless(one: trial.Trial) -> trial.Row:
+def endless(one: trial.Trial) -> trial.TrialRow:
     """None ends; each says that it has begun."""
     Path(tempfile.gettempdir(), "playing").touch()
     threading.Event().wait()
@@ -79,7 +79,7 @@ def main(function: str, source: str, out: str) -> None:
     """Play the campaign so on two workers, as `tandem sweep` does."""
     inbox = Inbox("misbehaving")
     stop_by_signal(inbox)
-    means = execution.Means(workers=2, play=f"tests.misbehaving:{function}")
+    means = execution.ExecutionOptions(workers=2, play=f"tests.misbehaving:{function}")
     silent = execution.Progress(say=print, begin=lambda *_: None, done=lambda _: None)
     with patch.object(worker_pool, "Child", Owned):
         results = execution.sweep(spec.load(source), Path(out), means, inbox, silent)

@@ -23,11 +23,11 @@ from typing import NamedTuple
 
 from compose.network import KEYED
 from protocol.journal import journal_file
-from protocol.messages import Drive, End, Environment, Farewell, Missed
+from protocol.messages import Command, DeadlineMissed, Environment, FinalReport, MissionEnd
 from protocol.network import session
 from protocol.network.endpoints import Endpoints, configured
 from protocol.wire import MAX_FRAME_BYTES, decode
-from tests.commands import LONG, PAPER_1, Command, Ended, journals, size, tandem, until
+from tests.commands import LONG, PAPER_1, Ended, TandemProcess, journals, size, tandem, until
 from world.scenario import Scenario
 
 HOSTS = {"world": "10.77.0.1", "a": "10.77.0.2", "b": "10.77.0.3", "router": "10.77.0.4"}
@@ -123,11 +123,13 @@ class Run:
                 robot, "agent", robot, "--connect", router if case.routed else clock
             )
 
-    def _part(self, host: str, *arguments: str) -> Command:
+    def _part(self, host: str, *arguments: str) -> TandemProcess:
         through = self._network.on(host)
         name = host if host == "world" else f"agent-{host}"
         keys = ["--keys", str(self._keys / name)] if self._keys is not None else []
-        return self._stack.enter_context(Command(*arguments, *keys, "--out", self.out, "-q", through=through))
+        return self._stack.enter_context(
+            TandemProcess(*arguments, *keys, "--out", self.out, "-q", through=through)
+        )
 
     def start_router(self) -> None:
         """The router between the world and the agents."""
@@ -141,11 +143,11 @@ class Run:
 
     def answered(self) -> int:
         """The latest tick in which both answered."""
-        kinds = Environment | Scenario | Drive | Missed | End | Farewell
+        kinds = Environment | Scenario | Command | DeadlineMissed | MissionEnd | FinalReport
         both: dict[int, int] = {}
         for frame in journal_file.read(self.out / "world.journal"):
             message = decode(frame, kinds, MAX_FRAME_BYTES)
-            if isinstance(message, Drive):
+            if isinstance(message, Command):
                 both[message.tick] = both.get(message.tick, 0) + 1
         return max([tick for tick, number in both.items() if number == 2], default=-1)
 

@@ -27,7 +27,7 @@ from compose.audit.replay import Replay, replay
 from compose.recording.run import WORLD_JOURNAL, agent_journal
 from compose.view.export.folder import export
 from protocol.journal import journal_file
-from tests.commands import LONG, Command, journals, process_of, processes_of, tandem, until
+from tests.commands import LONG, TandemProcess, journals, process_of, processes_of, tandem, until
 from tests.same_plans import played, said, scenario
 
 PAPER = ("paper-1", "paper-2")
@@ -78,7 +78,7 @@ def killed(draw: random.Random, folder: Path) -> tuple[str, bool]:
     who = draw.choice(["world", "agent a", "agent b", "run"])
     watched = out / (WORLD_JOURNAL if who in ("world", "run") else agent_journal(who[-1]))
     moment = draw.randint(1, KILL_BYTES)
-    with Command("run", folder / "long.toml", "-q", "--out", out) as run:
+    with TandemProcess("run", folder / "long.toml", "-q", "--out", out) as run:
         run.until_written(watched, moment)
         os.kill(run.pid if who == "run" else process_of(out, *who.split()), signal.SIGKILL)
         run.ended()

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from agent.planning import planner
-from agent.planning.state import Mind
+from agent.planning.state import RobotState
 from compose.scenario.scenario_file import load
-from protocol.messages import Drive, Report, Sense
+from protocol.messages import Command, Observation, Report
 from world.tick import World, advance, release, senses
 
 
@@ -16,17 +16,17 @@ class Step(NamedTuple):
     """One tick: what went into each of its halves, and what came out."""
 
     world: World
-    sensed: list[Sense]
-    before: dict[str, Mind]
-    observed: dict[str, Mind]
+    sensed: list[Observation]
+    before: dict[str, RobotState]
+    observed: dict[str, RobotState]
     heard: dict[str, list[Report]]
-    drives: dict[str, Drive]
+    drives: dict[str, Command]
 
 
 def steps(name: str) -> Iterator[Step]:
     """The ticks of the scenario `name`, which ends localised."""
     world = release(load(name))
-    minds = {robot.id: Mind(world.scenario.briefing(robot.id)) for robot in world.scenario.robots}
+    minds = {robot.id: RobotState(world.scenario.briefing(robot.id)) for robot in world.scenario.robots}
     while True:
         sensed = senses(world)
         observed = {sense.robot: planner.observe(minds[sense.robot], sense) for sense in sensed}

@@ -32,18 +32,27 @@ from compose.launch import in_process
 from compose.recording.summary_json import leave, summary
 from compose.scenario.scenario_file import load
 from protocol.journal.journal_file import read
-from protocol.messages import Briefing, Drive, End, Environment, Estimate, Farewell, Report, Sense
+from protocol.messages import (
+    Command,
+    Environment,
+    Estimate,
+    FinalReport,
+    MissionEnd,
+    Observation,
+    Report,
+    RobotConfig,
+)
 from protocol.motion import Controls
 from protocol.network import keys, session
 from protocol.network.endpoints import at
 from protocol.network.inbox import Inbox
 from protocol.wire import MAX_SENT_BYTES, decode, encode
-from tests.commands import BOUND_S, SECTION_IV, Command, until, world
+from tests.commands import BOUND_S, SECTION_IV, TandemProcess, until, world
 from world.scenario import Scenario
 
 RUN = "storm"
 CALM_TICKS = 12
-"""at the end, so that the last frame is in before the End"""
+"""at the end, so that the last frame is in before the MissionEnd"""
 LINK_BYTES = 47_000
 """a little less than what breaks a low-latency link"""
 PLAYED, PUPPETS = ("a", "b"), ("c", "d")
@@ -111,12 +120,20 @@ class Genuine:
         for robot, peer in peers.items():
             for frame in read(folder / f"agent-{robot}.journal"):
                 message: Any = decode(
-                    frame, Environment | Briefing | Sense | Report | Drive | Estimate | End | Farewell
+                    frame,
+                    Environment
+                    | RobotConfig
+                    | Observation
+                    | Report
+                    | Command
+                    | Estimate
+                    | MissionEnd
+                    | FinalReport,
                 )
                 match message:
-                    case Sense():
+                    case Observation():
                         key = keys.sense(RUN, robot)
-                    case Drive():
+                    case Command():
                         key = keys.drive(RUN, robot)
                     case Estimate():
                         key = keys.estimate(RUN, robot)
@@ -219,7 +236,7 @@ class Storm:
             return self.truncated(key, tick)
         past = self._draw.randrange(max(0, tick - 80), tick - 1)
         message = self._forged(key, past)
-        fates: dict[type, Fate] = {Drive: "passed over", Report: "either"}
+        fates: dict[type, Fate] = {Command: "passed over", Report: "either"}
         kind = type(message).__name__
         return Shot(f"{kind} of an old tick", key, encode(message), fates.get(type(message), "refused"))
 
@@ -265,11 +282,11 @@ class Storm:
         robot, some = _robot(key), self._draw.uniform(0.01, 3.0)
         match _topic(key):
             case "sense" if end and self._draw.random() < 0.3:
-                return End(tick, "localised" if some < 1.0 else "failed", None)
+                return MissionEnd(tick, "localised" if some < 1.0 else "failed", None)
             case "sense":
-                return Sense(tick, robot, Controls(some / 3.0, some), some)
+                return Observation(tick, robot, Controls(some / 3.0, some), some)
             case "drive":
-                return Drive(tick, robot, some / 3.0, -some, 2, "storming")
+                return Command(tick, robot, some / 3.0, -some, 2, "storming")
             case _:
                 return Report(tick, robot, 1, "storming", None, 0, 0, (), 0, (), 0, self._draw.randint(0, 1))
 
@@ -352,7 +369,9 @@ def rage(
     tally, storm = Tally(), Storm(genuine, seed)
     with world(file, "--run", RUN, "--out", out) as (clock, endpoint), ExitStack() as others:
         agents = {
-            robot: others.enter_context(Command("agent", robot, "--connect", endpoint, "--out", out, "-q"))
+            robot: others.enter_context(
+                TandemProcess("agent", robot, "--connect", endpoint, "--out", out, "-q")
+            )
             for robot in PLAYED
         }
         for robot, agent in agents.items():
@@ -435,20 +454,22 @@ def _played(inbox: Inbox, drives: dict[str, zenoh.Publisher], genuine: Genuine) 
         arrival = inbox.next(BOUND_S)
         assert arrival.topic == "sense", "the world is silent"
         robot = arrival.source.robot
-        message: Sense | End | Farewell = decode(arrival.frame, Sense | End | Farewell)
+        message: Observation | MissionEnd | FinalReport = decode(
+            arrival.frame, Observation | MissionEnd | FinalReport
+        )
         match message:
-            case Sense(tick):
+            case Observation(tick):
                 if tick > latest:
                     latest = tick
                     yield tick
                 drives[robot].put(genuine.by_key[keys.drive(RUN, robot)][tick])
-            case End():
+            case MissionEnd():
                 drives[robot].put(genuine.farewells[robot])
-            case Farewell():
+            case FinalReport():
                 parted.add(robot)
 
 
-def _look(processes: dict[str, Command], tally: Tally) -> None:
+def _look(processes: dict[str, TandemProcess], tally: Tally) -> None:
     for name, process in processes.items():
         status = Path(f"/proc/{process.pid}/status").read_text()
         found = re.search(r"VmRSS:\s*(\d+) kB", status)
@@ -487,7 +508,7 @@ def main(arguments: argparse.Namespace) -> int:
     console.print(
         f"{tally.frames:,} frames in {tally.seconds:.0f} s, {tally.frames / tally.seconds:,.0f} a second; "
         f"{tally.outcome}, {'the same' if tally.same else 'ANOTHER'} ticks.csv; "
-        f"the world left aside {tally.late:,} Drives of ticks past; statuses {tally.statuses}"
+        f"the world left aside {tally.late:,} Commands of ticks past; statuses {tally.statuses}"
     )
     good = tally.outcome == "localised" and tally.same and all(map(tally.accounted, tally.memory))
     if not good:

@@ -25,7 +25,7 @@ from agent.planning.phase3_last_manoeuvre import compared
 from compose.cli.figures import draw as draw_all
 from compose.figures import PICTURES, catalogue, decisions, manoeuvre, over_time, phase_one, steps, trajectory
 from compose.figures.account import account
-from compose.figures.pair import Pair, of_record
+from compose.figures.pair import PairRecord, of_record
 from compose.figures.sheet import Absent
 from compose.figures.style import look
 from compose.launch.in_process import play
@@ -33,7 +33,7 @@ from compose.recording.run import estimates, read
 from compose.recording.summary_json import first_claim
 from compose.scenario.scenario_file import load, parse
 from protocol.journal.journal_file import read as frames
-from protocol.messages import Drive
+from protocol.messages import Command
 from protocol.mission import Role
 from protocol.motion import step, wrap
 from protocol.wire import MalformedFrame, decode, encode
@@ -89,7 +89,7 @@ def recorded(name: str, records: Path) -> Path:
     return folder
 
 
-def pair(folder: Path, number: int = 0) -> Pair:
+def pair(folder: Path, number: int = 0) -> PairRecord:
     record = read(folder)
     places = record.scenario.pairs()[number]
     robots = [record.scenario.robots[place].id for place in places]
@@ -427,9 +427,9 @@ def test_no_plan_is_said_to_be_none_where_only_a_journal_is_missing(records: Pat
 
 
 def _turned(frame: bytes, tick: int) -> bytes:
-    """A Drive of that tick with a bit more of a turn."""
+    """A Command of that tick with a bit more of a turn."""
     try:
-        drive = decode(frame, Drive)
+        drive = decode(frame, Command)
     except MalformedFrame:
         return frame
     return encode(replace(drive, omega=drive.omega + 1e-12)) if drive.tick == tick else frame

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from compose.launch import in_process
-from compose.scenario.scenario_file import Setting, Unworkable, validate
+from compose.scenario.scenario_file import ScenarioTemplate, Unworkable, validate
 from compose.scenario.toml_file import table_in
 from compose.sweep import spec
 from compose.sweep.cells import cells, trial_seed, trial_table
@@ -47,7 +47,7 @@ def test_thousands_of_missions_in_any_setting_localise_or_are_refused() -> None:
     assert outcomes["refused"] < 0.12 * outcomes.total()
 
 
-def released(mission: str, a: str, b: str) -> Setting:
+def released(mission: str, a: str, b: str) -> ScenarioTemplate:
     text = f'name = "case"\n[mission]\n{mission}\n[[robot]]\nid = "a"\n{a}\n[[robot]]\nid = "b"\n{b}\n'
     return validate(table_in(text, "case"), "case")
 

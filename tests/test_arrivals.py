@@ -15,13 +15,13 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from compose.scenario.scenario_file import load
-from protocol.messages import Drive, Report, Sense
+from protocol.messages import Command, Observation, Report
 from protocol.motion import ORIGIN
 from protocol.network import keys, session
 from protocol.network.endpoints import listening
 from protocol.network.inbox import COMPLAINTS, NOTHING, Inbox
 from protocol.wire import encode
-from tests.commands import BOUND_S, Command, several_pairs, tandem, until, world
+from tests.commands import BOUND_S, TandemProcess, several_pairs, tandem, until, world
 from tests.storm import stranger_at
 
 RUN = "mine"
@@ -113,8 +113,8 @@ ODD = [
 FRAMES = [
     b"",
     b"\xff" * 40,
-    encode(Drive(0, "a", 1.0, 1.0, 1, "forged")),
-    encode(Sense(0, "a", None, 1.0)),
+    encode(Command(0, "a", 1.0, 1.0, 1, "forged")),
+    encode(Observation(0, "a", None, 1.0)),
     encode(Report(0, "b", 1, "forged", ORIGIN, 0, 0, (), 0, (), 0, 0)),
 ]
 
@@ -149,8 +149,8 @@ def test_wildcards_odd_keys_and_deletions_end_no_process_and_change_nothing(tmp_
     scenario.write_text(several_pairs(2))
     with world(scenario, "--run", RUN, "--out", out) as (clock, endpoint), ExitStack() as others:
 
-        def start(*arguments: str | Path) -> Command:
-            return others.enter_context(Command(*arguments, "--connect", endpoint))
+        def start(*arguments: str | Path) -> TandemProcess:
+            return others.enter_context(TandemProcess(*arguments, "--connect", endpoint))
 
         watch = start("watch", "--port", "0")
         watch.until_says("http://")

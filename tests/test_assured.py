@@ -16,13 +16,13 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from agent.estimation.closed_forms import Placement, same_placement
-from agent.estimation.exact import Sighting, turn_error, weigh_placements
+from agent.estimation.exact import PairObservation, turn_error, weigh_placements
 from agent.planning import planner
 from agent.planning.phase3_last_manoeuvre import SPEEDS, TURN_RATES, LastManoeuvre, base, solve
 from agent.planning.precision import apart, drift
-from agent.planning.state import Mind
+from agent.planning.state import RobotState
 from compose.launch.in_process import play
-from compose.recording.run import Moment, Record
+from compose.recording.run import Record, TickRecord
 from compose.scenario.scenario_file import parse
 from protocol.messages import Localised
 from protocol.mission import Mission, obstacle
@@ -113,7 +113,7 @@ def assert_localised(record: Record) -> None:
         assert max(errors(verdict.pose, truth)) < 1e-6, starts
 
 
-def in_contact(record: Record, moment: Moment) -> bool:
+def in_contact(record: Record, moment: TickRecord) -> bool:
     a, b = moment.truth.local
     return math.hypot(a.x - b.x, a.y - b.y) <= record.scenario.mission.sensing_range
 
@@ -141,7 +141,7 @@ def states(record: Record, robot: str) -> list[tuple[int, str]]:
 # --- phase 3 begins as soon as it can -----------------------------------------------------------------
 
 
-def off_anchor(record: Record, moment: Moment) -> bool:
+def off_anchor(record: Record, moment: TickRecord) -> bool:
     """Whether b is at least half way to where it waits, R / 8 from its anchor."""
     anchor, place = record.scenario.robots[1].anchor, moment.truth.local[1]
     return math.hypot(place.x - anchor.x, place.y - anchor.y) >= record.scenario.mission.sensing_range / 16.0
@@ -233,7 +233,7 @@ def test_however_long_b_has_waited_the_first_report_tells_the_whole_way(
 # --- what was sensed before phase 3 counts ------------------------------------------------------------
 
 
-def encounter(record: Record) -> list[Moment]:
+def encounter(record: Record) -> list[TickRecord]:
     """The ticks from the beginning of phase 3 until b sets out on its last manoeuvre, or the claim."""
     moments = record.moments[met(record) :]
     end = next(
@@ -291,7 +291,7 @@ def test_without_what_was_sensed_before_phase_3_more_placements_would_be_left(tm
 # --- nobody claims without a check --------------------------------------------------------------------
 
 
-def places(moment: Moment) -> tuple[float, ...]:
+def places(moment: TickRecord) -> tuple[float, ...]:
     """m: of a and of b."""
     a, b = moment.truth.local
     return a.x, a.y, b.x, b.y
@@ -368,7 +368,7 @@ def test_to_look_behind_is_never_slower_than_to_circle_for_who_turns_slowly_and_
 # --- the last manoeuvre -------------------------------------------------------------------------------
 
 
-def left_out(mind: Mind, v: float, omega: float, candidates: tuple[Placement, ...]) -> list[Placement]:
+def left_out(mind: RobotState, v: float, omega: float, candidates: tuple[Placement, ...]) -> list[Placement]:
     """Those by which a is out of range of b, who is at `mind`, once b has driven (v, omega)."""
     mission = mind.briefing.mission
     end = step(mind.local_pose, v, omega, mission.period)
@@ -440,12 +440,12 @@ coordinates = st.floats(-20.0, 20.0)
 poses = st.builds(Pose, coordinates, coordinates, angles)
 
 
-def sighted(placement: Placement, a: Pose, b: Pose) -> Sighting:
+def sighted(placement: Placement, a: Pose, b: Pose) -> PairObservation:
     there = placement.place(a)
-    return Sighting(0, a, b, math.hypot(there.x - b.x, there.y - b.y))
+    return PairObservation(0, a, b, math.hypot(there.x - b.x, there.y - b.y))
 
 
-def ranges_of(distance: float, phi: float, psi: float, sightings: list[Sighting]) -> list[float]:
+def ranges_of(distance: float, phi: float, psi: float, sightings: list[PairObservation]) -> list[float]:
     """m: as predicted where M1 lies in the direction psi of M2, and <a(M1)> is turned by phi."""
     placement = Placement(phi, distance * math.cos(psi), distance * math.sin(psi))
     found = [sighted(placement, one.a, one.b).range for one in sightings if one.range is not None]
@@ -471,7 +471,7 @@ def test_turn_error_is_how_far_least_squares_would_turn_a_robot_at_the_worst(
     slopes = np.column_stack([by_phi, by_psi])
     assume(np.linalg.cond(slopes) < 1e3)
     fit = np.linalg.pinv(slopes)
-    sighted_all = [*sightings, Sighting(0, Pose(1.0, 2.0, 3.0), ORIGIN, None)]
+    sighted_all = [*sightings, PairObservation(0, Pose(1.0, 2.0, 3.0), ORIGIN, None)]
     alone = [np.abs(turned).sum() for turned in (fit[0] - fit[1], fit[1])]
     assert turn_error(placement, sighted_all, 1.0, 0.0) == pytest.approx(max(alone), rel=1e-3)
     places = [placement.place(one.a) for one in sightings]
@@ -502,7 +502,9 @@ OPEN = {
 """Double roots of eq. (7), and less: a placement, and where a and b were when they were ranged"""
 
 
-def seen_at(placement: Placement, *places: tuple[tuple[float, float], tuple[float, float]]) -> list[Sighting]:
+def seen_at(
+    placement: Placement, *places: tuple[tuple[float, float], tuple[float, float]]
+) -> list[PairObservation]:
     return [sighted(placement, Pose(*a, 0.0), Pose(*b, 0.0)) for a, b in places]
 
 

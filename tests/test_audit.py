@@ -16,7 +16,7 @@ import pytest
 from msgspec.structs import replace
 
 from agent.planning import planner
-from agent.planning.state import Mind
+from agent.planning.state import RobotState
 from agent.process.robot import Robot
 from compose.audit.findings import Findings, Violation
 from compose.audit.rules import RULES, audit, judge
@@ -24,26 +24,35 @@ from compose.launch import in_process
 from compose.recording.frames import KINDS
 from compose.recording.run import WORLD_JOURNAL, agent_journal, read
 from compose.scenario.scenario_file import load, parse, shipped
-from protocol.attack import Lie
+from protocol.attack import Attack
 from protocol.journal import journal_file
-from protocol.journal.journal_file import CorruptJournal, Kept
+from protocol.journal.journal_file import CorruptJournal, MemoryJournal
 from protocol.messages import (
-    Briefing,
+    Command,
     Contact,
-    Drive,
-    End,
+    DeadlineMissed,
     Estimate,
-    Farewell,
+    FinalReport,
     Localised,
-    Missed,
+    MissionEnd,
+    Observation,
     Report,
-    Sense,
+    RobotConfig,
     Undecided,
 )
 from protocol.mission import Anchor
-from protocol.motion import Covariance, Run
+from protocol.motion import Covariance, Segment
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
-from tests.commands import OVER, REAL_TIME, SECTION_IV, Command, Ended, process_of, several_pairs, tandem
+from tests.commands import (
+    OVER,
+    REAL_TIME,
+    SECTION_IV,
+    Ended,
+    TandemProcess,
+    process_of,
+    several_pairs,
+    tandem,
+)
 from tests.test_real_time import missed
 from world.referee import Judgement
 from world.scenario import Scenario
@@ -81,7 +90,7 @@ def noise(seed: int, variant: str) -> Scenario:
 
 def kept(scenario: Scenario) -> dict[str, list[bytes]]:
     """The journals of its run in this process."""
-    books = {name: Kept() for name in in_process.journals(scenario)}
+    books = {name: MemoryJournal() for name in in_process.journals(scenario)}
     in_process.played(scenario, books)
     return {name: book.frames for name, book in books.items()}
 
@@ -118,7 +127,7 @@ def test_an_honest_run_keeps_every_rule(scenario: Scenario) -> None:
     assert made["sense"] == robots * ticks
     assert (
         made["decision"] == 2 * robots * ticks + made["log"] + robots
-    )  # Drives, Estimates; Reports; Farewells
+    )  # Commands, Estimates; Reports; FinalReports
     assert made["order"] == 1 + robots * (2 * ticks + 3)
     heard = [decode(frame, KINDS, MAX_FRAME_BYTES) for name in journals for frame in journals[name]]
     assert made["report"] == made["log"] == sum(isinstance(one, Report) for one in heard) / 2
@@ -147,11 +156,11 @@ def test_a_run_as_processes_keeps_every_rule_and_the_command_says_so(tmp_path: P
 def test_a_run_in_real_time_in_which_drives_were_missed_keeps_every_rule(tmp_path: Path) -> None:
     out = tmp_path / "out"
     (tmp_path / "assured.toml").write_text(REAL_TIME)
-    with Command("run", tmp_path / "assured.toml", "--rate", "20", "--out", out, "-q") as run:
+    with TandemProcess("run", tmp_path / "assured.toml", "--rate", "20", "--out", out, "-q") as run:
         run.until_written(out / WORLD_JOURNAL, 3000)
         stopped = process_of(out, "agent", "a")
         os.kill(stopped, SIGSTOP)
-        run.until(lambda: missed(out / WORLD_JOURNAL, "a") >= 3, "three of a's Drives are missed")
+        run.until(lambda: missed(out / WORLD_JOURNAL, "a") >= 3, "three of a's Commands are missed")
         os.kill(stopped, SIGCONT)
         assert run.ended().status in OVER
     findings = audit(out)
@@ -160,9 +169,9 @@ def test_a_run_in_real_time_in_which_drives_were_missed_keeps_every_rule(tmp_pat
 
 
 def test_a_run_that_failed_was_failed_by_nobody_on_record() -> None:
-    """The world ends it when nobody answers any more; a robot that did answers the End."""
+    """The world ends it when nobody answers any more; a robot that did answers the MissionEnd."""
     scenario = load("paper-1")
-    books = {name: Kept() for name in in_process.journals(scenario)}
+    books = {name: MemoryJournal() for name in in_process.journals(scenario)}
     course = Course(scenario, books[WORLD_JOURNAL])
     robots = {robot: Robot(scenario.briefing(robot), books[agent_journal(robot)]) for robot in "ab"}
     for _ in range(5):
@@ -180,7 +189,7 @@ def test_a_run_that_failed_was_failed_by_nobody_on_record() -> None:
     course.farewells([robots["a"].farewell(end)])
     findings = judge({name: book.frames for name, book in books.items()})
     assert found(findings) == [(4, "b", "order")]
-    assert findings.violations[0].what == "its journal breaks off here, expected End and Farewell"
+    assert findings.violations[0].what == "its journal breaks off here, expected MissionEnd and Farewell"
 
 
 # --- a record that breaks off -----------------------------------------------------------------------------
@@ -198,15 +207,15 @@ def test_a_journal_that_breaks_off_anywhere_breaks_no_other_rule(
     whole = paper_1[name]
     for count in range(2 * (name == WORLD_JOURNAL), len(whole)):  # its scenario at least
         findings = judge(paper_1 | {name: whole[:count]})
-        if name == WORLD_JOURNAL and count >= len(whole) - 2:  # a Farewell is lacking, or both
-            assert {one.what for one in findings.violations} == {"the world has no Farewell of it"}
+        if name == WORLD_JOURNAL and count >= len(whole) - 2:  # a FinalReport is lacking, or both
+            assert {one.what for one in findings.violations} == {"the world has no FinalReport of it"}
             continue
         (violation,) = findings.violations
         left = [decode(frame, KINDS, MAX_FRAME_BYTES) for frame in whole[:count]]
-        ticks = [one.tick for one in left if isinstance(one, Sense)]
+        ticks = [one.tick for one in left if isinstance(one, Observation)]
         if name == WORLD_JOURNAL:
-            ticks = [one.tick for one in left[:-1] if isinstance(one, Drive) and one.robot == "b"]
-            ticks += [one.tick for one in left[-1:] if isinstance(one, Drive) and one.robot == "b"]
+            ticks = [one.tick for one in left[:-1] if isinstance(one, Command) and one.robot == "b"]
+            ticks += [one.tick for one in left[-1:] if isinstance(one, Command) and one.robot == "b"]
         robot = {A: "a", B: "b"}.get(name)
         assert (violation.rule, violation.robot, violation.tick) == (
             "order",
@@ -281,17 +290,17 @@ def what(findings: Findings, rule: str) -> list[str]:
 
 def test_drives_in_another_order_are_found_and_what_follows_is_not_read(folder: Path) -> None:
     told = messages(folder / WORLD_JOURNAL)
-    a, b = (i for i, one in enumerate(told) if isinstance(one, Drive) and one.tick == 12)
+    a, b = (i for i, one in enumerate(told) if isinstance(one, Command) and one.tick == 12)
     told[a], told[b] = told[b], told[a]
     written(folder / WORLD_JOURNAL, told)
     findings = audit(folder)
     assert [one.line for one in findings.violations] == [
-        "tick 12, the world, order: a Drive of b of tick 12 is out of order"
+        "tick 12, the world, order: a Command of b of tick 12 is out of order"
     ]
     assert findings.ticks == 12
 
 
-@pytest.mark.parametrize("kind", [Sense, Drive, Estimate])
+@pytest.mark.parametrize("kind", [Observation, Command, Estimate])
 def test_a_frame_that_an_agent_has_not_journaled_is_missed(kind: type, folder: Path) -> None:
     plant(folder / A, (of(kind, 12), nothing))
     findings = audit(folder)
@@ -302,20 +311,22 @@ def test_a_tick_that_an_agent_has_left_out_is_missed(folder: Path) -> None:
     told = [one for one in messages(folder / A) if getattr(one, "tick", None) != 12]
     written(folder / A, told)
     assert [one.line for one in audit(folder).violations] == [
-        "tick 13, a, order: a Sense of tick 13 is out of order"
+        "tick 13, a, order: a Observation of tick 13 is out of order"
     ]
 
 
 def test_a_drive_that_the_world_was_not_given_is_found(folder: Path) -> None:
-    plant(folder / A, (of(Drive, 12), to(omega=0.25)))
+    plant(folder / A, (of(Command, 12), to(omega=0.25)))
     findings = audit(folder)
     assert found(findings) == [(12, "a", "order"), (12, "a", "decision")]
-    assert what(findings, "order") == ["the world's Drive of it: omega is 0.15384615384615385, expected 0.25"]
-    assert what(findings, "decision") == ["in its Drive, omega is 0.25, expected 0.15384615384615385"]
+    assert what(findings, "order") == [
+        "the world's Command of it: omega is 0.15384615384615385, expected 0.25"
+    ]
+    assert what(findings, "decision") == ["in its Command, omega is 0.25, expected 0.15384615384615385"]
 
 
 def test_a_drive_that_the_world_has_changed_is_found_and_leads_elsewhere(folder: Path) -> None:
-    plant(folder / WORLD_JOURNAL, (of(Drive, 40, "b"), to(v=0.5)))
+    plant(folder / WORLD_JOURNAL, (of(Command, 40, "b"), to(v=0.5)))
     findings = audit(folder)
     assert found(findings)[:2] == [(40, "b", "order"), (41, "b", "sense")]
     assert {(robot, rule) for tick, robot, rule in found(findings)[1:]} <= {
@@ -324,13 +335,13 @@ def test_a_drive_that_the_world_has_changed_is_found_and_leads_elsewhere(folder:
 
 
 def test_a_drive_that_was_missed_in_lockstep_is_found(folder: Path) -> None:
-    plant(folder / WORLD_JOURNAL, (of(Drive, LAST, "a"), lambda _: Missed(LAST, "a")))
+    plant(folder / WORLD_JOURNAL, (of(Command, LAST, "a"), lambda _: DeadlineMissed(LAST, "a")))
     assert (LAST, "a", "order") in found(audit(folder))
-    assert "the world went without its Drive, expected it to wait" in what(audit(folder), "order")
+    assert "the world went without its Command, expected it to wait" in what(audit(folder), "order")
 
 
 def test_a_report_that_was_missed_in_lockstep_is_found(folder: Path) -> None:
-    plant(folder / A, (of(Report, LAST, "b"), lambda _: Missed(LAST, "b")))
+    plant(folder / A, (of(Report, LAST, "b"), lambda _: DeadlineMissed(LAST, "b")))
     findings = audit(folder)
     assert (LAST, "a", "order") in found(findings)
     assert {rule for _, _, rule in found(findings)} == {"order", "decision", "claim"}  # by two ranges
@@ -338,18 +349,18 @@ def test_a_report_that_was_missed_in_lockstep_is_found(folder: Path) -> None:
 
 
 def test_an_end_and_a_farewell_that_are_told_otherwise_are_found(folder: Path) -> None:
-    plant(folder / A, (of(End), to(reason="none")), (of(Farewell), to(reports_heard=2)))
+    plant(folder / A, (of(MissionEnd), to(reason="none")), (of(FinalReport), to(reports_heard=2)))
     findings = audit(folder)
     assert found(findings) == [(LAST, "a", "order")] * 2 + [(LAST, "a", "decision")]
-    assert what(findings, "order")[1] == "the world's Farewell of it: reports_heard is 3, expected 2"
-    assert what(findings, "decision") == ["in its Farewell, reports_heard is 2, expected 3"]
+    assert what(findings, "order")[1] == "the world's FinalReport of it: reports_heard is 3, expected 2"
+    assert what(findings, "decision") == ["in its FinalReport, reports_heard is 2, expected 3"]
 
 
 @pytest.mark.parametrize("lacking", ["a", "b"])
 def test_a_farewell_that_the_world_has_not_got_is_missed(lacking: str, folder: Path) -> None:
-    plant(folder / WORLD_JOURNAL, (of(Farewell, robot=lacking), nothing))
+    plant(folder / WORLD_JOURNAL, (of(FinalReport, robot=lacking), nothing))
     assert [one.line for one in audit(folder).violations] == [
-        f"tick 48, {lacking}, order: the world has no Farewell of it"
+        f"tick 48, {lacking}, order: the world has no FinalReport of it"
     ]
 
 
@@ -360,7 +371,11 @@ def test_farewells_in_another_order_are_found(folder: Path) -> None:
 
 
 def test_an_agent_that_ended_before_the_world_did_is_found(folder: Path) -> None:
-    told = [one for one in messages(folder / A) if getattr(one, "tick", None) != LAST or isinstance(one, End)]
+    told = [
+        one
+        for one in messages(folder / A)
+        if getattr(one, "tick", None) != LAST or isinstance(one, MissionEnd)
+    ]
     written(folder / A, told)
     findings = audit(folder)
     assert (LAST, "a", "order") in found(findings)
@@ -369,7 +384,9 @@ def test_an_agent_that_ended_before_the_world_did_is_found(folder: Path) -> None
 
 
 def test_a_briefing_that_is_not_the_scenarios_is_found(folder: Path) -> None:
-    plant(folder / B, (of(Briefing), lambda told: replace(told, mission=replace(told.mission, accuracy=0.2))))
+    plant(
+        folder / B, (of(RobotConfig), lambda told: replace(told, mission=replace(told.mission, accuracy=0.2)))
+    )
     findings = audit(folder)
     assert found(findings) == [(None, "b", "briefing")]
     assert findings.violations[0].line.startswith("no tick, b, briefing: mission is ")
@@ -377,12 +394,12 @@ def test_a_briefing_that_is_not_the_scenarios_is_found(folder: Path) -> None:
 
 def test_how_long_a_tick_lasts_is_not_the_scenarios_to_say(folder: Path) -> None:
     for name in (A, B):
-        plant(folder / name, (of(Briefing), to(tick_s=0.5)))
+        plant(folder / name, (of(RobotConfig), to(tick_s=0.5)))
     assert found(audit(folder)) == []
 
 
 def test_robots_that_were_told_different_durations_of_a_tick_are_found(folder: Path) -> None:
-    plant(folder / B, (of(Briefing), to(tick_s=0.5)))
+    plant(folder / B, (of(RobotConfig), to(tick_s=0.5)))
     assert found(audit(folder)) == [(None, "b", "briefing")]
 
 
@@ -391,7 +408,7 @@ def plant_scenario(folder: Path, change: Callable[[Scenario], Scenario]) -> None
     plant(folder / WORLD_JOURNAL, (of(Scenario), change))
     (told,) = [one for one in messages(folder / WORLD_JOURNAL) if isinstance(one, Scenario)]
     for name in (A, B):
-        plant(folder / name, (of(Briefing), lambda briefed: told.briefing(briefed.robot)))
+        plant(folder / name, (of(RobotConfig), lambda briefed: told.briefing(briefed.robot)))
 
 
 def with_robots(**fields: Any) -> Callable[[Scenario], Scenario]:
@@ -413,7 +430,7 @@ def test_an_orbit_that_does_not_follow_from_the_mission_is_found_without_a_world
     plan = load("paper-1").robots[0].rendezvous
     (folder / WORLD_JOURNAL).unlink()
     for name in (A, B):
-        plant(folder / name, (of(Briefing), to(rendezvous=replace(plan, bound=plan.bound + 1.0))))
+        plant(folder / name, (of(RobotConfig), to(rendezvous=replace(plan, bound=plan.bound + 1.0))))
     assert found(audit(folder)) == [(None, "a", "briefing"), (None, "b", "briefing")]
 
 
@@ -434,7 +451,7 @@ def test_a_robot_that_starts_outside_the_range_of_its_anchor_is_found(tmp_path: 
         (lambda told: replace(told, mission=replace(told.mission, safety_distance=2.9)), "mission.safety"),
         (lambda told: replace(told, mission=replace(told.mission, max_speed=1e-5)), "mission: a tick moves"),
         (with_robots(anchor=Anchor(0.0, 0.0)), "its anchor is 0 m from its peer's"),
-        (with_robots(lie=Lie("heading", 0.1, "orbit")), "its lie is of the start, and not of all"),
+        (with_robots(lie=Attack("heading", 0.1, "orbit")), "its lie is of the start, and not of all"),
         (lambda told: replace(told, robots=told.robots[::-1]), "role is a: the first of a pair is a"),
     ],
 )
@@ -446,10 +463,10 @@ def test_a_scenario_that_no_run_accepts_is_found(
 
 
 def test_a_sense_that_is_off_in_its_last_bit_is_found(folder: Path) -> None:
-    (sensed,) = [one for one in messages(folder / A) if of(Sense, 47)(one)]
+    (sensed,) = [one for one in messages(folder / A) if of(Observation, 47)(one)]
     measured = sensed.contacts[0].range
     off = math.nextafter(measured, 0.0)
-    plant(folder / A, (of(Sense, 47), to(contacts=(Contact("b", off, (47,)),))))
+    plant(folder / A, (of(Observation, 47), to(contacts=(Contact("b", off, (47,)),))))
     findings = audit(folder)
     assert found(findings) == [(47, "a", "sense")]
     assert what(findings, "sense") == [
@@ -459,8 +476,8 @@ def test_a_sense_that_is_off_in_its_last_bit_is_found(folder: Path) -> None:
 
 def test_a_sense_that_tells_of_another_manoeuvre_is_found(folder: Path) -> None:
     sensed = messages(folder / A)
-    (before,) = [one for one in sensed if of(Sense, 30)(one)]
-    plant(folder / A, (of(Sense, 30), to(executed=replace(before.executed, v=-0.0, omega=0.0))))
+    (before,) = [one for one in sensed if of(Observation, 30)(one)]
+    plant(folder / A, (of(Observation, 30), to(executed=replace(before.executed, v=-0.0, omega=0.0))))
     findings = audit(folder)
     assert found(findings)[0] == (30, "a", "sense")
     assert len(what(findings, "sense")) == 1
@@ -474,15 +491,15 @@ FAR = Report(20, "a", 2, "orbiting", None, 0, 0, (), 0, (), 0, 0)
 
 
 def test_a_report_that_was_sent_out_of_contact_is_found(folder: Path) -> None:
-    plant(folder / A, (of(Sense, 20), lambda sense: [sense, FAR]))
+    plant(folder / A, (of(Observation, 20), lambda sense: [sense, FAR]))
     findings = audit(folder)
     assert found(findings) == [(20, "a", "contact"), (20, "a", "decision")]
     assert what(findings, "contact") == ["it sent a report, expected none: out of contact"]
 
 
 def test_a_report_that_was_heard_out_of_contact_is_found(folder: Path) -> None:
-    plant(folder / A, (of(Sense, 20), lambda sense: [sense, FAR]))
-    plant(folder / B, (of(Sense, 20), lambda sense: [sense, FAR]))
+    plant(folder / A, (of(Observation, 20), lambda sense: [sense, FAR]))
+    plant(folder / B, (of(Observation, 20), lambda sense: [sense, FAR]))
     findings = audit(folder)
     heard = [one.what for one in findings.violations if one.robot == "b" and one.rule == "contact"]
     assert heard == [
@@ -494,11 +511,11 @@ def test_a_report_that_was_heard_out_of_contact_is_found(folder: Path) -> None:
 def test_a_late_report_from_out_of_contact_is_found(folder: Path) -> None:
     """Heard in contact, and listed; but not sent in contact."""
     late = replace(FAR, tick=45)
-    plant(folder / A, (of(Sense, 45), lambda sense: [sense, late]))
+    plant(folder / A, (of(Observation, 45), lambda sense: [sense, late]))
     plant(
         folder / B,
         (
-            of(Sense, 46),
+            of(Observation, 46),
             lambda sense: replace(sense, contacts=(Contact("a", sense.contacts[0].range, (46, 45)),)),
         ),
         (of(Report, 46, "a"), lambda report: [report, late]),
@@ -535,7 +552,7 @@ def test_a_report_that_was_changed_on_its_way_is_found(folder: Path) -> None:
 
 
 def test_a_report_that_was_never_sent_is_found(folder: Path) -> None:
-    plant(folder / B, (of(Sense, 20), lambda sense: [sense, FAR]))
+    plant(folder / B, (of(Observation, 20), lambda sense: [sense, FAR]))
     findings = audit(folder)
     assert what(findings, "report") == ["it heard a report of tick 20, which a never sent"]
     assert {(robot, rule) for _, robot, rule in found(findings)} == {
@@ -559,7 +576,7 @@ def test_a_report_that_does_not_follow_is_found_at_its_sender(folder: Path) -> N
 def test_a_planner_that_fails_on_its_inputs_is_a_violation_and_no_crash(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fails(mind: Mind) -> Drive:
+    def fails(mind: RobotState) -> Command:
         if mind.tick == 12 and mind.briefing.robot == "a":
             raise ZeroDivisionError("12")
         return drive(mind)
@@ -574,7 +591,7 @@ def test_a_planner_that_fails_on_its_inputs_is_a_violation_and_no_crash(
 @pytest.mark.parametrize("beyond", [{"v": 1.5}, {"v": -1.5}, {"omega": 3.2}])
 def test_a_drive_beyond_the_limits_is_found(beyond: dict[str, float], folder: Path) -> None:
     for name in (A, WORLD_JOURNAL):
-        plant(folder / name, (of(Drive, LAST, "a"), to(**beyond)))
+        plant(folder / name, (of(Command, LAST, "a"), to(**beyond)))
     findings = audit(folder)
     assert found(findings) == [(LAST, "a", "decision"), (LAST, "a", "limits")]
     ((quantity, value),) = beyond.items()
@@ -583,8 +600,8 @@ def test_a_drive_beyond_the_limits_is_found(beyond: dict[str, float], folder: Pa
 
 
 def test_a_manoeuvre_beyond_the_limits_is_found(folder: Path) -> None:
-    (before,) = [one for one in messages(folder / B) if of(Sense, LAST)(one)]
-    plant(folder / B, (of(Sense, LAST), to(executed=replace(before.executed, v=1.0 + 1e-9))))
+    (before,) = [one for one in messages(folder / B) if of(Observation, LAST)(one)]
+    plant(folder / B, (of(Observation, LAST), to(executed=replace(before.executed, v=1.0 + 1e-9))))
     findings = audit(folder)
     assert what(findings, "limits") == ["it drove v = 1, expected 1 at the most"]
     assert {(tick, robot) for tick, robot, _ in found(findings)} == {(LAST, "b")}
@@ -599,7 +616,7 @@ def lied(folder: Path, change: Callable[[Report], Report]) -> Findings:
 
 
 def test_a_manoeuvre_that_was_told_otherwise_is_found(folder: Path) -> None:
-    findings = lied(folder, to(runs=(Run(1, 0.9, 0.0), Run(1, 0.0, 0.0))))
+    findings = lied(folder, to(runs=(Segment(1, 0.9, 0.0), Segment(1, 0.0, 0.0))))
     assert (LAST, "a", "log") in found(findings)
     assert what(findings, "log") == ["it told of (0.9, 0) until tick 47, expected [1.0,0.0]"]
     assert {rule for _, _, rule in found(findings)} == {"log", "decision"}
@@ -627,7 +644,7 @@ def test_a_range_that_was_told_otherwise_is_found(tick: int, folder: Path) -> No
 
 
 def test_a_log_that_makes_no_sense_is_found(folder: Path) -> None:
-    findings = lied(folder, to(runs=(Run(2**31, 0.0, 0.0),)))
+    findings = lied(folder, to(runs=(Segment(2**31, 0.0, 0.0),)))
     assert what(findings, "log") == ["it told manoeuvres that do not fill [46, 48]"]
 
 
@@ -638,7 +655,7 @@ def claims(pose: Any, covariance: Covariance | None = None) -> Callable[[Any], A
 def test_a_claim_that_is_wrong_is_found_and_so_is_an_end_that_hides_it(folder: Path) -> None:
     pose = read(folder).moments[LAST].truth.poses[0]
     for name in (A, WORLD_JOURNAL):
-        plant(folder / name, (of(Drive, LAST, "a"), claims(replace(pose, x=pose.x + 2e-6))))
+        plant(folder / name, (of(Command, LAST, "a"), claims(replace(pose, x=pose.x + 2e-6))))
     findings = audit(folder)
     assert found(findings) == [(LAST, "a", "decision"), (LAST, "a", "claim"), (LAST, None, "claim")]
     assert what(findings, "claim") == [
@@ -651,7 +668,7 @@ def test_a_claim_that_is_less_accurate_than_was_asked_is_found(folder: Path) -> 
     pose = read(folder).moments[LAST].truth.poses[0]
     vague = Covariance(1e15, 0.0, 0.0, 1e15, 0.0, 1e-4)
     for name in (A, WORLD_JOURNAL):
-        plant(folder / name, (of(Drive, LAST, "a"), claims(pose, vague)))
+        plant(folder / name, (of(Command, LAST, "a"), claims(pose, vague)))
     assert what(audit(folder), "claim") == [
         "it claims a position known to 4.47e+07 m, of 0.1",
         "it ends localised, expected undecided (a claims a position known to 4.47e+07 m, of 0.1)",
@@ -661,7 +678,7 @@ def test_a_claim_that_is_less_accurate_than_was_asked_is_found(folder: Path) -> 
 def test_a_claim_without_a_redundant_range_is_found(folder: Path) -> None:
     pose = read(folder).moments[47].truth.poses[0]
     for name in (A, WORLD_JOURNAL):
-        plant(folder / name, (of(Drive, 47, "a"), claims(pose)))
+        plant(folder / name, (of(Command, 47, "a"), claims(pose)))
     findings = audit(folder)
     assert found(findings) == [(47, "a", "decision"), (47, "a", "claim")]
     assert what(findings, "claim") == [
@@ -673,9 +690,9 @@ def test_ranges_taken_twice_in_the_same_place_are_not_redundant(folder: Path) ->
     """In real time: neither moved before the third range."""
     pose = read(folder).moments[47].truth.poses[0]
     for name in (A, WORLD_JOURNAL):
-        plant(folder / name, (of(Drive, LAST, "a"), claims(pose)))
-    plant(folder / B, (of(Drive, 47), to(v=0.0, omega=0.0)))
-    plant(folder / WORLD_JOURNAL, (of(Drive, 47, "b"), to(v=0.0, omega=0.0)))
+        plant(folder / name, (of(Command, LAST, "a"), claims(pose)))
+    plant(folder / B, (of(Command, 47), to(v=0.0, omega=0.0)))
+    plant(folder / WORLD_JOURNAL, (of(Command, 47, "b"), to(v=0.0, omega=0.0)))
     findings = audit(folder)
     assert "it claims by 2 relative placements with a mutual range, expected 3 at the least" in what(
         findings, "claim"
@@ -692,11 +709,11 @@ def test_ranges_taken_twice_in_the_same_place_are_not_redundant(folder: Path) ->
 def test_a_claim_by_too_few_noisy_ranges_is_found(variant: str, says: str, tmp_path: Path) -> None:
     in_process.play(noise(1, variant), tmp_path)
     record = read(tmp_path)
-    first = next(one.tick for one in messages(tmp_path / A) if isinstance(one, Sense) and one.contacts)
+    first = next(one.tick for one in messages(tmp_path / A) if isinstance(one, Observation) and one.contacts)
     pose = record.moments[first].truth.poses[0]
     sure = Covariance(1e-6, 0.0, 0.0, 1e-6, 0.0, 1e-6)
     for name in (A, WORLD_JOURNAL):
-        plant(tmp_path / name, (of(Drive, first, "a"), claims(pose, sure)))
+        plant(tmp_path / name, (of(Command, first, "a"), claims(pose, sure)))
     findings = audit(tmp_path)
     assert (first, "a", "claim") in found(findings)
     assert what(findings, "claim")[0].startswith("it claims by ")
@@ -705,7 +722,7 @@ def test_a_claim_by_too_few_noisy_ranges_is_found(variant: str, says: str, tmp_p
 
 def test_an_end_that_is_not_the_referees_is_found(folder: Path) -> None:
     for name in (A, B, WORLD_JOURNAL):
-        plant(folder / name, (of(End), to(outcome="undecided", reason="a: tired")))
+        plant(folder / name, (of(MissionEnd), to(outcome="undecided", reason="a: tired")))
     assert [one.line for one in audit(folder).violations] == [
         "tick 48, the world, claim: it ends undecided (a: tired), expected localised"
     ]
@@ -713,16 +730,16 @@ def test_an_end_that_is_not_the_referees_is_found(folder: Path) -> None:
 
 def test_a_run_that_ends_before_the_referee_says_so_is_found(folder: Path) -> None:
     for robot, name in (("a", A), ("b", B)):
-        plant(folder / name, (of(Drive, LAST), to(verdict=None)))
-        plant(folder / WORLD_JOURNAL, (of(Drive, LAST, robot), to(verdict=None)))
+        plant(folder / name, (of(Command, LAST), to(verdict=None)))
+        plant(folder / WORLD_JOURNAL, (of(Command, LAST, robot), to(verdict=None)))
     findings = audit(folder)
-    assert (LAST, None, "order") in found(findings)  # the End of tick 48 has no place after its Drives
+    assert (LAST, None, "order") in found(findings)  # the End of tick 48 has no place after its Commands
     assert {rule for _, _, rule in found(findings)} == {"order", "decision"}
 
 
 def test_a_robot_that_gave_up_and_a_run_that_is_said_to_be_localised_are_found(folder: Path) -> None:
     for name in (A, WORLD_JOURNAL):
-        plant(folder / name, (of(Drive, LAST, "a"), to(verdict=Undecided("tired"))))
+        plant(folder / name, (of(Command, LAST, "a"), to(verdict=Undecided("tired"))))
     findings = audit(folder)
     assert found(findings) == [(LAST, "a", "decision"), (LAST, None, "claim")]
     assert what(findings, "claim") == ["it ends localised, expected undecided (a: tired)"]
@@ -821,10 +838,10 @@ def test_what_befell_the_reports_is_listed_and_another_plan_is_found(tmp_path: P
     lost = next(
         one
         for one in messages(tmp_path / A)
-        if isinstance(one, Sense) and one.contacts and not one.contacts[0].heard
+        if isinstance(one, Observation) and one.contacts and not one.contacts[0].heard
     )
     heard = replace(lost, contacts=(replace(lost.contacts[0], heard=(lost.tick,)),))
-    plant(tmp_path / A, (of(Sense, lost.tick), to(contacts=heard.contacts)))
+    plant(tmp_path / A, (of(Observation, lost.tick), to(contacts=heard.contacts)))
     assert (lost.tick, "a", "faults") in found(audit(tmp_path))
 
 

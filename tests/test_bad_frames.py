@@ -21,7 +21,7 @@ from msgspec.structs import replace
 from compose.launch.processes import free_endpoint
 from compose.scenario.scenario_file import load
 from protocol.journal.journal_file import read
-from protocol.messages import Contact, Drive, End, Farewell, Message, Report, Sense
+from protocol.messages import Command, Contact, FinalReport, Message, MissionEnd, Observation, Report
 from protocol.motion import ORIGIN, REST
 from protocol.network import inbox, keys, session
 from protocol.network.endpoints import listening
@@ -32,7 +32,7 @@ from tests.commands import (
     LONG,
     LONG_JOURNAL_BYTES,
     LONG_TICKS,
-    Command,
+    TandemProcess,
     several_pairs,
     tandem,
     until,
@@ -48,8 +48,8 @@ STORM = 3000
 SETTLED_MB = 8.0
 
 GENUINE = {
-    "sense": (Sense(0, "a", None, 1.0), 1 << 20),
-    "drive": (Drive(0, "a", 0.5, 0.5, 1, "straight"), 1 << 20),
+    "sense": (Observation(0, "a", None, 1.0), 1 << 20),
+    "drive": (Command(0, "a", 0.5, 0.5, 1, "straight"), 1 << 20),
     "report": (Report(0, "b", 1, "straight", ORIGIN, 0, 0, (), 0, (), 0, 0), 4096),
 }
 """by topic: what robot a gets, says, and is told by its peer, b; and the longest frame in bytes"""
@@ -63,7 +63,7 @@ TRUSTED = {
 WATCHED = [keys.truth(RUN), keys.estimate(RUN, "a"), keys.briefing(RUN, "a")]
 """those that nobody of the mission listens to"""
 GHOST, OTHER = keys.drive(RUN, "ghost"), keys.drive(RUN, "b")
-"""a Drive comes by them that says it is from somebody else, or from nobody"""
+"""a Command comes by them that says it is from somebody else, or from nobody"""
 
 
 def framed(content: object, version: int = 1) -> bytes:
@@ -142,13 +142,13 @@ def volley(stranger: Mapping[str, zenoh.Publisher], nonsense: Mapping[str, Mappi
             stranger[key].put(frame)
 
 
-def complaints(command: Command, key: str) -> list[str]:
+def complaints(command: TandemProcess, key: str) -> list[str]:
     """What it has said of frames on `key`."""
     said = re.findall(rf"refused a frame on {re.escape(key)}: (.*)", command.err)
     return [str(why) for why in said]
 
 
-def refused_on(key: str, command: Command, frames: Mapping[bytes, str]) -> None:
+def refused_on(key: str, command: TandemProcess, frames: Mapping[bytes, str]) -> None:
     """It has complained of every kind, and of each only once."""
     told = complaints(command, key)
     for frame, pattern in frames.items():
@@ -163,7 +163,7 @@ def test_nonsense_before_the_first_tick_is_refused_told_once_and_counted(tmp_pat
     nonsense = {key: bad_frames(topic) for topic, key in TRUSTED.items()}
     with world(scenario, "--run", RUN, "--out", out) as (clock, endpoint), ExitStack() as others:
         agents = [
-            others.enter_context(Command("agent", robot, "--connect", endpoint, "--out", out))
+            others.enter_context(TandemProcess("agent", robot, "--connect", endpoint, "--out", out))
             for robot in ("a", "b", "c")
         ]
         for robot, agent in zip("abc", agents, strict=True):
@@ -173,11 +173,11 @@ def test_nonsense_before_the_first_tick_is_refused_told_once_and_counted(tmp_pat
         for _ in range(TIMES):
             volley(stranger, nonsense)
             volley(stranger, dict.fromkeys(WATCHED, bad_frames("sense")))
-            stranger[GHOST].put(encode(Drive(0, "ghost", 1.0, 0.0, 1, "haunting")))
-            stranger[OTHER].put(encode(Drive(0, "a", 1.0, 0.0, 1, "posing")))
+            stranger[GHOST].put(encode(Command(0, "ghost", 1.0, 0.0, 1, "haunting")))
+            stranger[OTHER].put(encode(Command(0, "a", 1.0, 0.0, 1, "posing")))
         clock.until_says(f"refused a frame on {OTHER}")
         assert isinstance(session.ask(link, keys.briefing(RUN, "*"), 5.0), str)
-        agents.append(others.enter_context(Command("agent", "d", "--connect", endpoint, "--out", out)))
+        agents.append(others.enter_context(TandemProcess("agent", "d", "--connect", endpoint, "--out", out)))
         assert clock.ended().status == 0
         assert [agent.ended().status for agent in agents] == [0] * 4
 
@@ -205,7 +205,7 @@ def test_a_mission_under_fire_goes_on_as_if_nothing_happened(tmp_path: Path) -> 
     fired = 0
     with world(scenario, "--run", RUN, "--out", out) as (clock, endpoint), ExitStack() as others:
         agents = [
-            others.enter_context(Command("agent", robot, "--connect", endpoint, "--out", out))
+            others.enter_context(TandemProcess("agent", robot, "--connect", endpoint, "--out", out))
             for robot in ("a", "b")
         ]
         stranger = publishers(others.enter_context(stranger_at(endpoint)))
@@ -228,7 +228,7 @@ def test_a_mission_under_fire_goes_on_as_if_nothing_happened(tmp_path: Path) -> 
     summary = json.loads((out / "summary.json").read_text())
     assert (summary["outcome"], summary["ticks"]) == ("localised", LONG_TICKS)
     assert summary["robots"]["a"]["reports_refused"] > 0
-    for robot in ("a", "b"):  # all but the Farewell, which counts what was refused
+    for robot in ("a", "b"):  # all but the FinalReport, which counts what was refused
         path = f"agent-{robot}.journal"
         assert list(read(out / path))[:-1] == list(read(alone / path))[:-1]
 
@@ -260,8 +260,8 @@ def test_a_robot_refuses_what_is_out_of_step_and_hears_a_repeated_report_once(tm
     def told(tick: int, **otherwise: object) -> Report:
         return replace(Report(tick, "b", 1, "straight", None, 0, 0, (), 0, (), 0, 0), **otherwise)
 
-    def sense(tick: int) -> Sense:
-        return Sense(tick, "a", REST if tick else None, 2.5, (Contact("b", 2.0, (tick,)),))
+    def sense(tick: int) -> Observation:
+        return Observation(tick, "a", REST if tick else None, 2.5, (Contact("b", 2.0, (tick,)),))
 
     with session.open_router(listening(endpoint)) as link:
         session.answer(link, keys.briefing(RUN, "*"), lambda _: scenario.briefing("a"))
@@ -271,25 +271,25 @@ def test_a_robot_refuses_what_is_out_of_step_and_hears_a_repeated_report_once(tm
         peer_says = session.publisher(link, keys.report(RUN, "b", "a"))
 
         def play(tick: int, *reports: Report) -> None:
-            """Its Drive of `tick` comes, and no other."""
+            """Its Command of `tick` comes, and no other."""
             for report in reports:
                 peer_says.put(encode(report))
             world_says.put(encode(sense(tick)))
-            assert answer(said, Drive).tick == tick
+            assert answer(said, Command).tick == tick
 
         _token = session.show_alive(link, keys.world_alive(RUN))
-        with Command("agent", "a", "--connect", endpoint, "--out", tmp_path) as agent:
+        with TandemProcess("agent", "a", "--connect", endpoint, "--out", tmp_path) as agent:
             assert said.next(BOUND_S).topic == "alive"
             play(0, told(0), told(0), told(0, robot="a"), told(0, robot="c"), told(0, state="otherwise"))
             play(1, told(1), told(2, state="too early"), told(0), told(0))
             play(2, told(2, state="as it is"), told(900), told(0, heard=1))
-            for odd in (sense(0), sense(1), sense(4), sense(900), End(1, "failed", None)):
+            for odd in (sense(0), sense(1), sense(4), sense(900), MissionEnd(1, "failed", None)):
                 world_says.put(encode(odd))
             world_says.put(encode(replace(sense(2), anchor_range=1.0)))
-            world_says.put(encode(End(900, "localised", None)))
+            world_says.put(encode(MissionEnd(900, "localised", None)))
             play(3, told(3))
-            world_says.put(encode(End(3, "undecided", "for a test")))
-            farewell = answer(said, Farewell)
+            world_says.put(encode(MissionEnd(3, "undecided", "for a test")))
+            farewell = answer(said, FinalReport)
             world_says.put(encode(sense(1)))
             world_says.put(encode(farewell))
             assert agent.ended().status == 1

@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from tests.test_noise import Z, has_share
-from world.channel import Air, carried, of_plan
-from world.faults import LATEST, MAX_DELAY, MAX_FAULTS, UNLUCKY, Fault, Link, Window, hold_up
+from world.channel import LinkState, carried, of_plan
+from world.faults import LATEST, MAX_DELAY, MAX_FAULTS, UNLUCKY, Fault, LinkSelector, Window, hold_up
 
 N = 10_000
 """ticks, where a statistic is looked at"""
-A_TO_B, BOTH_WAYS = Link("a", "b", both=False), Link("a", "b", both=True)
+A_TO_B, BOTH_WAYS = LinkSelector("a", "b", both=False), LinkSelector("a", "b", both=True)
 
 chances = st.sampled_from([0.0, 0.1, 0.5, 1.0])
 delays = st.tuples(st.integers(0, 6), st.integers(0, 6)).map(lambda two: (min(two), max(two)))
@@ -48,16 +48,16 @@ seeds = st.integers(0, 2**63 - 1)
 
 def flown(
     plan: Sequence[Fault], contact: Sequence[bool], seed: int = 1, way: tuple[str, str] = ("a", "b")
-) -> list[Air]:
+) -> list[LinkState]:
     """The air of a link, tick after tick."""
-    links, air, found = of_plan(plan, *way), Air(), []
+    links, air, found = of_plan(plan, *way), LinkState(), []
     for tick, together in enumerate(contact):
         air = carried(air, links, seed, tick, in_contact=together)
         found.append(air)
     return found
 
 
-def came(airs: Sequence[Air]) -> list[tuple[int, int, bool]]:
+def came(airs: Sequence[LinkState]) -> list[tuple[int, int, bool]]:
     """Every copy that came: the tick in which it did, that of its report, and whether it was damaged."""
     return [
         (now, tick, damaged)
@@ -255,7 +255,7 @@ def test_a_fault_is_there_in_its_windows_and_at_no_other_time(
     ],
     ids=["a->b", "a<->b", "*"],
 )
-def test_a_fault_is_on_its_link_and_on_no_other(link: Link | None, cut: set[tuple[str, str]]) -> None:
+def test_a_fault_is_on_its_link_and_on_no_other(link: LinkSelector | None, cut: set[tuple[str, str]]) -> None:
     plan = [Fault(link=link, partition=True)]
     for way in [("a", "b"), ("b", "a"), ("c", "d"), ("d", "c")]:
         heard = any(air.heard for air in flown(plan, [True] * 20, way=way))
@@ -282,7 +282,7 @@ ROUGH = (
 )
 
 
-def fates(airs: Sequence[Air]) -> dict[int, Counter[tuple[int, bool]]]:
+def fates(airs: Sequence[LinkState]) -> dict[int, Counter[tuple[int, bool]]]:
     """Of each report: when its copies came, and which were damaged."""
     found: dict[int, Counter[tuple[int, bool]]] = {}
     for now, tick, damaged in came(airs):

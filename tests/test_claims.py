@@ -17,15 +17,15 @@ from scipy.stats import chi2  # type: ignore[import-untyped]
 
 from compose.launch.in_process import play
 from compose.recording.claim import matrix, nees
-from compose.recording.run import Moment, Record
+from compose.recording.run import Record, TickRecord
 from compose.recording.summary_json import leave, summary
 from compose.scenario.scenario_file import load, parse
 from compose.sweep import execution, report, spec, trial
 from compose.sweep.cells import cells
-from compose.sweep.statistics import Counted, counted
+from compose.sweep.statistics import CellSummary, counted
 from compose.sweep.table import of_rows, schema_of
 from compose.terminal.progress import result
-from protocol.messages import Drive, End, Farewell, Localised
+from protocol.messages import Command, FinalReport, Localised, MissionEnd
 from protocol.motion import Covariance, Pose
 from tests.commands import SECTION_IV, tandem
 from world.referee import Judgement
@@ -56,8 +56,8 @@ def covariance_of(p: NDArray[np.float64]) -> Covariance:
     return Covariance(*[float(p[i, j]) for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))])
 
 
-def claims(tick: int, robot: str, pose: Pose, covariance: Covariance | None) -> Drive:
-    return Drive(tick, robot, 0.0, 0.0, 3, "localised", Localised(pose, covariance))
+def claims(tick: int, robot: str, pose: Pose, covariance: Covariance | None) -> Command:
+    return Command(tick, robot, 0.0, 0.0, 3, "localised", Localised(pose, covariance))
 
 
 def off(pose: Pose, by: float) -> Pose:
@@ -70,14 +70,14 @@ def claimed(text: str, covariance: Covariance | None, *, by: float = 0.03) -> Re
     world = release(scenario)
     first = {
         "a": claims(0, "a", off(world.truth.poses[0], by), covariance),
-        "b": Drive(0, "b", 0.0, 0.0, 1, "straight", None),
+        "b": Command(0, "b", 0.0, 0.0, 1, "straight", None),
     }
     onward = advance(world, first)
     assert isinstance(onward, World)
     judgement = advance(onward, {})
     assert isinstance(judgement, Judgement)
-    end = End(1, judgement.outcome, judgement.reason)
-    return Record(scenario, (Moment(world.truth, first), Moment(onward.truth, {})), end, {})
+    end = MissionEnd(1, judgement.outcome, judgement.reason)
+    return Record(scenario, (TickRecord(world.truth, first), TickRecord(onward.truth, {})), end, {})
 
 
 # --- NEES ---------------------------------------------------------------------------------------------
@@ -176,13 +176,13 @@ HONEST = ["cov_xx", "cov_xy", "cov_xh", "cov_yy", "cov_yh", "cov_hh"]
 SWEEP = 'name = "noisy"\nscenario = "noisy.toml"\ntrials = 3\n'
 
 
-def row_of(record: Record, number: int = 0) -> trial.Row:
+def row_of(record: Record, number: int = 0) -> trial.TrialRow:
     return trial.row(trial.Trial(0, number, record.scenario, processes=False), record, 0.5)
 
 
-def farewell(robot: str, hypotheses: int, odds: float) -> Farewell:
+def farewell(robot: str, hypotheses: int, odds: float) -> FinalReport:
     counts = (3, 4, 0, 0, 0, 0, 600)
-    return Farewell(robot, 5, 3, "circle", -2.5, (4, 2), 0.5, 1.5, hypotheses, odds, None, None, *counts)
+    return FinalReport(robot, 5, 3, "circle", -2.5, (4, 2), 0.5, 1.5, hypotheses, odds, None, None, *counts)
 
 
 def test_a_row_has_what_each_robot_claimed() -> None:
@@ -208,7 +208,7 @@ def test_a_row_counts_the_claims_within_three_times_the_accuracy() -> None:
     assert row_of(claimed(generous, SURE, by=0.5)).claims_within == 1
 
 
-def results_of(rows: list[trial.Row], folder: Path) -> execution.Results:
+def results_of(rows: list[trial.TrialRow], folder: Path) -> execution.Results:
     """Of a campaign of one cell."""
     (folder / "noisy.toml").write_text(NOISY)
     (folder / "sweep.toml").write_text(SWEEP)
@@ -218,7 +218,7 @@ def results_of(rows: list[trial.Row], folder: Path) -> execution.Results:
     return execution.Results(campaign, (cell,), table, {0: counted(table)}, None, False, len(rows))
 
 
-def figures_of(rows: list[trial.Row], folder: Path) -> Counted:
+def figures_of(rows: list[trial.TrialRow], folder: Path) -> CellSummary:
     return results_of(rows, folder).figures[0]
 
 
@@ -253,7 +253,7 @@ def test_a_trial_with_two_claims_counts_once_in_the_mean_nees() -> None:
         robot: claims(0, robot, off(pose, by), SURE)
         for robot, pose, by in zip("ab", poses, (0.01, 0.05), strict=True)
     }
-    row = row_of(Record(scenario, (Moment(world.truth, drives),), End(0, "localised", None), {}))
+    row = row_of(Record(scenario, (TickRecord(world.truth, drives),), MissionEnd(0, "localised", None), {}))
     each = [nees(off(pose, by), pose, SURE) for pose, by in zip(poses, (0.01, 0.05), strict=True)]
     assert row.claims == 2
     assert row.nees == pytest.approx(sum(each) / 2)
@@ -280,7 +280,7 @@ PLAYED = play(load("paper-1"))
 
 
 def missing_at(record: Record, robot: str, ticks: Container[int]) -> Record:
-    """The record without that robot's Drives of `ticks`, and without its Farewell."""
+    """The record without that robot's Commands of `ticks`, and without its FinalReport."""
     moments = [
         replace(one, drives={who: drive for who, drive in one.drives.items() if who != robot})
         if one.truth.tick in ticks
@@ -306,9 +306,9 @@ def test_the_end_says_how_many_deadlines_each_robot_missed_and_suggests_a_lower_
 @pytest.mark.parametrize(
     ("ticks", "why"),
     [
-        (range(1000), "no Drive of it came in time"),
-        (range(9, 1000), "its last Drive in time was of tick 8 of LAST"),
-        ((), "it did not answer the End"),
+        (range(1000), "no Command of it came in time"),
+        (range(9, 1000), "its last Command in time was of tick 8 of LAST"),
+        ((), "it did not answer the MissionEnd"),
     ],
 )
 def test_the_summary_says_why_a_robot_has_no_farewell(ticks: Container[int], why: str) -> None:

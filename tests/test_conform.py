@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from compose.hardware.conformance import judged
-from compose.hardware.exercise import Trial
+from compose.hardware.exercise import ExerciseRun
 from compose.launch.driver_loader import briefed
 from compose.scenario.scenario_file import load
 from tests import broken_drivers, virtual_time
@@ -48,7 +48,7 @@ def test_a_broken_driver_is_told_what_it_breaks(
     for module in virtual_time.MODULES:
         monkeypatch.setattr(module, "time", clock)
     driver = getattr(broken_drivers, broken)(BRIEFING, MANOEUVRE_S)
-    trial = Trial(driver, BRIEFING, MANOEUVRE_S)
+    trial = ExerciseRun(driver, BRIEFING, MANOEUVRE_S)
     trial.go_through()
     assert said in "; ".join([one.wrong for one in judged(trial) if one.wrong is not None])
 

@@ -24,8 +24,8 @@ from compose.scenario.toml_file import table_in
 from compose.sweep import spec
 from compose.sweep.cells import cells
 from compose.sweep.trial import Trial, play
-from protocol.journal.journal_file import Kept
-from tests.commands import ENDLESS, PAPER_1, Command, tandem, temporary_in, until
+from protocol.journal.journal_file import MemoryJournal
+from tests.commands import ENDLESS, PAPER_1, TandemProcess, tandem, temporary_in, until
 from tests.test_bad_input import refused
 from world.scenario import Scenario
 
@@ -88,7 +88,7 @@ def test_a_trial_that_leaves_another_record_has_failed_and_says_where(
 ) -> None:
     real = in_process.played
 
-    def otherwise(scenario: Scenario, sinks: dict[str, Kept]) -> Record:
+    def otherwise(scenario: Scenario, sinks: dict[str, MemoryJournal]) -> Record:
         record = real(scenario, sinks)
         if name == "ticks.csv":
             return replace(record, moments=record.moments[:-1])
@@ -112,7 +112,7 @@ def test_a_process_that_is_never_started_again_ends_its_trial() -> None:
 def test_however_a_trial_ends_its_processes_end_with_it(how: str, tmp_path: Path) -> None:
     (tmp_path / "endless.toml").write_text(ENDLESS + '[[kill]]\nwho = "a"\ntick = 1\n')
     (tmp_path / "hung.toml").write_text(HUNG + ("10.0" if "hung" in how else "600.0"))
-    with Command("sweep", "hung.toml", "--out", "out", "--workers", "1", cwd=tmp_path) as command:
+    with TandemProcess("sweep", "hung.toml", "--out", "out", "--workers", "1", cwd=tmp_path) as command:
         command.until(lambda: list(tmp_path.glob("tmp/*/*/agent-b.journal")), "they play")
         command.until(lambda: len(left(tmp_path)) == 4, "a worker, a world and two agents are there")
         if "hung" in how:

@@ -19,7 +19,7 @@ from ruamel.yaml import YAML
 from compose.cli.main import parser
 from compose.launch.processes import free_endpoint
 from protocol.journal import journal_file
-from tests.commands import Command, tandem
+from tests.commands import TandemProcess, tandem
 
 HOUSE = Path(__file__).parents[1]
 DEPLOY = HOUSE / "compose" / "deploy"
@@ -151,13 +151,13 @@ def test_the_services_commands_play_a_mission_though_one_is_killed_and_started_a
             line = line.replace(said, place)
         commands[name] = line.split("\n")
     with ExitStack() as stack:
-        playing = {name: stack.enter_context(Command(*line)) for name, line in commands.items()}
+        playing = {name: stack.enter_context(TandemProcess(*line)) for name, line in commands.items()}
         for robot in ("a", "b"):
             playing[f"agent-{robot}"].until_answered(robot, tmp_path / f"agent-{robot}")
         record = tmp_path / "world" / "world.journal"
         playing["world"].until(lambda: len(list(journal_file.read(record))) >= 4, "three ticks are on record")
         playing[killed].tell(SIGKILL)
-        playing[killed] = stack.enter_context(Command(*commands[killed]))
+        playing[killed] = stack.enter_context(TandemProcess(*commands[killed]))
         ended = {name: command.ended() for name, command in playing.items()}
     assert {name: end.status for name, end in ended.items()} == dict.fromkeys(commands, 0), ended
     assert "again, " in ended[killed].out
@@ -194,14 +194,14 @@ def test_the_units_command_plays_a_robot_with_its_keys(tmp_path: Path) -> None:
     (start,) = unit()["ExecStart"]
     with ExitStack() as stack:
         listens = ("--listen", endpoint, "--keys", keys / "world", "-q")
-        playing = [stack.enter_context(Command("world", "paper-1", *listens))]
+        playing = [stack.enter_context(TandemProcess("world", "paper-1", *listens))]
         for robot in ("a", "b"):
             line = start.replace("%i", robot).replace("%d", str(keys / f"agent-{robot}"))
             line = line.replace("%S", str(tmp_path / "state"))
             line = line.replace("$TANDEM_OPTIONS", f"--connect {endpoint} --wait 60")
             program, *arguments = shlex.split(line)
             assert program == "/opt/tandem/bin/tandem"
-            playing.append(stack.enter_context(Command(*arguments)))
+            playing.append(stack.enter_context(TandemProcess(*arguments)))
         assert [one.ended().status for one in playing] == [0, 0, 0]
     assert (tmp_path / "state" / "tandem" / "a" / "agent-a.journal").exists()
 
@@ -210,7 +210,7 @@ def test_the_units_command_plays_a_robot_with_its_keys(tmp_path: Path) -> None:
 def test_a_stop_is_none_of_the_failures_after_which_the_unit_starts_again(tmp_path: Path) -> None:
     service = unit()
     assert service["Restart"] == ["on-failure"]
-    with Command("agent", "a", "--connect", free_endpoint(), "--out", tmp_path) as waiting:
+    with TandemProcess("agent", "a", "--connect", free_endpoint(), "--out", tmp_path) as waiting:
         waiting.until_says("looking for one")
         waiting.tell(SIGTERM)
         assert [str(waiting.ended().status)] == service["SuccessExitStatus"]

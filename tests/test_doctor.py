@@ -33,7 +33,7 @@ from protocol.network import session
 from protocol.network.diagnosis import MUTE
 from protocol.network.endpoints import configured, listening
 from protocol.wire import VERSION
-from tests.commands import ENDLESS, LONG, Command, Ended, tandem, world
+from tests.commands import ENDLESS, LONG, Ended, TandemProcess, tandem, world
 from tests.test_keys import expire, give_foreign, last, world_of
 from tests.test_topologies import Router, connect, listen, record_of, routing, same
 
@@ -78,7 +78,7 @@ def test_a_library_that_is_too_old_is_to_be_installed_anew(
     (tmp_path / "numpy-1.26.4.dist-info").mkdir()
     (tmp_path / "numpy-1.26.4.dist-info" / "METADATA").write_text("Name: numpy\nVersion: 1.26.4\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    with Command("doctor") as doctor:
+    with TandemProcess("doctor") as doctor:
         only_fix(doctor.ended(), "versions: numpy 1.26.4; tandem-ranging", "needs <3,>=2.2: install it anew")
 
 
@@ -246,7 +246,7 @@ def test_who_listens_and_never_says_a_word_is_waited_for_within_bounds_and_until
 ) -> None:
     with socket.create_server(("127.0.0.1", 0)) as mute:
         endpoint = f"tcp/127.0.0.1:{mute.getsockname()[1]}"
-        with Command(command, *connect(endpoint)) as stopped:
+        with TandemProcess(command, *connect(endpoint)) as stopped:
             mute.accept()[0].close()  # it has come as far as that
             stopped.tell(Signals.SIGINT)
             assert stopped.ended(within=5.0).status == -Signals.SIGINT
@@ -295,7 +295,7 @@ def test_a_robot_that_the_world_does_not_know_is_told(keys: Path, tmp_path: Path
     assert tandem("keys", everybody, "--robots", "c").status == 0
     endpoint = free_endpoint("tls")
     arguments = ("world", "paper-1", "--run", "mine", "--listen", endpoint, "--keys", everybody / "world")
-    with Command(*arguments) as part:
+    with TandemProcess(*arguments) as part:
         part.until_says("waiting for")
         ended = tandem("doctor", "--connect", endpoint, "--keys", everybody / "agent-c")
     only_fix(ended, "alive: mine: this world has no robot 'c'; it has a, b")
@@ -359,10 +359,10 @@ def router_by(keys: Path, change: Callable[[dict[str, Any]], None], folder: Path
 
 def start(
     keys: Path, endpoint: str, out: Path, stack: ExitStack, who: str, *arguments: str | Path
-) -> Command:
+) -> TandemProcess:
     """A part of a mission, by the keys of `who`."""
     where = ("--connect", endpoint, "--keys", keys / who, "--out", out, "-q")
-    return stack.enter_context(Command(*arguments, *where))
+    return stack.enter_context(TandemProcess(*arguments, *where))
 
 
 FORGED = "robot/a/beat, robot/a/sense, robot/b/drive, robot/b/estimate, robot/b/to/a, world/truth"
@@ -458,7 +458,7 @@ def test_a_mission_beside_which_all_is_tried_leaves_the_record_of_one_alone(
         started["a"].until_answered("a", out)
         doctors = [
             stack.enter_context(
-                Command("doctor", "--connect", endpoint, "--keys", keys / who, "--wait", "20")
+                TandemProcess("doctor", "--connect", endpoint, "--keys", keys / who, "--wait", "20")
             )
             for who in ("agent-a", "agent-b", "viewer")
         ]

@@ -1,4 +1,4 @@
-"""A robot moves by Drives of its own agent, of this tick, in time, and by nothing else."""
+"""A robot moves by Commands of its own agent, of this tick, in time, and by nothing else."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from msgspec.structs import replace
 from compose.launch.driver_loader import briefed
 from compose.scenario.scenario_file import parse
 from protocol.messages import (
-    Alarm,
-    Beat,
-    Drive,
-    End,
-    Farewell,
+    Command,
+    FinalReport,
+    Inconsistent,
     Localised,
+    MissionEnd,
+    Observation,
     Ranged,
     Report,
-    Sense,
+    TickStart,
     Undecided,
     Verdict,
 )
@@ -36,7 +36,7 @@ from world.hardware.driver_journal import DrivenTick, DriverPast
 from world.hardware.termination import LAST_WORDS, Ending
 
 Answer = Callable[[int], Iterable[bytes]]
-"""what somebody says to the Sense of a tick"""
+"""what somebody says to the Observation of a tick"""
 LINK = cast(zenoh.Session, None)
 """a stage needs none"""
 MANOEUVRE_S = 0.1
@@ -76,37 +76,37 @@ class Recorded:
         pass
 
 
-FAREWELL = Farewell("a", 0, 0, None, None, None, None, None, None, None, None, None, 0, 0, 0, 0, 0, 0, 0)
+FAREWELL = FinalReport("a", 0, 0, None, None, None, None, None, None, None, None, None, 0, 0, 0, 0, 0, 0, 0)
 
 
-def drive(tick: int, robot: str = "a", v: float = 0.5, verdict: Verdict | None = None) -> Drive:
-    return Drive(tick, robot, v, 0.25, 1, "straight", verdict)
+def drive(tick: int, robot: str = "a", v: float = 0.5, verdict: Verdict | None = None) -> Command:
+    return Command(tick, robot, v, 0.25, 1, "straight", verdict)
 
 
-Play = Callable[..., tuple[Field, End, list[End]]]
+Play = Callable[..., tuple[Field, MissionEnd, list[MissionEnd]]]
 
 
 @pytest.fixture
 def played(stage: Stage) -> Play:
-    """Plays a mission of a with that driver, and an agent that says `answer` to each Sense, `after` a while.
+    """Plays a mission of a with that driver, and an agent that says `answer` to each Observation, `after` a while.
 
-    The field, the End that it came to, and those that it told.
+    The field, the MissionEnd that it came to, and those that it told.
     """
 
     def play(
         driver: Recorded, answer: Answer, ticks: int = 5, patience: float = 60.0, after: float = 0.001
-    ) -> tuple[Field, End, list[End]]:
+    ) -> tuple[Field, MissionEnd, list[MissionEnd]]:
         driver.clock = stage.monotonic
-        ends: list[End] = []
+        ends: list[MissionEnd] = []
 
         def said(key: str, frame: bytes) -> None:
             if key != keys.sense("r", "a"):
                 return
-            match decode(frame, Sense | End | Farewell):
-                case Sense(tick):
+            match decode(frame, Observation | MissionEnd | FinalReport):
+                case Observation(tick):
                     for one in answer(tick):
                         stage.comes("drive", keys.drive("r", "a"), one, after)
-                case End() as end:
+                case MissionEnd() as end:
                     ends.append(end)
                     stage.comes("drive", keys.drive("r", "a"), encode(FAREWELL))
 
@@ -137,7 +137,7 @@ NONSENSE: dict[str, Answer] = {
     "bytes": lambda _: [b"", b"\0" * 40, b"nonsense" * 400],
     "torn": lambda tick: [encode(drive(tick))[:-3]],
     "another's": lambda tick: [encode(drive(tick, "b"))],
-    "a Sense": lambda tick: [encode(Sense(tick, "a", None, None))],
+    "a Sense": lambda tick: [encode(Observation(tick, "a", None, None))],
     "of a tick to come": lambda tick: [encode(drive(tick + 1))],
     "of a tick past": lambda tick: [encode(drive(max(0, tick - 1)))] if tick else [],
     "silence": lambda _: [],
@@ -157,7 +157,7 @@ def test_a_robot_whose_agent_speaks_nonsense_stands_still(kind: str, played: Pla
 
 def test_nobody_drives_faster_than_the_mission_says(played: Play) -> None:
     driver = Recorded()
-    played(driver, lambda tick: [encode(Drive(tick, "a", -7.0, 1e6, 1, "straight"))], ticks=1)
+    played(driver, lambda tick: [encode(Command(tick, "a", -7.0, 1e6, 1, "straight"))], ticks=1)
     assert driver.drives == [(-1.0, 3.141592653589793)] * 2
 
 
@@ -220,7 +220,9 @@ def report(tick: int, heard: int, verdict: Verdict | None) -> Report:
     return Report(tick, "b", 3, "standing", ORIGIN, 0, 0, (), 0, (Ranged(0, 1.0),), heard, 1, verdict)
 
 
-def ended(own: Verdict | None, said: Report | None, patience: float = 60.0, ticks: int = 30) -> End | None:
+def ended(
+    own: Verdict | None, said: Report | None, patience: float = 60.0, ticks: int = 30
+) -> MissionEnd | None:
     """The End of a mission in which a comes to `own` at tick 10, and hears `said` at tick 12."""
     ending = Ending(BRIEFING, 25, patience)
     for tick in range(ticks):
@@ -244,8 +246,8 @@ LOCALISED = Localised(ORIGIN)
         (LOCALISED, report(12, 11, None), 25, "undecided", "a is localised; b was not heard to be"),
         (LOCALISED, None, 25, "undecided", "a is localised; b was not heard to be"),
         (LOCALISED, report(12, 11, Undecided("why")), 12 + LAST_WORDS, "undecided", "b: why"),
-        (LOCALISED, report(12, 11, Alarm("lies")), 12 + LAST_WORDS, "alarm", "b: a tells lies"),
-        (Alarm("lies"), report(12, 11, LOCALISED), 12 + LAST_WORDS, "alarm", "a: b tells lies"),
+        (LOCALISED, report(12, 11, Inconsistent("lies")), 12 + LAST_WORDS, "alarm", "b: a tells lies"),
+        (Inconsistent("lies"), report(12, 11, LOCALISED), 12 + LAST_WORDS, "alarm", "a: b tells lies"),
         (Undecided("why"), report(12, 11, None), 25, "undecided", "a: why"),
         (None, report(12, 11, LOCALISED), 25, "undecided", "max_ticks: a not localised by then"),
     ],
@@ -276,15 +278,15 @@ def test_b_begins_when_a_does_and_counts_a_s_ticks(stage: Stage) -> None:
 
     def answer(key: str, frame: bytes) -> None:
         if key == keys.sense("r", "b"):
-            sense = decode(frame, Sense | End | Farewell)
-            said = drive(sense.tick, "b") if isinstance(sense, Sense) else FAREWELL
+            sense = decode(frame, Observation | MissionEnd | FinalReport)
+            said = drive(sense.tick, "b") if isinstance(sense, Observation) else FAREWELL
             stage.comes("drive", keys.drive("r", "b"), encode(said), 0.001)
 
     stage.answer = answer
     stage.alive("b")
     later = 0.5 + 2.5 * MANOEUVRE_S
     for tick, after in ((7, 0.5), (0, later), (500, later)):  # 0 is of an a that lost its past
-        stage.comes("beat", keys.beat("r", "a"), encode(Beat(tick, "a")), after)
+        stage.comes("beat", keys.beat("r", "a"), encode(TickStart(tick, "a")), after)
     field.attach(LINK)
     end = field.play(10.0, lambda: None)
     assert end.tick == 12
@@ -298,7 +300,7 @@ def test_b_begins_when_a_does_and_counts_a_s_ticks(stage: Stage) -> None:
 
 def past_of(ticks: int, *, robot: str) -> DriverPast:
     """What a driver has on record that has come so far, driving in every second tick."""
-    senses = [Sense(tick, robot, REST if tick else None, 2.0) for tick in range(ticks)]
+    senses = [Observation(tick, robot, REST if tick else None, 2.0) for tick in range(ticks)]
     return DriverPast(
         tuple(
             [
@@ -321,14 +323,16 @@ def test_a_robot_that_was_down_catches_up_with_its_peer_standing(robot: str, pee
 
     def answer(key: str, frame: bytes) -> None:
         if key == keys.sense("r", robot):
-            sense = decode(frame, Sense | End | Farewell)
-            sent.extend([sense.tick] if isinstance(sense, Sense) else [])
-            said = drive(sense.tick, robot) if isinstance(sense, Sense) else replace(FAREWELL, robot=robot)
+            sense = decode(frame, Observation | MissionEnd | FinalReport)
+            sent.extend([sense.tick] if isinstance(sense, Observation) else [])
+            said = (
+                drive(sense.tick, robot) if isinstance(sense, Observation) else replace(FAREWELL, robot=robot)
+            )
             stage.comes("drive", keys.drive("r", robot), encode(said), 0.001)
 
     stage.answer = answer
     stage.alive(robot)
-    stage.comes("beat", keys.beat("r", peer), encode(Beat(300, peer)), 0.01)
+    stage.comes("beat", keys.beat("r", peer), encode(TickStart(300, peer)), 0.01)
     field.attach(LINK)
     end = field.play(10.0, lambda: None)
     assert end.tick == 305
@@ -342,7 +346,7 @@ def test_a_robot_that_was_down_catches_up_with_its_peer_standing(robot: str, pee
 
 def test_an_a_that_was_not_down_does_not_go_by_its_peers_ticks(stage: Stage, played: Play) -> None:
     driver = Recorded()
-    stage.comes("beat", keys.beat("r", "b"), encode(Beat(4, "b")), 0.05)
+    stage.comes("beat", keys.beat("r", "b"), encode(TickStart(4, "b")), 0.05)
     played(driver, lambda tick: [encode(drive(tick))])
     assert driver.ticks[-1][1] - driver.ticks[0][1] == pytest.approx(5 * (1 + THINKING) * MANOEUVRE_S)
 
@@ -356,7 +360,7 @@ def test_a_b_that_was_killed_before_tick_0_begins_though_a_waits_for_it(stage: S
     field.resume(DriverPast(), known=-1)
     stage.alive("a", "b")
     tick_s = (1.0 + THINKING) * MANOEUVRE_S
-    stage.comes("beat", keys.beat("r", "a"), encode(Beat(0, "a")), 9.5 * tick_s)
+    stage.comes("beat", keys.beat("r", "a"), encode(TickStart(0, "a")), 9.5 * tick_s)
     field.attach(LINK)
     end = field.play(10.0, lambda: None)
     times = dict(driver.ticks)
@@ -371,7 +375,7 @@ def test_a_robot_says_why_there_is_no_farewell(stage: Stage, capsys: pytest.Capt
     field = Field(Recorded(), BRIEFING, "r", stage, max_ticks=2, manoeuvre_s=MANOEUVRE_S)
     field.attach(LINK)
     field.play(10.0, lambda: None)
-    assert "no Farewell of a: no answer to the End" in capsys.readouterr().err
+    assert "no FinalReport of a: no answer to the MissionEnd" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("robot", ["a", "b"])
@@ -404,9 +408,9 @@ def test_a_robot_whose_driver_takes_a_whole_tick_to_sense_hears_its_agent(stage:
 
     def answer(key: str, frame: bytes) -> None:
         if key == keys.sense("r", "a"):
-            message = decode(frame, Sense | End | Farewell)
-            if isinstance(message, Sense):
-                drive = Drive(message.tick, "a", 1.0, 0.0, 1, "straight")
+            message = decode(frame, Observation | MissionEnd | FinalReport)
+            if isinstance(message, Observation):
+                drive = Command(message.tick, "a", 1.0, 0.0, 1, "straight")
                 stage.comes("drive", keys.drive("r", "a"), encode(drive), 0.001)
 
     stage.answer = answer

@@ -27,7 +27,7 @@ from tests.commands import (
     LONG,
     LONG_JOURNAL_BYTES,
     LONG_TICKS,
-    Command,
+    TandemProcess,
     process_of,
     processes_of,
     size,
@@ -45,7 +45,7 @@ PATIENCE = "5"
 """s; longer than a busy machine takes to connect a process"""
 
 draw = Random(7).random
-Moment = Callable[[Command, Path], bool]
+Moment = Callable[[TandemProcess, Path], bool]
 
 
 def journaled(bytes_written: int) -> Moment:
@@ -56,11 +56,11 @@ def processes(number: int) -> Moment:
     return lambda run, out: run.catches(SIGTERM) and len(processes_of(out)) >= number
 
 
-def ready(run: Command, _out: Path) -> bool:
+def ready(run: TandemProcess, _out: Path) -> bool:
     return run.catches(SIGTERM)
 
 
-def concluded(_run: Command, out: Path) -> bool:
+def concluded(_run: TandemProcess, out: Path) -> bool:
     return (out / "summary.json").exists()
 
 
@@ -100,7 +100,7 @@ def test_a_run_that_is_told_to_stop_says_so_and_leaves_no_process(
     moment: str, number: signal.Signals, endless: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    with Command("run", endless, "--out", out, "-q") as run:
+    with TandemProcess("run", endless, "--out", out, "-q") as run:
         run.until(lambda: MOMENTS[moment](run, out), moment)
         run.tell(number)
         ended = run.ended(AT_ONCE_S)
@@ -114,7 +114,7 @@ def test_a_run_that_is_told_to_stop_as_it_ends_says_either(
     moment: str, number: signal.Signals, long: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    with Command("run", long, "--out", out, "-q") as run:
+    with TandemProcess("run", long, "--out", out, "-q") as run:
         until(lambda: LAST_MOMENTS[moment](run, out) or not run.running, moment)
         run.tell(number)
         ended = run.ended(AT_ONCE_S)
@@ -131,7 +131,7 @@ def test_a_run_that_is_told_to_stop_while_it_starts_leaves_no_process(
     delay: float, endless: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    with Command("run", endless, "--out", out, "-q") as run:
+    with TandemProcess("run", endless, "--out", out, "-q") as run:
         began = time.monotonic()
         run.until(lambda: time.monotonic() >= began + delay, f"{delay} s have passed")
         run.tell(SIGTERM)
@@ -142,7 +142,7 @@ def test_a_run_that_is_told_to_stop_while_it_starts_leaves_no_process(
 
 def test_a_second_ctrl_c_changes_nothing(endless: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    with Command("run", endless, "--out", out, "-q") as run:
+    with TandemProcess("run", endless, "--out", out, "-q") as run:
         run.until_written(out / "world.journal", 10_000)
         until(lambda: not run.tell(SIGINT), "it ends, told again and again")
         ended = run.ended(AT_ONCE_S)
@@ -154,7 +154,7 @@ def test_a_second_ctrl_c_changes_nothing(endless: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("number", series([SIGINT, SIGTERM]), ids=["SIGINT", "SIGTERM"])
 def test_a_world_and_an_agent_that_are_told_to_stop_say_so(number: signal.Signals) -> None:
     with world("paper-1") as (clock, endpoint):
-        with Command("agent", "a", "--connect", endpoint) as agent:
+        with TandemProcess("agent", "a", "--connect", endpoint) as agent:
             agent.until_says("a: in run")
             agent.tell(number)
             assert agent.ended(AT_ONCE_S)[::2] == (130, f"tandem agent a: stopped by {number.name}\n")
@@ -163,7 +163,7 @@ def test_a_world_and_an_agent_that_are_told_to_stop_say_so(number: signal.Signal
 
 
 def test_an_agent_that_looks_for_a_world_can_be_told_to_stop() -> None:
-    with Command("agent", "a", "--connect", free_endpoint()) as agent:
+    with TandemProcess("agent", "a", "--connect", free_endpoint()) as agent:
         agent.until(lambda: agent.catches(SIGTERM), "it is ready")
         agent.tell(SIGINT)
         assert agent.ended(AT_ONCE_S) == (130, "", "tandem agent a: stopped by SIGINT\n")
@@ -177,7 +177,7 @@ def test_a_process_that_dies_ends_the_run_at_once_and_is_named(
     child: str, endless: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    with Command("run", endless, "--out", out, "-q") as run:
+    with TandemProcess("run", endless, "--out", out, "-q") as run:
         run.until_written(out / "world.journal", 10_000)
         os.kill(process_of(out, *child.split()), SIGKILL)
         ended = run.ended(AT_ONCE_S)
@@ -191,7 +191,7 @@ def test_a_process_that_dies_ends_the_run_at_once_and_is_named(
 
 def test_a_robot_that_falls_silent_fails_the_run_within_the_patience(endless: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    with Command("run", endless, "--out", out, "--patience", PATIENCE, "-q") as run:
+    with TandemProcess("run", endless, "--out", out, "--patience", PATIENCE, "-q") as run:
         run.until_written(out / "world.journal", 10_000)
         os.kill(process_of(out, "agent", "b"), SIGSTOP)
         ended = run.ended(SOON_S)
@@ -204,7 +204,7 @@ def test_a_robot_that_falls_silent_fails_the_run_within_the_patience(endless: Pa
 def test_an_agent_whose_world_dies_ends_within_its_patience(tmp_path: Path) -> None:
     with world("paper-1", "--run", "mine") as (clock, endpoint):
         patience = ("--patience", PATIENCE, "--out", tmp_path)
-        with Command("agent", "a", "--connect", endpoint, *patience) as agent:
+        with TandemProcess("agent", "a", "--connect", endpoint, *patience) as agent:
             agent.until_answered("a", tmp_path)
             clock.tell(SIGKILL)
             ended = agent.ended(SOON_S)
@@ -222,10 +222,10 @@ def test_a_world_whose_robot_never_comes_fails_and_says_who_was_missing(comes: s
     endpoint = free_endpoint()
     with ExitStack() as stack:
         if comes == "a":
-            agent = stack.enter_context(Command("agent", "a", "--connect", endpoint))
+            agent = stack.enter_context(TandemProcess("agent", "a", "--connect", endpoint))
             agent.until(lambda: agent.catches(SIGTERM), "it looks for its world")
         arguments = ("--listen", endpoint, "--patience", PATIENCE, "--out", tmp_path)
-        clock = stack.enter_context(Command("world", "paper-1", *arguments))
+        clock = stack.enter_context(TandemProcess("world", "paper-1", *arguments))
         ended = clock.ended(SOON_S)
         if comes == "a":
             parted = agent.ended(SOON_S)
@@ -257,7 +257,7 @@ def test_an_agent_at_a_port_that_does_not_speak_zenoh_gives_up() -> None:
 
 def test_processes_end_when_their_launcher_is_killed(endless: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    with Command("run", endless, "--out", out, "-q") as run:
+    with TandemProcess("run", endless, "--out", out, "-q") as run:
         run.until_written(out / "world.journal", 10_000)
         os.kill(run.pid, SIGKILL)
         until(lambda: not processes_of(out), "all have ended")

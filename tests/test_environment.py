@@ -18,7 +18,7 @@ from compose.scenario.scenario_file import load
 from protocol.journal import environment, journal_file
 from protocol.journal.journal_file import CorruptJournal
 from protocol.journal.resume import Retrace
-from protocol.messages import Drive, Environment, Estimate
+from protocol.messages import Command, Environment, Estimate
 from protocol.wire import MalformedFrame, decode, encode
 from tests.commands import Ended, tandem
 
@@ -144,7 +144,7 @@ def test_a_robot_goes_on_elsewhere_where_it_decides_the_same_and_says_why_where_
         assert memory is not None
         assert memory.end is not None
     assert path.read_bytes() == before
-    changed(path, Drive, lambda one: replace(one, omega=one.omega + 1e-15), first=20)
+    changed(path, Command, lambda one: replace(one, omega=one.omega + 1e-15), first=20)
     again = f"at tick 20: recorded with tandem {OLDER}; here is tandem"
     with closing(Retrace(path)) as retrace, pytest.raises(CorruptJournal, match=again):
         remember(retrace)

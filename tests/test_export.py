@@ -47,10 +47,10 @@ from compose.view.export.folder import export
 from compose.view.foxglove.gate import GUESTS, GUESTS_FILES
 from compose.view.foxglove.views import LEAST
 from protocol.journal import journal_file
-from protocol.messages import Estimate, Sense
+from protocol.messages import Estimate, Observation
 from protocol.motion import wrap
 from protocol.wire import decode
-from tests.commands import BOUND_S, OVER, REAL_TIME, Command, processes_of, tandem, until
+from tests.commands import BOUND_S, OVER, REAL_TIME, TandemProcess, processes_of, tandem, until
 from tests.doctor import complaints
 from tests.replays import journals_of, killed
 from world.referee import errors
@@ -176,7 +176,7 @@ def test_every_frame_is_as_its_channels_schema_says(faulty: Path) -> None:
             assert said[0] in form["prefixItems"][0]["enum"]
     sense = next(one for one, _, _ in told(faulty / "run.mcap") if one.name == "tandem.Sense")
     titles = [item["title"] for item in json.loads(sense.data)["$defs"]["Sense"]["prefixItems"]]
-    assert titles == ["kind", *Sense.__struct_fields__]
+    assert titles == ["kind", *Observation.__struct_fields__]
 
 
 def test_times_are_those_of_the_simulation_and_of_when_a_frame_was_journaled(faulty: Path) -> None:
@@ -312,7 +312,7 @@ def test_frames_are_rows_with_their_fields_by_name(faulty: Path) -> None:
         assert int(row["bytes"]) == len(frame)
         assert row["kind"] == msgpack.unpackb(frame[5:])[0]
         if row["kind"] == "sense":
-            said, sense = json.loads(row["message"]), decode(frame, Sense)
+            said, sense = json.loads(row["message"]), decode(frame, Observation)
             assert (said["robot"], said["anchor_range"]) == (sense.robot, sense.anchor_range)
 
 
@@ -423,7 +423,7 @@ def test_where_there_is_no_room_nothing_half_written_is_left(paper_1: Path, tmp_
     for name in FILES:
         out = tmp_path / name
         limit = f'ulimit -f {sizes[name] // 2 // 512}; exec "$@"'  # blocks of 512 bytes
-        with Command("export", paper_1, "--out", out, through=["sh", "-c", limit, "sh"]) as command:
+        with TandemProcess("export", paper_1, "--out", out, through=["sh", "-c", limit, "sh"]) as command:
             ended = command.ended()
         assert (ended.status, ended.out) == (2, "")
         assert re.fullmatch(r"tandem export: --out: \S+ cannot be written: .*\n", ended.err), ended.err
@@ -432,7 +432,7 @@ def test_where_there_is_no_room_nothing_half_written_is_left(paper_1: Path, tmp_
 
 
 def test_ctrl_c_ends_an_export_and_leaves_nothing_half_written(paper_1: Path, tmp_path: Path) -> None:
-    with Command("export", paper_1, "--out", tmp_path / "out") as command:
+    with TandemProcess("export", paper_1, "--out", tmp_path / "out") as command:
         command.until(lambda: command.catches(Signals.SIGTERM), "it catches signals")
         command.tell(Signals.SIGINT)
         ended = command.ended()
@@ -500,7 +500,9 @@ def test_a_viewer_sees_a_run_while_it_is_played_and_to_its_end(tmp_path: Path) -
     out = tmp_path / "out"
     (tmp_path / "assured.toml").write_text(REAL_TIME)
     scenario = tmp_path / "assured.toml"
-    with Command("run", scenario, "-q", "--rate", "40", "--foxglove", str(port), "--out", out) as played:
+    with TandemProcess(
+        "run", scenario, "-q", "--rate", "40", "--foxglove", str(port), "--out", out
+    ) as played:
         played.until_says(f"what Foxglove's viewers show at ws://127.0.0.1:{port}")
         topics = asyncio.run(asyncio.wait_for(watched(port, "The mission ends: "), BOUND_S))
         played.until_says("until Ctrl-C")
@@ -516,7 +518,7 @@ def test_a_viewer_sees_a_run_while_it_is_played_and_to_its_end(tmp_path: Path) -
 
 def test_who_comes_late_sees_what_stands_and_the_end() -> None:
     port = int(free_endpoint().rsplit(":", 1)[1])
-    with Command("run", "paper-1", "-q", "--foxglove", str(port)) as played:
+    with TandemProcess("run", "paper-1", "-q", "--foxglove", str(port)) as played:
         played.until_says("until Ctrl-C")
         assert asyncio.run(asyncio.wait_for(watched(port, "The mission ends: localised"), BOUND_S))
         played.tell(Signals.SIGINT)
@@ -539,7 +541,7 @@ ORIGINS = {
 def test_of_web_pages_only_foxglove_s_app_and_those_named_see_a_run() -> None:
     port = int(free_endpoint().rsplit(":", 1)[1])
     allowed = ("--foxglove-origin", "http://localhost:8080")
-    with Command("run", "paper-1", "-q", "--foxglove", str(port), *allowed) as played:
+    with TandemProcess("run", "paper-1", "-q", "--foxglove", str(port), *allowed) as played:
         played.until_says("until Ctrl-C")
         for origin, status in ORIGINS.items():
             for host, known in (("127.0.0.1", True), ("localhost", True), ("elsewhere.example", False)):
@@ -561,7 +563,7 @@ def test_a_crowd_of_viewers_is_turned_away_and_leaves_room_for_those_that_come_a
     files = GUESTS_FILES + 50
     limited = ("sh", "-c", f'ulimit -n {files}; exec "$@"', "sh")
     heads = {"Host": f"127.0.0.1:{port}"}
-    with Command("run", "paper-1", "-q", "--foxglove", str(port), through=limited) as played:
+    with TandemProcess("run", "paper-1", "-q", "--foxglove", str(port), through=limited) as played:
         played.until_says("until Ctrl-C")
         crowd = [asking(port, heads) for _ in range(GUESTS)]
         assert {connection.getresponse().status for connection in crowd} == {101}

@@ -12,7 +12,7 @@ import pytest
 from compose.launch import in_process
 from compose.scenario.scenario_file import load
 from compose.sweep import axis_figures, execution, spec
-from compose.sweep.cells import Refused, cells, setting_of
+from compose.sweep.cells import RefusedCell, cells, setting_of
 from compose.sweep.field_paths import NoSuchField, steps, with_value
 from compose.sweep.trial import Trial, row
 from protocol.network.inbox import Inbox
@@ -32,7 +32,7 @@ def scenarios(name: str) -> list[Scenario]:
     for cell in cells(campaign):
         assert cell.key == "{}"
         setting = setting_of(campaign, cell)
-        assert not isinstance(setting, Refused)
+        assert not isinstance(setting, RefusedCell)
         found.append(setting.seeded(7))
     assert len({tuple(robot.start for robot in scenario.robots) for scenario in found}) == 1
     return found
@@ -112,7 +112,9 @@ def test_labels_that_are_numbers_make_a_curve_with_a_band(labels: str, curve: bo
     (tmp_path / "small.toml").write_text(SMALL.replace("LABELS", labels))
     campaign = spec.load(str(tmp_path / "small.toml"))
     silent = execution.Progress(say=print, begin=lambda *_: None, done=lambda _: None)
-    results = execution.sweep(campaign, tmp_path / "out", execution.Means(workers=1), Inbox("test"), silent)
+    results = execution.sweep(
+        campaign, tmp_path / "out", execution.ExecutionOptions(workers=1), Inbox("test"), silent
+    )
     (axes,) = axis_figures.ticks_against(results, 0).axes
     median = axes.lines[0]
     assert median.get_linestyle() == ("-" if curve else "None")

@@ -10,7 +10,7 @@ import pytest
 from compose.scenario.scenario_file import BadScenario, parse
 from tests.commands import PAPER_1, SECTION_IV, journals, several_pairs, tandem
 from tests.test_bad_input import refused, refused_scenario
-from world.faults import Fault, Link
+from world.faults import Fault, LinkSelector
 
 ROUGH = """
 [[fault]]
@@ -47,7 +47,7 @@ def test_a_file_and_the_command_line_say_the_same(tmp_path: Path) -> None:
     assert written == said
     assert written.faults == (
         Fault(
-            Link("a", "b", both=False),
+            LinkSelector("a", "b", both=False),
             loss=0.3,
             burst_start=0.2,
             burst_end=0.25,
@@ -63,7 +63,7 @@ def test_a_file_and_the_command_line_say_the_same(tmp_path: Path) -> None:
             reports_per_tick=0.75,
             contact_ticks=(2, 100),
         ),
-        Fault(Link("a", "b", both=True), partition=True, contact_ticks=(4, 9)),
+        Fault(LinkSelector("a", "b", both=True), partition=True, contact_ticks=(4, 9)),
     )
     (tmp_path / "rough.toml").write_text(RANDOM + ROUGH)
     (tmp_path / "plain.toml").write_text(RANDOM)

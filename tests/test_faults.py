@@ -14,7 +14,16 @@ from compose.recording.run import Record
 from compose.recording.summary_json import summary
 from compose.scenario.scenario_file import load
 from protocol.journal import journal_file
-from protocol.messages import Briefing, Drive, End, Environment, Estimate, Farewell, Report, Sense
+from protocol.messages import (
+    Command,
+    Environment,
+    Estimate,
+    FinalReport,
+    MissionEnd,
+    Observation,
+    Report,
+    RobotConfig,
+)
 from protocol.wire import decode
 from tests.commands import journals, several_pairs, tandem
 from tests.series import series
@@ -148,11 +157,14 @@ def test_what_was_heard_refused_and_lost_adds_up_to_what_the_world_let_through(
             assert said.reports_heard + said.reports_refused + said.reports_lost == peers.reports_sent
 
 
-def senses(folder: Path, robot: str) -> Iterator[Sense]:
+def senses(folder: Path, robot: str) -> Iterator[Observation]:
     """What `robot` sensed, by its own journal."""
     for frame in frames(folder, f"agent-{robot}.journal"):
-        message = decode(frame, Environment | Briefing | Sense | Report | Drive | Estimate | End | Farewell)
-        if isinstance(message, Sense):
+        message = decode(
+            frame,
+            Environment | RobotConfig | Observation | Report | Command | Estimate | MissionEnd | FinalReport,
+        )
+        if isinstance(message, Observation):
             yield message
 
 

@@ -21,10 +21,10 @@ from compose.launch.processes import free_endpoint
 from compose.scenario.scenario_file import load
 from docs.rover import Rover
 from protocol.journal import journal_file
-from protocol.messages import Drive, OfRobot
+from protocol.messages import Command, OfRobot
 from protocol.motion import REST
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
-from tests.commands import OVER, PAPER_1, Command, Ended, process_of, processes_of, tandem
+from tests.commands import OVER, PAPER_1, Ended, TandemProcess, process_of, processes_of, tandem
 from tests.series import series
 
 STARTS = {"a": "2.4,-1.2,4.8", "b": "11.3,-0.4,3.6"}
@@ -47,14 +47,14 @@ def beacon() -> Iterator[str]:
 
 
 @contextmanager
-def pair(out: Path, *more: str | Path, protocol: str = "tcp") -> Iterator[dict[str, Command]]:
+def pair(out: Path, *more: str | Path, protocol: str = "tcp") -> Iterator[dict[str, TandemProcess]]:
     """Both robots of paper-1's geometry, on their way."""
     (out / "field.toml").write_text(ASSURED)
     endpoint = free_endpoint(protocol)
     with beacon() as air:
 
-        def robot(name: str, flag: str) -> Command:
-            return Command(
+        def robot(name: str, flag: str) -> TandemProcess:
+            return TandemProcess(
                 *("robot", name, "--mission", out / "field.toml", "--driver", "docs.rover:Rover"),
                 *("--rate", "4", flag, endpoint, *more, "--out", out / name, "--patience", "20"),
                 *("--option", f"start={STARTS[name]}", "--option", f"beacon={air}"),
@@ -78,10 +78,10 @@ def pose(ended: Ended, robot: str, word: str) -> tuple[float, ...]:
     return tuple(float(number) for number in line.removeprefix(f"{robot}: {word}").split()[:3])
 
 
-def both_have_ended(out: Path, robots: dict[str, Command]) -> None:
+def both_have_ended(out: Path, robots: dict[str, TandemProcess]) -> None:
     """Neither is accused, each record follows from what came in, and each claim is true.
 
-    In real time nobody promises more; but robots that had every Drive in time localise.
+    In real time nobody promises more; but robots that had every Command in time localise.
     """
     ends = {name: robot.ended() for name, robot in robots.items()}
     late = any(f"{name}: stood 0 of" not in ended.out for name, ended in ends.items())
@@ -134,7 +134,7 @@ def test_a_decision_that_does_not_follow_is_found_without_a_world(tmp_path: Path
     path = tmp_path / "a" / "agent-a.journal"
     frames = list(journal_file.read(path))
     place, drive = next(
-        (i, one) for i, one in enumerate(messages(frames)) if isinstance(one, Drive) and one.v
+        (i, one) for i, one in enumerate(messages(frames)) if isinstance(one, Command) and one.v
     )
     frames[place] = encode(replace(drive, v=0.5 * drive.v))
     path.unlink()
@@ -142,7 +142,7 @@ def test_a_decision_that_does_not_follow_is_found_without_a_world(tmp_path: Path
         changed.write(*frames)
     replayed = tandem("replay", tmp_path / "a")
     assert replayed.status == 1
-    assert f"tick {drive.tick}, a, Drive v: recorded {0.5 * drive.v}, recomputed {drive.v}" in replayed.out
+    assert f"tick {drive.tick}, a, Command v: recorded {0.5 * drive.v}, recomputed {drive.v}" in replayed.out
 
 
 @pytest.mark.parametrize("killed", series(["b", "a"]))

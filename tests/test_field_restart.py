@@ -18,12 +18,12 @@ from compose.hardware.driver_recording import recorded
 from compose.launch.processes import free_endpoint
 from compose.scenario.scenario_file import load
 from protocol.journal.journal_file import CorruptJournal
-from protocol.messages import Sense
+from protocol.messages import Observation
 from protocol.motion import REST
 from protocol.network.inbox import Inbox
 from protocol.wire import encode
 from tests.broken_drivers import LosesAReading
-from tests.commands import Command, processes_of, size, tandem, until
+from tests.commands import TandemProcess, processes_of, size, tandem, until
 from tests.series import series
 from tests.test_field import ASSURED, STARTS, beacon, both_have_ended, told
 from world.hardware import driver_journal
@@ -42,9 +42,9 @@ class Pair:
         (out / "field.toml").write_text(ASSURED)
         self.robots = {name: self._started(name) for name in "ba"}
 
-    def _started(self, name: str) -> Command:
+    def _started(self, name: str) -> TandemProcess:
         return self._open.enter_context(
-            Command(
+            TandemProcess(
                 *("robot", name, "--mission", self._out / "field.toml", "--driver", self._drivers[name]),
                 *("--rate", "4", "--listen" if name == "a" else "--connect", self._endpoint),
                 *("--out", self._out / name, "--option", f"state={self._out / f'body-{name}'}"),
@@ -105,7 +105,7 @@ def test_a_robot_that_is_killed_goes_on_from_its_record(pair: Pair, killed: str,
 def test_both_robots_that_lose_power_at_once_go_on_from_what_is_left_of_their_records(
     pair: Pair, tmp_path: Path
 ) -> None:
-    """Of each journal the last write is torn: the driver's, as its Sense was never sent; the agent's, too."""
+    """Of each journal the last write is torn: the driver's, as its Observation was never sent; the agent's, too."""
     for name in "ab":
         pair.robots[name].until_written(pair.path(name), 3000)
     pair.kill("a", "b")
@@ -148,7 +148,7 @@ def test_a_recording_that_a_power_cut_may_have_shortened_is_refused(
     def taken_up() -> DriverPast:
         with recorded(tmp_path, briefing, inbox, fsync=fsync) as record:
             record.take_up(driver, "any", field)
-            sense = Sense(record.past.tick + 1, "a", REST if record.again else None, 1.0, ())
+            sense = Observation(record.past.tick + 1, "a", REST if record.again else None, 1.0, ())
             record.journal.write(encode(sense))
             return record.past
 

@@ -21,7 +21,7 @@ from compose.recording import summary_json
 from compose.scenario.scenario_file import load
 from compose.view.export import folder as export
 from protocol import files
-from tests.commands import PAPER_1, Command, Ended, processes_of
+from tests.commands import PAPER_1, Ended, TandemProcess, processes_of
 
 
 def fifo(path: Path) -> None:
@@ -76,7 +76,7 @@ def test_only_a_regular_file_is_opened(kind: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("command", [["run"], ["sweep"], ["run", "paper-1", "--in-process", "--out"]])
 def test_a_fifo_in_place_of_a_users_file_is_one_line(command: list[str], tmp_path: Path) -> None:
     fifo(tmp_path / "it")
-    with Command(*command, "it", cwd=tmp_path) as tandem:
+    with TandemProcess(*command, "it", cwd=tmp_path) as tandem:
         one_line(tandem.ended(), "it")
 
 
@@ -86,7 +86,7 @@ def test_a_fifo_in_place_of_a_journal_is_one_line(command: str, recording: Path,
         (tmp_path / journal.name).write_bytes(journal.read_bytes())
     (tmp_path / "world.journal").unlink()
     fifo(tmp_path / "world.journal")
-    with Command(command, tmp_path) as tandem:
+    with TandemProcess(command, tmp_path) as tandem:
         one_line(tandem.ended(), "not a regular file")
 
 
@@ -95,7 +95,7 @@ def test_a_fifo_or_a_link_in_place_of_a_journal_is_not_resumed(recording: Path, 
     fifo(tmp_path / "agent-b.journal")
     before = (recording / "agent-a.journal").read_bytes()
     for robot in "ab":
-        with Command("agent", robot, "--connect", "tcp/127.0.0.1:9", "--out", tmp_path) as tandem:
+        with TandemProcess("agent", robot, "--connect", "tcp/127.0.0.1:9", "--out", tmp_path) as tandem:
             one_line(tandem.ended(), f"agent-{robot}.journal cannot be opened")
     assert (recording / "agent-a.journal").read_bytes() == before
 
@@ -104,9 +104,9 @@ def test_a_byte_order_mark_is_accepted_in_scenarios_and_sweeps(tmp_path: Path) -
     (tmp_path / "it.toml").write_text(PAPER_1, encoding="utf-8-sig")
     spec = 'name = "small"\nscenario = "it.toml"\ntrials = 1\n[[axis]]\nfield = "v"\nvalues = [1]\n'
     (tmp_path / "small.toml").write_text(spec, encoding="utf-8-sig")
-    with Command("run", "it.toml", "--in-process", "-q", cwd=tmp_path) as tandem:
+    with TandemProcess("run", "it.toml", "--in-process", "-q", cwd=tmp_path) as tandem:
         assert tandem.ended() == (0, "localised after 48 ticks\n", "")
-    with Command("sweep", "small.toml", cwd=tmp_path) as tandem:
+    with TandemProcess("sweep", "small.toml", cwd=tmp_path) as tandem:
         one_line(tandem.ended(), "small.toml: axis[0].field: 'v'")
 
 
@@ -238,7 +238,7 @@ def test_the_draft_of_a_process_that_was_killed_is_removed_and_that_of_a_live_on
 )
 def test_too_few_descriptors_or_too_little_memory_is_one_line(limit: str, words: str, tmp_path: Path) -> None:
     through = ("sh", "-c", f'ulimit {limit} && exec "$@"', "sh")
-    with Command("run", "paper-1", "-q", "--out", tmp_path / "out", through=through) as tandem:
+    with TandemProcess("run", "paper-1", "-q", "--out", tmp_path / "out", through=through) as tandem:
         status, out, err = tandem.ended()
     assert (status, out, err.count("\n")) == (3, "", 1), err
     assert re.search(words, err), err

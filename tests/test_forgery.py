@@ -15,16 +15,16 @@ import pytest
 from compose.launch.processes import free_endpoint
 from compose.network import KEYED
 from compose.scenario.scenario_file import load
-from compose.view.web.live import AHEAD, LEAP, Heard, Refused
+from compose.view.web.live import AHEAD, LEAP, Heard, RefusedFrame
 from protocol.messages import (
-    Drive,
-    End,
+    Command,
     Estimate,
+    GroundTruth,
     Localised,
     Message,
+    MissionEnd,
+    Observation,
     Report,
-    Sense,
-    Truth,
     Undecided,
 )
 from protocol.motion import ORIGIN, Pose
@@ -32,15 +32,15 @@ from protocol.network import keys, session
 from protocol.network.endpoints import configured
 from protocol.network.keys import Key
 from protocol.wire import MalformedFrame, encode
-from tests.commands import PAPER_1, Command, Ended, tandem, until
+from tests.commands import PAPER_1, Ended, TandemProcess, tandem, until
 
 RUN = "mine"
 LAST = 2**31
 HERE = Pose(99.0, 99.0, 0.0)
 
 
-def drive(tick: int, robot: str, verdict: Localised | Undecided | None = None) -> Drive:
-    return Drive(tick, robot, 1.0, 0.0, 1, "forged", verdict)
+def drive(tick: int, robot: str, verdict: Localised | Undecided | None = None) -> Command:
+    return Command(tick, robot, 1.0, 0.0, 1, "forged", verdict)
 
 
 def report(tick: int, robot: str) -> Report:
@@ -48,15 +48,15 @@ def report(tick: int, robot: str) -> Report:
 
 
 FORGED: dict[str, Message] = {
-    "the end": End(0, "localised", "forged"),
-    "an end to come": End(LAST, "failed", "forged"),
-    "the truth": Truth(0, {"a": HERE, "b": HERE}),
+    "the end": MissionEnd(0, "localised", "forged"),
+    "an end to come": MissionEnd(LAST, "failed", "forged"),
+    "the truth": GroundTruth(0, {"a": HERE, "b": HERE}),
     "b's verdict": drive(0, "b", Localised(HERE)),
     "b's manoeuvre": drive(0, "b"),
     "b's report": report(0, "b"),
     "b's belief": Estimate(0, "b", (HERE,), (HERE,), localised=True),
-    "b's sense": Sense(0, "b", None, 1.0),
-    "a's own sense": Sense(0, "a", None, 1.0),
+    "b's sense": Observation(0, "b", None, 1.0),
+    "a's own sense": Observation(0, "a", None, 1.0),
     "a tick to come": drive(LAST, "a"),
     "a report to come": report(LAST, "a"),
     "a belief to come": Estimate(LAST, "a", (HERE,), (HERE,), localised=True),
@@ -77,7 +77,7 @@ def heard() -> Heard:
     one = Heard(RUN)
     for robot in "ab":
         one.take(Key(keys.briefing, RUN, robot), encode(load("paper-1").briefing(robot)))
-        one.take(Key(keys.sense, RUN, robot), encode(Sense(0, robot, None, 1.0)))
+        one.take(Key(keys.sense, RUN, robot), encode(Observation(0, robot, None, 1.0)))
     return one
 
 
@@ -87,7 +87,7 @@ def test_a_viewer_takes_nothing_of_that_from_a_robot_by_its_keys(
     what: str, source: Key, heard: Heard
 ) -> None:
     before = told(heard)
-    with pytest.raises((Refused, MalformedFrame)):
+    with pytest.raises((RefusedFrame, MalformedFrame)):
         heard.take(source, encode(FORGED[what]))
     assert told(heard) == before
 
@@ -110,11 +110,11 @@ def test_a_tick_is_none_before_the_world_has_said_it(heard: Heard) -> None:
     unheard.take(own, encode(drive(LAST, "a")))
     assert unheard.known.last == -1
     heard.take(own, encode(drive(AHEAD, "a")))
-    with pytest.raises(Refused):
+    with pytest.raises(RefusedFrame):
         heard.take(own, encode(drive(AHEAD + 1, "a")))
-    with pytest.raises(Refused):
-        heard.take(sense, encode(Sense(LEAP + 1, "a", None, 1.0)))
-    heard.take(sense, encode(Sense(LEAP, "a", None, 1.0)))
+    with pytest.raises(RefusedFrame):
+        heard.take(sense, encode(Observation(LEAP + 1, "a", None, 1.0)))
+    heard.take(sense, encode(Observation(LEAP, "a", None, 1.0)))
     heard.take(own, encode(drive(LEAP + AHEAD, "a")))
     assert heard.known.last == LEAP + AHEAD
 
@@ -140,8 +140,8 @@ def test_with_one_robots_certificate_nobody_forges_end_truth_ticks_or_another_ro
 
     with ExitStack() as stack:
 
-        def start(*arguments: str | Path) -> Command:
-            return stack.enter_context(Command(*arguments))
+        def start(*arguments: str | Path) -> TandemProcess:
+            return stack.enter_context(TandemProcess(*arguments))
 
         clock = start("world", scenario, "--run", RUN, "--listen", endpoint, *keyed("world"))
         clock.until_says("waiting for")

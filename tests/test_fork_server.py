@@ -22,7 +22,7 @@ from protocol.network.inbox import Inbox
 from tests.commands import (
     ENDLESS,
     OVER,
-    Command,
+    TandemProcess,
     journals,
     process_of,
     processes_of,
@@ -80,7 +80,7 @@ def gone(pid: int) -> bool:
 
 def test_each_has_its_own_session_and_group_and_is_named_in_ps(endless: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    with Command("run", endless, "--out", out, "-q") as run:
+    with TandemProcess("run", endless, "--out", out, "-q") as run:
         run.until_written(out / "world.journal", 5_000)
         (server,) = fork_servers_of(run.pid)
         for name in NAMES:
@@ -150,7 +150,7 @@ def test_a_run_whose_fork_server_is_killed_says_so_and_leaves_no_process(
     endless: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    with Command("run", endless, "--out", out, "-q") as run:
+    with TandemProcess("run", endless, "--out", out, "-q") as run:
         run.until_written(out / "world.journal", 5_000)
         (server,) = fork_servers_of(run.pid)
         os.kill(server, SIGKILL)
@@ -166,7 +166,7 @@ def test_a_run_whose_fork_server_is_stopped_can_be_stopped_all_the_same(
     endless: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    with Command("run", endless, "--out", out, "-q") as run:
+    with TandemProcess("run", endless, "--out", out, "-q") as run:
         run.until_written(out / "world.journal", 5_000)
         (server,) = fork_servers_of(run.pid)
         os.kill(server, SIGSTOP)
@@ -176,7 +176,7 @@ def test_a_run_whose_fork_server_is_stopped_can_be_stopped_all_the_same(
 
 
 def test_a_run_whose_fork_server_is_suspended_comes_to_its_end() -> None:
-    with Command("run", "paper-1", "--rate", "20") as run:
+    with TandemProcess("run", "paper-1", "--rate", "20") as run:
         until(lambda: fork_servers_of(run.pid), "there is a fork server")
         (server,) = fork_servers_of(run.pid)
         until(lambda: len(children_of(server)) == 3, "all processes run")
@@ -195,7 +195,7 @@ def test_the_more_robots_a_run_starts_the_longer_each_looks_for_its_world(
     for one, two in (("a", "b"), ("b", "a")):
         mission = mission.replace(f'id = "{one}"', f'id = "{one}"\npeer = "{two}"')
     endless.write_text(mission + "".join(others))
-    with Command("run", endless, "--out", out, "-q") as run:
+    with TandemProcess("run", endless, "--out", out, "-q") as run:
         run.until_written(out / "agent-c.journal", 1)
         words = processes_of(out)[process_of(out, "agent", "c")]
     assert words[words.index("--wait") + 1] == "62.0"
@@ -207,7 +207,7 @@ def test_processes_that_are_stopped_end_too_when_their_launcher_is_killed(
     server_too: bool, endless: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    with Command("run", endless, "--out", out, "-q") as run:
+    with TandemProcess("run", endless, "--out", out, "-q") as run:
         run.until_written(out / "world.journal", 5_000)
         (server,) = fork_servers_of(run.pid)
         for name in NAMES:
@@ -222,7 +222,7 @@ def test_processes_that_are_stopped_end_too_when_their_launcher_is_killed(
 def test_a_fork_server_that_still_imports_ends_with_its_launcher(
     number: signal.Signals, endless: Path, tmp_path: Path
 ) -> None:
-    with Command("run", endless, "--out", tmp_path / "out", "-q") as run:
+    with TandemProcess("run", endless, "--out", tmp_path / "out", "-q") as run:
         run.until(lambda: fork_servers_of(run.pid), "it has a fork server")
         servers = fork_servers_of(run.pid)
         os.kill(run.pid, number)
@@ -231,7 +231,7 @@ def test_a_fork_server_that_still_imports_ends_with_its_launcher(
 
 
 def test_no_fork_server_outlasts_a_run() -> None:
-    with Command("run", "paper-1", "-q") as run:
+    with TandemProcess("run", "paper-1", "-q") as run:
         run.until(lambda: fork_servers_of(run.pid), "it has a fork server")
         servers = fork_servers_of(run.pid)
         assert run.ended().status == 0
@@ -306,8 +306,8 @@ def test_who_has_answered_is_not_told_again_as_often_as_who_has_not(tmp_path: Pa
     with (
         world(path, "--run", "mine") as (_, endpoint),
         session.open_client(at(endpoint), lambda: None) as link,
-        Command("agent", "c", "--connect", endpoint, "--out", tmp_path / "c") as c,
-        Command("agent", "d", "--connect", endpoint, "--out", tmp_path / "d") as d,
+        TandemProcess("agent", "c", "--connect", endpoint, "--out", tmp_path / "c") as c,
+        TandemProcess("agent", "d", "--connect", endpoint, "--out", tmp_path / "d") as d,
     ):
         c.until_answered("c", tmp_path / "c")
         d.until_answered("d", tmp_path / "d")

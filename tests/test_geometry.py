@@ -10,8 +10,8 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from agent.estimation.closed_forms import Placement, circle_intersections, included_angle, placements
-from agent.estimation.exact import Sighting, branches, weigh_branches, weigh_placements
-from protocol.motion import TAU, Pose, Run, chord, compose, follow, step, wrap
+from agent.estimation.exact import PairObservation, branches, weigh_branches, weigh_placements
+from protocol.motion import TAU, Pose, Segment, chord, compose, follow, step, wrap
 
 EXACT = 1e-9
 FLOOR = 1e-7
@@ -82,7 +82,7 @@ def test_following_n_equal_ticks_is_n_steps(
     end = start
     for _ in range(ticks):
         end = step(end, v, omega, period)
-    followed = follow(start, [Run(ticks, v, omega)], period)
+    followed = follow(start, [Segment(ticks, v, omega)], period)
     assert apart(followed, end) < EXACT
     assert followed.heading == pytest.approx(end.heading, abs=EXACT)
 
@@ -446,12 +446,12 @@ def test_nothing_is_placed_where_nothing_fits(rho1: float, rho2: float, p2a: Pos
 # --- weighing placements ------------------------------------------------------------------------------
 
 
-def sightings_of(encounter: Encounter, third: Pose) -> list[Sighting]:
+def sightings_of(encounter: Encounter, third: Pose) -> list[PairObservation]:
     """Its two ranges, and one more after b has moved to `third`."""
     return [
-        Sighting(0, encounter.p1a, encounter.p1b, encounter.rho1),
-        Sighting(1, encounter.p2a, encounter.p1b, encounter.rho2),
-        Sighting(2, encounter.p2a, third, separation(encounter.truth, encounter.p2a, third)),
+        PairObservation(0, encounter.p1a, encounter.p1b, encounter.rho1),
+        PairObservation(1, encounter.p2a, encounter.p1b, encounter.rho2),
+        PairObservation(2, encounter.p2a, third, separation(encounter.truth, encounter.p2a, third)),
     ]
 
 
@@ -493,7 +493,10 @@ def test_a_third_range_drops_the_placements_that_predict_another(
     assert all(nearest([placement], encounter.truth) < 1e-3 for placement in left) or all(
         encounter.residual(placement) < 2e-7 for placement in left
     )
-    assert weigh_placements(told, [*sightings[:2], Sighting(2, encounter.p2a, third, 5e3)], 1e4, FLOOR) == ()
+    assert (
+        weigh_placements(told, [*sightings[:2], PairObservation(2, encounter.p2a, third, 5e3)], 1e4, FLOOR)
+        == ()
+    )
 
 
 @given(encounters(), st.floats(0.5, 2.0), angles)
@@ -503,7 +506,7 @@ def test_silence_drops_the_placements_that_would_have_been_heard(
     assume(encounter.is_tame)
     third = step(Pose(encounter.p1b.x, encounter.p1b.y, course), way, 0.0, 1.0)
     true = separation(encounter.truth, encounter.p2a, third)
-    silent = [*sightings_of(encounter, third)[:2], Sighting(2, encounter.p2a, third, None)]
+    silent = [*sightings_of(encounter, third)[:2], PairObservation(2, encounter.p2a, third, None)]
     found = encounter.solutions()
     left = weigh_placements(found, silent, true - 1e-3, FLOOR)
     assert nearest(left, encounter.truth) < EXACT

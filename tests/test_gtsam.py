@@ -18,17 +18,27 @@ import pytest
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian.hypotheses import Weighed, search
+from agent.estimation.gaussian.hypotheses import ScoredHypothesis, search
 from agent.estimation.gaussian.least_squares import Fit, poses
-from agent.estimation.gaussian.range_model import Pair
+from agent.estimation.gaussian.range_model import PairRanges
 from agent.planning import inference, planner
-from agent.planning.state import Done, Mind
+from agent.planning.state import Done, RobotState
 from compose.launch.in_process import play
 from compose.scenario.scenario_file import parse
 from protocol.journal import journal_file
-from protocol.messages import Briefing, Drive, End, Estimate, Farewell, Localised, Report, Sense, Undecided
+from protocol.messages import (
+    Command,
+    Estimate,
+    FinalReport,
+    Localised,
+    MissionEnd,
+    Observation,
+    Report,
+    RobotConfig,
+    Undecided,
+)
 from protocol.motion import Controls, Pose, compose, step
-from protocol.noise import Drift, Noise
+from protocol.noise import Noise, VelocityNoise
 from protocol.wire import decode
 from tests.series import series
 
@@ -49,7 +59,12 @@ STEPS = 200
 
 SIGMAS = ((0.01, 0.01), (0.02, 0.05), (0.1, 0.1))
 """m, of ranges to anchors and between robots"""
-DRIFTS = (Drift(), Drift(0.001, 0.001), Drift(0.01, 0.01), Drift(0.001, 0.01, 0.02, 0.005))
+DRIFTS = (
+    VelocityNoise(),
+    VelocityNoise(0.001, 0.001),
+    VelocityNoise(0.01, 0.01),
+    VelocityNoise(0.001, 0.01, 0.02, 0.005),
+)
 SETTINGS = tuple(product(SIGMAS, DRIFTS))
 """missions go through them in turn; neither T_s nor v_max is 1 in any, so that none can be forgotten"""
 
@@ -105,14 +120,14 @@ def recorded(number: int, folder: Path) -> None:
     assert record.end.outcome == "localised", record.end
 
 
-def said(folder: Path, robot: str) -> Iterator[Sense | Report | Drive]:
+def said(folder: Path, robot: str) -> Iterator[Observation | Report | Command]:
     """What the journal of `robot` has in and out, until it claims."""
     frames = journal_file.read(folder / f"agent-{robot}.journal")
     for frame in islice(frames, 2, None):
-        match decode(frame, Sense | Report | Drive | Estimate | End | Farewell):
-            case Sense() | Report() as message:
+        match decode(frame, Observation | Report | Command | Estimate | MissionEnd | FinalReport):
+            case Observation() | Report() as message:
                 yield message
-            case Drive() as drive:
+            case Command() as drive:
                 yield drive
                 if isinstance(drive.verdict, Localised):
                     return
@@ -121,7 +136,7 @@ def said(folder: Path, robot: str) -> Iterator[Sense | Report | Drive]:
 
 
 def measured(folder: Path, robot: str) -> Measured:
-    senses = [message for message in said(folder, robot) if isinstance(message, Sense)]
+    senses = [message for message in said(folder, robot) if isinstance(message, Observation)]
     assert [sense.tick for sense in senses] == list(range(len(senses)))
     return Measured(
         [sense.executed for sense in senses if sense.executed is not None],
@@ -135,21 +150,21 @@ def measured(folder: Path, robot: str) -> Measured:
     )
 
 
-def remembered(folder: Path, robot: str) -> tuple[Mind, Localised]:
+def remembered(folder: Path, robot: str) -> tuple[RobotState, Localised]:
     """A mind that has sensed and heard what the robot had when it claimed, and the claim.
 
     It has come to a verdict before it began, so it decides nothing, and takes no time.
     """
-    briefing = decode(list(journal_file.read(folder / f"agent-{robot}.journal"))[1], Briefing)
-    mind = Mind(briefing, Done(1, Undecided("was not asked")))
+    briefing = decode(list(journal_file.read(folder / f"agent-{robot}.journal"))[1], RobotConfig)
+    mind = RobotState(briefing, Done(1, Undecided("was not asked")))
     heard: list[Report] = []
     for message in said(folder, robot):
         match message:
-            case Sense():
+            case Observation():
                 mind, heard = planner.observe(mind, message), []
             case Report() if message.robot != robot:
                 heard.append(message)
-            case Drive(verdict=verdict):
+            case Command(verdict=verdict):
                 mind = planner.decide(mind, heard)
                 if isinstance(verdict, Localised):
                     return mind, verdict
@@ -270,10 +285,10 @@ def optimum(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, last: Seque
 class Compared(NamedTuple):
     """One mission."""
 
-    briefing: Briefing
+    briefing: RobotConfig
     claimed: Localised
-    pair: Pair
-    ours: Weighed
+    pair: PairRanges
+    ours: ScoredHypothesis
     theirs: Optimum
 
 

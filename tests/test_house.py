@@ -14,7 +14,7 @@ import msgspec
 import pytest
 
 from agent.planning import planner
-from agent.planning.state import Mind
+from agent.planning.state import RobotState
 from compose.scenario.scenario_file import load
 from protocol.wire import encode
 from tests.steps import steps
@@ -252,7 +252,7 @@ def test_the_same_values_give_the_same_step_and_are_left_as_they_were(name: str)
 
 def test_a_mind_and_a_world_cannot_be_changed() -> None:
     scenario = load("paper-1")
-    mind, world = Mind(scenario.briefing("a")), release(scenario)
+    mind, world = RobotState(scenario.briefing("a")), release(scenario)
     for value in (mind, mind.log, mind.radio, mind.findings, mind.briefing, world, world.truth, scenario):
         assert isinstance(value, msgspec.Struct)
         field = value.__struct_fields__[0]

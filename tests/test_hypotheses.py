@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 
 from agent.estimation import closed_forms
 from agent.estimation.closed_forms import Placement, same_placement
-from agent.estimation.gaussian.hypotheses import Weighed, missing, of_anchor, search, silence
+from agent.estimation.gaussian.hypotheses import ScoredHypothesis, missing, of_anchor, search, silence
 from agent.estimation.gaussian.least_squares import fit, poses
 from agent.estimation.gaussian.odometry_noise import Array, track
-from agent.estimation.gaussian.range_model import Pair, Ranges
+from agent.estimation.gaussian.range_model import PairRanges, Ranges
 from protocol.motion import Pose, step, wrap
-from protocol.noise import Drift, Noise
+from protocol.noise import Noise, VelocityNoise
 
 REACH = 3.0
 NONE = np.array([], np.intp)
@@ -68,7 +68,7 @@ RANGES = Noise(anchor_sigma=SIGMA, mutual_sigma=SIGMA)
 
 def alone(
     drives: Sequence[tuple[float, float]], anchor: tuple[float, float], seed: int
-) -> tuple[Weighed, ...]:
+) -> tuple[ScoredHypothesis, ...]:
     """What a robot holds that has driven so from the origin, with its anchor there."""
     v, omega = np.array(drives).T
     path = track(v, omega, 1.0)
@@ -102,7 +102,7 @@ APART = (4.0, 0.0)
 class Driven:
     """A robot that has driven at random, and what its odometry says of it."""
 
-    def __init__(self, start: Pose, drives: Array, drift: Drift, draws: np.random.Generator) -> None:
+    def __init__(self, start: Pose, drives: Array, drift: VelocityNoise, draws: np.random.Generator) -> None:
         self.poses = [start]
         spread = []
         for v, omega in drives.tolist():
@@ -132,7 +132,7 @@ def distance(one: Pose, x: float, y: float) -> float:
     return math.hypot(one.x - x, one.y - y)
 
 
-def drawn(seed: int, noise: Noise) -> tuple[Pair, Array]:
+def drawn(seed: int, noise: Noise) -> tuple[PairRanges, Array]:
     """A pair that drives about between its anchors; and the truth, as a guess."""
     draws = np.random.default_rng(seed)
     robots = []
@@ -146,11 +146,11 @@ def drawn(seed: int, noise: Noise) -> tuple[Pair, Array]:
     of_a, of_b = (told(one, noise.anchor_sigma, draws) for one in own)
     ranges = Ranges.of_lists(of_a, of_b, told(between, noise.mutual_sigma, draws), noise)
     silent = [missing(ranges.tick[ranges.rows(kind)], 13) for kind in range(3)]
-    pair = Pair((a.track, b.track), ranges, (silent[0], silent[1], silent[2]), APART, REACH, noise)
+    pair = PairRanges((a.track, b.track), ranges, (silent[0], silent[1], silent[2]), APART, REACH, noise)
     return pair, np.array([*a.guess((0.0, 0.0)), *b.guess(APART)])
 
 
-def sigmas(one: Weighed, other: Array) -> float:
+def sigmas(one: ScoredHypothesis, other: Array) -> float:
     """How far apart the two are, by the covariance of the first."""
     error = one.fit.guess - other
     error[2::3] = np.remainder(error[2::3] + math.pi, math.tau) - math.pi
@@ -159,7 +159,7 @@ def sigmas(one: Weighed, other: Array) -> float:
 
 @pytest.mark.parametrize(
     "noise",
-    [RANGES, Noise(0.1, 0.1), Noise(0.02, 0.02, odometry=Drift(0.01, 0.01))],
+    [RANGES, Noise(0.1, 0.1), Noise(0.02, 0.02, odometry=VelocityNoise(0.01, 0.01))],
     ids=["fine", "coarse", "odometry"],
 )
 def test_the_truth_is_among_the_hypotheses_and_their_odds_are_a_distribution(noise: Noise) -> None:
@@ -212,7 +212,7 @@ EXACT = 1e-6
 """m: sigma; what the robots hold an exact range to be at best"""
 
 
-def met(corner: bool, start: Pose, standing: Pose) -> tuple[Pair, list[Placement]]:
+def met(corner: bool, start: Pose, standing: Pose) -> tuple[PairRanges, list[Placement]]:
     """a has taken three ranges of b, which stands; and eq. (7) by them, in <b(M2)>.
 
     Both know where their anchors are: by ranges along an L. M2 is 10 m from M1.
@@ -220,8 +220,8 @@ def met(corner: bool, start: Pose, standing: Pose) -> tuple[Pair, list[Placement
     ell = [(0.5, 0.0), (0.5, 0.0), (0.0, math.pi / 2), (0.5, 0.0)]
     last = [(0.4, 0.0), (0.0, math.pi / 2 if corner else 0.0), (0.4, 0.0)]
     draws = np.random.default_rng(0)
-    a = Driven(start, np.array([*ell, *([(0.8, 0.0)] * 9), *last]), Drift(), draws)
-    b = Driven(standing, np.array([*ell, *([(0.0, 0.0)] * 12)]), Drift(), draws)
+    a = Driven(start, np.array([*ell, *([(0.8, 0.0)] * 9), *last]), VelocityNoise(), draws)
+    b = Driven(standing, np.array([*ell, *([(0.0, 0.0)] * 12)]), VelocityNoise(), draws)
     ticks = (13, 14, 16)
     looks = [distance(a.poses[tick], b.poses[tick].x, b.poses[tick].y) for tick in ticks]
     assert max(looks) < REACH
@@ -232,7 +232,7 @@ def met(corner: bool, start: Pose, standing: Pose) -> tuple[Pair, list[Placement
         list(zip(ticks, looks, strict=True)),
         noise,
     )
-    pair = Pair((a.track, b.track), ranges, (NONE, NONE, NONE), (10.0, 0.0), REACH, noise)
+    pair = PairRanges((a.track, b.track), ranges, (NONE, NONE, NONE), (10.0, 0.0), REACH, noise)
     # <a(M1)> along <W>, so that <b(M2)>, too, is where it is but for M2: placements are T = -M2
     here = Pose(b.poses[-1].x - 10.0, b.poses[-1].y, b.poses[-1].heading)
     found = closed_forms.placements(10.0, here, a.poses[13], a.poses[14], looks[0], looks[1])

@@ -16,7 +16,7 @@ from compose.scenario.scenario_file import load
 from protocol.journal import journal_file
 from protocol.journal.environment import of_world
 from protocol.journal.journal_file import CorruptJournal, Journal, RecordExists, Tail
-from protocol.messages import Drive, End, Environment, Farewell
+from protocol.messages import Command, Environment, FinalReport, MissionEnd
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from tests.examples import EXAMPLES
 from world.scenario import Scenario
@@ -47,10 +47,10 @@ def test_any_msgpack_library_reads_a_journal(tmp_path: Path) -> None:
     play(load("paper-1"), tmp_path)
     with (tmp_path / "world.journal").open("rb") as file:
         frames = list(msgpack.Unpacker(file))
-    kinds = Environment | Scenario | Drive | End | Farewell
+    kinds = Environment | Scenario | Command | MissionEnd | FinalReport
     messages = [decode(frame, kinds) for frame in frames]
     assert messages[:2] == [of_world(), load("paper-1")]
-    assert [type(message) for message in messages[-3:]] == [End, Farewell, Farewell]
+    assert [type(message) for message in messages[-3:]] == [MissionEnd, FinalReport, FinalReport]
     assert len(messages) == 2 + 2 * 49 + 3
     assert msgpack.unpackb(frames[2][5:])[:3] == ["drive", 0, "a"]
 

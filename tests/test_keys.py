@@ -24,7 +24,7 @@ from protocol.network import keys as tree
 from protocol.network import session
 from protocol.network.diagnosis import MUTE
 from protocol.network.endpoints import BadConfiguration, Endpoints, configured, listening
-from tests.commands import Command, Ended, journals, tandem
+from tests.commands import Ended, TandemProcess, journals, tandem
 
 EVERYBODY = ("agent-a", "agent-b", "router", "viewer", "world")
 
@@ -184,9 +184,9 @@ def test_a_mission_in_one_process_has_nothing_to_secure() -> None:
 def test_a_folder_of_keys_may_lie_anywhere(keys: Path, mine: Path, tmp_path: Path) -> None:
     endpoint = free_endpoint("tls")
     with (
-        Command("world", "paper-1", "--listen", endpoint, "--keys", keys / "world") as world,
-        Command("agent", "a", "--connect", endpoint, "--keys", mine.name, cwd=tmp_path) as a,
-        Command("agent", "b", "--connect", endpoint, "--keys", keys / "agent-b") as b,
+        TandemProcess("world", "paper-1", "--listen", endpoint, "--keys", keys / "world") as world,
+        TandemProcess("agent", "a", "--connect", endpoint, "--keys", mine.name, cwd=tmp_path) as a,
+        TandemProcess("agent", "b", "--connect", endpoint, "--keys", keys / "agent-b") as b,
     ):
         for part in (a, b, world):
             assert part.ended().status == 0
@@ -338,7 +338,7 @@ def test_a_wrong_password_is_told_to_be_checked(tmp_path: Path) -> None:
 def test_a_page_whose_certificate_is_refused_says_so(keys: Path, tmp_path: Path) -> None:
     own = shutil.copytree(keys / "viewer", tmp_path / "viewer")
     take_away(own, keys)
-    with world_of(keys) as endpoint, Command("watch", "--connect", endpoint, "--keys", own) as page:
+    with world_of(keys) as endpoint, TandemProcess("watch", "--connect", endpoint, "--keys", own) as page:
         page.until_says(f"no router at {endpoint} yet: it asks for a certificate, and there is none")
 
 
@@ -388,9 +388,9 @@ def test_a_configuration_may_say_where_to_connect(tmp_path: Path) -> None:
     )
     (tmp_path / "agent.json5").write_text(f"{{connect: {{endpoints: {{client: ['{endpoint}']}}}}}}")
     with (
-        Command("world", "paper-1", "--config", tmp_path / "world.json5") as world,
-        Command("agent", "a", "--config", tmp_path / "agent.json5") as a,
-        Command("agent", "b", "--config", tmp_path / "agent.json5") as b,
+        TandemProcess("world", "paper-1", "--config", tmp_path / "world.json5") as world,
+        TandemProcess("agent", "a", "--config", tmp_path / "agent.json5") as a,
+        TandemProcess("agent", "b", "--config", tmp_path / "agent.json5") as b,
     ):
         for part in (a, b, world):
             assert part.ended().status == 0
@@ -437,15 +437,15 @@ def test_flags_that_do_not_go_together_are_told(arguments: tuple[str, ...], word
 def test_who_listens_beyond_this_machine_without_keys_is_warned(keys: Path) -> None:
     where = free_endpoint().replace("127.0.0.1", "0.0.0.0")
     warning = f"listening beyond this machine without --keys, at {where}: whoever reaches it"
-    with Command("world", "paper-1", "--listen", where) as world:
+    with TandemProcess("world", "paper-1", "--listen", where) as world:
         world.until_says("waiting for")
         assert world.err.startswith(f"tandem world: {warning}")
         assert world.err.count("\n") == 1
-    with Command("world", "paper-1", "--listen", free_endpoint()) as world:
+    with TandemProcess("world", "paper-1", "--listen", free_endpoint()) as world:
         world.until_says("waiting for")
         assert world.err == ""
     where = free_endpoint("tls").replace("127.0.0.1", "0.0.0.0")
-    with Command("world", "paper-1", "--listen", where, "--keys", keys / "world") as world:
+    with TandemProcess("world", "paper-1", "--listen", where, "--keys", keys / "world") as world:
         world.until_says("waiting for")
         assert world.err == ""
 

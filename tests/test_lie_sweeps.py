@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from compose.sweep import attack_figures, axis_figures, execution, spec
-from compose.sweep.cells import Refused, cells, setting_of
-from protocol.attack import Lie
+from compose.sweep.cells import RefusedCell, cells, setting_of
+from protocol.attack import Attack
 from protocol.network.inbox import Inbox
 
 SPEC = """
@@ -46,19 +46,21 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> execution.Results:
     (folder / "few.toml").write_text(SPEC)
     progress = execution.Progress(say=lambda _: None, begin=lambda *_: None, done=lambda _: None)
     campaign = spec.load(str(folder / "few.toml"))
-    return execution.sweep(campaign, folder / "out", execution.Means(workers=1), Inbox("test"), progress)
+    return execution.sweep(
+        campaign, folder / "out", execution.ExecutionOptions(workers=1), Inbox("test"), progress
+    )
 
 
 def test_the_campaign_that_ships_tells_the_lies_of_its_labels() -> None:
     campaign = spec.load("lies")
-    seen: dict[str, Lie | None] = {}
+    seen: dict[str, Attack | None] = {}
     for cell in cells(campaign):
         setting = setting_of(campaign, cell)
-        assert not isinstance(setting, Refused)
+        assert not isinstance(setting, RefusedCell)
         a, b = setting.scenario.robots
         assert b.lie is None
         seen[campaign.axes[0].label(cell.place[0])] = a.lie
-    assert seen.pop("honest") == Lie("scale", 1.0), "which is no lie"
+    assert seen.pop("honest") == Attack("scale", 1.0), "which is no lie"
     for label, lie in seen.items():
         assert lie is not None
         kind, *part, size = label.removesuffix(" deg").removesuffix(" m").split()
@@ -97,7 +99,9 @@ def test_a_campaign_without_lies_has_no_such_pictures(tmp_path: Path) -> None:
     (tmp_path / "few.toml").write_text('name = "few"\nscenario = "random"\ntrials = 2\nseed = 1\n')
     progress = execution.Progress(say=lambda _: None, begin=lambda *_: None, done=lambda _: None)
     campaign = spec.load(str(tmp_path / "few.toml"))
-    results = execution.sweep(campaign, tmp_path / "out", execution.Means(workers=1), Inbox("test"), progress)
+    results = execution.sweep(
+        campaign, tmp_path / "out", execution.ExecutionOptions(workers=1), Inbox("test"), progress
+    )
     assert attack_figures.axis_of_lies(results) is None
     axis_figures.draw(results, tmp_path / "figures")
     assert not (tmp_path / "figures" / "roc.svg").exists()

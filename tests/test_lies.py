@@ -16,9 +16,9 @@ from compose.launch.in_process import play
 from compose.recording.run import Record
 from compose.recording.summary_json import summary
 from compose.scenario.scenario_file import BadScenario, parse, shipped
-from protocol.attack import Kind, Lie, Part
-from protocol.messages import Alarm, Ranged, Report, Undecided
-from protocol.motion import ORIGIN, Pose, Run, follow
+from protocol.attack import Attack, Kind, Part
+from protocol.messages import Inconsistent, Ranged, Report, Undecided
+from protocol.motion import ORIGIN, Pose, Segment, follow
 from tests.steps import Step, steps
 
 DEGREE = math.pi / 180.0
@@ -28,12 +28,12 @@ SIZES: dict[Kind, tuple[float, ...]] = {
     "rotate": (15.0 * DEGREE, DEGREE),
     "shift": (-0.3, 0.01),
 }
-OF_DRIVES = [Lie(kind, size, part) for kind, sizes in SIZES.items() for size in sizes for part in PARTS]
-OF_STARTS = [Lie("radius", 0.01), Lie("radius", 0.3), Lie("heading", DEGREE), Lie("heading", 0.5)]
+OF_DRIVES = [Attack(kind, size, part) for kind, sizes in SIZES.items() for size in sizes for part in PARTS]
+OF_STARTS = [Attack("radius", 0.01), Attack("radius", 0.3), Attack("heading", DEGREE), Attack("heading", 0.5)]
 FINE = "noise = {anchor_sigma = 0.01, mutual_sigma = 0.01}\n"
 
 
-def mission(seed: int, lies: dict[str, Lie], noise: str = "") -> Record:
+def mission(seed: int, lies: dict[str, Attack], noise: str = "") -> Record:
     """A random mission, in which those robots tell those lies."""
     text = shipped()["random"].read_text().replace("[mission]\n", f"[mission]\n{noise}")
     scenario = parse(text, "random", seed=seed)
@@ -52,7 +52,7 @@ def outcome(record: Record) -> str:
 @pytest.mark.parametrize(
     "lie", [*OF_DRIVES, *OF_STARTS], ids=lambda lie: f"{lie.kind}-{lie.part}-{lie.size:.2g}"
 )
-def test_every_lie_about_a_drive_or_a_start_is_an_alarm(lie: Lie, liar: str) -> None:
+def test_every_lie_about_a_drive_or_a_start_is_an_alarm(lie: Attack, liar: str) -> None:
     for seed in range(6):
         record = mission(seed, {liar: lie})
         if not _tells_otherwise(record, liar, lie):
@@ -63,7 +63,7 @@ def test_every_lie_about_a_drive_or_a_start_is_an_alarm(lie: Lie, liar: str) -> 
         assert (record.end.reason or "").startswith(f"{peer}: {liar} tells "), record.end.reason
 
 
-def _tells_otherwise(record: Record, liar: str, lie: Lie) -> bool:
+def _tells_otherwise(record: Record, liar: str, lie: Attack) -> bool:
     """Whether there was anything to lie about: in that part of its log the robot has driven."""
     phases = {"phase-1": 1, "orbit": 2, "encounter": 3}
     return lie.part == "all" or any(
@@ -77,20 +77,20 @@ def test_turning_its_whole_story_about_its_anchor_tells_nothing_false() -> None:
     """The frame of an anchor has no direction of its own: nobody can find out, and nobody is misled."""
     for seed in range(6):
         for liar in ("a", "b"):
-            assert outcome(mission(seed, {liar: Lie("reframe", 1.0)})) == "localised"
+            assert outcome(mission(seed, {liar: Attack("reframe", 1.0)})) == "localised"
 
 
 def test_two_liars_are_no_more_believed_than_one() -> None:
     for seed in range(6):
-        assert outcome(mission(seed, {"a": Lie("heading", 0.1), "b": Lie("radius", 0.2)})) == "alarm"
+        assert outcome(mission(seed, {"a": Attack("heading", 0.1), "b": Attack("radius", 0.2)})) == "alarm"
 
 
 def test_the_liar_hears_that_it_is_not_believed_and_gives_up() -> None:
-    record = mission(0, {"a": Lie("scale", 0.5)})
+    record = mission(0, {"a": Attack("scale", 0.5)})
     last = record.moments[-1].drives
-    assert isinstance(last["b"].verdict, Alarm)
+    assert isinstance(last["b"].verdict, Inconsistent)
     met = next(step for step in steps("paper-1") if step.heard["a"])
-    told = [replace(report, verdict=Alarm("a tall story")) for report in met.heard["a"]]
+    told = [replace(report, verdict=Inconsistent("a tall story")) for report in met.heard["a"]]
     verdict = planner.decide(met.observed["a"], told).verdict
     assert verdict == Undecided("b does not believe it: a tall story")
 
@@ -100,10 +100,14 @@ def test_the_liar_hears_that_it_is_not_believed_and_gives_up() -> None:
 
 @pytest.mark.parametrize(
     "lie",
-    [Lie("scale", 0.5, "orbit"), Lie("scale", 0.5, "encounter"), Lie("rotate", 15.0 * DEGREE, "encounter")],
+    [
+        Attack("scale", 0.5, "orbit"),
+        Attack("scale", 0.5, "encounter"),
+        Attack("rotate", 15.0 * DEGREE, "encounter"),
+    ],
     ids=lambda lie: f"{lie.kind}-{lie.part}",
 )
-def test_under_noise_a_lie_that_is_large_beside_it_is_an_alarm(lie: Lie) -> None:
+def test_under_noise_a_lie_that_is_large_beside_it_is_an_alarm(lie: Attack) -> None:
     """Of a, whose way from its anchor to the encounter stands in no range of its own."""
     for seed in range(3):
         record = mission(seed, {"a": lie}, FINE)
@@ -112,7 +116,7 @@ def test_under_noise_a_lie_that_is_large_beside_it_is_an_alarm(lie: Lie) -> None
             drive.verdict
             for moment in record.moments
             for drive in moment.drives.values()
-            if isinstance(drive.verdict, Alarm)
+            if isinstance(drive.verdict, Inconsistent)
         )
         assert alarm.p_value < 1e-4
         assert alarm.residual is not None
@@ -121,7 +125,7 @@ def test_under_noise_a_lie_that_is_large_beside_it_is_an_alarm(lie: Lie) -> None
 
 @pytest.mark.parametrize("seed", [30, 49, 109])
 def test_who_plans_by_a_lie_and_loses_its_peer_finds_other_places_to_range_from(seed: int) -> None:
-    assert outcome(mission(seed, {"a": Lie("scale", 0.5, "phase-1")}, FINE)) == "alarm"
+    assert outcome(mission(seed, {"a": Attack("scale", 0.5, "phase-1")}, FINE)) == "alarm"
 
 
 def test_under_noise_the_honest_are_believed() -> None:
@@ -138,7 +142,7 @@ def told_to_a(phase: int) -> tuple[Step, Report]:
     return step, step.heard["a"][0]
 
 
-def objection(step: Step, *reports: Report) -> Alarm | None:
+def objection(step: Step, *reports: Report) -> Inconsistent | None:
     """Of a, to the last of `reports`, after it has heard the others."""
     mind = step.observed["a"]
     for report in reports[:-1]:
@@ -157,7 +161,7 @@ def test_what_an_honest_peer_tells_is_believed_and_so_is_what_it_tells_again() -
 def test_a_second_story_is_held_against_the_first() -> None:
     step, report = told_to_a(2)
     last = report.runs[-1]
-    slower = replace(report, runs=(*report.runs[:-1], Run(last.ticks, 0.5 * last.v, last.omega)))
+    slower = replace(report, runs=(*report.runs[:-1], Segment(last.ticks, 0.5 * last.v, last.omega)))
     assert "otherwise before" in _claim(objection(step, report, slower))
     farther = replace(report, ranges=(Ranged(report.ranges[0].tick, 0.5), *report.ranges[1:]))
     assert "otherwise before" in _claim(objection(step, report, farther))
@@ -169,7 +173,7 @@ def test_a_second_story_is_held_against_the_first() -> None:
 def test_a_drive_beyond_v_max_or_omega_max_is_not_believed() -> None:
     step, report = told_to_a(2)
     first = report.runs[0]
-    for run in (Run(first.ticks, 1.001, first.omega), Run(first.ticks, first.v, -3.15)):
+    for run in (Segment(first.ticks, 1.001, first.omega), Segment(first.ticks, first.v, -3.15)):
         alarm = objection(step, replace(report, runs=(run, *report.runs[1:])))
         assert "at the most" in _claim(alarm)
 
@@ -188,20 +192,20 @@ def test_who_says_that_it_orbits_is_on_its_orbit_and_heads_along_it() -> None:
     step, report = told_to_a(2)
     assert report.state == "orbiting"
     last = report.runs[-1]
-    late = (*report.runs[:-1], Run(last.ticks - 1, last.v, last.omega))
-    straight = replace(report, runs=(*late, Run(1, last.v, 0.0)))
+    late = (*report.runs[:-1], Segment(last.ticks - 1, last.v, last.omega))
+    straight = replace(report, runs=(*late, Segment(1, last.v, 0.0)))
     assert "off the orbit" in _claim(objection(step, straight))
-    turned = replace(report, runs=(*late, Run(1, 0.0, 1.0)))
+    turned = replace(report, runs=(*late, Segment(1, 0.0, 1.0)))
     assert "heading" in _claim(objection(step, turned))
 
 
-def _claim(alarm: Alarm | None) -> str:
+def _claim(alarm: Inconsistent | None) -> str:
     return alarm.claim if alarm is not None else ""
 
 
 # --- lying --------------------------------------------------------------------------------------------
 
-runs = st.builds(Run, st.integers(1, 5), st.floats(-1.0, 1.0), st.floats(-3.0, 3.0))
+runs = st.builds(Segment, st.integers(1, 5), st.floats(-1.0, 1.0), st.floats(-3.0, 3.0))
 logs = st.lists(runs, min_size=1, max_size=8).map(
     lambda runs: Logbook().extended(0, 0, Logbook(sum(run.ticks for run in runs), tuple(runs)))
 )
@@ -211,7 +215,7 @@ ticks = st.none() | st.integers(0, 40)
 @settings(max_examples=100)
 @given(logs, st.sampled_from([*OF_DRIVES, *OF_STARTS]), ticks, ticks, st.integers(1, 40))
 def test_a_liar_tells_the_same_story_as_it_grows(
-    log: Logbook, lie: Lie, parted: int | None, later: int | None, seen: int
+    log: Logbook, lie: Attack, parted: int | None, later: int | None, seen: int
 ) -> None:
     """What it told of its first ticks it still tells when there are more of them."""
     met = None if parted is None or later is None else parted + later
@@ -228,7 +232,7 @@ def test_a_liar_tells_the_same_story_as_it_grows(
 def test_a_rotation_turns_what_was_driven_in_its_part_and_nothing_after(
     log: Logbook, parted: int, orbit: int, angle: float
 ) -> None:
-    told = false_reports.told(log, Lie("rotate", angle, "orbit"), parted, parted + orbit, 1.0)
+    told = false_reports.told(log, Attack("rotate", angle, "orbit"), parted, parted + orbit, 1.0)
     true_end = follow(ORIGIN, log.between(0, log.through), 1.0)
     told_end = follow(ORIGIN, told.between(0, log.through), 1.0)
     over = orbit > 0 and parted + orbit < log.through
@@ -237,8 +241,8 @@ def test_a_rotation_turns_what_was_driven_in_its_part_and_nothing_after(
 
 
 def test_a_false_radius_goes_with_false_ranges_and_moves_the_start_only() -> None:
-    log = Logbook(3, (Run(3, 1.0, 0.0),), (Ranged(0, 1.0), Ranged(1, 0.2)))
-    lie = Lie("radius", -0.5)
+    log = Logbook(3, (Segment(3, 1.0, 0.0),), (Ranged(0, 1.0), Ranged(1, 0.2)))
+    lie = Attack("radius", -0.5)
     assert false_reports.told(log, lie, None, None, 1.0).ranges == (Ranged(0, 0.5), Ranged(1, 0.0))
     assert false_reports.start(Pose(1.0, 0.0, 2.0), lie) == Pose(0.5, 0.0, 2.0)
 
@@ -251,8 +255,8 @@ def test_a_scenario_says_who_lies_and_how() -> None:
         shipped()["paper-1"].read_text().replace('id = "b"', 'id = "b"\nlie = {kind = "scale", size = 0.5}')
     )
     scenario = parse(text, "paper-1")
-    assert [robot.lie for robot in scenario.robots] == [None, Lie("scale", 0.5, "all")]
-    assert [scenario.briefing(robot).lie for robot in ("a", "b")] == [None, Lie("scale", 0.5, "all")]
+    assert [robot.lie for robot in scenario.robots] == [None, Attack("scale", 0.5, "all")]
+    assert [scenario.briefing(robot).lie for robot in ("a", "b")] == [None, Attack("scale", 0.5, "all")]
 
 
 @pytest.mark.parametrize(

@@ -13,16 +13,16 @@ from msgspec.structs import replace
 from agent.peer.motion_log import Logbook
 from agent.peer.peer_state import Radio, contradiction, hear
 from agent.planning import planner
-from agent.planning.state import Done, Mind
+from agent.planning.state import Done, RobotState
 from compose.scenario.scenario_file import load
 from protocol.messages import MAX_REPORT_RANGES, MAX_REPORT_RUNS, Localised, Ranged, Report, Undecided
-from protocol.motion import ORIGIN, Pose, Run, step
+from protocol.motion import ORIGIN, Pose, Segment, step
 from protocol.wire import MAX_REPORT_BYTES, decode, encode
 
 Tick = tuple[float, float, float | None]
 """v and omega over one tick, and the anchor range at its end, if there is one"""
 
-MIND = Mind(load("paper-1").briefing("a"))
+MIND = RobotState(load("paper-1").briefing("a"))
 
 ticks = st.builds(
     lambda few, times: few * times,
@@ -229,7 +229,7 @@ def test_a_log_knows_where_the_robot_was_at_every_tick(driven: list[Tick], data:
 
 def test_equal_manoeuvres_are_one_entry() -> None:
     book = Logbook().drove(1.0, 0.0).drove(1.0, 0.0).drove(1.0, 0.5).drove(1.0, 0.0, 3)
-    assert book == Logbook(6, (Run(2, 1.0, 0.0), Run(1, 1.0, 0.5), Run(3, 1.0, 0.0)))
+    assert book == Logbook(6, (Segment(2, 1.0, 0.0), Segment(1, 1.0, 0.5), Segment(3, 1.0, 0.0)))
 
 
 # --- contradictions -----------------------------------------------------------------------------------
@@ -242,7 +242,7 @@ SOUND = Report(
     start=None,
     since=2,
     through=8,
-    runs=(Run(4, 1.0, 0.0), Run(2, 0.5, 0.1)),
+    runs=(Segment(4, 1.0, 0.0), Segment(2, 0.5, 0.1)),
     ranges_since=1,
     ranges=(Ranged(3, 1.0), Ranged(8, 2.0)),
     heard=4,
@@ -255,7 +255,7 @@ def test_a_sound_report_contradicts_nothing() -> None:
     assert contradiction(replace(SOUND, tick=8)) is None
     assert contradiction(replace(SOUND, since=8, runs=(), ranges=())) is None
     from_the_start = replace(
-        SOUND, since=0, runs=(Run(8, 1.0, 0.0),), ranges_since=0, ranges=(Ranged(0, 1.0), Ranged(8, 2.0))
+        SOUND, since=0, runs=(Segment(8, 1.0, 0.0),), ranges_since=0, ranges=(Ranged(0, 1.0), Ranged(8, 2.0))
     )
     assert contradiction(from_the_start) is None
 
@@ -266,8 +266,8 @@ def test_a_sound_report_contradicts_nothing() -> None:
         ({"tick": 7}, "log over [2, 8] told at tick 7"),
         ({"since": 9, "runs": (), "ranges": ()}, "log over [9, 8]"),
         ({"runs": ()}, "do not fill [2, 8]"),
-        ({"runs": (Run(7, 1.0, 0.0),)}, "do not fill [2, 8]"),
-        ({"runs": (Run(2**31, 1.0, 0.0),)}, "do not fill [2, 8]"),
+        ({"runs": (Segment(7, 1.0, 0.0),)}, "do not fill [2, 8]"),
+        ({"runs": (Segment(2**31, 1.0, 0.0),)}, "do not fill [2, 8]"),
         ({"since": 3}, "do not fill [3, 8]"),
         ({"ranges": (Ranged(10, 1.0),)}, "range of tick 10 outside"),
         ({"ranges": (Ranged(0, 1.0),)}, "range of tick 0 outside"),

@@ -15,7 +15,7 @@ from agent.planning import planner
 from agent.planning.phase1_anchor import third_point
 from agent.planning.phase3_last_manoeuvre import SPEEDS, TURN_RATES, last_manoeuvre
 from compose.launch.in_process import play
-from compose.recording.run import Moment, Record
+from compose.recording.run import Record, TickRecord
 from compose.scenario.scenario_file import load, parse
 from protocol.messages import Localised
 from protocol.mission import OPTIMAL_TURN, Mission, Variant, third_point_turn_rate
@@ -235,7 +235,7 @@ def test_nobody_claims_before_a_third_mutual_range() -> None:
             assert sum(tick <= claims[0] for tick in ranged) >= 3
 
 
-def _places(moment: Moment) -> list[tuple[float, float]]:
+def _places(moment: TickRecord) -> list[tuple[float, float]]:
     return [(pose.x, pose.y) for pose in moment.truth.poses]
 
 

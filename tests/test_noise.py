@@ -16,13 +16,13 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from compose.launch import in_process
-from compose.recording.run import WORLD_JOURNAL, Moment, Record, read
+from compose.recording.run import WORLD_JOURNAL, Record, TickRecord, read
 from compose.recording.ticks_csv import ticks_csv
 from compose.scenario.scenario_file import load, parse
 from protocol.journal import journal_file
-from protocol.messages import Drive, Localised, Sense, Undecided
+from protocol.messages import Command, Localised, Observation, Undecided
 from protocol.motion import REST, Controls, Covariance, Pose, step
-from protocol.noise import Drift, Noise
+from protocol.noise import Noise, VelocityNoise
 from protocol.wire import decode, encode
 from tests.commands import SECTION_IV, journals, tandem
 from tests.series import series
@@ -95,8 +95,8 @@ def known(ranges: Sequence[float | None]) -> Floats:
     return np.array([rho for rho in ranges if rho is not None])
 
 
-def sent(v: float, omega: float, robot: str = "a", tick: int = 0) -> Drive:
-    return Drive(tick, robot, v, omega, 1, "straight")
+def sent(v: float, omega: float, robot: str = "a", tick: int = 0) -> Command:
+    return Command(tick, robot, v, omega, 1, "straight")
 
 
 def has_mean(values: Floats, mean: float, sigma: float) -> bool:
@@ -139,7 +139,7 @@ def test_without_noise_nothing_is_drawn_and_every_tick_is_the_same_to_the_bit(
     table = ticks_csv(in_process.play(exact, without))
     for name in ("gaussian", "uniform"):
         monkeypatch.setattr(sensors, name, drawn)
-    zeros = Noise(outlier_bias=(0.1, 0.2), actuation=Drift(0.0, 0.0, 0.0, 0.0))
+    zeros = Noise(outlier_bias=(0.1, 0.2), actuation=VelocityNoise(0.0, 0.0, 0.0, 0.0))
     assert zeros.exact
     scenario = replace(exact, mission=replace(exact.mission, noise=zeros))
     assert ticks_csv(in_process.play(scenario, zero)) == table
@@ -151,7 +151,7 @@ def test_without_noise_nothing_is_drawn_and_every_tick_is_the_same_to_the_bit(
 
 
 def frames(folder: Path, robot: str) -> list[bytes]:
-    """What a robot sensed, heard and said: not its Briefing, which names the noise, nor what precedes it."""
+    """What a robot sensed, heard and said: not its RobotConfig, which names the noise, nor what precedes it."""
     return list(journal_file.read(folder / f"agent-{robot}.journal"))[2:]
 
 
@@ -424,7 +424,7 @@ def test_wheels_saturate_before_they_err() -> None:
 
 
 def test_the_fastest_robot_with_the_worst_wheels_can_be_told_what_it_did() -> None:
-    drift = Drift(0.5, 0.5, 1e4, 1e4)
+    drift = VelocityNoise(0.5, 0.5, 1e4, 1e4)
     noise = Noise(outliers=0.5, outlier_bias=(0.0, 1e6), actuation=drift, odometry=drift)
     exact = near()
     mission = replace(exact.mission, max_speed=1e6, max_turn_rate=1e6, noise=noise)
@@ -432,8 +432,8 @@ def test_the_fastest_robot_with_the_worst_wheels_can_be_told_what_it_did() -> No
     fastest = 0.0
     for tick in range(2000):
         done = odometry(executed(Controls(1e6, 1e6), scenario, "a", tick), scenario, "a", tick + 1)
-        sense = Sense(tick, "a", done, anchor_ranges(at_tick(scenario, tick), scenario)[0])
-        assert decode(encode(sense), Sense) == sense
+        sense = Observation(tick, "a", done, anchor_ranges(at_tick(scenario, tick), scenario)[0])
+        assert decode(encode(sense), Observation) == sense
         fastest = max(fastest, abs(done.v))
     assert fastest > 3e6
 
@@ -441,11 +441,11 @@ def test_the_fastest_robot_with_the_worst_wheels_can_be_told_what_it_did() -> No
 # --- what is claimed ----------------------------------------------------------------------------------
 
 
-def claims(tick: int, robot: str, pose: Pose, covariance: Covariance | None = None) -> Drive:
-    return Drive(tick, robot, 0.0, 0.0, 3, "localised", Localised(pose, covariance))
+def claims(tick: int, robot: str, pose: Pose, covariance: Covariance | None = None) -> Command:
+    return Command(tick, robot, 0.0, 0.0, 3, "localised", Localised(pose, covariance))
 
 
-def moved_on(world: World, drives: dict[str, Drive]) -> World:
+def moved_on(world: World, drives: dict[str, Command]) -> World:
     onward = advance(world, drives)
     assert isinstance(onward, World)
     return onward
@@ -462,7 +462,7 @@ def test_a_claim_is_held_against_where_the_robot_was_when_it_claimed() -> None:
     stale = advance(later, {"b": claims(1, "b", b)})
     assert isinstance(stale, Judgement)
     assert stale.outcome == "wrong"
-    gives_up = Drive(1, "b", 0.0, 0.0, 3, "undecided", Undecided("no way"))
+    gives_up = Command(1, "b", 0.0, 0.0, 3, "undecided", Undecided("no way"))
     assert advance(later, {"b": gives_up}) == Judgement("undecided", "b: no way")
 
 
@@ -522,7 +522,7 @@ def test_processes_leave_the_same_bytes_as_one_process(noise: str, seed: str, tm
     assert told[0] == told[1]
 
 
-def driven(scenario: Scenario, folder: Path, ticks: int) -> tuple[list[Truth], list[list[Sense]]]:
+def driven(scenario: Scenario, folder: Path, ticks: int) -> tuple[list[Truth], list[list[Observation]]]:
     """The truth and the senses of robots that drive without a mind, with the world's journal in `folder`."""
     with closing(journal_file.Journal(folder / WORLD_JOURNAL)) as kept:
         course = Course(scenario, kept)
@@ -574,11 +574,11 @@ def shortest(value: float | None) -> str:
 
 
 def test_ticks_gives_what_a_robot_did_of_which_no_drive_came() -> None:
-    """In real time a robot whose Drive came too late is told to rest; a floor moves it all the same."""
+    """In real time a robot whose Command came too late is told to rest; a floor moves it all the same."""
     scenario = near("actuation = {v_floor = 0.1}", max_ticks=1)
     world = release(scenario)
     onward = moved_on(world, {})
-    record = Record(scenario, (Moment(world.truth, {}), Moment(onward.truth, {})), None, {})
+    record = Record(scenario, (TickRecord(world.truth, {}), TickRecord(onward.truth, {})), None, {})
     first, *_, last = csv.DictReader(ticks_csv(record).splitlines())
     assert onward.executed is not None
     assert float(first["v"]) == onward.executed[0].v != 0.0

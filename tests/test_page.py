@@ -16,17 +16,17 @@ from playwright.sync_api import Page, expect
 from compose.recording.run import WORLD_JOURNAL, estimates, read
 from protocol.journal import journal_file
 from protocol.journal.journal_file import Journal
-from protocol.messages import Drive, Sense
+from protocol.messages import Command, Observation
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 from tests.browser import Open, inks, picture, shot, until_shown, watching
-from tests.commands import ENDLESS, Command, until, world
+from tests.commands import ENDLESS, TandemProcess, until, world
 from tests.series import series
 from world.referee import errors
 
 # --- live -------------------------------------------------------------------------------------------
 
 
-def frames_to(path: Path, tick: int, first: type[Sense | Drive] = Sense) -> int:
+def frames_to(path: Path, tick: int, first: type[Observation | Command] = Observation) -> int:
     """How many frames stand in a journal before those of `tick`, of which `first` is the first."""
     for place, frame in enumerate(journal_file.read(path)):
         with suppress(MalformedFrame):
@@ -45,9 +45,9 @@ def test_what_becomes_known_of_a_tick_later_is_on_the_time_line_and_in_the_log(
         growing = {name: stack.enter_context(Journal(tmp_path / name)) for name in whole}
 
         def grow(robots: int, drives: int) -> None:
-            """The robots have journaled what comes before that tick, the world all Drives before that."""
+            """The robots have journaled what comes before that tick, the world all Commands before that."""
             goals = {name: frames_to(paper_1 / name, robots) for name in whole if name != WORLD_JOURNAL}
-            goals[WORLD_JOURNAL] = frames_to(paper_1 / WORLD_JOURNAL, drives, Drive)
+            goals[WORLD_JOURNAL] = frames_to(paper_1 / WORLD_JOURNAL, drives, Command)
             for name, goal in goals.items():
                 growing[name].write(*whole[name][told[name] : goal])
                 told[name] = goal
@@ -93,12 +93,12 @@ def test_a_killed_robot_keeps_its_phase_and_is_shown_as_down_until_it_is_back(
     patient = ("--patience", "600")
     with (
         world(scenario, "--out", record, *patient) as (_, endpoint),
-        Command("agent", "b", "--connect", endpoint, "--out", record, *patient),
+        TandemProcess("agent", "b", "--connect", endpoint, "--out", record, *patient),
         watching(record) as (_, of_journals),
         watching("--connect", endpoint) as (_, of_network),
     ):
         a = ("agent", "a", "--connect", endpoint, "--out", record, *patient)
-        with Command(*a) as killed:
+        with TandemProcess(*a) as killed:
             pages = [opened(of_journals), opened(of_network, dark=True)]
             for page in pages:
                 expect(page.locator(".card[data-robot=a]")).to_have_attribute("data-phase", "2")
@@ -117,7 +117,7 @@ def test_a_killed_robot_keeps_its_phase_and_is_shown_as_down_until_it_is_back(
             until_shown(page, 0)
             assert marks(page) > 20
             page.keyboard.press("End")
-        with Command(*a):
+        with TandemProcess(*a):
             for page in pages:
                 expect(page.locator("#log")).to_contain_text("a is back: its process runs again")
                 expect(page.locator(".card[data-robot=a] .doing")).not_to_contain_text("down")

@@ -18,7 +18,16 @@ from compose.recording.summary_json import summary
 from compose.recording.ticks_csv import ticks_csv
 from compose.scenario.scenario_file import load
 from protocol.journal import journal_file
-from protocol.messages import Briefing, Drive, End, Environment, Estimate, Farewell, Report, Sense
+from protocol.messages import (
+    Command,
+    Environment,
+    Estimate,
+    FinalReport,
+    MissionEnd,
+    Observation,
+    Report,
+    RobotConfig,
+)
 from protocol.mission import Mission
 from protocol.motion import Pose, wrap
 from protocol.orbits import half_arc, longest_meeting, rendezvous
@@ -40,7 +49,7 @@ def first_tick(record: Record, robot: str, state: str) -> int:
     return next(moment.truth.tick for moment in record.moments if moment.drives[robot].state == state)
 
 
-def drive(record: Record, robot: str, tick: int) -> Drive:
+def drive(record: Record, robot: str, tick: int) -> Command:
     return record.moments[tick].drives[robot]
 
 
@@ -83,9 +92,9 @@ def test_a_robot_senses_the_references_ranges_and_what_it_drove(
 ) -> None:
     reference = SIMULATIONS[name]
     play(load(name), tmp_path)
-    kinds = Environment | Briefing | Sense | Report | Drive | Estimate | End | Farewell
+    kinds = Environment | RobotConfig | Observation | Report | Command | Estimate | MissionEnd | FinalReport
     frames = [decode(frame, kinds) for frame in journal_file.read(tmp_path / f"agent-{robot}.journal")]
-    senses = [frame for frame in frames if isinstance(frame, Sense)]
+    senses = [frame for frame in frames if isinstance(frame, Observation)]
     controls = reference.u_a if robot == "a" else reference.u_b
     ranges = reference.range_a if robot == "a" else reference.range_b
 

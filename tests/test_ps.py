@@ -15,11 +15,11 @@ import zenoh
 
 from compose.launch.processes import free_endpoint
 from compose.scenario.scenario_file import load
-from protocol.messages import Drive, End, Sense
+from protocol.messages import Command, MissionEnd, Observation
 from protocol.network import keys, session
 from protocol.network.endpoints import at, listening
 from protocol.wire import VERSION, encode
-from tests.commands import BOUND_S, ENDLESS, Command, several_pairs, tandem, until, world
+from tests.commands import BOUND_S, ENDLESS, TandemProcess, several_pairs, tandem, until, world
 from tests.test_topologies import Router, routing
 
 
@@ -43,7 +43,7 @@ def test_a_mission_is_a_line_and_so_is_each_robot_there_or_not(tmp_path: Path) -
             "  a  not there",
             "  b  not there",
         ]
-        a = stack.enter_context(Command("agent", "a", "--connect", endpoint, "--out", tmp_path))
+        a = stack.enter_context(TandemProcess("agent", "a", "--connect", endpoint, "--out", tmp_path))
         a.until_answered("a", tmp_path)
         assert listed(endpoint) == [
             f"mine at {endpoint}, tick 0, missing: b",
@@ -56,7 +56,7 @@ def test_a_mission_that_runs_is_told_to_a_program_with_all_that_is_known(tmp_pat
     (tmp_path / "endless.toml").write_text(ENDLESS)
     with world(tmp_path / "endless.toml", "--run", "mine") as (_, endpoint), ExitStack() as stack:
         for robot in "ab":
-            stack.enter_context(Command("agent", robot, "--connect", endpoint, "--out", tmp_path))
+            stack.enter_context(TandemProcess("agent", robot, "--connect", endpoint, "--out", tmp_path))
         until(lambda: all(one["tick"] for one in told(endpoint)), "it runs")
         (mission,) = told(endpoint)
     assert {name: mission[name] for name in ("run", "at", "world", "outcome", "versions", "missing")} == {
@@ -92,8 +92,8 @@ def test_missions_of_several_endpoints_are_listed() -> None:
 def test_robots_whose_world_has_gone_are_listed_and_it_is_missing(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     with routing(Router(endpoint), tmp_path), ExitStack() as stack:
-        part = stack.enter_context(Command("world", "paper-1", "--connect", endpoint, "--run", "mine"))
-        a = stack.enter_context(Command("agent", "a", "--connect", endpoint, "--out", tmp_path))
+        part = stack.enter_context(TandemProcess("world", "paper-1", "--connect", endpoint, "--run", "mine"))
+        a = stack.enter_context(TandemProcess("agent", "a", "--connect", endpoint, "--out", tmp_path))
         a.until_answered("a", tmp_path)
         part.tell(Signals.SIGKILL)
         a.until_says("the world has gone")
@@ -124,7 +124,7 @@ def test_a_viewer_lists_over_tls_what_there_is(tmp_path: Path) -> None:
     folder, endpoint = tmp_path / "keys", free_endpoint("tls")
     assert tandem("keys", folder, "--robots", "a,b").status == 0
     arguments = ("world", "paper-1", "--run", "mine", "--listen", endpoint, "--keys", folder / "world")
-    with Command(*arguments) as part:
+    with TandemProcess(*arguments) as part:
         part.until_says("waiting for")
         assert listed(endpoint, "--keys", folder / "viewer")[0] == (
             f"mine at {endpoint}, tick 0, missing: a, b"
@@ -182,16 +182,16 @@ def alive(mission: Played) -> None:
 def running(mission: Played) -> None:
     alive(mission)
     mission.frames = {
-        keys.sense("r", "a"): encode(Sense(7, "a", None, None)),
-        keys.drive("r", "a"): encode(Drive(7, "a", 0.0, 0.0, 2, "orbiting")),
+        keys.sense("r", "a"): encode(Observation(7, "a", None, None)),
+        keys.drive("r", "a"): encode(Command(7, "a", 0.0, 0.0, 2, "orbiting")),
     }
 
 
 def over(mission: Played) -> None:
     alive(mission)
     mission.frames = {
-        keys.sense("r", "a"): encode(End(9, "undecided", "it was dark")),
-        keys.drive("r", "a"): encode(Drive(9, "a", 0.0, 0.0, 3, "undecided")),
+        keys.sense("r", "a"): encode(MissionEnd(9, "undecided", "it was dark")),
+        keys.drive("r", "a"): encode(Command(9, "a", 0.0, 0.0, 3, "undecided")),
     }
 
 

@@ -15,7 +15,7 @@ import pytest
 import zenoh
 
 from protocol.journal import journal_file
-from protocol.messages import Drive, End, Environment, Farewell, Missed, Sense
+from protocol.messages import Command, DeadlineMissed, Environment, FinalReport, MissionEnd, Observation
 from protocol.network import keys, session
 from protocol.network.endpoints import at
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
@@ -26,7 +26,7 @@ from tests.commands import (
     OVER,
     PAPER_1,
     REAL_TIME,
-    Command,
+    TandemProcess,
     process_of,
     tandem,
     world,
@@ -35,16 +35,16 @@ from world.scenario import Scenario
 
 
 def missed(path: Path, robot: str) -> int:
-    """In how many ticks the world went without `robot`'s Drive."""
-    kinds = Environment | Scenario | Drive | Missed | End | Farewell
+    """In how many ticks the world went without `robot`'s Command."""
+    kinds = Environment | Scenario | Command | DeadlineMissed | MissionEnd | FinalReport
     messages = [decode(frame, kinds, MAX_FRAME_BYTES) for frame in journal_file.read(path)]
-    return sum(isinstance(message, Missed) and message.robot == robot for message in messages)
+    return sum(isinstance(message, DeadlineMissed) and message.robot == robot for message in messages)
 
 
 def test_a_rate_that_cannot_be_kept_can_still_be_stopped(tmp_path: Path) -> None:
     scenario = tmp_path / "endless.toml"
     scenario.write_text(ENDLESS)
-    with Command("run", scenario, "--rate", "2000", "--out", tmp_path / "out", "-q") as run:
+    with TandemProcess("run", scenario, "--rate", "2000", "--out", tmp_path / "out", "-q") as run:
         run.until_written(tmp_path / "out" / "world.journal", 10_000)
         os.kill(run.pid, SIGINT)
         ended = run.ended()
@@ -53,16 +53,16 @@ def test_a_rate_that_cannot_be_kept_can_still_be_stopped(tmp_path: Path) -> None
 
 
 @contextmanager
-def robots_at(endpoint: str, answers: Callable[[Sense], bool]) -> Iterator[ExitStack]:
+def robots_at(endpoint: str, answers: Callable[[Observation], bool]) -> Iterator[ExitStack]:
     """Robots a and b of run r, which rest in the ticks that `answers` picks; b leaves when it is closed."""
     with session.open_client(at(endpoint), lambda: None) as a, ExitStack() as leaves:
         b = leaves.enter_context(session.open_client(at(endpoint), lambda: None))
         drives = {one: session.publisher(a, keys.drive("r", one)) for one in "ab"}
 
         def answer(sample: zenoh.Sample) -> None:
-            sense = decode(sample.payload.to_bytes(), Sense | End)
-            if isinstance(sense, Sense) and answers(sense):
-                drives[sense.robot].put(encode(Drive(sense.tick, sense.robot, 0.0, 0.0, 1, "straight")))
+            sense = decode(sample.payload.to_bytes(), Observation | MissionEnd)
+            if isinstance(sense, Observation) and answers(sense):
+                drives[sense.robot].put(encode(Command(sense.tick, sense.robot, 0.0, 0.0, 1, "straight")))
 
         subscribed = [a.declare_subscriber(keys.sense("r", one), answer) for one in "ab"]
         tokens = [session.show_alive(link, keys.robot_alive("r", one)) for link, one in ((a, "a"), (b, "b"))]
@@ -94,11 +94,11 @@ def test_a_rate_beyond_all_sense_is_refused(rate: str, lasts: str) -> None:
 def test_a_robot_whose_agent_is_stopped_stands_still_and_the_mission_goes_on(tmp_path: Path) -> None:
     out = tmp_path / "out"
     (tmp_path / "assured.toml").write_text(REAL_TIME)
-    with Command("run", tmp_path / "assured.toml", "--rate", "20", "--out", out) as run:
+    with TandemProcess("run", tmp_path / "assured.toml", "--rate", "20", "--out", out) as run:
         run.until_written(out / "world.journal", 3000)
         stopped = process_of(out, "agent", "a")
         os.kill(stopped, SIGSTOP)
-        run.until(lambda: missed(out / "world.journal", "a") >= 10, "ten of a's Drives are missed")
+        run.until(lambda: missed(out / "world.journal", "a") >= 10, "ten of a's Commands are missed")
         os.kill(stopped, SIGCONT)
         ended = run.ended()
     assert ended.status in OVER
@@ -118,7 +118,7 @@ def test_a_world_says_why_there_is_no_farewell_of_a_robot(tmp_path: Path) -> Non
     (tmp_path / "short.toml").write_text("max_ticks = 9\n" + ASSURED.partition("\n")[2])
     second = threading.Event()
 
-    def answers(sense: Sense) -> bool:
+    def answers(sense: Observation) -> bool:
         if sense.tick:
             second.set()
         return sense.tick == 0
@@ -132,8 +132,10 @@ def test_a_world_says_why_there_is_no_farewell_of_a_robot(tmp_path: Path) -> Non
         ended = clock.ended()
     assert ended.status == 1
     behind, gone = [line for line in ended.err.splitlines() if "no Farewell" in line]
-    assert behind.startswith("tandem world: no Farewell of a: behind, at tick 0 of 9; a lower --rate leaves")
-    assert gone == "tandem world: no Farewell of b: gone; the last Drive was of tick 0"
+    assert behind.startswith(
+        "tandem world: no FinalReport of a: behind, at tick 0 of 9; a lower --rate leaves"
+    )
+    assert gone == "tandem world: no FinalReport of b: gone; the last Command was of tick 0"
     assert "deadlines missed, of 9: a 8, b 8; a lower --rate, such as --rate 10, leaves" in ended.out
     robots = json.loads((out / "summary.json").read_text())["robots"]
-    assert robots["a"]["no_farewell"] == "its last Drive in time was of tick 0 of 9"
+    assert robots["a"]["no_farewell"] == "its last Command in time was of tick 0 of 9"

@@ -17,7 +17,7 @@ from compose.recording.frames import KINDS
 from compose.recording.run import WORLD_JOURNAL, agent_journal
 from compose.scenario.scenario_file import load, parse
 from protocol.journal import journal_file
-from protocol.messages import Drive, End, Report, Sense
+from protocol.messages import Command, MissionEnd, Observation, Report
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode, encode
 from tests.commands import journals, tandem
 from tests.same_plans import scenario as random_plan
@@ -123,39 +123,39 @@ def record(tmp_path: Path) -> Path:
 
 
 def test_the_first_difference_is_shown_with_tick_robot_field_and_both_values(record: Path) -> None:
-    before, after = planted(record, A, Drive, 12, v=0.125)
+    before, after = planted(record, A, Command, 12, v=0.125)
     ended = tandem("replay", record)
     assert (ended.status, ended.err) == (1, "")
     lines = ended.out.splitlines()
     assert lines[:2] == [
         "paper-1: not as recorded",
-        f"tick 12, a, Drive v: recorded {after.v!r}, recomputed {before.v!r}",
+        f"tick 12, a, Command v: recorded {after.v!r}, recomputed {before.v!r}",
     ]
     assert lines[2] == "and 1 more, which `tandem audit` tells"
 
 
 def test_a_value_is_shown_however_deep_it_stands(record: Path) -> None:
     told = [decode(frame, KINDS, MAX_FRAME_BYTES) for frame in journal_file.read(record / A)]
-    sense = next(one for one in told if isinstance(one, Sense) and one.contacts)
+    sense = next(one for one in told if isinstance(one, Observation) and one.contacts)
     (contact,) = sense.contacts
     assert contact.range is not None
-    planted(record, A, Sense, sense.tick, contacts=(replace(contact, range=contact.range + 1e-15),))
+    planted(record, A, Observation, sense.tick, contacts=(replace(contact, range=contact.range + 1e-15),))
     (first, *_) = tandem("replay", record).out.splitlines()[1:]
     assert first == (
-        f"tick {sense.tick}, a, Sense contacts[0].range: "
+        f"tick {sense.tick}, a, Observation contacts[0].range: "
         f"recorded {contact.range + 1e-15!r}, recomputed {contact.range!r}"
     )
 
 
 def test_a_record_whose_drives_the_world_has_otherwise_is_found_there(record: Path) -> None:
     frames = list(journal_file.read(record / WORLD_JOURNAL))
-    drive = decode(frames[2 + 2 * 20 + 1], Drive)
+    drive = decode(frames[2 + 2 * 20 + 1], Command)
     assert (drive.robot, drive.tick) == ("b", 20)
     frames[2 + 2 * 20 + 1] = encode(replace(drive, omega=drive.omega + 1e-9))
     (record / WORLD_JOURNAL).write_bytes(journal_file.packed(frames))
     ended = tandem("replay", record)
     assert ended.status == 1
-    assert ended.out.splitlines()[1].startswith("tick 20, b, Drive omega: recorded ")
+    assert ended.out.splitlines()[1].startswith("tick 20, b, Command omega: recorded ")
 
 
 def changed(record: dict[str, list[bytes]], name: str, was: Any, **fields: Any) -> dict[str, list[bytes]]:
@@ -183,7 +183,9 @@ def test_a_report_that_is_heard_and_that_no_sense_lists_is_found(paper_1: dict[s
 def test_an_end_that_does_not_follow_is_found_though_all_say_the_same(
     paper_1: dict[str, list[bytes]],
 ) -> None:
-    end = next(one for frame in paper_1[A] if isinstance(one := decode(frame, KINDS, MAX_FRAME_BYTES), End))
+    end = next(
+        one for frame in paper_1[A] if isinstance(one := decode(frame, KINDS, MAX_FRAME_BYTES), MissionEnd)
+    )
     record = paper_1
     for name in paper_1:
         record = changed(record, name, end, outcome="undecided")
@@ -220,7 +222,7 @@ def test_where_it_tears_is_told(record: Path) -> None:
     assert rest > 0
     assert tears == [
         "no tick, b: it has left no journal",
-        f"tick {last.tick}, a: its journal breaks off here, expected End and Farewell",
+        f"tick {last.tick}, a: its journal breaks off here, expected MissionEnd and Farewell",
         f"agent-a.journal ends with {rest} bytes of a torn write",
     ]
 

@@ -27,7 +27,16 @@ from compose.scenario.scenario_file import load
 from protocol.journal import journal_file
 from protocol.journal.journal_file import CannotRecord, CorruptJournal, Journal
 from protocol.journal.resume import Retrace
-from protocol.messages import Contact, Drive, End, Environment, Farewell, Missed, Report, Sense
+from protocol.messages import (
+    Command,
+    Contact,
+    DeadlineMissed,
+    Environment,
+    FinalReport,
+    MissionEnd,
+    Observation,
+    Report,
+)
 from protocol.network import keys, session
 from protocol.network.endpoints import listening
 from protocol.network.inbox import Inbox
@@ -37,8 +46,8 @@ from tests.commands import (
     OVER,
     PAPER_1,
     REAL_TIME,
-    Command,
     Ended,
+    TandemProcess,
     journals,
     processes_of,
     tandem,
@@ -149,9 +158,9 @@ def test_in_real_time_whoever_is_away_stands_still_and_is_told_what_it_missed(tm
         away = [row for row in csv.DictReader(file) if row["state"] == ""]
     assert "a" in {row["robot"] for row in away}
     assert {(row["v"], row["omega"]) for row in away} == {("0.0", "0.0")}
-    kinds = Environment | Scenario | Drive | Missed | End | Farewell
+    kinds = Environment | Scenario | Command | DeadlineMissed | MissionEnd | FinalReport
     messages = [decode(frame, kinds, MAX_FRAME_BYTES) for frame in journal_file.read(out / "world.journal")]
-    assert sum(isinstance(message, Missed) for message in messages) == len(away)
+    assert sum(isinstance(message, DeadlineMissed) for message in messages) == len(away)
     for robot in ("a", "b"):
         lived = past(journal_file.read(out / f"agent-{robot}.journal"), robot)
         assert [step.sense.tick for step in lived.steps] == list(range(len(lived.steps)))
@@ -264,13 +273,13 @@ def test_a_worlds_journal_torn_anywhere_is_finished_with_the_same_bytes(
         assert torn.read_bytes() == data, cut
 
 
-def shells(out: Path, endpoint: str, folder: ExitStack) -> dict[str, Command]:
+def shells(out: Path, endpoint: str, folder: ExitStack) -> dict[str, TandemProcess]:
     parts = {
         "world": ("world", "paper-1", "--listen", endpoint),
         "a": ("agent", "a", "--connect", endpoint),
         "b": ("agent", "b", "--connect", endpoint),
     }
-    return {name: folder.enter_context(Command(*part, "--out", out)) for name, part in parts.items()}
+    return {name: folder.enter_context(TandemProcess(*part, "--out", out)) for name, part in parts.items()}
 
 
 def at_tick(frames: list[bytes], tick: int) -> int:
@@ -308,18 +317,18 @@ def test_a_world_and_an_agent_that_are_killed_go_on_by_the_same_commands(
     clock = ("world", "paper-1", "--listen", endpoint, "--out", tmp_path)
     a, b = (("agent", robot, "--connect", endpoint, "--out", tmp_path) for robot in ("a", "b"))
     with ExitStack() as folder:
-        first = folder.enter_context(Command(*clock))
+        first = folder.enter_context(TandemProcess(*clock))
         first.until_says("waiting for a, b")
-        agent = folder.enter_context(Command(*a))
+        agent = folder.enter_context(TandemProcess(*a))
         agent.until_answered("a", tmp_path)
         agent.tell(SIGKILL)
-        agent = folder.enter_context(Command(*a))
+        agent = folder.enter_context(TandemProcess(*a))
         agent.until_says("again, from tick 0 on")
         first.tell(SIGKILL)
         agent.until_says("the world has gone; waiting 30 s for it")
-        second = folder.enter_context(Command(*clock))
+        second = folder.enter_context(TandemProcess(*clock))
         second.until_says("waiting for a, b")
-        last = folder.enter_context(Command(*b))
+        last = folder.enter_context(TandemProcess(*b))
         assert [part.ended().status for part in (second, agent, last)] == [0, 0, 0]
     same(tmp_path, undisturbed)
 
@@ -364,17 +373,19 @@ def test_an_agent_says_farewell_until_a_world_has_it_on_record(tmp_path: Path) -
         while True:
             arrival = there.next(REPEAT_S)
             if arrival.topic == "drive":
-                assert isinstance(decode(arrival.frame, Farewell), Farewell)
+                assert isinstance(decode(arrival.frame, FinalReport), FinalReport)
                 return arrival.frame
-            publisher.put(encode(End(0, "undecided", "for a test")))
+            publisher.put(encode(MissionEnd(0, "undecided", "for a test")))
 
     with ExitStack() as folder:
         with session.open_router(listening(endpoint)) as link:
             session.answer(link, keys.briefing(run, "*"), lambda _: scenario.briefing("a"))
             _token = session.show_alive(link, keys.world_alive(run))
-            agent = folder.enter_context(Command("agent", "a", "--connect", endpoint, "--out", tmp_path))
+            agent = folder.enter_context(
+                TandemProcess("agent", "a", "--connect", endpoint, "--out", tmp_path)
+            )
             first = farewell_of(link)
-        agent.until_says("the world has gone after its End; waiting 30 s for it")
+        agent.until_says("the world has gone after its MissionEnd; waiting 30 s for it")
         there = Inbox("test")
         with session.open_router(listening(endpoint), BOUND_S) as link:
             assert farewell_of(link) == first
@@ -390,7 +401,7 @@ def test_a_repeated_sense_makes_an_agent_say_all_its_latest_reports_again(tmp_pa
     scenario, endpoint, run = load("paper-1"), free_endpoint(), "mine"
     reports: SimpleQueue[int] = SimpleQueue()
     there = Inbox("test")
-    senses = [Sense(tick, "a", None, 2.5, (Contact("b", 2.0, ()),)) for tick in range(70)]
+    senses = [Observation(tick, "a", None, 2.5, (Contact("b", 2.0, ()),)) for tick in range(70)]
     senses[1:] = [replace(sense, executed=None) for sense in senses[1:]]
     latest = list(range(69 - 59, 70))
 
@@ -407,7 +418,7 @@ def test_a_repeated_sense_makes_an_agent_say_all_its_latest_reports_again(tmp_pa
         publisher = session.publisher(link, keys.sense(run, "a"))
         _token = session.show_alive(link, keys.world_alive(run))
         part = ("agent", "a", "--connect", endpoint, "--out", tmp_path)
-        with Command(*part) as agent:
+        with TandemProcess(*part) as agent:
             assert there.next(BOUND_S).topic == "alive"
             for sense in senses:
                 publisher.put(encode(sense))
@@ -416,7 +427,7 @@ def test_a_repeated_sense_makes_an_agent_say_all_its_latest_reports_again(tmp_pa
             heard(latest)
             os.kill(agent.pid, SIGKILL)
         assert there.next(BOUND_S).topic == "gone"
-        with Command(*part):
+        with TandemProcess(*part):
             assert there.next(BOUND_S).topic == "alive"
             publisher.put(encode(senses[-1]))
             heard(latest)
@@ -513,7 +524,7 @@ def test_an_agents_record_of_another_briefing_is_refused(record: Path, tmp_path:
 def test_an_agents_record_in_which_it_sensed_otherwise_is_no_use(record: Path, paper_2: str) -> None:
     path = record / "agent-a.journal"
     path.write_bytes(journal_file.packed(list(journal_file.read(path))[:4]))
-    with Command("agent", "b", "--connect", paper_2):  # whose briefings are those of paper-1
+    with TandemProcess("agent", "b", "--connect", paper_2):  # whose briefings are those of paper-1
         ended = tandem("agent", "a", "--connect", paper_2, "--out", record)
     said = "the record is another run's: in this one, a senses otherwise at tick 0"
     assert (ended.status, ended.err) == (3, f"tandem agent a: {said}\n")
@@ -523,7 +534,7 @@ def test_a_record_on_which_it_decided_otherwise_is_refused(record: Path) -> None
     path = record / "agent-a.journal"
     frames = list(journal_file.read(path))
     place = next(i for i, frame in enumerate(frames) if frame[5:].find(b"drive\x0c") > 0)
-    drive = decode(frames[place], Drive)
+    drive = decode(frames[place], Command)
     assert drive.tick == 12
     frames[place] = encode(replace(drive, v=drive.v / 2.0))
     path.write_bytes(journal_file.packed(frames))
@@ -550,7 +561,7 @@ def test_a_journal_is_locked_as_long_as_it_is_open(tmp_path: Path) -> None:
 
 
 def test_a_world_that_has_lost_its_record_is_told_so(record: Path, paper_1: str) -> None:
-    with Command("agent", "b", "--connect", paper_1):
+    with TandemProcess("agent", "b", "--connect", paper_1):
         ended = tandem("agent", "a", "--connect", paper_1, "--out", record)
     tick = past(journal_file.read(record / "agent-a.journal"), "a").steps[-1].sense.tick
     assert ended.status == 3
@@ -597,7 +608,7 @@ def test_who_has_ended_waits_for_no_world_that_has_gone_however_patient(
     with ExitStack() as stack:
         playing, endpoint = stack.enter_context(world("paper-1"))
         reach = ("--connect", endpoint, "--out", tmp_path, "--patience", "600")
-        agent = stack.enter_context(Command("agent", "a", *reach))
+        agent = stack.enter_context(TandemProcess("agent", "a", *reach))
         agent.until_says("again, from tick 48 on")
         playing.tell(SIGKILL)
         ended = agent.ended()

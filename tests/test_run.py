@@ -15,7 +15,7 @@ from compose.launch.processes import free_endpoint
 from tests.commands import (
     OVER,
     PAPER_1,
-    Command,
+    TandemProcess,
     journals,
     on_a_terminal,
     processes_of,
@@ -266,7 +266,10 @@ def test_the_table_at_the_end_says_how_each_robot_fared() -> None:
 
 
 def test_output_that_nobody_takes_is_one_line_and_no_traceback() -> None:
-    with Path("/dev/full").open("wb") as full, Command("run", "paper-1", "-q", terminal=full.fileno()) as run:
+    with (
+        Path("/dev/full").open("wb") as full,
+        TandemProcess("run", "paper-1", "-q", terminal=full.fileno()) as run,
+    ):
         ended = run.ended()
     assert ended.status == 3
     assert ended.err == "tandem run: cannot go on: No space left on device\n"
@@ -276,7 +279,7 @@ def test_a_world_whose_output_nobody_takes_does_not_blame_its_record(tmp_path: P
     options = ("--listen", free_endpoint(), "--out", tmp_path / "out")
     with (
         Path("/dev/full").open("wb") as full,
-        Command("world", "paper-1", *options, terminal=full.fileno()) as run,
+        TandemProcess("world", "paper-1", *options, terminal=full.fileno()) as run,
     ):
         ended = run.ended()
     assert ended.status == 3
@@ -337,7 +340,7 @@ def test_whatever_is_listed_is_a_whole_sentence_and_stands_in_one_column() -> No
 
 def test_runs_side_by_side_do_not_disturb_each_other(played: tuple[str, Path], tmp_path: Path) -> None:
     name, alone = played
-    runs = [Command("run", name, "--out", tmp_path / str(i), "-q") for i in range(3)]
+    runs = [TandemProcess("run", name, "--out", tmp_path / str(i), "-q") for i in range(3)]
     for i, run in enumerate(runs):
         with run:
             assert run.ended() == (0, f"localised after {PAPER_TICKS[name]} ticks\n", "")

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from agent.estimation.gaussian.least_squares import STILL, Fit, deviation, fit, poses
 from agent.estimation.gaussian.odometry_noise import (
     Errors,
-    Seen,
+    Projection,
     Track,
     attributed,
     shifted,
@@ -25,7 +25,7 @@ from agent.estimation.gaussian.odometry_noise import (
 )
 from agent.estimation.gaussian.range_model import Ranges, predict
 from protocol.motion import ORIGIN, Pose, compose, step
-from protocol.noise import Drift, Noise
+from protocol.noise import Noise, VelocityNoise
 
 Array = NDArray[np.float64]
 
@@ -37,7 +37,7 @@ turns = st.one_of(st.floats(-4.0, 4.0), st.sampled_from((0.0, 1e-4, -1e-4)))
 manoeuvres = st.lists(st.tuples(speeds, turns), min_size=1, max_size=8)
 periods = st.floats(0.2, 2.0)
 shares = st.floats(0.0, 0.1)
-drifts = st.builds(Drift, shares, shares, shares, shares)
+drifts = st.builds(VelocityNoise, shares, shares, shares, shares)
 lengths = st.floats(-5.0, 5.0)
 seeds = st.integers(0, 2**32 - 1)
 some = settings(max_examples=50)
@@ -55,7 +55,7 @@ def near(expected: Array) -> object:
     return pytest.approx(expected, rel=1e-6, abs=1e-7 * max(1.0, float(np.max(np.abs(expected)))))
 
 
-def variances(drift: Drift, measured: Track) -> Array:
+def variances(drift: VelocityNoise, measured: Track) -> Array:
     """Of the noise in v at each tick, then of that in omega."""
     ticks = zip(measured.v.tolist(), measured.omega.tolist(), strict=True)
     return np.array([drift.variances(v, omega) for v, omega in ticks]).T.ravel()
@@ -84,7 +84,7 @@ class Looks(NamedTuple):
     """Rows along a path, and the derivatives of what they look at."""
 
     path: Track
-    rows: Seen
+    rows: Projection
     by_noise: Array
     """in v at each tick, then in omega; (rows, 2 k)"""
 
@@ -99,7 +99,7 @@ def looks(draw: st.DrawFn) -> Looks:
     ticks = np.array([tick for tick, *_ in seen], np.intp)
     heading = np.array([turned for *_, turned in seen])
     u = np.where(heading, 0.0, np.array([(x, y) for _, x, y, _ in seen]).T)
-    rows = Seen.positions(path, ticks, u)
+    rows = Projection.positions(path, ticks, u)
     rows.lever[heading] = path.period
 
     def looked_at(noise: Array) -> Array:
@@ -111,14 +111,14 @@ def looks(draw: st.DrawFn) -> Looks:
 
 @some
 @given(looks(), drifts)
-def test_noise_of_the_odometry_spreads_along_the_path(look: Looks, drift: Drift) -> None:
+def test_noise_of_the_odometry_spreads_along_the_path(look: Looks, drift: VelocityNoise) -> None:
     covariance = look.by_noise @ np.diag(variances(drift, look.path)) @ look.by_noise.T
     assert spread(wander(look.path, drift, look.path), look.rows) == near(covariance)
 
 
 @some
 @given(looks(), drifts, seeds)
-def test_errors_of_the_odometry_move_every_later_place(look: Looks, drift: Drift, seed: int) -> None:
+def test_errors_of_the_odometry_move_every_later_place(look: Looks, drift: VelocityNoise, seed: int) -> None:
     errors = np.random.default_rng(seed).normal(size=(2, len(look.path.v)))
     move = shifted(wander(look.path, drift, look.path), look.rows, Errors(*errors))
     assert move == near(look.by_noise @ errors.ravel())
@@ -127,7 +127,7 @@ def test_errors_of_the_odometry_move_every_later_place(look: Looks, drift: Drift
 @some
 @given(looks(), drifts, seeds)
 def test_what_is_seen_off_its_place_is_attributed_to_the_noise_before(
-    look: Looks, drift: Drift, seed: int
+    look: Looks, drift: VelocityNoise, seed: int
 ) -> None:
     off = np.random.default_rng(seed).normal(size=len(look.rows.tick))
     errors = attributed(wander(look.path, drift, look.path), look.rows, off)
@@ -138,7 +138,7 @@ def test_what_is_seen_off_its_place_is_attributed_to_the_noise_before(
 @few
 @given(manoeuvres, periods, drifts)
 def test_noise_has_the_size_of_what_was_measured_and_the_course_of_what_was_driven(
-    driven: list[tuple[float, float]], period: float, drift: Drift
+    driven: list[tuple[float, float]], period: float, drift: VelocityNoise
 ) -> None:
     path, measured = track_of(driven, period), track_of([(1.0, -0.5)] * len(driven), period)
     wandered = wander(path, drift, measured)
@@ -267,7 +267,7 @@ noises = st.builds(
     st.floats(1e-3, 0.05),
     st.floats(1e-3, 0.05),
     odometry=st.builds(
-        Drift, *[st.sampled_from((0.0, 1e-3, 1e-2))] * 2, *[st.sampled_from((0.0, 1e-3, 5e-3))] * 2
+        VelocityNoise, *[st.sampled_from((0.0, 1e-3, 1e-2))] * 2, *[st.sampled_from((0.0, 1e-3, 5e-3))] * 2
     ),
 )
 
@@ -389,7 +389,7 @@ def test_a_fit_that_begins_where_one_ended_ends_there_too() -> None:
     """Straight at its anchor nothing bends, and the guess is right at once; the path is corrected even so."""
     measured, driven = (track(np.full(8, v), np.zeros(8), 1.0) for v in (1.0, 1.01))
     told = [(tick, 20.0 - x) for tick, x in enumerate(driven.x.tolist())]
-    noise = Noise(0.01, odometry=Drift(v=0.05))
+    noise = Noise(0.01, odometry=VelocityNoise(v=0.05))
     ranges = Ranges.of_lists(told, (), (), noise)
     first = fit(np.array((20.0, 0.0, 0.0)), [measured], ranges, noise)
     again = fit(first.guess, [measured], ranges, noise)
@@ -398,7 +398,7 @@ def test_a_fit_that_begins_where_one_ended_ends_there_too() -> None:
     assert first.paths[0].x[-1] == pytest.approx(driven.x[-1], abs=0.01)
 
 
-ROUGH = Noise(0.01, 0.01, outliers=0.05, outlier_bias=(0.3, 2.0), odometry=Drift(0.001, 0.001))
+ROUGH = Noise(0.01, 0.01, outliers=0.05, outlier_bias=(0.3, 2.0), odometry=VelocityNoise(0.001, 0.001))
 
 
 @some
@@ -434,7 +434,7 @@ def test_exact_ranges_and_strides_of_a_kilometre_leave_a_covariance_that_can_be_
     anchor = np.array((400.0, 300.0, 0.0))
     rho = np.hypot(path.x - anchor[0], path.y - anchor[1])
     ranges = Ranges.of_lists(list(enumerate(rho.tolist())), (), (), EXACT)
-    found = fit(anchor + (1.0, -1.0, 0.0), [path], ranges, Noise(odometry=Drift(0.01, 0.01)))
+    found = fit(anchor + (1.0, -1.0, 0.0), [path], ranges, Noise(odometry=VelocityNoise(0.01, 0.01)))
     assert found.guess == pytest.approx(anchor, abs=1e-3)
     assert np.min(np.linalg.eigvalsh(found.covariance)) > 0.0
     assert found.last_step < STILL

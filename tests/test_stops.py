@@ -14,7 +14,7 @@ import pytest
 from compose.launch.processes import free_endpoint
 from compose.scenario.scenario_file import load
 from protocol.journal import journal_file
-from protocol.messages import Drive, End, Environment, Farewell, Missed
+from protocol.messages import Command, DeadlineMissed, Environment, FinalReport, MissionEnd
 from protocol.network import keys, session
 from protocol.network.endpoints import at, listening
 from protocol.network.inbox import Inbox
@@ -24,7 +24,7 @@ from tests.commands import (
     LONG_TICKS,
     OVER,
     REAL_TIME,
-    Command,
+    TandemProcess,
     process_of,
     processes_of,
     size,
@@ -104,7 +104,7 @@ def given_up(bystander: Inbox) -> bool:
 
 def test_stopped_for_a_moment_each_in_turn_a_run_goes_on(undisturbed: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    with Command("run", undisturbed, "--out", out, "-q") as run:
+    with TandemProcess("run", undisturbed, "--out", out, "-q") as run:
         for turn in range(9):
             run.until_written(out / "world.journal", 2_000 + 8_000 * turn)
             pid = process_of(out, *NAMES[turn % 3].split())
@@ -122,7 +122,7 @@ def test_stopped_until_its_link_is_given_up_a_process_goes_on(
     name: str, undisturbed: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    with Command("run", undisturbed, "--out", out, "-q") as run:
+    with TandemProcess("run", undisturbed, "--out", out, "-q") as run:
         run.until_written(out / "world.journal", 2_000)
         pid = process_of(out, *name.split())
         with watched(out, name) as bystander:
@@ -143,7 +143,7 @@ def test_stopped_for_longer_than_the_patience_a_process_fails_the_run(
     name: str, undisturbed: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    with Command("run", undisturbed, "--out", out, "-q", "--patience", str(PATIENCE_S)) as run:
+    with TandemProcess("run", undisturbed, "--out", out, "-q", "--patience", str(PATIENCE_S)) as run:
         run.until_written(out / "world.journal", 2_000)
         stop(process_of(out, *name.split()))
         ended = run.ended()
@@ -163,7 +163,7 @@ def test_a_link_over_which_nothing_comes_is_replaced_by_another() -> None:
         session.watch_liveliness(link, keys.robot_alive("mute", "a"), inbox)
         session.answer(link, keys.briefing("mute", "*"), lambda _key: briefing)
         _token = session.show_alive(link, keys.world_alive("mute"))
-        with Command("agent", "a", "--connect", endpoint, "--patience", "20") as agent:
+        with TandemProcess("agent", "a", "--connect", endpoint, "--patience", "20") as agent:
             for topic in ("alive", "gone", "alive"):
                 until(lambda topic=topic: inbox.next(0.1).topic == topic, f"a is {topic}")  # type: ignore[misc]
                 assert agent.running
@@ -177,12 +177,12 @@ def test_in_real_time_who_is_stopped_stands_still_from_the_next_period_on(
     assured: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    with Command("run", assured, "--rate", "20", "--out", out, "-q") as run:
+    with TandemProcess("run", assured, "--rate", "20", "--out", out, "-q") as run:
         run.until_written(out / "world.journal", 1500)
         pid = process_of(out, "agent", "a")
         with watched(out, "agent a") as bystander:
             stop(pid)
-            answered = ticks(out) + 1  # whose Sense may have come before
+            answered = ticks(out) + 1  # whose Observation may have come before
             until(lambda: given_up(bystander), "its link is given up")
             until(lambda: ticks(out) > answered + 20, "twenty ticks are over")
             continued = ticks(out)
@@ -193,13 +193,17 @@ def test_in_real_time_who_is_stopped_stands_still_from_the_next_period_on(
     away = [rows[tick] for tick in range(answered + 1, continued)]
     assert len(away) >= 20
     assert {(row["v"], row["omega"], row["state"]) for row in away} == {("0.0", "0.0", "")}
-    missed = {message.tick for message in played(out) if isinstance(message, Missed) and message.robot == "a"}
+    missed = {
+        message.tick
+        for message in played(out)
+        if isinstance(message, DeadlineMissed) and message.robot == "a"
+    }
     assert {int(row["tick"]) for row in away} <= missed
 
 
 def test_in_real_time_a_world_that_is_stopped_goes_on(assured: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    with Command("run", assured, "--rate", "20", "--out", out, "-q") as run:
+    with TandemProcess("run", assured, "--rate", "20", "--out", out, "-q") as run:
         run.until_written(out / "world.journal", 1500)
         pid = process_of(out, "world")
         with watched(out, "world") as bystander:
@@ -211,11 +215,11 @@ def test_in_real_time_a_world_that_is_stopped_goes_on(assured: Path, tmp_path: P
     assert not processes_of(out)
 
 
-def played(out: Path) -> list[Environment | Scenario | Drive | Missed | End | Farewell]:
-    kinds = Environment | Scenario | Drive | Missed | End | Farewell
+def played(out: Path) -> list[Environment | Scenario | Command | DeadlineMissed | MissionEnd | FinalReport]:
+    kinds = Environment | Scenario | Command | DeadlineMissed | MissionEnd | FinalReport
     return [decode(frame, kinds, MAX_FRAME_BYTES) for frame in journal_file.read(out / "world.journal")]
 
 
 def ticks(out: Path) -> int:
     """The latest tick that is on record."""
-    return max(message.tick for message in played(out) if isinstance(message, Drive | Missed))
+    return max(message.tick for message in played(out) if isinstance(message, Command | DeadlineMissed))

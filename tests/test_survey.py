@@ -11,12 +11,12 @@ import pytest
 from msgspec.structs import replace
 
 import agent.planning.assured
-from agent.estimation.gaussian.hypotheses import Weighed, search
-from agent.estimation.gaussian.range_model import Pair
+from agent.estimation.gaussian.hypotheses import ScoredHypothesis, search
+from agent.estimation.gaussian.range_model import PairRanges
 from agent.planning import planner
 from agent.planning.assured import OFF_RADIUS
 from agent.planning.phase2_orbit import Aligning, Radial, orientation
-from agent.planning.state import Mind
+from agent.planning.state import RobotState
 from compose.launch.in_process import play
 from compose.recording.run import Record
 from compose.recording.summary_json import summary
@@ -198,10 +198,10 @@ SHORT = 6
 """a seed"""
 
 
-def ticks(scenario: Scenario) -> Iterator[tuple[World, dict[str, Mind], dict[str, Mind]]]:
+def ticks(scenario: Scenario) -> Iterator[tuple[World, dict[str, RobotState], dict[str, RobotState]]]:
     """The world, the minds before and those that have observed; each step checked against a copy's."""
     world = release(scenario)
-    minds = {robot.id: Mind(scenario.briefing(robot.id)) for robot in scenario.robots}
+    minds = {robot.id: RobotState(scenario.briefing(robot.id)) for robot in scenario.robots}
     while isinstance(world, World):
         sensed = senses(world)
         observed = {sense.robot: planner.observe(minds[sense.robot], sense) for sense in sensed}
@@ -286,7 +286,7 @@ def test_drop_outs_that_add_up_do_not_keep_a_robot_in_phase_1() -> None:
 def test_a_robot_that_turns_out_to_head_off_its_radius_turns_onto_it_again() -> None:
     """Set off as if it were aligned, a robot finds by its next range which way it heads."""
     world = release(scenario_of(SIGMA, SHORT))
-    minds = {robot.id: Mind(world.scenario.briefing(robot.id)) for robot in world.scenario.robots}
+    minds = {robot.id: RobotState(world.scenario.briefing(robot.id)) for robot in world.scenario.robots}
     misled = False
     while isinstance(world, World):
         for sense in senses(world):
@@ -315,7 +315,7 @@ def test_a_robot_that_left_its_peers_range_does_not_go_there_again() -> None:
 def test_nothing_is_claimed_by_a_fit_that_still_moves(monkeypatch: pytest.MonkeyPatch) -> None:
     ticks = len(survey(SIGMA, SHORT).moments)
 
-    def searched(pair: Pair) -> tuple[Weighed, ...]:
+    def searched(pair: PairRanges) -> tuple[ScoredHypothesis, ...]:
         return tuple([one._replace(fit=one.fit._replace(last_step=0.5)) for one in search(pair)])
 
     monkeypatch.setattr(agent.planning.assured, "search", searched)

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from agent.estimation.gaussian.odometry_noise import Array
-from agent.planning.active_sensing import AHEAD, Held, alone, choice, stride, together
+from agent.planning.active_sensing import AHEAD, PlanningHypothesis, alone, choice, stride, together
 from agent.planning.phase2_orbit import pursuit
 from agent.planning.range_seeking import Homing, arrived, homeward
 from protocol.mission import Mission
 from protocol.motion import REST, Controls, Pose, step
-from protocol.noise import Drift, Noise
+from protocol.noise import Noise, VelocityNoise
 from protocol.orbits import Orbit, clearance, rendezvous
 
 SIGMA = 0.1
@@ -44,8 +44,8 @@ def after(pose: Pose, drive: Controls, mission: Mission = MISSION) -> Pose:
     return pose
 
 
-def held(pose: Pose, odds: float = 1.0, covariance: Array = SETTLED) -> Held:
-    return Held(odds, np.array([pose.x, pose.y, pose.heading]), covariance)
+def held(pose: Pose, odds: float = 1.0, covariance: Array = SETTLED) -> PlanningHypothesis:
+    return PlanningHypothesis(odds, np.array([pose.x, pose.y, pose.heading]), covariance)
 
 
 # --- manoeuvres ---------------------------------------------------------------------------------------
@@ -120,7 +120,7 @@ def test_together_robots_keep_in_range_and_apart(
     b = Pose(M2[0] + off * REACH * math.cos(bearing), off * REACH * math.sin(bearing), b_heading)
     a = Pose(b.x + between * REACH * math.cos(towards), b.y + between * REACH * math.sin(towards), heading)
     poses = np.array([a.x, a.y, a.heading, b.x, b.y, b.heading])
-    by_a, by_b = together([Held(1.0, poses, BOTH_SETTLED)], M2, between * REACH, MISSION)
+    by_a, by_b = together([PlanningHypothesis(1.0, poses, BOTH_SETTLED)], M2, between * REACH, MISSION)
     there, peer = after(a, by_a), after(b, by_b)
     assert 0.15 * REACH < math.hypot(there.x - peer.x, there.y - peer.y) < 0.95 * REACH
     assert math.hypot(peer.x - M2[0], peer.y - M2[1]) < 0.95 * REACH
@@ -185,7 +185,7 @@ def test_exact_sensors_need_no_clearance_and_the_plan_is_as_it_was() -> None:
 
 def test_what_is_not_known_makes_the_way_round_longer() -> None:
     exact, coarse = replace(MISSION, noise=Noise()), MISSION
-    drifting = replace(MISSION, noise=Noise(SIGMA, SIGMA, odometry=Drift(0.02, 0.02)))
+    drifting = replace(MISSION, noise=Noise(SIGMA, SIGMA, odometry=VelocityNoise(0.02, 0.02)))
     assert 0.0 < clearance(coarse, 10.0) < clearance(drifting, 10.0) < 0.5 * REACH
     bounds = [rendezvous(one, 10.0, "assured").bound for one in (exact, coarse, drifting)]
     assert bounds == sorted(set(bounds))

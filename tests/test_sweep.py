@@ -29,13 +29,13 @@ from compose.cli.sweep import status_of
 from compose.errors import UserError
 from compose.scenario.scenario_file import load
 from compose.sweep import axis_figures, cluster, execution, report, spec
-from compose.sweep.cells import Refused, cells, setting_of, trial_seed
+from compose.sweep.cells import RefusedCell, cells, setting_of, trial_seed
 from compose.sweep.statistics import wilson
 from compose.sweep.table import schema_of
 from compose.sweep.worker import PLAY
 from protocol.network.inbox import Inbox
-from protocol.noise import Drift, Noise
-from tests.commands import PAPER_1, Command, Ended, tandem, temporary_in, until
+from protocol.noise import Noise, VelocityNoise
+from tests.commands import PAPER_1, Ended, TandemProcess, tandem, temporary_in, until
 
 HOUSE = Path(__file__).parents[1]
 RANDOM = PAPER_1.replace("start", "# start")
@@ -128,7 +128,7 @@ def played(
     return execution.sweep(
         campaign,
         folder / out,
-        execution.Means(workers=workers, play=play, audit=audit),
+        execution.ExecutionOptions(workers=workers, play=play, audit=audit),
         Inbox("test"),
         silent,
     )
@@ -196,7 +196,7 @@ def test_rows_are_the_same_by_a_scheduler_and_workers_started_by_hand_even_if_on
             dask(stack, "dask_worker", address, "--nthreads", "1", "--no-nanny", *arguments, cwd=folder)
             for _ in range(2)
         ]
-        with Command(
+        with TandemProcess(
             "sweep", "lengthy.toml", "--out", "there", "--scheduler", address, cwd=folder
         ) as command:
             command.until(lambda: parts(folder / "there") >= 2, "two chunks are done")
@@ -288,7 +288,7 @@ def test_trials_that_raise_die_or_hang_are_rows_and_the_others_go_on(folder: Pat
 def test_a_campaign_that_is_killed_twice_goes_on_where_it_was(folder: Path) -> None:
     out = folder / "killed"
     for already in (0, 1):
-        with Command("sweep", "lengthy.toml", "--out", "killed", cwd=folder) as command:
+        with TandemProcess("sweep", "lengthy.toml", "--out", "killed", cwd=folder) as command:
             was = parts(out)
             assert was >= already
             command.until(lambda: parts(out) > was, "a chunk is done")  # noqa: B023  # within the round
@@ -319,7 +319,7 @@ def test_a_campaign_whose_trials_hang_can_be_stopped(folder: Path) -> None:
 
 @pytest.mark.long
 def test_a_stopped_campaign_says_so_in_one_line_and_goes_on(folder: Path) -> None:
-    with Command("sweep", "lengthy.toml", "--out", "out", "--workers", "1", cwd=folder) as command:
+    with TandemProcess("sweep", "lengthy.toml", "--out", "out", "--workers", "1", cwd=folder) as command:
         command.until(lambda: parts(folder / "out"), "a chunk is done")
         command.tell(SIGINT)
         ended = command.ended()
@@ -341,7 +341,7 @@ def test_a_campaign_goes_on_after_its_machine_has_slept(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL", "1s")
-    with Command("sweep", "lengthy.toml", "--out", "out", "--workers", "1", cwd=folder) as command:
+    with TandemProcess("sweep", "lengthy.toml", "--out", "out", "--workers", "1", cwd=folder) as command:
         command.until(lambda: parts(folder / "out"), "a chunk is done")
         command.tell(SIGSTOP)
         time.sleep(12.0)  # longer than ten heartbeats of a worker
@@ -564,10 +564,10 @@ def test_an_axis_reaches_into_tables_that_the_base_scenario_leaves_out(folder: P
     results = played(folder, "nested.toml", "out")
     for cell, (v, sigma, accuracy) in zip(results.cells, [(0.0, 0.0, 0.1), (0.01, 0.02, 0.3)], strict=True):
         setting = setting_of(results.campaign, cell)
-        assert not isinstance(setting, Refused)
+        assert not isinstance(setting, RefusedCell)
         assert load(str(folder / "out" / "cells" / cell.file_name)) == setting.scenario
         mission = setting.scenario.mission
-        assert mission.noise == Noise(anchor_sigma=sigma, odometry=Drift(v=v))
+        assert mission.noise == Noise(anchor_sigma=sigma, odometry=VelocityNoise(v=v))
         assert mission.accuracy == accuracy
     assert [row["mission.noise.odometry.v"] for row in rows(folder / "out")] == [0.0, 0.01]
 
@@ -612,7 +612,7 @@ def test_a_campaign_that_ships_can_be_played(name: str) -> None:
     execution.check_columns(campaign, schema_of(campaign, list(cells(campaign))))
     for cell in cells(campaign):
         setting = setting_of(campaign, cell)
-        assert isinstance(setting, Refused) or setting.scenario.name == campaign.base["name"]
+        assert isinstance(setting, RefusedCell) or setting.scenario.name == campaign.base["name"]
     assert f"{name:10} " in tandem("scenarios").out
 
 
@@ -624,7 +624,7 @@ def test_the_campaign_of_noise_plays_the_same_starts_in_every_cell() -> None:
     missions = set()
     starts = set()
     for setting in settings:
-        assert not isinstance(setting, Refused)
+        assert not isinstance(setting, RefusedCell)
         scenario = setting.seeded(7)
         starts.add(tuple(robot.start for robot in scenario.robots))
         mission, noise = scenario.mission, scenario.mission.noise
@@ -749,7 +749,7 @@ def test_a_spec_that_is_not_there_is_named() -> None:
 @pytest.mark.long
 def test_a_sweep_of_draws_counts_what_it_refused_and_resumes(folder: Path) -> None:
     words = ("anywhere", "--trials", "80", "--workers", "1", "--no-audit")
-    with Command("sweep", *words, "--out", "out", cwd=folder) as command:
+    with TandemProcess("sweep", *words, "--out", "out", cwd=folder) as command:
         command.until(lambda: parts(folder / "out"), "a chunk is done")
         command.tell(SIGINT)
         assert command.ended().status == 130

@@ -17,13 +17,13 @@ from hypothesis import strategies as st
 
 from compose.launch.processes import free_endpoint
 from compose.terminal.tables import console
-from protocol.messages import Drive, End, Farewell, Sense, Undecided
+from protocol.messages import Command, FinalReport, MissionEnd, Observation, Undecided
 from protocol.network import keys, session
 from protocol.network.endpoints import at
 from protocol.network.inbox import Inbox
 from protocol.output import one_line, say
 from protocol.wire import decode, encode
-from tests.commands import BOUND_S, PAPER_1, Command, Ended, tandem, world
+from tests.commands import BOUND_S, PAPER_1, Ended, TandemProcess, tandem, world
 from tests.examples import EXAMPLES
 
 RUN = "mine"
@@ -35,9 +35,9 @@ ESCAPED = one_line(REASON)
 HARMFUL = ("\x1b[2J", "\x9b", "\x07", "\x7f", "\u202e", "\u2028")
 
 
-def farewell(robot: str) -> Farewell:
-    [found] = [one for one in EXAMPLES if isinstance(one, Farewell) and not one.anchor_ranges]
-    return Farewell(robot, *[getattr(found, name) for name in found.__struct_fields__[1:]])
+def farewell(robot: str) -> FinalReport:
+    [found] = [one for one in EXAMPLES if isinstance(one, FinalReport) and not one.anchor_ranges]
+    return FinalReport(robot, *[getattr(found, name) for name in found.__struct_fields__[1:]])
 
 
 def play_hostile(endpoint: str, pause: Callable[[], object] = lambda: None) -> None:
@@ -50,17 +50,19 @@ def play_hostile(endpoint: str, pause: Callable[[], object] = lambda: None) -> N
         while True:
             arrival = heard.next(BOUND_S)
             assert arrival.topic == "sense"
-            message: Sense | End | Farewell = decode(arrival.frame, Sense | End | Farewell)
+            message: Observation | MissionEnd | FinalReport = decode(
+                arrival.frame, Observation | MissionEnd | FinalReport
+            )
             match message:
-                case Sense(tick):
+                case Observation(tick):
                     verdict = Undecided(REASON) if tick == 3 else None
-                    drive.put(encode(Drive(tick, "b", 0.0, 0.0, 1, STATE, verdict)))
+                    drive.put(encode(Command(tick, "b", 0.0, 0.0, 1, STATE, verdict)))
                     if tick == 2 and not paused:
                         paused = True
                         pause()
-                case End():
+                case MissionEnd():
                     drive.put(encode(farewell("b")))
-                case Farewell():
+                case FinalReport():
                     break
         del token
 
@@ -101,7 +103,7 @@ def test_what_a_robot_says_is_escaped_by_world_agent_audit_and_replay(tmp_path: 
     scenario.write_text(PAPER_1)
     with (
         world(scenario, "--run", RUN, "--out", out) as (clock, endpoint),
-        Command("agent", "a", "--connect", endpoint, "--out", out) as agent,
+        TandemProcess("agent", "a", "--connect", endpoint, "--out", out) as agent,
     ):
         play_hostile(endpoint)
         assert (clock.ended().status, agent.ended().status) == (1, 1)
@@ -121,7 +123,7 @@ def test_what_a_robot_says_is_escaped_by_ps_and_is_json_where_that_is_asked_for(
     scenario.write_text(PAPER_1)
     with (
         world(scenario, "--run", RUN) as (clock, endpoint),
-        Command("agent", "a", "--connect", endpoint),
+        TandemProcess("agent", "a", "--connect", endpoint),
     ):
 
         def look() -> None:
@@ -143,7 +145,10 @@ def test_a_live_table_and_an_outcome_on_a_terminal_show_what_a_robot_says_escape
     scenario.write_text(PAPER_1)
     ours, theirs = pty.openpty()
     arguments = ("world", scenario, "--run", RUN, "--listen", endpoint)
-    with Command(*arguments, terminal=theirs) as clock, Command("agent", "a", "--connect", endpoint) as agent:
+    with (
+        TandemProcess(*arguments, terminal=theirs) as clock,
+        TandemProcess("agent", "a", "--connect", endpoint) as agent,
+    ):
         os.close(theirs)
         play_hostile(endpoint)
         assert agent.ended().status == 1

@@ -20,13 +20,13 @@ from protocol.journal.journal_file import Journal, read
 from protocol.journal.resume import Retrace
 from protocol.messages import (
     MAX_TEXT,
-    Alarm,
-    Drive,
-    End,
-    Farewell,
+    Command,
+    FinalReport,
+    Inconsistent,
     Message,
+    MissionEnd,
+    Observation,
     OfRobot,
-    Sense,
     Undecided,
     Verdict,
 )
@@ -97,7 +97,12 @@ def example_of(kind: type[msgspec.Struct]) -> msgspec.Struct:
 
 
 def test_the_text_fields_are_these() -> None:
-    assert set(FIELDS) == {(Undecided, "reason"), (Alarm, "claim"), (End, "reason"), (Farewell, "missing")}
+    assert set(FIELDS) == {
+        (Undecided, "reason"),
+        (Inconsistent, "claim"),
+        (MissionEnd, "reason"),
+        (FinalReport, "missing"),
+    }
 
 
 @pytest.mark.parametrize(("kind", "field"), FIELDS)
@@ -105,12 +110,14 @@ def test_the_text_fields_are_these() -> None:
 def test_what_is_encoded_is_within_its_bound(kind: type[msgspec.Struct], field: str, words: str) -> None:
     made = replace(example_of(kind), **{field: words})
     assert len(getattr(made, field)) == MAX_TEXT
-    told: Message = made if isinstance(made, Message) else Drive(0, "a", 0.0, 0.0, 1, "done", _verdict(made))
+    told: Message = (
+        made if isinstance(made, Message) else Command(0, "a", 0.0, 0.0, 1, "done", _verdict(made))
+    )
     assert decode(encode(told), type(told)) == told
 
 
 def _verdict(value: object) -> Verdict:
-    assert isinstance(value, Undecided | Alarm)
+    assert isinstance(value, Undecided | Inconsistent)
     return value
 
 
@@ -149,8 +156,8 @@ def _taken(message: Message, path: tuple[object, ...], value: str) -> bool:
 
 def test_every_word_for_a_state_is_within_its_bound() -> None:
     for word in (*WORDS.values(), "localised", "undecided", "alarm"):
-        drive = Drive(0, "a", 0.0, 0.0, 1, word)
-        assert decode(encode(drive), Drive) == drive
+        drive = Command(0, "a", 0.0, 0.0, 1, word)
+        assert decode(encode(drive), Command) == drive
 
 
 # --- journals -----------------------------------------------------------------------------------------
@@ -170,11 +177,11 @@ def test_an_agent_that_gives_up_at_length_leaves_a_journal_that_is_read(tmp_path
     scenario, path = load("paper-1"), tmp_path / "agent-a.journal"
     with Journal(path) as journal:
         robot = Robot(scenario.briefing("a"), journal)
-        robot.sense(Sense(0, "a", None, 1.0))
+        robot.sense(Observation(0, "a", None, 1.0))
         robot.mind = robot.mind.undecided("\U0001f600" * 1000)
         drive = robot.decide()
         robot.estimate()
-        robot.farewell(End(1, "undecided", f"a: {'x' * 1000}"))
+        robot.farewell(MissionEnd(1, "undecided", f"a: {'x' * 1000}"))
     assert drive.verdict == Undecided("\U0001f600" * MAX_TEXT)
     assert past(read(path), path).farewell is not None
     for frame in read(path):
@@ -199,16 +206,18 @@ def test_a_verdict_of_as_many_words_as_there_may_be_ends_a_run_whose_record_is_r
             arrival = heard.next(BOUND_S)
             assert arrival.topic == "sense", clock.err
             robot = arrival.source.robot
-            message: Sense | End | Farewell = decode(arrival.frame, Sense | End | Farewell)
+            message: Observation | MissionEnd | FinalReport = decode(
+                arrival.frame, Observation | MissionEnd | FinalReport
+            )
             match message:
-                case Sense(tick):
-                    drives[robot].put(encode(Drive(tick, robot, 0.0, 0.0, 1, "undecided", gives_up)))
-                case End(_, outcome, reason):
+                case Observation(tick):
+                    drives[robot].put(encode(Command(tick, robot, 0.0, 0.0, 1, "undecided", gives_up)))
+                case MissionEnd(_, outcome, reason):
                     assert (outcome, reason) == ("undecided", f"a: {gives_up.reason}"[:MAX_TEXT])
-                    said = replace(example_of(Farewell), robot=robot)
-                    assert isinstance(said, Farewell)
+                    said = replace(example_of(FinalReport), robot=robot)
+                    assert isinstance(said, FinalReport)
                     drives[robot].put(encode(said))
-                case Farewell():
+                case FinalReport():
                     parted.add(robot)
         assert clock.ended().status == 1, clock.err
         del tokens

@@ -15,7 +15,7 @@ from compose.scenario.scenario_file import load
 from protocol.network import keys, session
 from protocol.network.endpoints import at, listening
 from protocol.wire import encode
-from tests.commands import Command, journals, processes_of, several_pairs, tandem, world
+from tests.commands import TandemProcess, journals, processes_of, several_pairs, tandem, world
 from tests.series import series
 
 NOBODY = "nobody listens there; check the address, and that the router runs"
@@ -42,7 +42,7 @@ def test_any_order_of_starting_gives_the_same_record(
 ) -> None:
     endpoint, out = free_endpoint(), tmp_path / "out"
     with ExitStack() as shells:
-        started: dict[str, Command] = {}
+        started: dict[str, TandemProcess] = {}
         for name in order:
             if name == "world":
                 for agent in started.values():  # which it says after 5 s
@@ -50,7 +50,7 @@ def test_any_order_of_starting_gives_the_same_record(
                 part = ("world", "paper-1", "--listen", endpoint)
             else:
                 part = ("agent", name, "--connect", endpoint)
-            started[name] = shells.enter_context(Command(*part, "--out", out))
+            started[name] = shells.enter_context(TandemProcess(*part, "--out", out))
             if name == "world":
                 started[name].until_says("waiting for a, b")
             if "world" in started and len(started) == 2:
@@ -69,7 +69,7 @@ def test_any_order_of_starting_gives_the_same_record(
 def test_each_shell_may_keep_its_record_in_a_folder_of_its_own(paper_1: Path, tmp_path: Path) -> None:
     with world("paper-1", "--out", tmp_path / "world") as (clock, endpoint), ExitStack() as shells:
         for robot in ("a", "b"):
-            agent = Command("agent", robot, "--connect", endpoint, "--out", tmp_path / robot)
+            agent = TandemProcess("agent", robot, "--connect", endpoint, "--out", tmp_path / robot)
             shells.enter_context(agent)
         assert clock.ended().status == 0
     found = {name: data for part in ("world", "a", "b") for name, data in journals(tmp_path / part).items()}
@@ -83,7 +83,7 @@ def test_several_pairs_localise_side_by_side_in_one_world(pairs: int, tmp_path: 
     robots = "abcdef"[: 2 * pairs]
     with world(scenario, "--out", out) as (clock, endpoint), ExitStack() as shells:
         agents = [
-            shells.enter_context(Command("agent", robot, "--connect", endpoint, "--out", out))
+            shells.enter_context(TandemProcess("agent", robot, "--connect", endpoint, "--out", out))
             for robot in reversed(robots)
         ]
         assert clock.ended().status == 0
@@ -124,7 +124,7 @@ def waiting(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     out = tmp_path_factory.mktemp("waiting") / "out"
     with (
         world("paper-1", "--run", "mine", "--patience", "100") as (_, endpoint),
-        Command("agent", "a", "--connect", endpoint, "--out", out) as agent,
+        TandemProcess("agent", "a", "--connect", endpoint, "--out", out) as agent,
     ):
         agent.until_answered("a", out)
         yield endpoint
@@ -143,7 +143,7 @@ def test_a_second_agent_of_the_same_robot_is_refused(waiting: str) -> None:
 @pytest.mark.long
 def test_an_agent_that_is_refused_leaves_the_mission_alone(paper_1: Path, tmp_path: Path) -> None:
     with world("paper-1", "--out", tmp_path) as (clock, endpoint):
-        with Command("agent", "a", "--connect", endpoint, "--out", tmp_path) as a:
+        with TandemProcess("agent", "a", "--connect", endpoint, "--out", tmp_path) as a:
             a.until_answered("a", tmp_path)
             for refused in ("a", "z"):
                 assert tandem("agent", refused, "--connect", endpoint).status == 2
@@ -171,7 +171,7 @@ def test_whatever_a_stranger_answers_an_agent_finds_its_world(stranger: str) -> 
             _tokens = [session.show_alive(link, keys.world_alive(run)) for run in ("a", "yours", "z")]
         else:
             link.declare_queryable(key, reply)
-        with Command("agent", "a", "--connect", endpoint) as agent:
+        with TandemProcess("agent", "a", "--connect", endpoint) as agent:
             agent.until_says("a: in run mine, with b")
 
 
@@ -194,5 +194,5 @@ def test_an_agent_that_meets_several_runs_must_be_told_which() -> None:
         ended = tandem("agent", "a", "--connect", endpoint)
         says = "tandem agent: several runs are alive: mine, yours; choose one with --run\n"
         assert ended == (2, "", says)
-        with Command("agent", "a", "--connect", endpoint, "--run", "mine") as agent:
+        with TandemProcess("agent", "a", "--connect", endpoint, "--run", "mine") as agent:
             agent.until_says("a: in run mine, with b")

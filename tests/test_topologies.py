@@ -16,7 +16,7 @@ from compose.launch.processes import free_endpoint
 from compose.network import KEYED
 from protocol.network import session
 from protocol.network.endpoints import listening
-from tests.commands import BOUND_S, LONG, LONG_JOURNAL_BYTES, PAPER_1, Command, journals, tandem
+from tests.commands import BOUND_S, LONG, LONG_JOURNAL_BYTES, PAPER_1, TandemProcess, journals, tandem
 from tests.series import series
 
 ROUTER = [sys.executable, "-m", "tests.router"]
@@ -59,12 +59,13 @@ def routing(router: Router, folder: Path) -> Iterator[subprocess.Popen[str]]:
 
 def parts(
     scenario: Path, out: Path, flags: Mapping[str, Sequence[str | Path]], stack: ExitStack
-) -> dict[str, Command]:
+) -> dict[str, TandemProcess]:
     """The world and the agents, each with flags of its own."""
     what: dict[str, list[str | Path]]
     what = {"world": ["world", scenario], "a": ["agent", "a"], "b": ["agent", "b"]}
     return {
-        name: stack.enter_context(Command(*what[name], *flags[name], "--out", out, "-q")) for name in what
+        name: stack.enter_context(TandemProcess(*what[name], *flags[name], "--out", out, "-q"))
+        for name in what
     }
 
 
@@ -77,7 +78,7 @@ def record_of(text: str, folder: Path) -> dict[str, bytes]:
     return journals(folder / "local") | {"ticks.csv": (folder / "local/ticks.csv").read_bytes()}
 
 
-def same(mission: dict[str, Command], out: Path, expected: dict[str, bytes]) -> None:
+def same(mission: dict[str, TandemProcess], out: Path, expected: dict[str, bytes]) -> None:
     """All localise, and leave that record."""
     ended = {name: part.ended() for name, part in mission.items()}
     assert {name: end.status for name, end in ended.items()} == dict.fromkeys(mission, 0), ended
@@ -204,9 +205,9 @@ def test_a_world_that_listens_says_what_to_check_of_a_router_that_is_not_there_a
     tmp_path: Path,
 ) -> None:
     x, y = free_endpoint(), free_endpoint()
-    with Command("world", "paper-1", *listen(y), *connect(x), "--out", tmp_path) as world:
+    with TandemProcess("world", "paper-1", *listen(y), *connect(x), "--out", tmp_path) as world:
         world.until_says(f"no router at {x} yet: nobody listens there")
-        robots = [Command("agent", robot, *connect(y)) for robot in "ab"]
+        robots = [TandemProcess("agent", robot, *connect(y)) for robot in "ab"]
         for robot in robots:
             with robot:
                 assert robot.ended(BOUND_S).status == 0

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from agent.planning import planner, precision
 from compose.launch.in_process import play
 from compose.scenario.scenario_file import parse, shipped
-from protocol.messages import Drive, Localised, Report, Undecided
+from protocol.messages import Command, Localised, Report, Undecided
 from protocol.motion import ORIGIN, Covariance
 from tests.steps import steps
 from tests.surveys import scenario_of
@@ -86,8 +86,8 @@ def judged(text: str, a: Covariance | None, *, off: float = 0.0) -> Judgement | 
     return advance(
         world,
         {
-            "a": Drive(0, "a", 0.0, 0.0, 3, "localised", claim),
-            "b": Drive(0, "b", 0.0, 0.0, 3, "localised", Localised(other)),
+            "a": Command(0, "a", 0.0, 0.0, 3, "localised", claim),
+            "b": Command(0, "b", 0.0, 0.0, 3, "localised", Localised(other)),
         },
     )
 
@@ -127,7 +127,7 @@ def test_without_a_world_a_claim_less_accurate_than_was_asked_does_not_end_local
     for mine, other, outcome in ((own, peers, "undecided"), (good, good, "localised")):
         ending = Ending(briefing, 100, 30.0)
         ending.told(Report(0, "b", 3, "localised", ORIGIN, 0, 0, (), 0, (), 0, 0, other))
-        drive = Drive(0, "a", 0.0, 0.0, 3, "localised", mine)
+        drive = Command(0, "a", 0.0, 0.0, 3, "localised", mine)
         ends = [ending.after(tick, drive, peer_there=True) for tick in range(LAST_WORDS + 1)]
         assert ends[-1] is not None
         assert ends[-1].outcome == outcome

@@ -26,7 +26,7 @@ from compose.launch import in_process
 from compose.recording.run import read
 from compose.scenario.scenario_file import load
 from protocol.journal import journal_file
-from protocol.messages import Message, OfRobot, Sense
+from protocol.messages import Message, Observation, OfRobot
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from tests.browser import SCRUB, Open, address_of, inks, picture, shot, until_shown, watching
 from tests.commands import (
@@ -34,7 +34,7 @@ from tests.commands import (
     ENDLESS,
     PAPER_1,
     SECTION_IV,
-    Command,
+    TandemProcess,
     journals,
     processes_of,
     tandem,
@@ -203,7 +203,7 @@ def test_robots_without_a_world_are_shown_by_what_they_know(
 
 def as_a_driver_tells(message: Message) -> Message:
     """Without a world nobody lists what is heard."""
-    if not isinstance(message, Sense):
+    if not isinstance(message, Observation):
         return message
     return replace(message, contacts=tuple([replace(one, heard=None) for one in message.contacts]))
 
@@ -300,7 +300,7 @@ def test_a_campaign_shows_its_cells_and_its_figures(opened: Open, tmp_path: Path
         '[[axis]]\nfield = "mission.max_speed"\nvalues = [0.5, 1.0]\n'
     )
     folder = tmp_path / "campaign"
-    with Command("sweep", spec, "--out", folder, "--workers", "1", "-q", "--no-audit") as sweep:
+    with TandemProcess("sweep", spec, "--out", folder, "--workers", "1", "-q", "--no-audit") as sweep:
         assert sweep.ended(4 * BOUND_S).status == 0
     with watching(folder) as (_, where):
         page = opened(where)
@@ -323,8 +323,8 @@ def test_a_mission_is_followed_to_its_end_from_its_journals_and_from_the_network
     with (
         world(scenario, "--out", record, *PATIENT) as (_, endpoint),
         world("paper-2", *PATIENT) as (_, other),
-        Command("agent", "a", "--connect", endpoint, "--out", record, *PATIENT) as a,
-        Command("agent", "b", "--connect", other),
+        TandemProcess("agent", "a", "--connect", endpoint, "--out", record, *PATIENT) as a,
+        TandemProcess("agent", "b", "--connect", other),
         watching(record) as (_, of_journals),
         watching("--connect", endpoint, "--connect", other) as (_, of_network),
     ):
@@ -336,7 +336,7 @@ def test_a_mission_is_followed_to_its_end_from_its_journals_and_from_the_network
             until_shown(page, 0)
             expect(page.locator("#status")).to_have_text("● runs, tick 0")
             expect(page.locator("#follow")).to_be_visible()
-        with Command("agent", "b", "--connect", endpoint, "--out", record) as b:
+        with TandemProcess("agent", "b", "--connect", endpoint, "--out", record) as b:
             for page in (files, heard):
                 expect(page.locator("#status")).to_have_text("localised after 48 ticks")
                 until_shown(page, 48)
@@ -356,7 +356,7 @@ def test_a_page_keeps_up_with_a_mission_as_fast_as_it_goes(opened: Open, tmp_pat
     """By leaving out frames: thousands of ticks are past, and it is never far behind for long."""
     scenario, out = tmp_path / "endless.toml", tmp_path / "out"
     scenario.write_text(ENDLESS)
-    with Command("run", scenario, "--watch", "--out", out, "-q") as run:
+    with TandemProcess("run", scenario, "--watch", "--out", out, "-q") as run:
         page = opened(address_of(run))
 
         def shown() -> int:
@@ -372,7 +372,7 @@ def test_a_page_keeps_up_with_a_mission_as_fast_as_it_goes(opened: Open, tmp_pat
 def test_run_watch_stays_until_ctrl_c_and_leaves_the_record_that_it_would_have_left(
     opened: Open, paper_1: Path, tmp_path: Path
 ) -> None:
-    with Command("run", "paper-1", "--watch", "--out", tmp_path / "record", "-q") as run:
+    with TandemProcess("run", "paper-1", "--watch", "--out", tmp_path / "record", "-q") as run:
         page = opened(address_of(run))
         run.until_says("the page stays at")
         expect(page.locator("#status")).to_have_text("localised after 48 ticks")
@@ -408,7 +408,7 @@ def test_every_test_that_opens_a_page_skips_where_there_is_no_browser(tmp_path: 
 
 
 def test_the_page_ends_with_whoever_launched_it(tmp_path: Path) -> None:
-    with Command("run", "paper-1", "--watch", "--out", tmp_path / "record", "-q") as run:
+    with TandemProcess("run", "paper-1", "--watch", "--out", tmp_path / "record", "-q") as run:
         run.until_says("the page stays at")
         assert processes_of(tmp_path / "record")
         run.tell(SIGKILL)
@@ -493,7 +493,7 @@ def test_a_port_that_is_taken_is_one_line(paper_1: Path) -> None:
 
 
 def test_a_page_on_every_address_is_told_of_and_answers_to_addresses_and_to_no_names(paper_1: Path) -> None:
-    with Command("watch", paper_1, "--address", "0.0.0.0") as command:
+    with TandemProcess("watch", paper_1, "--address", "0.0.0.0") as command:
         command.until_says("until Ctrl-C")
         assert "tandem watch: --address: whoever reaches 0.0.0.0 can watch\n" in command.err
         address = command.out.split()[0]
@@ -508,7 +508,7 @@ def test_a_page_on_every_address_is_told_of_and_answers_to_addresses_and_to_no_n
 
 
 def test_a_page_on_an_address_of_this_machine_answers_to_it(paper_1: Path) -> None:
-    with Command("watch", paper_1, "--address", "127.0.0.2") as command:
+    with TandemProcess("watch", paper_1, "--address", "127.0.0.2") as command:
         command.until_says("until Ctrl-C")
         assert command.err == ""
         address = command.out.split()[0]

@@ -17,7 +17,16 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from compose.scenario.scenario_file import load
-from protocol.messages import MAX_REPORT_RANGES, MAX_REPORT_RUNS, Drive, End, Farewell, Message, Report, Sense
+from protocol.messages import (
+    MAX_REPORT_RANGES,
+    MAX_REPORT_RUNS,
+    Command,
+    FinalReport,
+    Message,
+    MissionEnd,
+    Observation,
+    Report,
+)
 from protocol.mission import Mission
 from protocol.wire import MAX_FRAME_BYTES, VERSION, MalformedFrame, decode, encode
 from tests.examples import EXAMPLES
@@ -131,7 +140,7 @@ def test_an_unknown_tag_is_refused(tag: object) -> None:
 
 @by_message
 def test_a_message_of_another_kind_is_refused(message: Message) -> None:
-    for kind in (Sense | End, Drive | Farewell, Report):
+    for kind in (Observation | MissionEnd, Command | FinalReport, Report):
         if not isinstance(message, kind):
             refuses(encode(message), kind)
 
@@ -241,7 +250,7 @@ def test_too_many_entries_and_too_long_words_are_refused() -> None:
 )
 def test_a_hostile_body_is_refused(body: bytes) -> None:
     refuses(framed(body))
-    refuses(framed(body), Sense | End)
+    refuses(framed(body), Observation | MissionEnd)
     refuses(framed(body), Scenario)
 
 

@@ -15,13 +15,13 @@ from msgspec.structs import replace
 from compose.audit.hardware_rules import RULES, judge_alone
 from compose.figures import over_time, phase_one, steps, trajectory
 from compose.figures.account import account
-from compose.figures.pair import Pair, of_record, of_robots
+from compose.figures.pair import PairRecord, of_record, of_robots
 from compose.figures.sheet import NO_PLACES, Absent
 from compose.launch.in_process import play
 from compose.recording.run import past_of, read
 from compose.scenario.scenario_file import load, parse
 from protocol.journal import journal_file
-from protocol.messages import Drive, Message, OfRobot, Report
+from protocol.messages import Command, Message, OfRobot, Report
 from protocol.mission import Role
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from tests.commands import several_pairs, tandem
@@ -44,11 +44,11 @@ def folders(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     return whole, alone
 
 
-def pair_of(whole: Path) -> Pair:
+def pair_of(whole: Path) -> PairRecord:
     return of_record(read(whole), (0, 1), {robot: account(whole, robot) for robot in "ab"})
 
 
-def alone_of(alone: Path, robots: str = "ab") -> Pair:
+def alone_of(alone: Path, robots: str = "ab") -> PairRecord:
     return of_robots({robot: account(alone, robot) for robot in robots})
 
 
@@ -228,7 +228,7 @@ def test_a_tick_that_is_left_out_is_no_record(folders: tuple[Path, Path], tmp_pa
     (tmp_path / "agent-a.journal").write_bytes(b"".join([msgpack.packb(frame) for frame in frames]))
     ended = tandem("export", tmp_path)
     assert (ended.status, ended.out) == (2, "")
-    assert ended.err.endswith("agent-a.journal: a Sense of tick 6 is out of order\n")
+    assert ended.err.endswith("agent-a.journal: a Observation of tick 6 is out of order\n")
 
 
 def test_the_audit_holds_robots_to_their_limits_and_to_what_they_sensed(folders: tuple[Path, Path]) -> None:
@@ -240,7 +240,7 @@ def test_the_audit_holds_robots_to_their_limits_and_to_what_they_sensed(folders:
 
 
 def too_fast(message: Message) -> Message:
-    return replace(message, v=2.0) if isinstance(message, Drive) else message
+    return replace(message, v=2.0) if isinstance(message, Command) else message
 
 
 def another_range(message: Message) -> Message:

@@ -10,7 +10,7 @@ from types import ModuleType
 from compose.hardware import exercise
 from docs import rover
 from docs.rover import Rover as RealRover
-from protocol.messages import Briefing
+from protocol.messages import RobotConfig
 from tests import broken_drivers
 
 
@@ -34,7 +34,7 @@ MODULES: tuple[ModuleType, ...] = (exercise, rover, broken_drivers)
 class Rover(RealRover):
     """The example, in a process where time is virtual from now on."""
 
-    def __init__(self, briefing: Briefing, manoeuvre_s: float) -> None:
+    def __init__(self, briefing: RobotConfig, manoeuvre_s: float) -> None:
         clock = Clock()
         for module in MODULES:
             module.time = clock  # type: ignore[attr-defined]

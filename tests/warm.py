@@ -26,7 +26,7 @@ DRAWING = ("matplotlib.backends.backend_pdf", "matplotlib.backends.backend_svg")
 """modules that Matplotlib imports only when it writes a file"""
 
 
-class Command(msgspec.Struct, frozen=True):
+class Request(msgspec.Struct, frozen=True):
     """A command line, its working directory and its environment."""
 
     words: list[bytes]
@@ -50,7 +50,7 @@ def run(words: list[str], folder: Path | None, out: IO[bytes], err: IO[bytes], w
 
     Raises AssertionError if it runs for longer than `within` seconds.
     """
-    command = Command([*map(os.fsencode, words)], str(folder or Path.cwd()), dict(os.environb))
+    command = Request([*map(os.fsencode, words)], str(folder or Path.cwd()), dict(os.environb))
     with tempfile.NamedTemporaryFile() as file:
         file.write(msgspec.msgpack.encode(command))
         file.flush()
@@ -66,7 +66,7 @@ def run(words: list[str], folder: Path | None, out: IO[bytes], err: IO[bytes], w
 def run_command() -> None:
     """Run the command whose file sys.argv names, in this forked process."""
     with open(sys.argv[1], "rb") as file:
-        command = msgspec.msgpack.decode(file.read(), type=Command)
+        command = msgspec.msgpack.decode(file.read(), type=Request)
     os.dup(0)  # that stays open: a fork server takes a process that closes it for one that has ended
     for path, stream, flags in ((sys.argv[2], 1, os.O_WRONLY), (os.devnull, 0, os.O_RDONLY)):
         opened = os.open(path, flags)

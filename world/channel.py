@@ -15,7 +15,7 @@ from world.faults import Fault
 from world.random_streams import uniform
 
 
-class Flying(NamedTuple):
+class InFlight(NamedTuple):
     """A copy of a report under way."""
 
     due: int
@@ -29,14 +29,14 @@ class Flying(NamedTuple):
     """which of the copies: bit i is set where the fault at place i has made it"""
 
 
-class Air(msgspec.Struct, frozen=True):
+class LinkState(msgspec.Struct, frozen=True):
     """One link, after a tick: what it carries, and what has come in it."""
 
     heard: tuple[int, ...] = ()
     """the ticks of the reports that came in this tick, in order"""
     damaged: tuple[int, ...] = ()
     """of those that came damaged"""
-    flying: tuple[Flying, ...] = ()
+    flying: tuple[InFlight, ...] = ()
     contacts: int = 0
     """ticks in which the two have been in contact"""
     bursts: tuple[bool, ...] = ()
@@ -45,7 +45,7 @@ class Air(msgspec.Struct, frozen=True):
     """of each: how many reports may come yet"""
 
 
-class Links(NamedTuple):
+class LinkFaults(NamedTuple):
     """The faults on one link, each with its place in the plan."""
 
     sender: str
@@ -58,13 +58,13 @@ class Links(NamedTuple):
         return f"{self.sender}->{self.receiver}"
 
 
-def of_plan(plan: Sequence[Fault], sender: str, receiver: str) -> Links:
+def of_plan(plan: Sequence[Fault], sender: str, receiver: str) -> LinkFaults:
     """What of `plan` is on the way from `sender` to `receiver`."""
     on_it = [(i, fault) for i, fault in enumerate(plan) if fault.on(sender, receiver)]
-    return Links(sender, receiver, tuple(on_it))
+    return LinkFaults(sender, receiver, tuple(on_it))
 
 
-def carried(air: Air, links: Links, seed: int, tick: int, *, in_contact: bool) -> Air:
+def carried(air: LinkState, links: LinkFaults, seed: int, tick: int, *, in_contact: bool) -> LinkState:
     """The air one tick on: at `tick`, in which the sender says its report if the two are in contact.
 
     What is due out of contact is lost.
@@ -82,7 +82,7 @@ def carried(air: Air, links: Links, seed: int, tick: int, *, in_contact: bool) -
         flying += tuple(_sent(links, bursts, active, seed, tick))
     due = sorted([one for one in flying if one.due <= tick], key=lambda one: one.overtaken)
     coming, room = _let_through(due if in_contact else [], links, air, tick)
-    return Air(
+    return LinkState(
         heard=tuple([one.tick for one in coming if not one.damaged]),
         damaged=tuple([one.tick for one in coming if one.damaged]),
         flying=tuple([one for one in flying if one.due > tick]),
@@ -99,20 +99,24 @@ def _burst(burst: bool | None, fault: Fault, draw: float) -> bool:
     return draw >= fault.burst_end if burst else draw < fault.burst_start
 
 
-def _draw(seed: int, fault: int, what: str, links: Links, tick: int) -> float:
+def _draw(seed: int, fault: int, what: str, links: LinkFaults, tick: int) -> float:
     return uniform(seed, f"fault/{fault}/{what}", links.name, tick)
 
 
-def _sent(links: Links, bursts: Sequence[bool], active: Sequence[bool], seed: int, tick: int) -> list[Flying]:
+def _sent(
+    links: LinkFaults, bursts: Sequence[bool], active: Sequence[bool], seed: int, tick: int
+) -> list[InFlight]:
     """The copies of the report of `tick` that are not lost at once."""
-    copies = [Flying(tick, tick, overtaken=False, damaged=False, copy=0)]
+    copies = [InFlight(tick, tick, overtaken=False, damaged=False, copy=0)]
     for (i, fault), burst, there in zip(links.faults, bursts, active, strict=True):
         if there:
             copies = [copy for one in copies for copy in _befallen(one, i, fault, burst, links, seed)]
     return copies
 
 
-def _befallen(one: Flying, place: int, fault: Fault, burst: bool, links: Links, seed: int) -> list[Flying]:
+def _befallen(
+    one: InFlight, place: int, fault: Fault, burst: bool, links: LinkFaults, seed: int
+) -> list[InFlight]:
     """What becomes of a copy."""
 
     def happens(what: str, chance: float, copy: int = one.copy) -> bool:
@@ -130,14 +134,14 @@ def _befallen(one: Flying, place: int, fault: Fault, burst: bool, links: Links, 
         overtaken = happens("reorder", fault.reorder, k)
         damaged = happens("corrupt", fault.corrupt, k)
         copies.append(
-            Flying(due + overtaken, one.tick, one.overtaken or overtaken, one.damaged or damaged, copy=k)
+            InFlight(due + overtaken, one.tick, one.overtaken or overtaken, one.damaged or damaged, copy=k)
         )
     return copies
 
 
 def _let_through(
-    due: Sequence[Flying], links: Links, air: Air, tick: int
-) -> tuple[list[Flying], tuple[float, ...]]:
+    due: Sequence[InFlight], links: LinkFaults, air: LinkState, tick: int
+) -> tuple[list[InFlight], tuple[float, ...]]:
     """Those of `due` for which every fault's bandwidth has room, and the room that is left.
 
     What is left is kept, up to one report's: else of 0.6 a tick only one in two ticks would come.

@@ -24,7 +24,7 @@ Window = tuple[Tick, Tick]
 """ticks, the first inside and the last outside"""
 
 
-class Link(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+class LinkSelector(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
     """From one robot to its peer, or both ways."""
 
     sender: RobotId
@@ -41,7 +41,7 @@ class Link(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=T
 class Fault(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
     """What may befall a report on a link; several faults befall it one after the other."""
 
-    link: Link | None = None
+    link: LinkSelector | None = None
     """all of them, where there is none"""
     loss: Chance = 0.0
     """the probability that it is lost"""

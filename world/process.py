@@ -1,10 +1,10 @@
 """The world's process: its clock is the barrier of the tick.
 
 Lockstep goes as fast as the answers come, and no decision depends on a time-out. A robot that has not
-answered is sent its Sense again when it appears, and every REPEAT_S; and so is its peer, whose reports it may
+answered is sent its Observation again when it appears, and every REPEAT_S; and so is its peer, whose reports it may
 have lost. That one rule serves late starters, lost messages and restarted agents; and a world that is started
-again, which says to everyone what it would have said. Everyone is sent its Sense again every REPEAT_TO_ALL_S,
-so that no link falls silent meanwhile. In real time a tick lasts its period, and a robot whose Drive did not
+again, which says to everyone what it would have said. Everyone is sent its Observation again every REPEAT_TO_ALL_S,
+so that no link falls silent meanwhile. In real time a tick lasts its period, and a robot whose Command did not
 come stands still.
 """
 
@@ -17,7 +17,7 @@ from typing import Any
 
 import zenoh
 
-from protocol.messages import Drive, End, Farewell, Message, Sense, Truth
+from protocol.messages import Command, FinalReport, GroundTruth, Message, MissionEnd, Observation
 from protocol.network import keys, session
 from protocol.network.inbox import NOTHING, Arrival, Inbox
 from protocol.spelling import did_you_mean
@@ -40,7 +40,7 @@ class NoAnswer(TimeoutError):
     """Somebody did not answer within the patience; says who."""
 
 
-class LinkLost(Exception):
+class RobotsLinkLost(Exception):
     """Nothing comes over this link any more; over another the robots may be there."""
 
 
@@ -80,7 +80,7 @@ class WorldProcess:
         self._late = 0
         """Drives of ticks that are over"""
         self._latest: dict[str, int] = {}
-        """of each robot: the tick of the latest Drive that came, in time or not"""
+        """of each robot: the tick of the latest Command that came, in time or not"""
         self._truth_wanted = False
         self._mute = math.inf
         """when its link counts as lost, if nothing comes until then"""
@@ -88,10 +88,10 @@ class WorldProcess:
         self._began: float | None = None
         """when everyone had answered the first Sense"""
         self.playing_s = 0.0
-        """wall time since then, to the End"""
+        """wall time since then, to the MissionEnd"""
         self._parting: float | None = None
-        """when the End was first said"""
-        self._last_words: dict[str, Farewell] = {}
+        """when the MissionEnd was first said"""
+        self._last_words: dict[str, FinalReport] = {}
 
     def attach(self, link: zenoh.Session, *, replaceable: bool = False) -> None:
         """From now on, this is the session over which it hears and is heard; `replaceable` by silence."""
@@ -106,8 +106,8 @@ class WorldProcess:
         session.answer(link, keys.briefing(run, "*"), self._brief)
         self._token = session.show_alive(link, keys.world_alive(run))
 
-    def play(self) -> End:
-        """The run, to its End.
+    def play(self) -> MissionEnd:
+        """The run, to its MissionEnd.
 
         Raises LinkLost, to be played on over another; or Interrupted when told to stop.
         """
@@ -143,8 +143,8 @@ class WorldProcess:
 
     # --- a tick ---
 
-    def _answers(self, senses: list[Sense], due: float | None) -> dict[str, Drive]:
-        """Everyone's Drive; in real time, where `due` is when the tick ends, those that came until then."""
+    def _answers(self, senses: list[Observation], due: float | None) -> dict[str, Command]:
+        """Everyone's Command; in real time, where `due` is when the tick ends, those that came until then."""
         tick = self._course.tick
         frames = {sense.robot: encode(sense) for sense in senses}
         if self._reached is not None:
@@ -153,7 +153,7 @@ class WorldProcess:
         if self._reached is not None:
             self._reached("report", tick)
         self._show_truth()
-        drives: dict[str, Drive] = {}
+        drives: dict[str, Command] = {}
         now = time.monotonic()
         self._set_repeat(now)
         while due is not None or len(drives) < len(self._robots):
@@ -209,7 +209,7 @@ class WorldProcess:
         if arrival is not NOTHING:
             self._mute = now + self._silence
         elif time.monotonic() >= self._mute:
-            raise LinkLost
+            raise RobotsLinkLost
         robot = arrival.source.robot
         if arrival.topic == "alive" and robot in self._robots:
             if robot not in self._alive:
@@ -219,10 +219,10 @@ class WorldProcess:
             self._alive.discard(robot)
         return arrival
 
-    def _accepted(self, arrival: Arrival, kind: Any) -> Drive | Farewell | None:
+    def _accepted(self, arrival: Arrival, kind: Any) -> Command | FinalReport | None:
         """The message that arrived, if it is one of `kind` and from the robot whose key it came by."""
         try:
-            message: Drive | Farewell = decode(arrival.frame, kind)
+            message: Command | FinalReport = decode(arrival.frame, kind)
         except MalformedFrame as error:
             self._inbox.refuse(arrival, error)
             return None
@@ -231,10 +231,10 @@ class WorldProcess:
             return None
         return message
 
-    def _answer(self, arrival: Arrival) -> Drive | None:
-        """The Drive that arrived, if it is of this tick."""
-        drive = self._accepted(arrival, Drive)
-        if not isinstance(drive, Drive):
+    def _answer(self, arrival: Arrival) -> Command | None:
+        """The Command that arrived, if it is of this tick."""
+        drive = self._accepted(arrival, Command)
+        if not isinstance(drive, Command):
             return None
         if drive.tick <= self._course.tick:
             self._latest[drive.robot] = drive.tick
@@ -246,30 +246,30 @@ class WorldProcess:
             self._late += 1
         return None
 
-    def _who_is_missing(self, drives: Mapping[str, Drive]) -> str:
+    def _who_is_missing(self, drives: Mapping[str, Command]) -> str:
         missing = [robot for robot in self._robots if robot not in drives]
         names = ", ".join(robot if robot in self._alive else f"{robot} (not there)" for robot in missing)
         return f"no answer from {names} at tick {self._course.tick} for {self._patience:g} s"
 
     def _say_who_gave_none(self) -> None:
-        """Tell of which robots there is no Farewell, and why."""
+        """Tell of which robots there is no FinalReport, and why."""
         reasons: dict[str, list[str]] = {}
         for robot in self._robots:
             if robot not in self._course.parted:
                 reasons.setdefault(self._why_none(robot), []).append(robot)
         for reason, robots in reasons.items():
-            self._inbox.say(f"no Farewell of {', '.join(robots)}: {reason}")
+            self._inbox.say(f"no FinalReport of {', '.join(robots)}: {reason}")
 
     def _why_none(self, robot: str) -> str:
         latest = self._latest.get(robot)
         if robot not in self._alive:
-            return "not there" if latest is None else f"gone; the last Drive was of tick {latest}"
+            return "not there" if latest is None else f"gone; the last Command was of tick {latest}"
         if latest is None:
-            return "there, but no Drive has come"
+            return "there, but no Command has come"
         if latest < self._course.tick:
             slower = "; a lower --rate leaves more time for each tick" if self._period is not None else ""
             return f"behind, at tick {latest} of {self._course.tick}{slower}"
-        return "no answer to the End"
+        return "no answer to the MissionEnd"
 
     # --- beside the tick ---
 
@@ -277,7 +277,7 @@ class WorldProcess:
         if self._truth_wanted:
             truth = self._course.world.truth
             poses = dict(zip(self._robots, truth.poses, strict=True))
-            self._truth.put(encode(Truth(truth.tick, poses)))
+            self._truth.put(encode(GroundTruth(truth.tick, poses)))
 
     def _want_truth(self, wanted: bool) -> None:
         self._truth_wanted = wanted
@@ -288,7 +288,7 @@ class WorldProcess:
             return f"this world has no robot '{robot}'; it has {', '.join(self._robots)}{near}"
         return self._scenario.briefing(robot, self._period)
 
-    def _farewells(self, end: End, expected: Collection[str]) -> list[Farewell]:
+    def _farewells(self, end: MissionEnd, expected: Collection[str]) -> list[FinalReport]:
         """Tell everyone that it is over, until everyone has answered or left.
 
         Who answered in the last tick is waited for with patience, though it be started again; `expected`, and
@@ -316,8 +316,8 @@ class WorldProcess:
             if arrival.topic == "alive":
                 self._put_again(frames, [arrival.source.robot])
             if arrival.topic == "drive":
-                last = self._accepted(arrival, Drive | Farewell)
-                if isinstance(last, Farewell):
+                last = self._accepted(arrival, Command | FinalReport)
+                if isinstance(last, FinalReport):
                     said[last.robot] = last
                 elif last is not None and last.tick <= end.tick:
                     self._latest[last.robot] = last.tick

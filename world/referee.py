@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import msgspec
 
-from protocol.messages import Alarm, Localised, Outcome, Undecided, Verdict
+from protocol.messages import Inconsistent, Localised, Outcome, Undecided, Verdict
 from protocol.mission import HEADING_ACCURACY, Mission
 from protocol.motion import Pose, wrap
 from protocol.rounding import TOLERANCE
@@ -80,7 +80,7 @@ def judge(
     open_cases = [
         robot.id
         for robot in scenario.robots
-        if robot.id not in verdicts and not isinstance(verdicts.get(robot.peer), Undecided | Alarm)
+        if robot.id not in verdicts and not isinstance(verdicts.get(robot.peer), Undecided | Inconsistent)
     ]
     if open_cases and truth.tick < scenario.max_ticks:
         return None
@@ -97,7 +97,7 @@ def _no_better(scenario: Scenario, verdicts: Mapping[str, Verdict], open_cases: 
     """The judgement where no claim is wrong."""
     for robot in scenario.robots:
         verdict = verdicts.get(robot.id)
-        if isinstance(verdict, Alarm):
+        if isinstance(verdict, Inconsistent):
             return Judgement("alarm", f"{robot.id}: {robot.peer} tells {verdict.claim}")
     for robot in scenario.robots:
         match verdicts.get(robot.id):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import msgspec
 
-from protocol.attack import Lie
-from protocol.messages import Briefing
+from protocol.attack import Attack
+from protocol.messages import RobotConfig
 from protocol.mission import Anchor, Mission, Role, Variant
 from protocol.motion import Pose
 from protocol.orbits import Rendezvous
@@ -13,7 +13,7 @@ from protocol.units import RobotId, Tick
 from world.faults import Fault
 
 
-class Placed(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+class RobotSpec(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
     """One robot: whom it is to find, which anchor ranges it, and where it is released."""
 
     id: RobotId
@@ -22,7 +22,7 @@ class Placed(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields
     anchor: Anchor
     start: Pose
     rendezvous: Rendezvous
-    lie: Lie | None = None
+    lie: Attack | None = None
 
 
 class Scenario(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="scenario"):
@@ -33,7 +33,7 @@ class Scenario(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fiel
     max_ticks: Tick
     mission: Mission
     variant: Variant
-    robots: tuple[Placed, ...]
+    robots: tuple[RobotSpec, ...]
     faults: tuple[Fault, ...] = ()
     """of the radio"""
 
@@ -42,22 +42,22 @@ class Scenario(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fiel
         place = {robot.id: i for i, robot in enumerate(self.robots)}
         return tuple((place[one.id], place[one.peer]) for one in self.robots if one.role == "a")
 
-    def robot(self, robot: str) -> Placed:
+    def robot(self, robot: str) -> RobotSpec:
         """Raises KeyError if nobody is called that."""
         for placed in self.robots:
             if placed.id == robot:
                 return placed
         raise KeyError(robot)
 
-    def is_of(self, briefing: Briefing) -> bool:
+    def is_of(self, briefing: RobotConfig) -> bool:
         """Whether that is what one of its robots is told, be it in real time or in lockstep."""
         known = any(placed.id == briefing.robot for placed in self.robots)
         return known and self.briefing(briefing.robot, briefing.tick_s) == briefing
 
-    def briefing(self, robot: str, tick_s: float | None = None) -> Briefing:
+    def briefing(self, robot: str, tick_s: float | None = None) -> RobotConfig:
         """What `robot` is told; nothing of where it is. `tick_s` is set in real time only."""
         own = self.robot(robot)
-        return Briefing(
+        return RobotConfig(
             robot=own.id,
             peer=own.peer,
             role=own.role,

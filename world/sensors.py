@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from protocol.motion import Controls
-from protocol.noise import Drift
+from protocol.noise import VelocityNoise
 from world.random_streams import gaussian, uniform
 from world.scenario import Scenario
 from world.truth import Truth
@@ -79,7 +79,9 @@ def odometry(driven: Controls, scenario: Scenario, robot: str, tick: int) -> Con
     return _disturbed(driven, scenario.mission.noise.odometry, scenario.seed, "odometry", robot, tick)
 
 
-def _disturbed(controls: Controls, drift: Drift, seed: int, sensor: str, robot: str, tick: int) -> Controls:
+def _disturbed(
+    controls: Controls, drift: VelocityNoise, seed: int, sensor: str, robot: str, tick: int
+) -> Controls:
     v, omega = drift.variances(controls.v, controls.omega)
     return Controls(
         controls.v + math.sqrt(v) * gaussian(seed, f"{sensor}-v", robot, tick) if v else controls.v,

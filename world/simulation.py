@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping
 
 from protocol.journal import environment
 from protocol.journal.journal_file import CorruptJournal, Sink
-from protocol.journal.resume import Otherwise, Retrace
-from protocol.messages import Drive, End, Environment, Farewell, Missed, Sense
+from protocol.journal.resume import ReplayMismatch, Retrace
+from protocol.messages import Command, DeadlineMissed, Environment, FinalReport, MissionEnd, Observation
 from protocol.wire import encode
 from world.referee import Judgement
 from world.scenario import Scenario
@@ -18,18 +18,18 @@ from world.world_journal import history
 class Course:
     """Whatever carries the frames, the world goes through here, so every mode journals the same bytes.
 
-    The journal holds the scenario, every tick's Drives (in the scenario's order), End and the Farewells.
+    The journal holds the scenario, every tick's Commands (in the scenario's order), MissionEnd and the FinalReports.
     """
 
     def __init__(self, scenario: Scenario, journal: Sink | None = None) -> None:
         self.world = release(scenario)
-        self.over: End | None = None
+        self.over: MissionEnd | None = None
         """once the run is"""
         self.witnesses: tuple[str, ...] = ()
         """who answered in the tick that was the last, if they ended the run"""
-        self.parted: dict[str, Farewell] = {}
+        self.parted: dict[str, FinalReport] = {}
         """what they said to that, as far as it is on record"""
-        self.missed: dict[str, list[Sense]] = {}
+        self.missed: dict[str, list[Observation]] = {}
         """what robots have sensed since they last answered in time; a process that comes back may not know"""
         self._journal = journal
         if journal is not None:
@@ -40,7 +40,7 @@ class Course:
         """k"""
         return self.world.truth.tick
 
-    def senses(self) -> list[Sense]:
+    def senses(self) -> list[Observation]:
         """What every robot senses now, in the order of the scenario."""
         return senses(self.world)
 
@@ -48,22 +48,22 @@ class Course:
         """Go on journaling there."""
         self._journal = journal
 
-    def drive(self, drives: Mapping[str, Drive]) -> End | None:
+    def drive(self, drives: Mapping[str, Command]) -> MissionEnd | None:
         """One tick on; or the end. A robot that is not in `drives` stands still."""
         self.record(drives)
         return self.advance(drives)
 
-    def record(self, drives: Mapping[str, Drive]) -> None:
+    def record(self, drives: Mapping[str, Command]) -> None:
         """First half of `drive`: the tick is on record."""
         if self._journal is not None:
             self._journal.write(
                 *[
-                    encode(drives[robot.id] if robot.id in drives else Missed(self.tick, robot.id))
+                    encode(drives[robot.id] if robot.id in drives else DeadlineMissed(self.tick, robot.id))
                     for robot in self.world.scenario.robots
                 ]
             )
 
-    def advance(self, drives: Mapping[str, Drive]) -> End | None:
+    def advance(self, drives: Mapping[str, Command]) -> MissionEnd | None:
         """Second half of `drive`: everyone has moved."""
         if self.missed or len(drives) < len(self.world.scenario.robots):
             self._note_missed(drives)
@@ -74,22 +74,22 @@ class Course:
         self.world = onward
         return None
 
-    def _note_missed(self, drives: Mapping[str, Drive]) -> None:
+    def _note_missed(self, drives: Mapping[str, Command]) -> None:
         for sense in self.senses():
             if sense.robot in drives:
                 self.missed.pop(sense.robot, None)
             else:
                 self.missed.setdefault(sense.robot, []).append(sense)
 
-    def end(self, judgement: Judgement) -> End:
+    def end(self, judgement: Judgement) -> MissionEnd:
         """The run is over."""
-        self.over = End(self.tick, judgement.outcome, judgement.reason)
+        self.over = MissionEnd(self.tick, judgement.outcome, judgement.reason)
         if self._journal is not None:
             self._journal.write(encode(self.over))
         return self.over
 
-    def farewells(self, farewells: Iterable[Farewell]) -> None:
-        """What the robots answered to the End; those that answered."""
+    def farewells(self, farewells: Iterable[FinalReport]) -> None:
+        """What the robots answered to the MissionEnd; those that answered."""
         said = {farewell.robot: farewell for farewell in farewells}
         ids = [robot.id for robot in self.world.scenario.robots]
         latest = max([ids.index(robot) for robot in self.parted], default=-1)
@@ -127,7 +127,7 @@ def _retrace(course: Course, record: Retrace, named: Environment | None) -> None
         if lived.end is not None and course.over is None:
             course.end(Judgement(lived.end.outcome, lived.end.reason))
         course.farewells(lived.farewells.values())
-    except Otherwise:
+    except ReplayMismatch:
         raise CorruptJournal(
             f"{record.path}: on record the world went on otherwise at tick {course.tick}: "
             + (environment.otherwise(named, environment.of_world()) or "the journal is another version's")

@@ -1,4 +1,4 @@
-"""One tick of the world, by value: Sense for everyone, then everyone's Drive, and on."""
+"""One tick of the world, by value: Observation for everyone, then everyone's Command, and on."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 
 import msgspec
 
-from protocol.messages import Contact, Drive, Localised, Sense, Verdict
+from protocol.messages import Command, Contact, Localised, Observation, Verdict
 from protocol.motion import Controls, Pose
-from world.channel import Air, carried, of_plan
+from world.channel import LinkState, carried, of_plan
 from world.referee import Judgement, judge
 from world.scenario import Scenario
 from world.sensors import anchor_ranges, executed, mutual_ranges, odometry
@@ -28,7 +28,7 @@ class World(msgspec.Struct, frozen=True):
     """where each of those who claim to be localised was when it did: noise may move it from there"""
     pairs: tuple[tuple[int, int], ...]
     """which robots are each other's peer, by their place in the scenario"""
-    air: tuple[Air, ...] = ()
+    air: tuple[LinkState, ...] = ()
     """in this tick: of each pair the link from the first to the second, then back; none without faults"""
 
 
@@ -41,11 +41,11 @@ def release(scenario: Scenario) -> World:
         for i, robot in enumerate(scenario.robots)
     )
     truth = Truth(0, local, tuple(origins[i] for i in range(len(local))))
-    still = (Air(),) * (2 * len(pairs)) if scenario.faults else ()
+    still = (LinkState(),) * (2 * len(pairs)) if scenario.faults else ()
     return World(scenario, truth, None, {}, {}, pairs, _carried(still, scenario, truth, pairs))
 
 
-def senses(world: World) -> list[Sense]:
+def senses(world: World) -> list[Observation]:
     """What every robot's sensors say now, in the order of the scenario."""
     scenario, truth, driven = world.scenario, world.truth, world.executed
     tick, robots = truth.tick, scenario.robots
@@ -56,15 +56,19 @@ def senses(world: World) -> list[Sense]:
     mutuals = mutual_ranges(truth, scenario, world.pairs)
     for i, ((one, other), mutual) in enumerate(zip(world.pairs, mutuals, strict=True)):
         if mutual is not None:
-            to_other, to_one = world.air[2 * i : 2 * i + 2] if world.air else (Air((tick,)), Air((tick,)))
+            to_other, to_one = (
+                world.air[2 * i : 2 * i + 2] if world.air else (LinkState((tick,)), LinkState((tick,)))
+            )
             contacts[one] = (Contact(robots[other].id, mutual.range, to_one.heard, to_one.damaged),)
             contacts[other] = (Contact(robots[one].id, mutual.range, to_other.heard, to_other.damaged),)
     ranges = anchor_ranges(truth, scenario)
-    return [Sense(tick, robot.id, measured[i], ranges[i], contacts[i]) for i, robot in enumerate(robots)]
+    return [
+        Observation(tick, robot.id, measured[i], ranges[i], contacts[i]) for i, robot in enumerate(robots)
+    ]
 
 
-def advance(world: World, drives: Mapping[str, Drive]) -> World | Judgement:
-    """The world one tick later, or how the run ended. A robot without a Drive stands still."""
+def advance(world: World, drives: Mapping[str, Command]) -> World | Judgement:
+    """The world one tick later, or how the run ended. A robot without a Command stands still."""
     scenario, truth = world.scenario, world.truth
     verdicts, claimed = world.verdicts, world.claimed
     driven = []
@@ -87,8 +91,8 @@ def advance(world: World, drives: Mapping[str, Drive]) -> World | Judgement:
 
 
 def _carried(
-    air: Sequence[Air], scenario: Scenario, truth: Truth, pairs: Sequence[tuple[int, int]]
-) -> tuple[Air, ...]:
+    air: Sequence[LinkState], scenario: Scenario, truth: Truth, pairs: Sequence[tuple[int, int]]
+) -> tuple[LinkState, ...]:
     """The air of every link at the tick of `truth`, a tick after `air`."""
     if not air:
         return ()

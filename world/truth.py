@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import msgspec
 
-from protocol.messages import Drive
+from protocol.messages import Command
 from protocol.mission import Anchor, Mission
 from protocol.motion import REST, Controls, Pose, step
 
@@ -53,8 +53,8 @@ class Truth(msgspec.Struct, frozen=True):
         return Truth(self.tick + 1, tuple(local), self.origins, tuple(legs))
 
 
-def asked(drive: Drive | None, mission: Mission) -> Controls:
-    """The command that a Drive gives: it saturates at v_max and omega_max; without a Drive it is to rest."""
+def asked(drive: Command | None, mission: Mission) -> Controls:
+    """The command that a Command gives: it saturates at v_max and omega_max; without a Command it is to rest."""
     if drive is None:
         return REST
     return Controls(

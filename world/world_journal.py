@@ -9,7 +9,7 @@ from msgspec.structs import replace
 
 from protocol.journal.environment import named_in
 from protocol.journal.journal_file import CorruptJournal
-from protocol.messages import Drive, End, Environment, Farewell, Missed
+from protocol.messages import Command, DeadlineMissed, Environment, FinalReport, MissionEnd
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 from world.referee import Judgement
 from world.scenario import Scenario
@@ -17,14 +17,14 @@ from world.tick import World, advance, release
 
 
 class Tick(msgspec.Struct, frozen=True):
-    """One tick of which every robot's Drive is on record."""
+    """One tick of which every robot's Command is on record."""
 
     world: World
-    drives: dict[str, Drive]
-    """none of a robot whose Drive did not come in time"""
+    drives: dict[str, Command]
+    """none of a robot whose Command did not come in time"""
 
 
-class Disorder(msgspec.Struct, frozen=True):
+class UnexpectedFrame(msgspec.Struct, frozen=True):
     """The first frame that stands where none such can; what comes after it is not read."""
 
     tick: int | None
@@ -40,9 +40,9 @@ class History(msgspec.Struct, frozen=True):
     """at the tick after these; none once the referee has judged the last of them"""
     judgement: Judgement | None
     """the referee's, by the truth"""
-    end: End | None = None
-    farewells: dict[str, Farewell] = {}
-    disorder: Disorder | None = None
+    end: MissionEnd | None = None
+    farewells: dict[str, FinalReport] = {}
+    disorder: UnexpectedFrame | None = None
     environment: Environment | None = None
     """where it was written; none of an older recording"""
 
@@ -53,9 +53,9 @@ class History(msgspec.Struct, frozen=True):
 
 
 def history(frames: Iterable[bytes], source: object) -> History:
-    """What `frames` tell, the world moved by their Drives. Raises CorruptJournal, which names `source`."""
+    """What `frames` tell, the world moved by their Commands. Raises CorruptJournal, which names `source`."""
     scenario, named, rest = opened(list(frames), source)
-    reading = Reading(scenario)
+    reading = JournalReading(scenario)
     try:
         for frame in rest:
             if not reading.take(frame):
@@ -75,46 +75,46 @@ def opened(frames: Sequence[bytes], source: object) -> tuple[Scenario, Environme
     return _scenario_of(rest[0] if rest else b"", source), named, rest[1:]
 
 
-class Reading:
+class JournalReading:
     """A world's journal after its scenario, frame by frame: as much of it as there is yet."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
         self._ids = [robot.id for robot in scenario.robots]
-        self._said: dict[str, Drive | Missed] = {}
+        self._said: dict[str, Command | DeadlineMissed] = {}
         self.world: World = release(scenario)
         """at the tick after the last one on record; at that one, once it has been judged"""
         self.ticks: list[Tick] = []
         self.judgement: Judgement | None = None
-        self.end: End | None = None
-        self.farewells: dict[str, Farewell] = {}
-        self.disorder: Disorder | None = None
+        self.end: MissionEnd | None = None
+        self.farewells: dict[str, FinalReport] = {}
+        self.disorder: UnexpectedFrame | None = None
 
     def take(self, frame: bytes) -> bool:
         """Whether `frame` can come next; none is to be taken after one that cannot. Raises MalformedFrame."""
-        message = decode(frame, Drive | Missed | End | Farewell)
+        message = decode(frame, Command | DeadlineMissed | MissionEnd | FinalReport)
         going_on = self.end is None and self.judgement is None
         tick = self.world.truth.tick
         match message:
-            case Drive() | Missed() if (
+            case Command() | DeadlineMissed() if (
                 going_on and message.tick == tick and message.robot == self._ids[len(self._said)]
             ):
                 self._said[message.robot] = message
                 if len(self._said) == len(self._ids):
                     self._go_on()
-            case End() if message.tick == tick and self.end is None and not self._said:
+            case MissionEnd() if message.tick == tick and self.end is None and not self._said:
                 self.end = message
-            case Farewell() if self.end is not None and message.robot in _still_to_come(
+            case FinalReport() if self.end is not None and message.robot in _still_to_come(
                 self._ids, self.farewells
             ):
                 self.farewells[message.robot] = message
             case _:
-                self.disorder = Disorder(getattr(message, "tick", None), _named(message))
+                self.disorder = UnexpectedFrame(getattr(message, "tick", None), _named(message))
                 return False
         return True
 
     def _go_on(self) -> None:
-        drives = {robot: drive for robot, drive in self._said.items() if isinstance(drive, Drive)}
+        drives = {robot: drive for robot, drive in self._said.items() if isinstance(drive, Command)}
         self.ticks.append(Tick(self.world, drives))
         self._said = {}
         onward = advance(self.world, drives)
@@ -164,12 +164,12 @@ def _unpaired(scenario: Scenario) -> str | None:
 
 
 def _still_to_come(ids: list[str], farewells: Iterable[str]) -> list[str]:
-    """Who may say Farewell next: they stand in the order of the scenario, and some may be lacking."""
+    """Who may say FinalReport next: they stand in the order of the scenario, and some may be lacking."""
     last = [ids.index(robot) for robot in farewells][-1:]
     return ids[last[0] + 1 :] if last else ids
 
 
-def _named(message: Drive | Missed | End | Farewell) -> str:
-    whose = "" if isinstance(message, End) else f" of {message.robot}"
-    tick = "" if isinstance(message, Farewell) else f" of tick {message.tick}"
+def _named(message: Command | DeadlineMissed | MissionEnd | FinalReport) -> str:
+    whose = "" if isinstance(message, MissionEnd) else f" of {message.robot}"
+    tick = "" if isinstance(message, FinalReport) else f" of tick {message.tick}"
     return f"a {type(message).__name__}{whose}{tick} is out of order"

@@ -147,7 +147,7 @@ def polished(branch: Branch, ranged: Sequence[tuple[Pose, float]]) -> Branch:
     return Branch(wrap(branch.alpha + fitted - branch.start.heading), Pose(rho0, 0.0, fitted))
 
 
-class Sighting(msgspec.Struct, frozen=True):
+class PairObservation(msgspec.Struct, frozen=True):
     """One tick of an encounter: both robots in the frames of their own anchors, and the range between."""
 
     tick: int
@@ -161,7 +161,7 @@ RangedPair = tuple[Pose, Pose, float]
 
 
 def weigh_placements(
-    candidates: Iterable[Placement], sightings: Sequence[Sighting], sensing_range: float, floor: float
+    candidates: Iterable[Placement], sightings: Sequence[PairObservation], sensing_range: float, floor: float
 ) -> tuple[Placement, ...]:
     """Return those of `candidates` that explain every sighting, be it a range or silence.
 
@@ -202,7 +202,9 @@ def _explains_silence(placement: Placement, silent: Iterable[tuple[Pose, Pose]],
     return True
 
 
-def turn_error(placement: Placement, sightings: Sequence[Sighting], floor: float, anchors: float) -> float:
+def turn_error(
+    placement: Placement, sightings: Sequence[PairObservation], floor: float, anchors: float
+) -> float:
     """Return how far (rad), at the most, either robot may be turned about its anchor off `placement`.
 
     To first order, of least squares over all ranges in `sightings`: each is off by `floor` m on its own,
@@ -225,7 +227,7 @@ def turn_error(placement: Placement, sightings: Sequence[Sighting], floor: float
     return max(turned_a, turned_b) / determinant
 
 
-def information(placement: Placement, sightings: Sequence[Sighting]) -> tuple[float, float, float]:
+def information(placement: Placement, sightings: Sequence[PairObservation]) -> tuple[float, float, float]:
     """What the ranges in `sightings` tell of phi and of psi, the bearing of M1 in <b(M2)>.
 
     The Fisher information for ranges of 1 m standard deviation, in 1 / rad^2: of phi, mixed, of psi.
@@ -243,7 +245,7 @@ def _information(slopes: Iterable[tuple[float, float, float, float]]) -> tuple[f
 
 
 def _slopes(
-    placement: Placement, sightings: Sequence[Sighting]
+    placement: Placement, sightings: Sequence[PairObservation]
 ) -> Iterator[tuple[float, float, float, float]]:
     """Yield, for each range, its derivatives by phi and by psi (m / rad), and the direction from b to a."""
     tx, ty = placement.x, placement.y

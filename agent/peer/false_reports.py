@@ -8,14 +8,14 @@ from itertools import pairwise
 from msgspec.structs import replace
 
 from agent.peer.motion_log import Logbook
-from protocol.attack import Lie
+from protocol.attack import Attack
 from protocol.messages import Ranged
-from protocol.motion import Pose, Run
+from protocol.motion import Pose, Segment
 
 STARTS = ("radius", "heading", "reframe")
 
 
-def told(log: Logbook, lie: Lie, parted: int | None, met: int | None, period: float) -> Logbook:
+def told(log: Logbook, lie: Attack, parted: int | None, met: int | None, period: float) -> Logbook:
     """`log`, as `lie` has it; phase 1 was over at the tick `parted`, and phase 3 began at `met`."""
     if lie.kind == "radius":
         ranges = tuple([Ranged(one.tick, max(0.0, one.range + lie.size)) for one in log.ranges])
@@ -27,13 +27,13 @@ def told(log: Logbook, lie: Lie, parted: int | None, met: int | None, period: fl
     tick = 0
     for run in log.runs:
         for begin, end in _cut(tick, tick + run.ticks, first, last):
-            part = _bent(Run(end - begin, run.v, run.omega), begin, lie, first, last, period)
+            part = _bent(Segment(end - begin, run.v, run.omega), begin, lie, first, last, period)
             book = book.drove(part.v, part.omega, part.ticks)
         tick += run.ticks
     return book
 
 
-def _span(lie: Lie, through: int, parted: int | None, met: int | None) -> tuple[int, int]:
+def _span(lie: Attack, through: int, parted: int | None, met: int | None) -> tuple[int, int]:
     """The ticks of the part: the first, and the one after the last; empty while it has not come."""
     end = through + 1
     parted = parted if parted is not None else end
@@ -55,22 +55,22 @@ def _cut(begin: int, end: int, first: int, last: int) -> list[tuple[int, int]]:
     return list(pairwise(marks))
 
 
-def _bent(run: Run, tick: int, lie: Lie, first: int, last: int, period: float) -> Run:
+def _bent(run: Segment, tick: int, lie: Attack, first: int, last: int, period: float) -> Segment:
     """What is told of a run that begins at `tick`."""
     match lie.kind:
         case "scale" if first <= tick < last:
-            return Run(run.ticks, run.v * lie.size, run.omega)
+            return Segment(run.ticks, run.v * lie.size, run.omega)
         case "shift" if tick == first < last:
-            return Run(run.ticks, run.v + lie.size / period, run.omega)
+            return Segment(run.ticks, run.v + lie.size / period, run.omega)
         case "rotate" if tick == first < last:
-            return Run(run.ticks, run.v, run.omega + lie.size / period)
+            return Segment(run.ticks, run.v, run.omega + lie.size / period)
         case "rotate" if tick == last > first:
-            return Run(run.ticks, run.v, run.omega - lie.size / period)
+            return Segment(run.ticks, run.v, run.omega - lie.size / period)
         case _:
             return run
 
 
-def start(true: Pose, lie: Lie) -> Pose:
+def start(true: Pose, lie: Attack) -> Pose:
     """Where tick 0 of its odometry lies in the frame of its anchor, as `lie` has it."""
     match lie.kind:
         case "radius":

@@ -8,14 +8,14 @@ from itertools import pairwise
 import msgspec
 
 from protocol.messages import MAX_REPORT_RANGES, MAX_REPORT_RUNS, Ranged
-from protocol.motion import Pose, Run, arc, follow
+from protocol.motion import Pose, Segment, arc, follow
 
 
 class Logbook(msgspec.Struct, frozen=True):
     """What was executed over [0, through], never what was asked, and the ranges taken on the way."""
 
     through: int = 0
-    runs: tuple[Run, ...] = ()
+    runs: tuple[Segment, ...] = ()
     ranges: tuple[Ranged, ...] = ()
 
     def moved(self, unrest: tuple[float, float] = (0.0, 0.0)) -> int:
@@ -30,7 +30,7 @@ class Logbook(msgspec.Struct, frozen=True):
             at_rest += run.ticks
         return self.through - at_rest
 
-    def until(self, tick: int) -> tuple[Run, ...]:
+    def until(self, tick: int) -> tuple[Segment, ...]:
         """Return what was driven over [0, tick]."""
         return self.runs if tick >= self.through else _between(self.runs, 0, tick)
 
@@ -41,8 +41,8 @@ class Logbook(msgspec.Struct, frozen=True):
             last = runs[-1]
             if last.v == v and last.omega == omega:
                 runs, ticks_in_all = runs[:-1], last.ticks + ticks
-                return Logbook(self.through + ticks, (*runs, Run(ticks_in_all, v, omega)), self.ranges)
-        return Logbook(self.through + ticks, (*runs, Run(ticks, v, omega)), self.ranges)
+                return Logbook(self.through + ticks, (*runs, Segment(ticks_in_all, v, omega)), self.ranges)
+        return Logbook(self.through + ticks, (*runs, Segment(ticks, v, omega)), self.ranges)
 
     def ranged(self, distance: float) -> Logbook:
         """The log with an anchor range (m) at its last tick."""
@@ -68,7 +68,7 @@ class Logbook(msgspec.Struct, frozen=True):
         news = told.ranges[known - ranges_since :] if ranges_since <= known else ()
         return Logbook(book.through, book.runs, self.ranges + news)
 
-    def between(self, first: int, last: int) -> tuple[Run, ...]:
+    def between(self, first: int, last: int) -> tuple[Segment, ...]:
         """What was driven over [first, last], as few runs."""
         runs = _between(self.runs, first, last)
         if all(one.v != other.v or one.omega != other.omega for one, other in pairwise(runs)):
@@ -88,7 +88,7 @@ class Logbook(msgspec.Struct, frozen=True):
         return track
 
 
-def _dated(runs: Iterable[Run]) -> Iterator[tuple[int, Run]]:
+def _dated(runs: Iterable[Segment]) -> Iterator[tuple[int, Segment]]:
     """Each run with the tick it begins at, the first at 0."""
     begin = 0
     for run in runs:
@@ -96,9 +96,9 @@ def _dated(runs: Iterable[Run]) -> Iterator[tuple[int, Run]]:
         begin += run.ticks
 
 
-def _between(runs: tuple[Run, ...], first: int, last: int) -> tuple[Run, ...]:
+def _between(runs: tuple[Segment, ...], first: int, last: int) -> tuple[Segment, ...]:
     """What was driven over [first, last]."""
-    found: list[Run] = []
+    found: list[Segment] = []
     end = 0
     for run in runs:
         begin, end = end, end + run.ticks
@@ -106,5 +106,5 @@ def _between(runs: tuple[Run, ...], first: int, last: int) -> tuple[Run, ...]:
             break
         if end > first:
             whole = begin >= first and end <= last
-            found.append(run if whole else Run(min(end, last) - max(begin, first), run.v, run.omega))
+            found.append(run if whole else Segment(min(end, last) - max(begin, first), run.v, run.omega))
     return tuple(found)

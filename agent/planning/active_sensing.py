@@ -122,7 +122,7 @@ def choice(mission: Mission) -> Choice:
     )
 
 
-class Held(NamedTuple):
+class PlanningHypothesis(NamedTuple):
     """A hypothesis, as far as planning needs it."""
 
     odds: float
@@ -132,7 +132,7 @@ class Held(NamedTuple):
     """of the anchor's place, (2, 2); or of both poses, (6, 6)"""
 
 
-def alone(held: Sequence[Held], mission: Mission, within: float | None = None) -> Controls:
+def alone(held: Sequence[PlanningHypothesis], mission: Mission, within: float | None = None) -> Controls:
     """The manoeuvre whose ranges to the anchor, at the origin, are expected to tell most.
 
     The covariance is that of the anchor's place. `within` is how far (m) from it the robot may go.
@@ -165,7 +165,7 @@ def alone(held: Sequence[Held], mission: Mission, within: float | None = None) -
 
 
 def together(
-    held: Sequence[Held], m2: tuple[float, float], rho: float, mission: Mission
+    held: Sequence[PlanningHypothesis], m2: tuple[float, float], rho: float, mission: Mission
 ) -> tuple[Controls, Controls]:
     """The manoeuvres of a and b after which both know best where they are.
 
@@ -186,7 +186,7 @@ def together(
 
 def _best_of(
     ways: Choice,
-    held: Sequence[Held],
+    held: Sequence[PlanningHypothesis],
     m2: tuple[float, float],
     latest: float,
     mission: Mission,
@@ -248,7 +248,7 @@ def _best_of(
 
 
 def _keep_apart(
-    ways: Choice, held: Sequence[Held], rho: float, mission: Mission, of_a: Places, of_b: Places
+    ways: Choice, held: Sequence[PlanningHypothesis], rho: float, mission: Mission, of_a: Places, of_b: Places
 ) -> NDArray[np.bool]:
     """Which of the ways keep the safety distance: by all of `held`, or too short for any to matter."""
     lengths = np.abs(ways.v) * stride(mission) * mission.period
@@ -284,7 +284,9 @@ def _information(covariance: Array, mission: Mission) -> Array:
     return information
 
 
-def _confusion(held: Sequence[Held], distances: Sequence[Array], sigma: float, reach: float) -> Array:
+def _confusion(
+    held: Sequence[PlanningHypothesis], distances: Sequence[Array], sigma: float, reach: float
+) -> Array:
     """What is left of the odds of taking the first hypothesis for another."""
     left = np.zeros(len(distances[0]))
     first = np.minimum(distances[0], RIM * reach)

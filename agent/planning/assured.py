@@ -12,12 +12,12 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from agent.estimation.gaussian.consistency import DOUBTFUL, LOOKS, UNBELIEVABLE, WARY
-from agent.estimation.gaussian.hypotheses import Weighed, follow, search
+from agent.estimation.gaussian.hypotheses import ScoredHypothesis, follow, search
 from agent.planning import active_sensing, inference, phase2_orbit, range_seeking
 from agent.planning.active_sensing import Listening, Retreating, Surveying
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent
 from agent.planning.range_seeking import Backing, Circling, Homing, Straight, Turning
-from agent.planning.state import Asleep, Done, Mind
+from agent.planning.state import Asleep, Done, RobotState
 from protocol.messages import BranchKind, Localised
 from protocol.motion import ORIGIN, REST, Controls
 
@@ -49,7 +49,7 @@ ENOUGH = 60
 """mutual ranges, after which it is ranges to the anchor that are lacking"""
 
 
-def sensed(mind: Mind, anchor_range: float | None) -> Mind:
+def sensed(mind: RobotState, anchor_range: float | None) -> RobotState:
     """`mind` in the state that its own senses lead to."""
     match mind.state:
         case Straight("anchor") | Backing("anchor") | Turning("anchor") | Circling("anchor"):
@@ -73,12 +73,12 @@ def sensed(mind: Mind, anchor_range: float | None) -> Mind:
             return mind
 
 
-def decides(mind: Mind) -> bool:
+def decides(mind: RobotState) -> bool:
     """Whether this is a tick for a new manoeuvre; the same for both robots, so that they choose together."""
     return mind.tick % active_sensing.stride(mind.briefing.mission) == 0
 
 
-def _surveyed(mind: Mind) -> Mind:
+def _surveyed(mind: RobotState) -> RobotState:
     """Phase 1: what the ranges to the anchor leave possible, and whether that is enough.
 
     Where no hypothesis explains in which places the anchor was silent, its ranges mislead: then more of them
@@ -104,19 +104,19 @@ def _surveyed(mind: Mind) -> Mind:
     return replace(mind, state=Surveying("anchor", drive))
 
 
-def _by_drop_outs(mind: Mind) -> float:
+def _by_drop_outs(mind: RobotState) -> float:
     """In log-likelihood: what as many drop-outs cost as there may be by now."""
     p = mind.briefing.mission.noise.drop_outs
     expected = p * (mind.tick + 1)
     return (expected + UNLUCKY * math.sqrt(expected)) * math.log(p) if p else 0.0
 
 
-def _silent(mind: Mind) -> int:
+def _silent(mind: RobotState) -> int:
     """Ticks since the anchor was ranged."""
     return mind.tick - mind.log.ranges[-1].tick
 
 
-def _homeward(mind: Mind) -> Mind:
+def _homeward(mind: RobotState) -> RobotState:
     """Back to where the anchor was ranged last; all that is held of where it is, is doubted."""
     last = mind.log.ranges[-1].tick
     place = mind.log.pose(ORIGIN, last, mind.briefing.mission.period)
@@ -124,16 +124,16 @@ def _homeward(mind: Mind) -> Mind:
     return replace(mind, state=Homing(place), findings=findings)
 
 
-def _parted(mind: Mind) -> Mind:
+def _parted(mind: RobotState) -> RobotState:
     """To the rendezvous, for the first time or again."""
     mu = phase2_orbit.orientation(mind.local_pose)
     return _under_way(replace(mind, state=Aligning(mind.odometry.heading - mu)), False)
 
 
-def _under_way(mind: Mind, ranged: bool) -> Mind:
+def _under_way(mind: RobotState, ranged: bool) -> RobotState:
     """Phase 2, with what another range to the anchor adds; b goes on to survey where it waits."""
     mission = mind.briefing.mission
-    weighed: Sequence[Weighed] = ()
+    weighed: Sequence[ScoredHypothesis] = ()
     if ranged and decides(mind) and (weighed := inference.own_anchor(mind)):
         mind = inference.with_own(mind, weighed)
         if isinstance(mind.state, Radial) and abs(phase2_orbit.orientation(mind.local_pose)) > OFF_RADIUS:
@@ -161,7 +161,7 @@ def _under_way(mind: Mind, ranged: bool) -> Mind:
 # --- with the peer ------------------------------------------------------------------------------------
 
 
-def _beside(mind: Mind) -> Mind:
+def _beside(mind: RobotState) -> RobotState:
     """Phase 3, by whether the peer, and for b its anchor, are in range."""
     stride = active_sensing.stride(mind.briefing.mission)
     match mind.state:
@@ -177,7 +177,7 @@ def _beside(mind: Mind) -> Mind:
             return mind
 
 
-def heard(mind: Mind) -> Mind:
+def heard(mind: RobotState) -> RobotState:
     """What the robot is set to do once it has heard its peer, in range."""
     match mind.state:
         case Done() | Asleep():
@@ -196,7 +196,7 @@ def heard(mind: Mind) -> Mind:
             return _considered(mind)
 
 
-def _considered(mind: Mind) -> Mind:
+def _considered(mind: RobotState) -> RobotState:
     """Both logs in hand: weigh the hypotheses; then claim, or plan what both do next."""
     mission, role = mind.briefing.mission, mind.briefing.role
     if mind.findings.met is None:
@@ -233,13 +233,13 @@ def _considered(mind: Mind) -> Mind:
     return replace(judged, state=Surveying("peer", a if role == "a" else b))
 
 
-def _against(mind: Mind, bound: float) -> bool:
+def _against(mind: RobotState, bound: float) -> bool:
     """Whether what most speaks against the likeliest hypothesis is less probable than `bound`."""
     against = mind.findings.against
     return against is not None and against.p_value < bound
 
 
-def _doubted(mind: Mind) -> Mind:
+def _doubted(mind: RobotState) -> RobotState:
     """`mind`, after a search of the whole plane; alarmed, if its peer is beyond belief over and over."""
     findings = mind.findings
     against = findings.against
@@ -251,7 +251,7 @@ def _doubted(mind: Mind) -> Mind:
     return mind.alarmed(against.alarm) if doubts >= LOOKS else mind
 
 
-def _blindly(mind: Mind) -> Mind:
+def _blindly(mind: RobotState) -> RobotState:
     """While nothing is known of how the two lie: b stands, a goes straight on (Section III.C.a)."""
     mission = mind.briefing.mission
     if mind.briefing.role == "b" or not mind.mutual:
@@ -260,6 +260,6 @@ def _blindly(mind: Mind) -> Mind:
     return replace(mind, state=Surveying("peer", Controls(step / mission.period, 0.0)))
 
 
-def claimed(mind: Mind) -> Mind:
+def claimed(mind: RobotState) -> RobotState:
     """The likeliest hypothesis is the one."""
     return replace(mind, state=Done(3, Localised(mind.findings.poses[0], mind.findings.covariance)))

@@ -6,27 +6,27 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from agent.estimation.exact import Sighting, weigh_placements
+from agent.estimation.exact import PairObservation, weigh_placements
 from agent.planning import paper, phase3_last_manoeuvre, precision
 from agent.planning.phase2_orbit import Orbiting, off_anchor
 from agent.planning.phase3_last_manoeuvre import LastManoeuvre, Standing, Waiting
 from agent.planning.range_seeking import Straight, stretch
-from agent.planning.state import WORDS, Done, Mind
-from protocol.messages import Alarm, Localised
+from agent.planning.state import WORDS, Done, RobotState
+from protocol.messages import Inconsistent, Localised
 from protocol.mission import SHORTEST_STEP
 
 PEER_RESTS = (WORDS[Standing], WORDS[Waiting])
 """what it says then: two that move at once may do so in mirror image, and learn nothing"""
 
 
-def meets(mind: Mind) -> bool:
+def meets(mind: RobotState) -> bool:
     """Whether phase 3 begins, once in contact: by the letter when both orbit, else as soon as it can."""
     if mind.briefing.variant == "paper":
         return isinstance(mind.state, Orbiting) and (mind.radio.phase == 3 or mind.radio.state == mind.doing)
     return mind.radio.phase == 3 or (mind.radio.start is not None and mind.off_anchor)
 
 
-def lingers(mind: Mind) -> bool:
+def lingers(mind: RobotState) -> bool:
     """Whether the robot stands still so as not to lose a peer with which phase 3 cannot begin yet.
 
     The peer is in phase 1, or has not been heard; or it is b, and too near its anchor.
@@ -38,7 +38,7 @@ def lingers(mind: Mind) -> bool:
     )
 
 
-def met(mind: Mind) -> Mind:
+def met(mind: RobotState) -> RobotState:
     """Phase 3 begins: b stops, a goes straight on (Section III.C.a)."""
     findings = replace(mind.findings, met=mind.tick)
     if mind.briefing.role == "b":
@@ -50,13 +50,13 @@ def met(mind: Mind) -> Mind:
     return replace(mind, state=straight, findings=findings)
 
 
-def _may_go(mind: Mind) -> bool:
+def _may_go(mind: RobotState) -> bool:
     """Whether a knows that b stands, and is far enough from it to go straight on."""
     now = bool(mind.mutual) and mind.mutual[-1].tick == mind.tick == mind.radio.peer.through
     return now and stretch("peer", mind.mutual[-1].range, mind.briefing.mission) >= SHORTEST_STEP
 
 
-def considered(mind: Mind) -> Mind:
+def considered(mind: RobotState) -> RobotState:
     """Both logs in hand: weigh the placements; then claim, plan the last manoeuvre, or go on.
 
     Not before the peer has told of everything up to where this robot stands; and not twice of the same.
@@ -70,7 +70,7 @@ def considered(mind: Mind) -> Mind:
     return _settled(replace(mind, state=replace(mind.state, through=last)))
 
 
-def _settled(mind: Mind) -> Mind:
+def _settled(mind: RobotState) -> RobotState:
     """The same, where sensors are exact.
 
     The letter looks at the encounter alone; `assured` also at what was ranged, and what was silent, before.
@@ -91,7 +91,7 @@ def _settled(mind: Mind) -> Mind:
     left = mind.findings.placements
     checked = phase3_last_manoeuvre.redundant(ranged, base)
     if not left:
-        return mind.alarmed(Alarm("a path that no placement brings together with the mutual ranges"))
+        return mind.alarmed(Inconsistent("a path that no placement brings together with the mutual ranges"))
     if checked and len(left) == 1 and precision.pinned_down(mind, left[0], ranged, off):
         return replace(mind, state=Done(3, Localised(mind.world_pose(left[0]))))
     mover = mind.briefing.role
@@ -120,8 +120,11 @@ def _settled(mind: Mind) -> Mind:
 
 
 def _weighed(
-    mind: Mind, sightings: Sequence[Sighting], base: tuple[Sighting, Sighting], floor: float
-) -> Mind:
+    mind: RobotState,
+    sightings: Sequence[PairObservation],
+    base: tuple[PairObservation, PairObservation],
+    floor: float,
+) -> RobotState:
     """The placements of eq. (7) that every range and every silent tick in `sightings` leave."""
     reach, findings = mind.briefing.mission.sensing_range, mind.findings
     if findings.candidates is None:

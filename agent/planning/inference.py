@@ -9,14 +9,14 @@ import numpy as np
 from msgspec.structs import replace
 
 from agent.estimation.exact import Branch
-from agent.estimation.gaussian.consistency import DOUBTFUL, FINISHED, Doubt, doubt
-from agent.estimation.gaussian.hypotheses import Weighed, missing, of_anchor
+from agent.estimation.gaussian.consistency import DOUBTFUL, FINISHED, Inconsistency, doubt
+from agent.estimation.gaussian.hypotheses import ScoredHypothesis, missing, of_anchor
 from agent.estimation.gaussian.least_squares import deviation, poses
 from agent.estimation.gaussian.odometry_noise import Array, Track, track
-from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Pair, Ranges
+from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, Ranges
 from agent.peer.motion_log import Logbook
-from agent.planning.active_sensing import Held
-from agent.planning.state import Mind
+from agent.planning.active_sensing import PlanningHypothesis
+from agent.planning.state import RobotState
 from protocol.mission import HEADING_ACCURACY, Mission
 from protocol.motion import Covariance, Pose, compose, inverse, wrap
 
@@ -30,7 +30,7 @@ def path_of(log: Logbook, through: int, period: float) -> Track:
     return track(v, omega, period)
 
 
-def own_anchor(mind: Mind) -> tuple[Weighed, ...]:
+def own_anchor(mind: RobotState) -> tuple[ScoredHypothesis, ...]:
     """Where the robot's anchor may lie in the frame of its odometry."""
     mission = mind.briefing.mission
     path = path_of(mind.log, mind.tick, mission.period)
@@ -46,14 +46,14 @@ def _told(log: Logbook, through: int) -> list[tuple[int, float]]:
     return [(ranged.tick, ranged.range) for ranged in log.ranges if ranged.tick <= through]
 
 
-def with_own(mind: Mind, weighed: Sequence[Weighed]) -> Mind:
+def with_own(mind: RobotState, weighed: Sequence[ScoredHypothesis]) -> RobotState:
     """`mind`, with these hypotheses of its anchor; where it stands now follows from the likeliest."""
     own = tuple([one.hypothesis for one in weighed])
     branches = tuple([branch_of(mind, one) for one in weighed])
     return replace(mind, findings=replace(mind.findings, own=own, branches=branches, branch=branches[0]))
 
 
-def branch_of(mind: Mind, weighed: Weighed) -> Branch:
+def branch_of(mind: RobotState, weighed: ScoredHypothesis) -> Branch:
     """The likeliest trajectory; its start is such that the odometry leads to where the robot is now."""
     mx, my = weighed.hypothesis.guess[:2]
     path = weighed.fit.paths[0]
@@ -65,18 +65,18 @@ def branch_of(mind: Mind, weighed: Weighed) -> Branch:
     return Branch(wrap(-frame), start)
 
 
-def held_alone(weighed: Sequence[Weighed]) -> list[Held]:
+def held_alone(weighed: Sequence[ScoredHypothesis]) -> list[PlanningHypothesis]:
     """For planning: the robot, relative to its anchor."""
     held = []
     for one in weighed:
         mx, my = one.hypothesis.guess[:2]
         path = one.fit.paths[0]
         now = np.array((path.x[-1] - mx, path.y[-1] - my, path.heading[-1]))
-        held.append(Held(one.hypothesis.odds, now, one.fit.covariance))
+        held.append(PlanningHypothesis(one.hypothesis.odds, now, one.fit.covariance))
     return held
 
 
-def settled(weighed: Sequence[Weighed], mission: Mission) -> bool:
+def settled(weighed: Sequence[ScoredHypothesis], mission: Mission) -> bool:
     """Whether what is left to know of the anchor is worth less than moving on."""
     best = weighed[0]
     enough = ANCHOR_RANGES_WITH_OUTLIERS if mission.noise.outliers else ANCHOR_RANGES
@@ -94,17 +94,17 @@ ANCHOR_RANGES, ANCHOR_RANGES_WITH_OUTLIERS = 5, 7
 """to its anchor at the least, before a robot goes: two unknowns, and three that check them"""
 
 
-def known_through(mind: Mind) -> int:
+def known_through(mind: RobotState) -> int:
     """The last tick that both logs cover."""
     return min(mind.tick, mind.radio.peer.through, mind.radio.ranges_through)
 
 
-def answered(mind: Mind) -> bool:
+def answered(mind: RobotState) -> bool:
     """Whether the peer has told of everything up to where this robot has come to rest, or is now."""
     return known_through(mind) >= mind.log.moved(mind.briefing.mission.noise.unrest)
 
 
-def pair_of(mind: Mind) -> Pair:
+def pair_of(mind: RobotState) -> PairRanges:
     """All that both have measured: its own up to now, the peer's up to the last tick that both logs cover."""
     peer, briefing = mind.radio.peer, mind.briefing
     mission, last = briefing.mission, known_through(mind)
@@ -118,7 +118,7 @@ def pair_of(mind: Mind) -> Pair:
     ranges = ranges.within(mission.sensing_range)
     own, other = briefing.anchor, briefing.peer_anchor
     sign = 1.0 if briefing.role == "a" else -1.0
-    return Pair(
+    return PairRanges(
         (path_of(logs[0], ends[0], mission.period), path_of(logs[1], ends[1], mission.period)),
         ranges,
         (silent[0], silent[1], silent[2]),
@@ -128,13 +128,17 @@ def pair_of(mind: Mind) -> Pair:
     )
 
 
-def held_together(weighed: Sequence[Weighed], pair: Pair) -> list[Held]:
+def held_together(weighed: Sequence[ScoredHypothesis], pair: PairRanges) -> list[PlanningHypothesis]:
     """For planning: both poses relative to M1, and their covariance."""
-    return [Held(one.hypothesis.odds, *poses(one.fit, pair.apart)) for one in weighed]
+    return [PlanningHypothesis(one.hypothesis.odds, *poses(one.fit, pair.apart)) for one in weighed]
 
 
 def missing_for(
-    weighed: Sequence[Weighed], held: Sequence[Held], against: Doubt | None, pair: Pair, mission: Mission
+    weighed: Sequence[ScoredHypothesis],
+    held: Sequence[PlanningHypothesis],
+    against: Inconsistency | None,
+    pair: PairRanges,
+    mission: Mission,
 ) -> str | None:
     """What is lacking before a claim, there being ranges enough; None if it is nothing."""
     if against is None:
@@ -157,7 +161,7 @@ def missing_for(
     return None
 
 
-def finished(mind: Mind, weighed: Sequence[Weighed]) -> Mind:
+def finished(mind: RobotState, weighed: Sequence[ScoredHypothesis]) -> RobotState:
     """`mind`, which claims nothing by a fit that has not found its minimum."""
     if mind.findings.missing is not None or weighed[0].fit.last_step <= FINISHED:
         return mind
@@ -165,7 +169,9 @@ def finished(mind: Mind, weighed: Sequence[Weighed]) -> Mind:
     return replace(mind, findings=replace(mind.findings, missing=missing))
 
 
-def with_pair(mind: Mind, weighed: Sequence[Weighed], pair: Pair, mutual: int) -> Mind:
+def with_pair(
+    mind: RobotState, weighed: Sequence[ScoredHypothesis], pair: PairRanges, mutual: int
+) -> RobotState:
     """`mind`, with these hypotheses of how both lie in <W>; a claim needs `mutual` mutual ranges."""
     briefing = mind.briefing
     robot, m1 = (0, briefing.anchor) if briefing.role == "a" else (1, briefing.peer_anchor)
@@ -187,7 +193,7 @@ def with_pair(mind: Mind, weighed: Sequence[Weighed], pair: Pair, mutual: int) -
     return replace(mind, findings=findings)
 
 
-def claim(held: Held, robot: int, pair: Pair) -> tuple[Pose, Covariance]:
+def claim(held: PlanningHypothesis, robot: int, pair: PairRanges) -> tuple[Pose, Covariance]:
     """The pose of one robot, relative to M1, as the mean and the covariance of what is left of the best
     hypothesis. Ranges confine a robot to an arc, so both are taken to second order (see `bent`)."""
     mean, covariance = bent(held, pair.apart)
@@ -199,7 +205,7 @@ def claim(held: Held, robot: int, pair: Pair) -> tuple[Pose, Covariance]:
     )
 
 
-def bent(held: Held, m2: tuple[float, float]) -> tuple[Array, Array]:
+def bent(held: PlanningHypothesis, m2: tuple[float, float]) -> tuple[Array, Array]:
     """Mean and covariance of both poses, where it is range and bearing that are Gaussian: b's from M2, a's
     from b.
 

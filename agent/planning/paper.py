@@ -14,10 +14,10 @@ from agent.estimation.closed_forms import Placement
 from agent.estimation.exact import Branch
 from agent.estimation.gaussian.hypotheses import search
 from agent.planning import inference, phase3_last_manoeuvre
-from agent.planning.active_sensing import Held
+from agent.planning.active_sensing import PlanningHypothesis
 from agent.planning.assured import CHECKED_WITH_OUTLIERS, claimed
 from agent.planning.phase3_last_manoeuvre import LastManoeuvre, Standing, Waiting
-from agent.planning.state import WORDS, Mind
+from agent.planning.state import WORDS, RobotState
 from protocol.motion import ORIGIN, wrap
 
 CHECKED = 3
@@ -27,7 +27,7 @@ LIKELY = 0.05
 """odds from which on a branch is worth a manoeuvre that tells it from others"""
 
 
-def with_branches(mind: Mind) -> tuple[Mind, tuple[Branch, ...]]:
+def with_branches(mind: RobotState) -> tuple[RobotState, tuple[Branch, ...]]:
     """The branches that are likely, the likeliest first; and `mind`, which takes the first."""
     weighed = inference.own_anchor(mind)
     if not weighed:
@@ -37,7 +37,7 @@ def with_branches(mind: Mind) -> tuple[Mind, tuple[Branch, ...]]:
     return mind, tuple([branch for branch, one in likely if one.odds >= LIKELY])
 
 
-def considered(mind: Mind) -> Mind:
+def considered(mind: RobotState) -> RobotState:
     """Phase 3, after a's second range and again after b's last manoeuvre."""
     pair = inference.pair_of(mind)
     mutual = pair.ranges.counts[2]
@@ -66,14 +66,14 @@ def considered(mind: Mind) -> Mind:
     )
 
 
-def waits(mind: Mind) -> bool:
+def waits(mind: RobotState) -> bool:
     """Whether b has yet to hear that a has its second range."""
     return (
         isinstance(mind.state, Standing) and mind.findings.plan is None and mind.radio.state != WORDS[Waiting]
     )
 
 
-def _seen_from_b(held: Held) -> Placement:
+def _seen_from_b(held: PlanningHypothesis) -> Placement:
     """Where a is, and how it is turned, in b's own frame."""
     ax, ay, a_heading, bx, by, b_heading = held.poses.tolist()
     c, s = math.cos(b_heading), math.sin(b_heading)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation.closed_forms import Placement, placements
-from agent.estimation.exact import Sighting, information
+from agent.estimation.exact import PairObservation, information
 from agent.planning.range_seeking import travelled
 from agent.planning.separation import nearest
 from protocol.mission import RANGE_MARGIN, Mission, Role, Variant
@@ -113,13 +113,15 @@ class Compared(NamedTuple):
     """the same; -inf for manoeuvres that are not to be taken"""
 
 
-def base(sightings: Sequence[Sighting], floor: float) -> tuple[Sighting, Sighting] | None:
+def base(
+    sightings: Sequence[PairObservation], floor: float
+) -> tuple[PairObservation, PairObservation] | None:
     """The two ranges that eq. (7) is solved from: the first two between which only a has moved.
 
     b has not moved if it is where it was to `floor` m, the rounding of both odometries. Not two ranges by
     which b may stand on M1: there any turn of a about it would do.
     """
-    ranged: list[Sighting] = []
+    ranged: list[PairObservation] = []
     for sighting in sightings:
         if sighting.range is not None and not (
             ranged and (ranged[-1].a, ranged[-1].b) == (sighting.a, sighting.b)  # both have stood since
@@ -135,13 +137,13 @@ def base(sightings: Sequence[Sighting], floor: float) -> tuple[Sighting, Sightin
     return None
 
 
-def _as_far(sighting: Sighting, near: float) -> bool:
+def _as_far(sighting: PairObservation, near: float) -> bool:
     """Return whether a is as far from its own anchor as from b, to `near` m."""
     assert sighting.range is not None
     return abs(math.hypot(sighting.a.x, sighting.a.y) - sighting.range) <= near
 
 
-def solve(distance: float, base: tuple[Sighting, Sighting]) -> list[Placement]:
+def solve(distance: float, base: tuple[PairObservation, PairObservation]) -> list[Placement]:
     """The placements that eq. (7) leaves after two ranges; `distance` is D."""
     first, second = base
     assert first.range is not None
@@ -149,7 +151,7 @@ def solve(distance: float, base: tuple[Sighting, Sighting]) -> list[Placement]:
     return placements(distance, first.b, first.a, second.a, first.range, second.range)
 
 
-def redundant(sightings: Sequence[Sighting], base: tuple[Sighting, Sighting]) -> bool:
+def redundant(sightings: Sequence[PairObservation], base: tuple[PairObservation, PairObservation]) -> bool:
     """Whether there is a range more, from elsewhere, than the two that the placements were made from."""
     return any(
         sighting.range is not None
@@ -161,7 +163,7 @@ def redundant(sightings: Sequence[Sighting], base: tuple[Sighting, Sighting]) ->
     )
 
 
-def turn(sightings: Sequence[Sighting]) -> Role:
+def turn(sightings: Sequence[PairObservation]) -> Role:
     """Whose move it is: the other's than whose was the last. b moves first."""
     for before, now in pairwise(reversed(sightings)):
         if travelled(before.b, now.b) > 0.0:
@@ -225,7 +227,12 @@ def compared(question: Question, mission: Mission, variant: Variant) -> Compared
 
 
 def survey(
-    mover: Role, a: Pose, b: Pose, placement: Placement, sightings: Sequence[Sighting], mission: Mission
+    mover: Role,
+    a: Pose,
+    b: Pose,
+    placement: Placement,
+    sightings: Sequence[PairObservation],
+    mission: Mission,
 ) -> Plan | None:
     """The manoeuvre of `mover` after which one more range would pin down `placement` best; none as above.
 

@@ -34,9 +34,18 @@ from agent.planning.phase1_anchor import ThirdPoint
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent
 from agent.planning.phase3_last_manoeuvre import LastManoeuvre, Returning, Standing, Waiting
 from agent.planning.range_seeking import Backing, Circling, Homing, Straight, Turning
-from agent.planning.state import Asleep, Done, Mind
+from agent.planning.state import Asleep, Done, RobotState
 from protocol import messages
-from protocol.messages import Alarm, Drive, Estimate, Localised, Ranged, Report, Sense, Undecided
+from protocol.messages import (
+    Command,
+    Estimate,
+    Inconsistent,
+    Localised,
+    Observation,
+    Ranged,
+    Report,
+    Undecided,
+)
 from protocol.mission import RANGE_MARGIN
 from protocol.motion import ORIGIN, REST, Controls, Pose, step
 from protocol.rounding import SAME
@@ -44,7 +53,7 @@ from protocol.rounding import SAME
 # --- a tick -----------------------------------------------------------------------------------------
 
 
-def observe(mind: Mind, sense: Sense) -> Mind:
+def observe(mind: RobotState, sense: Observation) -> RobotState:
     """What the robot knows once it has sensed: where it drove, what was in range and what was silent."""
     log, odometry, leg = mind.log, mind.odometry, mind.leg
     if sense.executed is not None:
@@ -62,13 +71,13 @@ def observe(mind: Mind, sense: Sense) -> Mind:
             near = True
             if contact.range is not None:
                 mutual = (*mutual, Ranged(sense.tick, contact.range))
-    sensed = Mind(
+    sensed = RobotState(
         mind.briefing, mind.state, sense.tick, odometry, log, mutual, mind.findings, mind.radio, near, leg
     )
     return _advanced(sensed, sense.anchor_range)
 
 
-def report(mind: Mind) -> Report:
+def report(mind: RobotState) -> Report:
     """What the peer has not acknowledged yet."""
     since, ranges_since = mind.radio.acknowledged, mind.radio.ranges_acknowledged
     log, start = mind.log, mind.findings.branch.start if mind.findings.branch and mind.phase > 1 else None
@@ -94,7 +103,7 @@ def report(mind: Mind) -> Report:
     )
 
 
-def decide(mind: Mind, reports: Sequence[Report] = ()) -> Mind:
+def decide(mind: RobotState, reports: Sequence[Report] = ()) -> RobotState:
     """What the robot is set to do once it has heard its peer."""
     if reports:
         mind = _heard(mind, reports)
@@ -113,10 +122,10 @@ def decide(mind: Mind, reports: Sequence[Report] = ()) -> Mind:
             return mind
 
 
-def drive(mind: Mind) -> Drive:
+def drive(mind: RobotState) -> Command:
     """What the robot does over the tick to come."""
     controls = _controls(mind)
-    return Drive(
+    return Command(
         mind.tick,
         mind.briefing.robot,
         controls.v,
@@ -127,7 +136,7 @@ def drive(mind: Mind) -> Drive:
     )
 
 
-def estimate(mind: Mind) -> Estimate:
+def estimate(mind: RobotState) -> Estimate:
     """What the robot holds possible."""
     left = mind.findings.branches
     if not left and mind.findings.branch is not None:
@@ -151,7 +160,7 @@ def estimate(mind: Mind) -> Estimate:
     )
 
 
-def _heard(mind: Mind, reports: Sequence[Report]) -> Mind:
+def _heard(mind: RobotState, reports: Sequence[Report]) -> RobotState:
     """`mind`, with all that `reports` tell; and its verdict, if that cannot be so, or the peer gives up."""
     for told in reports:
         heard = peer_state.hear(mind.radio, told)
@@ -165,7 +174,7 @@ def _heard(mind: Mind, reports: Sequence[Report]) -> Mind:
         match mind.radio.verdict:
             case Undecided(reason):
                 return mind.undecided(f"{mind.briefing.peer} says: {reason}")
-            case Alarm(claim):
+            case Inconsistent(claim):
                 return mind.undecided(f"{mind.briefing.peer} does not believe it: {claim}")
     return mind
 
@@ -173,7 +182,7 @@ def _heard(mind: Mind, reports: Sequence[Report]) -> Mind:
 # --- what a tick changes ----------------------------------------------------------------------------
 
 
-def _advanced(mind: Mind, anchor_range: float | None) -> Mind:
+def _advanced(mind: RobotState, anchor_range: float | None) -> RobotState:
     """`mind` in the state that its own senses lead to."""
     if _surveys(mind) and not isinstance(mind.state, Asleep):
         return assured.sensed(mind, anchor_range)
@@ -202,12 +211,12 @@ def _advanced(mind: Mind, anchor_range: float | None) -> Mind:
             return mind
 
 
-def _surveys(mind: Mind) -> bool:
+def _surveys(mind: RobotState) -> bool:
     """Whether sensors are noisy, and more than one look at them may be taken."""
     return mind.briefing.variant == "assured" and not mind.briefing.mission.noise.exact
 
 
-def _again(mind: Mind, sense: Sense) -> bool:
+def _again(mind: RobotState, sense: Observation) -> bool:
     """Whether the anchor's range is the last one over again, from where the robot has stood since phase 1."""
     return (
         mind.findings.branch is not None
@@ -217,7 +226,7 @@ def _again(mind: Mind, sense: Sense) -> bool:
     )
 
 
-def _released(mind: Mind, rho0: float | None) -> Mind:
+def _released(mind: RobotState, rho0: float | None) -> RobotState:
     if rho0 is None and mind.briefing.mission.noise.drop_outs:
         return mind  # and listens
     if rho0 is None:
@@ -230,7 +239,7 @@ def _released(mind: Mind, rho0: float | None) -> Mind:
     return replace(mind, state=Straight("anchor", mind.odometry, rho0))
 
 
-def _second_range(mind: Mind) -> Mind:
+def _second_range(mind: RobotState) -> RobotState:
     """The branches +-alpha, less what silence on the way rules out."""
     if not mind.briefing.mission.noise.exact:
         mind, likely = paper.with_branches(mind)
@@ -243,7 +252,7 @@ def _second_range(mind: Mind) -> Mind:
     return _weighed(mind, possible, "circle" if isinstance(mind.state, Circling) else None)
 
 
-def _third_range(mind: Mind, state: ThirdPoint) -> Mind:
+def _third_range(mind: RobotState, state: ThirdPoint) -> RobotState:
     """The branch that explains the third range, or its absence: the virtual measurement."""
     measured = mind.log.ranges[-1].tick == mind.tick
     kind: messages.BranchKind = "three-ranges" if measured else "three-ranges-virtual"
@@ -253,7 +262,9 @@ def _third_range(mind: Mind, state: ThirdPoint) -> Mind:
     return _weighed(mind, state.branches, kind)
 
 
-def _weighed(mind: Mind, candidates: tuple[Branch, ...], kind: messages.BranchKind | None) -> Mind:
+def _weighed(
+    mind: RobotState, candidates: tuple[Branch, ...], kind: messages.BranchKind | None
+) -> RobotState:
     """Phase 1 goes on with those of `candidates` that explain all its ticks; it ends if one may be known.
 
     That takes ranges that fix the anchor as exactly as the claim needs; the letter takes no more of them.
@@ -273,7 +284,7 @@ def _weighed(mind: Mind, candidates: tuple[Branch, ...], kind: messages.BranchKi
     return _to_third_point(mind, left, margin)
 
 
-def _to_third_point(mind: Mind, left: tuple[Branch, ...], margin: float) -> Mind:
+def _to_third_point(mind: RobotState, left: tuple[Branch, ...], margin: float) -> RobotState:
     if not left:
         return mind.undecided("no pose explains the anchor ranges")
     mission, variant = mind.briefing.mission, mind.briefing.variant
@@ -285,7 +296,7 @@ def _to_third_point(mind: Mind, left: tuple[Branch, ...], margin: float) -> Mind
     return replace(mind, state=ThirdPoint(left, mind.odometry, controls))
 
 
-def _located(mind: Mind, branch: Branch, kind: messages.BranchKind, off: float = 0.0) -> Mind:
+def _located(mind: RobotState, branch: Branch, kind: messages.BranchKind, off: float = 0.0) -> RobotState:
     """Phase 1 is done: its pose relative to the anchor is known, and that it may be `off` m elsewhere."""
     findings = replace(mind.findings, branch=branch, branch_kind=kind, parted=mind.tick, own_anchor=off)
     mind = replace(mind, findings=findings)
@@ -293,7 +304,7 @@ def _located(mind: Mind, branch: Branch, kind: messages.BranchKind, off: float =
     return _on_to_orbit(mind, Aligning(mind.odometry.heading - mu))
 
 
-def _on_to_orbit(mind: Mind, state: phase2_orbit.Meeting) -> Mind:
+def _on_to_orbit(mind: RobotState, state: phase2_orbit.Meeting) -> RobotState:
     onward = phase2_orbit.onward(state, mind.odometry, mind.start, mind.orbit, mind.briefing.mission)
     if isinstance(onward, Orbiting) and not mind.briefing.mission.noise.exact:
         onward = Orbiting(phase2_orbit.pursuit(mind.local_pose, mind.orbit, mind.briefing.mission))
@@ -303,7 +314,7 @@ def _on_to_orbit(mind: Mind, state: phase2_orbit.Meeting) -> Mind:
 # --- what a mind implies ----------------------------------------------------------------------------
 
 
-def _controls(mind: Mind) -> Controls:
+def _controls(mind: RobotState) -> Controls:
     """What its state has it do; less, where it is in range of a peer of which it knows no more."""
     controls, mission = _intended(mind), mind.briefing.mission
     blind = mind.phase < 3 or isinstance(mind.state, Retreating)
@@ -316,7 +327,7 @@ def _controls(mind: Mind) -> Controls:
     )
 
 
-def _intended(mind: Mind) -> Controls:
+def _intended(mind: RobotState) -> Controls:
     match mind.state:
         case Aligning() | Radial() | Tangent() | Orbiting() if encounter.lingers(mind):
             return REST

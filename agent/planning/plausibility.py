@@ -11,7 +11,7 @@ from agent.peer.motion_log import Logbook
 from agent.peer.peer_state import Radio
 from agent.planning.phase2_orbit import Orbiting
 from agent.planning.state import WORDS
-from protocol.messages import Alarm, Briefing, Report
+from protocol.messages import Inconsistent, Report, RobotConfig
 from protocol.mission import Mission
 from protocol.motion import wrap
 
@@ -25,7 +25,7 @@ EXACT = 1e-6
 """m and rad: where sensors are exact, what is told of one tick agrees so far"""
 
 
-def objection(before: Radio, after: Radio, report: Report, briefing: Briefing) -> Alarm | None:
+def objection(before: Radio, after: Radio, report: Report, briefing: RobotConfig) -> Inconsistent | None:
     """What in `report` cannot be so, which led from `before` to `after`; None if all of it may be."""
     return (
         _second_story(before, report, briefing.mission)
@@ -35,22 +35,22 @@ def objection(before: Radio, after: Radio, report: Report, briefing: Briefing) -
     )
 
 
-def _second_story(before: Radio, report: Report, mission: Mission) -> Alarm | None:
+def _second_story(before: Radio, report: Report, mission: Mission) -> Inconsistent | None:
     """What was told once is told the same ever after."""
     last = min(report.through, before.peer.through)
     if report.since < last:
         told = Logbook(report.through - report.since, report.runs)
         if told.between(0, last - report.since) != before.peer.between(report.since, last):
-            return Alarm(f"manoeuvres over [{report.since}, {last}] that it told otherwise before")
+            return Inconsistent(f"manoeuvres over [{report.since}, {last}] that it told otherwise before")
     known = before.peer.ranges[report.ranges_since :][: len(report.ranges)]
     if known != report.ranges[: len(known)]:
-        return Alarm("ranges to its anchor that it told otherwise before")
+        return Inconsistent("ranges to its anchor that it told otherwise before")
     if mission.noise.exact and before.start is not None and report.start not in (None, before.start):
-        return Alarm("a start that it told otherwise before")
+        return Inconsistent("a start that it told otherwise before")
     return None
 
 
-def _impossible_drive(report: Report, mission: Mission) -> Alarm | None:
+def _impossible_drive(report: Report, mission: Mission) -> Inconsistent | None:
     """Nobody drives faster than v_max, or turns faster than omega_max."""
     noise = mission.noise
     speed = _most(mission.max_speed, noise.actuation.v, noise.odometry.v, noise.unrest[0])
@@ -58,7 +58,7 @@ def _impossible_drive(report: Report, mission: Mission) -> Alarm | None:
     for run in report.runs:
         for what, value, most in (("v", abs(run.v), speed), ("omega", abs(run.omega), rate)):
             if value > most:
-                return Alarm(f"{what} = {value:.6g}, of {most:.6g} at the most", value - most)
+                return Inconsistent(f"{what} = {value:.6g}, of {most:.6g} at the most", value - most)
     return None
 
 
@@ -67,7 +67,7 @@ def _most(asked: float, by_wheels: float, by_odometry: float, floor: float) -> f
     return asked * (1.0 + SLACK + NOISY * math.hypot(by_wheels, by_odometry)) + floor
 
 
-def _ranges_off_path(before: Radio, after: Radio, mission: Mission) -> Alarm | None:
+def _ranges_off_path(before: Radio, after: Radio, mission: Mission) -> Inconsistent | None:
     """Its ranges to its anchor are those of the path that it tells; those that are news are looked at."""
     book, start = after.peer, after.start
     if start is None:
@@ -79,11 +79,13 @@ def _ranges_off_path(before: Radio, after: Radio, mission: Mission) -> Alarm | N
         pose = book.pose(start, ranged.tick, mission.period)
         off = abs(math.hypot(pose.x, pose.y) - ranged.range)
         if off > EXACT * max(1.0, ranged.range):
-            return Alarm(f"a range to its anchor at tick {ranged.tick} that is not of the path it tells", off)
+            return Inconsistent(
+                f"a range to its anchor at tick {ranged.tick} that is not of the path it tells", off
+            )
     return None
 
 
-def _off_orbit(after: Radio, report: Report, briefing: Briefing) -> Alarm | None:
+def _off_orbit(after: Radio, report: Report, briefing: RobotConfig) -> Inconsistent | None:
     """Who orbits is on its circle, and heads along it."""
     plan = briefing.rendezvous
     orbit = plan.b if briefing.role == "a" else plan.a
@@ -92,9 +94,9 @@ def _off_orbit(after: Radio, report: Report, briefing: Briefing) -> Alarm | None
     pose = after.peer.pose(after.start, report.tick, briefing.mission.period)
     off = abs(math.hypot(pose.x, pose.y) - orbit.radius)
     if off > EXACT * max(1.0, orbit.radius):
-        return Alarm(f"a place off the orbit that it is on at tick {report.tick}", off)
+        return Inconsistent(f"a place off the orbit that it is on at tick {report.tick}", off)
     along = math.copysign(0.5 * math.pi, orbit.omega)
     askew = abs(wrap(pose.heading - math.atan2(pose.y, pose.x) - along))
     if orbit.v != 0.0 and askew > EXACT:
-        return Alarm(f"a heading that is none of the orbit that it is on at tick {report.tick}", askew)
+        return Inconsistent(f"a heading that is none of the orbit that it is on at tick {report.tick}", askew)
     return None

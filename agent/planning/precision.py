@@ -12,25 +12,25 @@ import msgspec
 from msgspec.structs import replace
 
 from agent.estimation.closed_forms import Placement
-from agent.estimation.exact import FITTED, Branch, Sighting, anchor_error, polished, turn_error
+from agent.estimation.exact import FITTED, Branch, PairObservation, anchor_error, polished, turn_error
 from agent.peer.motion_log import Logbook
-from agent.planning.state import Mind
+from agent.planning.state import RobotState
 from protocol.mission import RANGE_MARGIN, Mission
-from protocol.motion import ORIGIN, Pose, Run, follow
+from protocol.motion import ORIGIN, Pose, Segment, follow
 from protocol.rounding import BETTER, OUT_AND_BACK, SAME, SURE, WELL, foothold, rounding
 
 
-def size(mind: Mind) -> float:
+def size(mind: RobotState) -> float:
     """Return D + R in m: the largest coordinate in the computations of the robots and the world."""
     return mind.briefing.anchor_distance + mind.briefing.mission.sensing_range
 
 
-def drifted(mind: Mind, log: Logbook, tick: int) -> float:
+def drifted(mind: RobotState, log: Logbook, tick: int) -> float:
     """Return the bound in m on the rounding error of a range at `tick`, from the odometry of `log`."""
     return _rounded(size(mind), log.until(tick), mind.briefing.mission.period)
 
 
-def _rounded(extent: float, runs: Sequence[Run], period: float) -> float:
+def _rounded(extent: float, runs: Sequence[Segment], period: float) -> float:
     """Return the bound in m on the rounding error of a range after `runs`; `extent` is `size`."""
     path = turned = 0.0
     for run in runs:
@@ -59,7 +59,7 @@ class Known(msgspec.Struct, frozen=True):
     """whether phase 1 may end"""
 
 
-def anchor(mind: Mind, start: Pose, log: Logbook) -> Known:
+def anchor(mind: RobotState, start: Pose, log: Logbook) -> Known:
     """Return the smallest anchor error of the robot of `log`, whose branch begins at `start`.
 
     Phase 1 may end in three cases. Either the error is at most WELL of `foothold`; or it is at most
@@ -100,7 +100,7 @@ Next to a double root, rounding may end the two fits on either side of it.
 """
 
 
-def merged(mind: Mind, branches: tuple[Branch, ...]) -> tuple[Branch, ...]:
+def merged(mind: RobotState, branches: tuple[Branch, ...]) -> tuple[Branch, ...]:
     """Return `branches` without those that no range distinguishes from the first (see NEXT_TO)."""
     if len(branches) < 2 or len(mind.log.ranges) < FITTED:
         return branches
@@ -109,7 +109,7 @@ def merged(mind: Mind, branches: tuple[Branch, ...]) -> tuple[Branch, ...]:
     return (first, *(other for other in branches[1:] if math.dist(other.anchor, first.anchor) >= near))
 
 
-def fitted(mind: Mind, branch: Branch) -> tuple[Branch, Known]:
+def fitted(mind: RobotState, branch: Branch) -> tuple[Branch, Known]:
     """Return `branch` fitted to the ranges with the smallest anchor error, and that error."""
     known = anchor(mind, branch.start, mind.log)
     if known.ranges == len(mind.log.ranges):
@@ -119,33 +119,35 @@ def fitted(mind: Mind, branch: Branch) -> tuple[Branch, Known]:
     return branch, replace(known, error=anchor(mind, branch.start, mind.log).error)
 
 
-def peer_anchor(mind: Mind) -> float:
+def peer_anchor(mind: RobotState) -> float:
     """Return the anchor error of the peer in m."""
     assert mind.radio.start is not None
     return anchor(mind, mind.radio.start, mind.radio.peer).error
 
 
-def drift(mind: Mind) -> float:
+def drift(mind: RobotState) -> float:
     """Return the bound in m on both odometries' rounding, added up until now."""
     return _drift(mind, min(mind.tick, mind.radio.peer.through))
 
 
-def _drift(mind: Mind, tick: int) -> float:
+def _drift(mind: RobotState, tick: int) -> float:
     return drifted(mind, mind.log, tick) + drifted(mind, mind.radio.peer, tick)
 
 
-def apart(mind: Mind) -> float:
+def apart(mind: RobotState) -> float:
     """Return the bound in m on both anchors' errors and both odometries' rounding, added up until now."""
     return _apart(mind, min(mind.tick, mind.radio.peer.through))
 
 
-def _apart(mind: Mind, tick: int) -> float:
+def _apart(mind: RobotState, tick: int) -> float:
     own, peers = mind.findings.own_anchor, mind.findings.peer_anchor
     assert peers is not None
     return own + peers + _drift(mind, tick)
 
 
-def pinned_down(mind: Mind, placement: Placement, ranged: Sequence[Sighting], off: float) -> bool:
+def pinned_down(
+    mind: RobotState, placement: Placement, ranged: Sequence[PairObservation], off: float
+) -> bool:
     """Return whether the sightings in `ranged` determine `placement` to SURE; `off` is `apart`.
 
     Only rounding between the first and the last sighting makes the errors of their ranges differ. Rounding

@@ -8,8 +8,8 @@ import msgspec
 from msgspec.structs import replace
 
 from agent.estimation.closed_forms import Placement
-from agent.estimation.exact import Branch, Sighting
-from agent.estimation.gaussian.consistency import Doubt
+from agent.estimation.exact import Branch, PairObservation
+from agent.estimation.gaussian.consistency import Inconsistency
 from agent.estimation.gaussian.hypotheses import Hypothesis
 from agent.peer.motion_log import Logbook
 from agent.peer.peer_state import Radio
@@ -19,7 +19,7 @@ from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent, off
 from agent.planning.phase3_last_manoeuvre import LastManoeuvre, Plan, Returning, Standing, Waiting
 from agent.planning.range_seeking import Backing, Circling, Homing, Straight, Turning
 from protocol import messages
-from protocol.messages import Alarm, Briefing, Localised, Ranged, Undecided
+from protocol.messages import Inconsistent, Localised, Ranged, RobotConfig, Undecided
 from protocol.motion import ORIGIN, Covariance, Pose, compose
 from protocol.orbits import Orbit
 
@@ -63,7 +63,7 @@ WORDS: dict[type, str] = {
 }
 
 
-class Findings(msgspec.Struct, frozen=True):
+class Belief(msgspec.Struct, frozen=True):
     """What phases 1 and 3 have found out, beside the state."""
 
     possible: tuple[Branch, ...] = ()
@@ -98,7 +98,7 @@ class Findings(msgspec.Struct, frozen=True):
     """under noise: what there is to know yet, before it can claim"""
     sought: int = 0
     """under noise: how many mutual ranges there were when the whole plane was last searched"""
-    against: Doubt | None = None
+    against: Inconsistency | None = None
     """under noise: what most speaks against the first"""
     p_value: float | None = None
     """under noise: the least of all searches of the whole plane"""
@@ -108,17 +108,17 @@ class Findings(msgspec.Struct, frozen=True):
     """under noise: how often it went back to its anchor"""
 
 
-class Mind(msgspec.Struct, frozen=True):
+class RobotState(msgspec.Struct, frozen=True):
     """Everything that a robot knows."""
 
-    briefing: Briefing
+    briefing: RobotConfig
     state: State = Asleep()
     tick: int = -1
     odometry: Pose = ORIGIN
     """now, in the frame of tick 0"""
     log: Logbook = Logbook()
     mutual: tuple[Ranged, ...] = ()
-    findings: Findings = Findings()
+    findings: Belief = Belief()
     radio: Radio = Radio()
     in_contact: bool = False
     """whether the peer is in range in this tick"""
@@ -163,7 +163,7 @@ class Mind(msgspec.Struct, frozen=True):
         match self.state:
             case Done(_, Localised()):
                 return "localised"
-            case Done(_, Alarm()):
+            case Done(_, Inconsistent()):
                 return "alarm"
             case Done(_, Undecided()):
                 return "undecided"
@@ -175,11 +175,11 @@ class Mind(msgspec.Struct, frozen=True):
         """What it has come to, if it has."""
         return self.state.verdict if isinstance(self.state, Done) else None
 
-    def undecided(self, reason: str) -> Mind:
+    def undecided(self, reason: str) -> RobotState:
         """It cannot go on, and does not guess."""
         return replace(self, state=Done(self.phase, Undecided(reason)))
 
-    def alarmed(self, alarm: Alarm) -> Mind:
+    def alarmed(self, alarm: Inconsistent) -> RobotState:
         """The peer tells what cannot be so."""
         return replace(self, state=Done(self.phase, alarm))
 
@@ -212,7 +212,7 @@ class Mind(msgspec.Struct, frozen=True):
         track = self.log.track(ORIGIN, 0, self.tick, self.briefing.mission.period)
         return [(pose, ranges.get(tick)) for tick, pose in enumerate(track)]
 
-    def sightings(self, first: int) -> list[Sighting]:
+    def sightings(self, first: int) -> list[PairObservation]:
         """Every tick from `first` on that both robots' logs cover: where both were, and the range between."""
         last = min(self.tick, self.radio.peer.through)
         if self.radio.start is None or last < first:
@@ -223,6 +223,6 @@ class Mind(msgspec.Struct, frozen=True):
         a, b = (own, peer) if self.briefing.role == "a" else (peer, own)
         ranges = {ranged.tick: ranged.range for ranged in self.mutual}
         return [
-            Sighting(tick, at_a, at_b, ranges.get(tick))
+            PairObservation(tick, at_a, at_b, ranges.get(tick))
             for tick, at_a, at_b in zip(range(first, last + 1), a, b, strict=True)
         ]

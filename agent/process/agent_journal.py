@@ -8,23 +8,23 @@ from typing import Any
 import msgspec
 from msgspec.structs import replace
 
-from agent.process.robot import Told
+from agent.process.robot import FramedReport
 from protocol import motion
 from protocol.journal.environment import named_in
 from protocol.journal.journal_file import CorruptJournal
 from protocol.messages import (
-    Briefing,
+    Command,
     Contact,
-    Drive,
-    End,
+    DeadlineMissed,
     Environment,
     Estimate,
-    Farewell,
+    FinalReport,
     Localised,
-    Missed,
+    MissionEnd,
+    Observation,
     OfRobot,
     Report,
-    Sense,
+    RobotConfig,
 )
 from protocol.motion import ORIGIN, REST, Pose, compose, inverse
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
@@ -33,25 +33,25 @@ from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 class Step(msgspec.Struct, frozen=True):
     """One tick, in the order of the journal; what is none or empty did not come, or not any more."""
 
-    sense: Sense
+    sense: Observation
     frame: bytes
-    """that the Sense came in"""
-    report: Told | None = None
+    """that the Observation came in"""
+    report: FramedReport | None = None
     """to the peer, in contact"""
-    heard: tuple[Told, ...] = ()
+    heard: tuple[FramedReport, ...] = ()
     missed: tuple[str, ...] = ()
     """peers whose report did not come in time"""
-    drive: Drive | None = None
+    drive: Command | None = None
     estimate: Estimate | None = None
 
 
 class Past(msgspec.Struct, frozen=True):
     """A journal, whole or up to where it breaks off."""
 
-    briefing: Briefing
+    briefing: RobotConfig
     steps: tuple[Step, ...]
-    end: End | None = None
-    farewell: Farewell | None = None
+    end: MissionEnd | None = None
+    farewell: FinalReport | None = None
     environment: Environment | None = None
     """where it was written; none of an older recording"""
 
@@ -111,24 +111,24 @@ def past(frames: Iterable[bytes], source: object) -> Past:
     frames = list(frames)
     environment = named_in(frames)
     first = int(environment is not None)
-    briefing: Briefing | None = None
+    briefing: RobotConfig | None = None
     steps: list[Step] = []
-    end: End | None = None
-    farewell: Farewell | None = None
+    end: MissionEnd | None = None
+    farewell: FinalReport | None = None
     for place, frame in enumerate(frames[first:], first):
         message = _message(frame, source)
-        if place == first and not isinstance(message, Briefing):
+        if place == first and not isinstance(message, RobotConfig):
             raise CorruptJournal(f"{source}: an agent's journal begins with its Briefing")
         match message:
-            case Briefing() if place == first:
+            case RobotConfig() if place == first:
                 briefing = message
-            case End() if end is None:
+            case MissionEnd() if end is None:
                 end = message
-            case Farewell() if end is not None and farewell is None:
+            case FinalReport() if end is not None and farewell is None:
                 farewell = message
-            case Sense(tick) if end is None and tick == len(steps) and _answered(steps):
+            case Observation(tick) if end is None and tick == len(steps) and _answered(steps):
                 steps.append(Step(message, frame))
-            case Report() | Missed() | Drive() | Estimate() if steps and end is None:
+            case Report() | DeadlineMissed() | Command() | Estimate() if steps and end is None:
                 assert briefing is not None
                 onward = _with(steps[-1], message, frame, briefing.robot)
                 if onward is None:
@@ -137,12 +137,12 @@ def past(frames: Iterable[bytes], source: object) -> Past:
             case _:
                 raise OutOfOrder(message, place, source)
     if briefing is None:
-        raise CorruptJournal(f"{source}: there is no Briefing in it")
+        raise CorruptJournal(f"{source}: there is no RobotConfig in it")
     return Past(briefing, tuple(steps), end, farewell, environment)
 
 
 def _answered(steps: Sequence[Step]) -> bool:
-    """Whether the latest of them has come to its Drive, so that the next may come."""
+    """Whether the latest of them has come to its Command, so that the next may come."""
     return not steps or steps[-1].drive is not None
 
 
@@ -158,13 +158,13 @@ def _with(step: Step, message: object, frame: bytes, robot: str) -> Step | None:
     match message:
         case Estimate(tick=step.sense.tick) if step.drive is not None and step.estimate is None:
             return replace(step, estimate=message)
-        case Drive(tick=step.sense.tick) if step.drive is None:
+        case Command(tick=step.sense.tick) if step.drive is None:
             return replace(step, drive=message)
-        case Missed(tick=step.sense.tick) if step.drive is None:
+        case DeadlineMissed(tick=step.sense.tick) if step.drive is None:
             return replace(step, missed=(*step.missed, message.robot))
         case Report(tick=step.sense.tick) if message.robot == robot and step.report is None:
-            return replace(step, report=Told(message, frame))
+            return replace(step, report=FramedReport(message, frame))
         case Report() if message.robot != robot and step.drive is None:
-            return replace(step, heard=(*step.heard, Told(message, frame)))
+            return replace(step, heard=(*step.heard, FramedReport(message, frame)))
         case _:
             return None

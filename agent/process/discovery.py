@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import zenoh
 
-from protocol.messages import Briefing
+from protocol.messages import RobotConfig
 from protocol.network import diagnosis, keys, session
 from protocol.network.diagnosis import FIRST_WORD_S
 from protocol.network.endpoints import Endpoints
@@ -76,7 +76,7 @@ class Search:
 class _Offers(NamedTuple):
     """The answers to a robot of the worlds that are alive."""
 
-    briefings: dict[str, Briefing]
+    briefings: dict[str, RobotConfig]
     """by run"""
     played: str | None
     """a run in which the robot is there already"""
@@ -85,7 +85,7 @@ class _Offers(NamedTuple):
     """why an answer is not understood"""
 
 
-def join(link: zenoh.Session, run: str | None, robot: str, search: Search) -> tuple[str, Briefing] | None:
+def join(link: zenoh.Session, run: str | None, robot: str, search: Search) -> tuple[str, RobotConfig] | None:
     """Return the run that `robot` belongs to, and its briefing; None after SESSION_S without.
 
     `run` may name it. A robot's former process may have ended just now, and seem to be there for a moment.
@@ -121,29 +121,31 @@ def join(link: zenoh.Session, run: str | None, robot: str, search: Search) -> tu
 
 
 def _offers(link: zenoh.Session, worlds: Sequence[str], robot: str) -> _Offers:
-    briefings: dict[str, Briefing] = {}
+    briefings: dict[str, RobotConfig] = {}
     played = refused = strange = None
     for world in worlds:
         if session.alive(link, keys.robot_alive(world, robot), QUERY_S):
             played = world
             continue
         key = keys.briefing(world, robot)
-        answer = session.ask(link, key, QUERY_S, lambda frame: isinstance(_briefing(frame, robot), Briefing))
+        answer = session.ask(
+            link, key, QUERY_S, lambda frame: isinstance(_briefing(frame, robot), RobotConfig)
+        )
         if isinstance(answer, str):
             refused = answer
         elif answer is not None:
             found = _briefing(answer, robot)
-            if isinstance(found, Briefing):
+            if isinstance(found, RobotConfig):
                 briefings[world] = found
             else:
                 strange = found
     return _Offers(briefings, played, refused, strange)
 
 
-def _briefing(answer: bytes, robot: str) -> Briefing | str:
+def _briefing(answer: bytes, robot: str) -> RobotConfig | str:
     """Return the briefing of `robot` in a world's answer, or why there is none in it."""
     try:
-        briefing = decode(answer, Briefing)
+        briefing = decode(answer, RobotConfig)
     except MalformedFrame as error:
         return f"the world's briefing is not understood: {error}"
     if briefing.robot != robot:

@@ -8,7 +8,7 @@ from typing import Any
 
 import zenoh
 
-from protocol.messages import Briefing
+from protocol.messages import RobotConfig
 from protocol.network import keys, session
 from protocol.network.inbox import NOTHING, Arrival, Inbox
 
@@ -17,14 +17,14 @@ SILENCE_S = 3.0
 `session.LEASE_S` and connects again: now and then nothing comes over such a link, for good"""
 
 
-class LinkLost(Exception):
+class WorldLinkLost(Exception):
     """Nothing comes over this link any more; over another the world may be there."""
 
 
-class Link:
+class AgentLink:
     """One robot's in one run. Nothing is heard or said before a session is attached."""
 
-    def __init__(self, briefing: Briefing, run: str, inbox: Inbox) -> None:
+    def __init__(self, briefing: RobotConfig, run: str, inbox: Inbox) -> None:
         self._id = briefing.robot
         self._peer = briefing.peer
         self._run = run
@@ -54,7 +54,7 @@ class Link:
         if arrival.topic == "sense":
             self._heard_at = time.monotonic()
         elif arrival is NOTHING and time.monotonic() >= lost:
-            raise LinkLost
+            raise WorldLinkLost
         return arrival
 
     def appear(self) -> None:
@@ -64,7 +64,7 @@ class Link:
         self._token = self._show_alive()
 
     def drive(self, frame: bytes) -> None:
-        """Say a Drive, or a Farewell, to the world."""
+        """Say a Command, or a FinalReport, to the world."""
         self._drive.put(frame)
 
     def report(self, frame: bytes) -> None:

@@ -1,6 +1,6 @@
 """The agent's process: Zenoh in, journal, planner, Zenoh out. It knows nothing but what it is told.
 
-It reacts to what arrives and never steps twice: a Sense heard again makes it send again what it
+It reacts to what arrives and never steps twice: a Observation heard again makes it send again what it
 answered, so whatever is lost, late or doubled costs time and changes nothing. So does a process that is
 killed, its peer's or the world's: whoever is started again is told again what it must know. So do a process
 that is stopped, and a link that goes down: one over which nothing comes any more is replaced.
@@ -15,12 +15,12 @@ from collections.abc import Callable
 import zenoh
 
 from agent.process.discovery import ASK_AGAIN_S, NoWorld
-from agent.process.link import Link
-from agent.process.out_of_step import Disorder
+from agent.process.link import AgentLink
+from agent.process.out_of_step import OutOfStep
 from agent.process.recovery import REPORTS_KEPT, REPORTS_TOLD, Memory
 from agent.process.report_buffer import Post
-from agent.process.robot import Told
-from protocol.messages import End, Sense
+from agent.process.robot import FramedReport
+from protocol.messages import MissionEnd, Observation
 from protocol.network.inbox import Arrival, Inbox
 from protocol.wire import MalformedFrame, decode, encode
 
@@ -66,8 +66,8 @@ class AgentProcess:
         if self._sense is not None and self._robot.drive is None:
             self._set_due()
         real_time = self._tick_s is not None
-        self._link = Link(briefing, run, inbox)
-        self._disorder = Disorder(self._id, inbox, self._link.appear, real_time=real_time)
+        self._link = AgentLink(briefing, run, inbox)
+        self._disorder = OutOfStep(self._id, inbox, self._link.appear, real_time=real_time)
         self._post = Post(inbox, memory.heard, real_time=real_time)
         self._gone = False
         """whether it has been told that the world has gone"""
@@ -77,12 +77,12 @@ class AgentProcess:
         """when to do so once more, if it was asked for too soon"""
         self._told = deque(memory.told, maxlen=REPORTS_TOLD)
         """its own latest reports"""
-        self.end: End | None = memory.end if memory.farewell is not None else None
+        self.end: MissionEnd | None = memory.end if memory.farewell is not None else None
         """once the world has said it"""
         self._farewell = memory.farewell
 
-    def play(self) -> End:
-        """The run over the link that it is attached to, to its End.
+    def play(self) -> MissionEnd:
+        """The run over the link that it is attached to, to its MissionEnd.
 
         Raises LinkLost; NoWorld; or Interrupted when told to stop.
         """
@@ -91,9 +91,9 @@ class AgentProcess:
             match arrival.topic:
                 case "sense":
                     message = self._accepted(arrival)
-                    if isinstance(message, End) and self._is_over(message):
+                    if isinstance(message, MissionEnd) and self._is_over(message):
                         self._conclude(message)
-                    elif isinstance(message, Sense) and self._on_sense(message, arrival.frame):
+                    elif isinstance(message, Observation) and self._on_sense(message, arrival.frame):
                         self._give_up = time.monotonic() + self._silence
                 case "report":
                     self._post.take(arrival, self._known)
@@ -138,26 +138,26 @@ class AgentProcess:
 
     @property
     def _known(self) -> int:
-        """The tick of its latest Sense."""
+        """The tick of its latest Observation."""
         return self._sense.tick if self._sense is not None else -1
 
     # --- what arrives ---
 
-    def _accepted(self, arrival: Arrival) -> Sense | End | None:
+    def _accepted(self, arrival: Arrival) -> Observation | MissionEnd | None:
         try:
-            message: Sense | End = decode(arrival.frame, Sense | End)
+            message: Observation | MissionEnd = decode(arrival.frame, Observation | MissionEnd)
         except MalformedFrame as error:
             self._inbox.refuse(arrival, error)
             return None
-        if isinstance(message, Sense) and message.robot != self._id:
+        if isinstance(message, Observation) and message.robot != self._id:
             self._inbox.refuse(arrival, f"it is meant for '{message.robot}'")
             return None
         return message
 
-    def _is_over(self, end: End) -> bool:
+    def _is_over(self, end: MissionEnd) -> bool:
         return end.tick == self._known or self._disorder.persists(end, ENDED_S)
 
-    def _on_sense(self, sense: Sense, frame: bytes) -> bool:
+    def _on_sense(self, sense: Observation, frame: bytes) -> bool:
         """Whether it is in step. Raises NoWorld."""
         if sense.tick == self._known + 1:
             if self._reached is not None:
@@ -190,7 +190,7 @@ class AgentProcess:
     def _decide_when_all_is_heard(self) -> None:
         if self._sense is None or self._robot.drive is not None:
             return
-        heard: list[Told] = []
+        heard: list[FramedReport] = []
         missed: list[str] = []
         for contact in self._sense.contacts:
             listed = contact.heard
@@ -217,7 +217,7 @@ class AgentProcess:
             self._post.list(contact.damaged)
         self._post.forget(drive.tick - REPORTS_KEPT, self._robot.unheard)
 
-    def _send_report(self, told: Told) -> None:
+    def _send_report(self, told: FramedReport) -> None:
         self._link.report(told.frame)
         if self._reached is not None:
             self._reached("report", told.report.tick)
@@ -244,7 +244,7 @@ class AgentProcess:
         if self._robot.drive is not None:
             self._send_drive(self._robot.drive.tick)
 
-    def _conclude(self, end: End) -> None:
+    def _conclude(self, end: MissionEnd) -> None:
         self._post.forget(end.tick + REPORTS_KEPT + 1, self._robot.unheard)
         self._farewell = self._robot.farewell(
             end,
@@ -255,8 +255,8 @@ class AgentProcess:
         self.end = end
         self._give_up = time.monotonic() + self._patience
 
-    def _part(self, end: End) -> End:
-        """Answer the End, as often as it is said, until the world says that it has the answer on record."""
+    def _part(self, end: MissionEnd) -> MissionEnd:
+        """Answer the MissionEnd, as often as it is said, until the world says that it has the answer on record."""
         assert self._farewell is not None
         frame = encode(self._farewell)
         self._link.drive(frame)
@@ -268,7 +268,7 @@ class AgentProcess:
                 if arrival.frame == frame:
                     break
                 message = self._accepted(arrival)
-                if isinstance(message, Sense):
+                if isinstance(message, Observation):
                     self._disorder.sense(message, end.tick)
                 elif message is not None:
                     self._disorder.over()
@@ -279,6 +279,8 @@ class AgentProcess:
                 self._disorder.world(there=False)
                 gone = True  # what it said before may be on its way
             elif gone and arrival.topic == "nothing":
-                self._inbox.say(f"the world has gone after its End; waiting {self._patience:g} s for it")
+                self._inbox.say(
+                    f"the world has gone after its MissionEnd; waiting {self._patience:g} s for it"
+                )
                 gone = False
         return end

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 
 from agent.process.discovery import NoWorld
-from protocol.messages import End, Sense
+from protocol.messages import MissionEnd, Observation
 from protocol.network.inbox import Inbox
 
 BEHIND_S = 3.0
@@ -14,7 +14,7 @@ BEHIND_S = 3.0
 say anything, and in real time what lies between may be outstanding"""
 
 
-class Disorder:
+class OutOfStep:
     """What has been said out of step, with nothing in step since."""
 
     def __init__(self, robot: str, inbox: Inbox, appear: Callable[[], None], *, real_time: bool) -> None:
@@ -23,7 +23,7 @@ class Disorder:
         self._inbox = inbox
         self._appear = appear
         self._real_time = real_time
-        self._odd: tuple[Sense | End, float] | None = None
+        self._odd: tuple[Observation | MissionEnd, float] | None = None
         """the latest, and since when"""
         self._world_there = True
 
@@ -35,7 +35,7 @@ class Disorder:
         """The world has come, or gone; while it is gone, nobody is believed."""
         self._world_there, self._odd = there, None
 
-    def sense(self, sense: Sense, known: int) -> None:
+    def sense(self, sense: Observation, known: int) -> None:
         """The world is elsewhere, if it stays there: one of the two has lost its past, or comes too late.
 
         `known` is the latest tick in step. In real time it tells what lies between. Raises NoWorld.
@@ -54,13 +54,13 @@ class Disorder:
         late = "too late" if tick > known else "started again without its record"
         raise NoWorld(f"{late}: the world is at tick {tick}, {self._robot} knows it up to {known}")
 
-    def persists(self, message: Sense | End, bound_s: float) -> bool:
+    def persists(self, message: Observation | MissionEnd, bound_s: float) -> bool:
         """Whether the world has said `message`, and nothing in step, for `bound_s`; until then it is refused.
 
-        In lockstep it would say the same over and over; in real time its Senses go on.
+        In lockstep it would say the same over and over; in real time its Observations go on.
         """
         now = time.monotonic()
-        goes_on = self._real_time and isinstance(message, Sense)
+        goes_on = self._real_time and isinstance(message, Observation)
         if self._odd is None or not (message == self._odd[0] or goes_on):
             self._odd = message, now
         if self._world_there and now - self._odd[1] >= bound_s:

@@ -10,15 +10,15 @@ from collections import deque
 import msgspec
 
 from agent.process.agent_journal import past
-from agent.process.robot import Robot, Told
+from agent.process.robot import FramedReport, Robot
 from protocol.journal import environment
 from protocol.journal.journal_file import CorruptJournal
-from protocol.journal.resume import Otherwise, Retrace
-from protocol.messages import Briefing, End, Farewell, Sense
+from protocol.journal.resume import ReplayMismatch, Retrace
+from protocol.messages import FinalReport, MissionEnd, Observation, RobotConfig
 from protocol.wire import encode
 
 REPORTS_KEPT = 64
-"""ticks for which a report of the peer is kept that no Sense has listed yet"""
+"""ticks for which a report of the peer is kept that no Observation has listed yet"""
 REPORTS_TOLD = REPORTS_KEPT - 4
 """ticks for which a robot can say its own again; less, or the peer would count them twice"""
 
@@ -26,17 +26,17 @@ REPORTS_TOLD = REPORTS_KEPT - 4
 class Memory(msgspec.Struct, frozen=True):
     """A robot and what its process must know beside its mind; of a new robot, nothing."""
 
-    briefing: Briefing
+    briefing: RobotConfig
     robot: Robot
-    sense: Sense | None = None
+    sense: Observation | None = None
     """the latest"""
-    told: tuple[Told, ...] = ()
+    told: tuple[FramedReport, ...] = ()
     """its latest reports"""
-    heard: tuple[Told, ...] = ()
+    heard: tuple[FramedReport, ...] = ()
     """the peer's latest"""
-    end: End | None = None
-    farewell: Farewell | None = None
-    """what it has answered to the End"""
+    end: MissionEnd | None = None
+    farewell: FinalReport | None = None
+    """what it has answered to the MissionEnd"""
 
 
 def remember(record: Retrace) -> Memory | None:
@@ -51,7 +51,7 @@ def remember(record: Retrace) -> Memory | None:
     robot = Robot(lived.briefing)
     robot.keep(record)
     record.write(*[encode(one) for one in (named, lived.briefing) if one is not None])
-    told: deque[Told] = deque(maxlen=REPORTS_TOLD)
+    told: deque[FramedReport] = deque(maxlen=REPORTS_TOLD)
     for step in lived.steps:
         try:
             report = robot.sense(step.sense, step.frame)
@@ -60,7 +60,7 @@ def remember(record: Retrace) -> Memory | None:
             if step.drive is not None:
                 robot.decide(step.heard, step.missed)
                 robot.estimate()
-        except Otherwise:
+        except ReplayMismatch:
             raise CorruptJournal(
                 f"{record.path}: on record it decided otherwise at tick {step.sense.tick}: "
                 + (environment.otherwise(named, environment.of_robot()) or "the journal is another version's")

@@ -1,4 +1,4 @@
-"""The peer's reports as they come, until a Sense lists them, or nobody has asked for them for long."""
+"""The peer's reports as they come, until a Observation lists them, or nobody has asked for them for long."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable, Sequence
 
 from agent.peer import peer_state
 from agent.process.recovery import REPORTS_KEPT
-from agent.process.robot import Told
+from agent.process.robot import FramedReport
 from protocol.messages import Report
 from protocol.network.inbox import Arrival, Inbox
 from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode
@@ -15,18 +15,18 @@ from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode
 class Post:
     """What has come, by the tick in which it was told."""
 
-    def __init__(self, inbox: Inbox, heard: Sequence[Told], *, real_time: bool) -> None:
+    def __init__(self, inbox: Inbox, heard: Sequence[FramedReport], *, real_time: bool) -> None:
         """`heard` are those that a process which was started again has on record."""
         self._inbox = inbox
         self._real_time = real_time
         self._reports = {told.report.tick: told for told in heard}
         self._listed = set(self._reports)
-        """those of them that a Sense has listed"""
+        """those of them that a Observation has listed"""
         self.unheard = 0
         """those that went without"""
 
     def take(self, arrival: Arrival, known: int) -> None:
-        """Keep it, or refuse it; `known` is the tick of the latest Sense."""
+        """Keep it, or refuse it; `known` is the tick of the latest Observation."""
         try:
             report = decode(arrival.frame, Report, MAX_REPORT_BYTES)
         except MalformedFrame as error:
@@ -42,14 +42,16 @@ class Post:
             self._inbox.refuse(arrival, "it is of a tick to come")
         elif abs(report.tick - max(known, 0)) > REPORTS_KEPT:
             self.unheard += 1
-        elif self._reports.setdefault(report.tick, Told(report, arrival.frame)).frame != arrival.frame:
+        elif (
+            self._reports.setdefault(report.tick, FramedReport(report, arrival.frame)).frame != arrival.frame
+        ):
             self._inbox.refuse(arrival, "it was told otherwise before")
 
-    def of(self, tick: int) -> Told | None:
+    def of(self, tick: int) -> FramedReport | None:
         """What was told in `tick`, once it has come."""
         return self._reports.get(tick)
 
-    def waiting(self, known: int) -> list[Told]:
+    def waiting(self, known: int) -> list[FramedReport]:
         """What has come and was never heard, of ticks up to `known`, the oldest first."""
         return [
             self._reports[tick]
@@ -58,7 +60,7 @@ class Post:
         ]
 
     def list(self, ticks: Iterable[int]) -> None:
-        """A Sense has listed those of these `ticks`."""
+        """A Observation has listed those of these `ticks`."""
         self._listed.update(ticks)
 
     def forget(self, before: int, asked_for: Collection[int]) -> None:

@@ -10,14 +10,22 @@ from collections.abc import Sequence
 import msgspec
 
 from agent.planning import planner
-from agent.planning.state import Mind
+from agent.planning.state import RobotState
 from protocol.journal import environment
 from protocol.journal.journal_file import Sink
-from protocol.messages import Briefing, Drive, End, Farewell, Missed, Report, Sense
+from protocol.messages import (
+    Command,
+    DeadlineMissed,
+    FinalReport,
+    MissionEnd,
+    Observation,
+    Report,
+    RobotConfig,
+)
 from protocol.wire import encode
 
 
-class Told(msgspec.Struct, frozen=True):
+class FramedReport(msgspec.Struct, frozen=True):
     """A report and the frame that it came in, or goes out in."""
 
     report: Report
@@ -27,12 +35,12 @@ class Told(msgspec.Struct, frozen=True):
 class Robot:
     """One robot's mind, and the record of what went in and came out of it."""
 
-    def __init__(self, briefing: Briefing, journal: Sink | None = None) -> None:
-        self.mind = Mind(briefing)
-        self.told: Told | None = None
+    def __init__(self, briefing: RobotConfig, journal: Sink | None = None) -> None:
+        self.mind = RobotState(briefing)
+        self.told: FramedReport | None = None
         """the report of this tick, if there was anyone to hear it"""
-        self.drive: Drive | None = None
-        """the Drive of this tick; none before it is decided"""
+        self.drive: Command | None = None
+        """the Command of this tick; none before it is decided"""
         self.reports_sent = 0
         self.damaged = 0
         """reports that came damaged"""
@@ -41,7 +49,7 @@ class Robot:
         self.bytes_sent = 0
         self._frame: bytes | None = None
         self._unwritten: bytes | None = None
-        """a Sense that nothing has followed from yet; journaled with the Drive, before that is sent"""
+        """a Observation that nothing has followed from yet; journaled with the Command, before that is sent"""
         self._journal = journal
         if journal is not None:
             journal.write(encode(environment.of_robot()), encode(briefing))
@@ -57,13 +65,13 @@ class Robot:
 
     @property
     def drive_frame(self) -> bytes:
-        """What to send of this tick's Drive, once there is one."""
+        """What to send of this tick's Command, once there is one."""
         if self._frame is None:
             assert self.drive is not None
             self._frame = encode(self.drive)
         return self._frame
 
-    def sense(self, sense: Sense, frame: bytes | None = None) -> Told | None:
+    def sense(self, sense: Observation, frame: bytes | None = None) -> FramedReport | None:
         """Fold in what was sensed (it came in `frame`); the report to send, if anyone is there to hear it."""
         self.mind = planner.observe(self.mind, sense)
         self.told = self.drive = self._frame = None
@@ -73,7 +81,7 @@ class Robot:
             self.damaged += len(contact.damaged)
         if sense.contacts:
             report = planner.report(self.mind)
-            self.told = Told(report, encode(report))
+            self.told = FramedReport(report, encode(report))
             self.reports_sent += 1
             self.bytes_sent += len(self.told.frame)
             if self._journal is not None:
@@ -82,14 +90,14 @@ class Robot:
             self._unwritten = frame or encode(sense)
         return self.told
 
-    def decide(self, heard: Sequence[Told] = (), missed: Sequence[str] = ()) -> Drive:
+    def decide(self, heard: Sequence[FramedReport] = (), missed: Sequence[str] = ()) -> Command:
         """Fold in what was heard; the drive for the tick. `missed` are peers whose report did not come."""
         self.mind = planner.decide(self.mind, [told.report for told in heard])
         self.unheard.difference_update([told.report.tick for told in heard])
         self.drive = planner.drive(self.mind)
         if self._journal is not None:
             frames = [told.frame for told in heard]
-            frames += [encode(Missed(self.mind.tick, peer)) for peer in missed]
+            frames += [encode(DeadlineMissed(self.mind.tick, peer)) for peer in missed]
             if self._unwritten is not None:
                 frames.insert(0, self._unwritten)
                 self._unwritten = None
@@ -97,9 +105,9 @@ class Robot:
         return self.drive
 
     def estimate(self) -> bytes:
-        """The frame of what the robot holds possible, for whoever watches; once a tick, after the Drive.
+        """The frame of what the robot holds possible, for whoever watches; once a tick, after the Command.
 
-        Nobody waits for it, so it is made and journaled when the Drive is on its way.
+        Nobody waits for it, so it is made and journaled when the Command is on its way.
         """
         frame = encode(planner.estimate(self.mind))
         if self._journal is not None:
@@ -107,12 +115,12 @@ class Robot:
         return frame
 
     def farewell(
-        self, end: End, *, reports_refused: int = 0, reports_unheard: int = 0, frames_refused: int = 0
-    ) -> Farewell:
+        self, end: MissionEnd, *, reports_refused: int = 0, reports_unheard: int = 0, frames_refused: int = 0
+    ) -> FinalReport:
         """The mission is over: how it went, seen from inside, and what the wire brought that was no use."""
         mind, findings = self.mind, self.mind.findings
         plan = findings.plan
-        farewell = Farewell(
+        farewell = FinalReport(
             robot=mind.briefing.robot,
             anchor_ranges=len(mind.log.ranges),
             mutual_ranges=len(mind.mutual),

@@ -9,7 +9,7 @@ from agent.process.agent_journal import Step
 from agent.process.robot import Robot
 from compose.audit.evidence import Testified
 from compose.audit.findings import Checks, Violation, between, difference, said
-from protocol.messages import End, Farewell, Message, Report
+from protocol.messages import FinalReport, Message, MissionEnd, Report
 from protocol.mission import Mission
 from protocol.motion import Controls
 from protocol.wire import decode, encode
@@ -19,7 +19,7 @@ ROUNDING = 1e-12
 
 
 def decision(case: Testified) -> Checks:
-    """Every Report, Drive, Estimate and Farewell is, to the bit, what the planner makes of what came in."""
+    """Every Report, Command, Estimate and FinalReport is, to the bit, what the planner makes of what came in."""
     for robot, past in case.pasts.items():
         tick = None
         try:
@@ -60,8 +60,8 @@ def _same(tick: int, robot: str, found: Message, expected: bytes) -> Violation |
     return Violation("decision", tick, robot, what, between(found, wanted))
 
 
-def _last_word(again: Robot, robot: str, end: End, found: Farewell) -> Violation | None:
-    """The Farewell; what the wire brought that was no use, only the process knows."""
+def _last_word(again: Robot, robot: str, end: MissionEnd, found: FinalReport) -> Violation | None:
+    """The FinalReport; what the wire brought that was no use, only the process knows."""
     expected = again.farewell(
         end,
         reports_refused=found.reports_refused - again.damaged,
@@ -98,7 +98,7 @@ def _within(tick: int, robot: str, how: str, controls: Controls, mission: Missio
 
 
 def log(case: Testified) -> Checks:
-    """What a robot told of its manoeuvres and ranges is what its own Senses say.
+    """What a robot told of its manoeuvres and ranges is what its own Observations say.
 
     Who was told to lie tells, to the bit, what its lie makes of that; to which `decision` holds it.
     """

@@ -11,20 +11,20 @@ from agent.planning.paper import CHECKED as CHECKED_BY_LETTER
 from agent.planning.phase3_last_manoeuvre import ELSEWHERE
 from agent.planning.range_seeking import travelled
 from agent.process.agent_journal import Past
-from compose.audit.evidence import Case
+from compose.audit.evidence import Evidence
 from compose.audit.findings import Checks, Violation, between
-from protocol.messages import End, Localised
+from protocol.messages import Localised, MissionEnd
 from protocol.motion import Pose
 from world.referee import inaccuracy, mistake
-from world.scenario import Placed
+from world.scenario import RobotSpec
 
 PLACES = 3
 """different relative placements that exact ranges must have been taken from: two leave several solutions"""
 
 
-def claim(case: Case) -> Checks:
+def claim(case: Evidence) -> Checks:
     """Whoever claimed to be localised was right, knew it as well as the mission asks for, and had a redundant
-    range; the End is the referee's."""
+    range; the MissionEnd is the referee's."""
     for place, placed in enumerate(case.history.scenario.robots):
         tick, made = _first_claim(case, placed.id)
         if made is None:
@@ -40,7 +40,7 @@ def claim(case: Case) -> Checks:
     yield from outcome(case)
 
 
-def _first_claim(case: Case, robot: str) -> tuple[int, Localised | None]:
+def _first_claim(case: Evidence, robot: str) -> tuple[int, Localised | None]:
     """What it claimed, and when; whatever it says later, it has said that."""
     for tick, one in enumerate(case.history.ticks):
         drive = one.drives.get(robot)
@@ -49,7 +49,7 @@ def _first_claim(case: Case, robot: str) -> tuple[int, Localised | None]:
     return 0, None
 
 
-def _redundant(case: Case, placed: Placed, past: Past, tick: int) -> Violation | None:
+def _redundant(case: Evidence, placed: RobotSpec, past: Past, tick: int) -> Violation | None:
     """It had as many ranges as a claim takes, until the last tick of which it had heard the peer's log."""
     scenario = case.history.scenario
     noise = scenario.mission.noise
@@ -65,7 +65,7 @@ def _redundant(case: Case, placed: Placed, past: Past, tick: int) -> Violation |
     return _too_few(tick, placed, "mutual ranges", len(mutual), least)
 
 
-def _too_few(tick: int, placed: Placed, what: str, found: int, expected: int) -> Violation | None:
+def _too_few(tick: int, placed: RobotSpec, what: str, found: int, expected: int) -> Violation | None:
     if found >= expected:
         return None
     return Violation(
@@ -82,7 +82,7 @@ def _ranged(past: Past, through: int) -> list[int]:
     ]
 
 
-def _places(case: Case, placed: Placed, ticks: Sequence[int]) -> int:
+def _places(case: Evidence, placed: RobotSpec, ticks: Sequence[int]) -> int:
     """From how many different relative placements of the pair the ranges of those ticks were taken."""
     ids = [robot.id for robot in case.history.scenario.robots]
     one, other = ids.index(placed.id), ids.index(placed.peer)
@@ -97,12 +97,12 @@ def _places(case: Case, placed: Placed, ticks: Sequence[int]) -> int:
     return len(found)
 
 
-def outcome(case: Case) -> Checks:
-    """The End is what the referee says, by the truth; a run may have failed before he says anything."""
+def outcome(case: Evidence) -> Checks:
+    """The MissionEnd is what the referee says, by the truth; a run may have failed before he says anything."""
     end, judgement = case.history.end, case.history.judgement
     if end is None:
         return
-    expected = End(end.tick, *astuple(judgement)) if judgement is not None else None
+    expected = MissionEnd(end.tick, *astuple(judgement)) if judgement is not None else None
     if expected is not None and end != expected:
         what = f"it ends {_told(end)}, expected {_told(expected)}"
         yield Violation("claim", end.tick, None, what, between(end, expected))
@@ -112,5 +112,5 @@ def outcome(case: Case) -> Checks:
         yield None
 
 
-def _told(end: End) -> str:
+def _told(end: MissionEnd) -> str:
     return f"{end.outcome} ({end.reason})" if end.reason else end.outcome

@@ -6,14 +6,14 @@ import math
 from collections.abc import Sequence
 
 from agent.process.agent_journal import Past, Step
-from agent.process.robot import Told
-from compose.audit.evidence import Case, Testified
+from agent.process.robot import FramedReport
+from compose.audit.evidence import Evidence, Testified
 from compose.audit.findings import Checks, Violation, between, difference, said
 from protocol.wire import encode
 
 
-def sense(case: Case) -> Checks:
-    """Every Sense is, to the bit, what the sensors say where the Drives on record have led everyone."""
+def sense(case: Evidence) -> Checks:
+    """Every Observation is, to the bit, what the sensors say where the Commands on record have led everyone."""
     for robot, past in case.pasts.items():
         for step in past.steps[: len(case.senses)]:
             expected = case.senses[step.sense.tick][robot]
@@ -24,8 +24,8 @@ def sense(case: Case) -> Checks:
                 yield Violation("sense", step.sense.tick, robot, what, between(step.sense, expected))
 
 
-def contact(case: Case) -> Checks:
-    """Nothing was sent or heard but in contact, and what was heard is what the Sense listed."""
+def contact(case: Evidence) -> Checks:
+    """Nothing was sent or heard but in contact, and what was heard is what the Observation listed."""
     for robot, past in case.pasts.items():
         for step in past.steps:
             if step.report is not None and step.sense.tick < len(case.senses):
@@ -36,7 +36,7 @@ def contact(case: Case) -> Checks:
                 yield _heard(case, robot, step, told)
 
 
-def _sent(case: Case, robot: str, step: Step) -> Violation | None:
+def _sent(case: Evidence, robot: str, step: Step) -> Violation | None:
     if case.contact(robot, step.sense.tick) is not None:
         return None
     return Violation("contact", step.sense.tick, robot, "it sent a report, expected none: out of contact")
@@ -58,7 +58,7 @@ def _in_order(some: Sequence[int], of: Sequence[int]) -> bool:
     return all(one in rest for one in some)
 
 
-def _heard(case: Case, robot: str, step: Step, told: Told) -> Violation | None:
+def _heard(case: Evidence, robot: str, step: Step, told: FramedReport) -> Violation | None:
     now, then = step.sense.tick, told.report.tick
     if max(now, then) >= len(case.senses):
         return None  # where they were, nobody knows
@@ -89,7 +89,7 @@ def _on_record(peer: Past) -> float:
     return len(peer.steps) - 1 if cut else len(peer.steps)
 
 
-def _as_sent(robot: str, step: Step, told: Told, peer: Past) -> Violation | None:
+def _as_sent(robot: str, step: Step, told: FramedReport, peer: Past) -> Violation | None:
     tick, steps = step.sense.tick, peer.steps
     sent = steps[told.report.tick].report if told.report.tick < len(steps) else None
     if sent is None:

@@ -11,12 +11,12 @@ from agent.process.agent_journal import OutOfOrder, Past, past
 from compose.recording.run import WORLD_JOURNAL, agent_journal
 from protocol.journal.environment import is_blank, of_robot, otherwise
 from protocol.journal.journal_file import CorruptJournal
-from protocol.messages import Contact, Drive, Sense
+from protocol.messages import Command, Contact, Observation
 from world.tick import senses
 from world.world_journal import History, history
 
 
-class Testimony(msgspec.Struct, frozen=True):
+class AgentLog(msgspec.Struct, frozen=True):
     """A robot's journal, as far as it can be followed."""
 
     past: Past | None
@@ -36,13 +36,13 @@ class Testified(Protocol):
         """Of the robots that tell one."""
 
 
-class Case(msgspec.Struct, frozen=True):
+class Evidence(msgspec.Struct, frozen=True):
     """A run, before the judge."""
 
     history: History
-    senses: tuple[dict[str, Sense], ...]
-    """what every robot senses, tick by tick, where the Drives on record have led it"""
-    testimonies: dict[str, Testimony]
+    senses: tuple[dict[str, Observation], ...]
+    """what every robot senses, tick by tick, where the Commands on record have led it"""
+    testimonies: dict[str, AgentLog]
     """of every robot of the scenario"""
 
     @property
@@ -62,12 +62,12 @@ class Case(msgspec.Struct, frozen=True):
             return None
         return next(iter(self.senses[tick][robot].contacts), None)
 
-    def drive(self, robot: str, tick: int) -> Drive | None:
+    def drive(self, robot: str, tick: int) -> Command | None:
         """What the world had of `robot` at that tick."""
         return self.history.ticks[tick].drives.get(robot)
 
 
-def case_of(journals: Mapping[str, Iterable[bytes]], folder: object) -> Case:
+def case_of(journals: Mapping[str, Iterable[bytes]], folder: object) -> Evidence:
     """The frames of the journals in `folder`, by name, as a case.
 
     Raises CorruptJournal, whose text names the journal.
@@ -82,20 +82,20 @@ def case_of(journals: Mapping[str, Iterable[bytes]], folder: object) -> Case:
             raise CorruptJournal(f"{folder}/{name} is the journal of {testimony.past.briefing.robot}")
         testimonies[robot.id] = testimony
     sensed = tuple([{sense.robot: sense for sense in senses(world)} for world in told.worlds])
-    return Case(told, sensed, testimonies)
+    return Evidence(told, sensed, testimonies)
 
 
-_NONE = Testimony(None, missing=True)
+_NONE = AgentLog(None, missing=True)
 
 
-def testimony_of(frames: list[bytes], source: object) -> Testimony:
+def testimony_of(frames: list[bytes], source: object) -> AgentLog:
     """What `frames` tell, as far as that can be followed. Raises CorruptJournal."""
     if is_blank(frames):
-        return Testimony(None)
+        return AgentLog(None)
     try:
-        return Testimony(past(frames, source))
+        return AgentLog(past(frames, source))
     except OutOfOrder as error:
-        return Testimony(past(frames[: error.place], source), error.what, error.tick)
+        return AgentLog(past(frames[: error.place], source), error.what, error.tick)
 
 
 def other_versions(pasts: Mapping[str, Past]) -> str | None:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from agent.process.agent_journal import Past
-from compose.audit.evidence import Case
-from compose.audit.findings import Befallen, Checks, Violation, said
+from compose.audit.evidence import Evidence
+from compose.audit.findings import Checks, LinkStatistics, Violation, said
 
 
-def faults(case: Case) -> Checks:
-    """What each Sense lists as heard, and as damaged, is what the fault plan does to the reports sent."""
+def faults(case: Evidence) -> Checks:
+    """What each Observation lists as heard, and as damaged, is what the fault plan does to the reports sent."""
     if not case.history.scenario.faults:
         return
     for robot, past in case.pasts.items():
@@ -25,20 +25,20 @@ def faults(case: Case) -> Checks:
                     yield Violation("faults", step.sense.tick, robot, what)
 
 
-def befallen(case: Case) -> tuple[Befallen, ...]:
+def befallen(case: Evidence) -> tuple[LinkStatistics, ...]:
     """Of every link of the scenario's pairs whose receiver is on record; nothing without a fault plan."""
     if not case.history.scenario.faults:
         return ()
     return tuple([_befallen(past) for past in case.pasts.values()])
 
 
-def _befallen(past: Past) -> Befallen:
+def _befallen(past: Past) -> LinkStatistics:
     """Of the link to this robot."""
     contacts = [(step.sense.tick, contact) for step in past.steps for contact in step.sense.contacts]
     heard = [(now, tick) for now, contact in contacts for tick in contact.heard or ()]
     damaged = [tick for _, contact in contacts for tick in contact.damaged]
     ticks = [tick for _, tick in heard]
-    return Befallen(
+    return LinkStatistics(
         link=f"{past.briefing.peer}->{past.briefing.robot}",
         sent=len(contacts),
         heard=len(heard),

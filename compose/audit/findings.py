@@ -62,8 +62,8 @@ class Count(msgspec.Struct, frozen=True):
     violations: int
 
 
-class Befallen(msgspec.Struct, frozen=True):
-    """A link, and what became of the reports on it, as Senses have it; a copy counts for itself."""
+class LinkStatistics(msgspec.Struct, frozen=True):
+    """A link, and what became of the reports on it, as Observations have it; a copy counts for itself."""
 
     link: str
     sent: int
@@ -88,7 +88,7 @@ class Findings(msgspec.Struct, frozen=True):
     """a rule each"""
     violations: tuple[Violation, ...]
     """the earliest first"""
-    radio: tuple[Befallen, ...] = ()
+    radio: tuple[LinkStatistics, ...] = ()
     """of each link, under a fault plan"""
     rounding: tuple[Violation, ...] = ()
     """what differs by rounding alone, in a recording that was made with other versions: no violations"""
@@ -106,7 +106,7 @@ def findings_of(
     *,
     scenario: str,
     ticks: int,
-    radio: tuple[Befallen, ...] = (),
+    radio: tuple[LinkStatistics, ...] = (),
 ) -> Findings:
     """Return what each of `rules`, counted by its name, finds in `case`; `versions` says which differ."""
     checks = {rule.__name__: list(rule(case)) for rule in rules}

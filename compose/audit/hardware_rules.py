@@ -13,7 +13,7 @@ import msgspec
 from agent.process.agent_journal import Past
 from compose.audit.agent_rules import decision, limits, log
 from compose.audit.delivery_rules import report
-from compose.audit.evidence import Testimony, other_versions, testimony_of
+from compose.audit.evidence import AgentLog, other_versions, testimony_of
 from compose.audit.findings import Checks, Findings, findings_of
 from compose.audit.journal_rules import broken_off, whole
 from compose.audit.scenario_rules import briefing
@@ -24,7 +24,7 @@ from protocol.journal.journal_file import CorruptJournal
 class Alone(msgspec.Struct, frozen=True):
     """The robots' journals, and nothing else."""
 
-    testimonies: dict[str, Testimony]
+    testimonies: dict[str, AgentLog]
 
     @property
     def pasts(self) -> dict[str, Past]:
@@ -55,7 +55,7 @@ def judge_alone(
 
     Raises CorruptJournal, whose text names the journal.
     """
-    testimonies: dict[str, Testimony] = {}
+    testimonies: dict[str, AgentLog] = {}
     for name, frames in journals.items():
         testimony = testimony_of(list(frames), f"{folder}/{name}")
         robot = name.removeprefix("agent-").removesuffix(".journal")

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from agent.process.agent_journal import Past, Step
-from compose.audit.evidence import Case, Testimony
+from compose.audit.evidence import AgentLog, Evidence
 from compose.audit.findings import Checks, Violation, between, difference
 from protocol.wire import encode
 
 
-def order(case: Case) -> Checks:
+def order(case: Evidence) -> Checks:
     """Every journal is whole and in its order; what is in two of them is the same in both.
 
     Of a journal that breaks off, or is out of order somewhere, only that is said: what there is counts.
@@ -27,18 +27,18 @@ def order(case: Case) -> Checks:
             yield _same_farewell(case, robot, past)
 
 
-def _of_the_world(case: Case) -> Violation | None:
+def _of_the_world(case: Evidence) -> Violation | None:
     told = case.history
     if told.disorder is not None:
         return Violation("order", told.disorder.tick, None, told.disorder.what)
     if told.end is None:
         last = told.ticks[-1].world.truth.tick if told.ticks else None
-        what = "its journal breaks off here, expected an End"
+        what = "its journal breaks off here, expected an MissionEnd"
         return Violation("order", last, None, what, breaks_off=True)
     return None
 
 
-def _of_the_robot(case: Case, robot: str, testimony: Testimony) -> Violation | None:
+def _of_the_robot(case: Evidence, robot: str, testimony: AgentLog) -> Violation | None:
     past, end = testimony.past, case.history.end
     if testimony.missing:
         return Violation("order", None, robot, "it has left no journal", breaks_off=True)
@@ -52,25 +52,25 @@ def _of_the_robot(case: Case, robot: str, testimony: Testimony) -> Violation | N
     return None
 
 
-def broken_off(robot: str, testimony: Testimony) -> Violation | None:
+def broken_off(robot: str, testimony: AgentLog) -> Violation | None:
     """Where its journal is out of order, or breaks off."""
     past = testimony.past
     if testimony.disorder is not None:
         return Violation("order", testimony.disorder_tick, robot, testimony.disorder)
     if past is None or past.farewell is None:
         last = past.steps[-1].sense.tick if past is not None and past.steps else None
-        what = "its journal breaks off here, expected End and Farewell"
+        what = "its journal breaks off here, expected MissionEnd and Farewell"
         return Violation("order", last, robot, what, breaks_off=True)
     return None
 
 
 def whole(robot: str, past: Past, step: Step, *, excused: bool) -> Violation | None:
-    """Every Sense was answered, but for the last: that may have come too late, or been the last of all."""
+    """Every Observation was answered, but for the last: that may have come too late, or been the last of all."""
     tick, last = step.sense.tick, step is past.steps[-1]
     if last and (past.end is None or (excused and step.drive is None)):
         return None
     if step.drive is None:
-        return Violation("order", tick, robot, "no Drive follows its Sense")
+        return Violation("order", tick, robot, "no Command follows its Sense")
     if step.estimate is None:
         return Violation("order", tick, robot, "no Estimate follows its Drive")
     if step.missed and past.briefing.tick_s is None:
@@ -78,49 +78,49 @@ def whole(robot: str, past: Past, step: Step, *, excused: bool) -> Violation | N
     return None
 
 
-def _same_drive(case: Case, robot: str, past: Past, step: Step) -> Violation | None:
-    """The world had the Drive that the robot gave."""
+def _same_drive(case: Evidence, robot: str, past: Past, step: Step) -> Violation | None:
+    """The world had the Command that the robot gave."""
     tick = step.sense.tick
     if tick >= len(case.history.ticks):
         return None
     had, gave = case.drive(robot, tick), step.drive
     if had is None and past.briefing.tick_s is None:
-        return Violation("order", tick, robot, "the world went without its Drive, expected it to wait")
+        return Violation("order", tick, robot, "the world went without its Command, expected it to wait")
     if had is None or (gave is None and past.end is None):
         return None
     if gave is None:
-        return Violation("order", tick, robot, "the world has a Drive of it, expected none: it gave none")
+        return Violation("order", tick, robot, "the world has a Command of it, expected none: it gave none")
     if encode(had) == encode(gave):
         return None
-    what = f"the world's Drive of it: {difference(had, gave)}"
+    what = f"the world's Command of it: {difference(had, gave)}"
     return Violation("order", tick, robot, what, between(had, gave))
 
 
-def _same_end(case: Case, robot: str, past: Past) -> Violation | None:
+def _same_end(case: Evidence, robot: str, past: Past) -> Violation | None:
     """The robot was told how it ended, as the world put it down."""
     assert past.end is not None
     assert case.history.end is not None
     if encode(past.end) == encode(case.history.end):
         return None
-    what = f"the End that it was told: {difference(past.end, case.history.end)}"
+    what = f"the MissionEnd that it was told: {difference(past.end, case.history.end)}"
     return Violation("order", past.end.tick, robot, what, between(past.end, case.history.end))
 
 
-def _same_farewell(case: Case, robot: str, past: Past) -> Violation | None:
+def _same_farewell(case: Evidence, robot: str, past: Past) -> Violation | None:
     """The world has heard the robot's last word."""
     assert past.end is not None
     said, heard = past.farewell, case.history.farewells.get(robot)
     if said is None:
         return None
     if heard is None:
-        return Violation("order", past.end.tick, robot, "the world has no Farewell of it", breaks_off=True)
+        return Violation("order", past.end.tick, robot, "the world has no FinalReport of it", breaks_off=True)
     if encode(heard) == encode(said):
         return None
-    what = f"the world's Farewell of it: {difference(heard, said)}"
+    what = f"the world's FinalReport of it: {difference(heard, said)}"
     return Violation("order", past.end.tick, robot, what, between(heard, said))
 
 
-def briefing(case: Case) -> Checks:
+def briefing(case: Evidence) -> Checks:
     """Every robot was told what the scenario says, and all of them the same duration of a tick."""
     tick_s = next((past.briefing.tick_s for past in case.pasts.values()), None)
     for robot, past in case.pasts.items():

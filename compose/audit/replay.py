@@ -1,6 +1,6 @@
 """A run once more, on what its journals say came in; and whether everything follows as it is on record.
 
-The world is moved by the Drives on record, and senses anew; every robot's planner is run on the Senses and
+The world is moved by the Commands on record, and senses anew; every robot's planner is run on the Observations and
 Reports that came to its process. This is the judge's own doing: of his rules those that recompute something.
 Where there was no world, the robots' journals are held against themselves.
 """
@@ -15,7 +15,7 @@ import msgspec
 from compose.audit.agent_rules import decision
 from compose.audit.claim_rules import outcome
 from compose.audit.delivery_rules import contact, report, sense
-from compose.audit.evidence import Case
+from compose.audit.evidence import Evidence
 from compose.audit.findings import Checks, Violation
 from compose.audit.hardware_rules import Alone
 from compose.audit.hardware_rules import order as order_alone
@@ -23,7 +23,7 @@ from compose.audit.journal_rules import briefing, order
 from compose.audit.rules import judged
 from compose.recording.run import books
 
-RULES: tuple[Callable[[Case], Checks], ...] = (briefing, sense, contact, report, decision, order, outcome)
+RULES: tuple[Callable[[Evidence], Checks], ...] = (briefing, sense, contact, report, decision, order, outcome)
 """in the order of a tick: what differs first has caused what differs later"""
 ALONE: tuple[Callable[[Alone], Checks], ...] = (report, decision, order_alone)
 """the same without a world"""

@@ -9,7 +9,7 @@ from compose.audit import hardware_rules
 from compose.audit.agent_rules import decision, limits, log
 from compose.audit.claim_rules import claim
 from compose.audit.delivery_rules import contact, report, sense
-from compose.audit.evidence import Case, case_of, other_versions
+from compose.audit.evidence import Evidence, case_of, other_versions
 from compose.audit.fault_rules import befallen, faults
 from compose.audit.findings import Checks, Findings, findings_of
 from compose.audit.hardware_rules import Alone, judge_alone
@@ -18,7 +18,7 @@ from compose.audit.scenario_rules import scenario
 from compose.recording.run import WORLD_JOURNAL, books
 from protocol.journal.environment import of_world, otherwise
 
-RULES: tuple[Callable[[Case], Checks], ...] = (
+RULES: tuple[Callable[[Evidence], Checks], ...] = (
     order,
     scenario,
     briefing,
@@ -46,7 +46,7 @@ def audit(folder: Path) -> Findings:
 def judged(
     journals: Mapping[str, Iterable[bytes]],
     folder: object,
-    rules: Sequence[Callable[[Case], Checks]] = RULES,
+    rules: Sequence[Callable[[Evidence], Checks]] = RULES,
     without: Sequence[Callable[[Alone], Checks]] = hardware_rules.RULES,
 ) -> Findings:
     """What there is to find by `rules`, or `without` a world, in the frames of `journals`, by name.
@@ -61,7 +61,7 @@ def judged(
 def judge(
     journals: Mapping[str, Iterable[bytes]],
     folder: object = "the record",
-    rules: Sequence[Callable[[Case], Checks]] = RULES,
+    rules: Sequence[Callable[[Evidence], Checks]] = RULES,
 ) -> Findings:
     """What there is to find in the frames of `journals`, by name; `folder` is where errors say they are.
 

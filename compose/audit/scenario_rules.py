@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 
-from compose.audit.evidence import Case, Testified
+from compose.audit.evidence import Evidence, Testified
 from compose.audit.findings import Checks, Violation, difference
 from compose.scenario.scenario_file import NEAREST_ANCHORS
 from protocol.attack import OF_THE_START
 from protocol.mission import Anchor, Mission, Variant, noise_obstacle, obstacle, safety_obstacle
 from protocol.orbits import Rendezvous, rendezvous
-from world.scenario import Placed
+from world.scenario import RobotSpec
 
 
-def scenario(case: Case) -> Checks:
+def scenario(case: Evidence) -> Checks:
     """Check that `tandem run` accepts the scenario, and that its orbits follow from the rest of it."""
     told = case.history.scenario
     for why in (noise_obstacle(told.mission), safety_obstacle(told.mission)):
@@ -41,17 +41,17 @@ def briefing(case: Testified) -> Checks:
         yield Violation("briefing", None, robot, why) if why is not None else None
 
 
-def _off_role(robot: Placed, *, first: bool) -> str | None:
+def _off_role(robot: RobotSpec, *, first: bool) -> str | None:
     return None if (robot.role == "a") == first else f"role is {robot.role}: the first of a pair is a"
 
 
-def _off_range(robot: Placed, mission: Mission) -> str | None:
+def _off_range(robot: RobotSpec, mission: Mission) -> str | None:
     rho0 = math.dist((robot.start.x, robot.start.y), (robot.anchor.x, robot.anchor.y))
     reach = mission.sensing_range
     return f"it starts {rho0:.12g} m from its anchor, outside R = {reach:.12g} m" if rho0 > reach else None
 
 
-def _off_lie(robot: Placed) -> str | None:
+def _off_lie(robot: RobotSpec) -> str | None:
     early = robot.lie is not None and robot.lie.kind in OF_THE_START and robot.lie.part != "all"
     return "its lie is of the start, and not of all" if early else None
 

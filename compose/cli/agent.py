@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from agent.process.discovery import NoWorld, Search, Unwelcome, join
-from agent.process.link import LinkLost
+from agent.process.link import WorldLinkLost
 from agent.process.node import AgentProcess
 from agent.process.recovery import Memory, remember
 from agent.process.robot import Robot
@@ -18,7 +18,7 @@ from compose.scenario import kills
 from compose.terminal.outcome import going_on
 from protocol.journal.journal_file import CannotRecord, CorruptJournal, Journal
 from protocol.journal.resume import Retrace
-from protocol.messages import Briefing, End
+from protocol.messages import MissionEnd, RobotConfig
 from protocol.network import session
 from protocol.network.endpoints import Endpoints
 from protocol.network.inbox import Inbox, Interrupted
@@ -58,7 +58,7 @@ def main(options: argparse.Namespace) -> int:
     return status_of(end.outcome)
 
 
-def _play(options: argparse.Namespace, inbox: Inbox) -> End:
+def _play(options: argparse.Namespace, inbox: Inbox) -> MissionEnd:
     endpoints = _endpoints(options)
     path: Path | None = options.out / f"agent-{options.id}.journal" if options.out is not None else None
     old = Retrace(path, fsync=options.fsync) if path is not None and path.exists() else None
@@ -97,7 +97,7 @@ def _play(options: argparse.Namespace, inbox: Inbox) -> End:
                 else:
                     process.attach(link)
                 return _left(options, process.play())
-        except LinkLost:
+        except WorldLinkLost:
             continue
         except NoWorld:
             end = process.end if process is not None else end
@@ -106,7 +106,7 @@ def _play(options: argparse.Namespace, inbox: Inbox) -> End:
             return end
 
 
-def _left(options: argparse.Namespace, end: End) -> End:
+def _left(options: argparse.Namespace, end: MissionEnd) -> MissionEnd:
     """Return `end`; a process of a launcher ends here instead, with its link open.
 
     The world has all of it on record, and where many robots end at once, closing takes a while.
@@ -125,7 +125,7 @@ def _endpoints(options: argparse.Namespace) -> Endpoints:
 
 def _ready(
     options: argparse.Namespace,
-    briefing: Briefing,
+    briefing: RobotConfig,
     old: Retrace | None,
     memory: Memory | None,
     inbox: Inbox,

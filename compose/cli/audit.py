@@ -6,7 +6,7 @@ import argparse
 
 from msgspec.structs import astuple
 
-from compose.audit.findings import Befallen, Findings
+from compose.audit.findings import Findings, LinkStatistics
 from compose.audit.rules import audit
 from compose.errors import CLEAN, VIOLATED
 from compose.recording.run import legible
@@ -34,7 +34,7 @@ def _show(findings: Findings) -> None:
         from compose.terminal import tables  # noqa: PLC0415  # rich takes time to import
 
         rows = [[str(value) for value in astuple(link)] for link in findings.radio]
-        made = tables.table(["link"], Befallen.__struct_fields__[1:], rows)
+        made = tables.table(["link"], LinkStatistics.__struct_fields__[1:], rows)
         say("", *tables.lines(made, text_width.room()))
     if findings.rounding:
         say("", f"{len(findings.rounding)} checks differ by rounding alone: {findings.versions}")

@@ -120,7 +120,7 @@ def _ticks(rounds: int, done: Callable[[], None]) -> Table:
 
 
 def _frame_sizes(played: Scenario) -> tuple[int, int]:
-    """Bytes of a typical Sense, and of a typical Drive."""
+    """Bytes of a typical Observation, and of a typical Command."""
     course = Course(played)
     senses: list[int] = []
     drives: list[int] = []

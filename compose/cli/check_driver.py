@@ -7,7 +7,7 @@ from contextlib import closing
 
 from compose.errors import CLEAN, VIOLATED
 from compose.hardware.conformance import judged
-from compose.hardware.exercise import Broken, Trial
+from compose.hardware.exercise import Broken, ExerciseRun
 from compose.launch.driver_loader import briefed, driver_class, made, mission, options_of
 from compose.scenario.scenario_file import check_rate
 from compose.terminal import text_width
@@ -25,7 +25,7 @@ def main(options: argparse.Namespace) -> int:
     briefing = briefed(scenario, options.robot, manoeuvre_s)
     maker, given = driver_class(options.driver), options_of(options.option)
     with closing(made(maker, options.driver, briefing, manoeuvre_s, given)) as driver:
-        trial = Trial(driver, briefing, manoeuvre_s)
+        trial = ExerciseRun(driver, briefing, manoeuvre_s)
         try:
             trial.go_through()
         except Broken as broken:

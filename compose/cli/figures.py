@@ -18,7 +18,7 @@ from protocol.output import say
 
 if TYPE_CHECKING:
     from compose.figures.account import Account
-    from compose.figures.pair import Pair
+    from compose.figures.pair import PairRecord
 
 
 def main(options: argparse.Namespace) -> int:
@@ -66,7 +66,7 @@ def _casts(folder: Path, record: Record | None) -> list[tuple[str, ...]]:
     return [(robots[a].id, robots[b].id) for a, b in record.scenario.pairs()]
 
 
-def _pair(record: Record | None, robots: Sequence[str], accounts: Mapping[str, Account]) -> Pair | None:
+def _pair(record: Record | None, robots: Sequence[str], accounts: Mapping[str, Account]) -> PairRecord | None:
     """None of those of whom nothing is known."""
     from compose.figures.pair import of_record, of_robots  # noqa: PLC0415
 
@@ -78,7 +78,7 @@ def _pair(record: Record | None, robots: Sequence[str], accounts: Mapping[str, A
 
 
 def draw(
-    pair: Pair,
+    pair: PairRecord,
     kinds: Sequence[str],
     formats: Sequence[str],
     folder: Path,

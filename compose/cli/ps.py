@@ -10,7 +10,7 @@ import msgspec
 
 from compose.doctor import running_missions
 from compose.doctor.router_session import Unreached, linked
-from compose.doctor.running_missions import Mission, Participant
+from compose.doctor.running_missions import Participant, RunningMission
 from compose.errors import ENDED, FAILED
 from compose.network import places
 from compose.terminal import text_width
@@ -23,7 +23,7 @@ INDENT = 4
 
 def main(options: argparse.Namespace) -> int:
     """Look once, and tell."""
-    found: list[tuple[str, Mission]] = []
+    found: list[tuple[str, RunningMission]] = []
     status = ENDED
     for place in places(options):
         try:
@@ -46,7 +46,7 @@ def main(options: argparse.Namespace) -> int:
     return status
 
 
-def _lines(at: str, mission: Mission, wait: float) -> Iterator[str]:
+def _lines(at: str, mission: RunningMission, wait: float) -> Iterator[str]:
     words = [f"{mission.run} at {at}"]
     words.append(f"tick {mission.tick}" if mission.tick is not None else f"no tick within {wait:g} s")
     if mission.outcome is not None:

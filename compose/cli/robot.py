@@ -10,14 +10,14 @@ from pathlib import Path
 from compose.errors import ENDED, FAILED, STOPPED, UserError, status_of
 from compose.hardware.driver_recording import recorded
 from compose.launch.driver_loader import briefed, driver_class, made, mission, options_of
-from compose.launch.processes import STOP_S, Child, ChildFailed, free_endpoint
+from compose.launch.processes import STOP_S, ChildFailed, MissionProcess, free_endpoint
 from compose.launch.signals import stop_by_signal
 from compose.network import beyond, reach
 from compose.recording.run import folder_for
 from compose.recording.summary_json import ended
 from compose.scenario.scenario_file import check_rate
 from protocol.journal.journal_file import CannotRecord, CorruptJournal
-from protocol.messages import End, Localised
+from protocol.messages import Localised, MissionEnd
 from protocol.motion import wrap
 from protocol.network import access_control, session
 from protocol.network.endpoints import Endpoints
@@ -39,9 +39,9 @@ class Agent:
         self._inbox = inbox
         self._child = self._start()
 
-    def _start(self) -> Child:
+    def _start(self) -> MissionProcess:
         self._started, self._told = time.monotonic(), False
-        return Child(f"agent {self._arguments[1]}", self._arguments, self._inbox, ())
+        return MissionProcess(f"agent {self._arguments[1]}", self._arguments, self._inbox, ())
 
     def again(self) -> None:
         """It has ended: by a signal, and it goes on from its journal; or raises ChildFailed."""
@@ -114,13 +114,15 @@ def main(options: argparse.Namespace) -> int:
         say(f"{options.id}: claims {pose.x:.9f} {pose.y:.9f} {wrap(pose.heading):+.9f} (m, m, rad)")
     if not options.quiet:
         slower = f"; a lower --rate, such as {rate / 2:g}, leaves more time" if field.missed else ""
-        stood = f"stood {field.missed} of {end.tick + 1} ticks for want of a Drive in time"
+        stood = f"stood {field.missed} of {end.tick + 1} ticks for want of a Command in time"
         say(f"{options.id}: {stood}{slower}")
     say(f"{options.id}: {ended(end.outcome, end.tick, end.reason)}")
     return status_of(end.outcome)
 
 
-def _play(options: argparse.Namespace, field: Field, reached: Endpoints, folder: Path, inbox: Inbox) -> End:
+def _play(
+    options: argparse.Namespace, field: Field, reached: Endpoints, folder: Path, inbox: Inbox
+) -> MissionEnd:
     """The mission, and an agent for it, which leaves with it."""
     keys = (
         ["--keys", str(options.keys.resolve().parent / access_control.agent(options.id))]

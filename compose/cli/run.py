@@ -18,7 +18,7 @@ from compose.launch.signals import stop_by_signal
 from compose.launch.viewers import Beside, beside, page, stay, viewers
 from compose.recording.run import folder_for, read
 from compose.scenario.kills import WORLD, Kill
-from compose.scenario.scenario_file import Setting, check_rate, run_name, setting
+from compose.scenario.scenario_file import ScenarioTemplate, check_rate, run_name, setting
 from compose.terminal.outcome import break_off, conclude, shown_live
 from protocol.journal.journal_file import CannotRecord
 from protocol.network.inbox import Inbox, Interrupted
@@ -57,7 +57,7 @@ def _check_viewers(options: argparse.Namespace) -> None:
         raise UserError("--foxglove-origin: of a page that shows what --foxglove serves, and there is none")
 
 
-def _kills(options: argparse.Namespace, found: Setting, scenario: Scenario) -> tuple[Kill, ...]:
+def _kills(options: argparse.Namespace, found: ScenarioTemplate, scenario: Scenario) -> tuple[Kill, ...]:
     """Those of the file, then those of the command line. Raises UserError."""
     ids = [robot.id for robot in scenario.robots]
     for kill in options.kill:

@@ -32,7 +32,7 @@ def main(options: argparse.Namespace) -> int:
 
     out = options.out if options.out is not None else Path(f"sweep-{campaign.name}")
     chosen = {"workers": options.workers} if options.workers is not None else {}
-    means = execution.Means(
+    means = execution.ExecutionOptions(
         scheduler=options.scheduler,
         processes=options.processes,
         audit=options.audit,

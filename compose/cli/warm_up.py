@@ -9,11 +9,11 @@ from compose.launch import in_process
 from compose.scenario.scenario_file import load
 from protocol import wire
 from protocol.journal import environment
-from protocol.messages import Briefing, Drive, End, Farewell, Report, Sense
+from protocol.messages import Command, FinalReport, MissionEnd, Observation, Report, RobotConfig
 from world.scenario import Scenario
 
 MISSION = "paper-1"
-RECEIVED = (Briefing, Scenario, Sense | End, Report, Drive, Drive | Farewell)
+RECEIVED = (RobotConfig, Scenario, Observation | MissionEnd, Report, Command, Command | FinalReport)
 """The types that worlds and agents decode."""
 
 

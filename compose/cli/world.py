@@ -25,7 +25,7 @@ from protocol.network import diagnosis, session
 from protocol.network.endpoints import Endpoints
 from protocol.network.inbox import Inbox, Interrupted
 from protocol.output import say
-from world.process import LinkLost, WorldProcess
+from world.process import RobotsLinkLost, WorldProcess
 from world.scenario import Scenario
 from world.simulation import Course, again
 
@@ -130,13 +130,13 @@ class _Way:
             self._inbox.say(f"no router at {self.endpoints} yet: {diagnosis.why(self.endpoints)}")
 
     def play(self, process: WorldProcess) -> None:
-        """The run to its End, over as many sessions as it takes. Raises NoRouter or Interrupted."""
+        """The run to its MissionEnd, over as many sessions as it takes. Raises NoRouter or Interrupted."""
         while True:
             assert self.session is not None
             process.attach(self.session, replaceable=self.endpoints.mode == "client")
             try:
                 process.play()
-            except LinkLost:
+            except RobotsLinkLost:
                 self.open()
             else:
                 return

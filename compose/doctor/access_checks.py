@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import zenoh
 
 from compose.doctor.finding import Finding, fix, ok, untried
-from protocol.messages import Briefing, Sense
+from protocol.messages import Observation, RobotConfig
 from protocol.network import access_control, keys, session
 from protocol.network.endpoints import Endpoints
 from protocol.wire import MalformedFrame, decode
@@ -37,7 +37,7 @@ NO_FRAME = b"?"
 RENEW = "the router must enforce the rules: start it by its zenoh.json5 as `tandem keys` left it"
 
 
-class Pair(NamedTuple):
+class SessionPair(NamedTuple):
     """Two sessions at one router, by the same keys."""
 
     speaker: zenoh.Session
@@ -66,7 +66,7 @@ def probe_run() -> str:
     return f"doctor-{random.SystemRandom().getrandbits(64):016x}"
 
 
-def tried(pair: Pair, endpoints: Endpoints, wait: float) -> Iterator[Finding]:
+def tried(pair: SessionPair, endpoints: Endpoints, wait: float) -> Iterator[Finding]:
     """What `tandem keys` gave these endpoints the right to do passes, and nothing else."""
     who = endpoints.participant
     if who is None:
@@ -102,7 +102,7 @@ def _short(key: str) -> str:
     return key.split("/", 2)[2]
 
 
-def _forged(pair: Pair, who: str, me: str | None, other: str) -> Iterator[Finding]:
+def _forged(pair: SessionPair, who: str, me: str | None, other: str) -> Iterator[Finding]:
     said = dict(_others(probe_run(), me or other, other))
     if passed := sorted(pair.passed(said)):
         yield fix(f"rules: {who} can put {', '.join(passed)}; {RENEW}")
@@ -119,7 +119,7 @@ def _runs(link: zenoh.Session) -> list[str]:
     return [key.run for key in session.alive(link, keys.world_alive("*"), ASK_S)]
 
 
-def _overheard(pair: Pair, run: str, me: str, wait: float) -> Iterator[Finding]:
+def _overheard(pair: SessionPair, run: str, me: str, wait: float) -> Iterator[Finding]:
     """What must not be heard of a mission that runs, while what may be is."""
     peer = _peer(pair.hearer, run, me)
     if peer is None:
@@ -159,7 +159,7 @@ def _overheard(pair: Pair, run: str, me: str, wait: float) -> Iterator[Finding]:
 def _peer(link: zenoh.Session, run: str, me: str) -> str | None:
     answer = session.ask(link, keys.briefing(run, me), ASK_S)
     try:
-        return decode(answer, Briefing).peer if isinstance(answer, bytes) else None
+        return decode(answer, RobotConfig).peer if isinstance(answer, bytes) else None
     except MalformedFrame:
         return None
 
@@ -172,6 +172,6 @@ def _under(key: str, ear: Any) -> zenoh.Sample | None:
 
 def _ticks(frame: bytes) -> set[int]:
     try:
-        return {decode(frame, Sense).tick}
+        return {decode(frame, Observation).tick}
     except MalformedFrame:
         return set()

@@ -30,7 +30,7 @@ FLIGHTS = 4
 """a handshake in memory is over after as many, either way"""
 
 
-class Paper(NamedTuple):
+class CertificateSet(NamedTuple):
     """A certificate, its key, and the authority that must have signed it."""
 
     certificate: Path
@@ -49,14 +49,14 @@ def papers(endpoints: Endpoints, now: float | None = None) -> Iterator[Finding]:
             for name in (f"{side}_certificate", f"{side}_private_key", "root_ca_certificate")
         )
         if certificate is not None and key is not None and authority is not None:
-            paper = Paper(certificate, key, authority, side == "connect")
+            paper = CertificateSet(certificate, key, authority, side == "connect")
             for finding in _findings(paper, endpoints, time.time() if now is None else now):
                 if finding not in told:
                     told.add(finding)
                     yield finding
 
 
-def _findings(paper: Paper, endpoints: Endpoints, now: float) -> Iterator[Finding]:
+def _findings(paper: CertificateSet, endpoints: Endpoints, now: float) -> Iterator[Finding]:
     at = paper.certificate
     if paper.key.stat().st_mode & 0o077:
         yield fix(f"key: others than its owner can read {paper.key}; chmod 600 {paper.key}")
@@ -91,13 +91,13 @@ def _findings(paper: Paper, endpoints: Endpoints, now: float) -> Iterator[Findin
         yield from _known(at, shown, endpoints)
 
 
-def _unusable(paper: Paper, error: ssl.SSLError) -> str:
+def _unusable(paper: CertificateSet, error: ssl.SSLError) -> str:
     if error.reason == "KEY_VALUES_MISMATCH":
         return f"{paper.key} is not its key"
     return f"with {paper.key.name} and {paper.authority.name} it cannot be read: {error.reason or error}"
 
 
-def _named(paper: Paper, name: str, endpoints: Endpoints) -> Iterator[Finding]:
+def _named(paper: CertificateSet, name: str, endpoints: Endpoints) -> Iterator[Finding]:
     """Whether the certificate, the configuration and the folder are of the same participant."""
     if endpoints.participant is None:
         return
@@ -160,7 +160,7 @@ def _date(when: float) -> str:
     return time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(when))
 
 
-def _shown(paper: Paper, trusted: Path) -> Mapping[str, Any]:
+def _shown(paper: CertificateSet, trusted: Path) -> Mapping[str, Any]:
     """What an end of a handshake sees of who shows this certificate. Raises ssl.SSLError."""
     client = _context(ssl.PROTOCOL_TLS_CLIENT, trusted)
     server = _context(ssl.PROTOCOL_TLS_SERVER, trusted)

@@ -10,7 +10,7 @@ import zenoh
 from msgspec.structs import replace
 
 from compose.doctor import access_checks, running_missions
-from compose.doctor.access_checks import ASK_S, Pair, probe_run
+from compose.doctor.access_checks import ASK_S, SessionPair, probe_run
 from compose.doctor.finding import Finding, fix, ok, untried
 from compose.doctor.router_session import Unreached, linked
 from protocol.network import access_control, keys, session
@@ -32,7 +32,7 @@ def network(endpoints: Endpoints, wait: float) -> Iterator[Finding]:
 def _at(endpoints: Endpoints, wait: float) -> Iterator[Finding]:
     with ExitStack() as stack:
         try:
-            pair = Pair(*(stack.enter_context(linked(endpoints)) for _ in range(2)))
+            pair = SessionPair(*(stack.enter_context(linked(endpoints)) for _ in range(2)))
         except Unreached as error:
             yield fix(f"router: {error}")
             return
@@ -43,7 +43,7 @@ def _at(endpoints: Endpoints, wait: float) -> Iterator[Finding]:
         yield from _missions(pair.hearer, endpoints, wait)
 
 
-def _clock(pair: Pair, endpoints: Endpoints) -> Finding:
+def _clock(pair: SessionPair, endpoints: Endpoints) -> Finding:
     """A router stamps what passes it with its own time, between the moments when it is sent and comes.
 
     That time is at most 0.5 s ahead of its host's, where another router's was.
@@ -83,7 +83,7 @@ def _missions(link: zenoh.Session, endpoints: Endpoints, wait: float) -> Iterato
     yield from found or [ok("alive: nobody; no mission is on this network")]
 
 
-def _told(mission: running_missions.Mission) -> Finding:
+def _told(mission: running_missions.RunningMission) -> Finding:
     there = ", ".join(
         [*(["its world"] if mission.world else []), *(one.robot for one in mission.robots if one.there)]
     )

@@ -1,7 +1,7 @@
 """What missions there are on a network, from a moment's listening.
 
 Nobody does anything for a listener that they would not do anyway: signs of life are asked for once, and what
-is listened to are Senses and Drives, which are said whoever listens. Truth and estimates, which are said only
+is listened to are Observations and Commands, which are said whoever listens. Truth and estimates, which are said only
 while somebody listens, are left alone; so are the robots. Listening ends as soon as each has said something.
 """
 
@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 import zenoh
 
-from protocol.messages import Briefing, Drive, End, Farewell, Outcome, Phase, Sense
+from protocol.messages import Command, FinalReport, MissionEnd, Observation, Outcome, Phase, RobotConfig
 from protocol.network import keys, session
 from protocol.network.keys import Key
 from protocol.wire import MalformedFrame, decode, version_of
@@ -25,7 +25,7 @@ FIND_S = 0.5
 """how long to look for a mission where none is to be seen: routers may have been linked just now"""
 LOOK_AGAIN_S = 0.02
 AHEAD = 4
-"""ticks by which a Drive may be ahead of the latest Sense that was heard, which may come by another way"""
+"""ticks by which a Command may be ahead of the latest Observation that was heard, which may come by another way"""
 
 
 class Participant(msgspec.Struct, frozen=True):
@@ -35,19 +35,19 @@ class Participant(msgspec.Struct, frozen=True):
     there: bool
     """whether it shows that it is alive"""
     tick: int | None = None
-    """of its latest Drive; none if it said none in the time"""
+    """of its latest Command; none if it said none in the time"""
     phase: Phase | None = None
     state: str | None = None
 
 
-class Mission(msgspec.Struct, frozen=True):
+class RunningMission(msgspec.Struct, frozen=True):
     """A run, as it was heard last."""
 
     run: str
     world: bool
     """whether its world shows that it is alive"""
     tick: int | None
-    """of the latest Sense or End; none if none was said in the time"""
+    """of the latest Observation or MissionEnd; none if none was said in the time"""
     outcome: Outcome | None
     """once it is over"""
     versions: tuple[int, ...]
@@ -62,7 +62,7 @@ class Mission(msgspec.Struct, frozen=True):
         return (*world, *(one.robot for one in self.robots if not one.there))
 
 
-def look(link: zenoh.Session, wait: float) -> tuple[Mission, ...]:
+def look(link: zenoh.Session, wait: float) -> tuple[RunningMission, ...]:
     """The missions that `link` sees; listens for `wait` s at the most. For viewers, and worlds."""
     there = _there(link)
     if not there:
@@ -137,7 +137,7 @@ class _Ear:
         return message if getattr(message, "robot", key.robot) == key.robot else None
 
 
-def _mission(link: zenoh.Session, ear: _Ear, run: str, there: frozenset[str]) -> Mission:
+def _mission(link: zenoh.Session, ear: _Ear, run: str, there: frozenset[str]) -> RunningMission:
     frames = [
         ear.latest[Key(kind, run, robot)]
         for kind in (keys.sense, keys.drive)
@@ -145,20 +145,22 @@ def _mission(link: zenoh.Session, ear: _Ear, run: str, there: frozenset[str]) ->
     ]
     answers = _briefings(link, run, ear.named(run, keys.sense) | there - {""}) if "" in there else {}
     frames += answers.values()
-    briefed = [one for frame in answers.values() if (one := _said(frame, Briefing)) is not None]
+    briefed = [one for frame in answers.values() if (one := _said(frame, RobotConfig)) is not None]
     named = there - {""} | ear.named(run, keys.sense) | ear.named(run, keys.drive)
     named |= {one.peer for one in briefed}
-    said = [ear.said(Key(keys.sense, run, robot), Sense | End | Farewell) for robot in named]
-    ends = [one for one in said if isinstance(one, End)]
-    tick = max((one.tick for one in said if isinstance(one, Sense | End)), default=None)
-    return Mission(
+    said = [ear.said(Key(keys.sense, run, robot), Observation | MissionEnd | FinalReport) for robot in named]
+    ends = [one for one in said if isinstance(one, MissionEnd)]
+    tick = max((one.tick for one in said if isinstance(one, Observation | MissionEnd)), default=None)
+    return RunningMission(
         run,
         "" in there,
         tick,
         ends[0].outcome if ends else None,
         tuple(sorted({version for frame in frames if (version := version_of(frame)) is not None})),
         tuple(
-            _participant(robot, robot in there, tick, ear.said(Key(keys.drive, run, robot), Drive | Farewell))
+            _participant(
+                robot, robot in there, tick, ear.said(Key(keys.drive, run, robot), Command | FinalReport)
+            )
             for robot in sorted(named)
         ),
     )
@@ -172,18 +174,20 @@ def _briefings(link: zenoh.Session, run: str, robots: set[str]) -> dict[str, byt
     for robot in sorted(robots):
         if robot not in paired and time.monotonic() < until:
             answer = session.ask(
-                link, keys.briefing(run, robot), ASK_S, lambda frame: _said(frame, Briefing) is not None
+                link, keys.briefing(run, robot), ASK_S, lambda frame: _said(frame, RobotConfig) is not None
             )
             if isinstance(answer, bytes):
                 found[robot] = answer
-                briefing = _said(answer, Briefing)
+                briefing = _said(answer, RobotConfig)
                 paired |= {briefing.peer} if briefing is not None else set()
     return found
 
 
-def _participant(robot: str, there: bool, latest: int | None, drive: Drive | Farewell | None) -> Participant:
+def _participant(
+    robot: str, there: bool, latest: int | None, drive: Command | FinalReport | None
+) -> Participant:
     """As `drive` tells it, unless that is of a tick to come: the world is in tick `latest`."""
-    if not isinstance(drive, Drive) or (latest is not None and drive.tick > latest + AHEAD):
+    if not isinstance(drive, Command) or (latest is not None and drive.tick > latest + AHEAD):
         return Participant(robot, there)
     return Participant(robot, there, drive.tick, drive.phase, drive.state)
 

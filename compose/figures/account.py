@@ -6,7 +6,7 @@ from pathlib import Path
 
 import msgspec
 
-from agent.planning.state import Mind
+from agent.planning.state import RobotState
 from agent.process.agent_journal import Past
 from agent.process.robot import Robot
 from compose.recording.run import past_of
@@ -19,7 +19,7 @@ class Account(msgspec.Struct, frozen=True):
 
     past: Past | None
     """none if it was killed before it was briefed"""
-    minds: tuple[Mind, ...] = ()
+    minds: tuple[RobotState, ...] = ()
     """after each tick, from 0 on, as far as it decided in it"""
     broken: str | None = None
     """why minds end before the record does, if they do"""
@@ -42,7 +42,7 @@ def account(folder: Path, robot: str) -> Account:
 def _again(told: Past) -> Account:
     """Every decision once more, which must be the one on record."""
     robot = Robot(told.briefing)
-    minds: list[Mind] = []
+    minds: list[RobotState] = []
     for step in told.steps:
         tick = step.sense.tick
         try:

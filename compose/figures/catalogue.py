@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager
 from matplotlib.figure import Figure
 
 from compose.figures import decisions, manoeuvre, one_robot, over_time, phase_one, steps, trajectory
-from compose.figures.pair import Pair
+from compose.figures.pair import PairRecord
 from compose.figures.sheet import NO_TRUTH, Absent
 from compose.figures.story import Story
 from compose.figures.style import look
@@ -21,21 +21,21 @@ def settings(kind: str) -> AbstractContextManager[None]:
     return look(symbols=kind != "robot")
 
 
-def pictures(pair: Pair, kind: str) -> Iterator[Picture]:
+def pictures(pair: PairRecord, kind: str) -> Iterator[Picture]:
     """Those of one kind, in its `settings`; none where the journals that they need are missing."""
     return _DRAWN[kind](pair)
 
 
-def _trajectory(pair: Pair) -> Iterator[Picture]:
+def _trajectory(pair: PairRecord) -> Iterator[Picture]:
     yield f"trajectory-{pair.name}", trajectory.draw(pair)
 
 
-def _phase_one(pair: Pair) -> Iterator[Picture]:
+def _phase_one(pair: PairRecord) -> Iterator[Picture]:
     for role in pair.told:
         yield f"phase-1-{pair.robot(role).id}", phase_one.draw(pair, role)
 
 
-def _plan(pair: Pair) -> Iterator[Picture]:
+def _plan(pair: PairRecord) -> Iterator[Picture]:
     """What there is of them under noise is hypotheses, of `assured`."""
     if pair.told and pair.variant == "assured" and not pair.exact:
         yield f"plan-{pair.name}", decisions.draw(pair)
@@ -44,20 +44,20 @@ def _plan(pair: Pair) -> Iterator[Picture]:
             yield f"plan-{name}", figure
 
 
-def _encounter(pair: Pair) -> Iterator[Picture]:
+def _encounter(pair: PairRecord) -> Iterator[Picture]:
     yield f"encounter-{pair.name}", steps.draw(pair)
 
 
-def _ranges(pair: Pair) -> Iterator[Picture]:
+def _ranges(pair: PairRecord) -> Iterator[Picture]:
     yield f"ranges-{pair.name}", over_time.ranges(pair)
 
 
-def _errors(pair: Pair) -> Iterator[Picture]:
+def _errors(pair: PairRecord) -> Iterator[Picture]:
     if pair.told:
         yield f"errors-{pair.name}", over_time.errors(pair)
 
 
-def _robot(pair: Pair) -> Iterator[Picture]:
+def _robot(pair: PairRecord) -> Iterator[Picture]:
     for role in pair.told:
         name, account = pair.robot(role).id, pair.robot(role).account
         assert account is not None
@@ -68,7 +68,7 @@ def _robot(pair: Pair) -> Iterator[Picture]:
         yield f"robot-{name}", one_robot.figure_of(Story(pair.record, ids.index(name), account.held))
 
 
-_DRAWN: dict[str, Callable[[Pair], Iterator[Picture]]] = {
+_DRAWN: dict[str, Callable[[PairRecord], Iterator[Picture]]] = {
     "trajectory": _trajectory,
     "phase-1": _phase_one,
     "plan": _plan,

@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from agent.planning.active_sensing import Surveying, stride
-from agent.planning.state import Mind
-from compose.figures.pair import ROLES, Pair
+from agent.planning.state import RobotState
+from compose.figures.pair import ROLES, PairRecord
 from compose.figures.series import Series, some, square
 from compose.figures.sheet import NO_ENCOUNTER, Absent, Window, circle
 from compose.figures.style import COLOURS, INK, MARKS, PALE, PALER
@@ -25,17 +25,17 @@ LIKELY = 1e-3
 """odds from which on a hypothesis is within what is seen"""
 
 
-class Decision(NamedTuple):
+class PairDecision(NamedTuple):
     """A tick in which a robot weighed what it holds possible of both, and chose a manoeuvre."""
 
     tick: int
-    minds: dict[Role, Mind]
+    minds: dict[Role, RobotState]
     """of those robots that decided in it"""
 
 
-def decisions(pair: Pair) -> list[Decision]:
+def decisions(pair: PairRecord) -> list[PairDecision]:
     """Of phase 3, in order."""
-    found: dict[int, dict[Role, Mind]] = {}
+    found: dict[int, dict[Role, RobotState]] = {}
     for role in ROLES:
         before: object = ()
         for mind in pair.minds(role):
@@ -43,10 +43,10 @@ def decisions(pair: Pair) -> list[Decision]:
             if held and held is not before and (surveys or mind.verdict is not None):
                 found.setdefault(mind.tick, {})[role] = mind
             before = held
-    return [Decision(tick, found[tick]) for tick in sorted(found)]
+    return [PairDecision(tick, found[tick]) for tick in sorted(found)]
 
 
-def draw(pair: Pair) -> Figure | Absent:
+def draw(pair: PairRecord) -> Figure | Absent:
     """A panel a decision; as many as have room."""
     told = decisions(pair)
     if not told:
@@ -66,7 +66,7 @@ def draw(pair: Pair) -> Figure | Absent:
     return series.figure
 
 
-def _window(pair: Pair, shown: list[Decision]) -> Window:
+def _window(pair: PairRecord, shown: list[PairDecision]) -> Window:
     points = [
         (pose.x, pose.y)
         for one in shown
@@ -81,7 +81,7 @@ def _window(pair: Pair, shown: list[Decision]) -> Window:
     return square(points, 0.16, 0.5 * pair.mission.sensing_range)
 
 
-def _said(one: Decision, number: int) -> str:
+def _said(one: PairDecision, number: int) -> str:
     mind = next(iter(one.minds.values()))
     count, odds = len(mind.findings.pair), mind.findings.pair[0].odds
     held = f"{count} hypotheses" if count > 1 else "one hypothesis"
@@ -90,7 +90,7 @@ def _said(one: Decision, number: int) -> str:
     return f"({number}) $k$ = {one.tick}, {len(mind.mutual)} mutual ranges\n{held}, first {surest}{end}"
 
 
-def _panel(axes: Axes, pair: Pair, one: Decision) -> None:
+def _panel(axes: Axes, pair: PairRecord, one: PairDecision) -> None:
     for role in ROLES:
         anchor = pair.robot(role).anchor
         axes.plot(anchor.x, anchor.y, "x", color="k", ms=6, mew=1.4, zorder=2)
@@ -116,13 +116,13 @@ def _panel(axes: Axes, pair: Pair, one: Decision) -> None:
         axes.plot(truth.x, truth.y, "+", ms=9, mew=1.2, color=INK, zorder=6, gid=f"truth-{one.tick}-{role}")
 
 
-def _places(pair: Pair, tick: int) -> dict[Role, Pose]:
+def _places(pair: PairRecord, tick: int) -> dict[Role, Pose]:
     """Where each was; without a world, of those that have claimed to know."""
     paths = {role: pair.robot(role).path for role in ROLES}
     return {role: path[tick] for role, path in paths.items() if tick < len(path)}
 
 
-def _ties(axes: Axes, one: Decision) -> None:
+def _ties(axes: Axes, one: PairDecision) -> None:
     """Between places of a and b that belong to one hypothesis, where both hold the same."""
     if len(one.minds) < 2 or one.minds["a"].findings.pair != one.minds["b"].findings.pair:
         return
@@ -130,7 +130,7 @@ def _ties(axes: Axes, one: Decision) -> None:
         axes.plot([p.x, q.x], [p.y, q.y], "-", lw=0.7, color=PALER, zorder=3)
 
 
-def _drive(axes: Axes, pair: Pair, role: Role, mind: Mind) -> None:
+def _drive(axes: Axes, pair: PairRecord, role: Role, mind: RobotState) -> None:
     """Where the manoeuvre leads from the likeliest pose."""
     ends = _ends(mind, pair)
     if not ends:
@@ -148,7 +148,7 @@ def _drive(axes: Axes, pair: Pair, role: Role, mind: Mind) -> None:
     )
 
 
-def _ends(mind: Mind, pair: Pair) -> list[Pose]:
+def _ends(mind: RobotState, pair: PairRecord) -> list[Pose]:
     """Along the manoeuvre that was chosen, from the likeliest pose; none, where none was."""
     if not isinstance(mind.state, Surveying) or not mind.findings.poses:
         return []
@@ -160,7 +160,7 @@ def _ends(mind: Mind, pair: Pair) -> list[Pose]:
     ]
 
 
-def _signs(axes: Axes, pair: Pair) -> None:
+def _signs(axes: Axes, pair: PairRecord) -> None:
     for role in ROLES:
         axes.plot(
             [], [], MARKS[role]["marker"], ls="", ms=7, color=COLOURS[role],

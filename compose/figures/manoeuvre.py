@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from agent.estimation.closed_forms import Placement
 from agent.planning.phase3_last_manoeuvre import Array, Compared, LastManoeuvre, Plan, compared
-from compose.figures.pair import ROLES, Pair
+from compose.figures.pair import ROLES, PairRecord
 from compose.figures.sheet import ANCHORS, NO_ENCOUNTER, ROW, SMALL, Absent, Sheet, circle, equal
 from compose.figures.style import COLOURS, INK, MARKS, PALE, PALER
 from compose.figures.trajectory import heading
@@ -39,7 +39,7 @@ class Planned(NamedTuple):
     plan: Plan
 
 
-def planned(pair: Pair, role: Role) -> Iterator[Planned]:
+def planned(pair: PairRecord, role: Role) -> Iterator[Planned]:
     """Every last manoeuvre of one robot, in order."""
     before = None
     for mind in pair.minds(role):
@@ -49,7 +49,7 @@ def planned(pair: Pair, role: Role) -> Iterator[Planned]:
             yield Planned(mind.tick, before)
 
 
-def draw(pair: Pair) -> dict[str, Figure | Absent]:
+def draw(pair: PairRecord) -> dict[str, Figure | Absent]:
     """A picture of each plan, by what tells it from others: who made it, and when."""
     found: dict[str, Figure | Absent] = {}
     for role in ROLES:
@@ -61,7 +61,7 @@ def draw(pair: Pair) -> dict[str, Figure | Absent]:
     return found
 
 
-class Scene(NamedTuple):
+class ManoeuvreView(NamedTuple):
     """What was compared, seen from the mover: its frame turned such that it stands on the x-axis."""
 
     mover: Pose
@@ -76,7 +76,7 @@ class Scene(NamedTuple):
         return c * x - s * y, s * x + c * y
 
 
-def scene(plan: Plan) -> Scene:
+def scene(plan: Plan) -> ManoeuvreView:
     """Of `plan`."""
     mover, a, b, candidates = plan.question
     own, other = (a, b) if mover == "a" else (b, a)
@@ -85,7 +85,7 @@ def scene(plan: Plan) -> Scene:
     places = [
         compose(_inverse(one), other) if mover == "a" else one.place(other) for one in candidates
     ]  # fmt: skip
-    return Scene(compose(frame, own), tuple([compose(frame, place) for place in places]), spin)
+    return ManoeuvreView(compose(frame, own), tuple([compose(frame, place) for place in places]), spin)
 
 
 def _inverse(placement: Placement) -> Pose:
@@ -96,7 +96,7 @@ def _inverse(placement: Placement) -> Pose:
     )  # fmt: skip
 
 
-def _figure(pair: Pair, one: Planned) -> Figure:
+def _figure(pair: PairRecord, one: Planned) -> Figure:
     seen, plan, mission = scene(one.plan), one.plan, pair.mission
     ways = compared(plan.question, mission, pair.variant)
     below = 0.5 + ROW * math.ceil((SIGNS + len(seen.others)) / COLUMNS) + 0.05
@@ -118,7 +118,7 @@ def _figure(pair: Pair, one: Planned) -> Figure:
     return sheet.figure
 
 
-def _title(pair: Pair, one: Planned) -> str:
+def _title(pair: PairRecord, one: Planned) -> str:
     mover = one.plan.question.mover
     robot = pair.robot(mover).id
     frame = (
@@ -139,7 +139,7 @@ def _framed_by_itself(plan: Plan) -> bool:
     return plan.question.a == ORIGIN == plan.question.b
 
 
-def _candidates(axes: Axes, pair: Pair, one: Planned, seen: Scene, half: float) -> None:
+def _candidates(axes: Axes, pair: PairRecord, one: Planned, seen: ManoeuvreView, half: float) -> None:
     """Where the other may be, at the range last measured, and the axes of each two of these places."""
     mover: Role = one.plan.question.mover
     other = OTHER[mover]
@@ -170,7 +170,7 @@ def _candidates(axes: Axes, pair: Pair, one: Planned, seen: Scene, half: float) 
     axes.plot([], [], ls="", label=after)
 
 
-def _after(pair: Pair, one: Planned) -> str:
+def _after(pair: PairRecord, one: Planned) -> str:
     """What the manoeuvre led to."""
     if one.tick + 1 >= len(pair.mutual):
         return "the record ends before the next range"
@@ -192,11 +192,11 @@ def _bisector(axes: Axes, one: Pose, other: Pose, length: float, gid: str) -> No
     )  # fmt: skip
 
 
-def _end(seen: Scene, plan: Plan, mission: Mission) -> Pose:
+def _end(seen: ManoeuvreView, plan: Plan, mission: Mission) -> Pose:
     return step(seen.mover, plan.drive.v, plan.drive.omega, mission.period)
 
 
-def _reach(axes: Axes, pair: Pair, plan: Plan, seen: Scene, ways: Compared) -> None:
+def _reach(axes: Axes, pair: PairRecord, plan: Plan, seen: ManoeuvreView, ways: Compared) -> None:
     """The ends of all manoeuvres that were compared, and the one that was chosen."""
     mover = plan.question.mover
     colour = COLOURS[mover]

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatterMathtext, LogLocator, MaxNLocator, NullLocator
 
-from compose.figures.pair import ROLES, Pair
+from compose.figures.pair import ROLES, PairRecord
 from compose.figures.sheet import ANCHORS, NO_TRUTH, ROW, SMALL, Absent, Sheet
 from compose.figures.style import COLOURS, INK, MARKS, PALE, SHADE
 from compose.recording.claim import Claim
@@ -44,7 +44,7 @@ KEY_ROWS = 4
 Points = list[tuple[int, float]]
 
 
-def ranges(pair: Pair) -> Figure:
+def ranges(pair: PairRecord) -> Figure:
     """What each sensor measured, and how far apart the two were."""
     tall, key = TALL + 0.4, 2 * ROW + 0.05
     sheet = Sheet(_width(), 0.53 + tall + key, [pair.title])
@@ -64,7 +64,7 @@ def _width() -> float:
     return LEFT + WHOLE + APART + NEAR + 0.15
 
 
-def _panels(sheet: Sheet, pair: Pair, bottom: float, tall: float, *, named: bool = True) -> list[Axes]:
+def _panels(sheet: Sheet, pair: PairRecord, bottom: float, tall: float, *, named: bool = True) -> list[Axes]:
     """Of all ticks; and of those of the encounter, if there was one."""
     width = WHOLE if pair.met is not None else WHOLE + APART + NEAR
     panels = [sheet.panel(LEFT, bottom, width, tall)]
@@ -86,7 +86,7 @@ def _panels(sheet: Sheet, pair: Pair, bottom: float, tall: float, *, named: bool
     return panels
 
 
-def _shade(axes: Axes, pair: Pair) -> None:
+def _shade(axes: Axes, pair: PairRecord) -> None:
     """The ticks in contact."""
     for i, (first, last) in enumerate(pair.contacts):
         axes.axvspan(
@@ -95,7 +95,7 @@ def _shade(axes: Axes, pair: Pair) -> None:
         )  # fmt: skip
 
 
-def _ranges(axes: Axes, pair: Pair) -> None:
+def _ranges(axes: Axes, pair: PairRecord) -> None:
     apart = pair.separations[: len(pair.mutual)]
     if apart:
         axes.plot(
@@ -130,7 +130,7 @@ def _measured(
 # --- errors -------------------------------------------------------------------------------------------
 
 
-def errors(pair: Pair) -> Figure | Absent:
+def errors(pair: PairRecord) -> Figure | Absent:
     """How far off each robot's pose was: its position, and its heading."""
     if not pair.true:
         return Absent(NO_TRUTH)
@@ -165,14 +165,14 @@ def _askew(pose: Pose, truth: Pose) -> float:
     return abs(wrap(pose.heading - truth.heading))
 
 
-def _held(pair: Pair, role: Role) -> list[tuple[Estimate, Pose]]:
+def _held(pair: PairRecord, role: Role) -> list[tuple[Estimate, Pose]]:
     """Each estimate, and where the robot was then."""
     account, truth = pair.robot(role).account, pair.robot(role).path
     held = account.held if account is not None else ()
     return [(one, truth[one.tick]) for one in held if one.tick < len(truth)]
 
 
-def _errors(axes: Axes, pair: Pair, role: Role, name: str, off: Callable[[Pose, Pose], float]) -> None:
+def _errors(axes: Axes, pair: PairRecord, role: Role, name: str, off: Callable[[Pose, Pose], float]) -> None:
     """Of its likeliest pose, of others that it holds possible; before it has any, of its distance."""
     held, robot, colour = _held(pair, role), pair.robot(role), COLOURS[role]
     anchor = robot.anchor
@@ -223,7 +223,7 @@ def _line(axes: Axes, points: Points, **looks: Any) -> None:
         axes.plot([tick for tick, _ in points], [max(value, LEAST) for _, value in points], **looks)
 
 
-def _claimed(axes: Axes, pair: Pair, role: Role, of_claim: Callable[[Claim], float]) -> None:
+def _claimed(axes: Axes, pair: PairRecord, role: Role, of_claim: Callable[[Claim], float]) -> None:
     claim = pair.robot(role).claim
     if claim is not None:
         axes.plot(
@@ -234,7 +234,7 @@ def _claimed(axes: Axes, pair: Pair, role: Role, of_claim: Callable[[Claim], flo
         )  # fmt: skip
 
 
-def _scale(panels: Sequence[Axes], pair: Pair, name: str) -> None:
+def _scale(panels: Sequence[Axes], pair: PairRecord, name: str) -> None:
     """One scale for both; with a line at what would be wrong, where sensors are exact."""
     for axes in panels:
         axes.set_yscale("log")

@@ -9,13 +9,13 @@ from functools import cached_property
 import msgspec
 from msgspec.structs import replace
 
-from agent.planning.state import Mind
+from agent.planning.state import RobotState
 from compose.figures.account import Account
 from compose.recording.claim import Claim
 from compose.recording.robots import outcome
 from compose.recording.run import Record
 from compose.recording.summary_json import broken_off, ended, first_claim
-from protocol.messages import Drive
+from protocol.messages import Command
 from protocol.mission import Anchor, Mission, Role, Variant
 from protocol.motion import Pose
 from protocol.orbits import Orbit
@@ -32,7 +32,7 @@ class Side(msgspec.Struct, frozen=True):
     orbit: Orbit
     path: tuple[Pose, ...]
     """where it was; without a world, as it claims, and empty if it never did"""
-    drives: tuple[Drive | None, ...]
+    drives: tuple[Command | None, ...]
     """what it set out to do; none, where that did not come"""
     anchor_ranges: tuple[float | None, ...]
     """m, as measured"""
@@ -42,7 +42,7 @@ class Side(msgspec.Struct, frozen=True):
     """the first that it made, held against the truth; none without a world"""
 
 
-class Pair(msgspec.Struct, frozen=True, dict=True):
+class PairRecord(msgspec.Struct, frozen=True, dict=True):
     """Two robots that are each other's peers."""
 
     title: str
@@ -87,7 +87,7 @@ class Pair(msgspec.Struct, frozen=True, dict=True):
         """Who plays it."""
         return self.a if role == "a" else self.b
 
-    def drive(self, role: Role, tick: int) -> Drive | None:
+    def drive(self, role: Role, tick: int) -> Command | None:
         """What it set out to do then; none, if that did not come."""
         drives = self.robot(role).drives
         return drives[tick] if tick < len(drives) else None
@@ -109,7 +109,7 @@ class Pair(msgspec.Struct, frozen=True, dict=True):
         """Those whose journal can be read."""
         return [role for role in ROLES if self.robot(role).account is not None]
 
-    def minds(self, role: Role) -> tuple[Mind, ...]:
+    def minds(self, role: Role) -> tuple[RobotState, ...]:
         """After each tick, as far as the rest of the record goes."""
         account = self.robot(role).account
         return account.minds[: max(1, len(self.mutual))] if account is not None else ()
@@ -140,7 +140,7 @@ class Pair(msgspec.Struct, frozen=True, dict=True):
         return None
 
 
-def of_record(record: Record, places: tuple[int, int], accounts: Mapping[str, Account]) -> Pair:
+def of_record(record: Record, places: tuple[int, int], accounts: Mapping[str, Account]) -> PairRecord:
     """The robots at those places of the scenario, a first; `accounts` are those that can be read."""
     scenario, moments = record.scenario, record.moments
     last = len(moments) - 1
@@ -161,7 +161,7 @@ def of_record(record: Record, places: tuple[int, int], accounts: Mapping[str, Ac
             claim=first_claim(record, place),
         )
 
-    return Pair(
+    return PairRecord(
         title=f"{scenario.name}, seed {scenario.seed}, {scenario.variant}: {how}",
         mission=scenario.mission,
         variant=scenario.variant,
@@ -172,7 +172,7 @@ def of_record(record: Record, places: tuple[int, int], accounts: Mapping[str, Ac
     )
 
 
-def of_robots(accounts: Mapping[str, Account]) -> Pair:
+def of_robots(accounts: Mapping[str, Account]) -> PairRecord:
     """Without a world: of one or both of a pair, each of whom was briefed."""
     told = {robot: one.past for robot, one in accounts.items() if one.past is not None}
     briefing = next(iter(told.values())).briefing
@@ -197,7 +197,7 @@ def of_robots(accounts: Mapping[str, Account]) -> Pair:
             account=accounts.get(robot),
         )
 
-    pair = Pair(
+    pair = PairRecord(
         title=f"{' and '.join(told)} without a world, {briefing.variant}: {outcome(told)}",
         mission=briefing.mission,
         variant=briefing.variant,

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 
 from agent.estimation.exact import Branch
 from agent.planning.range_seeking import travelled
-from agent.planning.state import Mind
-from compose.figures.pair import Pair
+from agent.planning.state import RobotState
+from compose.figures.pair import PairRecord
 from compose.figures.sheet import ANCHORS, Absent, Sheet, around, circle, equal, fitted
 from compose.figures.style import COLOURS, INK, MARKS, PALE, PALER
 from protocol.messages import BranchKind
@@ -35,7 +35,7 @@ WORDS: dict[Fate, str] = {"kept": "kept", "rejected": "ruled out", "possible": "
 LINES: dict[Fate, str] = {"kept": "-", "rejected": ":", "possible": "--"}
 
 
-class Told(NamedTuple):
+class DrawnBranch(NamedTuple):
     """A branch, as it is drawn."""
 
     branch: Branch
@@ -43,7 +43,7 @@ class Told(NamedTuple):
     name: str
 
 
-def draw(pair: Pair, role: Role) -> Figure | Absent:
+def draw(pair: PairRecord, role: Role) -> Figure | Absent:
     """The branches, the rings of the ranges, and the sensing range."""
     mind = _at_its_end(pair.minds(role))
     if mind is None:
@@ -81,7 +81,7 @@ def draw(pair: Pair, role: Role) -> Figure | Absent:
     return sheet.figure
 
 
-def _at_its_end(minds: Sequence[Mind]) -> Mind | None:
+def _at_its_end(minds: Sequence[RobotState]) -> RobotState | None:
     """The mind in the tick in which phase 1 is over; or the last there is of it."""
     for mind in minds:
         if mind.findings.parted is not None:
@@ -90,7 +90,7 @@ def _at_its_end(minds: Sequence[Mind]) -> Mind | None:
     return alone[-1] if alone else None
 
 
-def _told(minds: Sequence[Mind], end: Mind) -> list[Told]:
+def _told(minds: Sequence[RobotState], end: RobotState) -> list[DrawnBranch]:
     """The branches that were held, the one that was kept first."""
     if end.briefing.mission.noise.exact:
         held = list(end.findings.possible)
@@ -109,11 +109,11 @@ def _told(minds: Sequence[Mind], end: Mind) -> list[Told]:
     if kept is not None:
         fates[0] = "kept"
     return [
-        Told(branch, fate, _name(branch, held, end)) for branch, fate in zip(held, fates, strict=True)
+        DrawnBranch(branch, fate, _name(branch, held, end)) for branch, fate in zip(held, fates, strict=True)
     ]  # fmt: skip
 
 
-def _name(branch: Branch, held: Sequence[Branch], end: Mind) -> str:
+def _name(branch: Branch, held: Sequence[Branch], end: RobotState) -> str:
     sign = "+" if branch.alpha >= 0.0 else "-"
     if end.briefing.mission.noise.exact:
         return rf"${sign}\alpha$, $\alpha = {abs(branch.alpha):.4f}$ rad"
@@ -121,7 +121,7 @@ def _name(branch: Branch, held: Sequence[Branch], end: Mind) -> str:
     return "the likeliest" if branch is held[0] else others
 
 
-def _title(pair: Pair, role: Role, mind: Mind) -> str:
+def _title(pair: PairRecord, role: Role, mind: RobotState) -> str:
     robot = pair.robot(role).id
     frame = rf"$\langle {role}({ANCHORS[role]})\rangle$"
     if mind.findings.parted is None:
@@ -131,7 +131,7 @@ def _title(pair: Pair, role: Role, mind: Mind) -> str:
     return f"Phase 1 of {robot} in {frame}: {how}"
 
 
-def _how(mind: Mind) -> str:
+def _how(mind: RobotState) -> str:
     ranges = f"{len(mind.log.ranges)} ranges"
     match mind.findings.branch_kind:
         case "three-ranges-virtual":
@@ -167,7 +167,7 @@ def _rings(axes: Axes, seen: Seen, branch: Branch, kind: BranchKind | None) -> N
         )  # fmt: skip
 
 
-def _draw(axes: Axes, role: Role, one: Told, seen: Seen, exact: bool, named: bool) -> None:
+def _draw(axes: Axes, role: Role, one: DrawnBranch, seen: Seen, exact: bool, named: bool) -> None:
     """The path that it says was driven."""
     places, kept = _places(one.branch, seen), one.fate == "kept"
     colour = COLOURS[role] if kept else INK

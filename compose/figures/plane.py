@@ -16,7 +16,7 @@ from compose.figures.style import COLOURS
 from protocol.messages import Estimate
 from protocol.motion import ORIGIN, Pose
 from protocol.rounding import TOLERANCE
-from world.scenario import Placed
+from world.scenario import RobotSpec
 
 Window = tuple[float, float, float, float]
 """left, right, low, high"""
@@ -72,7 +72,7 @@ def draw(axes: Axes, story: Story) -> None:
     axes.set_ylabel("y [m]")
 
 
-def _anchor(axes: Axes, one: Placed, story: Story) -> None:
+def _anchor(axes: Axes, one: RobotSpec, story: Story) -> None:
     """Its place, and how far it is heard."""
     place, reach = (one.anchor.x, one.anchor.y), story.record.scenario.mission.sensing_range
     own = one is story.own
@@ -89,7 +89,7 @@ def _anchor(axes: Axes, one: Placed, story: Story) -> None:
         axes.plot([], [], "--", color="0.4", lw=0.8, label=f"its sensing range, {reach:g} m")
 
 
-def _path(axes: Axes, story: Story, one: Placed) -> None:
+def _path(axes: Axes, story: Story, one: RobotSpec) -> None:
     """Where it truly drove; the peer's faintly."""
     truth, own = story.truth(one.id), one is story.own
     colour, alpha = COLOURS[one.role], 1.0 if own else 0.4

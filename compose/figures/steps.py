@@ -8,7 +8,7 @@ from itertools import pairwise
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from compose.figures.pair import ROLES, Pair
+from compose.figures.pair import ROLES, PairRecord
 from compose.figures.series import Series, some, square
 from compose.figures.sheet import NO_ENCOUNTER, NO_PLACES, Absent, Window, circle
 from compose.figures.style import COLOURS, DASHES, INK, MARKS, PALE
@@ -24,7 +24,7 @@ ARROW = 0.12
 """of the window: how long a heading is drawn"""
 
 
-def draw(pair: Pair) -> Figure | Absent:
+def draw(pair: PairRecord) -> Figure | Absent:
     """The ticks in which the two were ranged from new places."""
     if not pair.placed:
         return Absent(NO_PLACES)
@@ -42,7 +42,7 @@ def draw(pair: Pair) -> Figure | Absent:
     return series.figure
 
 
-def steps(pair: Pair) -> list[int]:
+def steps(pair: PairRecord) -> list[int]:
     """The ticks of phase 3 with a mutual range that is taken from elsewhere than the one before."""
     if pair.met is None:
         return []
@@ -56,7 +56,7 @@ def steps(pair: Pair) -> list[int]:
     return told
 
 
-def _window(pair: Pair, first: int, last: int) -> Window:
+def _window(pair: PairRecord, first: int, last: int) -> Window:
     ends = [pose for role in ROLES for pose in pair.robot(role).path[max(0, first - BEFORE) : last + 1]]
     return square([(p.x, p.y) for p in ends], 0.12, 0.2 * pair.mission.sensing_range)
 
@@ -70,7 +70,7 @@ def _title(ticks: list[int], shown: list[int]) -> str:
     return f"The encounter: {many}, $k$ = {ticks[0]} to {ticks[-1]}"
 
 
-def _said(pair: Pair, tick: int, number: int) -> str:
+def _said(pair: PairRecord, tick: int, number: int) -> str:
     """The range, and what each robot then sets out to do."""
     rho = pair.mutual[tick][1]
     doing = []
@@ -80,7 +80,7 @@ def _said(pair: Pair, tick: int, number: int) -> str:
     return f"({number}) $k$ = {tick}, " + rf"$\rho$ = {rho:.4f} m" + "\n" + ", ".join(doing)
 
 
-def _panel(axes: Axes, pair: Pair, met: int, before: int, tick: int) -> None:
+def _panel(axes: Axes, pair: PairRecord, met: int, before: int, tick: int) -> None:
     for role in ROLES:
         one = pair.robot(role)
         place = (one.anchor.x, one.anchor.y)
@@ -121,7 +121,7 @@ def _place(axes: Axes, role: Role, pose: Pose, ranged: bool, now: bool) -> None:
     )  # fmt: skip
 
 
-def _signs(axes: Axes, pair: Pair) -> None:
+def _signs(axes: Axes, pair: PairRecord) -> None:
     for role in ROLES:
         axes.plot(
             [],

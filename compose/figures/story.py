@@ -13,7 +13,7 @@ from compose.recording.run import Record
 from compose.recording.summary_json import first_claim
 from protocol.messages import Estimate
 from protocol.motion import Pose
-from world.scenario import Placed
+from world.scenario import RobotSpec
 
 
 class Span(msgspec.Struct, frozen=True):
@@ -34,12 +34,12 @@ class Story(msgspec.Struct, frozen=True, dict=True):
     """what it held possible, as it journaled"""
 
     @property
-    def own(self) -> Placed:
+    def own(self) -> RobotSpec:
         """Who it is."""
         return self.record.scenario.robots[self.place]
 
     @property
-    def peer(self) -> Placed:
+    def peer(self) -> RobotSpec:
         """Whom it is to find."""
         return self.record.scenario.robot(self.own.peer)
 
@@ -92,7 +92,7 @@ class Story(msgspec.Struct, frozen=True, dict=True):
 
     @cached_property
     def phases(self) -> tuple[Span, ...]:
-        """In order, over all ticks on record; one in which no Drive came goes with those before."""
+        """In order, over all ticks on record; one in which no Command came goes with those before."""
         told, phase = [], 1
         for moment in self.record.moments:
             drive = moment.drives.get(self.own.id)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from compose.figures.pair import ROLES, Pair
+from compose.figures.pair import ROLES, PairRecord
 from compose.figures.sheet import ANCHORS, NO_PLACES, Absent, Sheet, around, circle, equal, fitted
 from compose.figures.style import COLOURS, DASHES, INK, MARKS, PALE
 from protocol.mission import Role
@@ -21,7 +21,7 @@ MANY = 160
 LABEL = {"facecolor": "white", "alpha": 0.75, "pad": 0.6, "lw": 0}
 
 
-def draw(pair: Pair) -> Figure | Absent:
+def draw(pair: PairRecord) -> Figure | Absent:
     """The plane, and what the signs in it mean beside it."""
     if not pair.placed:
         return Absent(NO_PLACES)
@@ -47,7 +47,7 @@ def draw(pair: Pair) -> Figure | Absent:
     return sheet.figure
 
 
-def _extent(pair: Pair) -> list[tuple[float, float]]:
+def _extent(pair: PairRecord) -> list[tuple[float, float]]:
     points = [(pose.x, pose.y) for role in ROLES for pose in pair.robot(role).path]
     for role in ROLES:
         one = pair.robot(role)
@@ -56,12 +56,12 @@ def _extent(pair: Pair) -> list[tuple[float, float]]:
     return points
 
 
-def _arrow(pair: Pair) -> float:
+def _arrow(pair: PairRecord) -> float:
     """m: how long a heading is drawn."""
     return 0.35 * pair.mission.sensing_range
 
 
-def draw_anchor(axes: Axes, pair: Pair, role: Role) -> None:
+def draw_anchor(axes: Axes, pair: PairRecord, role: Role) -> None:
     """Its place, and how far it is heard."""
     one, reach = pair.robot(role), pair.mission.sensing_range
     place, first = (one.anchor.x, one.anchor.y), role == "a"
@@ -84,7 +84,7 @@ def draw_anchor(axes: Axes, pair: Pair, role: Role) -> None:
     )  # fmt: skip
 
 
-def _orbit(axes: Axes, pair: Pair, role: Role) -> None:
+def _orbit(axes: Axes, pair: PairRecord, role: Role) -> None:
     one = pair.robot(role)
     radius = one.orbit.radius
     circle(
@@ -123,7 +123,7 @@ def heading(axes: Axes, pose: Pose, length: float, colour: str, zorder: float = 
     )  # fmt: skip
 
 
-def _marks(axes: Axes, pair: Pair) -> None:
+def _marks(axes: Axes, pair: PairRecord) -> None:
     """Where the two met, and where they were last."""
     axes.plot([], [], "s", ms=7, mfc="white", mec=INK, mew=1.5, label="released, heading")
     tick = next((first for first, _ in pair.contacts if first < pair.placed), None)

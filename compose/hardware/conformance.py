@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares  # type: ignore[import-untyped]
 
-from compose.hardware.exercise import Trial, Try
+from compose.hardware.exercise import ExerciseRun, Try
 from protocol.mission import Mission
 from protocol.motion import ORIGIN, REST, Controls, Pose, step
 from world.hardware.driver import SENSING
@@ -164,7 +164,7 @@ def reach(mission: Mission, tries: Sequence[Try]) -> str | None:
 CHECKS: tuple[Check, ...] = (prompt, stands, drives, lasts, stops, fresh, ranges, reach)
 
 
-def judged(trial: Trial) -> list[Found]:
+def judged(trial: ExerciseRun) -> list[Found]:
     """What each check came to."""
     return [Found(str(check.__doc__), check(trial.briefing.mission, trial.tries)) for check in CHECKS]
 

@@ -14,12 +14,12 @@ from compose.recording.run import agent_journal
 from compose.terminal.outcome import going_on
 from protocol.journal.journal_file import CannotRecord, CorruptJournal, Journal
 from protocol.journal.resume import Retrace
-from protocol.messages import Briefing, OfRobot, Sense
+from protocol.messages import Observation, OfRobot, RobotConfig
 from protocol.network.inbox import Inbox
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode, encode
 from world.hardware.bridge import Field
 from world.hardware.driver import Driver
-from world.hardware.driver_journal import DriverPast, Start, boot, driver_journal, driver_past
+from world.hardware.driver_journal import DriverPast, ProcessStart, boot, driver_journal, driver_past
 
 RELEASE_S = 10.0
 """s that the agent of a killed launcher has to end, which unlocks its journal"""
@@ -35,7 +35,7 @@ class DriverRecord(msgspec.Struct, frozen=True):
     """the latest tick in the agent's journal; -1 if there is none"""
     again: bool
     """whether the journals existed before"""
-    start: Start
+    start: ProcessStart
     """the start of this process"""
 
     def take_up(self, driver: Driver, name: str, field: Field) -> None:
@@ -49,13 +49,13 @@ class DriverRecord(msgspec.Struct, frozen=True):
 
 
 @contextmanager
-def recorded(folder: Path, briefing: Briefing, inbox: Inbox, *, fsync: bool) -> Iterator[DriverRecord]:
+def recorded(folder: Path, briefing: RobotConfig, inbox: Inbox, *, fsync: bool) -> Iterator[DriverRecord]:
     """Yield the recording in `folder` of the robot with `briefing`; a new one if there is none.
 
     Raises CannotRecord, and CorruptJournal if the journals are not of the same robot and run, or if Reports
     that the robot has sent may be missing in them.
     """
-    start = Start(boot(), fsync)
+    start = ProcessStart(boot(), fsync)
     path = folder / driver_journal(briefing.robot)
     agents = folder / agent_journal(briefing.robot)
     if not path.exists():
@@ -101,7 +101,7 @@ def _frames(path: Path, inbox: Inbox) -> list[bytes]:
 def _known(frames: list[bytes], past: DriverPast, path: Path) -> int:
     """Return the latest tick in the agent's `frames`, -1 if there is none.
 
-    Raises CorruptJournal unless each Sense in them is that of the same tick in the driver's journal.
+    Raises CorruptJournal unless each Observation in them is that of the same tick in the driver's journal.
     """
     known = -1
     for frame in frames:
@@ -109,7 +109,7 @@ def _known(frames: list[bytes], past: DriverPast, path: Path) -> int:
             message = decode(frame, OfRobot, MAX_FRAME_BYTES)
         except MalformedFrame as error:
             raise CorruptJournal(f"{path}: {error}") from None
-        if isinstance(message, Sense):
+        if isinstance(message, Observation):
             known += 1
             if known > past.tick:
                 raise CorruptJournal(
@@ -117,5 +117,7 @@ def _known(frames: list[bytes], past: DriverPast, path: Path) -> int:
                     "only with --fsync both survive a power cut"
                 )
             if frame != past.ticks[known].frame:
-                raise CorruptJournal(f"{path}: at tick {known} another Sense than the driver's journal has")
+                raise CorruptJournal(
+                    f"{path}: at tick {known} another Observation than the driver's journal has"
+                )
     return known

@@ -9,7 +9,7 @@ import math
 import time
 from typing import NamedTuple
 
-from protocol.messages import Briefing, Sense
+from protocol.messages import Observation, RobotConfig
 from protocol.motion import REST, Controls
 from protocol.wire import MalformedFrame, decode, encode
 from world.hardware.driver import Driver, Reading
@@ -34,10 +34,10 @@ class Broken(Exception):
     """The exercise could not go on; its text says why."""
 
 
-class Trial:
+class ExerciseRun:
     """An exercise, as it is gone through."""
 
-    def __init__(self, driver: Driver, briefing: Briefing, manoeuvre_s: float) -> None:
+    def __init__(self, driver: Driver, briefing: RobotConfig, manoeuvre_s: float) -> None:
         self.briefing = briefing
         self.tries: list[Try] = []
         self._driver = driver
@@ -113,9 +113,14 @@ class Trial:
         if not isinstance(reading, Reading):
             raise Broken(f"sense({tick}) gives {type(reading).__name__}, expected a Reading")
         try:
-            decode(encode(Sense(tick, self.briefing.robot, reading.executed, reading.anchor_range)), Sense)
+            decode(
+                encode(Observation(tick, self.briefing.robot, reading.executed, reading.anchor_range)),
+                Observation,
+            )
             if reading.mutual_range is not None:
-                decode(encode(Sense(tick, self.briefing.robot, None, reading.mutual_range)), Sense)
+                decode(
+                    encode(Observation(tick, self.briefing.robot, None, reading.mutual_range)), Observation
+                )
         except (MalformedFrame, TypeError) as error:
             raise Broken(f"sense({tick}): {error}") from None
         share_s = self._manoeuvre_s

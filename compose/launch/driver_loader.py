@@ -9,7 +9,7 @@ from importlib import import_module
 
 from compose.errors import UserError
 from compose.scenario.scenario_file import setting
-from protocol.messages import Briefing
+from protocol.messages import RobotConfig
 from protocol.spelling import did_you_mean
 from world.hardware.driver import THINKING, Driver
 from world.hardware.driver_journal import DriverPast
@@ -42,7 +42,9 @@ def driver_class(name: str) -> Maker:
     return maker
 
 
-def made(maker: Maker, name: str, briefing: Briefing, manoeuvre_s: float, given: Mapping[str, str]) -> Driver:
+def made(
+    maker: Maker, name: str, briefing: RobotConfig, manoeuvre_s: float, given: Mapping[str, str]
+) -> Driver:
     """The driver itself. Raises UserError, by whatever it raised."""
     try:
         return maker(briefing, manoeuvre_s, **given)
@@ -84,6 +86,6 @@ def mission(source: str, robot: str) -> Scenario:
     return scenario
 
 
-def briefed(scenario: Scenario, robot: str, manoeuvre_s: float) -> Briefing:
+def briefed(scenario: Scenario, robot: str, manoeuvre_s: float) -> RobotConfig:
     """What `robot` is told; a tick lasts a manoeuvre and what thinking takes."""
     return scenario.briefing(robot, (1.0 + THINKING) * manoeuvre_s)

@@ -21,7 +21,7 @@ from importlib import import_module
 import msgspec
 from setproctitle import setproctitle
 
-from compose.launch.forked import LENGTH_BYTES, STREAMS, Ended, Signal, Start
+from compose.launch.forked import LENGTH_BYTES, STREAMS, Ended, ForkRequest, Signal
 from protocol.output import one_line
 
 NOT_FORKED = 71
@@ -33,15 +33,15 @@ PR_SET_PDEATHSIG = 1
 """<sys/prctl.h>"""
 
 
-class _Server:
+class _RequestLoop:
     """The request loop of the fork server, and the children that run, by process id."""
 
     def __init__(self, launcher: socket.socket) -> None:
         self._launcher = launcher
         self._numbers: dict[int, int] = {}
-        self._decoder = msgspec.msgpack.Decoder(Start | Signal)
+        self._decoder = msgspec.msgpack.Decoder(ForkRequest | Signal)
 
-    def serve(self) -> Start | None:
+    def serve(self) -> ForkRequest | None:
         """Handle the launcher's requests until the launcher has ended, then return None.
 
         It also returns in each forked process: there, the request for that process.
@@ -64,7 +64,7 @@ class _Server:
         while self._numbers and time.monotonic() < give_up:
             time.sleep(LOOK_AGAIN_S)
 
-    def _request(self) -> tuple[Start | Signal, list[int]] | None:
+    def _request(self) -> tuple[ForkRequest | Signal, list[int]] | None:
         head, streams, _, _ = socket.recv_fds(self._launcher, LENGTH_BYTES, STREAMS)
         if not head:
             return None
@@ -77,7 +77,7 @@ class _Server:
             body += self._launcher.recv(size - len(body)) or sys.exit(0)
         return body
 
-    def _fork(self, start: Start, streams: list[int]) -> bool:
+    def _fork(self, start: ForkRequest, streams: list[int]) -> bool:
         """Fork a process, and return whether this is the child."""
         parent = os.getpid()
         try:
@@ -114,7 +114,7 @@ class _Server:
             self._launcher.sendall(news.frame())
 
 
-def _become(start: Start, streams: list[int], parent: int) -> None:
+def _become(start: ForkRequest, streams: list[int], parent: int) -> None:
     """Give this forked process its own session, default signals, standard streams, arguments and title."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGCHLD])
@@ -148,7 +148,7 @@ def main() -> None:
     setproctitle(f"tandem fork-server of {os.getppid()}")
     gc.collect()
     gc.freeze()  # else garbage collection in a child would copy the pages of imported modules
-    server = _Server(socket.socket(fileno=0))
+    server = _RequestLoop(socket.socket(fileno=0))
     start = server.serve()
     if start is None:
         server.linger()

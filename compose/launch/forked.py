@@ -31,7 +31,7 @@ STREAMS = 3
 """The number of descriptors sent with a request for a process: its standard input, output and error."""
 
 
-class Start(msgspec.Struct, frozen=True, tag=True):
+class ForkRequest(msgspec.Struct, frozen=True, tag=True):
     """A request to fork a process."""
 
     number: int
@@ -195,7 +195,7 @@ class ForkServer:
         with self._lock:
             number = next(self._numbers)
             process = self._running[number] = Process(self, number, our_input, our_output, on_end)
-            self._ask(Start(number, main, title, arguments), [its_input, its_output, errors])
+            self._ask(ForkRequest(number, main, title, arguments), [its_input, its_output, errors])
         os.close(its_input)
         os.close(its_output)
         if self.gone:
@@ -227,7 +227,7 @@ class ForkServer:
         self._socket.close()
         self._errors.close()
 
-    def _ask(self, request: Start | Signal, streams: list[int]) -> None:
+    def _ask(self, request: ForkRequest | Signal, streams: list[int]) -> None:
         body = msgspec.msgpack.encode(request)
         frame = len(body).to_bytes(LENGTH_BYTES, "big") + body
         try:

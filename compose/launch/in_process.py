@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 
-from agent.process.robot import Robot, Told
-from compose.recording.run import WORLD_JOURNAL, Moment, Record, agent_journal
+from agent.process.robot import FramedReport, Robot
+from compose.recording.run import WORLD_JOURNAL, Record, TickRecord, agent_journal
 from protocol.journal.journal_file import Journal, Sink
-from protocol.messages import Drive, End, Farewell
+from protocol.messages import Command, FinalReport, MissionEnd
 from world.faults import LATEST
 from world.scenario import Scenario
 from world.simulation import Course
@@ -38,16 +38,16 @@ def played(scenario: Scenario, sinks: Mapping[str, Sink]) -> Record:
     ids = [robot.id for robot in scenario.robots]
     course = Course(scenario, sinks.get(WORLD_JOURNAL))
     robots = {robot: Robot(scenario.briefing(robot), sinks.get(agent_journal(robot))) for robot in ids}
-    moments: list[Moment] = []
-    end: End | None = None
-    told: dict[tuple[str, int], Told] = {}
+    moments: list[TickRecord] = []
+    end: MissionEnd | None = None
+    told: dict[tuple[str, int], FramedReport] = {}
     while end is None:
         senses = course.senses()
         for sense in senses:
             report = robots[sense.robot].sense(sense)
             if report is not None:
                 told[sense.robot, sense.tick] = report
-        drives: dict[str, Drive] = {}
+        drives: dict[str, Command] = {}
         for sense in senses:
             heard = [told[contact.peer, tick] for contact in sense.contacts for tick in contact.heard or ()]
             drives[sense.robot] = robots[sense.robot].decide(heard)
@@ -56,8 +56,8 @@ def played(scenario: Scenario, sinks: Mapping[str, Sink]) -> Record:
         if told:
             for robot in ids:  # nobody hears it any more
                 told.pop((robot, course.tick - LATEST), None)
-        moments.append(Moment(course.world.truth, drives))
+        moments.append(TickRecord(course.world.truth, drives))
         end = course.drive(drives)
-    farewells: dict[str, Farewell] = {robot: robots[robot].farewell(end) for robot in ids}
+    farewells: dict[str, FinalReport] = {robot: robots[robot].farewell(end) for robot in ids}
     course.farewells(farewells.values())
     return Record(scenario, tuple(moments), end, farewells)

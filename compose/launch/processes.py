@@ -57,7 +57,7 @@ def fork_server() -> ForkServer:
     return forked.fork_server("compose.cli.warm_up:missions")
 
 
-class Child:
+class MissionProcess:
     """A process of the run. It has its own session, so Ctrl-C reaches it only through the launcher."""
 
     def __init__(self, name: str, arguments: list[str], inbox: Inbox, kills: Sequence[Kill]) -> None:
@@ -201,7 +201,7 @@ class _Run:
         self._inbox = inbox
         self._arguments = arguments
         self.names = list(arguments)
-        self.children: dict[str, Child] = {}
+        self.children: dict[str, MissionProcess] = {}
         self._due: dict[str, float] = {}
         """monotonic time in s at which a killed process is restarted, by its name"""
 
@@ -209,7 +209,7 @@ class _Run:
         """Start or restart the process `name`, which will be killed at `kills`."""
         if name in self.children:
             self.children[name].forget()
-        self.children[name] = Child(name, self._arguments[name], self._inbox, kills)
+        self.children[name] = MissionProcess(name, self._arguments[name], self._inbox, kills)
         if name == WORLD:
             self.children[name].hand(encode(self._scenario))
 
@@ -238,7 +238,7 @@ class _Run:
             return min(self._due.values()) - time.monotonic()
         return None if world_runs else FOLLOW_S
 
-    def _bury(self, child: Child) -> None:
+    def _bury(self, child: MissionProcess) -> None:
         """Schedule the restart of a killed child.
 
         Raises ChildFailed if the child did not end by one of its kills, or by a kill without a restart.
@@ -263,7 +263,7 @@ class _Run:
             child.forget()
 
 
-def _stop(children: Iterable[Child]) -> None:
+def _stop(children: Iterable[MissionProcess]) -> None:
     for child in children:
         if child.running:
             child.stop()

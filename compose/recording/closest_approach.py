@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from compose.recording.run import Moment, Record
+from compose.recording.run import Record, TickRecord
 from protocol.motion import Pose, step
 from world.sensors import executed, mutual_ranges
 from world.truth import asked
@@ -32,7 +32,7 @@ def _of_pair(record: Record, pair: tuple[int, int]) -> float | None:
     return least
 
 
-def _way(record: Record, moment: Moment, place: int) -> list[Pose]:
+def _way(record: Record, moment: TickRecord, place: int) -> list[Pose]:
     """Where the robot is from this tick to the next."""
     scenario, pose = record.scenario, moment.truth.poses[place]
     if moment is record.moments[-1]:

@@ -8,13 +8,23 @@ from typing import Any
 
 import msgspec
 
-from compose.recording.run import Book
+from compose.recording.run import JournalFile
 from protocol.journal.journal_file import CorruptJournal
-from protocol.messages import Drive, End, Environment, Estimate, Farewell, Message, Missed, OfRobot, Sense
+from protocol.messages import (
+    Command,
+    DeadlineMissed,
+    Environment,
+    Estimate,
+    FinalReport,
+    Message,
+    MissionEnd,
+    Observation,
+    OfRobot,
+)
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, body, decode
 from world.scenario import Scenario
 
-OfWorld = Environment | Scenario | Drive | Missed | End | Farewell
+OfWorld = Environment | Scenario | Command | DeadlineMissed | MissionEnd | FinalReport
 """what stands in a world's journal"""
 KINDS = Scenario | OfRobot
 """what stands in a journal"""
@@ -65,13 +75,19 @@ class Telling:
             except MalformedFrame as error:
                 raise CorruptJournal(f"{self._name}: {error}") from None
             match message:
-                case Sense(tick) | Drive(tick) | Estimate(tick) | Missed(tick) | End(tick):
+                case (
+                    Observation(tick)
+                    | Command(tick)
+                    | Estimate(tick)
+                    | DeadlineMissed(tick)
+                    | MissionEnd(tick)
+                ):
                     self._tick = max(self._tick, tick)
             yield Journaled(self._name, self._place, self._tick, message, frame)
             self._place += 1
 
 
-def in_time(books: Mapping[str, Book]) -> Iterator[Journaled]:
+def in_time(books: Mapping[str, JournalFile]) -> Iterator[Journaled]:
     """Those of all journals, tick by tick; within one, journal by journal. Raises CorruptJournal."""
     each = [Telling(name).of(book.frames) for name, book in books.items()]
     return merge(*each, key=lambda one: one.tick)

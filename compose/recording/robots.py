@@ -14,7 +14,7 @@ from compose.recording.summary_json import broken_off, ended
 from protocol.journal import journal_file
 from protocol.journal.environment import named_in
 from protocol.journal.journal_file import CorruptJournal
-from protocol.messages import Briefing
+from protocol.messages import RobotConfig
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ def casts(folder: Path) -> list[tuple[str, ...]]:
     return [*dict.fromkeys(pairs), *[(robot,) for robot in robots if robot not in paired]]
 
 
-def agree(told: Mapping[str, Briefing], folder: object) -> None:
+def agree(told: Mapping[str, RobotConfig], folder: object) -> None:
     """Peers were briefed for one mission. Raises CorruptJournal if any two were not, or they are no pair."""
     for robot, one in told.items():
         other = told.get(one.peer)
@@ -66,7 +66,7 @@ def agree(told: Mapping[str, Briefing], folder: object) -> None:
             )
 
 
-def _shared(briefing: Briefing, robot: str) -> tuple[object, ...]:
+def _shared(briefing: RobotConfig, robot: str) -> tuple[object, ...]:
     """What both of a pair are told, seen from `robot`."""
     own = briefing.robot == robot
     return (
@@ -81,12 +81,12 @@ def _shared(briefing: Briefing, robot: str) -> tuple[object, ...]:
     )
 
 
-def _briefing(path: Path) -> Briefing | None:
+def _briefing(path: Path) -> RobotConfig | None:
     """None where it does not begin with one."""
     try:
         frames = journal_file.Tail(path).news()
         head = frames[named_in(frames) is not None :]
-        return decode(head[0], Briefing, MAX_FRAME_BYTES) if head else None
+        return decode(head[0], RobotConfig, MAX_FRAME_BYTES) if head else None
     except (CorruptJournal, MalformedFrame):
         return None
 

@@ -14,7 +14,7 @@ import msgspec
 from compose.errors import UserError
 from protocol.journal import journal_file
 from protocol.journal.environment import is_blank
-from protocol.messages import Drive, End, Estimate, Farewell
+from protocol.messages import Command, Estimate, FinalReport, MissionEnd
 from world.scenario import Scenario
 from world.truth import Truth
 from world.world_journal import history, opened
@@ -67,24 +67,24 @@ def cannot_write(out: Path, error: OSError) -> str:
     return f"--out: {out} cannot be written: {error.strerror or error}"
 
 
-class Moment(msgspec.Struct, frozen=True):
+class TickRecord(msgspec.Struct, frozen=True):
     """One tick: where everyone was, and what everyone then set out to do."""
 
     truth: Truth
-    drives: dict[str, Drive]
+    drives: dict[str, Command]
 
 
 class Record(msgspec.Struct, frozen=True):
     """A run, whole."""
 
     scenario: Scenario
-    moments: tuple[Moment, ...]
-    end: End | None
+    moments: tuple[TickRecord, ...]
+    end: MissionEnd | None
     """none if the record breaks off"""
-    farewells: dict[str, Farewell]
+    farewells: dict[str, FinalReport]
 
 
-class Book(msgspec.Struct, frozen=True):
+class JournalFile(msgspec.Struct, frozen=True):
     """A journal, as it is found."""
 
     frames: list[bytes]
@@ -92,7 +92,7 @@ class Book(msgspec.Struct, frozen=True):
     """bytes of a torn write behind them"""
 
 
-def books(folder: Path) -> dict[str, Book]:
+def books(folder: Path) -> dict[str, JournalFile]:
     """Every journal of the record in `folder`, by its name; the world's is the first, if there is one.
 
     Raises OSError if there is none at all or one cannot be read, journal.CorruptJournal where something
@@ -101,7 +101,7 @@ def books(folder: Path) -> dict[str, Book]:
     names = sorted([path.name for path in folder.glob(agent_journal("*"))])
     if not names or (folder / WORLD_JOURNAL).exists():
         names.insert(0, WORLD_JOURNAL)
-    return {name: Book(*journal_file.torn(folder / name)) for name in names}
+    return {name: JournalFile(*journal_file.torn(folder / name)) for name in names}
 
 
 def read(folder: Path) -> Record:
@@ -113,7 +113,7 @@ def read(folder: Path) -> Record:
     told = history(journal_file.read(path), path)
     if told.disorder is not None:
         raise journal_file.CorruptJournal(f"{path}: {told.disorder.what}")
-    moments = tuple([Moment(tick.world.truth, tick.drives) for tick in told.ticks])
+    moments = tuple([TickRecord(tick.world.truth, tick.drives) for tick in told.ticks])
     return Record(told.scenario, moments, told.end, told.farewells)
 
 

@@ -17,7 +17,7 @@ from compose.recording.claim import Claim, claim, matrix
 from compose.recording.run import Record
 from compose.recording.ticks_csv import ticks_csv
 from protocol import files
-from protocol.messages import Farewell, Localised, Outcome
+from protocol.messages import FinalReport, Localised, Outcome
 from protocol.motion import Pose, wrap
 from protocol.output import one_line
 from world.sensors import mutual_ranges
@@ -99,18 +99,18 @@ def _robot_summary(record: Record, place: int) -> dict[str, Any]:
 
 
 def _why_none(record: Record, robot: str) -> str:
-    """Why there is no Farewell of `robot`, as far as the world's journal tells."""
+    """Why there is no FinalReport of `robot`, as far as the world's journal tells."""
     if record.end is None:
         return "the record breaks off"
     latest = max([moment.truth.tick for moment in record.moments if robot in moment.drives], default=None)
     if latest is None:
-        return "no Drive of it came in time"
+        return "no Command of it came in time"
     if latest < record.end.tick:
-        return f"its last Drive in time was of tick {latest} of {record.end.tick}"
-    return "it did not answer the End"
+        return f"its last Command in time was of tick {latest} of {record.end.tick}"
+    return "it did not answer the MissionEnd"
 
 
-_SAID = [field for field in Farewell.__struct_fields__ if field != "robot"]
+_SAID = [field for field in FinalReport.__struct_fields__ if field != "robot"]
 
 
 def _listed(pose: Pose) -> list[float]:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from agent.process.agent_journal import Past
 
 
-class Row(msgspec.Struct, frozen=True):
+class TickRow(msgspec.Struct, frozen=True):
     """One robot in one tick, as `ticks.csv` has it; what is none is an empty field there."""
 
     tick: int
@@ -46,7 +46,7 @@ class Row(msgspec.Struct, frozen=True):
         return Pose(self.x, self.y, self.heading)
 
 
-def rows(record: Record) -> Iterator[Row]:
+def rows(record: Record) -> Iterator[TickRow]:
     """One per tick and robot, tick 0 included."""
     scenario = record.scenario
     last = record.moments[-1].truth.tick if record.moments else 0
@@ -60,14 +60,14 @@ def rows(record: Record) -> Iterator[Row]:
             if tick != last:
                 done = executed(asked(drive, scenario.mission), scenario, robot.id, tick)
                 v, omega = done.v, done.omega
-            yield Row(
+            yield TickRow(
                 *(tick, robot.id, pose.x, pose.y, wrap(pose.heading), v, omega),
                 *(anchor[i], mutual.get(robot.id)),
                 *((drive.phase, drive.state) if drive is not None else (None, None)),
             )
 
 
-def rows_of(told: Mapping[str, Past]) -> Iterator[Row]:
+def rows_of(told: Mapping[str, Past]) -> Iterator[TickRow]:
     """The same of robots without a world: speeds as measured, and nothing of their true poses."""
     for tick in range(max([len(past.steps) for past in told.values()], default=0)):
         for robot, past in told.items():
@@ -76,7 +76,7 @@ def rows_of(told: Mapping[str, Past]) -> Iterator[Row]:
             sense, drive = past.steps[tick].sense, past.steps[tick].drive
             after = past.steps[tick + 1].sense.executed if tick + 1 < len(past.steps) else None
             contact = past.contact(tick)
-            yield Row(
+            yield TickRow(
                 tick,
                 robot,
                 x=None,
@@ -96,11 +96,11 @@ def ticks_csv(record: Record) -> str:
     return table(rows(record))
 
 
-def table(rows: Iterable[Row]) -> str:
+def table(rows: Iterable[TickRow]) -> str:
     """`rows` as `ticks.csv` has them: floats in their shortest exact form."""
     out = io.StringIO()
     written = csv.writer(out, lineterminator="\n")
-    written.writerow(Row.__struct_fields__)
+    written.writerow(TickRow.__struct_fields__)
     written.writerows([["" if one is None else one for one in astuple(row)] for row in rows])
     return out.getvalue()
 

@@ -10,7 +10,7 @@ import msgspec
 from msgspec import Meta
 from msgspec.structs import asdict
 
-from world.faults import MAX_DELAY, MAX_FAULTS, Delay, Fault, Link
+from world.faults import MAX_DELAY, MAX_FAULTS, Delay, Fault, LinkSelector
 
 _LINK = re.compile(r"\s*(?P<one>[A-Za-z0-9_-]+)\s*(?P<way><->|->)\s*(?P<other>[A-Za-z0-9_-]+)\s*")
 _NUMBER = re.compile(r"-?[0-9]*\.?[0-9]+(?:[eE]-?[0-9]+)?")
@@ -61,7 +61,7 @@ def added(plan: Sequence[Fault], table: FaultTable, pairs: Sequence[tuple[str, s
     return plan
 
 
-def _link(text: str, pairs: Sequence[tuple[str, str]]) -> Link | None:
+def _link(text: str, pairs: Sequence[tuple[str, str]]) -> LinkSelector | None:
     if text.strip() == EVERYWHERE:
         return None
     match = _LINK.fullmatch(text)
@@ -70,7 +70,7 @@ def _link(text: str, pairs: Sequence[tuple[str, str]]) -> Link | None:
     one, other = match["one"], match["other"]
     if (one, other) not in pairs and (other, one) not in pairs:
         raise BadFault(f"link: '{one}' and '{other}' are no pair of the scenario")
-    return Link(one, other, both=match["way"] == "<->")
+    return LinkSelector(one, other, both=match["way"] == "<->")
 
 
 def table_of(text: str) -> dict[str, Any]:

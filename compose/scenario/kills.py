@@ -15,9 +15,9 @@ from msgspec import Meta
 from protocol.spelling import did_you_mean
 
 Point = Literal["sense", "report", "journal", "drive"]
-"""How far a tick has come. An agent's: its Sense is there, and nothing on record; its Report is sent; its
-Drive is on record, and not sent; it is sent. The world's: no Sense is sent; all are; all Drives are on
-record, and nobody has moved; all Drives are there, and not on record."""
+"""How far a tick has come. An agent's: its Observation is there, and nothing on record; its Report is sent; its
+Command is on record, and not sent; it is sent. The world's: no Observation is sent; all are; all Commands are on
+record, and nobody has moved; all Commands are there, and not on record."""
 
 POINTS: tuple[Point, ...] = get_args(Point)
 WORLD = "world"

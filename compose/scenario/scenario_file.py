@@ -20,8 +20,8 @@ from compose.errors import UserError
 from compose.scenario.fault_syntax import BadFault, FaultTable, added, table_of
 from compose.scenario.kills import DRAWN, POINTS, BadKill, Kill, KillTable, drawn
 from compose.scenario.toml_file import field_first, read_text, table_in
-from protocol.attack import OF_THE_START, Kind, Lie, Part
-from protocol.messages import Briefing
+from protocol.attack import OF_THE_START, Attack, Kind, Part
+from protocol.messages import RobotConfig
 from protocol.mission import Anchor, Mission, Role, Variant, noise_obstacle, obstacle, safety_obstacle
 from protocol.motion import TAU, Pose, wrap
 from protocol.orbits import Rendezvous, rendezvous, tick_budget
@@ -30,7 +30,7 @@ from protocol.spelling import did_you_mean
 from protocol.units import NAME, RobotId
 from protocol.wire import MalformedFrame, decode, encode
 from world.faults import Fault, hold_up
-from world.scenario import Placed, Scenario
+from world.scenario import RobotSpec, Scenario
 
 MAX_TICKS = 10**9
 MAX_ROBOTS = 200
@@ -83,7 +83,7 @@ class RobotTable(_Table, frozen=True):
     """x, y in m, heading in rad; drawn from the seed inside the sensing range where it is left out"""
     peer: RobotId | None = None
     """needed only with more than two robots"""
-    lie: Lie | None = None
+    lie: Attack | None = None
     """what it tells its peer instead of the truth"""
 
 
@@ -102,7 +102,7 @@ class ScenarioFile(_Table, frozen=True):
     """of processes: the world knows nothing of it, and no record tells"""
 
 
-class Setting(msgspec.Struct, frozen=True):
+class ScenarioTemplate(msgspec.Struct, frozen=True):
     """A scenario file found good, and the scenario that it makes; another draw from it is cheap."""
 
     file: ScenarioFile
@@ -178,7 +178,7 @@ def load(source: str, *, seed: int | None = None, faults: Sequence[str] = ()) ->
     return setting(source, faults).seeded(seed)
 
 
-def setting(source: str, faults: Sequence[str] = ()) -> Setting:
+def setting(source: str, faults: Sequence[str] = ()) -> ScenarioTemplate:
     """That of the scenario of that name, or in the file at that path, with `faults`.
 
     Raises NotToml and BadScenario.
@@ -201,7 +201,7 @@ def parse(text: str, source: str, *, seed: int | None = None, faults: Sequence[s
     return validate(table_in(text, source), source, faults).seeded(seed)
 
 
-def validate(table: Mapping[str, Any], source: str, faults: Sequence[str] = ()) -> Setting:
+def validate(table: Mapping[str, Any], source: str, faults: Sequence[str] = ()) -> ScenarioTemplate:
     """The setting that the table of a scenario file describes, with `faults`.
 
     Raises BadScenario and Unworkable.
@@ -210,7 +210,7 @@ def validate(table: Mapping[str, Any], source: str, faults: Sequence[str] = ()) 
         file = msgspec.convert(table, ScenarioFile)
     except msgspec.ValidationError as error:
         raise BadScenario(f"{source}: {field_first(str(error), CHOICES)}") from None
-    found = Setting(file, _validated(file, source, faults))
+    found = ScenarioTemplate(file, _validated(file, source, faults))
     try:
         found.kills(file.seed)
     except BadKill as error:
@@ -222,7 +222,7 @@ def _validated(file: ScenarioFile, source: str, told: Sequence[str]) -> Scenario
     _check_noise(file.mission, source)
     peers = _peers(file.robot, source)
     place = {robot.id: i for i, robot in enumerate(file.robot)}
-    placed: list[Placed] = []
+    placed: list[RobotSpec] = []
     plans: dict[str, Rendezvous] = {}
     for i, robot in enumerate(file.robot):
         peer = peers[robot.id]
@@ -241,7 +241,9 @@ def _validated(file: ScenarioFile, source: str, told: Sequence[str]) -> Scenario
                 f"{source}: robot[{i}].lie.part: a lie of the {robot.lie.kind} is of the beginning, "
                 "and so of all"
             )
-        placed.append(Placed(robot.id, peer, role, Anchor(*robot.anchor), start, plans[robot.id], robot.lie))
+        placed.append(
+            RobotSpec(robot.id, peer, role, Anchor(*robot.anchor), start, plans[robot.id], robot.lie)
+        )
     faults = _faults(file, told, list(peers.items()), source)
     budget = max(tick_budget(file.mission, plan) for plan in plans.values())
     held_up = EXCHANGES * hold_up(faults) if faults else 0
@@ -259,7 +261,7 @@ def _validated(file: ScenarioFile, source: str, told: Sequence[str]) -> Scenario
     )
     try:
         for one in scenario.robots:
-            decode(encode(scenario.briefing(one.id)), Briefing)
+            decode(encode(scenario.briefing(one.id)), RobotConfig)
     except MalformedFrame as error:
         raise Unworkable(f"{source}: mission: no robot could be told of it: {error}") from None
     return scenario

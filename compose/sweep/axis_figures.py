@@ -19,7 +19,7 @@ from compose.figures.style import look, save
 from compose.sweep import attack_figures, crash_figures
 from compose.sweep.execution import Results
 from compose.sweep.spec import Axis
-from compose.sweep.statistics import Counted, column, counted, orbited_over_t_max
+from compose.sweep.statistics import CellSummary, column, counted, orbited_over_t_max
 
 STYLES = (
     ("#0b3c6f", "-", "o"),
@@ -88,7 +88,7 @@ def _success(results: Results, place: int) -> Figure:
     return figure
 
 
-def _rates(figures: Sequence[Counted]) -> tuple[Any, Any, Any]:
+def _rates(figures: Sequence[CellSummary]) -> tuple[Any, Any, Any]:
     rows = [(one.rate or 0.0, one.rate_low or 0.0, one.rate_high or 0.0) for one in figures]
     rates, low, high = np.array(rows).reshape(-1, 3).T
     return rates, np.minimum(low, rates), np.maximum(high, rates)

@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from compose.scenario.scenario_file import Setting, Unworkable, validate
+from compose.scenario.scenario_file import ScenarioTemplate, Unworkable, validate
 from compose.sweep.field_paths import canonical, with_value
 from compose.sweep.spec import Campaign
 
@@ -33,7 +33,7 @@ class Cell(msgspec.Struct, frozen=True):
         return f"{self.index:03d}.toml"
 
 
-class Refused(msgspec.Struct, frozen=True):
+class RefusedCell(msgspec.Struct, frozen=True):
     """A cell in whose setting no mission can be played."""
 
     reason: str
@@ -60,13 +60,13 @@ def label(campaign: Campaign, cell: Cell) -> str:
     return "; ".join(said) or "the only one"
 
 
-def setting_of(campaign: Campaign, cell: Cell) -> Setting | Refused:
+def setting_of(campaign: Campaign, cell: Cell) -> ScenarioTemplate | RefusedCell:
     """The cell's scenario, validated. Raises BadScenario where the user is mistaken in one of its fields."""
     source = f"{campaign.source}: cell {cell.index} ({label(campaign, cell)})"
     try:
         return validate(cell.table, source)
     except Unworkable as error:
-        return Refused(str(error).removeprefix(f"{source}: "))
+        return RefusedCell(str(error).removeprefix(f"{source}: "))
 
 
 def trial_table(campaign: Campaign, cell: Cell, trial: int) -> dict[str, Any]:

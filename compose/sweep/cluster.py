@@ -22,8 +22,8 @@ from distributed.security import Security
 
 from compose.errors import UserError
 from compose.sweep import worker_pool
-from compose.sweep.remaining_work import EngineFailed, Orders, Work, chunks_of
-from compose.sweep.trial import Row, lost
+from compose.sweep.remaining_work import EngineFailed, TrialOptions, Work, chunks_of
+from compose.sweep.trial import TrialRow, lost
 from compose.sweep.worker import MAX_ERROR, Chunk
 from protocol.network.inbox import Inbox
 from protocol.output import one_line
@@ -112,7 +112,11 @@ async def _look_for(address: str) -> None:
 
 
 def play(
-    client: Client, work: Sequence[Work], orders: Orders, inbox: Inbox, done: Callable[[list[Row]], None]
+    client: Client,
+    work: Sequence[Work],
+    orders: TrialOptions,
+    inbox: Inbox,
+    done: Callable[[list[TrialRow]], None],
 ) -> None:
     """Run all of `work`, and call `done` with the rows of each chunk as it completes.
 
@@ -151,14 +155,14 @@ def play(
         _leave(client, campaign, [future for future, _, _ in flying.values()])
 
 
-def _rows(future: Future[Any], chunk: Chunk) -> list[Row]:
+def _rows(future: Future[Any], chunk: Chunk) -> list[TrialRow]:
     """Return the rows of a chunk that has ended; if its worker or process died, each row is a lost trial.
 
     Raises EngineFailed if the result is lost, or if the worker failed for another reason.
     """
     try:
         if future.status == "finished":
-            return [msgspec.msgpack.decode(row, type=Row) for row in future.result(RESULT_S)]
+            return [msgspec.msgpack.decode(row, type=TrialRow) for row in future.result(RESULT_S)]
         error = future.exception(RESULT_S) if future.status == "error" else None
     except TimeoutError:  # the worker with the result is lost
         error = None

@@ -11,12 +11,12 @@ import msgspec
 import numpy as np
 import pyarrow as pa
 
-from compose.sweep.cells import Cell, Refused, setting_of
-from compose.sweep.remaining_work import EngineFailed, Orders, Work
+from compose.sweep.cells import Cell, RefusedCell, setting_of
+from compose.sweep.remaining_work import EngineFailed, TrialOptions, Work
 from compose.sweep.results_folder import Folder, opened
 from compose.sweep.spec import BadSpec, Campaign
-from compose.sweep.statistics import Counted, counted, header, summary_csv
-from compose.sweep.trial import Row
+from compose.sweep.statistics import CellSummary, counted, header, summary_csv
+from compose.sweep.trial import TrialRow
 from compose.sweep.worker import PLAY
 from protocol import files
 from protocol.network.inbox import Inbox, Interrupted
@@ -24,7 +24,7 @@ from protocol.network.inbox import Inbox, Interrupted
 SUMMARY = "summary.csv"
 
 
-class Means(msgspec.Struct, frozen=True):
+class ExecutionOptions(msgspec.Struct, frozen=True):
     """Where and how trials are played; nothing in their rows depends on it but the wall time."""
 
     workers: int = os.cpu_count() or 1
@@ -56,7 +56,7 @@ class Results(msgspec.Struct, frozen=True):
     campaign: Campaign
     cells: tuple[Cell, ...]
     table: pa.Table
-    figures: dict[int, Counted]
+    figures: dict[int, CellSummary]
     """of each cell"""
     stopped: str | None
     """why there is no more yet"""
@@ -81,7 +81,9 @@ class Results(msgspec.Struct, frozen=True):
         ]
 
 
-def sweep(campaign: Campaign, out: Path, means: Means, inbox: Inbox, progress: Progress) -> Results:
+def sweep(
+    campaign: Campaign, out: Path, means: ExecutionOptions, inbox: Inbox, progress: Progress
+) -> Results:
     """Play what has no row in `out` yet, and gather what there is then, however it ended.
 
     Raises UserError: of the spec, a cell that is not a scenario, `out` or the scheduler.
@@ -131,7 +133,7 @@ def _left(folder: Folder, progress: Progress) -> list[Work]:
         if not left:
             continue
         setting = setting_of(campaign, cell)
-        if isinstance(setting, Refused):
+        if isinstance(setting, RefusedCell):
             refused[cell.index] = setting.reason
             count -= campaign.trials
         else:
@@ -146,13 +148,15 @@ def _left(folder: Folder, progress: Progress) -> list[Work]:
     return work
 
 
-def _play(folder: Folder, work: list[Work], means: Means, inbox: Inbox, progress: Progress) -> None:
+def _play(
+    folder: Folder, work: list[Work], means: ExecutionOptions, inbox: Inbox, progress: Progress
+) -> None:
     campaign = folder.campaign
-    orders = Orders(
+    orders = TrialOptions(
         campaign.seed, means.processes, campaign.trial_timeout, means.play, means.audit, campaign.draws
     )
 
-    def keep(rows: list[Row]) -> None:
+    def keep(rows: list[TrialRow]) -> None:
         folder.add(rows)
         progress.done(len(rows))
 
@@ -175,7 +179,7 @@ def _gathered(folder: Folder, stopped: str | None, interrupted: bool) -> Results
     return Results(folder.campaign, cells, table, figures, stopped, interrupted, trials)
 
 
-def _figures(table: pa.Table, cells: tuple[Cell, ...], refused: Mapping[int, str]) -> dict[int, Counted]:
+def _figures(table: pa.Table, cells: tuple[Cell, ...], refused: Mapping[int, str]) -> dict[int, CellSummary]:
     ends = table["cell"].to_numpy().searchsorted([cell.index for cell in cells], side="right")
     begins = [0, *ends[:-1]]
     return {

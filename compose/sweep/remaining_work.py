@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from compose.scenario.scenario_file import Setting
+from compose.scenario.scenario_file import ScenarioTemplate
 from compose.sweep.cells import trial_seed
 from compose.sweep.draws import Draws
 from compose.sweep.worker import Chunk
@@ -38,7 +38,7 @@ class Work(msgspec.Struct):
     cell: int
     key: str
     """of its seeds"""
-    setting: Setting
+    setting: ScenarioTemplate
     trials: list[int]
     table: dict[str, Any]
     """of its scenario's file"""
@@ -63,7 +63,7 @@ class Work(msgspec.Struct):
         return max(1, min(round(fitting), share, MAX_CHUNK))
 
 
-class Orders(msgspec.Struct, frozen=True):
+class TrialOptions(msgspec.Struct, frozen=True):
     """What holds for every trial of a campaign."""
 
     seed: int
@@ -76,7 +76,7 @@ class Orders(msgspec.Struct, frozen=True):
 
 
 def chunks_of(
-    work: Sequence[Work], orders: Orders, threads: Callable[[], int]
+    work: Sequence[Work], orders: TrialOptions, threads: Callable[[], int]
 ) -> Iterator[tuple[Chunk, Work]]:
     """All of it, each chunk as large as fits when it is asked for."""
     for source in work:

@@ -14,7 +14,7 @@ from rich.text import Text
 from compose.sweep.cells import Cell
 from compose.sweep.execution import SUMMARY, Progress, Results
 from compose.sweep.results_folder import CELLS
-from compose.sweep.statistics import Counted, noted, refusals
+from compose.sweep.statistics import CellSummary, noted, refusals
 from compose.terminal import tables, text_width
 from protocol.output import say
 
@@ -136,7 +136,7 @@ def _shown(results: Results) -> list[Cell]:
     return [cell for cell in results.cells if not _well(results.figures[cell.index])]
 
 
-def _well(figures: Counted) -> bool:
+def _well(figures: CellSummary) -> bool:
     """All were played and localised, and nothing was found in those that were judged."""
     return (
         figures.refused is None and figures.trials == figures.localised and figures.audited == figures.clean
@@ -168,7 +168,7 @@ def _axes(results: Results, cell: Cell) -> list[str]:
     return [str(cell.index), *[axis.label(place) for axis, place in places]]
 
 
-def _figures(figures: Counted) -> dict[str, str]:
+def _figures(figures: CellSummary) -> dict[str, str]:
     return {
         "trials": str(figures.trials),
         **{name: str(getattr(figures, name)) for name in OUTCOMES},

@@ -23,7 +23,7 @@ from compose.sweep.cells import Cell, cells, label
 from compose.sweep.field_paths import canonical
 from compose.sweep.spec import Campaign
 from compose.sweep.table import encoded, gathered, of_rows, read, schema_of
-from compose.sweep.trial import Row
+from compose.sweep.trial import TrialRow
 from protocol import files
 
 TRIALS = "trials.parquet"
@@ -34,7 +34,7 @@ MAX_DIFFERENCE = 60
 """characters, of a value that differs"""
 
 
-class Asked(msgspec.Struct, frozen=True):
+class Manifest(msgspec.Struct, frozen=True):
     """`campaign.json`: what a folder's rows are of."""
 
     campaign: Campaign
@@ -71,7 +71,7 @@ class Folder:
     def ask(self, refused: Mapping[int, str]) -> None:
         """Put down what is about to be played, and each cell's scenario."""
         self.refused = dict(refused)
-        asked = msgspec.json.encode(Asked(self.campaign, self.refused))
+        asked = msgspec.json.encode(Manifest(self.campaign, self.refused))
         files.write(self.path / CAMPAIGN, msgspec.json.format(asked, indent=2) + b"\n")
         (self.path / CELLS).mkdir(exist_ok=True)
         self._parts.mkdir(exist_ok=True)
@@ -80,7 +80,7 @@ class Folder:
             text = f"{comment}\n{tomli_w.dumps(cell.table)}"
             files.write(self.path / CELLS / cell.file_name, text.encode())
 
-    def add(self, rows: Sequence[Row]) -> None:
+    def add(self, rows: Sequence[TrialRow]) -> None:
         """Keep the rows of a chunk."""
         if rows:
             name = f"{rows[0].cell:05d}-{rows[0].trial:08d}.parquet"
@@ -141,7 +141,7 @@ def opened(path: Path, campaign: Campaign) -> Iterator[Folder]:
 def _refused_before(path: Path, campaign: Campaign) -> dict[int, str]:
     """The cells that an earlier run found unworkable. Raises UserError if it was of another campaign."""
     try:
-        asked = msgspec.json.decode(files.read_bytes(path / CAMPAIGN), type=Asked)
+        asked = msgspec.json.decode(files.read_bytes(path / CAMPAIGN), type=Manifest)
     except FileNotFoundError:
         if (path / TRIALS).exists() or (path / PARTS).exists():
             raise UserError(f"--out: {path} holds the rows of an unknown campaign") from None

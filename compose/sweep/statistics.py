@@ -34,7 +34,7 @@ WORSE = ("wrong", "alarm", "failed", "undecided")
 """outcomes that call for a look, the worst first"""
 
 
-class Counted(msgspec.Struct, frozen=True):
+class CellSummary(msgspec.Struct, frozen=True):
     """A row of `summary.csv`, after its axes; what does not apply is None."""
 
     trials: int
@@ -94,7 +94,7 @@ class Counted(msgspec.Struct, frozen=True):
     """why no mission can be played in this setting"""
 
 
-class Noted(msgspec.Struct, frozen=True):
+class NotableTrial(msgspec.Struct, frozen=True):
     """A trial that deserves a look: one that breaks a rule; else the worst outcome; else the longest."""
 
     cell: int
@@ -105,7 +105,7 @@ class Noted(msgspec.Struct, frozen=True):
     why: str | None
 
 
-def counted(table: pa.Table, refused: str | None = None) -> Counted:
+def counted(table: pa.Table, refused: str | None = None) -> CellSummary:
     """The figures of these trials."""
     everything = len(table)
     table = _played(table)
@@ -119,7 +119,7 @@ def counted(table: pa.Table, refused: str | None = None) -> Counted:
     claims, nees = int(_known(column(table, "claims")).sum()), _known(column(right, "nees"))
     nees_low, nees_high = nees_band(len(nees))
     violations = _known(column(table, "violations"))
-    return Counted(
+    return CellSummary(
         trials=n,
         **counts,
         rate=k / n if n else None,
@@ -205,7 +205,7 @@ def orbited_over_t_max(table: pa.Table) -> Floats:
     return np.divide(orbited * column(table, "period_s"), t_max, out=at_once, where=t_max > 0.0)
 
 
-def summary_csv(campaign: Campaign, cells: Sequence[Cell], figures: Mapping[int, Counted]) -> str:
+def summary_csv(campaign: Campaign, cells: Sequence[Cell], figures: Mapping[int, CellSummary]) -> str:
     """A row a cell."""
     out = io.StringIO()
     rows = csv.writer(out, lineterminator="\n")
@@ -226,7 +226,7 @@ def header(campaign: Campaign) -> list[str]:
         for axis in campaign.axes
         for name in ([axis.name] if axis.labels is not None else []) + list(axis.fields)
     ]
-    return ["cell", *axes, *Counted.__struct_fields__]
+    return ["cell", *axes, *CellSummary.__struct_fields__]
 
 
 def _played(table: pa.Table) -> pa.Table:
@@ -249,7 +249,7 @@ def refusals(table: pa.Table) -> list[tuple[str, int]]:
     return [(first[kind], count) for kind, count in counts.most_common()]
 
 
-def noted(table: pa.Table) -> Noted | None:
+def noted(table: pa.Table) -> NotableTrial | None:
     """The trial to look at first, if any was played."""
     table = _played(table)
     if not len(table):
@@ -262,7 +262,7 @@ def noted(table: pa.Table) -> Noted | None:
     else:
         place = outcomes.index(worst) if worst is not None else int(np.nanargmax(column(table, "ticks")))
     found = table.slice(place, 1).to_pylist()[0]
-    return Noted(
+    return NotableTrial(
         cell=found["cell"],
         trial=found["trial"],
         seed=found["seed"],

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 from compose.sweep.cells import Cell
 from compose.sweep.field_paths import canonical
 from compose.sweep.spec import Campaign
-from compose.sweep.trial import RobotRow, Row
+from compose.sweep.trial import RobotRow, TrialRow
 from protocol.files import open_file
 from protocol.motion import Covariance
 
@@ -34,7 +34,7 @@ _KINDS: dict[str, pa.DataType] = {
     ),
     **dict.fromkeys([f"cov_{name}" for name in Covariance.__struct_fields__], pa.float64()),
 }
-_OF_ALL = [field for field in Row.__struct_fields__ if field not in ("cell", "trial", "robots", "drawn")]
+_OF_ALL = [field for field in TrialRow.__struct_fields__ if field not in ("cell", "trial", "robots", "drawn")]
 
 
 def schema_of(campaign: Campaign, cells: Sequence[Cell]) -> pa.Schema:
@@ -84,7 +84,7 @@ def _held(value: Any, kind: pa.DataType) -> Any:
 
 
 def of_rows(
-    rows: Sequence[Row], campaign: Campaign, cells: Mapping[int, Cell], schema: pa.Schema
+    rows: Sequence[TrialRow], campaign: Campaign, cells: Mapping[int, Cell], schema: pa.Schema
 ) -> pa.Table:
     """The table of `rows`; what the axes say belongs to the cell."""
     columns: dict[str, list[Any]] = {"cell": [row.cell for row in rows]}

@@ -15,7 +15,7 @@ from compose.recording.run import Record
 from compose.recording.summary_json import first_claim, first_contact
 from compose.scenario.kills import Kill
 from compose.sweep.trial_mission import as_processes, run_in_process
-from protocol.messages import Farewell
+from protocol.messages import FinalReport
 from protocol.motion import Covariance
 from world.scenario import Scenario
 
@@ -74,7 +74,7 @@ class RobotRow(msgspec.Struct, frozen=True, array_like=True):
     cov_hh: float | None = None
 
 
-class Row(msgspec.Struct, frozen=True, array_like=True):
+class TrialRow(msgspec.Struct, frozen=True, array_like=True):
     """A trial that was played, or was lost; what does not apply is None."""
 
     cell: int
@@ -135,17 +135,19 @@ class Row(msgspec.Struct, frozen=True, array_like=True):
     """fields that the trial drew, by their paths"""
 
 
-def refused(cell: int, trial: int, seed: int, reason: str, drawn: dict[str, float]) -> Row:
+def refused(cell: int, trial: int, seed: int, reason: str, drawn: dict[str, float]) -> TrialRow:
     """Return the row of a trial in whose setting no mission can be played."""
-    return Row(cell, trial, seed, "refused", reason, drawn=drawn)
+    return TrialRow(cell, trial, seed, "refused", reason, drawn=drawn)
 
 
-def lost(cell: int, trial: int, seed: int, error: str, wall_s: float | None) -> Row:
+def lost(cell: int, trial: int, seed: int, error: str, wall_s: float | None) -> TrialRow:
     """The row of a trial that was not played to an end."""
-    return Row(cell, trial, seed, "failed", error=error, wall_s=None if wall_s is None else round(wall_s, 6))
+    return TrialRow(
+        cell, trial, seed, "failed", error=error, wall_s=None if wall_s is None else round(wall_s, 6)
+    )
 
 
-def play(trial: Trial) -> Row:
+def play(trial: Trial) -> TrialRow:
     """Play it. What it raises becomes a row with that error."""
     if trial.processes or trial.kills is not None:
         played = as_processes(trial.scenario, audit=trial.audit, kills=trial.kills)
@@ -161,7 +163,7 @@ def play(trial: Trial) -> Row:
     return replace(found, outcome="failed", reason=why)
 
 
-def row(trial: Trial, record: Record, wall_s: float, findings: Findings | None = None) -> Row:
+def row(trial: Trial, record: Record, wall_s: float, findings: Findings | None = None) -> TrialRow:
     """What is kept of a record, and of what its audit found."""
     scenario, end = record.scenario, record.end
     if end is None:
@@ -174,7 +176,7 @@ def row(trial: Trial, record: Record, wall_s: float, findings: Findings | None =
     said = record.farewells.values()
     errors = [robot.position_error_m for robot in robots.values() if robot.position_error_m is not None]
     nees = [robot.nees for robot in robots.values() if robot.nees is not None]
-    return Row(
+    return TrialRow(
         cell=trial.cell,
         trial=trial.number,
         seed=scenario.seed,
@@ -213,7 +215,7 @@ def _robot_row(record: Record, place: int) -> RobotRow:
     return _claimed(_said(record.farewells.get(robot)), first_claim(record, place))
 
 
-def _said(farewell: Farewell | None) -> RobotRow:
+def _said(farewell: FinalReport | None) -> RobotRow:
     """What the robot says of itself in the end."""
     if farewell is None:
         return RobotRow()

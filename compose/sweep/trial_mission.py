@@ -16,7 +16,7 @@ from compose.recording.run import Record, read
 from compose.recording.ticks_csv import ticks_csv
 from compose.scenario.kills import Kill
 from compose.scenario.scenario_file import run_name
-from protocol.journal.journal_file import Kept, packed
+from protocol.journal.journal_file import MemoryJournal, packed
 from protocol.network.inbox import Inbox
 from world.scenario import Scenario
 
@@ -43,7 +43,7 @@ def run_in_process(scenario: Scenario, *, audit: bool) -> Played:
     began = time.perf_counter()
     if not audit:
         return Played(in_process.play(scenario), None, time.perf_counter() - began)
-    kept = {name: Kept() for name in in_process.journals(scenario)}
+    kept = {name: MemoryJournal() for name in in_process.journals(scenario)}
     record = in_process.played(scenario, kept)
     findings = rules.judge({name: journal.frames for name, journal in kept.items()})
     return Played(record, findings, time.perf_counter() - began)
@@ -75,7 +75,7 @@ def as_processes(scenario: Scenario, *, audit: bool, kills: Sequence[Kill] | Non
 
 
 def _otherwise(record: Record, out: Path) -> tuple[str, ...]:
-    undisturbed = {name: Kept() for name in in_process.journals(record.scenario)}
+    undisturbed = {name: MemoryJournal() for name in in_process.journals(record.scenario)}
     ticks = ticks_csv(in_process.played(record.scenario, undisturbed))
     files = [name for name, kept in undisturbed.items() if (out / name).read_bytes() != packed(kept.frames)]
     return (*files, "ticks.csv") if ticks_csv(record) != ticks else tuple(files)

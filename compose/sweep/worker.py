@@ -21,7 +21,7 @@ from typing import Any, BinaryIO
 import msgspec
 from msgspec.structs import replace
 
-from compose.scenario.scenario_file import Setting, Unworkable, validate
+from compose.scenario.scenario_file import ScenarioTemplate, Unworkable, validate
 from compose.sweep import trial
 from compose.sweep.draws import Draws
 from protocol.output import one_line
@@ -44,7 +44,7 @@ class Chunk(msgspec.Struct, frozen=True):
     trials: tuple[int, ...]
     seeds: tuple[int, ...]
     """of each trial"""
-    setting: Setting
+    setting: ScenarioTemplate
     processes: bool
     timeout: float
     """s of wall time that a trial may last"""
@@ -112,7 +112,7 @@ def framed(body: bytes) -> bytes:
     return len(body).to_bytes(LENGTH_BYTES, "big") + body
 
 
-def _played(chunk: Chunk, number: int, seed: int) -> trial.Row:
+def _played(chunk: Chunk, number: int, seed: int) -> trial.TrialRow:
     began = time.perf_counter()
     try:
         player = _function(chunk.play)
@@ -134,7 +134,7 @@ def _played(chunk: Chunk, number: int, seed: int) -> trial.Row:
 
 
 @cache
-def _function(path: str) -> Callable[[trial.Trial], trial.Row]:
+def _function(path: str) -> Callable[[trial.Trial], trial.TrialRow]:
     module, _, name = path.partition(":")
-    found: Callable[[trial.Trial], trial.Row] = getattr(import_module(module), name)
+    found: Callable[[trial.Trial], trial.TrialRow] = getattr(import_module(module), name)
     return found

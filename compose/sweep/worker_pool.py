@@ -33,7 +33,7 @@ class Hung(Exception):
     """A process has not answered within its timeout."""
 
 
-class Child:
+class WorkerProcess:
     """A process in which trials run. It has its own session, so Ctrl-C reaches only its owner."""
 
     def __init__(self) -> None:
@@ -103,11 +103,11 @@ class _Children:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._working: dict[tuple[str, int], Child] = {}
-        self._resting: dict[tuple[str, int], Child] = {}
+        self._working: dict[tuple[str, int], WorkerProcess] = {}
+        self._resting: dict[tuple[str, int], WorkerProcess] = {}
         self._over: set[str] = set()
 
-    def take(self, campaign: str) -> tuple[Child, bool] | None:
+    def take(self, campaign: str) -> tuple[WorkerProcess, bool] | None:
         """Return this thread's process and whether it is reused; None if the sweep is over.
 
         Raises Died or Hung if a new process does not become ready.
@@ -117,7 +117,7 @@ class _Children:
             if campaign in self._over:
                 return None
             kept = self._resting.pop(key, None)
-            child = self._working[key] = kept or Child()
+            child = self._working[key] = kept or WorkerProcess()
         if kept is None:
             try:
                 ready = child.answer(START_S)

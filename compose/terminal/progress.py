@@ -14,7 +14,7 @@ from compose.recording.run import WORLD_JOURNAL
 from compose.recording.summary_json import outcome_line
 from compose.terminal import tables, text_width
 from protocol.journal.journal_file import Tail
-from protocol.messages import Drive, End, Farewell, Missed
+from protocol.messages import Command, DeadlineMissed, FinalReport, MissionEnd
 from protocol.output import one_line, say
 from protocol.wire import MAX_FRAME_BYTES, decode
 from world.scenario import Scenario
@@ -46,13 +46,15 @@ NAMED = 10
 def live(scenario: Scenario, folder: Path) -> Iterator[None]:
     """Show the run whose record grows in `folder`, ten times a second."""
     journal = Tail(folder / WORLD_JOURNAL)
-    drives: dict[str, Drive] = {}
+    drives: dict[str, Command] = {}
 
     def update() -> None:
         with suppress(OSError, ValueError):
             for frame in journal.news():
-                message = decode(frame, Scenario | Drive | Missed | End | Farewell, MAX_FRAME_BYTES)
-                if isinstance(message, Drive):
+                message = decode(
+                    frame, Scenario | Command | DeadlineMissed | MissionEnd | FinalReport, MAX_FRAME_BYTES
+                )
+                if isinstance(message, Command):
                     drives[message.robot] = message
 
     def table() -> Table:
@@ -83,7 +85,7 @@ def live(scenario: Scenario, folder: Path) -> Iterator[None]:
 
 
 def result(summary: Mapping[str, Any], rate: float | None = None) -> None:
-    """The table at the end of a run that went at `rate`, and what became of deadlines and Farewells."""
+    """The table at the end of a run that went at `rate`, and what became of deadlines and FinalReports."""
     robots: Mapping[str, Any] = summary["robots"]
     exact = all(robot["covariance"] is None for robot in robots.values())
     late = {name: missed for name, robot in robots.items() if (missed := robot["deadlines_missed"])}

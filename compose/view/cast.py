@@ -7,8 +7,8 @@ from collections.abc import Mapping
 
 import msgspec
 
-from protocol.attack import Lie
-from protocol.messages import Briefing
+from protocol.attack import Attack
+from protocol.messages import RobotConfig
 from protocol.mission import Anchor, Mission, Role, Variant
 from protocol.motion import Pose
 from protocol.orbits import Orbit
@@ -25,7 +25,7 @@ class Seat(msgspec.Struct, frozen=True):
     role: Role
     anchor: Anchor
     orbit: Orbit
-    lie: Lie | None = None
+    lie: Attack | None = None
     """what it is told to tell its peer instead of the truth"""
     frame: Pose | None = None
     """that of its own anchor, in the world's: the x-axis leads from the anchor to where the robot was
@@ -99,7 +99,7 @@ def of_scenario(scenario: Scenario, mode: str | None = None, tick_s: float | Non
     )
 
 
-def of_briefings(name: str, briefings: Mapping[str, Briefing]) -> Stage:
+def of_briefings(name: str, briefings: Mapping[str, RobotConfig]) -> Stage:
     """As the robots were told it; there must be one at least."""
     told = list(briefings.values())
     return Stage(

@@ -13,7 +13,7 @@ from compose.view.cast import Seat, Stage
 from compose.view.deliveries import Passage, contact_of
 from compose.view.facts import Facts
 from compose.view.words import doing
-from protocol.messages import Alarm, Drive, End, Localised
+from protocol.messages import Command, Inconsistent, Localised, MissionEnd
 from protocol.motion import wrap
 
 Kind = Literal[
@@ -34,7 +34,7 @@ class Event(msgspec.Struct, frozen=True):
 
 
 def events(
-    stage: Stage, before: Facts | None, now: Facts, passages: Sequence[Passage], end: End | None
+    stage: Stage, before: Facts | None, now: Facts, passages: Sequence[Passage], end: MissionEnd | None
 ) -> Iterator[Event]:
     """Robot by robot, then on the radio; `before` is the tick before, if it is known."""
     for who in (None, *stage.ids):
@@ -118,7 +118,7 @@ def _deciding(seat: Seat, before: Facts | None, now: Facts) -> Iterator[Event]:
         yield _verdict(seat, drive, now)
 
 
-def _verdict(seat: Seat, drive: Drive, now: Facts) -> Event:
+def _verdict(seat: Seat, drive: Command, now: Facts) -> Event:
     robot = seat.id
     match drive.verdict:
         case Localised(pose):
@@ -129,7 +129,7 @@ def _verdict(seat: Seat, drive: Drive, now: Facts) -> Event:
                 text += f"; it is {metres(math.hypot(x - truth.x, y - truth.y))} off"
             return Event(now.tick, "claim", robot, text)
         case verdict:
-            kind: Kind = "alarm" if isinstance(verdict, Alarm) else "undecided"
+            kind: Kind = "alarm" if isinstance(verdict, Inconsistent) else "undecided"
             return Event(now.tick, kind, robot, doing(seat, drive.phase, drive.state, verdict))
 
 

@@ -5,16 +5,16 @@ from __future__ import annotations
 import msgspec
 
 from protocol.messages import (
-    Briefing,
-    Drive,
-    End,
+    Command,
+    DeadlineMissed,
     Estimate,
-    Farewell,
+    FinalReport,
+    GroundTruth,
     Message,
-    Missed,
+    MissionEnd,
+    Observation,
     Report,
-    Sense,
-    Truth,
+    RobotConfig,
 )
 from protocol.motion import Pose
 
@@ -34,13 +34,13 @@ class Facts(msgspec.Struct, frozen=True):
 
     tick: int
     truth: dict[str, Pose] = msgspec.field(default_factory=dict)
-    senses: dict[str, Sense] = msgspec.field(default_factory=dict)
+    senses: dict[str, Observation] = msgspec.field(default_factory=dict)
     reports: dict[str, Said] = msgspec.field(default_factory=dict)
     """by who says them"""
-    drives: dict[str, Drive] = msgspec.field(default_factory=dict)
+    drives: dict[str, Command] = msgspec.field(default_factory=dict)
     estimates: dict[str, Estimate] = msgspec.field(default_factory=dict)
     late: set[str] = msgspec.field(default_factory=set)
-    """robots whose Drive did not come in time"""
+    """robots whose Command did not come in time"""
     without: set[str] = msgspec.field(default_factory=set)
     """robots that went without their peer's report, which did not come in time"""
     under_way: dict[Link, tuple[int, ...]] = msgspec.field(default_factory=dict)
@@ -56,9 +56,9 @@ class Gathering:
 
     def __init__(self) -> None:
         self.ticks: dict[int, Facts] = {}
-        self.briefings: dict[str, Briefing] = {}
-        self.farewells: dict[str, Farewell] = {}
-        self.end: End | None = None
+        self.briefings: dict[str, RobotConfig] = {}
+        self.farewells: dict[str, FinalReport] = {}
+        self.end: MissionEnd | None = None
         self.last = -1
         """the latest tick of which anything is known"""
         self.has_truth = False
@@ -104,18 +104,18 @@ class Gathering:
         `teller` is the robot in whose journal it stands; none of the world's, or on the network.
         """
         match message:
-            case Sense(tick, robot):
+            case Observation(tick, robot):
                 self.at(tick).senses.setdefault(robot, message)
-            case Drive(tick, robot):
+            case Command(tick, robot):
                 self.at(tick).drives.setdefault(robot, message)
             case Estimate(tick, robot):
                 self.at(tick).estimates.setdefault(robot, message)
             case Report(tick, robot):
                 self.at(tick).reports.setdefault(robot, Said(message, size))
-            case Truth(tick, poses):
+            case GroundTruth(tick, poses):
                 self.at(tick).truth.update(poses)
                 self.has_truth = True
-            case Missed(tick, robot):
+            case DeadlineMissed(tick, robot):
                 facts = self.at(tick)
                 (facts.late if teller is None else facts.without).add(teller or robot)
             case _:
@@ -123,9 +123,9 @@ class Gathering:
 
     def _take_once(self, message: Message) -> None:
         match message:
-            case Briefing(robot):
+            case RobotConfig(robot):
                 self.briefings.setdefault(robot, message)
-            case Farewell(robot):
+            case FinalReport(robot):
                 self.farewells.setdefault(robot, message)
-            case End():
+            case MissionEnd():
                 self.end = self.end or message

@@ -14,10 +14,10 @@ from compose.view.scene import Scene, scene
 from protocol import files
 from protocol.journal.environment import is_blank
 from protocol.journal.journal_file import CorruptJournal, Tail
-from protocol.messages import End, Farewell, OfRobot
+from protocol.messages import FinalReport, MissionEnd, OfRobot
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 from world.tick import World, senses
-from world.world_journal import Reading, opened
+from world.world_journal import JournalReading, opened
 
 
 class Performance(msgspec.Struct, frozen=True):
@@ -26,9 +26,9 @@ class Performance(msgspec.Struct, frozen=True):
     stage: Stage
     scenes: tuple[Scene, ...]
     """one a tick, from the first that is known on"""
-    end: End | None
+    end: MissionEnd | None
     """none where the record breaks off"""
-    farewells: dict[str, Farewell]
+    farewells: dict[str, FinalReport]
     notes: tuple[str, ...]
     """what could not be read, a line each"""
 
@@ -71,7 +71,7 @@ class Journals:
         self.notes: list[str] = []
         """journals that are damaged; what stands in one from there on is left out"""
         self._tails: dict[str, Tail] = {}
-        self._world: Reading | None = None
+        self._world: JournalReading | None = None
         self._head: list[bytes] = []
         """of the world's journal, while its scenario has not come"""
 
@@ -122,7 +122,7 @@ class Journals:
                 self._head = frames
                 return
             scenario, _, rest = opened(frames, path)
-            self._world = Reading(scenario)
+            self._world = JournalReading(scenario)
             self.stage = of_scenario(scenario, self._mode())
             self._show(self._world.world)
             frames = list(rest)

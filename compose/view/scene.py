@@ -9,7 +9,7 @@ from compose.view.deliveries import Passage, passages
 from compose.view.events import Event, events
 from compose.view.facts import Facts
 from compose.view.words import doing
-from protocol.messages import Contact, End, Odds, Phase, Verdict, Word
+from protocol.messages import Contact, MissionEnd, Phase, Probability, Verdict, Word
 from protocol.motion import Controls, Covariance, Pose, wrap
 
 
@@ -35,13 +35,13 @@ class Decision(msgspec.Struct, frozen=True):
     verdict: Verdict | None = None
 
 
-class Held(msgspec.Struct, frozen=True):
+class HeldPoses(msgspec.Struct, frozen=True):
     """What a robot holds possible."""
 
     local: tuple[Pose, ...]
     """in the frame of its own anchor; `Seat.frame` says where that lies"""
     world: tuple[Pose, ...]
-    odds: tuple[Odds, ...]
+    odds: tuple[Probability, ...]
     """of each of `world`, or, while there is none, of `local`; none where each is equally possible"""
     covariance: Covariance | None
     """of the first of `world`"""
@@ -57,7 +57,7 @@ class Player(msgspec.Struct, frozen=True, omit_defaults=True):
     pose: Pose | None = None
     """the true one; its heading is wrapped"""
     sensed: bool = False
-    """whether its Sense is known; if not, no range tells nothing"""
+    """whether its Observation is known; if not, no range tells nothing"""
     down: bool = False
     """whether its process was seen to be gone, and has not been seen again"""
     executed: Controls | None = None
@@ -66,7 +66,7 @@ class Player(msgspec.Struct, frozen=True, omit_defaults=True):
     contacts: tuple[Contact, ...] = ()
     sent: Sent | None = None
     drive: Decision | None = None
-    held: Held | None = None
+    held: HeldPoses | None = None
 
 
 class Scene(msgspec.Struct, frozen=True):
@@ -86,7 +86,7 @@ class Scene(msgspec.Struct, frozen=True):
         raise KeyError(robot)
 
 
-def scene(stage: Stage, before: Facts | None, now: Facts, end: End | None = None) -> Scene:
+def scene(stage: Stage, before: Facts | None, now: Facts, end: MissionEnd | None = None) -> Scene:
     """What there is to see in the tick of `now`; `before` is the tick before, if it is known."""
     players = tuple([_player(seat, now) for seat in stage.robots])
     flying = tuple(passages(stage, before, now))
@@ -125,7 +125,7 @@ def _player(seat: Seat, now: Facts) -> Player:
             else None
         ),
         held=(
-            Held(estimate.local, estimate.world, estimate.odds, estimate.covariance, estimate.localised)
+            HeldPoses(estimate.local, estimate.world, estimate.odds, estimate.covariance, estimate.localised)
             if estimate is not None
             else None
         ),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from compose.view.cast import Seat
-from protocol.messages import Alarm, Undecided, Verdict
+from protocol.messages import Inconsistent, Undecided, Verdict
 
 SEEKING = {
     "straight": "{robot} drives straight ahead, for a second range to {beacon}",
@@ -35,12 +35,12 @@ WAITING = "{robot} waits beside its anchor until {peer} comes by"
 
 
 def doing(seat: Seat, phase: int, state: str, verdict: Verdict | None) -> str:
-    """What a robot is doing whose Drive says so."""
+    """What a robot is doing whose Command says so."""
     beacon = seat.peer if phase == 3 else "its anchor"
     match verdict:
         case Undecided(reason):
             return f"{seat.id} cannot go on: {reason}"
-        case Alarm(claim):
+        case Inconsistent(claim):
             return f"{seat.id} does not believe {seat.peer}, which tells {claim}"
     sentence = SEEKING.get(state) or DOING.get(state) or "{robot}: " + state
     if state == "orbiting" and seat.orbit.v == 0.0:

@@ -47,7 +47,7 @@ class Sink(Protocol):
         """All of `frames`, at once."""
 
 
-class Kept:
+class MemoryJournal:
     """A journal that is kept in memory, for whoever judges the run as soon as it is over."""
 
     def __init__(self) -> None:

@@ -13,7 +13,7 @@ from protocol.files import open_regular
 from protocol.journal.journal_file import CannotRecord, Journal, lock, packed, torn
 
 
-class Otherwise(ValueError):
+class ReplayMismatch(ValueError):
     """Something else is on record than what is written to its Retrace."""
 
 
@@ -49,7 +49,7 @@ class Retrace:
             elif frame == self.frames[self._met]:
                 self._met += 1
             else:
-                raise Otherwise
+                raise ReplayMismatch
 
     def go_on(self) -> tuple[Journal, int]:
         """The journal, to be written on, and how many bytes were cut off: what there was of a torn write.

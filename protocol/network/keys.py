@@ -23,20 +23,20 @@ def truth(run: str) -> str:
 
 
 def briefing(run: str, robot: str) -> str:
-    """Return the key of the world's queryable for that robot's Briefing; the world declares it for "*"."""
+    """Return the key of the world's queryable for that robot's RobotConfig; the world declares it for "*"."""
     return f"{ROOT}/{run}/world/briefing/{robot}"
 
 
 def sense(run: str, robot: str) -> str:
-    """Return the key on which the world sends each Sense to that robot, and End after the last.
+    """Return the key on which the world sends each Observation to that robot, and MissionEnd after the last.
 
-    The world then sends the robot's Farewell back, once it is in the recording.
+    The world then sends the robot's FinalReport back, once it is in the recording.
     """
     return f"{ROOT}/{run}/robot/{robot}/sense"
 
 
 def drive(run: str, robot: str) -> str:
-    """Return the key on which that robot sends each Drive to the world, and Farewell after the mission."""
+    """Return the key on which that robot sends each Command to the world, and FinalReport after the mission."""
     return f"{ROOT}/{run}/robot/{robot}/drive"
 
 

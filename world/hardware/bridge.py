@@ -1,4 +1,4 @@
-"""One robot without a world: its driver's Senses to its agent, its agent's Drives to the driver.
+"""One robot without a world: its driver's Observations to its agent, its agent's Commands to the driver.
 
 The agent is the one that a world has, in a process of its own: whatever becomes of it, its robot stands still
 within a manoeuvre. A tick is a manoeuvre of T_s and a moment at rest, in which is sensed, heard and decided.
@@ -18,7 +18,17 @@ import msgspec
 import zenoh
 
 from protocol.journal.journal_file import Sink
-from protocol.messages import Beat, Briefing, Contact, Drive, End, Farewell, Report, Sense, Verdict
+from protocol.messages import (
+    Command,
+    Contact,
+    FinalReport,
+    MissionEnd,
+    Observation,
+    Report,
+    RobotConfig,
+    TickStart,
+    Verdict,
+)
 from protocol.network import keys, session
 from protocol.network.inbox import NOTHING, Arrival, Inbox
 from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode, encode
@@ -27,7 +37,7 @@ from world.hardware.driver_journal import DriverPast, Mark
 from world.hardware.termination import Ending
 
 REPEAT_S = 0.25
-"""how often the End is said again"""
+"""how often the MissionEnd is said again"""
 FAREWELL_S = 2.0
 """how long to wait for the agent's last word"""
 ASTRAY = 64
@@ -41,7 +51,7 @@ UNKNOWN = -math.inf
 UNHEARD = 4.0
 """ticks within which a robot that goes on tells that it does"""
 
-M = TypeVar("M", Drive, Beat, Report)
+M = TypeVar("M", Command, TickStart, Report)
 
 
 class NoStart(TimeoutError):
@@ -58,7 +68,7 @@ class Field:
     def __init__(
         self,
         driver: Driver,
-        briefing: Briefing,
+        briefing: RobotConfig,
         run: str,
         inbox: Inbox,
         *,
@@ -83,7 +93,7 @@ class Field:
         self._journal = journal
         self._max_ticks = max_ticks
         self._ending = Ending(briefing, max_ticks, self._patience)
-        self._end: End | None = None
+        self._end: MissionEnd | None = None
         """once it is on record"""
         self._again = False
         """whether its process was killed before, be it before tick 0"""
@@ -138,7 +148,7 @@ class Field:
         session.answer(link, keys.briefing(run, me), lambda _: self._briefing)
         self._token = session.show_alive(link, keys.world_alive(run))
 
-    def play(self, wait: float, ended: Callable[[], None]) -> End:
+    def play(self, wait: float, ended: Callable[[], None]) -> MissionEnd:
         """The whole mission; looks for agent and peer for `wait` seconds. The robot stands when this is over.
 
         `ended` is called when the agent's process has ended; it may start it again, or raise. Raises NoStart;
@@ -151,7 +161,7 @@ class Field:
             while end is None:
                 end = self._play_tick()
         except DriverFailed as failure:
-            end = End(max(self._tick, 0), "failed", f"{self._id}'s driver: {failure}")
+            end = MissionEnd(max(self._tick, 0), "failed", f"{self._id}'s driver: {failure}")
         finally:
             self._stop()
         if self._end is None:
@@ -192,13 +202,13 @@ class Field:
             return True
         return self._next != UNKNOWN if self._briefing.role == "b" else self._peer in self._alive
 
-    def _play_tick(self) -> End | None:
+    def _play_tick(self) -> MissionEnd | None:
         self._tick += 1
         tick = self._tick
         now = time.monotonic()
         self._next = (now if self._next == UNKNOWN else self._next) + self._tick_s
         if not self._resumed or self._next > now:  # one that catches up says so once it is there
-            self._beat.put(encode(Beat(tick, self._id)))
+            self._beat.put(encode(TickStart(tick, self._id)))
         reading = self._reading(tick)
         sense = _sense(reading, tick, self._briefing)
         self._write(*_mark(reading, tick, self._id), sense)
@@ -216,7 +226,7 @@ class Field:
             self._take(self._inbox.next(max(until, self._next) - now))
         self._take_waiting()
         if self._unanswered and now - self._answered > self._patience:
-            return End(tick, "failed", f"no answer from {self._id}'s agent for {self._patience:g} s")
+            return MissionEnd(tick, "failed", f"no answer from {self._id}'s agent for {self._patience:g} s")
         return self._ending.after(tick, drive, peer_there=self._peer in self._alive)
 
     def _reading(self, tick: int) -> Reading:
@@ -231,10 +241,10 @@ class Field:
     def _stop(self) -> None:
         try:
             self._driver.stop()
-        except Exception as error:  # noqa: BLE001  # as above; and there is an End to be told
+        except Exception as error:  # noqa: BLE001  # as above; and there is an MissionEnd to be told
             self._inbox.say(f"the driver does not stop: {type(error).__name__}: {error}")
 
-    def _set_off(self, drive: Drive) -> None:
+    def _set_off(self, drive: Command) -> None:
         """At v_max and omega_max at the most."""
         mission = self._briefing.mission
         v = min(max(drive.v, -mission.max_speed), mission.max_speed)
@@ -244,8 +254,8 @@ class Field:
         except Exception as error:  # as above
             raise DriverFailed(f"drive({v:g}, {omega:g}): {type(error).__name__}: {error}") from error
 
-    def _awaited(self, tick: int) -> Drive | None:
-        """The Drive of this tick, if it comes before the manoeuvre would outlast the tick."""
+    def _awaited(self, tick: int) -> Command | None:
+        """The Command of this tick, if it comes before the manoeuvre would outlast the tick."""
         while (left := self._next - self._manoeuvre_s - time.monotonic()) > 0.0:
             drive = self._take(self._inbox.next(left))
             if drive is not None and drive.tick == tick:
@@ -262,8 +272,8 @@ class Field:
                 return
             self._take(arrival)
 
-    def _take(self, arrival: Arrival) -> Drive | None:
-        """Do what is to be done about it; the agent's Drive, if it is one, of whichever tick."""
+    def _take(self, arrival: Arrival) -> Command | None:
+        """Do what is to be done about it; the agent's Command, if it is one, of whichever tick."""
         match arrival.topic:
             case "drive":
                 return self._on_drive(arrival)
@@ -296,8 +306,8 @@ class Field:
             return None
         return message
 
-    def _on_drive(self, arrival: Arrival) -> Drive | None:
-        drive = self._accepted(arrival, Drive)
+    def _on_drive(self, arrival: Arrival) -> Command | None:
+        drive = self._accepted(arrival, Command)
         if drive is None or drive.tick > self._tick:
             if drive is not None:
                 self._inbox.refuse(arrival, "it is of a tick to come")
@@ -312,7 +322,7 @@ class Field:
 
         An a that has been started again goes by b in the same way, as long as it is behind.
         """
-        beat = self._accepted(arrival, Beat)
+        beat = self._accepted(arrival, TickStart)
         if beat is None:
             return
         left = self._tick + 1 - beat.tick
@@ -331,7 +341,7 @@ class Field:
 
     # --- the end ---
 
-    def _part(self, end: End) -> None:
+    def _part(self, end: MissionEnd) -> None:
         """Tell the agent that it is over, until it has said its last word, and that this has been heard."""
         give_up = time.monotonic() + FAREWELL_S
         while (now := time.monotonic()) < give_up and self._id in self._alive:
@@ -344,18 +354,18 @@ class Field:
                 elif arrival.topic == "drive" and _is_farewell(arrival.frame, self._id):
                     self._sense.put(arrival.frame)
                     return
-        why = "no answer to the End" if self._id in self._alive else "its agent has gone"
-        self._inbox.say(f"no Farewell of {self._id}: {why}")
+        why = "no answer to the MissionEnd" if self._id in self._alive else "its agent has gone"
+        self._inbox.say(f"no FinalReport of {self._id}: {why}")
 
 
-def _sense(reading: Reading, tick: int, briefing: Briefing) -> bytes:
-    """The frame of the Sense that `reading` makes. Raises DriverFailed if it is none."""
+def _sense(reading: Reading, tick: int, briefing: RobotConfig) -> bytes:
+    """The frame of the Observation that `reading` makes. Raises DriverFailed if it is none."""
     ranged = reading.mutual_range is not None
     contacts = (Contact(briefing.peer, reading.mutual_range, None),) if ranged or reading.contact else ()
     executed = reading.executed if tick > 0 else None
     try:
-        frame = encode(Sense(tick, briefing.robot, executed, reading.anchor_range, contacts))
-        decode(frame, Sense)
+        frame = encode(Observation(tick, briefing.robot, executed, reading.anchor_range, contacts))
+        decode(frame, Observation)
     except (MalformedFrame, TypeError, msgspec.MsgspecError) as error:
         raise DriverFailed(f"sense({tick}): {error}") from None
     return frame
@@ -375,6 +385,6 @@ def _mark(reading: Reading, tick: int, robot: str) -> list[bytes]:
 
 def _is_farewell(frame: bytes, robot: str) -> bool:
     try:
-        return decode(frame, Farewell).robot == robot
+        return decode(frame, FinalReport).robot == robot
     except MalformedFrame:
         return False

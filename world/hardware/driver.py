@@ -1,6 +1,6 @@
 """The contract of a robot's own driver: wheels and sensors of one robot, in the world's place.
 
-What the world is to a robot, its hardware is without one: from both come Senses, to both go Drives, and an
+What the world is to a robot, its hardware is without one: from both come Observations, to both go Commands, and an
 agent cannot tell which it has. So the contract stands in this room, and `world/hardware/bridge.py` plays by
 it. docs/driver.md tells a driver's author the same at length, and `tandem conform` tries a driver.
 """
@@ -36,7 +36,7 @@ class Reading(msgspec.Struct, frozen=True):
 
 
 class Driver(Protocol):
-    """Made of the robot's Briefing, the seconds that a manoeuvre lasts, and the user's options, as strings.
+    """Made of the robot's RobotConfig, the seconds that a manoeuvre lasts, and the user's options, as strings.
 
     The laws: a robot moves only by `drive`, for one manoeuvre at the most, and then stands until told
     otherwise, whatever becomes of whoever told it; over a manoeuvre that was not interrupted,

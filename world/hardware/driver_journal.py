@@ -1,6 +1,6 @@
 """The journal of a robot's driver: the measurements and commands that a resume needs.
 
-A Sense is written before it is sent to the agent, and a Drive before it is executed. After a kill, the
+A Observation is written before it is sent to the agent, and a Command before it is executed. After a kill, the
 journal therefore contains everything that was sent or executed, and at most the reading of one tick has to
 be repeated. After a power cut this holds only if each write was synced (`--fsync`). If not, the robot
 refuses to resume: its Reports could contradict earlier ones, and its peer would find them inconsistent.
@@ -15,7 +15,7 @@ from typing import Annotated
 import msgspec
 
 from protocol.journal.journal_file import CorruptJournal
-from protocol.messages import Briefing, Drive, End, Message, Report, Sense
+from protocol.messages import Command, Message, MissionEnd, Observation, Report, RobotConfig
 from protocol.units import Finite, RobotId, Tick
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 
@@ -29,14 +29,14 @@ def driver_journal(robot: str) -> str:
 
 
 class Mark(Message, frozen=True):
-    """The mark of a reading (see `driver.Reading`), written before the Sense made from that reading."""
+    """The mark of a reading (see `driver.Reading`), written before the Observation made from that reading."""
 
     tick: Tick
     robot: RobotId
     mark: Annotated[tuple[Finite, ...], msgspec.Meta(max_length=MAX_MARK)]
 
 
-class Start(Message, frozen=True):
+class ProcessStart(Message, frozen=True):
     """The start of the process that writes the frames after it."""
 
     boot: Annotated[str, msgspec.Meta(max_length=64)]
@@ -59,10 +59,10 @@ BOOT = Path("/proc/sys/kernel/random/boot_id")
 class DrivenTick(msgspec.Struct, frozen=True):
     """One tick of a driver's journal."""
 
-    sense: Sense
+    sense: Observation
     frame: bytes
     """the encoded Sense"""
-    drive: Drive | None = None
+    drive: Command | None = None
     """None if the agent missed the deadline"""
     reports: tuple[Report, ...] = ()
     """the peer's Reports that affect when the mission is over"""
@@ -74,8 +74,8 @@ class DriverPast(msgspec.Struct, frozen=True):
     ticks: tuple[DrivenTick, ...] = ()
     mark: tuple[float, ...] = ()
     """the mark of the latest reading; empty if it has none"""
-    end: End | None = None
-    start: Start | None = None
+    end: MissionEnd | None = None
+    start: ProcessStart | None = None
     """the latest Start"""
 
     @property
@@ -90,7 +90,7 @@ class DriverPast(msgspec.Struct, frozen=True):
         return self.end is None and start is not None and not start.synced and start.boot != boot()
 
 
-def driver_past(frames: Sequence[bytes], briefing: Briefing, path: Path) -> DriverPast:
+def driver_past(frames: Sequence[bytes], briefing: RobotConfig, path: Path) -> DriverPast:
     """Return the content of the journal at `path` from its `frames`.
 
     Raises CorruptJournal if a frame is malformed or out of order, or if it is not the mission of `briefing`.
@@ -98,34 +98,40 @@ def driver_past(frames: Sequence[bytes], briefing: Briefing, path: Path) -> Driv
     ticks: list[DrivenTick] = []
     mark: tuple[float, ...] = ()
     marked: Mark | None = None
-    end: End | None = None
-    start: Start | None = None
+    end: MissionEnd | None = None
+    start: ProcessStart | None = None
     for place, frame in enumerate(frames):
         message = _message(frame, path)
         match message:
-            case Briefing() if place == 0:
+            case RobotConfig() if place == 0:
                 if message != briefing:
                     raise CorruptJournal(f"{path}: another run's: its briefing is not this mission's")
-            case Start() if place > 0 and end is None:
+            case ProcessStart() if place > 0 and end is None:
                 start = message
             case Mark(tick) if tick == len(ticks):
                 marked = message
-            case Sense(tick) if tick == len(ticks) and place > 0:
+            case Observation(tick) if tick == len(ticks) and place > 0:
                 ticks.append(DrivenTick(message, frame))
                 mark = marked.mark if marked is not None and marked.tick == tick else ()
-            case Drive() if ticks and message.tick == ticks[-1].sense.tick and ticks[-1].drive is None:
+            case Command() if ticks and message.tick == ticks[-1].sense.tick and ticks[-1].drive is None:
                 ticks[-1] = msgspec.structs.replace(ticks[-1], drive=message)
             case Report() if ticks:
                 ticks[-1] = msgspec.structs.replace(ticks[-1], reports=(*ticks[-1].reports, message))
-            case End() if end is None:
+            case MissionEnd() if end is None:
                 end = message
             case _:
                 raise CorruptJournal(f"{path}: a {type(message).__name__} is out of order")
     return DriverPast(tuple(ticks), mark, end, start)
 
 
-def _message(frame: bytes, path: Path) -> Briefing | Start | Mark | Sense | Drive | Report | End:
+def _message(
+    frame: bytes, path: Path
+) -> RobotConfig | ProcessStart | Mark | Observation | Command | Report | MissionEnd:
     try:
-        return decode(frame, Briefing | Start | Mark | Sense | Drive | Report | End, MAX_FRAME_BYTES)
+        return decode(
+            frame,
+            RobotConfig | ProcessStart | Mark | Observation | Command | Report | MissionEnd,
+            MAX_FRAME_BYTES,
+        )
     except MalformedFrame as error:
         raise CorruptJournal(f"{path}: {error}") from None

@@ -16,7 +16,7 @@ from typing import Any
 import zenoh
 from rosbags.typesys import Stores, get_typestore
 
-from protocol.messages import Briefing
+from protocol.messages import RobotConfig
 from protocol.motion import ORIGIN, Controls, Pose, wrap
 from protocol.network import session
 from protocol.network.endpoints import at
@@ -75,7 +75,7 @@ class Ros2:
 
     def __init__(
         self,
-        briefing: Briefing,
+        briefing: RobotConfig,
         manoeuvre_s: float,
         *,
         connect: str = "tcp/127.0.0.1:7448",

@@ -8,7 +8,16 @@ from __future__ import annotations
 
 import time
 
-from protocol.messages import Alarm, Briefing, Drive, End, Localised, Report, Undecided, Verdict
+from protocol.messages import (
+    Command,
+    Inconsistent,
+    Localised,
+    MissionEnd,
+    Report,
+    RobotConfig,
+    Undecided,
+    Verdict,
+)
 from world.referee import inaccuracy
 
 LAST_WORDS = 4
@@ -18,7 +27,7 @@ LAST_WORDS = 4
 class Ending:
     """What is known of both verdicts."""
 
-    def __init__(self, briefing: Briefing, max_ticks: int, patience: float) -> None:
+    def __init__(self, briefing: RobotConfig, max_ticks: int, patience: float) -> None:
         self._peer = briefing.peer
         self._me = briefing.robot
         self._mission = briefing.mission
@@ -48,13 +57,13 @@ class Ending:
         """Whether the peer knows this robot's verdict."""
         return self.verdict is not None and self._acknowledged >= self._at
 
-    def after(self, tick: int, drive: Drive | None, *, peer_there: bool) -> End | None:
-        """The End, if `tick` was the last, in which the robot gave `drive`; else none."""
+    def after(self, tick: int, drive: Command | None, *, peer_there: bool) -> MissionEnd | None:
+        """The MissionEnd, if `tick` was the last, in which the robot gave `drive`; else none."""
         if self.verdict is None and drive is not None and drive.verdict is not None:
             self.verdict, self._at, self._since = drive.verdict, tick, time.monotonic()
         if self.verdict is None:
             if tick >= self._max_ticks:
-                return End(tick, "undecided", f"max_ticks: {self._me} not localised by then")
+                return MissionEnd(tick, "undecided", f"max_ticks: {self._me} not localised by then")
             return None
         gone = not peer_there and self._peers is not None
         if self._known is None and self._peers is not None and (self._heard or gone):
@@ -65,19 +74,19 @@ class Ending:
             return self._end(tick)
         return None
 
-    def _end(self, tick: int) -> End:
+    def _end(self, tick: int) -> MissionEnd:
         for who, other, verdict in (
             (self._me, self._peer, self.verdict),
             (self._peer, self._me, self._peers),
         ):
             match verdict:
-                case Alarm(claim):
-                    return End(tick, "alarm", f"{who}: {other} tells {claim}")
+                case Inconsistent(claim):
+                    return MissionEnd(tick, "alarm", f"{who}: {other} tells {claim}")
                 case Undecided(reason):
-                    return End(tick, "undecided", f"{who}: {reason}")
+                    return MissionEnd(tick, "undecided", f"{who}: {reason}")
         for who, verdict in ((self._me, self.verdict), (self._peer, self._peers)):
             if isinstance(verdict, Localised) and (vague := inaccuracy(verdict, self._mission)) is not None:
-                return End(tick, "undecided", f"{who} {vague}")
+                return MissionEnd(tick, "undecided", f"{who} {vague}")
         if isinstance(self._peers, Localised):
-            return End(tick, "localised", None)
-        return End(tick, "undecided", f"{self._me} is localised; {self._peer} was not heard to be")
+            return MissionEnd(tick, "localised", None)
+        return MissionEnd(tick, "undecided", f"{self._me} is localised; {self._peer} was not heard to be")

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from agent.estimation.gaussian.least_squares import Fit
-from agent.estimation.gaussian.range_model import Pair
-from protocol.messages import Alarm
+from agent.estimation.gaussian.range_model import PairRanges
+from protocol.messages import Inconsistent
 
 DOUBTFUL = 1e-3
 """less probable than this, a fit is not what a robot claims by: it takes more ranges"""
@@ -28,7 +28,7 @@ FINISHED = 0.1
 """sigmas: a fit whose last step was longer than this has not found its minimum"""
 
 
-class Doubt(NamedTuple):
+class Inconsistency(NamedTuple):
     """What speaks most against a fit."""
 
     what: str
@@ -36,12 +36,12 @@ class Doubt(NamedTuple):
     p_value: float
 
     @property
-    def alarm(self) -> Alarm:
+    def alarm(self) -> Inconsistent:
         """The same, as a verdict on the peer."""
-        return Alarm(self.what, self.sigmas, self.p_value)
+        return Inconsistent(self.what, self.sigmas, self.p_value)
 
 
-def doubt(fit: Fit, pair: Pair) -> Doubt:
+def doubt(fit: Fit, pair: PairRanges) -> Inconsistency:
     """The less probable of two: all residuals as they are, and the distance of the anchors that they imply.
 
     What a robot drove from its anchor to the encounter stands in no range of its own; it is the distance
@@ -53,9 +53,11 @@ def doubt(fit: Fit, pair: Pair) -> Doubt:
     stretched = abs(_stretched(fit, pair)) if fit.last_step <= FINISHED else 0.0
     apart = math.erfc(stretched / math.sqrt(2.0))
     if apart < misfit:
-        return Doubt("a way that puts the anchors at another distance from each other", stretched, apart)
+        return Inconsistency(
+            "a way that puts the anchors at another distance from each other", stretched, apart
+        )
     what = f"what fits the ranges badly: chi-square {fit.chi2:.3g} for {free} degrees of freedom"
-    return Doubt(what, max(sigmas, 0.0), misfit)
+    return Inconsistency(what, max(sigmas, 0.0), misfit)
 
 
 def _normal(chi2: float, free: int) -> float:
@@ -67,7 +69,7 @@ def _normal(chi2: float, free: int) -> float:
     return float(((max(chi2, 0.0) / free) ** (1.0 / 3.0) - (1.0 - spread)) / math.sqrt(spread))
 
 
-def _stretched(fit: Fit, pair: Pair) -> float:
+def _stretched(fit: Fit, pair: PairRanges) -> float:
     """Sigmas by which the ranges would have the anchors at another distance (the score test, Rao 1948)."""
     mutual = pair.ranges.rows(2)
     length = math.hypot(*pair.apart)

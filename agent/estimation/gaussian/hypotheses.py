@@ -15,7 +15,7 @@ import numpy as np
 from agent.estimation.gaussian.initial_guesses import MOST, SEED_RANGES, anchors, placements, without_drift
 from agent.estimation.gaussian.least_squares import STEPS, Fit, deviation, fit
 from agent.estimation.gaussian.odometry_noise import Array, Places, Track
-from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Pair, Ranges, placed
+from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, Ranges, placed
 from protocol.noise import Noise
 
 ODDS_KEPT = 1e-7
@@ -41,7 +41,7 @@ class Hypothesis(NamedTuple):
     """the probability that it is the true one; of all that are left they sum to 1"""
 
 
-class Weighed(NamedTuple):
+class ScoredHypothesis(NamedTuple):
     """A hypothesis and the fit that it is."""
 
     hypothesis: Hypothesis
@@ -50,7 +50,7 @@ class Weighed(NamedTuple):
     """the log of how likely it makes it to have been in range where it was, and out of it where it was not"""
 
 
-def with_odds(fits: Sequence[tuple[Fit, float]]) -> tuple[Weighed, ...]:
+def with_odds(fits: Sequence[tuple[Fit, float]]) -> tuple[ScoredHypothesis, ...]:
     """The likeliest first, each once; of those that are left. A fit comes with what silence says of it."""
     weighed = [(one.log_likelihood + 0.5 * _log_volume(one) + silent, one, silent) for one, silent in fits]
     weighed.sort(key=lambda one: -one[0])
@@ -62,7 +62,7 @@ def with_odds(fits: Sequence[tuple[Fit, float]]) -> tuple[Weighed, ...]:
             left.append((math.exp(weight - weighed[0][0]), one, silent))
     total = sum([odds for odds, _, _ in left])
     return tuple(
-        Weighed(Hypothesis(tuple(one.guess.tolist()), odds / total), one, silent)
+        ScoredHypothesis(Hypothesis(tuple(one.guess.tolist()), odds / total), one, silent)
         for odds, one, silent in left
     )
 
@@ -115,7 +115,7 @@ def of_anchor(
     silent: Places,
     sensing_range: float,
     noise: Noise,
-) -> tuple[Weighed, ...]:
+) -> tuple[ScoredHypothesis, ...]:
     """Where its anchor may lie in the frame of a robot's odometry: phase 1. `before` is what was left a
     tick ago; at the ticks `silent` there was no range."""
     known = tuple(before)
@@ -178,7 +178,7 @@ def _log_volume(one: Fit) -> float:
 # --- the pair -----------------------------------------------------------------------------------------
 
 
-def search(pair: Pair) -> tuple[Weighed, ...]:
+def search(pair: PairRanges) -> tuple[ScoredHypothesis, ...]:
     """How the two may lie in <W>, wherever that is: branch of a, branch of b, and placement.
 
     First by fits that take the odometry's drift for noise of the ranges; then the likely ones in full.
@@ -197,17 +197,17 @@ def search(pair: Pair) -> tuple[Weighed, ...]:
     return _fitted([one.fit.guess for one in rough], pair, STEPS)
 
 
-def follow(before: Sequence[Hypothesis], pair: Pair) -> tuple[Weighed, ...]:
+def follow(before: Sequence[Hypothesis], pair: PairRanges) -> tuple[ScoredHypothesis, ...]:
     """What is left of what was held `before`, after another tick."""
     return _fitted([np.array(one.guess) for one in before], pair, WARM_STEPS)
 
 
-def _fitted(guesses: Sequence[Array], pair: Pair, steps: int) -> tuple[Weighed, ...]:
+def _fitted(guesses: Sequence[Array], pair: PairRanges, steps: int) -> tuple[ScoredHypothesis, ...]:
     fits = [fit(guess, pair.paths, pair.ranges, pair.noise, pair.apart, steps) for guess in guesses]
     return with_odds([(one, _silence(one, pair)) for one in fits])
 
 
-def _silence(one: Fit, pair: Pair) -> float:
+def _silence(one: Fit, pair: PairRanges) -> float:
     """The log of how likely the fit makes it who was in range of what, and when."""
     weight = 0.0
     for robot in (0, 1):
@@ -216,7 +216,7 @@ def _silence(one: Fit, pair: Pair) -> float:
     return weight + _together(one, pair)
 
 
-def _together(one: Fit, pair: Pair) -> float:
+def _together(one: Fit, pair: PairRanges) -> float:
     """Of being out of each other's range at the silent ticks."""
     silent = pair.silent[2]
     if not len(silent):

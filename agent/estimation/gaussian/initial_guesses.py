@@ -14,8 +14,8 @@ import numpy as np
 from msgspec.structs import replace
 
 from agent.estimation.gaussian.odometry_noise import Array, Track, wander
-from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Pair, Ranges, mixture, placed
-from protocol.noise import Drift, Noise
+from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, Ranges, mixture, placed
+from protocol.noise import Noise, VelocityNoise
 
 SEED_RANGES = 10
 """with so many ranges to the anchor, where it may lie is settled but for the hypotheses that are left"""
@@ -65,7 +65,7 @@ def anchors(
 
 def _loosened(path: Track, ranges: Ranges, noise: Noise) -> Array:
     """m^2: about how much drift may move a range, without its correlations."""
-    if noise.odometry == Drift():
+    if noise.odometry == VelocityNoise():
         return np.zeros_like(ranges.rho)
     drift = wander(path, noise.odometry, path)
     turn, bx, by, xx, _, yy = drift.sums
@@ -145,9 +145,9 @@ UNLIKELY = 25.0
 # --- a pair -----------------------------------------------------------------------------------------
 
 
-def without_drift(pair: Pair) -> Pair:
+def without_drift(pair: PairRanges) -> PairRanges:
     """The same, with ranges as much less sure as the odometry's drift makes them."""
-    if pair.noise.odometry == Drift():
+    if pair.noise.odometry == VelocityNoise():
         return pair
     variance = np.square(pair.ranges.sigma)
     for robot, path in enumerate(pair.paths):
@@ -155,10 +155,10 @@ def without_drift(pair: Pair) -> Pair:
         loosened[pair.ranges.rows(1 - robot)] = 0.0
         variance = variance + loosened
     ranges = pair.ranges._replace(sigma=np.sqrt(variance))
-    return pair._replace(ranges=ranges, noise=replace(pair.noise, odometry=Drift()))
+    return pair._replace(ranges=ranges, noise=replace(pair.noise, odometry=VelocityNoise()))
 
 
-def placements(of_a: Array, of_b: Array, pair: Pair) -> list[tuple[float, float]]:
+def placements(of_a: Array, of_b: Array, pair: PairRanges) -> list[tuple[float, float]]:
     """Headings of the odometry frames in <W> that may explain the mutual ranges, the likeliest few.
 
     The anchors are at `of_a` and `of_b` (m) in these frames.
@@ -207,7 +207,7 @@ def _turned(
     sigma: Array,
     apart: tuple[float, float],
     lever: Array,
-    pair: Pair,
+    pair: PairRanges,
 ) -> Array:
     """The most likely of `turns` (near, far), polished by Gauss-Newton on the mutual ranges alone."""
     coarse = 3.0 * math.tau / SCAN * float(lever[0])

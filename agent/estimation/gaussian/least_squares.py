@@ -19,17 +19,17 @@ import numpy as np
 from agent.estimation.gaussian.odometry_noise import (
     Array,
     Errors,
+    OdometryNoiseModel,
     Places,
-    Seen,
+    Projection,
     Track,
-    Wander,
     attributed,
     shifted,
     spread,
     wander,
 )
 from agent.estimation.gaussian.range_model import Ranges, mixture, outliers, predict
-from protocol.noise import Drift, Noise
+from protocol.noise import Noise, VelocityNoise
 
 STEPS = 8
 """of Gauss-Newton at the most"""
@@ -82,12 +82,12 @@ class Fit(NamedTuple):
     """of the ranges"""
     directions: tuple[Array, ...]
     """see `Predicted`"""
-    drifts: tuple[Wander, ...]
+    drifts: tuple[OdometryNoiseModel, ...]
     """along each path; none where odometry is exact"""
-    system: System
+    system: NormalEquations
 
 
-class System(NamedTuple):
+class NormalEquations(NamedTuple):
     """One step of Gauss-Newton: what is left to explain, and in which units."""
 
     jacobian: Array
@@ -120,10 +120,10 @@ def fit(
     """Gauss-Newton from `guess` (see `predict`); outliers lose their weight on the way."""
     free = slice(0, 2) if len(measured) == 1 else slice(0, 6)
     paths: tuple[Track, ...] = tuple(measured)
-    drifts: tuple[Wander, ...] = ()
+    drifts: tuple[OdometryNoiseModel, ...] = ()
     errors: tuple[Errors, ...] = ()
     guess, weights = guess.copy(), np.ones_like(ranges.rho)
-    drifting = noise.odometry != Drift()
+    drifting = noise.odometry != VelocityNoise()
     for step in range(steps + 1):
         predicted = predict(guess, paths, ranges, apart)
         residuals = ranges.rho - predicted.distance
@@ -173,7 +173,7 @@ def fit(
     )
 
 
-def _wandered(drifts: Sequence[Wander], seen: Sequence[Seen]) -> Array:
+def _wandered(drifts: Sequence[OdometryNoiseModel], seen: Sequence[Projection]) -> Array:
     """m^2: the covariance that all robots' odometry makes between the ranges; (N, N)."""
     first, *others = [spread(drift, rows) for drift, rows in zip(drifts, seen, strict=True)]
     for other in others:
@@ -189,7 +189,7 @@ def _variance(sigma: Array, weights: Array) -> Array:
 
 def _solved(
     jacobian: Array, innovation: Array, variance: Array, wandered: Array | None, invert: bool
-) -> System:
+) -> NormalEquations:
     columns = np.column_stack((jacobian, innovation))
     covariance, inverse = variance, None
     weighted: Array
@@ -207,7 +207,7 @@ def _solved(
     of_guess = inverse_of(information)
     change = of_guess @ (jacobian.T @ weighted[:, -1])
     multipliers = weighted[:, -1] - weighted[:, :-1] @ change
-    return System(
+    return NormalEquations(
         jacobian, innovation, covariance, weighted, inverse, information, of_guess, change, multipliers
     )
 
@@ -222,7 +222,7 @@ def inverse_of(matrix: Array) -> Array:
     return np.asarray(np.linalg.inv(matrix), np.float64)
 
 
-def _trust(system: System, weights: Array, sigma: Array, noise: Noise) -> Array:
+def _trust(system: NormalEquations, weights: Array, sigma: Array, noise: Noise) -> Array:
     """How probable it is that each range is no outlier, by what all the others predict of it."""
     alone = 1.0 / system.covariance if system.inverse is None else np.diagonal(system.inverse)
     explained = np.sum((system.weighted[:, :-1] @ system.of_guess) * system.weighted[:, :-1], 1)
@@ -233,7 +233,7 @@ def _trust(system: System, weights: Array, sigma: Array, noise: Noise) -> Array:
 
 
 def _log_likelihood(
-    system: System, chi2: float, residuals: Array, weights: Array, sigma: Array, noise: Noise
+    system: NormalEquations, chi2: float, residuals: Array, weights: Array, sigma: Array, noise: Noise
 ) -> float:
     """Of what is no outlier, by its covariance; and of outliers by their bias."""
     good = weights > 0.5
@@ -272,7 +272,7 @@ def poses(fitted: Fit, apart: tuple[float, float]) -> tuple[Array, Array]:
         mean[i : i + 3] = wx + robot * apart[0], wy + robot * apart[1], theta + float(path.heading[-1])
         turn[i : i + 3, i : i + 3] = ((-c, s, -wy), (-s, -c, wx), (0.0, 0.0, 1.0))
         last = np.full(3, len(path.v), np.intp)
-        end = Seen.positions(path, last, np.array(((c, s, 0.0), (-s, c, 0.0))))
+        end = Projection.positions(path, last, np.array(((c, s, 0.0), (-s, c, 0.0))))
         end.lever[2] = path.period
         ends.append(end)
     system = fitted.system
@@ -283,7 +283,7 @@ def poses(fitted: Fit, apart: tuple[float, float]) -> tuple[Array, Array]:
         zip(fitted.paths, fitted.drifts, fitted.directions, ends, strict=True)
     ):
         rows = slice(3 * robot, 3 * robot + 3)
-        both = spread(drift, end.then(Seen.positions(path, fitted.ticks, u)))
+        both = spread(drift, end.then(Projection.positions(path, fitted.ticks, u)))
         prior[rows, rows], cross[rows] = both[:3, :3], both[:3, 3:]
     gain = np.linalg.solve(system.covariance, cross.T).T
     left = turn - gain @ system.jacobian

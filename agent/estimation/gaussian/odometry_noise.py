@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.noise import Drift
+from protocol.noise import VelocityNoise
 
 Array = NDArray[np.float64]
 Places = NDArray[np.intp]
@@ -62,7 +62,7 @@ def _summed(values: Array) -> Array:
     return sums
 
 
-class Wander(NamedTuple):
+class OdometryNoiseModel(NamedTuple):
     """What noise in a track's v and omega does to it: sums along it, up to each tick.
 
     Noise e in omega at tick j moves the position at a later tick t, along u, by (lever - u . b_j) e, where
@@ -79,7 +79,7 @@ class Wander(NamedTuple):
     """of q_omega; q_omega b, its x and y; q_omega b b' + q_v shift shift', its xx, xy, yy; (6, k + 1)"""
 
 
-def wander(path: Track, drift: Drift, measured: Track) -> Wander:
+def wander(path: Track, drift: VelocityNoise, measured: Track) -> OdometryNoiseModel:
     """Of `path`, whose odometry measured what `measured` says, with noise of `drift`."""
     k, period = len(path.v), path.period
     variances = np.empty((2, k))
@@ -102,7 +102,7 @@ def wander(path: Track, drift: Drift, measured: Track) -> Wander:
     terms[3] += along[0] * sx
     terms[4] += along[0] * sy
     terms[5] += along[1] * sy
-    return Wander(variances, b, path.shift, _summed(terms))
+    return OdometryNoiseModel(variances, b, path.shift, _summed(terms))
 
 
 def _shortening(half: Array, period: float) -> Array:
@@ -117,7 +117,7 @@ SLIGHT = 1e-4
 """rad: less than this, a turn shortens a chord as its series says"""
 
 
-class Seen(NamedTuple):
+class Projection(NamedTuple):
     """Along what each of N rows looks at a robot: its tick, a direction, and its lever on noise in omega."""
 
     tick: Places
@@ -127,21 +127,21 @@ class Seen(NamedTuple):
     """m s; T_s where the row is a heading"""
 
     @staticmethod
-    def positions(path: Track, tick: Places, u: Array) -> Seen:
+    def positions(path: Track, tick: Places, u: Array) -> Projection:
         """Rows that look at its position; those that do not, as their u is 0, may be of later ticks."""
         tick = np.minimum(tick, len(path.v))
-        return Seen(tick, u, path.period * (u[1] * path.x[tick] - u[0] * path.y[tick]))
+        return Projection(tick, u, path.period * (u[1] * path.x[tick] - u[0] * path.y[tick]))
 
-    def then(self, more: Seen) -> Seen:
+    def then(self, more: Projection) -> Projection:
         """These rows and `more` of the same robot."""
-        return Seen(
+        return Projection(
             np.concatenate((self.tick, more.tick)),
             np.concatenate((self.u, more.u), axis=1),
             np.concatenate((self.lever, more.lever)),
         )
 
 
-def spread(drift: Wander, rows: Seen) -> Array:
+def spread(drift: OdometryNoiseModel, rows: Projection) -> Array:
     """m^2: the covariance, between N rows, that noise in the odometry makes; (N, N)."""
     at = np.minimum(rows.tick[:, None], rows.tick)
     c0, bx, by, xx, xy, yy = drift.sums[:, at]
@@ -164,7 +164,7 @@ class Errors(NamedTuple):
         return track(measured.v + self.v, measured.omega + self.omega, measured.period)
 
 
-def shifted(drift: Wander, rows: Seen, errors: Errors) -> Array:
+def shifted(drift: OdometryNoiseModel, rows: Projection, errors: Errors) -> Array:
     """m: by how much `errors` move what the rows look at, to first order; shape (N,)."""
     moves = np.empty((3, len(errors.v)))
     moves[0] = errors.omega
@@ -174,7 +174,7 @@ def shifted(drift: Wander, rows: Seen, errors: Errors) -> Array:
     return move
 
 
-def attributed(drift: Wander, rows: Seen, residuals: Array) -> Errors:
+def attributed(drift: OdometryNoiseModel, rows: Projection, residuals: Array) -> Errors:
     """The odometry's errors that go with `residuals`, weighted by their inverse covariance; shape (N,)."""
     k = drift.b.shape[1]
     after = np.zeros((3, k + 1))

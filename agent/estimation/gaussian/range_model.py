@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.gaussian.odometry_noise import Array, Places, Seen, Track
+from agent.estimation.gaussian.odometry_noise import Array, Places, Projection, Track
 from protocol.noise import Noise
 
 SIGMA_FLOOR = 1e-6
@@ -73,7 +73,7 @@ class Ranges(NamedTuple):
         return Ranges(self.rho[possible], self.tick[possible], self.sigma[possible], (first, second, mutual))
 
 
-class Pair(NamedTuple):
+class PairRanges(NamedTuple):
     """All that both robots have measured; robot 0 is the paper's a."""
 
     paths: tuple[Track, Track]
@@ -107,9 +107,11 @@ class Predicted(NamedTuple):
     directions: tuple[Array, ...]
     """along what each range looks at each robot, in the frame of its odometry; 0 where it does not; (2, N)"""
 
-    def seen(self, paths: Sequence[Track], ranges: Ranges) -> list[Seen]:
+    def seen(self, paths: Sequence[Track], ranges: Ranges) -> list[Projection]:
         """The same, as rows along the paths."""
-        return [Seen.positions(path, ranges.tick, u) for path, u in zip(paths, self.directions, strict=True)]
+        return [
+            Projection.positions(path, ranges.tick, u) for path, u in zip(paths, self.directions, strict=True)
+        ]
 
 
 def predict(guess: Array, paths: Sequence[Track], ranges: Ranges, apart: tuple[float, float]) -> Predicted:

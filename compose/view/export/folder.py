@@ -13,12 +13,12 @@ from compose.recording import run
 from compose.recording.frames import in_time
 from compose.recording.robots import pasts
 from compose.recording.run import WORLD_JOURNAL
-from compose.recording.ticks_csv import Row, rows, rows_of, table
+from compose.recording.ticks_csv import TickRow, rows, rows_of, table
 from compose.view import recorded
 from compose.view.export.parquet import At, frames_csv, write_ticks
 from compose.view.foxglove.mcap import TooLong, write_mcap
 from protocol import files
-from protocol.messages import Drive, Estimate
+from protocol.messages import Command, Estimate
 
 
 class Exported(msgspec.Struct, frozen=True):
@@ -34,8 +34,8 @@ class Exported(msgspec.Struct, frozen=True):
 class _Ticks(NamedTuple):
     """What goes into the tables of ticks."""
 
-    rows: list[Row]
-    drives: dict[At, Drive]
+    rows: list[TickRow]
+    drives: dict[At, Command]
     held: dict[At, Estimate]
     period: float
 

@@ -15,8 +15,8 @@ from msgspec.structs import asdict
 
 from compose.recording.claim import nees
 from compose.recording.frames import Journaled
-from compose.recording.ticks_csv import Row
-from protocol.messages import Drive, Estimate, Localised
+from compose.recording.ticks_csv import TickRow
+from protocol.messages import Command, Estimate, Localised
 from protocol.motion import Covariance, Pose
 from world.referee import errors
 
@@ -34,7 +34,7 @@ _MEASURES = ["position_error_m", "heading_error_rad", "position_sigma_m", "headi
 _COVARIANCE = [f"cov_{name}" for name in Covariance.__struct_fields__]
 COLUMNS = [
     *("tick", "time_s"),
-    *Row.__struct_fields__[1:],
+    *TickRow.__struct_fields__[1:],
     *("verdict", "local", "world", "odds"),
     *("estimate_x", "estimate_y", "estimate_heading"),
     *_COVARIANCE,
@@ -46,8 +46,8 @@ At = tuple[str, int]
 
 
 def write_ticks(
-    rows: Iterable[Row],
-    drives: Mapping[At, Drive],
+    rows: Iterable[TickRow],
+    drives: Mapping[At, Command],
     held: Mapping[At, Estimate],
     period: float,
     path: Path,

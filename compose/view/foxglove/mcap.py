@@ -19,7 +19,7 @@ from foxglove import Channel, Context, Schema
 from foxglove.mcap import MCAPWriteOptions
 
 from compose.recording.frames import Journaled, OfWorld, in_time, kind_of
-from compose.recording.run import WORLD_JOURNAL, Book, agent_journal
+from compose.recording.run import WORLD_JOURNAL, JournalFile, agent_journal
 from compose.view.foxglove.schemas import schema
 from compose.view.foxglove.views import Views, nanoseconds, topics
 from compose.view.recorded import Performance
@@ -105,7 +105,7 @@ class Channels:
 
 
 def write_mcap(
-    books: Mapping[str, Book], run: Performance, path: Path, check: Callable[[], object] = lambda: None
+    books: Mapping[str, JournalFile], run: Performance, path: Path, check: Callable[[], object] = lambda: None
 ) -> int:
     """Write `path` anew; how many frames are in it. Calls `check` in each tick, which may raise.
 
@@ -129,7 +129,10 @@ def write_mcap(
 
 
 def _tell(
-    books: Mapping[str, Book], run: Performance, channels: Channels, checks: Sequence[Callable[[], object]]
+    books: Mapping[str, JournalFile],
+    run: Performance,
+    channels: Channels,
+    checks: Sequence[Callable[[], object]],
 ) -> int:
     """Everything, tick by tick: first the frames, then what there is to see."""
     views = Views(run.stage)
@@ -150,7 +153,7 @@ def _tell(
     return count
 
 
-def _by_tick(books: Mapping[str, Book], run: Performance) -> Iterator[tuple[int, Journaled | Scene]]:
+def _by_tick(books: Mapping[str, JournalFile], run: Performance) -> Iterator[tuple[int, Journaled | Scene]]:
     frames: Iterable[tuple[int, int, Journaled | Scene]] = ((one.tick, 0, one) for one in in_time(books))
     scenes = ((scene.tick, 1, scene) for scene in run.scenes)
     for tick, _, one in merge(frames, scenes, key=itemgetter(0, 1)):

@@ -15,7 +15,7 @@ from foxglove import messages as fox
 from compose.view.cast import Seat, Stage
 from compose.view.events import Event
 from compose.view.foxglove import shapes
-from compose.view.scene import Held, Player, Scene
+from compose.view.scene import HeldPoses, Player, Scene
 from protocol.mission import Role
 from protocol.motion import Pose
 
@@ -222,7 +222,7 @@ class Views:
     # --- what a robot holds possible ---
 
     def _belief(
-        self, seat: Seat, frame: str, poses: Sequence[Pose], held: Held, at: fox.Timestamp
+        self, seat: Seat, frame: str, poses: Sequence[Pose], held: HeldPoses, at: fox.Timestamp
     ) -> fox.SceneEntity:
         """An arrow for each hypothesis, the paler the less probable, and the ellipse of the first."""
         colour = COLOURS[seat.role]
@@ -250,7 +250,7 @@ class Views:
         )
 
 
-def _placed(robot: str, held: Held) -> tuple[str, tuple[Pose, ...]]:
+def _placed(robot: str, held: HeldPoses) -> tuple[str, tuple[Pose, ...]]:
     """The frame that its hypotheses are given in, and these."""
     return (WORLD, held.world) if held.world else (f"{robot}/anchor", held.local)
 

@@ -13,7 +13,17 @@ import zenoh
 from compose.view.cast import of_briefings
 from compose.view.facts import Gathering
 from compose.view.web.sources import UNANSWERED, Show
-from protocol.messages import Briefing, Drive, End, Estimate, Farewell, Message, Report, Sense, Truth
+from protocol.messages import (
+    Command,
+    Estimate,
+    FinalReport,
+    GroundTruth,
+    Message,
+    MissionEnd,
+    Observation,
+    Report,
+    RobotConfig,
+)
 from protocol.network import diagnosis, keys, session
 from protocol.network.endpoints import Endpoints
 from protocol.network.inbox import Arrival, Inbox, Interrupted
@@ -28,10 +38,10 @@ LISTENED = (
     keys.estimate("*", "*"),
 )
 CARRIED: Mapping[Callable[..., str] | None, Any] = {
-    keys.truth: Truth,
-    keys.briefing: Briefing,
-    keys.sense: Sense | End | Farewell,
-    keys.drive: Drive | Farewell,
+    keys.truth: GroundTruth,
+    keys.briefing: RobotConfig,
+    keys.sense: Observation | MissionEnd | FinalReport,
+    keys.drive: Command | FinalReport,
     keys.report: Report,
     keys.estimate: Estimate,
 }
@@ -56,7 +66,7 @@ TICKS_KEPT = 100_000
 """robots times ticks, of one mission; beyond, the oldest are forgotten"""
 
 
-class Refused(ValueError):
+class RefusedFrame(ValueError):
     """A frame that the key it came under does not carry; its text says why."""
 
 
@@ -81,7 +91,7 @@ class Heard(Show):
         message: Message = decode(frame, CARRIED[source.kind])
         robot = getattr(message, "robot", source.robot)
         if robot != source.robot:
-            raise Refused(f"it says it is from '{robot}'")
+            raise RefusedFrame(f"it says it is from '{robot}'")
         tick: int | None = getattr(message, "tick", None)
         if tick is not None and not self._timely(tick, by_world=source.kind in OF_WORLD):
             return
@@ -97,7 +107,7 @@ class Heard(Show):
         """Whether `tick` has begun: the world says so, and before it has, nobody is heard. Raises Refused."""
         latest = self._tick
         if latest is not None and tick > latest + (LEAP if by_world else AHEAD):
-            raise Refused("it is of a tick to come")
+            raise RefusedFrame("it is of a tick to come")
         if by_world:
             self._tick = max(tick, latest or 0)
         return self._tick is not None
@@ -175,7 +185,7 @@ class Listener:
             return
         try:
             self.shows[run].take(arrival.source, arrival.frame)
-        except (MalformedFrame, Refused) as error:
+        except (MalformedFrame, RefusedFrame) as error:
             self._inbox.refuse(arrival, error)
 
     # --- in the thread ---
