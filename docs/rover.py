@@ -35,7 +35,7 @@ class Rover:
 
     def __init__(
         self,
-        briefing: RobotConfig,
+        config: RobotConfig,
         manoeuvre_s: float,
         *,
         start: str = "",
@@ -49,9 +49,9 @@ class Rover:
         its wheels are at. `patience` (s) bounds the wait for the peer to stand in the same tick: this robot
         has no drop-outs, and rather than call silence what is none, it gives up.
         """
-        self._briefing = briefing
+        self._config = config
         self._manoeuvre_s = manoeuvre_s
-        anchor = briefing.anchor
+        anchor = config.anchor
         self.pose = (
             Pose(*[float(word) for word in start.split(",")])
             if start
@@ -85,7 +85,7 @@ class Rover:
         executed, self._driven = self._driven, REST
         self._tick, self._executed = tick, executed
         self._save()
-        anchor, reach = self._briefing.anchor, self._briefing.mission.sensing_range
+        anchor, reach = self._config.anchor, self._config.mission.sensing_range
         rho = math.hypot(self.pose.x - anchor.x, self.pose.y - anchor.y)
         return Reading(executed, rho if rho <= reach else None, self._mutual_range(tick))
 
@@ -117,14 +117,14 @@ class Rover:
         if self._radio is not None:
             self._radio.close()
         x, y, heading = self.pose.x, self.pose.y, wrap(self.pose.heading)
-        print(f"{self._briefing.robot}: truly at {x:.9f} {y:.9f} {heading:+.9f}", flush=True)
+        print(f"{self._config.robot}: truly at {x:.9f} {y:.9f} {heading:+.9f}", flush=True)
 
     def _settle(self) -> None:
         """Move `pose` to where the wheels have come by now, and count what took it there."""
         share = min(1.0, (time.monotonic() - self._began) / self._manoeuvre_s) - self._done
         self._done += share
         v, omega = self._controls.v * share, self._controls.omega * share
-        self.pose = step(self.pose, v, omega, self._briefing.mission.period)
+        self.pose = step(self.pose, v, omega, self._config.mission.period)
         self._driven = Controls(self._driven.v + v, self._driven.omega + omega)
 
     def _save(self) -> None:
@@ -160,7 +160,7 @@ class Rover:
         raise TimeoutError(f"no answer of the beacon for {self._give_up_s:g} s")
 
     def _tell(self, tick: int, *, parked: bool = False) -> None:
-        where = {"robot": self._briefing.robot, "peer": self._briefing.peer, "tick": tick, "parked": parked}
+        where = {"robot": self._config.robot, "peer": self._config.peer, "tick": tick, "parked": parked}
         if self._radio is not None:
             with suppress(ConnectionRefusedError):  # what was sent before found no beacon
                 self._radio.send(json.dumps(where | {"x": self.pose.x, "y": self.pose.y}).encode())

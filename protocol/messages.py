@@ -144,7 +144,7 @@ class RobotConfig(Message, frozen=True):
     mission: Mission
     variant: Variant
     rendezvous: Rendezvous
-    lie: Attack | None
+    attack: Attack | None
     """what it is told to tell its peer, instead of the truth"""
     tick_s: Annotated[float, Meta(gt=0.0, le=1e6)] | None
     """s of wall time that a tick lasts; none in lockstep, where no decision depends on a time-out"""
@@ -217,7 +217,7 @@ class Estimate(Message, frozen=True):
     world: tuple[Pose, ...]
     """its pose in the world frame, one for each placement that is left"""
     localised: bool
-    odds: tuple[Probability, ...] = ()
+    probability: tuple[Probability, ...] = ()
     """of each in `world`, or while there is none of each in `local`, the likeliest first; they sum to 1.
     None where sensors are exact: what is possible there is equally so"""
     covariance: Covariance | None = None
@@ -274,9 +274,9 @@ class FinalReport(Message, frozen=True):
     """J of eq. (8); none where one candidate was left, and nothing to be told apart"""
     hypotheses: Count | None
     """about the poses of both, that are left in the end"""
-    odds: Probability | None
+    probability: Probability | None
     """of the likeliest of them; none where sensors are exact"""
-    missing: Text | None
+    blocking_reason: Text | None
     """under noise: what there was to know yet, before it could claim"""
     p_value: Probability | None
     """under noise: the least with which the ranges spoke against what the peer told"""

@@ -10,7 +10,7 @@ from msgspec import Meta
 
 from protocol.motion import TAU
 from protocol.noise import Noise
-from protocol.rounding import EPSILON, SAME, SURE, foothold, rounding
+from protocol.rounding import EPSILON, SAME, SURE, required_anchor_error, rounding
 from protocol.units import Clearance, Coordinate, Duration, Length, Speed, TurnRate
 
 Variant = Literal["assured", "paper"]
@@ -91,7 +91,7 @@ FOOTHOLD = 0.05
 """of R: with a worse one, the orbit's margin would take too much of R"""
 
 
-def obstacle(mission: Mission, distance: float) -> str | None:
+def infeasibility(mission: Mission, distance: float) -> str | None:
     """Why robots with anchors `distance` m (D) apart could not be sure of their poses; None if they can."""
     step, reach = mission.first_straight, mission.sensing_range
     if step < SHORTEST_STEP * (1.0 - EPSILON):
@@ -102,7 +102,7 @@ def obstacle(mission: Mission, distance: float) -> str | None:
     size = distance + reach
     if AMPLIFIED * EPSILON * size * max(1.0, reach / distance) * max(1.0, size) / step > SURE:
         which = "mutual"
-    elif MARGIN * _anchor_error(mission, size) > foothold(size, distance, reach):
+    elif MARGIN * _anchor_error(mission, size) > required_anchor_error(size, distance, reach):
         which = "anchor"
     else:
         return None
@@ -140,7 +140,7 @@ def _anchor_error(mission: Mission, size: float) -> float:
     return max(radial, floor * (1.0 + SAME + 2.0 * reach / step))
 
 
-def safety_obstacle(mission: Mission) -> str | None:
+def safety_infeasibility(mission: Mission) -> str | None:
     """The field, and why `safety_distance` could not be kept; None if it can."""
     warned = mission.sensing_range - 2.0 * mission.max_speed * mission.period
     if mission.safety_distance <= max(0.0, warned):
@@ -156,7 +156,7 @@ MOST_OUTLIERS = 0.25
 """of all ranges: with half of them, 2 claims of 23 tried were wrong"""
 
 
-def noise_obstacle(mission: Mission) -> str | None:
+def noise_infeasibility(mission: Mission) -> str | None:
     """The field, and why no robot could be sure of its pose with such noise; None if it can."""
     noise, reach, accuracy = mission.noise, mission.sensing_range, mission.accuracy
     if noise.exact:

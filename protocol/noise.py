@@ -60,7 +60,7 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
         return not ranges and self.actuation == self.odometry == VelocityNoise()
 
     @property
-    def unrest(self) -> tuple[float, float]:
+    def standstill_bound(self) -> tuple[float, float]:
         """m/s and rad/s: more than this is hardly ever measured by a robot that was told to stand."""
         return (
             UNREST * math.hypot(self.actuation.v_floor, self.odometry.v_floor),

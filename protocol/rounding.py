@@ -55,7 +55,7 @@ def same_turn(size: float) -> float:
 
 
 WELL = 0.125
-"""The fraction of `foothold` at which an anchor error suffices wherever the robots meet."""
+"""The fraction of `required_anchor_error` at which an anchor error suffices wherever the robots meet."""
 
 BETTER = 0.9
 """The ratio to which a range must reduce the anchor error for another range to be worthwhile."""
@@ -68,7 +68,7 @@ reduces the error.
 """
 
 
-def foothold(size: float, distance: float, sensing_range: float) -> float:
+def required_anchor_error(size: float, distance: float, sensing_range: float) -> float:
     """Return the anchor error in m that a robot may have when phase 1 ends.
 
     An anchor error e rotates the line between the anchors by e / D, or by up to twice that if the ranges were

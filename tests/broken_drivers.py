@@ -43,7 +43,7 @@ class RangesInFeet(Rover):
 
 class RangesBeyondReach(Rover):
     def sense(self, tick: int) -> Reading:
-        anchor = self._briefing.anchor
+        anchor = self._config.anchor
         reading = super().sense(tick)
         rho = math.hypot(self.pose.x - anchor.x, self.pose.y - anchor.y)
         return replace(reading, anchor_range=rho)
@@ -101,16 +101,16 @@ class DrivesOnAfterStop(Rover):
 
 
 class DrivesForTwiceAsLong(Rover):
-    def __init__(self, briefing: RobotConfig, manoeuvre_s: float) -> None:
-        super().__init__(briefing, manoeuvre_s)
+    def __init__(self, config: RobotConfig, manoeuvre_s: float) -> None:
+        super().__init__(config, manoeuvre_s)
         self._manoeuvre_s = 2.0 * manoeuvre_s
 
 
 class DrivesInHalfTheTime(Rover):
     """All of it, twice as fast."""
 
-    def __init__(self, briefing: RobotConfig, manoeuvre_s: float) -> None:
-        super().__init__(briefing, manoeuvre_s)
+    def __init__(self, config: RobotConfig, manoeuvre_s: float) -> None:
+        super().__init__(config, manoeuvre_s)
         self._manoeuvre_s = 0.5 * manoeuvre_s
 
 

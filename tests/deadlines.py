@@ -65,7 +65,7 @@ def played(folder: Path, rate: int, stopped: float) -> Record:
 
 def late(record: Record, robot: str) -> list[int]:
     """The ticks for which its drive did not come."""
-    return [moment.truth.tick for moment in record.moments[:-1] if robot not in moment.drives]
+    return [moment.truth.tick for moment in record.moments[:-1] if robot not in moment.commands]
 
 
 def drifted(record: Record, tick: int) -> float:

@@ -27,7 +27,7 @@ from world.hardware.driver_journal import Mark, ProcessStart
 POSE = Pose(1.5, -2.5, 0.75)
 
 EXAMPLES: tuple[Message, ...] = (
-    load("paper-1").briefing("a", tick_s=0.25),
+    load("paper-1").config("a", tick_s=0.25),
     Observation(7, "a", Controls(1.0, -0.5), 2.5, (Contact("b", 1.25, (5, 7)), Contact("c", None, ()))),
     Observation(0, "a", None, None),
     Report(

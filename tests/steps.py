@@ -9,7 +9,7 @@ from agent.planning import planner
 from agent.planning.state import RobotState
 from compose.scenario.scenario_file import load
 from protocol.messages import Command, Observation, Report
-from world.tick import World, advance, release, senses
+from world.tick import World, advance, release, observations
 
 
 class Step(NamedTuple):
@@ -20,24 +20,24 @@ class Step(NamedTuple):
     before: dict[str, RobotState]
     observed: dict[str, RobotState]
     heard: dict[str, list[Report]]
-    drives: dict[str, Command]
+    commands: dict[str, Command]
 
 
 def steps(name: str) -> Iterator[Step]:
     """The ticks of the scenario `name`, which ends localised."""
     world = release(load(name))
-    minds = {robot.id: RobotState(world.scenario.briefing(robot.id)) for robot in world.scenario.robots}
+    states = {robot.id: RobotState(world.scenario.config(robot.id)) for robot in world.scenario.robots}
     while True:
-        sensed = senses(world)
-        observed = {sense.robot: planner.observe(minds[sense.robot], sense) for sense in sensed}
+        sensed = observations(world)
+        observed = {observation.robot: planner.observe(states[observation.robot], observation) for observation in sensed}
         heard = {
-            sense.robot: [planner.report(observed[contact.peer]) for contact in sense.contacts]
-            for sense in sensed
+            observation.robot: [planner.report(observed[contact.peer]) for contact in observation.contacts]
+            for observation in sensed
         }
-        before, minds = minds, {robot: planner.decide(mind, heard[robot]) for robot, mind in observed.items()}
-        drives = {robot: planner.drive(mind) for robot, mind in minds.items()}
-        yield Step(world, sensed, before, observed, heard, drives)
-        onward = advance(world, drives)
+        before, states = states, {robot: planner.decide(state, heard[robot]) for robot, state in observed.items()}
+        commands = {robot: planner.command(state) for robot, state in states.items()}
+        yield Step(world, sensed, before, observed, heard, commands)
+        onward = advance(world, commands)
         if not isinstance(onward, World):
             assert onward.outcome == "localised"
             return

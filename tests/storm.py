@@ -114,7 +114,7 @@ class Genuine:
         record = in_process.play(played, folder)
         leave(record, summary(record, "in-process", None), folder)
         self.ticks = record.moments[-1].truth.tick
-        self.farewells = {robot: encode(farewell) for robot, farewell in record.farewells.items()}
+        self.final_reports = {robot: encode(final_report) for robot, final_report in record.final_reports.items()}
         self.by_key: dict[str, dict[int, bytes]] = {}
         peers = {robot.id: robot.peer for robot in played.robots}
         for robot, peer in peers.items():
@@ -132,9 +132,9 @@ class Genuine:
                 )
                 match message:
                     case Observation():
-                        key = keys.sense(RUN, robot)
+                        key = keys.observation(RUN, robot)
                     case Command():
-                        key = keys.drive(RUN, robot)
+                        key = keys.command(RUN, robot)
                     case Estimate():
                         key = keys.estimate(RUN, robot)
                     case Report() if message.robot == robot:
@@ -154,21 +154,21 @@ class Storm:
         self.acted_on = [
             key
             for one, other in (PLAYED, PLAYED[::-1])
-            for key in (keys.sense(RUN, one), keys.drive(RUN, one), keys.report(RUN, one, other))
+            for key in (keys.observation(RUN, one), keys.command(RUN, one), keys.report(RUN, one, other))
         ]
         """keys by which somebody of a, b and the world acts on frames"""
         self.watched = [
             keys.truth(RUN),
-            keys.briefing(RUN, "a"),
+            keys.config(RUN, "a"),
             keys.world_alive(RUN),
             *[key for one in PLAYED for key in (keys.estimate(RUN, one), keys.robot_alive(RUN, one))],
         ]
         """others of the mission, and nothing put on them changes anything"""
-        self.ghost = keys.drive(RUN, "ghost")
+        self.ghost = keys.command(RUN, "ghost")
         self.wild = [
             *("**", "tandem/**", f"tandem/{RUN}/**", "tandem/*/robot/*/drive", f"tandem/{RUN}/robot/*/drive"),
             *(f"tandem/{RUN}/robot/a/*", f"tandem/{RUN}/r$*/a/sense", "*/*/*/*/*", "**/to/*"),
-            *(f"{keys.drive(RUN, 'a')}/**", f"tandem/{RUN}/robot/*/**/b"),
+            *(f"{keys.command(RUN, 'a')}/**", f"tandem/{RUN}/robot/*/**/b"),
         ]
         """wildcards, each of which covers keys by which somebody acts on frames"""
         self.odd = [
@@ -341,11 +341,11 @@ class Tally:
 
 
 LISTENED = (
-    ("world", keys.drive(RUN, "*")),
+    ("world", keys.command(RUN, "*")),
     *[
         (one, key)
         for one, other in (PLAYED, PLAYED[::-1])
-        for key in (keys.sense(RUN, one), keys.report(RUN, other, one))
+        for key in (keys.observation(RUN, one), keys.report(RUN, other, one))
     ],
 )
 """who listens to what, of the processes that act on it"""
@@ -439,15 +439,15 @@ def _ticks(endpoint: str, genuine: Genuine) -> Iterator[Iterator[int]]:
 
     inbox = Inbox("storm")
     with session.open_client(at(endpoint), nobody) as link:
-        drives = {robot: session.publisher(link, keys.drive(RUN, robot)) for robot in PUPPETS}
+        commands = {robot: session.publisher(link, keys.command(RUN, robot)) for robot in PUPPETS}
         for robot in PUPPETS:
-            session.subscribe(link, keys.sense(RUN, robot), inbox, "sense")
+            session.subscribe(link, keys.observation(RUN, robot), inbox, "sense")
         tokens = [session.show_alive(link, keys.robot_alive(RUN, robot)) for robot in PUPPETS]
-        yield _played(inbox, drives, genuine)
+        yield _played(inbox, commands, genuine)
         del tokens
 
 
-def _played(inbox: Inbox, drives: dict[str, zenoh.Publisher], genuine: Genuine) -> Iterator[int]:
+def _played(inbox: Inbox, commands: dict[str, zenoh.Publisher], genuine: Genuine) -> Iterator[int]:
     latest = -1
     parted: set[str] = set()
     while len(parted) < len(PUPPETS):
@@ -462,9 +462,9 @@ def _played(inbox: Inbox, drives: dict[str, zenoh.Publisher], genuine: Genuine) 
                 if tick > latest:
                     latest = tick
                     yield tick
-                drives[robot].put(genuine.by_key[keys.drive(RUN, robot)][tick])
+                commands[robot].put(genuine.by_key[keys.command(RUN, robot)][tick])
             case MissionEnd():
-                drives[robot].put(genuine.farewells[robot])
+                commands[robot].put(genuine.final_reports[robot])
             case FinalReport():
                 parted.add(robot)
 

@@ -76,4 +76,4 @@ ROUNDING = 1e-6
 
 def states(record: Record, robot: str) -> list[str]:
     """What the robot did, tick by tick."""
-    return [moment.drives[robot].state for moment in record.moments]
+    return [moment.commands[robot].state for moment in record.moments]

@@ -19,11 +19,11 @@ from tests.commands import BOUND_S, tandem, until
 
 KEYS = {
     "truth": keys.truth("r"),
-    "briefing of a": keys.briefing("r", "a"),
-    "sense of a": keys.sense("r", "a"),
-    "drive of a": keys.drive("r", "a"),
+    "briefing of a": keys.config("r", "a"),
+    "sense of a": keys.observation("r", "a"),
+    "drive of a": keys.command("r", "a"),
     "report of a to b": keys.report("r", "a", "b"),
-    "beat of a": keys.beat("r", "a"),
+    "beat of a": keys.tick_start("r", "a"),
     "estimate of a": keys.estimate("r", "a"),
     "world alive": keys.world_alive("r"),
     "a alive": keys.robot_alive("r", "a"),
@@ -102,7 +102,7 @@ def network(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
         world = stack.enter_context(router)
         if routes == "router":
             world = opened("world")
-        for key in {*KEYS.values(), keys.briefing("r", "b")}:
+        for key in {*KEYS.values(), keys.config("r", "b")}:
             world.declare_queryable(key, partial(answer, "world"))
             stack.callback(undeclare, session.show_alive(world, key))
         yield Network(opened, world)
@@ -141,7 +141,7 @@ class Participant:
     def __init__(self, network: Network, name: str) -> None:
         self.session = network.open(name)
         self._world = network.world
-        self._own = keys.briefing("r", name.removeprefix("agent-") if name != "viewer" else "a")
+        self._own = keys.config("r", name.removeprefix("agent-") if name != "viewer" else "a")
         until(lambda: answers(self.session, self._own), f"{name} is answered")
 
     def _settled(self) -> None:
@@ -244,5 +244,5 @@ def test_the_answer_of_a_robot_that_may_not_answer_is_not_asked_for(network: Net
     declared: Any = robot.session.declare_queryable("tandem/r/world/briefing/**", partial(answer, "agent-b"))
     robot._settled()
     a = Participant(network, "agent-a")
-    assert answers(a.session, keys.briefing("r", "a")) == ["world"]
+    assert answers(a.session, keys.config("r", "a")) == ["world"]
     undeclare(declared)

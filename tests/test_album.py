@@ -139,9 +139,9 @@ def test_a_plan_shows_each_candidate_and_the_axis_of_each_two_and_the_choice(
     told, computed = pair(recorded(name, records)), REFERENCE.sims[simulation]
     (figure,) = [drawn(one) for one in manoeuvre.draw(told).values()]
     assert told.record is not None
-    farewell = told.record.farewells["b"]
-    assert farewell.candidates is not None
-    count = farewell.candidates[1]
+    final_report = told.record.final_reports["b"]
+    assert final_report.candidates is not None
+    count = final_report.candidates[1]
     assert len(found(figure, r"candidate-\d+")) == count == len(computed.d_i)
     assert len(found(figure, r"bisector-\d+-\d+")) == count * (count - 1) // 2
     places = [line(figure, f"candidate-{i + 1}")[0] for i in range(count)]
@@ -157,8 +157,8 @@ def test_a_plan_shows_each_candidate_and_the_axis_of_each_two_and_the_choice(
         for point in line(figure, f"bisector-{i + 1}-{j + 1}"):
             assert math.dist(point, places[i]) == pytest.approx(math.dist(point, places[j]))
     ((omega, value),) = line(figure, "cost-chosen")
-    assert omega == farewell.last_turn_rate == pytest.approx(computed.w2, abs=1e-9)
-    assert value == farewell.separation_m2 == pytest.approx(computed.J, abs=1e-9)
+    assert omega == final_report.last_turn_rate == pytest.approx(computed.w2, abs=1e-9)
+    assert value == final_report.separation_m2 == pytest.approx(computed.J, abs=1e-9)
     assert max(value for _, value in line(figure, "cost")) == value
     assert min(math.dist(end, point) for point in line(figure, "reach")) < 1e-9
 
@@ -168,10 +168,10 @@ def test_what_is_compared_is_what_was_chosen_from(records: Path) -> None:
     (one,) = [one for role in ("b", "a") for one in manoeuvre.planned(told, role)][:1]
     ways = compared(one.plan.question, told.mission, "assured")
     row, column = np.unravel_index(np.argmax(ways.value), ways.value.shape)
-    assert (ways.reach.v[row, 0], ways.reach.omega[column]) == (one.plan.drive.v, one.plan.drive.omega)
-    drive = told.drive(one.plan.question.mover, one.tick)
-    assert drive is not None
-    assert (drive.v, drive.omega, drive.state) == (one.plan.drive.v, one.plan.drive.omega, "last-manoeuvre")
+    assert (ways.reach.v[row, 0], ways.reach.omega[column]) == (one.plan.command.v, one.plan.command.omega)
+    command = told.command(one.plan.question.mover, one.tick)
+    assert command is not None
+    assert (command.v, command.omega, command.state) == (one.plan.command.v, one.plan.command.omega, "last-manoeuvre")
     (figure,) = [drawn(one) for one in manoeuvre.draw(told).values()][:1]
     assert len(found(figure, r"reach-\d+")) == len(ways.reach.v) - 1
 
@@ -329,11 +329,11 @@ def test_under_noise_a_panel_has_each_hypothesis_that_the_journal_tells_of(recor
             ]
             assert marks == [(pose.x, pose.y) for pose in held[tick].world]
             assert not found(figure, f"hypothesis-{tick}-{role}-{len(marks) + 1}")
-            drive = told.drive(role, tick)
-            assert drive is not None
-            if drive.verdict is None:
+            command = told.command(role, tick)
+            assert command is not None
+            if command.verdict is None:
                 goal = step(
-                    held[tick].world[0], drive.v, drive.omega, stride(told.mission) * told.mission.period
+                    held[tick].world[0], command.v, command.omega, stride(told.mission) * told.mission.period
                 )
                 assert line(figure, f"chosen-{tick}-{role}") == [(goal.x, goal.y)]
 
@@ -404,7 +404,7 @@ def test_a_journal_of_another_version_is_followed_to_where_it_decides_otherwise(
     folder = copied(recorded("paper-1", records), tmp_path)
     path = folder / "agent-b.journal"
     path.write_bytes(b"".join([msgpack.packb(_turned(frame, 20)) for frame in frames(path)]))
-    assert len(pair(folder).minds("b")) == 20
+    assert len(pair(folder).states("b")) == 20
     ended = tandem("figures", folder, "--only", "plan", "--format", "svg")
     assert ended.status == 3
     assert ended.err == (
@@ -429,10 +429,10 @@ def test_no_plan_is_said_to_be_none_where_only_a_journal_is_missing(records: Pat
 def _turned(frame: bytes, tick: int) -> bytes:
     """A Command of that tick with a bit more of a turn."""
     try:
-        drive = decode(frame, Command)
+        command = decode(frame, Command)
     except MalformedFrame:
         return frame
-    return encode(replace(drive, omega=drive.omega + 1e-12)) if drive.tick == tick else frame
+    return encode(replace(command, omega=command.omega + 1e-12)) if command.tick == tick else frame
 
 
 # --- the command ----------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from compose.scenario.toml_file import table_in
 from compose.sweep import spec
 from compose.sweep.cells import cells, trial_seed, trial_table
 from compose.sweep.spec import BadSpec
-from protocol.mission import Mission, obstacle
+from protocol.mission import Mission, infeasibility
 from protocol.rounding import TOLERANCE
 from tests.test_hard_starts import assert_localised
 
@@ -130,7 +130,7 @@ def test_the_paper_is_never_wrong_either() -> None:
     ],
 )
 def test_what_double_precision_does_not_allow_is_in_the_way(mission: Mission, distance: float) -> None:
-    why = obstacle(mission, distance)
+    why = infeasibility(mission, distance)
     assert why is not None
     assert "too short for a pose to be sure to a micrometre in double precision" in why
 
@@ -139,7 +139,7 @@ def test_what_double_precision_does_not_allow_is_in_the_way(mission: Mission, di
     ("reach", "distance"), [(1e4, 1e4), (300.0, 600.0), (0.01, 1e-5), (0.01, 0.3), (3.0, 10.0)]
 )
 def test_what_double_precision_allows_is_not(reach: float, distance: float) -> None:
-    assert obstacle(Mission(reach, 1.0, 0.9 * reach, 3.0), distance) is None
+    assert infeasibility(Mission(reach, 1.0, 0.9 * reach, 3.0), distance) is None
 
 
 # --- the draws ----------------------------------------------------------------------------------------

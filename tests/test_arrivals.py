@@ -177,20 +177,20 @@ def test_wildcards_odd_keys_and_deletions_end_no_process_and_change_nothing(tmp_
 
 
 def test_an_answer_of_a_stranger_under_a_wildcard_is_no_briefing() -> None:
-    briefing = load("paper-1").briefing("a")
+    config = load("paper-1").config("a")
     with session.open_router(listening("tcp/127.0.0.1:0")) as link:
         declared: list[Any] = []
 
         def answers(key: str, reply: Callable[[zenoh.Query], None]) -> bytes | str | None:
             declared.append(link.declare_queryable(key, reply))
             try:
-                return session.ask(link, keys.briefing(RUN, "a"), BOUND_S)
+                return session.ask(link, keys.config(RUN, "a"), BOUND_S)
             finally:
                 declared.pop().undeclare()
 
-        asked = keys.briefing(RUN, "a")
-        assert answers("tandem/**", lambda query: query.reply("tandem/**", encode(briefing))) is None
-        assert answers(asked, lambda query: query.reply(asked, encode(briefing))) == encode(briefing)
+        asked = keys.config(RUN, "a")
+        assert answers("tandem/**", lambda query: query.reply("tandem/**", encode(config))) is None
+        assert answers(asked, lambda query: query.reply(asked, encode(config))) == encode(config)
         refusal = answers(asked, lambda query: query.reply_err(b"\xff\xfe" * 1000, encoding=session.REFUSAL))
         assert isinstance(refusal, str)
         assert len(refusal) <= 300
@@ -212,16 +212,16 @@ def test_a_flood_of_keys_that_are_none_is_counted_and_told_of_a_bounded_number(
 def test_what_comes_under_a_wildcard_is_delivered_to_nobody(capsys: pytest.CaptureFixture[str]) -> None:
     inbox = Inbox("test")
     with session.open_router(listening("tcp/127.0.0.1:0")) as link:
-        session.subscribe(link, keys.drive(RUN, "*"), inbox, "drive")
+        session.subscribe(link, keys.command(RUN, "*"), inbox, "drive")
         session.watch_liveliness(link, keys.robot_alive(RUN, "*"), inbox)
         link.put("tandem/**", FRAMES[2])
-        link.delete(keys.drive(RUN, "a"))
+        link.delete(keys.command(RUN, "a"))
         token: Any = link.liveliness().declare_token("**")
-        link.put(keys.drive(RUN, "a"), FRAMES[2])
+        link.put(keys.command(RUN, "a"), FRAMES[2])
         arrival = inbox.next(BOUND_S)
         assert (arrival.topic, arrival.source, arrival.frame) == (
             "drive",
-            keys.Key(keys.drive, RUN, "a"),
+            keys.Key(keys.command, RUN, "a"),
             FRAMES[2],
         )
         token.undeclare()

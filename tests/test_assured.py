@@ -25,7 +25,7 @@ from compose.launch.in_process import play
 from compose.recording.run import Record, TickRecord
 from compose.scenario.scenario_file import parse
 from protocol.messages import Localised
-from protocol.mission import Mission, obstacle
+from protocol.mission import Mission, infeasibility
 from protocol.motion import ORIGIN, Pose, compose, step
 from tests.steps import Step, steps
 from world.referee import errors
@@ -108,7 +108,7 @@ def assert_localised(record: Record) -> None:
     assert record.end.outcome == "localised", (record.end, starts)
     last = record.moments[-1]
     for robot, truth in zip(record.scenario.robots, last.truth.poses, strict=True):
-        verdict = last.drives[robot.id].verdict
+        verdict = last.commands[robot.id].verdict
         assert isinstance(verdict, Localised)
         assert max(errors(verdict.pose, truth)) < 1e-6, starts
 
@@ -120,21 +120,21 @@ def in_contact(record: Record, moment: TickRecord) -> bool:
 
 def met(record: Record) -> int:
     """The tick in which phase 3 begins."""
-    return next(m.truth.tick for m in record.moments if any(d.phase == 3 for d in m.drives.values()))
+    return next(m.truth.tick for m in record.moments if any(d.phase == 3 for d in m.commands.values()))
 
 
 def claimed(record: Record) -> int:
     """The tick of the first claim."""
-    return next(m.truth.tick for m in record.moments if any(d.verdict for d in m.drives.values()))
+    return next(m.truth.tick for m in record.moments if any(d.verdict for d in m.commands.values()))
 
 
 def states(record: Record, robot: str) -> list[tuple[int, str]]:
     """Phase and state of `robot`, one after the other."""
     found: list[tuple[int, str]] = []
     for moment in record.moments:
-        drive = moment.drives[robot]
-        if not found or found[-1] != (drive.phase, drive.state):
-            found.append((drive.phase, drive.state))
+        command = moment.commands[robot]
+        if not found or found[-1] != (command.phase, command.state):
+            found.append((command.phase, command.state))
     return found
 
 
@@ -161,13 +161,13 @@ def test_phase_3_begins_in_the_first_tick_of_contact_in_which_both_know_their_an
             moment
             for moment in record.moments
             if in_contact(record, moment)
-            and all(drive.phase > 1 for drive in moment.drives.values())
+            and all(command.phase > 1 for command in moment.commands.values())
             and off_anchor(record, moment)
         )
         assert met(record) == first.truth.tick, seed
-        assert [drive.phase for drive in first.drives.values()] == [3, 3], seed
+        assert [command.phase for command in first.commands.values()] == [3, 3], seed
         last = record.moments[first.truth.tick - 1]
-        before_orbit += any(drive.state != "orbiting" for drive in last.drives.values())
+        before_orbit += any(command.state != "orbiting" for command in last.commands.values())
     assert before_orbit >= on_the_way
 
 
@@ -178,9 +178,9 @@ def test_who_is_done_with_phase_1_stands_still_while_a_peer_in_range_is_not(sett
         record = drawn(setting, seed)
         for moment in record.moments:
             for one, other in (("a", "b"), ("b", "a")):
-                drive = moment.drives[one]
-                if in_contact(record, moment) and drive.phase == 2 and moment.drives[other].phase == 1:
-                    assert (drive.v, drive.omega) == (0.0, 0.0), seed
+                command = moment.commands[one]
+                if in_contact(record, moment) and command.phase == 2 and moment.commands[other].phase == 1:
+                    assert (command.v, command.omega) == (0.0, 0.0), seed
                     waited += 1
     assert waited >= 8
 
@@ -189,12 +189,12 @@ def test_a_stands_still_while_b_in_range_drives_off_its_anchor() -> None:
     """On its anchor, b's ranges would not tell how it is turned."""
     record = released(CLOSE._replace(speed=0.1), Pose(4.0, 0.5, 1.0), Pose(7.0, 0.0, 2.0))
     waited = [
-        moment.drives["a"]
+        moment.commands["a"]
         for moment in record.moments
-        if [moment.drives[robot].phase for robot in "ab"] == [2, 2] and not off_anchor(record, moment)
+        if [moment.commands[robot].phase for robot in "ab"] == [2, 2] and not off_anchor(record, moment)
     ]
     assert len(waited) >= 3
-    assert {(drive.v, drive.omega) for drive in waited} == {(0.0, 0.0)}
+    assert {(command.v, command.omega) for command in waited} == {(0.0, 0.0)}
     assert off_anchor(record, record.moments[met(record)])
     assert not off_anchor(record, record.moments[met(record) - 1])
     assert_localised(record)
@@ -205,7 +205,7 @@ def test_once_both_orbit_phase_3_begins_within_the_bound(setting: Setting) -> No
     for seed in range(60):
         record = drawn(setting, seed)
         orbits = sum(
-            all(drive.state == "orbiting" for drive in moment.drives.values()) for moment in record.moments
+            all(command.state == "orbiting" for command in moment.commands.values()) for moment in record.moments
         )
         bound = record.scenario.robots[0].rendezvous.bound
         assert orbits * setting.period <= bound + 1e-9, seed
@@ -219,7 +219,7 @@ def test_however_long_b_has_waited_the_first_report_tells_the_whole_way(
     for seed in (0, 2):
         waited = 0
         for moment in steps_of(tmp_path, Setting(reach=reach, period=0.05), seed):
-            waited += moment.drives["b"].state == "orbiting"
+            waited += moment.commands["b"].state == "orbiting"
             if any(moment.heard.values()):
                 break
         assert waited > 300
@@ -227,7 +227,7 @@ def test_however_long_b_has_waited_the_first_report_tells_the_whole_way(
         assert len(moment.before["b"].log.ranges) < 100
         for told in moment.heard.values():
             assert [(report.since, report.through) for report in told] == [(0, moment.world.truth.tick)]
-        assert {drive.phase for drive in moment.drives.values()} == {3}
+        assert {command.phase for command in moment.commands.values()} == {3}
 
 
 # --- what was sensed before phase 3 counts ------------------------------------------------------------
@@ -239,7 +239,7 @@ def encounter(record: Record) -> list[TickRecord]:
     end = next(
         i
         for i, moment in enumerate(moments)
-        if moment.drives["b"].state == "last-manoeuvre" or any(d.verdict for d in moment.drives.values())
+        if moment.commands["b"].state == "last-manoeuvre" or any(d.verdict for d in moment.commands.values())
     )
     return list(moments[: end + 1])
 
@@ -250,9 +250,9 @@ def test_silence_before_phase_3_rules_placements_out() -> None:
     for seed in range(150):
         record = drawn(CLOSE, seed)
         if all(in_contact(record, moment) for moment in encounter(record)):
-            candidates = record.farewells["b"].candidates
+            candidates = record.final_reports["b"].candidates
             assert candidates is not None
-            assert candidates == record.farewells["a"].candidates
+            assert candidates == record.final_reports["a"].candidates
             fewer += candidates[1] < candidates[0]
     assert fewer >= 15
 
@@ -267,7 +267,7 @@ def test_ranges_before_phase_3_make_a_last_manoeuvre_needless() -> None:
         if len(since) < 3:
             assert len(since) == 2
             assert len([tick for tick in ranged if tick <= claimed(record)]) >= 3
-            assert all(moment.drives["b"].state != "last-manoeuvre" for moment in record.moments)
+            assert all(moment.commands["b"].state != "last-manoeuvre" for moment in record.moments)
             spared += 1
     assert spared >= 15
 
@@ -275,14 +275,14 @@ def test_ranges_before_phase_3_make_a_last_manoeuvre_needless() -> None:
 def test_without_what_was_sensed_before_phase_3_more_placements_would_be_left(tmp_path: Path) -> None:
     more = 0
     for seed in range(60):
-        claim = next(step for step in steps_of(tmp_path, CLOSE, seed) if step.drives["b"].verdict)
-        mind = planner.decide(claim.observed["b"], claim.heard["b"])
-        assert mind.findings.met is not None
-        late = mind.sightings(mind.findings.met)
-        pair = base(late, drift(mind))
+        claim = next(step for step in steps_of(tmp_path, CLOSE, seed) if step.commands["b"].verdict)
+        state = planner.decide(claim.observed["b"], claim.heard["b"])
+        assert state.belief.encounter_tick is not None
+        late = state.pair_observations(state.belief.encounter_tick)
+        pair = base(late, drift(state))
         assert pair is not None
-        left = weigh_placements(solve(CLOSE.distance, pair), late, CLOSE.reach, apart(mind))
-        (known,) = mind.findings.placements
+        left = weigh_placements(solve(CLOSE.distance, pair), late, CLOSE.reach, apart(state))
+        (known,) = state.belief.placements
         assert any(same_placement(known, one, 1e-6) for one in left), seed
         more += len(left) > 1
     assert more >= 6
@@ -309,7 +309,7 @@ def test_nobody_claims_before_ranges_from_three_different_places(setting: Settin
             if in_contact(record, moment) and all(math.dist(here, there) > 1e-6 for there in different):
                 different.append(here)
         assert len(different) >= 3, seed
-        single += record.farewells["b"].candidates in {(2, 1), (4, 1), (1, 1)}
+        single += record.final_reports["b"].candidates in {(2, 1), (4, 1), (1, 1)}
     assert single >= 5 or setting != CLOSE
 
 
@@ -330,8 +330,8 @@ def test_who_leaves_the_range_straight_ahead_looks_behind_before_it_circles(sett
         for robot, phase in (("a", 1), ("b", 1), ("a", 3)):
             ways.add((phase, *sought(record, robot, phase)))
         for moment in record.moments:
-            for drive in moment.drives.values():
-                assert drive.state != "backing" or (drive.v < 0.0 and drive.omega == 0.0)
+            for command in moment.commands.values():
+                assert command.state != "backing" or (command.v < 0.0 and command.omega == 0.0)
     whole = ("straight", "backing", "turning", "circling")
     assert ways - {(1,)} <= {(phase, *whole[:length]) for phase in (1, 3) for length in (1, 2, 4)}
     assert (1, *whole[:2]) in ways
@@ -342,12 +342,12 @@ def test_who_leaves_the_range_straight_ahead_looks_behind_before_it_circles(sett
 def test_the_letter_never_looks_behind() -> None:
     for seed in range(100):
         record = drawn(SECTION_IV, seed, "paper")
-        assert all(drive.state != "backing" for moment in record.moments for drive in moment.drives.values())
+        assert all(command.state != "backing" for moment in record.moments for command in moment.commands.values())
 
 
 def known(record: Record, robot: str) -> int:
     """The tick at which phase 1 ends."""
-    return next(moment.truth.tick for moment in record.moments if moment.drives[robot].phase > 1)
+    return next(moment.truth.tick for moment in record.moments if moment.commands[robot].phase > 1)
 
 
 @pytest.mark.parametrize("reach", [1.0, 3.0, 5.0])
@@ -359,7 +359,7 @@ def test_to_look_behind_is_never_slower_than_to_circle_for_who_turns_slowly_and_
     for seed in range(60):
         ours, letters = drawn(setting, seed), drawn(setting, seed, "paper")
         for robot in "ab":
-            if sought(ours, robot, 1) == ["straight", "backing"] and letters.farewells[robot].branch:
+            if sought(ours, robot, 1) == ["straight", "backing"] and letters.final_reports[robot].branch:
                 assert known(ours, robot) < known(letters, robot), seed
                 behind += 1
     assert behind >= 10
@@ -368,11 +368,11 @@ def test_to_look_behind_is_never_slower_than_to_circle_for_who_turns_slowly_and_
 # --- the last manoeuvre -------------------------------------------------------------------------------
 
 
-def left_out(mind: RobotState, v: float, omega: float, candidates: tuple[Placement, ...]) -> list[Placement]:
-    """Those by which a is out of range of b, who is at `mind`, once b has driven (v, omega)."""
-    mission = mind.briefing.mission
-    end = step(mind.local_pose, v, omega, mission.period)
-    a = mind.sightings(mind.tick)[-1].a
+def left_out(state: RobotState, v: float, omega: float, candidates: tuple[Placement, ...]) -> list[Placement]:
+    """Those by which a is out of range of b, who is at `state`, once b has driven (v, omega)."""
+    mission = state.config.mission
+    end = step(state.local_pose, v, omega, mission.period)
+    a = state.pair_observations(state.tick)[-1].a
     rim = mission.sensing_range - 1e-6
     return [one for one in candidates if math.hypot(one.place(a).x - end.x, one.place(a).y - end.y) > rim]
 
@@ -388,14 +388,14 @@ def test_the_last_manoeuvre_leaves_no_more_placements_out_of_range_than_it_must(
     counts = set()
     for seed in (*range(20), 64, 78, 83, 86):
         for moment in steps_of(tmp_path, SLOW, seed):
-            mind = planner.decide(moment.observed["b"], moment.heard["b"])
-            if isinstance(mind.state, LastManoeuvre) and not isinstance(
-                moment.before["b"].state, LastManoeuvre
+            state = planner.decide(moment.observed["b"], moment.heard["b"])
+            if isinstance(state.mode, LastManoeuvre) and not isinstance(
+                moment.before["b"].mode, LastManoeuvre
             ):
-                candidates = mind.findings.placements
-                drive = moment.drives["b"]
-                out = len(left_out(mind, drive.v, drive.omega, candidates))
-                assert out <= min(len(left_out(mind, *one, candidates)) for one in grid(SLOW.mission)), seed
+                candidates = state.belief.placements
+                command = moment.commands["b"]
+                out = len(left_out(state, command.v, command.omega, candidates))
+                assert out <= min(len(left_out(state, *one, candidates)) for one in grid(SLOW.mission)), seed
                 assert out <= 1
                 counts.add(out)
     assert counts == {0, 1}
@@ -404,19 +404,19 @@ def test_the_last_manoeuvre_leaves_no_more_placements_out_of_range_than_it_must(
 @pytest.mark.parametrize("seed", [64, 78, 83])
 def test_silence_names_the_placement_left_out_and_b_drives_back_to_tell(seed: int, tmp_path: Path) -> None:
     moments = list(steps_of(tmp_path, SLOW, seed))
-    doing = [moment.drives["b"].state for moment in moments]
+    doing = [moment.commands["b"].state for moment in moments]
     out = doing.index("returning")
     setting_out, silent, back = moments[out - 1], moments[out], moments[out + 1]
-    drive, returning = setting_out.drives["b"], silent.drives["b"]
-    assert drive.state == "last-manoeuvre"
+    command, returning = setting_out.commands["b"], silent.commands["b"]
+    assert command.state == "last-manoeuvre"
     assert not silent.heard["b"]
-    assert (returning.v, returning.omega) == (-drive.v, -drive.omega)
+    assert (returning.v, returning.omega) == (-command.v, -command.omega)
     assert math.dist(places_of(back)[1], places_of(setting_out)[1]) < 1e-9
     assert back.heard["b"]
-    mind = planner.decide(setting_out.observed["b"], setting_out.heard["b"])
+    state = planner.decide(setting_out.observed["b"], setting_out.heard["b"])
     for robot in "ab":
-        named = planner.decide(back.observed[robot], back.heard[robot]).findings.placements
-        (only,) = left_out(mind, drive.v, drive.omega, mind.findings.placements)
+        named = planner.decide(back.observed[robot], back.heard[robot]).belief.placements
+        (only,) = left_out(state, command.v, command.omega, state.belief.placements)
         assert len(named) == 1
         assert same_placement(named[0], only, 1e-6)
 
@@ -429,8 +429,8 @@ def places_of(moment: Step) -> list[tuple[float, float]]:
 def test_b_sets_out_only_once_a_stands(setting: Setting) -> None:
     for seed in range(100):
         for moment in drawn(setting, seed).moments:
-            if moment.drives["b"].state == "last-manoeuvre":
-                assert (moment.drives["a"].v, moment.drives["a"].omega) == (0.0, 0.0), seed
+            if moment.commands["b"].state == "last-manoeuvre":
+                assert (moment.commands["a"].v, moment.commands["a"].omega) == (0.0, 0.0), seed
 
 
 # --- how exact a placement is -------------------------------------------------------------------------
@@ -445,10 +445,10 @@ def sighted(placement: Placement, a: Pose, b: Pose) -> PairObservation:
     return PairObservation(0, a, b, math.hypot(there.x - b.x, there.y - b.y))
 
 
-def ranges_of(distance: float, phi: float, psi: float, sightings: list[PairObservation]) -> list[float]:
+def ranges_of(distance: float, phi: float, psi: float, pair_observations: list[PairObservation]) -> list[float]:
     """m: as predicted where M1 lies in the direction psi of M2, and <a(M1)> is turned by phi."""
     placement = Placement(phi, distance * math.cos(psi), distance * math.sin(psi))
-    found = [sighted(placement, one.a, one.b).range for one in sightings if one.range is not None]
+    found = [sighted(placement, one.a, one.b).range for one in pair_observations if one.range is not None]
     return [rho for rho in found if rho is not None]
 
 
@@ -457,13 +457,13 @@ def test_turn_error_is_how_far_least_squares_would_turn_a_robot_at_the_worst(
     distance: float, phi: float, psi: float, pairs: list[tuple[Pose, Pose]]
 ) -> None:
     placement = Placement(phi, distance * math.cos(psi), distance * math.sin(psi))
-    sightings = [sighted(placement, a, b) for a, b in pairs]
-    assume(all((one.range or 0.0) > 0.1 for one in sightings))
+    pair_observations = [sighted(placement, a, b) for a, b in pairs]
+    assume(all((one.range or 0.0) > 0.1 for one in pair_observations))
     h = 1e-5
     by_phi, by_psi = (
         np.subtract(
-            ranges_of(distance, phi + h * turn, psi + h * (1 - turn), sightings),
-            ranges_of(distance, phi - h * turn, psi - h * (1 - turn), sightings),
+            ranges_of(distance, phi + h * turn, psi + h * (1 - turn), pair_observations),
+            ranges_of(distance, phi - h * turn, psi - h * (1 - turn), pair_observations),
         )
         / (2 * h)
         for turn in (1, 0)
@@ -471,12 +471,12 @@ def test_turn_error_is_how_far_least_squares_would_turn_a_robot_at_the_worst(
     slopes = np.column_stack([by_phi, by_psi])
     assume(np.linalg.cond(slopes) < 1e3)
     fit = np.linalg.pinv(slopes)
-    sighted_all = [*sightings, PairObservation(0, Pose(1.0, 2.0, 3.0), ORIGIN, None)]
+    sighted_all = [*pair_observations, PairObservation(0, Pose(1.0, 2.0, 3.0), ORIGIN, None)]
     alone = [np.abs(turned).sum() for turned in (fit[0] - fit[1], fit[1])]
     assert turn_error(placement, sighted_all, 1.0, 0.0) == pytest.approx(max(alone), rel=1e-3)
-    places = [placement.place(one.a) for one in sightings]
+    places = [placement.place(one.a) for one in pair_observations]
     away = np.array(
-        [(there.x - one.b.x, there.y - one.b.y) for there, one in zip(places, sightings, strict=True)]
+        [(there.x - one.b.x, there.y - one.b.y) for there, one in zip(places, pair_observations, strict=True)]
     )
     towards = away / np.linalg.norm(away, axis=1, keepdims=True)
     together = [np.linalg.norm(turned @ towards) for turned in (fit[0] - fit[1], fit[1])]
@@ -511,13 +511,13 @@ def seen_at(
 @pytest.mark.parametrize("case", OPEN)
 def test_ranges_that_leave_a_turn_open_pin_nothing_down(case: str) -> None:
     placement, places = OPEN[case]
-    sightings = seen_at(placement, *places)
-    assert turn_error(placement, sightings, 1e-12, 1e-12) == math.inf
+    pair_observations = seen_at(placement, *places)
+    assert turn_error(placement, pair_observations, 1e-12, 1e-12) == math.inf
 
 
 def test_ranges_from_where_nothing_is_special_pin_a_placement_down() -> None:
-    sightings = seen_at(GENERAL, ((8.0, 3.0), (0.3, 0.2)), ((7.5, 4.0), (0.3, 0.2)))
-    assert turn_error(GENERAL, sightings, 1e-12, 1e-12) < 1e-10
+    pair_observations = seen_at(GENERAL, ((8.0, 3.0), (0.3, 0.2)), ((7.5, 4.0), (0.3, 0.2)))
+    assert turn_error(GENERAL, pair_observations, 1e-12, 1e-12) < 1e-10
 
 
 def test_one_more_range_from_elsewhere_pins_a_double_root_down() -> None:
@@ -636,7 +636,7 @@ def test_who_turns_slowly_gets_through_phase_1_from_next_to_its_anchor(rho0: flo
     setting = Setting(reach=1.0, period=0.05, turn_rate=0.2)
     for heading in (*RADIAL_AND_TANGENT, 1.0, 4.0):
         text = text_of(setting, Pose(rho0, 0.0, heading), None, max_ticks=200)
-        assert play(parse(text, "assured")).moments[-1].drives["a"].phase > 1, heading
+        assert play(parse(text, "assured")).moments[-1].commands["a"].phase > 1, heading
 
 
 # --- what is too small and too large ------------------------------------------------------------------
@@ -644,7 +644,7 @@ def test_who_turns_slowly_gets_through_phase_1_from_next_to_its_anchor(rho0: flo
 
 @given(st.floats(0.1, 1.5), st.floats(0.05, 1.0), st.floats(0.2, math.pi))
 def test_nothing_is_in_the_way_of_ordinary_missions(ratio: float, period: float, turn_rate: float) -> None:
-    assert obstacle(Mission(10.0 * ratio, period, 1.0, turn_rate), 10.0) is None
+    assert infeasibility(Mission(10.0 * ratio, period, 1.0, turn_rate), 10.0) is None
 
 
 @pytest.mark.parametrize(
@@ -658,11 +658,11 @@ def test_nothing_is_in_the_way_of_ordinary_missions(ratio: float, period: float,
 def test_ticks_that_move_a_robot_too_little_are_in_the_way(
     mission: Mission, distance: float, step: str
 ) -> None:
-    why = obstacle(mission, distance)
+    why = infeasibility(mission, distance)
     assert why is not None
     assert f"a tick moves a robot by {step} at most" in why
     assert why.endswith("raise max_speed or period")
-    assert obstacle(replace(mission, max_speed=mission.max_speed * 1e3), distance) is None
+    assert infeasibility(replace(mission, max_speed=mission.max_speed * 1e3), distance) is None
 
 
 @pytest.mark.parametrize(
@@ -676,9 +676,9 @@ def test_ticks_that_move_a_robot_too_little_are_in_the_way(
 def test_distances_too_large_for_the_manoeuvres_are_in_the_way(
     mission: Mission, distance: float, named: tuple[str, str, str]
 ) -> None:
-    why = obstacle(mission, distance)
+    why = infeasibility(mission, distance)
     assert why is not None
     between, reach, step = named
     assert f"with {between} between the anchors and ranges up to {reach}, manoeuvres of {step} are" in why
     assert why.endswith("raise max_speed or period")
-    assert obstacle(replace(mission, max_speed=mission.max_speed * 1e3), distance) is None
+    assert infeasibility(replace(mission, max_speed=mission.max_speed * 1e3), distance) is None

@@ -173,20 +173,20 @@ def test_a_run_that_failed_was_failed_by_nobody_on_record() -> None:
     scenario = load("paper-1")
     books = {name: MemoryJournal() for name in in_process.journals(scenario)}
     course = Course(scenario, books[WORLD_JOURNAL])
-    robots = {robot: Robot(scenario.briefing(robot), books[agent_journal(robot)]) for robot in "ab"}
+    robots = {robot: Robot(scenario.config(robot), books[agent_journal(robot)]) for robot in "ab"}
     for _ in range(5):
-        drives = {}
-        for sense in course.senses():
-            robots[sense.robot].sense(sense)
-            drives[sense.robot] = robots[sense.robot].decide()
-            robots[sense.robot].estimate()
-        assert course.drive(drives) is None
-    a, _ = course.senses()
-    robots["a"].sense(a)
+        commands = {}
+        for observation in course.observations():
+            robots[observation.robot].observation(observation)
+            commands[observation.robot] = robots[observation.robot].decide()
+            robots[observation.robot].estimate()
+        assert course.command(commands) is None
+    a, _ = course.observations()
+    robots["a"].observation(a)
     robots["a"].decide()
     robots["a"].estimate()
     end = course.end(Judgement("failed", "no answer from b at tick 5 for 30 s"))
-    course.farewells([robots["a"].farewell(end)])
+    course.final_reports([robots["a"].final_report(end)])
     findings = judge({name: book.frames for name, book in books.items()})
     assert found(findings) == [(4, "b", "order")]
     assert findings.violations[0].what == "its journal breaks off here, expected MissionEnd and Farewell"
@@ -408,7 +408,7 @@ def plant_scenario(folder: Path, change: Callable[[Scenario], Scenario]) -> None
     plant(folder / WORLD_JOURNAL, (of(Scenario), change))
     (told,) = [one for one in messages(folder / WORLD_JOURNAL) if isinstance(one, Scenario)]
     for name in (A, B):
-        plant(folder / name, (of(RobotConfig), lambda briefed: told.briefing(briefed.robot)))
+        plant(folder / name, (of(RobotConfig), lambda briefed: told.config(briefed.robot)))
 
 
 def with_robots(**fields: Any) -> Callable[[Scenario], Scenario]:
@@ -451,7 +451,7 @@ def test_a_robot_that_starts_outside_the_range_of_its_anchor_is_found(tmp_path: 
         (lambda told: replace(told, mission=replace(told.mission, safety_distance=2.9)), "mission.safety"),
         (lambda told: replace(told, mission=replace(told.mission, max_speed=1e-5)), "mission: a tick moves"),
         (with_robots(anchor=Anchor(0.0, 0.0)), "its anchor is 0 m from its peer's"),
-        (with_robots(lie=Attack("heading", 0.1, "orbit")), "its lie is of the start, and not of all"),
+        (with_robots(attack=Attack("heading", 0.1, "orbit")), "its lie is of the start, and not of all"),
         (lambda told: replace(told, robots=told.robots[::-1]), "role is a: the first of a pair is a"),
     ],
 )
@@ -491,15 +491,15 @@ FAR = Report(20, "a", 2, "orbiting", None, 0, 0, (), 0, (), 0, 0)
 
 
 def test_a_report_that_was_sent_out_of_contact_is_found(folder: Path) -> None:
-    plant(folder / A, (of(Observation, 20), lambda sense: [sense, FAR]))
+    plant(folder / A, (of(Observation, 20), lambda observation: [observation, FAR]))
     findings = audit(folder)
     assert found(findings) == [(20, "a", "contact"), (20, "a", "decision")]
     assert what(findings, "contact") == ["it sent a report, expected none: out of contact"]
 
 
 def test_a_report_that_was_heard_out_of_contact_is_found(folder: Path) -> None:
-    plant(folder / A, (of(Observation, 20), lambda sense: [sense, FAR]))
-    plant(folder / B, (of(Observation, 20), lambda sense: [sense, FAR]))
+    plant(folder / A, (of(Observation, 20), lambda observation: [observation, FAR]))
+    plant(folder / B, (of(Observation, 20), lambda observation: [observation, FAR]))
     findings = audit(folder)
     heard = [one.what for one in findings.violations if one.robot == "b" and one.rule == "contact"]
     assert heard == [
@@ -511,12 +511,12 @@ def test_a_report_that_was_heard_out_of_contact_is_found(folder: Path) -> None:
 def test_a_late_report_from_out_of_contact_is_found(folder: Path) -> None:
     """Heard in contact, and listed; but not sent in contact."""
     late = replace(FAR, tick=45)
-    plant(folder / A, (of(Observation, 45), lambda sense: [sense, late]))
+    plant(folder / A, (of(Observation, 45), lambda observation: [observation, late]))
     plant(
         folder / B,
         (
             of(Observation, 46),
-            lambda sense: replace(sense, contacts=(Contact("a", sense.contacts[0].range, (46, 45)),)),
+            lambda observation: replace(observation, contacts=(Contact("a", observation.contacts[0].range, (46, 45)),)),
         ),
         (of(Report, 46, "a"), lambda report: [report, late]),
     )
@@ -552,7 +552,7 @@ def test_a_report_that_was_changed_on_its_way_is_found(folder: Path) -> None:
 
 
 def test_a_report_that_was_never_sent_is_found(folder: Path) -> None:
-    plant(folder / B, (of(Observation, 20), lambda sense: [sense, FAR]))
+    plant(folder / B, (of(Observation, 20), lambda observation: [observation, FAR]))
     findings = audit(folder)
     assert what(findings, "report") == ["it heard a report of tick 20, which a never sent"]
     assert {(robot, rule) for _, robot, rule in found(findings)} == {
@@ -576,12 +576,12 @@ def test_a_report_that_does_not_follow_is_found_at_its_sender(folder: Path) -> N
 def test_a_planner_that_fails_on_its_inputs_is_a_violation_and_no_crash(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fails(mind: RobotState) -> Command:
-        if mind.tick == 12 and mind.briefing.robot == "a":
+    def fails(state: RobotState) -> Command:
+        if state.tick == 12 and state.config.robot == "a":
             raise ZeroDivisionError("12")
-        return drive(mind)
+        return command(state)
 
-    drive = planner.drive
+    command = planner.command
     monkeypatch.setattr(planner, "drive", fails)
     assert [one.line for one in audit(folder).violations] == [
         "tick 12, a, decision: the planner cannot go on from its inputs: ZeroDivisionError: 12"
@@ -826,7 +826,7 @@ def test_what_befell_the_reports_is_listed_and_another_plan_is_found(tmp_path: P
     in_process.play(parse(text, "random", faults=["b->a: loss=0.5, delay=0..2, corrupt=0.2"]), tmp_path)
     findings = audit(tmp_path)
     assert found(findings) == []
-    to_a, to_b = findings.radio
+    to_a, to_b = findings.peer_state
     assert (to_a.link, to_b.link) == ("b->a", "a->b")
     assert to_b.heard == to_b.sent == to_a.sent
     assert to_b.late == to_b.twice == to_b.damaged == to_b.lost == 0

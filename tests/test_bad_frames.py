@@ -55,14 +55,14 @@ GENUINE = {
 """by topic: what robot a gets, says, and is told by its peer, b; and the longest frame in bytes"""
 
 TRUSTED = {
-    "sense": keys.sense(RUN, "a"),
-    "drive": keys.drive(RUN, "a"),
+    "sense": keys.observation(RUN, "a"),
+    "drive": keys.command(RUN, "a"),
     "report": keys.report(RUN, "b", "a"),
 }
 """the keys that somebody acts on"""
-WATCHED = [keys.truth(RUN), keys.estimate(RUN, "a"), keys.briefing(RUN, "a")]
+WATCHED = [keys.truth(RUN), keys.estimate(RUN, "a"), keys.config(RUN, "a")]
 """those that nobody of the mission listens to"""
-GHOST, OTHER = keys.drive(RUN, "ghost"), keys.drive(RUN, "b")
+GHOST, OTHER = keys.command(RUN, "ghost"), keys.command(RUN, "b")
 """a Command comes by them that says it is from somebody else, or from nobody"""
 
 
@@ -176,7 +176,7 @@ def test_nonsense_before_the_first_tick_is_refused_told_once_and_counted(tmp_pat
             stranger[GHOST].put(encode(Command(0, "ghost", 1.0, 0.0, 1, "haunting")))
             stranger[OTHER].put(encode(Command(0, "a", 1.0, 0.0, 1, "posing")))
         clock.until_says(f"refused a frame on {OTHER}")
-        assert isinstance(session.ask(link, keys.briefing(RUN, "*"), 5.0), str)
+        assert isinstance(session.ask(link, keys.config(RUN, "*"), 5.0), str)
         agents.append(others.enter_context(TandemProcess("agent", "d", "--connect", endpoint, "--out", out)))
         assert clock.ended().status == 0
         assert [agent.ended().status for agent in agents] == [0] * 4
@@ -191,9 +191,9 @@ def test_nonsense_before_the_first_tick_is_refused_told_once_and_counted(tmp_pat
     assert tandem("run", scenario, "--in-process", "-q", "--out", alone).status == 0
     assert (out / "ticks.csv").read_bytes() == (alone / "ticks.csv").read_bytes()
     robots = json.loads((out / "summary.json").read_text())["robots"]
-    senses, reports = (TIMES * len(nonsense[TRUSTED[topic]]) for topic in ("sense", "report"))
+    observations, reports = (TIMES * len(nonsense[TRUSTED[topic]]) for topic in ("sense", "report"))
     assert [robots[name]["reports_refused"] for name in "abcd"] == [reports, 0, 0, 0]
-    assert [robots[name]["frames_refused"] for name in "abcd"] == [senses + reports, 0, 0, 0]
+    assert [robots[name]["frames_refused"] for name in "abcd"] == [observations + reports, 0, 0, 0]
 
 
 def test_a_mission_under_fire_goes_on_as_if_nothing_happened(tmp_path: Path) -> None:
@@ -260,21 +260,21 @@ def test_a_robot_refuses_what_is_out_of_step_and_hears_a_repeated_report_once(tm
     def told(tick: int, **otherwise: object) -> Report:
         return replace(Report(tick, "b", 1, "straight", None, 0, 0, (), 0, (), 0, 0), **otherwise)
 
-    def sense(tick: int) -> Observation:
+    def observation(tick: int) -> Observation:
         return Observation(tick, "a", REST if tick else None, 2.5, (Contact("b", 2.0, (tick,)),))
 
     with session.open_router(listening(endpoint)) as link:
-        session.answer(link, keys.briefing(RUN, "*"), lambda _: scenario.briefing("a"))
-        session.subscribe(link, keys.drive(RUN, "a"), said, "drive")
+        session.answer(link, keys.config(RUN, "*"), lambda _: scenario.config("a"))
+        session.subscribe(link, keys.command(RUN, "a"), said, "drive")
         session.watch_liveliness(link, keys.robot_alive(RUN, "*"), said)
-        world_says = session.publisher(link, keys.sense(RUN, "a"))
+        world_says = session.publisher(link, keys.observation(RUN, "a"))
         peer_says = session.publisher(link, keys.report(RUN, "b", "a"))
 
         def play(tick: int, *reports: Report) -> None:
             """Its Command of `tick` comes, and no other."""
             for report in reports:
                 peer_says.put(encode(report))
-            world_says.put(encode(sense(tick)))
+            world_says.put(encode(observation(tick)))
             assert answer(said, Command).tick == tick
 
         _token = session.show_alive(link, keys.world_alive(RUN))
@@ -283,19 +283,19 @@ def test_a_robot_refuses_what_is_out_of_step_and_hears_a_repeated_report_once(tm
             play(0, told(0), told(0), told(0, robot="a"), told(0, robot="c"), told(0, state="otherwise"))
             play(1, told(1), told(2, state="too early"), told(0), told(0))
             play(2, told(2, state="as it is"), told(900), told(0, heard=1))
-            for odd in (sense(0), sense(1), sense(4), sense(900), MissionEnd(1, "failed", None)):
+            for odd in (observation(0), observation(1), observation(4), observation(900), MissionEnd(1, "failed", None)):
                 world_says.put(encode(odd))
-            world_says.put(encode(replace(sense(2), anchor_range=1.0)))
+            world_says.put(encode(replace(observation(2), anchor_range=1.0)))
             world_says.put(encode(MissionEnd(900, "localised", None)))
             play(3, told(3))
             world_says.put(encode(MissionEnd(3, "undecided", "for a test")))
-            farewell = answer(said, FinalReport)
-            world_says.put(encode(sense(1)))
-            world_says.put(encode(farewell))
+            final_report = answer(said, FinalReport)
+            world_says.put(encode(observation(1)))
+            world_says.put(encode(final_report))
             assert agent.ended().status == 1
-    assert (farewell.reports_heard, farewell.reports_unheard) == (4, 0)
-    assert farewell.reports_refused == 6
-    assert farewell.frames_refused == 6 + 7
+    assert (final_report.reports_heard, final_report.reports_unheard) == (4, 0)
+    assert final_report.reports_refused == 6
+    assert final_report.frames_refused == 6 + 7
 
 
 def answer(said: Inbox, kind: type[Message]) -> Any:

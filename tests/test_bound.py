@@ -40,7 +40,7 @@ def ends_and_ranges(record: Record, starts: Sequence[float]) -> tuple[Array, Arr
     poses = [[Pose(*starts[:3])], [Pose(*starts[3:])]]
     for moment in record.moments[:-1]:
         for path, robot in zip(poses, scenario.robots, strict=True):
-            asked = moment.drives[robot.id]
+            asked = moment.commands[robot.id]
             done = executed(Controls(asked.v, asked.omega), scenario, robot.id, moment.truth.tick)
             path.append(step(path[-1], done.v, done.omega, scenario.mission.period))
     reach, ranges = scenario.mission.sensing_range, []

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from tests.test_noise import Z, has_share
 from world.channel import LinkState, carried, of_plan
-from world.faults import LATEST, MAX_DELAY, MAX_FAULTS, UNLUCKY, Fault, LinkSelector, Window, hold_up
+from world.faults import LATEST, MAX_DELAY, MAX_FAULTS, UNLUCKY, Fault, LinkSelector, Window, delivery_time_bound
 
 N = 10_000
 """ticks, where a statistic is looked at"""
@@ -339,10 +339,10 @@ def test_the_share_that_gets_through_is_known(fault: Fault) -> None:
 
 
 def test_a_wait_is_as_long_as_the_worst_of_what_lets_anything_through() -> None:
-    assert hold_up([Fault()]) == UNLUCKY
-    assert hold_up([Fault(loss=0.9)]) == pytest.approx(10.0 * UNLUCKY, abs=1.0)
-    assert hold_up([Fault(burst_start=0.001, burst_end=0.01)]) == 100.0 * UNLUCKY
-    assert hold_up([Fault(delay=(3, 20), reorder=0.1)]) == 21 + UNLUCKY
-    assert hold_up([Fault(partition=True, contact_ticks=(10, 60))]) == 50 + UNLUCKY
-    assert hold_up([Fault(loss=1.0, ticks=(0, 30))]) == 30 + UNLUCKY
-    assert hold_up([Fault(partition=True)]) == UNLUCKY, "nobody waits for what never comes"
+    assert delivery_time_bound([Fault()]) == UNLUCKY
+    assert delivery_time_bound([Fault(loss=0.9)]) == pytest.approx(10.0 * UNLUCKY, abs=1.0)
+    assert delivery_time_bound([Fault(burst_start=0.001, burst_end=0.01)]) == 100.0 * UNLUCKY
+    assert delivery_time_bound([Fault(delay=(3, 20), reorder=0.1)]) == 21 + UNLUCKY
+    assert delivery_time_bound([Fault(partition=True, contact_ticks=(10, 60))]) == 50 + UNLUCKY
+    assert delivery_time_bound([Fault(loss=1.0, ticks=(0, 30))]) == 30 + UNLUCKY
+    assert delivery_time_bound([Fault(partition=True)]) == UNLUCKY, "nobody waits for what never comes"

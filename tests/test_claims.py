@@ -180,19 +180,19 @@ def row_of(record: Record, number: int = 0) -> trial.TrialRow:
     return trial.row(trial.Trial(0, number, record.scenario, processes=False), record, 0.5)
 
 
-def farewell(robot: str, hypotheses: int, odds: float) -> FinalReport:
+def final_report(robot: str, hypotheses: int, probability: float) -> FinalReport:
     counts = (3, 4, 0, 0, 0, 0, 600)
-    return FinalReport(robot, 5, 3, "circle", -2.5, (4, 2), 0.5, 1.5, hypotheses, odds, None, None, *counts)
+    return FinalReport(robot, 5, 3, "circle", -2.5, (4, 2), 0.5, 1.5, hypotheses, probability, None, None, *counts)
 
 
 def test_a_row_has_what_each_robot_claimed() -> None:
     record = replace(
-        claimed(NOISY, SURE), farewells={"a": farewell("a", 1, 0.99995), "b": farewell("b", 3, 0.6)}
+        claimed(NOISY, SURE), final_reports={"a": final_report("a", 1, 0.99995), "b": final_report("b", 3, 0.6)}
     )
     row = row_of(record)
     a, b = row.robots["a"], row.robots["b"]
     assert [getattr(a, name) for name in HONEST] == [0.0009, 0.0002, -0.0001, 0.0016, 0.0003, 0.0004]
-    assert (a.hypotheses, a.odds, b.hypotheses, b.odds) == (1, 0.99995, 3, 0.6)
+    assert (a.hypotheses, a.probability, b.hypotheses, b.probability) == (1, 0.99995, 3, 0.6)
     assert a.position_sigma_m == pytest.approx(0.05)
     assert a.nees == row.nees == pytest.approx(summary(record, "in-process", 0.5)["robots"]["a"]["nees"])
     assert [getattr(b, name) for name in (*HONEST, "nees", "position_sigma_m", "position_error_m")] == [
@@ -249,11 +249,11 @@ def test_a_trial_with_two_claims_counts_once_in_the_mean_nees() -> None:
     scenario = parse("max_ticks = 1\n" + NOISY, "noisy")
     world = release(scenario)
     poses = world.truth.poses
-    drives = {
+    commands = {
         robot: claims(0, robot, off(pose, by), SURE)
         for robot, pose, by in zip("ab", poses, (0.01, 0.05), strict=True)
     }
-    row = row_of(Record(scenario, (TickRecord(world.truth, drives),), MissionEnd(0, "localised", None), {}))
+    row = row_of(Record(scenario, (TickRecord(world.truth, commands),), MissionEnd(0, "localised", None), {}))
     each = [nees(off(pose, by), pose, SURE) for pose, by in zip(poses, (0.01, 0.05), strict=True)]
     assert row.claims == 2
     assert row.nees == pytest.approx(sum(each) / 2)
@@ -282,13 +282,13 @@ PLAYED = play(load("paper-1"))
 def missing_at(record: Record, robot: str, ticks: Container[int]) -> Record:
     """The record without that robot's Commands of `ticks`, and without its FinalReport."""
     moments = [
-        replace(one, drives={who: drive for who, drive in one.drives.items() if who != robot})
+        replace(one, commands={who: command for who, command in one.commands.items() if who != robot})
         if one.truth.tick in ticks
         else one
         for one in record.moments
     ]
-    farewells = {who: said for who, said in record.farewells.items() if who != robot}
-    return replace(record, moments=tuple(moments), farewells=farewells)
+    final_reports = {who: said for who, said in record.final_reports.items() if who != robot}
+    return replace(record, moments=tuple(moments), final_reports=final_reports)
 
 
 def test_the_end_says_how_many_deadlines_each_robot_missed_and_suggests_a_lower_rate(

@@ -272,7 +272,7 @@ def of_another_version(keys: Path) -> Iterator[str]:
         def brief(query: Any) -> None:
             query.reply(query.key_expr, bytes([VERSION + 1]) + b"whatever it says")
 
-        link.declare_queryable(tree.briefing("r", "*"), brief)
+        link.declare_queryable(tree.config("r", "*"), brief)
         tokens = [
             session.show_alive(link, key) for key in (tree.world_alive("r"), tree.robot_alive("r", "b"))
         ]

@@ -53,7 +53,7 @@ class Recorded:
     """A driver that does nothing but to note what it was told, and when."""
 
     def __init__(self, fails_at: int | None = None, reading: Reading | None = None) -> None:
-        self.drives: list[tuple[float, float]] = []
+        self.commands: list[tuple[float, float]] = []
         self.ticks: list[tuple[int, float]] = []
         self.stopped = 0
         self.clock = time.monotonic
@@ -67,7 +67,7 @@ class Recorded:
         return self._reading
 
     def drive(self, v: float, omega: float) -> None:
-        self.drives.append((v, omega))
+        self.commands.append((v, omega))
 
     def stop(self) -> None:
         self.stopped += 1
@@ -79,7 +79,7 @@ class Recorded:
 FAREWELL = FinalReport("a", 0, 0, None, None, None, None, None, None, None, None, None, 0, 0, 0, 0, 0, 0, 0)
 
 
-def drive(tick: int, robot: str = "a", v: float = 0.5, verdict: Verdict | None = None) -> Command:
+def command(tick: int, robot: str = "a", v: float = 0.5, verdict: Verdict | None = None) -> Command:
     return Command(tick, robot, v, 0.25, 1, "straight", verdict)
 
 
@@ -100,15 +100,15 @@ def played(stage: Stage) -> Play:
         ends: list[MissionEnd] = []
 
         def said(key: str, frame: bytes) -> None:
-            if key != keys.sense("r", "a"):
+            if key != keys.observation("r", "a"):
                 return
             match decode(frame, Observation | MissionEnd | FinalReport):
                 case Observation(tick):
                     for one in answer(tick):
-                        stage.comes("drive", keys.drive("r", "a"), one, after)
+                        stage.comes("drive", keys.command("r", "a"), one, after)
                 case MissionEnd() as end:
                     ends.append(end)
-                    stage.comes("drive", keys.drive("r", "a"), encode(FAREWELL))
+                    stage.comes("drive", keys.command("r", "a"), encode(FAREWELL))
 
         stage.answer = said
         stage.alive("a", "b")
@@ -123,9 +123,9 @@ def played(stage: Stage) -> Play:
 
 def test_a_drive_in_time_is_driven_and_a_tick_is_a_manoeuvre_and_a_moment_to_think(played: Play) -> None:
     driver = Recorded()
-    field, end, told = played(driver, lambda tick: [encode(drive(tick))])
+    field, end, told = played(driver, lambda tick: [encode(command(tick))])
     assert (end.tick, end.outcome, field.missed) == (5, "undecided", 0)
-    assert driver.drives == [(0.5, 0.25)] * 6
+    assert driver.commands == [(0.5, 0.25)] * 6
     assert [tick for tick, _ in driver.ticks] == [0, 1, 2, 3, 4, 5]
     assert told == [end]
     assert driver.stopped >= 1
@@ -135,14 +135,14 @@ def test_a_drive_in_time_is_driven_and_a_tick_is_a_manoeuvre_and_a_moment_to_thi
 
 NONSENSE: dict[str, Answer] = {
     "bytes": lambda _: [b"", b"\0" * 40, b"nonsense" * 400],
-    "torn": lambda tick: [encode(drive(tick))[:-3]],
-    "another's": lambda tick: [encode(drive(tick, "b"))],
+    "torn": lambda tick: [encode(command(tick))[:-3]],
+    "another's": lambda tick: [encode(command(tick, "b"))],
     "a Sense": lambda tick: [encode(Observation(tick, "a", None, None))],
-    "of a tick to come": lambda tick: [encode(drive(tick + 1))],
-    "of a tick past": lambda tick: [encode(drive(max(0, tick - 1)))] if tick else [],
+    "of a tick to come": lambda tick: [encode(command(tick + 1))],
+    "of a tick past": lambda tick: [encode(command(max(0, tick - 1)))] if tick else [],
     "silence": lambda _: [],
-    "no number": lambda tick: [encode(drive(tick, v=float("nan")))],
-    "infinite": lambda tick: [encode(drive(tick, v=float("inf")))],
+    "no number": lambda tick: [encode(command(tick, v=float("nan")))],
+    "infinite": lambda tick: [encode(command(tick, v=float("inf")))],
 }
 
 
@@ -150,7 +150,7 @@ NONSENSE: dict[str, Answer] = {
 def test_a_robot_whose_agent_speaks_nonsense_stands_still(kind: str, played: Play) -> None:
     driver = Recorded()
     field, end, _ = played(driver, NONSENSE[kind])
-    assert driver.drives == []
+    assert driver.commands == []
     assert field.missed == end.tick + 1
     assert end.outcome == "undecided"
 
@@ -158,18 +158,18 @@ def test_a_robot_whose_agent_speaks_nonsense_stands_still(kind: str, played: Pla
 def test_nobody_drives_faster_than_the_mission_says(played: Play) -> None:
     driver = Recorded()
     played(driver, lambda tick: [encode(Command(tick, "a", -7.0, 1e6, 1, "straight"))], ticks=1)
-    assert driver.drives == [(-1.0, 3.141592653589793)] * 2
+    assert driver.commands == [(-1.0, 3.141592653589793)] * 2
 
 
 def test_a_drive_that_comes_late_is_not_driven(played: Play) -> None:
     driver = Recorded()
     late = THINKING * MANOEUVRE_S
-    field, end, _ = played(driver, lambda tick: [encode(drive(tick))], after=1.01 * late)
-    assert driver.drives == []
+    field, end, _ = played(driver, lambda tick: [encode(command(tick))], after=1.01 * late)
+    assert driver.commands == []
     assert field.missed == end.tick + 1
     in_time = Recorded()
-    field, end, _ = played(in_time, lambda tick: [encode(drive(tick))], after=0.99 * late)
-    assert len(in_time.drives) == end.tick + 1
+    field, end, _ = played(in_time, lambda tick: [encode(command(tick))], after=0.99 * late)
+    assert len(in_time.commands) == end.tick + 1
 
 
 @pytest.mark.parametrize(
@@ -185,7 +185,7 @@ def test_a_drive_that_comes_late_is_not_driven(played: Play) -> None:
 def test_a_driver_that_cannot_go_on_ends_the_mission_and_stands(
     driver: Recorded, said: str, played: Play
 ) -> None:
-    _, end, told = played(driver, lambda tick: [encode(drive(tick))])
+    _, end, told = played(driver, lambda tick: [encode(command(tick))])
     assert end.outcome == "failed"
     assert end.reason is not None
     assert end.reason.startswith(said)
@@ -229,7 +229,7 @@ def ended(
         if tick == 12 and said is not None:
             ending.told(said)
         verdict = own if tick >= 10 else None
-        end = ending.after(tick, drive(tick, verdict=verdict), peer_there=True)
+        end = ending.after(tick, command(tick, verdict=verdict), peer_there=True)
         if end is not None:
             return end
     return None
@@ -273,20 +273,20 @@ def test_b_begins_when_a_does_and_counts_a_s_ticks(stage: Stage) -> None:
     """Late by seven ticks, it goes through those at once, standing; then it drives in a's."""
     driver = Recorded()
     driver.clock = stage.monotonic
-    briefing = briefed(parse(ASSURED, "assured"), "b", MANOEUVRE_S)
-    field = Field(driver, briefing, "r", stage, max_ticks=12, manoeuvre_s=MANOEUVRE_S)
+    config = briefed(parse(ASSURED, "assured"), "b", MANOEUVRE_S)
+    field = Field(driver, config, "r", stage, max_ticks=12, manoeuvre_s=MANOEUVRE_S)
 
     def answer(key: str, frame: bytes) -> None:
-        if key == keys.sense("r", "b"):
-            sense = decode(frame, Observation | MissionEnd | FinalReport)
-            said = drive(sense.tick, "b") if isinstance(sense, Observation) else FAREWELL
-            stage.comes("drive", keys.drive("r", "b"), encode(said), 0.001)
+        if key == keys.observation("r", "b"):
+            observation = decode(frame, Observation | MissionEnd | FinalReport)
+            said = command(observation.tick, "b") if isinstance(observation, Observation) else FAREWELL
+            stage.comes("drive", keys.command("r", "b"), encode(said), 0.001)
 
     stage.answer = answer
     stage.alive("b")
     later = 0.5 + 2.5 * MANOEUVRE_S
     for tick, after in ((7, 0.5), (0, later), (500, later)):  # 0 is of an a that lost its past
-        stage.comes("beat", keys.beat("r", "a"), encode(TickStart(tick, "a")), after)
+        stage.comes("beat", keys.tick_start("r", "a"), encode(TickStart(tick, "a")), after)
     field.attach(LINK)
     end = field.play(10.0, lambda: None)
     assert end.tick == 12
@@ -295,17 +295,17 @@ def test_b_begins_when_a_does_and_counts_a_s_ticks(stage: Stage) -> None:
     assert driver.ticks[7][1] == pytest.approx(0.5)
     assert field.missed == 7
     assert stage.refused["beat"] == 2
-    assert len(driver.drives) == 6
+    assert len(driver.commands) == 6
 
 
 def past_of(ticks: int, *, robot: str) -> DriverPast:
     """What a driver has on record that has come so far, driving in every second tick."""
-    senses = [Observation(tick, robot, REST if tick else None, 2.0) for tick in range(ticks)]
+    observations = [Observation(tick, robot, REST if tick else None, 2.0) for tick in range(ticks)]
     return DriverPast(
         tuple(
             [
-                DrivenTick(one, encode(one), drive(one.tick, robot) if one.tick % 2 == 0 else None)
-                for one in senses
+                DrivenTick(one, encode(one), command(one.tick, robot) if one.tick % 2 == 0 else None)
+                for one in observations
             ]
         )
     )
@@ -316,23 +316,23 @@ def test_a_robot_that_was_down_catches_up_with_its_peer_standing(robot: str, pee
     """However many ticks it was down; then it goes on in the peer's."""
     driver = Recorded()
     driver.clock = stage.monotonic
-    briefing = briefed(parse(ASSURED, "assured"), robot, MANOEUVRE_S)
-    field = Field(driver, briefing, "r", stage, max_ticks=305, manoeuvre_s=MANOEUVRE_S)
+    config = briefed(parse(ASSURED, "assured"), robot, MANOEUVRE_S)
+    field = Field(driver, config, "r", stage, max_ticks=305, manoeuvre_s=MANOEUVRE_S)
     field.resume(past_of(20, robot=robot), known=17)
     sent: list[int] = []
 
     def answer(key: str, frame: bytes) -> None:
-        if key == keys.sense("r", robot):
-            sense = decode(frame, Observation | MissionEnd | FinalReport)
-            sent.extend([sense.tick] if isinstance(sense, Observation) else [])
+        if key == keys.observation("r", robot):
+            observation = decode(frame, Observation | MissionEnd | FinalReport)
+            sent.extend([observation.tick] if isinstance(observation, Observation) else [])
             said = (
-                drive(sense.tick, robot) if isinstance(sense, Observation) else replace(FAREWELL, robot=robot)
+                command(observation.tick, robot) if isinstance(observation, Observation) else replace(FAREWELL, robot=robot)
             )
-            stage.comes("drive", keys.drive("r", robot), encode(said), 0.001)
+            stage.comes("drive", keys.command("r", robot), encode(said), 0.001)
 
     stage.answer = answer
     stage.alive(robot)
-    stage.comes("beat", keys.beat("r", peer), encode(TickStart(300, peer)), 0.01)
+    stage.comes("beat", keys.tick_start("r", peer), encode(TickStart(300, peer)), 0.01)
     field.attach(LINK)
     end = field.play(10.0, lambda: None)
     assert end.tick == 305
@@ -341,13 +341,13 @@ def test_a_robot_that_was_down_catches_up_with_its_peer_standing(robot: str, pee
     times = dict(driver.ticks)
     assert times[299] - times[21] < 2 * (1 + THINKING) * MANOEUVRE_S
     assert times[305] - times[301] == pytest.approx(4 * (1 + THINKING) * MANOEUVRE_S)
-    assert 5 <= len(driver.drives) <= 7
+    assert 5 <= len(driver.commands) <= 7
 
 
 def test_an_a_that_was_not_down_does_not_go_by_its_peers_ticks(stage: Stage, played: Play) -> None:
     driver = Recorded()
-    stage.comes("beat", keys.beat("r", "b"), encode(TickStart(4, "b")), 0.05)
-    played(driver, lambda tick: [encode(drive(tick))])
+    stage.comes("beat", keys.tick_start("r", "b"), encode(TickStart(4, "b")), 0.05)
+    played(driver, lambda tick: [encode(command(tick))])
     assert driver.ticks[-1][1] - driver.ticks[0][1] == pytest.approx(5 * (1 + THINKING) * MANOEUVRE_S)
 
 
@@ -355,12 +355,12 @@ def test_a_b_that_was_killed_before_tick_0_begins_though_a_waits_for_it(stage: S
     """a is there, and says nothing; when it does, it turns out to be behind, and b waits for it."""
     driver = Recorded()
     driver.clock = stage.monotonic
-    briefing = briefed(parse(ASSURED, "assured"), "b", MANOEUVRE_S)
-    field = Field(driver, briefing, "r", stage, max_ticks=9, manoeuvre_s=MANOEUVRE_S)
+    config = briefed(parse(ASSURED, "assured"), "b", MANOEUVRE_S)
+    field = Field(driver, config, "r", stage, max_ticks=9, manoeuvre_s=MANOEUVRE_S)
     field.resume(DriverPast(), known=-1)
     stage.alive("a", "b")
     tick_s = (1.0 + THINKING) * MANOEUVRE_S
-    stage.comes("beat", keys.beat("r", "a"), encode(TickStart(0, "a")), 9.5 * tick_s)
+    stage.comes("beat", keys.tick_start("r", "a"), encode(TickStart(0, "a")), 9.5 * tick_s)
     field.attach(LINK)
     end = field.play(10.0, lambda: None)
     times = dict(driver.ticks)
@@ -384,8 +384,8 @@ def test_a_robot_that_was_killed_waits_for_its_agent_however_long_its_peer_is_th
 ) -> None:
     driver = Recorded()
     driver.clock = stage.monotonic
-    briefing = briefed(parse(ASSURED, "assured"), robot, MANOEUVRE_S)
-    field = Field(driver, briefing, "r", stage, max_ticks=25, manoeuvre_s=MANOEUVRE_S)
+    config = briefed(parse(ASSURED, "assured"), robot, MANOEUVRE_S)
+    field = Field(driver, config, "r", stage, max_ticks=25, manoeuvre_s=MANOEUVRE_S)
     field.resume(past_of(20, robot=robot), known=19)
     stage.alive("b" if robot == "a" else "a")
     stage.comes("alive", keys.robot_alive("r", robot), after=3.0)
@@ -407,11 +407,11 @@ def test_a_robot_whose_driver_takes_a_whole_tick_to_sense_hears_its_agent(stage:
     field = Field(driver, BRIEFING, "r", stage, max_ticks=100, manoeuvre_s=MANOEUVRE_S, patience=1.0)
 
     def answer(key: str, frame: bytes) -> None:
-        if key == keys.sense("r", "a"):
+        if key == keys.observation("r", "a"):
             message = decode(frame, Observation | MissionEnd | FinalReport)
             if isinstance(message, Observation):
-                drive = Command(message.tick, "a", 1.0, 0.0, 1, "straight")
-                stage.comes("drive", keys.drive("r", "a"), encode(drive), 0.001)
+                command = Command(message.tick, "a", 1.0, 0.0, 1, "straight")
+                stage.comes("drive", keys.command("r", "a"), encode(command), 0.001)
 
     stage.answer = answer
     stage.alive("a", "b")

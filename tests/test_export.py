@@ -174,8 +174,8 @@ def test_every_frame_is_as_its_channels_schema_says(faulty: Path) -> None:
             said = msgpack.unpackb(message.data)
             assert form["minItems"] <= len(said) <= form["maxItems"]
             assert said[0] in form["prefixItems"][0]["enum"]
-    sense = next(one for one, _, _ in told(faulty / "run.mcap") if one.name == "tandem.Sense")
-    titles = [item["title"] for item in json.loads(sense.data)["$defs"]["Sense"]["prefixItems"]]
+    observation = next(one for one, _, _ in told(faulty / "run.mcap") if one.name == "tandem.Sense")
+    titles = [item["title"] for item in json.loads(observation.data)["$defs"]["Sense"]["prefixItems"]]
     assert titles == ["kind", *Observation.__struct_fields__]
 
 
@@ -238,7 +238,7 @@ def test_viewers_see_an_ellipse_where_there_is_a_covariance(noisy: Path) -> None
     for one, belief in zip(held, shown, strict=True):
         (entity,) = belief.entities
         assert len(entity.arrows) == len(one.world or one.local)
-        assert [arrow.color.a for arrow in entity.arrows] == [max(LEAST, share) for share in one.odds]
+        assert [arrow.color.a for arrow in entity.arrows] == [max(LEAST, share) for share in one.probability]
         assert bool(entity.lines) == (one.covariance is not None and bool(one.world))
         for point in entity.lines[0].points if one.covariance is not None and entity.lines else ():
             assert one.covariance is not None
@@ -312,8 +312,8 @@ def test_frames_are_rows_with_their_fields_by_name(faulty: Path) -> None:
         assert int(row["bytes"]) == len(frame)
         assert row["kind"] == msgpack.unpackb(frame[5:])[0]
         if row["kind"] == "sense":
-            said, sense = json.loads(row["message"]), decode(frame, Observation)
-            assert (said["robot"], said["anchor_range"]) == (sense.robot, sense.anchor_range)
+            said, observation = json.loads(row["message"]), decode(frame, Observation)
+            assert (said["robot"], said["anchor_range"]) == (observation.robot, observation.anchor_range)
 
 
 # --- records that are not whole, or come from several hosts -------------------------------------------

@@ -88,7 +88,7 @@ def test_a_row_counts_what_was_lost_and_refused() -> None:
     scenario = load("random", faults=["loss=0.5, corrupt=0.3"])
     record = in_process.play(scenario)
     found = row(Trial(0, 0, scenario, processes=False), record, 0.1)
-    said = record.farewells.values()
+    said = record.final_reports.values()
     assert found.reports_lost == sum([one.reports_lost for one in said]) > 0
     assert found.reports_refused == sum([one.reports_refused for one in said]) > 0
     heard = sum([one.reports_heard for one in said])

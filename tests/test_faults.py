@@ -115,10 +115,10 @@ def test_under_noise_a_robot_that_has_not_been_answered_stands_and_listens() -> 
     quiet = scenario_of(NOISE, 1)
     record = in_process.play(replace(quiet, faults=load("random", faults=["delay=6"]).faults, max_ticks=3000))
     assert localises(record)
-    drives = [moment.drives[robot] for moment in record.moments for robot in "ab"]
-    listening = [drive for drive in drives if drive.state == "listening"]
+    commands = [moment.commands[robot] for moment in record.moments for robot in "ab"]
+    listening = [command for command in commands if command.state == "listening"]
     assert len(listening) > 20
-    assert all((drive.phase, drive.v, drive.omega) == (3, 0.0, 0.0) for drive in listening)
+    assert all((command.phase, command.v, command.omega) == (3, 0.0, 0.0) for command in listening)
 
 
 def test_two_that_never_hear_each_other_claim_nothing() -> None:
@@ -136,8 +136,8 @@ def test_one_that_is_never_heard_keeps_both_from_a_claim() -> None:
     record = in_process.play(replace(scenario, max_ticks=300))
     assert record.end is not None
     assert record.end.outcome == "undecided"
-    assert record.farewells["a"].reports_lost == 0 < record.farewells["a"].reports_heard
-    assert record.farewells["b"].reports_heard == 0 < record.farewells["b"].reports_lost
+    assert record.final_reports["a"].reports_lost == 0 < record.final_reports["a"].reports_heard
+    assert record.final_reports["b"].reports_heard == 0 < record.final_reports["b"].reports_lost
 
 
 @pytest.mark.parametrize("plan", ["a delay", "all together", "duplication", "damage"])
@@ -146,9 +146,9 @@ def test_what_was_heard_refused_and_lost_adds_up_to_what_the_world_let_through(
 ) -> None:
     record = in_process.play(load("random", seed=3, faults=PLANS[plan]), tmp_path)
     for robot, peer in (("a", "b"), ("b", "a")):
-        contacts = [(sense.tick, contact) for sense in senses(tmp_path, robot) for contact in sense.contacts]
+        contacts = [(observation.tick, contact) for observation in observations(tmp_path, robot) for contact in observation.contacts]
         came = {tick for _, contact in contacts for tick in (*(contact.heard or ()), *contact.damaged)}
-        said, peers = record.farewells[robot], record.farewells[peer]
+        said, peers = record.final_reports[robot], record.final_reports[peer]
         assert peers.reports_sent == said.reports_sent == len(contacts) > 0
         assert said.reports_heard == sum([len(contact.heard or ()) for _, contact in contacts])
         assert said.reports_refused == sum([len(contact.damaged) for _, contact in contacts])
@@ -157,7 +157,7 @@ def test_what_was_heard_refused_and_lost_adds_up_to_what_the_world_let_through(
             assert said.reports_heard + said.reports_refused + said.reports_lost == peers.reports_sent
 
 
-def senses(folder: Path, robot: str) -> Iterator[Observation]:
+def observations(folder: Path, robot: str) -> Iterator[Observation]:
     """What `robot` sensed, by its own journal."""
     for frame in frames(folder, f"agent-{robot}.journal"):
         message = decode(

@@ -102,18 +102,18 @@ def test_two_robots_find_out_where_they_are_without_a_world(tmp_path: Path) -> N
         both_have_ended(tmp_path, robots)
     a, b = told(tmp_path, "a"), told(tmp_path, "b")
     for one, other in ((a, b), (b, a)):
-        sent = {step.sense.tick for step in other.steps if step.report is not None}
+        sent = {step.observation.tick for step in other.steps if step.report is not None}
         heard = [report.report.tick for step in one.steps for report in step.heard]
         assert heard
         assert len(heard) == len(set(heard))
         assert set(heard) <= sent
-        assert all(report.report.tick <= step.sense.tick for step in one.steps for report in step.heard)
-        assert all(step.sense.contacts for step in one.steps if step.heard)
-        assert one.farewell is not None
-        assert one.farewell.reports_heard == len(heard)
-        near = {step.sense.tick for step in one.steps if step.sense.contacts}
-        assert one.farewell.reports_lost == len(near - set(heard)) < len(near)
-        assert all(contact.heard is None for step in one.steps for contact in step.sense.contacts)
+        assert all(report.report.tick <= step.observation.tick for step in one.steps for report in step.heard)
+        assert all(step.observation.contacts for step in one.steps if step.heard)
+        assert one.final_report is not None
+        assert one.final_report.reports_heard == len(heard)
+        near = {step.observation.tick for step in one.steps if step.observation.contacts}
+        assert one.final_report.reports_lost == len(near - set(heard)) < len(near)
+        assert all(contact.heard is None for step in one.steps for contact in step.observation.contacts)
     shutil.copy(tmp_path / "b" / "agent-b.journal", tmp_path / "a")
     both = tandem("replay", tmp_path / "a")
     assert both.status == 0
@@ -133,16 +133,16 @@ def test_a_decision_that_does_not_follow_is_found_without_a_world(tmp_path: Path
         both_have_ended(tmp_path, robots)
     path = tmp_path / "a" / "agent-a.journal"
     frames = list(journal_file.read(path))
-    place, drive = next(
+    place, command = next(
         (i, one) for i, one in enumerate(messages(frames)) if isinstance(one, Command) and one.v
     )
-    frames[place] = encode(replace(drive, v=0.5 * drive.v))
+    frames[place] = encode(replace(command, v=0.5 * command.v))
     path.unlink()
     with journal_file.Journal(path) as changed:
         changed.write(*frames)
     replayed = tandem("replay", tmp_path / "a")
     assert replayed.status == 1
-    assert f"tick {drive.tick}, a, Command v: recorded {0.5 * drive.v}, recomputed {drive.v}" in replayed.out
+    assert f"tick {command.tick}, a, Command v: recorded {0.5 * command.v}, recomputed {command.v}" in replayed.out
 
 
 @pytest.mark.parametrize("killed", series(["b", "a"]))
@@ -156,9 +156,9 @@ def test_a_robot_whose_agent_is_killed_stands_still_and_goes_on_from_its_record(
         os.kill(process_of(tmp_path / killed, "agent", killed), SIGKILL)
         robots[killed].until_says("was killed by signal 9, and is started again")
         both_have_ended(tmp_path, robots)
-    stood = [step for step in told(tmp_path, killed).steps if step.sense.executed == REST and step.sense.tick]
+    stood = [step for step in told(tmp_path, killed).steps if step.observation.executed == REST and step.observation.tick]
     assert stood
-    assert [step.sense.tick for step in told(tmp_path, killed).steps] == list(
+    assert [step.observation.tick for step in told(tmp_path, killed).steps] == list(
         range(len(told(tmp_path, killed).steps))
     )
 
@@ -178,7 +178,7 @@ def test_a_robot_whose_agent_is_stopped_stands_still_within_a_period_and_the_mis
         os.kill(agent, SIGCONT)
         both_have_ended(tmp_path, robots)
     steps = told(tmp_path, "a").steps
-    assert all(step.sense.executed == REST for step in steps[before + 2 : before + 6])
+    assert all(step.observation.executed == REST for step in steps[before + 2 : before + 6])
 
 
 def test_ctrl_c_ends_a_robot_and_leaves_nobody_behind(tmp_path: Path) -> None:
@@ -198,7 +198,7 @@ def test_a_robot_without_a_beacon_waits_for_it_idle_and_gives_up() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as nobody:
         nobody.bind(("127.0.0.1", 0))
         where = f"127.0.0.1:{nobody.getsockname()[1]}"
-    rover = Rover(load("paper-1").briefing("a"), 0.25, beacon=where, patience="1")
+    rover = Rover(load("paper-1").config("a"), 0.25, beacon=where, patience="1")
     busy = time.process_time()
     with pytest.raises(TimeoutError, match="no answer of the beacon for 1 s"):
         rover.sense(0)
@@ -236,7 +236,7 @@ def test_a_robot_whose_peer_does_not_come_has_not_moved(tmp_path: Path) -> None:
 def test_a_mistake_is_one_line(tmp_path: Path, arguments: tuple[str, ...], said: str) -> None:
     (tmp_path / "faults.toml").write_text(f"{PAPER_1}\n[[fault]]\nloss = 0.5\n")
     with journal_file.Journal(tmp_path / "agent-a.journal") as old:
-        old.write(encode(load("paper-1").briefing("a")))
+        old.write(encode(load("paper-1").config("a")))
     words = [word.format(faults=tmp_path / "faults.toml", record=tmp_path) for word in arguments]
     ended = tandem("robot", *words, "--driver", "docs.rover:Rover")
     assert ended.status == 2

@@ -81,7 +81,7 @@ def all_is_well(out: Path, pair: Pair) -> None:
     """Both come to their end; each tick is on record once; neither audit nor replay finds anything."""
     both_have_ended(out, pair.robots)
     for name in "ab":
-        assert [step.sense.tick for step in told(out, name).steps] == list(range(len(told(out, name).steps)))
+        assert [step.observation.tick for step in told(out, name).steps] == list(range(len(told(out, name).steps)))
     both = out / "both"
     both.mkdir()
     for name in "ab":
@@ -140,16 +140,16 @@ def test_a_recording_that_a_power_cut_may_have_shortened_is_refused(
     fsync: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What was told may be missing, unless each write was synced; a kill takes nothing along."""
-    briefing, inbox = load("paper-1").briefing("a"), Inbox("robot")
+    config, inbox = load("paper-1").config("a"), Inbox("robot")
     path = tmp_path / "driver-a.journal"
     driver: Any = SimpleNamespace(stop=lambda: None, resume=lambda *_: None)
     field: Any = SimpleNamespace(resume=lambda *_: None)
 
     def taken_up() -> DriverPast:
-        with recorded(tmp_path, briefing, inbox, fsync=fsync) as record:
+        with recorded(tmp_path, config, inbox, fsync=fsync) as record:
             record.take_up(driver, "any", field)
-            sense = Observation(record.past.tick + 1, "a", REST if record.again else None, 1.0, ())
-            record.journal.write(encode(sense))
+            observation = Observation(record.past.tick + 1, "a", REST if record.again else None, 1.0, ())
+            record.journal.write(encode(observation))
             return record.past
 
     assert [taken_up().tick for _ in range(3)] == [-1, 0, 1]
@@ -194,10 +194,10 @@ def test_what_a_robot_drives_as_it_goes_down_is_told_and_no_more_than_was_asked_
     all_is_well(tmp_path, pair)  # where it is follows from all that it has told
     steps = told(tmp_path, "a").steps
     for before, step in pairwise(steps):
-        assert before.drive is not None
-        assert step.sense.executed is not None
-        assert abs(step.sense.executed.v) <= abs(before.drive.v) + 1e-12
-        assert abs(step.sense.executed.omega) <= abs(before.drive.omega) + 1e-12
+        assert before.command is not None
+        assert step.observation.executed is not None
+        assert abs(step.observation.executed.v) <= abs(before.command.v) + 1e-12
+        assert abs(step.observation.executed.omega) <= abs(before.command.omega) + 1e-12
 
 
 def test_a_record_of_another_mission_is_refused(pair: Pair, tmp_path: Path) -> None:

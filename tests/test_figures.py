@@ -165,16 +165,16 @@ def test_what_is_drawn_over_time_is_what_the_robot_said_held_against_the_truth(n
     truth = [moment.truth.poses[0] for moment in story.record.moments]
     said = [one for one in story.held if one.world]
     off = [math.hypot(one.world[0].x - truth[one.tick].x, one.world[0].y - truth[one.tick].y) for one in said]
-    errors, odds = Figure().subplots(2)
+    errors, probability = Figure().subplots(2)
     belief.draw_error(errors, story)
-    belief.draw_odds(odds, story)
+    belief.draw_odds(probability, story)
     assert line(errors, "error") == ([one.tick for one in said], off)
     assert line(errors, "sigma")[1] == [one.covariance.position_sigma for one in said if one.covariance]
-    likeliest = line(odds, "odds-1-plane")
+    likeliest = line(probability, "odds-1-plane")
     assert likeliest[0] == [one.tick for one in said]
-    assert likeliest[1] == pytest.approx([one.odds[0] for one in said], abs=1e-5)  # 99.9995 % is the edge
+    assert likeliest[1] == pytest.approx([one.probability[0] for one in said], abs=1e-5)  # 99.9995 % is the edge
     assert max(likeliest[1]) < 1.0
-    before = line(odds, "odds-1-anchor")
+    before = line(probability, "odds-1-anchor")
     assert before[0] == [one.tick for one in story.held if not one.world]
     (claimed,) = line(errors, "claim")[0][:1]
     assert story.held[claimed].localised
@@ -236,8 +236,8 @@ def test_seconds_stand_below_the_ticks_where_a_tick_is_no_second(tmp_path: Path)
 @pytest.mark.parametrize(
     ("odds", "said"), [(0.5, "50 %"), (0.9999, "99.99 %"), (0.999999, "99.9999 %"), (1e-4, "0.01 %")]
 )
-def test_odds_are_said_in_as_many_digits_as_they_have(odds: float, said: str) -> None:
-    assert belief.percent(odds) == said
+def test_odds_are_said_in_as_many_digits_as_they_have(probability: float, said: str) -> None:
+    assert belief.percent(probability) == said
 
 
 # --- whatever the record --------------------------------------------------------------------------------

@@ -39,7 +39,7 @@ LAST = 2**31
 HERE = Pose(99.0, 99.0, 0.0)
 
 
-def drive(tick: int, robot: str, verdict: Localised | Undecided | None = None) -> Command:
+def command(tick: int, robot: str, verdict: Localised | Undecided | None = None) -> Command:
     return Command(tick, robot, 1.0, 0.0, 1, "forged", verdict)
 
 
@@ -51,24 +51,24 @@ FORGED: dict[str, Message] = {
     "the end": MissionEnd(0, "localised", "forged"),
     "an end to come": MissionEnd(LAST, "failed", "forged"),
     "the truth": GroundTruth(0, {"a": HERE, "b": HERE}),
-    "b's verdict": drive(0, "b", Localised(HERE)),
-    "b's manoeuvre": drive(0, "b"),
+    "b's verdict": command(0, "b", Localised(HERE)),
+    "b's manoeuvre": command(0, "b"),
     "b's report": report(0, "b"),
     "b's belief": Estimate(0, "b", (HERE,), (HERE,), localised=True),
     "b's sense": Observation(0, "b", None, 1.0),
     "a's own sense": Observation(0, "a", None, 1.0),
-    "a tick to come": drive(LAST, "a"),
+    "a tick to come": command(LAST, "a"),
     "a report to come": report(LAST, "a"),
     "a belief to come": Estimate(LAST, "a", (HERE,), (HERE,), localised=True),
 }
-OF_A = (Key(keys.drive, RUN, "a"), Key(keys.report, RUN, "a", "b"), Key(keys.estimate, RUN, "a"))
+OF_A = (Key(keys.command, RUN, "a"), Key(keys.report, RUN, "a", "b"), Key(keys.estimate, RUN, "a"))
 """keys that its certificate lets robot a put frames under"""
 
 
 def told(heard: Heard) -> dict[str, Any]:
     """All that is known, as text."""
     known = heard.known
-    return {"ticks": repr(known.ticks), "end": known.end, "last": known.last, "farewells": known.farewells}
+    return {"ticks": repr(known.ticks), "end": known.end, "last": known.last, "farewells": known.final_reports}
 
 
 @pytest.fixture
@@ -76,8 +76,8 @@ def heard() -> Heard:
     """A mission in tick 0, of which the world has spoken."""
     one = Heard(RUN)
     for robot in "ab":
-        one.take(Key(keys.briefing, RUN, robot), encode(load("paper-1").briefing(robot)))
-        one.take(Key(keys.sense, RUN, robot), encode(Observation(0, robot, None, 1.0)))
+        one.take(Key(keys.config, RUN, robot), encode(load("paper-1").config(robot)))
+        one.take(Key(keys.observation, RUN, robot), encode(Observation(0, robot, None, 1.0)))
     return one
 
 
@@ -94,28 +94,28 @@ def test_a_viewer_takes_nothing_of_that_from_a_robot_by_its_keys(
 
 def test_a_viewer_takes_what_a_key_carries(heard: Heard) -> None:
     for source, message in zip(
-        OF_A, (drive(0, "a"), report(0, "a"), Estimate(0, "a", (ORIGIN,), (), localised=False)), strict=True
+        OF_A, (command(0, "a"), report(0, "a"), Estimate(0, "a", (ORIGIN,), (), localised=False)), strict=True
     ):
         before = told(heard)
         heard.take(source, encode(message))
         assert told(heard) != before
     heard.take(Key(keys.truth, RUN), encode(FORGED["the truth"]))
-    heard.take(Key(keys.sense, RUN, "a"), encode(FORGED["the end"]))
+    heard.take(Key(keys.observation, RUN, "a"), encode(FORGED["the end"]))
     assert heard.known.end == FORGED["the end"]
 
 
 def test_a_tick_is_none_before_the_world_has_said_it(heard: Heard) -> None:
     """A robot may be a little ahead of the world, which may come by another way; the world makes no leap."""
-    unheard, own, sense = Heard(RUN), OF_A[0], Key(keys.sense, RUN, "a")
-    unheard.take(own, encode(drive(LAST, "a")))
+    unheard, own, observation = Heard(RUN), OF_A[0], Key(keys.observation, RUN, "a")
+    unheard.take(own, encode(command(LAST, "a")))
     assert unheard.known.last == -1
-    heard.take(own, encode(drive(AHEAD, "a")))
+    heard.take(own, encode(command(AHEAD, "a")))
     with pytest.raises(RefusedFrame):
-        heard.take(own, encode(drive(AHEAD + 1, "a")))
+        heard.take(own, encode(command(AHEAD + 1, "a")))
     with pytest.raises(RefusedFrame):
-        heard.take(sense, encode(Observation(LEAP + 1, "a", None, 1.0)))
-    heard.take(sense, encode(Observation(LEAP, "a", None, 1.0)))
-    heard.take(own, encode(drive(LEAP + AHEAD, "a")))
+        heard.take(observation, encode(Observation(LEAP + 1, "a", None, 1.0)))
+    heard.take(observation, encode(Observation(LEAP, "a", None, 1.0)))
+    heard.take(own, encode(command(LEAP + AHEAD, "a")))
     assert heard.known.last == LEAP + AHEAD
 
 

@@ -463,21 +463,21 @@ def test_a_third_range_leaves_the_true_placement_as_it_was(
     assume(encounter.is_tame)
     third = step(Pose(encounter.p1b.x, encounter.p1b.y, course), way, 0.0, 1.0)
     assume(separation(encounter.truth, encounter.p2a, third) > 0.3)
-    sightings = sightings_of(encounter, third)
-    left = weigh_placements([encounter.truth], sightings, 1000.0, FLOOR)
+    pair_observations = sightings_of(encounter, third)
+    left = weigh_placements([encounter.truth], pair_observations, 1000.0, FLOOR)
     assert len(left) == 1
     assert nearest(left, encounter.truth) < EXACT
-    for placement in weigh_placements(encounter.solutions(), sightings, 1000.0, FLOOR):
+    for placement in weigh_placements(encounter.solutions(), pair_observations, 1000.0, FLOOR):
         assert encounter.residual(placement) < 2e-7
-        assert separation(placement, encounter.p2a, third) == pytest.approx(sightings[2].range, abs=2e-7)
+        assert separation(placement, encounter.p2a, third) == pytest.approx(pair_observations[2].range, abs=2e-7)
 
 
 @given(encounters())
 def test_two_ranges_leave_every_placement_as_it_was(encounter: Encounter) -> None:
     assume(encounter.is_tame)
     found = encounter.solutions()
-    sightings = sightings_of(encounter, encounter.p1b)[:2]
-    assert weigh_placements(found, sightings, 1000.0, FLOOR) == tuple(found)
+    pair_observations = sightings_of(encounter, encounter.p1b)[:2]
+    assert weigh_placements(found, pair_observations, 1000.0, FLOOR) == tuple(found)
 
 
 @given(encounters(), st.floats(0.5, 2.0), angles)
@@ -486,15 +486,15 @@ def test_a_third_range_drops_the_placements_that_predict_another(
 ) -> None:
     assume(encounter.is_tame)
     third = step(Pose(encounter.p1b.x, encounter.p1b.y, course), way, 0.0, 1.0)
-    sightings = sightings_of(encounter, third)
+    pair_observations = sightings_of(encounter, third)
     wrong = [p for p in encounter.solutions() if nearest([p], encounter.truth) > 0.1]
-    told = [p for p in wrong if abs(separation(p, encounter.p2a, third) - (sightings[2].range or 0.0)) > 0.1]
-    left = weigh_placements(told, sightings, 1000.0, FLOOR)
+    told = [p for p in wrong if abs(separation(p, encounter.p2a, third) - (pair_observations[2].range or 0.0)) > 0.1]
+    left = weigh_placements(told, pair_observations, 1000.0, FLOOR)
     assert all(nearest([placement], encounter.truth) < 1e-3 for placement in left) or all(
         encounter.residual(placement) < 2e-7 for placement in left
     )
     assert (
-        weigh_placements(told, [*sightings[:2], PairObservation(2, encounter.p2a, third, 5e3)], 1e4, FLOOR)
+        weigh_placements(told, [*pair_observations[:2], PairObservation(2, encounter.p2a, third, 5e3)], 1e4, FLOOR)
         == ()
     )
 

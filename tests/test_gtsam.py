@@ -127,24 +127,24 @@ def said(folder: Path, robot: str) -> Iterator[Observation | Report | Command]:
         match decode(frame, Observation | Report | Command | Estimate | MissionEnd | FinalReport):
             case Observation() | Report() as message:
                 yield message
-            case Command() as drive:
-                yield drive
-                if isinstance(drive.verdict, Localised):
+            case Command() as command:
+                yield command
+                if isinstance(command.verdict, Localised):
                     return
             case _:
                 pass
 
 
 def measured(folder: Path, robot: str) -> Measured:
-    senses = [message for message in said(folder, robot) if isinstance(message, Observation)]
-    assert [sense.tick for sense in senses] == list(range(len(senses)))
+    observations = [message for message in said(folder, robot) if isinstance(message, Observation)]
+    assert [observation.tick for observation in observations] == list(range(len(observations)))
     return Measured(
-        [sense.executed for sense in senses if sense.executed is not None],
-        [(sense.tick, sense.anchor_range) for sense in senses if sense.anchor_range is not None],
+        [observation.executed for observation in observations if observation.executed is not None],
+        [(observation.tick, observation.anchor_range) for observation in observations if observation.anchor_range is not None],
         [
-            (sense.tick, contact.range)
-            for sense in senses
-            for contact in sense.contacts
+            (observation.tick, contact.range)
+            for observation in observations
+            for contact in observation.contacts
             if contact.range is not None
         ],
     )
@@ -155,19 +155,19 @@ def remembered(folder: Path, robot: str) -> tuple[RobotState, Localised]:
 
     It has come to a verdict before it began, so it decides nothing, and takes no time.
     """
-    briefing = decode(list(journal_file.read(folder / f"agent-{robot}.journal"))[1], RobotConfig)
-    mind = RobotState(briefing, Done(1, Undecided("was not asked")))
+    config = decode(list(journal_file.read(folder / f"agent-{robot}.journal"))[1], RobotConfig)
+    state = RobotState(config, Done(1, Undecided("was not asked")))
     heard: list[Report] = []
     for message in said(folder, robot):
         match message:
             case Observation():
-                mind, heard = planner.observe(mind, message), []
+                state, heard = planner.observe(state, message), []
             case Report() if message.robot != robot:
                 heard.append(message)
             case Command(verdict=verdict):
-                mind = planner.decide(mind, heard)
+                state = planner.decide(state, heard)
                 if isinstance(verdict, Localised):
-                    return mind, verdict
+                    return state, verdict
             case _:
                 pass
     raise AssertionError(f"{robot} has claimed nothing")
@@ -285,7 +285,7 @@ def optimum(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, last: Seque
 class Compared(NamedTuple):
     """One mission."""
 
-    briefing: RobotConfig
+    config: RobotConfig
     claimed: Localised
     pair: PairRanges
     ours: ScoredHypothesis
@@ -296,19 +296,19 @@ class Compared(NamedTuple):
 def mission(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Compared:
     folder = tmp_path_factory.mktemp("recorded")
     recorded(request.param, folder)
-    mind, claimed = remembered(folder, "a")
-    pair = inference.pair_of(mind)
+    state, claimed = remembered(folder, "a")
+    pair = inference.pair_of(state)
     ours = search(pair)[0]
     robots = [measured(folder, robot) for robot in ("a", "b")]
-    assert [len(seen.odometry) for seen in robots] == [mind.tick] * 2, "both claim in the same tick"
-    m1, m2 = mind.briefing.anchor, mind.briefing.peer_anchor
+    assert [len(seen.odometry) for seen in robots] == [state.tick] * 2, "both claim in the same tick"
+    m1, m2 = state.config.anchor, state.config.peer_anchor
     anchors = (np.zeros(2), np.array((m2.x - m1.x, m2.y - m1.y)))
-    period = mind.briefing.mission.period
-    graph = graph_of(robots, mind.briefing.mission.noise, period, anchors)
+    period = state.config.mission.period
+    graph = graph_of(robots, state.config.mission.noise, period, anchors)
     starts = nudged(ours.fit, anchors, np.random.default_rng(request.param))
     values = begun(robots, starts, period, anchors)
-    theirs = optimum(graph, values, [pose_of(robot, mind.tick) for robot in (0, 1)])
-    return Compared(mind.briefing, claimed, pair, ours, theirs)
+    theirs = optimum(graph, values, [pose_of(robot, state.tick) for robot in (0, 1)])
+    return Compared(state.config, claimed, pair, ours, theirs)
 
 
 def nudged(fit: Fit, anchors: Sequence[Array], draw: np.random.Generator) -> list[Pose]:
@@ -330,7 +330,7 @@ def wrapped(change: Array) -> Array:
 def test_the_claim_came_of_this_fit(mission: Compared) -> None:
     (held,) = inference.held_together([mission.ours], mission.pair)
     pose, covariance = inference.claim(held, 0, mission.pair)
-    anchor = mission.briefing.anchor
+    anchor = mission.config.anchor
     assert mission.claimed == Localised(Pose(anchor.x + pose.x, anchor.y + pose.y, pose.heading), covariance)
 
 

@@ -27,7 +27,7 @@ def assert_localised(scenario: Scenario) -> None:
     assert record.end.outcome == "localised", record.end
     last = record.moments[-1]
     for robot, truth in zip(scenario.robots, last.truth.poses, strict=True):
-        verdict = last.drives[robot.id].verdict
+        verdict = last.commands[robot.id].verdict
         assert isinstance(verdict, Localised)
         assert max(errors(verdict.pose, truth)) < 1e-6
 

@@ -18,7 +18,7 @@ from agent.planning.state import RobotState
 from compose.scenario.scenario_file import load
 from protocol.wire import encode
 from tests.steps import steps
-from world.tick import advance, release, senses
+from world.tick import advance, release, observations
 
 HOUSE = Path(__file__).parents[1]
 BELOW = {
@@ -224,36 +224,36 @@ def frozen(value: object) -> bytes:
 
 @pytest.mark.parametrize("name", ["paper-1", "paper-2", "random"])
 def test_the_same_values_give_the_same_step_and_are_left_as_they_were(name: str) -> None:
-    for world, sensed, before, observed, reports, drives in steps(name):
-        for sense in sensed:
-            mind, heard = before[sense.robot], reports[sense.robot]
-            was = frozen((mind, sense))
-            once, again = planner.observe(mind, sense), planner.observe(copy.deepcopy(mind), sense)
-            assert once == again == observed[sense.robot]
+    for world, sensed, before, observed, reports, commands in steps(name):
+        for observation in sensed:
+            state, heard = before[observation.robot], reports[observation.robot]
+            was = frozen((state, observation))
+            once, again = planner.observe(state, observation), planner.observe(copy.deepcopy(state), observation)
+            assert once == again == observed[observation.robot]
             assert frozen(once) == frozen(again)
-            assert frozen((mind, sense)) == was
+            assert frozen((state, observation)) == was
 
             was = frozen((once, heard))
             decided, anew = planner.decide(once, heard), planner.decide(copy.deepcopy(once), list(heard))
             assert decided == anew
             assert frozen(decided) == frozen(anew)
             assert (
-                encode(planner.drive(decided)) == encode(planner.drive(anew)) == encode(drives[sense.robot])
+                encode(planner.command(decided)) == encode(planner.command(anew)) == encode(commands[observation.robot])
             )
             assert encode(planner.report(decided)) == encode(planner.report(anew))
             assert encode(planner.estimate(decided)) == encode(planner.estimate(anew))
             assert frozen((once, heard)) == was
 
-        was = frozen((world, drives))
-        assert senses(world) == sensed
-        assert frozen(advance(world, drives)) == frozen(advance(copy.deepcopy(world), drives))
-        assert frozen((world, drives)) == was
+        was = frozen((world, commands))
+        assert observations(world) == sensed
+        assert frozen(advance(world, commands)) == frozen(advance(copy.deepcopy(world), commands))
+        assert frozen((world, commands)) == was
 
 
 def test_a_mind_and_a_world_cannot_be_changed() -> None:
     scenario = load("paper-1")
-    mind, world = RobotState(scenario.briefing("a")), release(scenario)
-    for value in (mind, mind.log, mind.radio, mind.findings, mind.briefing, world, world.truth, scenario):
+    state, world = RobotState(scenario.config("a")), release(scenario)
+    for value in (state, state.log, state.peer_state, state.belief, state.config, world, world.truth, scenario):
         assert isinstance(value, msgspec.Struct)
         field = value.__struct_fields__[0]
         with pytest.raises(AttributeError, match="immutable"):

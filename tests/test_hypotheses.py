@@ -67,10 +67,10 @@ RANGES = Noise(anchor_sigma=SIGMA, mutual_sigma=SIGMA)
 
 
 def alone(
-    drives: Sequence[tuple[float, float]], anchor: tuple[float, float], seed: int
+    commands: Sequence[tuple[float, float]], anchor: tuple[float, float], seed: int
 ) -> tuple[ScoredHypothesis, ...]:
     """What a robot holds that has driven so from the origin, with its anchor there."""
-    v, omega = np.array(drives).T
+    v, omega = np.array(commands).T
     path = track(v, omega, 1.0)
     true = np.hypot(path.x - anchor[0], path.y - anchor[1])
     measured = true + SIGMA * np.random.default_rng(seed).standard_normal(len(true))
@@ -85,11 +85,11 @@ def test_mirror_images_are_as_likely_until_a_range_tells(seed: int) -> None:
     anchor = (1.2, 0.9)
     straight = [(0.5, 0.0)] * 4
     one, other = alone(straight, anchor, seed)
-    assert one.hypothesis.odds == pytest.approx(0.5, abs=1e-6)
-    assert one.hypothesis.odds + other.hypothesis.odds == pytest.approx(1.0)
+    assert one.hypothesis.probability == pytest.approx(0.5, abs=1e-6)
+    assert one.hypothesis.probability + other.hypothesis.probability == pytest.approx(1.0)
     assert one.fit.guess[:2] == pytest.approx(other.fit.guess[:2] * (1.0, -1.0), abs=1e-6)
     turned = alone([*straight, (0.0, math.pi / 2), (0.5, 0.0)], anchor, seed)
-    assert turned[0].hypothesis.odds > 0.9999
+    assert turned[0].hypothesis.probability > 0.9999
     assert turned[0].fit.guess[:2] == pytest.approx(anchor, abs=5.0 * SIGMA)
 
 
@@ -102,13 +102,13 @@ APART = (4.0, 0.0)
 class Driven:
     """A robot that has driven at random, and what its odometry says of it."""
 
-    def __init__(self, start: Pose, drives: Array, drift: VelocityNoise, draws: np.random.Generator) -> None:
+    def __init__(self, start: Pose, commands: Array, drift: VelocityNoise, draws: np.random.Generator) -> None:
         self.poses = [start]
         spread = []
-        for v, omega in drives.tolist():
+        for v, omega in commands.tolist():
             self.poses.append(step(self.poses[-1], v, omega, 1.0))
             spread.append(drift.variances(v, omega))
-        measured = drives + np.sqrt(spread) * draws.standard_normal(drives.shape)
+        measured = commands + np.sqrt(spread) * draws.standard_normal(commands.shape)
         self.track = track(measured[:, 0], measured[:, 1], 1.0)
 
     def guess(self, anchor: tuple[float, float]) -> list[float]:
@@ -138,8 +138,8 @@ def drawn(seed: int, noise: Noise) -> tuple[PairRanges, Array]:
     robots = []
     for x in (1.2, 2.8):
         start = Pose(x + draws.uniform(-0.8, 0.8), draws.uniform(-0.8, 0.8), draws.uniform(-math.pi, math.pi))
-        drives = np.column_stack((draws.choice([-0.6, 0.6, 0.8], 12), draws.uniform(-1.5, 1.5, 12)))
-        robots.append(Driven(start, drives, noise.odometry, draws))
+        commands = np.column_stack((draws.choice([-0.6, 0.6, 0.8], 12), draws.uniform(-1.5, 1.5, 12)))
+        robots.append(Driven(start, commands, noise.odometry, draws))
     a, b = robots
     own = [[distance(pose, 0.0, 0.0) for pose in a.poses], [distance(pose, *APART) for pose in b.poses]]
     between = [distance(one, other.x, other.y) for one, other in zip(a.poses, b.poses, strict=True)]
@@ -170,12 +170,12 @@ def test_the_truth_is_among_the_hypotheses_and_their_odds_are_a_distribution(noi
         if min(pair.ranges.counts) < ENOUGH:
             continue
         found = search(pair)
-        odds = [one.hypothesis.odds for one in found]
-        assert sum(odds) == pytest.approx(1.0)
-        assert odds == sorted(odds, reverse=True)
+        probability = [one.hypothesis.probability for one in found]
+        assert sum(probability) == pytest.approx(1.0)
+        assert probability == sorted(probability, reverse=True)
         best = fit(truth, pair.paths, pair.ranges, pair.noise, pair.apart)
         off = [sigmas(one, best.guess) for one in found]
-        assert min(off) < 1.0, (seed, off, odds)
+        assert min(off) < 1.0, (seed, off, probability)
         tried, first = tried + 1, first + (off[0] < 1.0)
     assert first >= 0.8 * tried > 8
 

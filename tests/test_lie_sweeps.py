@@ -58,14 +58,14 @@ def test_the_campaign_that_ships_tells_the_lies_of_its_labels() -> None:
         setting = setting_of(campaign, cell)
         assert not isinstance(setting, RefusedCell)
         a, b = setting.scenario.robots
-        assert b.lie is None
-        seen[campaign.axes[0].label(cell.place[0])] = a.lie
+        assert b.attack is None
+        seen[campaign.axes[0].label(cell.place[0])] = a.attack
     assert seen.pop("honest") == Attack("scale", 1.0), "which is no lie"
-    for label, lie in seen.items():
-        assert lie is not None
+    for label, attack in seen.items():
+        assert attack is not None
         kind, *part, size = label.removesuffix(" deg").removesuffix(" m").split()
-        assert (lie.kind, lie.part) == (kind, part[0] if part else "all")
-        assert lie.size == pytest.approx(math.radians(float(size)) if "deg" in label else float(size))
+        assert (attack.kind, attack.part) == (kind, part[0] if part else "all")
+        assert attack.size == pytest.approx(math.radians(float(size)) if "deg" in label else float(size))
 
 
 def test_honest_missions_localise_and_lies_are_alarms(results: execution.Results) -> None:

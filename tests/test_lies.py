@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from agent.peer import false_reports, peer_state
-from agent.peer.motion_log import Logbook
+from agent.peer.motion_log import MotionLog
 from agent.planning import planner, plausibility
 from compose.launch.in_process import play
 from compose.recording.run import Record
@@ -37,7 +37,7 @@ def mission(seed: int, lies: dict[str, Attack], noise: str = "") -> Record:
     """A random mission, in which those robots tell those lies."""
     text = shipped()["random"].read_text().replace("[mission]\n", f"[mission]\n{noise}")
     scenario = parse(text, "random", seed=seed)
-    robots = tuple(replace(robot, lie=lies.get(robot.id)) for robot in scenario.robots)
+    robots = tuple(replace(robot, attack=lies.get(robot.id)) for robot in scenario.robots)
     return play(replace(scenario, robots=robots, max_ticks=400))
 
 
@@ -50,12 +50,12 @@ def outcome(record: Record) -> str:
 
 @pytest.mark.parametrize("liar", ["a", "b"])
 @pytest.mark.parametrize(
-    "lie", [*OF_DRIVES, *OF_STARTS], ids=lambda lie: f"{lie.kind}-{lie.part}-{lie.size:.2g}"
+    "lie", [*OF_DRIVES, *OF_STARTS], ids=lambda attack: f"{attack.kind}-{attack.part}-{attack.size:.2g}"
 )
-def test_every_lie_about_a_drive_or_a_start_is_an_alarm(lie: Attack, liar: str) -> None:
+def test_every_lie_about_a_drive_or_a_start_is_an_alarm(attack: Attack, liar: str) -> None:
     for seed in range(6):
-        record = mission(seed, {liar: lie})
-        if not _tells_otherwise(record, liar, lie):
+        record = mission(seed, {liar: attack})
+        if not _tells_otherwise(record, liar, attack):
             continue
         assert outcome(record) == "alarm", seed
         assert record.end is not None
@@ -63,13 +63,13 @@ def test_every_lie_about_a_drive_or_a_start_is_an_alarm(lie: Attack, liar: str) 
         assert (record.end.reason or "").startswith(f"{peer}: {liar} tells "), record.end.reason
 
 
-def _tells_otherwise(record: Record, liar: str, lie: Attack) -> bool:
+def _tells_otherwise(record: Record, liar: str, attack: Attack) -> bool:
     """Whether there was anything to lie about: in that part of its log the robot has driven."""
     phases = {"phase-1": 1, "orbit": 2, "encounter": 3}
-    return lie.part == "all" or any(
-        drive.phase == phases[lie.part] and (drive.v if lie.kind == "scale" else drive.v or drive.omega)
+    return attack.part == "all" or any(
+        command.phase == phases[attack.part] and (command.v if attack.kind == "scale" else command.v or command.omega)
         for moment in record.moments
-        for drive in [moment.drives[liar]]
+        for command in [moment.commands[liar]]
     )
 
 
@@ -87,7 +87,7 @@ def test_two_liars_are_no_more_believed_than_one() -> None:
 
 def test_the_liar_hears_that_it_is_not_believed_and_gives_up() -> None:
     record = mission(0, {"a": Attack("scale", 0.5)})
-    last = record.moments[-1].drives
+    last = record.moments[-1].commands
     assert isinstance(last["b"].verdict, Inconsistent)
     met = next(step for step in steps("paper-1") if step.heard["a"])
     told = [replace(report, verdict=Inconsistent("a tall story")) for report in met.heard["a"]]
@@ -105,18 +105,18 @@ def test_the_liar_hears_that_it_is_not_believed_and_gives_up() -> None:
         Attack("scale", 0.5, "encounter"),
         Attack("rotate", 15.0 * DEGREE, "encounter"),
     ],
-    ids=lambda lie: f"{lie.kind}-{lie.part}",
+    ids=lambda attack: f"{attack.kind}-{attack.part}",
 )
-def test_under_noise_a_lie_that_is_large_beside_it_is_an_alarm(lie: Attack) -> None:
+def test_under_noise_a_lie_that_is_large_beside_it_is_an_alarm(attack: Attack) -> None:
     """Of a, whose way from its anchor to the encounter stands in no range of its own."""
     for seed in range(3):
-        record = mission(seed, {"a": lie}, FINE)
+        record = mission(seed, {"a": attack}, FINE)
         assert outcome(record) == "alarm", seed
         alarm = next(
-            drive.verdict
+            command.verdict
             for moment in record.moments
-            for drive in moment.drives.values()
-            if isinstance(drive.verdict, Inconsistent)
+            for command in moment.commands.values()
+            if isinstance(command.verdict, Inconsistent)
         )
         assert alarm.p_value < 1e-4
         assert alarm.residual is not None
@@ -144,11 +144,11 @@ def told_to_a(phase: int) -> tuple[Step, Report]:
 
 def objection(step: Step, *reports: Report) -> Inconsistent | None:
     """Of a, to the last of `reports`, after it has heard the others."""
-    mind = step.observed["a"]
+    state = step.observed["a"]
     for report in reports[:-1]:
-        mind = replace(mind, radio=peer_state.hear(mind.radio, report))
+        state = replace(state, peer_state=peer_state.hear(state.peer_state, report))
     return plausibility.objection(
-        mind.radio, peer_state.hear(mind.radio, reports[-1]), reports[-1], mind.briefing
+        state.peer_state, peer_state.hear(state.peer_state, reports[-1]), reports[-1], state.config
     )
 
 
@@ -207,7 +207,7 @@ def _claim(alarm: Inconsistent | None) -> str:
 
 runs = st.builds(Segment, st.integers(1, 5), st.floats(-1.0, 1.0), st.floats(-3.0, 3.0))
 logs = st.lists(runs, min_size=1, max_size=8).map(
-    lambda runs: Logbook().extended(0, 0, Logbook(sum(run.ticks for run in runs), tuple(runs)))
+    lambda runs: MotionLog().extended(0, 0, MotionLog(sum(run.ticks for run in runs), tuple(runs)))
 )
 ticks = st.none() | st.integers(0, 40)
 
@@ -215,22 +215,22 @@ ticks = st.none() | st.integers(0, 40)
 @settings(max_examples=100)
 @given(logs, st.sampled_from([*OF_DRIVES, *OF_STARTS]), ticks, ticks, st.integers(1, 40))
 def test_a_liar_tells_the_same_story_as_it_grows(
-    log: Logbook, lie: Attack, parted: int | None, later: int | None, seen: int
+    log: MotionLog, attack: Attack, parted: int | None, later: int | None, seen: int
 ) -> None:
     """What it told of its first ticks it still tells when there are more of them."""
     met = None if parted is None or later is None else parted + later
     seen = min(seen, log.through)
-    young = Logbook(seen, log.between(0, seen))
+    young = MotionLog(seen, log.between(0, seen))
     known = [tick if tick is not None and tick <= seen else None for tick in (parted, met)]
-    whole = false_reports.told(log, lie, parted, met, 1.0)
+    whole = false_reports.told(log, attack, parted, met, 1.0)
     assert whole.through == log.through
-    assert false_reports.told(young, lie, known[0], known[1], 1.0).between(0, seen) == whole.between(0, seen)
+    assert false_reports.told(young, attack, known[0], known[1], 1.0).between(0, seen) == whole.between(0, seen)
 
 
 @settings(max_examples=50)
 @given(logs, st.integers(0, 10), st.integers(0, 10), st.floats(-3.0, 3.0))
 def test_a_rotation_turns_what_was_driven_in_its_part_and_nothing_after(
-    log: Logbook, parted: int, orbit: int, angle: float
+    log: MotionLog, parted: int, orbit: int, angle: float
 ) -> None:
     told = false_reports.told(log, Attack("rotate", angle, "orbit"), parted, parted + orbit, 1.0)
     true_end = follow(ORIGIN, log.between(0, log.through), 1.0)
@@ -241,10 +241,10 @@ def test_a_rotation_turns_what_was_driven_in_its_part_and_nothing_after(
 
 
 def test_a_false_radius_goes_with_false_ranges_and_moves_the_start_only() -> None:
-    log = Logbook(3, (Segment(3, 1.0, 0.0),), (Ranged(0, 1.0), Ranged(1, 0.2)))
-    lie = Attack("radius", -0.5)
-    assert false_reports.told(log, lie, None, None, 1.0).ranges == (Ranged(0, 0.5), Ranged(1, 0.0))
-    assert false_reports.start(Pose(1.0, 0.0, 2.0), lie) == Pose(0.5, 0.0, 2.0)
+    log = MotionLog(3, (Segment(3, 1.0, 0.0),), (Ranged(0, 1.0), Ranged(1, 0.2)))
+    attack = Attack("radius", -0.5)
+    assert false_reports.told(log, attack, None, None, 1.0).ranges == (Ranged(0, 0.5), Ranged(1, 0.0))
+    assert false_reports.start(Pose(1.0, 0.0, 2.0), attack) == Pose(0.5, 0.0, 2.0)
 
 
 # --- the scenario -------------------------------------------------------------------------------------
@@ -255,8 +255,8 @@ def test_a_scenario_says_who_lies_and_how() -> None:
         shipped()["paper-1"].read_text().replace('id = "b"', 'id = "b"\nlie = {kind = "scale", size = 0.5}')
     )
     scenario = parse(text, "paper-1")
-    assert [robot.lie for robot in scenario.robots] == [None, Attack("scale", 0.5, "all")]
-    assert [scenario.briefing(robot).lie for robot in ("a", "b")] == [None, Attack("scale", 0.5, "all")]
+    assert [robot.attack for robot in scenario.robots] == [None, Attack("scale", 0.5, "all")]
+    assert [scenario.config(robot).attack for robot in ("a", "b")] == [None, Attack("scale", 0.5, "all")]
 
 
 @pytest.mark.parametrize(
@@ -268,8 +268,8 @@ def test_a_scenario_says_who_lies_and_how() -> None:
         ('{kind = "shift", size = 1.0, part = "lunch"}', ("robot[1].lie.part", "lunch")),
     ],
 )
-def test_a_lie_that_cannot_be_told_is_refused_by_its_field(lie: str, words: tuple[str, ...]) -> None:
-    text = shipped()["paper-1"].read_text().replace('id = "b"', f'id = "b"\nlie = {lie}')
+def test_a_lie_that_cannot_be_told_is_refused_by_its_field(attack: str, words: tuple[str, ...]) -> None:
+    text = shipped()["paper-1"].read_text().replace('id = "b"', f'id = "b"\nlie = {attack}')
     with pytest.raises(BadScenario) as error:
         parse(text, "mine")
     assert all(word in str(error.value) for word in ("mine", *words)), str(error.value)

@@ -10,8 +10,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from agent.peer.motion_log import Logbook
-from agent.peer.peer_state import Radio, contradiction, hear
+from agent.peer.motion_log import MotionLog
+from agent.peer.peer_state import PeerState, contradiction, hear
 from agent.planning import planner
 from agent.planning.state import Done, RobotState
 from compose.scenario.scenario_file import load
@@ -22,7 +22,7 @@ from protocol.wire import MAX_REPORT_BYTES, decode, encode
 Tick = tuple[float, float, float | None]
 """v and omega over one tick, and the anchor range at its end, if there is one"""
 
-MIND = RobotState(load("paper-1").briefing("a"))
+MIND = RobotState(load("paper-1").config("a"))
 
 ticks = st.builds(
     lambda few, times: few * times,
@@ -37,9 +37,9 @@ ticks = st.builds(
 )
 
 
-def prefixes(driven: list[Tick]) -> list[Logbook]:
+def prefixes(driven: list[Tick]) -> list[MotionLog]:
     """The log of a robot that was in range at its start, after each of its ticks."""
-    book = Logbook().ranged(1.5)
+    book = MotionLog().ranged(1.5)
     grown = [book]
     for v, omega, distance in driven:
         book = book.drove(v, omega)
@@ -49,13 +49,13 @@ def prefixes(driven: list[Tick]) -> list[Logbook]:
     return grown
 
 
-def told(book: Logbook, radio: Radio) -> Report:
+def told(book: MotionLog, radio: PeerState) -> Report:
     """What the planner tells, having this log and this radio."""
-    return planner.report(replace(MIND, log=book, radio=radio, tick=book.through))
+    return planner.report(replace(MIND, log=book, peer_state=radio, tick=book.through))
 
 
 @st.composite
-def deliveries(draw: st.DrawFn) -> tuple[list[Logbook], list[tuple[int, int]]]:
+def deliveries(draw: st.DrawFn) -> tuple[list[MotionLog], list[tuple[int, int]]]:
     """A growing log, and (tick of the report, what it takes for acknowledged), in the order of arrival."""
     books = prefixes(draw(ticks))
     last = len(books) - 1
@@ -69,13 +69,13 @@ def deliveries(draw: st.DrawFn) -> tuple[list[Logbook], list[tuple[int, int]]]:
 @given(deliveries())
 @example((prefixes([(1.0, 0.0, 1.5)] * 300), [(300, 0), (300, 0)]))
 def test_reports_in_any_order_repeated_and_lost_give_back_the_log(
-    case: tuple[list[Logbook], list[tuple[int, int]]],
+    case: tuple[list[MotionLog], list[tuple[int, int]]],
 ) -> None:
     books, arrivals = case
-    radio = Radio()
+    radio = PeerState()
     for tick, since in arrivals:
         known = len(books[since].ranges)
-        report = told(books[tick], Radio(acknowledged=since, ranges_acknowledged=known))
+        report = told(books[tick], PeerState(acknowledged=since, ranges_acknowledged=known))
         assert contradiction(report) is None
         before = radio.peer
         radio = hear(radio, report)
@@ -90,7 +90,7 @@ def test_reports_in_any_order_repeated_and_lost_give_back_the_log(
     assert radio.heard == len(arrivals)
     whole = books[-1]
     for _ in range(2 + whole.through // MAX_REPORT_RUNS + len(whole.ranges) // MAX_REPORT_RANGES):
-        caught_up = Radio(acknowledged=radio.peer.through, ranges_acknowledged=len(radio.peer.ranges))
+        caught_up = PeerState(acknowledged=radio.peer.through, ranges_acknowledged=len(radio.peer.ranges))
         radio = hear(radio, told(whole, caught_up))
     assert radio.peer == whole
 
@@ -100,7 +100,7 @@ class Side:
 
     def __init__(self, driven: list[Tick]) -> None:
         self.books = prefixes(driven)
-        self.radio = Radio()
+        self.peer_state = PeerState()
         self.held: deque[Report] = deque()
 
     def hear(self, report: Report, fate: str) -> None:
@@ -111,10 +111,10 @@ class Side:
                 self.held.appendleft(report)
                 return
             case "twice":
-                self.radio = hear(self.radio, report)
-        self.radio = hear(self.radio, report)
+                self.peer_state = hear(self.peer_state, report)
+        self.peer_state = hear(self.peer_state, report)
         if self.held and fate == "late ones too":
-            self.radio = hear(self.radio, self.held.pop())
+            self.peer_state = hear(self.peer_state, self.held.pop())
 
 
 @given(
@@ -127,25 +127,25 @@ def test_what_is_acknowledged_is_known_and_what_is_lost_is_told_again(
     a, b = Side(a_drove[:length]), Side(b_drove[:length])
     fate = cycle(fates)
     for tick in range(length + 1):
-        from_a, from_b = told(a.books[tick], a.radio), told(b.books[tick], b.radio)
+        from_a, from_b = told(a.books[tick], a.peer_state), told(b.books[tick], b.peer_state)
         a.hear(from_b, next(fate))
         b.hear(from_a, next(fate))
-        for one, other in ((a.radio, b.radio), (b.radio, a.radio)):
+        for one, other in ((a.peer_state, b.peer_state), (b.peer_state, a.peer_state)):
             assert one.acknowledged <= other.peer.through
             assert one.ranges_acknowledged <= len(other.peer.ranges)
     for _ in range(5 + 2 * length // min(MAX_REPORT_RUNS, MAX_REPORT_RANGES)):
-        from_a, from_b = told(a.books[-1], a.radio), told(b.books[-1], b.radio)
+        from_a, from_b = told(a.books[-1], a.peer_state), told(b.books[-1], b.peer_state)
         a.hear(from_b, "heard")
         b.hear(from_a, "heard")
-    assert (a.radio.peer, b.radio.peer) == (b.books[-1], a.books[-1])
-    last = told(a.books[-1], a.radio)
+    assert (a.peer_state.peer, b.peer_state.peer) == (b.books[-1], a.books[-1])
+    last = told(a.books[-1], a.peer_state)
     assert (last.since, last.runs, last.ranges) == (length, (), ())
 
 
 def test_an_overtaken_report_does_not_bring_back_an_old_state() -> None:
-    old, new = (replace(told(Logbook(), Radio()), tick=tick) for tick in (3, 7))
+    old, new = (replace(told(MotionLog(), PeerState()), tick=tick) for tick in (3, 7))
     new = replace(new, state="standing", verdict=Undecided("lost"))
-    radio = hear(hear(Radio(), new), old)
+    radio = hear(hear(PeerState(), new), old)
     assert (radio.state, radio.verdict, radio.latest, radio.heard) == ("standing", Undecided("lost"), 7, 2)
 
 
@@ -157,7 +157,7 @@ def test_an_overtaken_report_does_not_bring_back_an_old_state() -> None:
 @example([(1.0, 0.0, None), (0.5, 0.0, None)] * 150)
 def test_a_report_fits_its_frame_and_tells_as_much_as_fits(driven: list[Tick]) -> None:
     book = prefixes(driven)[-1]
-    report = told(book, Radio())
+    report = told(book, PeerState())
     frame = encode(report)
     assert len(frame) <= MAX_REPORT_BYTES
     assert decode(frame, Report, MAX_REPORT_BYTES) == report
@@ -167,10 +167,10 @@ def test_a_report_fits_its_frame_and_tells_as_much_as_fits(driven: list[Tick]) -
     assert len(report.ranges) == min(len(book.ranges), MAX_REPORT_RANGES)
 
 
-def longest_log(begin: int, ticks_a_run: int) -> Logbook:
+def longest_log(begin: int, ticks_a_run: int) -> MotionLog:
     """More than a report can carry: no two manoeuvres in a row alike; as many ranges as both limits allow."""
     more = MAX_REPORT_RANGES - MAX_REPORT_RUNS
-    book = Logbook().drove(0.0, 0.0, begin) if begin else Logbook()
+    book = MotionLog().drove(0.0, 0.0, begin) if begin else MotionLog()
     for i in range(2 * MAX_REPORT_RUNS):
         book = book.drove(0.1 + i, 0.2, ticks_a_run)
         if i >= -more:
@@ -194,15 +194,15 @@ VERDICTS = {
 def test_the_longest_report_that_there_is_fits_its_frame(begin: int, verdict: str, ticks_a_run: int) -> None:
     book = longest_log(begin, ticks_a_run)
     said = VERDICTS[verdict]
-    mind = replace(
+    state = replace(
         MIND,
-        briefing=replace(MIND.briefing, robot="r" * 32),
-        state=Done(3, said) if said is not None else MIND.state,
+        config=replace(MIND.config, robot="r" * 32),
+        state=Done(3, said) if said is not None else MIND.mode,
         log=book,
         tick=book.through,
-        radio=Radio(acknowledged=begin),
+        peer_state=PeerState(acknowledged=begin),
     )
-    report = planner.report(mind)
+    report = planner.report(state)
     assert report.runs
     size = len(encode(report))
     assert size <= MAX_REPORT_BYTES
@@ -228,8 +228,8 @@ def test_a_log_knows_where_the_robot_was_at_every_tick(driven: list[Tick], data:
 
 
 def test_equal_manoeuvres_are_one_entry() -> None:
-    book = Logbook().drove(1.0, 0.0).drove(1.0, 0.0).drove(1.0, 0.5).drove(1.0, 0.0, 3)
-    assert book == Logbook(6, (Segment(2, 1.0, 0.0), Segment(1, 1.0, 0.5), Segment(3, 1.0, 0.0)))
+    book = MotionLog().drove(1.0, 0.0).drove(1.0, 0.0).drove(1.0, 0.5).drove(1.0, 0.0, 3)
+    assert book == MotionLog(6, (Segment(2, 1.0, 0.0), Segment(1, 1.0, 0.5), Segment(3, 1.0, 0.0)))
 
 
 # --- contradictions -----------------------------------------------------------------------------------

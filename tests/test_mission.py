@@ -173,9 +173,9 @@ def test_a_range_is_taken_up_to_r_and_at_r() -> None:
 
 def turns(record: Record, state: str) -> list[float]:
     """The turns that a makes on the spot, before it meets b."""
-    drives = [moment.drives["a"] for moment in record.moments if moment.drives["a"].phase < 3]
-    assert all(drive.v == 0.0 for drive in drives if drive.state == state)
-    return [drive.omega for drive in drives if drive.state == state]
+    commands = [moment.commands["a"] for moment in record.moments if moment.commands["a"].phase < 3]
+    assert all(command.v == 0.0 for command in commands if command.state == state)
+    return [command.omega for command in commands if command.state == state]
 
 
 def test_a_small_omega_max_makes_every_turn_take_several_ticks() -> None:
@@ -196,9 +196,9 @@ def test_no_robot_ever_asks_for_more_than_its_actuators_give() -> None:
     for record in (mission_of((2.4, -1.2, 4.8), turn_rate=0.5), mission_of((0.5, 0.2, 2.0), reach=1.0)):
         mission = record.scenario.mission
         for moment in record.moments:
-            for drive in moment.drives.values():
-                assert abs(drive.v) <= mission.max_speed * (1 + 1e-12)
-                assert abs(drive.omega) <= mission.max_turn_rate
+            for command in moment.commands.values():
+                assert abs(command.v) <= mission.max_speed * (1 + 1e-12)
+                assert abs(command.omega) <= mission.max_turn_rate
 
 
 @pytest.mark.parametrize(
@@ -208,7 +208,7 @@ def test_the_first_straight_is_shortened_where_it_would_come_near_the_range(
     reach: float, speed: float, straight: float
 ) -> None:
     record = mission_of((0.5, 0.2, 2.0), reach=reach, speed=speed)
-    first = record.moments[0].drives["a"]
+    first = record.moments[0].commands["a"]
     assert first.state == "straight"
     assert (first.v, first.omega) == pytest.approx((straight, 0.0))
     assert record.scenario.mission.first_straight == pytest.approx(straight)
@@ -218,8 +218,8 @@ def test_the_first_straight_is_shortened_where_it_would_come_near_the_range(
 
 def test_a_robot_released_on_its_anchor_knows_its_branch_at_once() -> None:
     record = mission_of((0.0, 0.0, 2.0))
-    assert record.farewells["a"].branch == "on-anchor"
-    assert record.moments[0].drives["a"].phase == 2
+    assert record.final_reports["a"].branch == "on-anchor"
+    assert record.moments[0].commands["a"].phase == 2
     assert record.end is not None
     assert record.end.outcome == "localised"
 
@@ -231,7 +231,7 @@ def test_nobody_claims_before_a_third_mutual_range() -> None:
         assert record.end.outcome == "localised"
         ranged = [moment.truth.tick for moment in record.moments if math.dist(*_places(moment)) <= 3.0]
         for robot in "ab":
-            claims = [m.truth.tick for m in record.moments if isinstance(m.drives[robot].verdict, Localised)]
+            claims = [m.truth.tick for m in record.moments if isinstance(m.commands[robot].verdict, Localised)]
             assert sum(tick <= claims[0] for tick in ranged) >= 3
 
 
@@ -241,15 +241,15 @@ def _places(moment: TickRecord) -> list[tuple[float, float]]:
 
 def test_a_single_candidate_is_checked_before_it_is_claimed() -> None:
     """Two mutual ranges and D leave no redundancy: with one placement left, b still makes a manoeuvre."""
-    second = next(step for step in steps("paper-1") if step.drives["b"].state == "last-manoeuvre")
-    mind, heard = second.observed["b"], second.heard["b"]
-    possible = planner.decide(mind, heard).findings.placements
+    second = next(step for step in steps("paper-1") if step.commands["b"].state == "last-manoeuvre")
+    state, heard = second.observed["b"], second.heard["b"]
+    possible = planner.decide(state, heard).belief.placements
     assert len(possible) == 4
     for placement in possible:
-        findings = replace(mind.findings, placements=(placement,), candidates=(4, 1))
-        decided = planner.decide(replace(mind, findings=findings), heard)
+        findings = replace(state.belief, placements=(placement,), candidates=(4, 1))
+        decided = planner.decide(replace(state, belief=findings), heard)
         assert decided.verdict is None
-        assert planner.drive(decided).v == 1.0
+        assert planner.command(decided).v == 1.0
 
 
 # --- eq. (8) ------------------------------------------------------------------------------------------
@@ -295,9 +295,9 @@ def test_the_letters_last_manoeuvre_maximises_eq_8_at_full_speed(
     plan = last_manoeuvre("b", a, b, found, SECTION_IV, "paper")
     assert plan is not None
     best = max(least(predicted(b, a, found, 1.0, omega)) for omega in grid())
-    assert plan.drive.v == 1.0
+    assert plan.command.v == 1.0
     assert plan.separation_m2 == pytest.approx(best, abs=1e-9)
-    attained = least(predicted(b, a, found, plan.drive.v, plan.drive.omega))
+    attained = least(predicted(b, a, found, plan.command.v, plan.command.omega))
     assert attained == pytest.approx(best, abs=1e-9)
 
 
@@ -317,7 +317,7 @@ def test_the_assured_last_manoeuvre_keeps_as_many_candidates_in_range_as_it_can(
         return -sum(distance > rim for distance in distances), least(distances)
 
     fewest, best = max(value(speed, omega) for speed in SPEEDS for omega in grid())
-    outside, attained = value(plan.drive.v, plan.drive.omega)
+    outside, attained = value(plan.command.v, plan.command.omega)
     assert outside == fewest
     assert attained == pytest.approx(best, abs=1e-9)
     assert plan.separation_m2 == pytest.approx(best, abs=1e-9)
@@ -328,8 +328,8 @@ def test_a_single_candidate_is_checked_from_where_its_range_changes_most() -> No
     ahead = Placement(0.0, -4.5, 0.0)
     plan = last_manoeuvre("b", a, b, [ahead], SECTION_IV, "assured")
     assert plan is not None
-    assert plan.drive.v == 1.0
-    assert plan.drive.omega == pytest.approx(0.0, abs=1e-9)
+    assert plan.command.v == 1.0
+    assert plan.command.omega == pytest.approx(0.0, abs=1e-9)
     assert predicted(b, a, [ahead], 1.0, 0.0) == [pytest.approx(1.0)]
 
 
@@ -357,6 +357,6 @@ def test_where_in_the_plane_the_anchors_stand_costs_no_digit() -> None:
             start = [{shift + 9.25}, {1.5 - shift}, 4.0]
             """
         moments = play(parse(text, "far-out")).moments
-        return [(d.v, d.omega, d.state) for moment in moments for d in moment.drives.values()]
+        return [(d.v, d.omega, d.state) for moment in moments for d in moment.commands.values()]
 
     assert driven(2.0**19) == driven(0.0)

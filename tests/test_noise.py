@@ -32,7 +32,7 @@ from world.referee import Judgement
 from world.scenario import Scenario
 from world.sensors import Mutual, anchor_ranges, executed, mutual_ranges, odometry
 from world.simulation import Course
-from world.tick import World, advance, release, senses
+from world.tick import World, advance, release, observations
 from world.truth import Truth
 
 Floats = NDArray[np.float64]
@@ -214,7 +214,7 @@ def test_a_mutual_range_is_measured_once_and_told_to_both() -> None:
     world = release(scenario)
     told = set()
     for tick in range(200):
-        one, other = senses(replace(world, truth=at_tick(scenario, tick)))
+        one, other = observations(replace(world, truth=at_tick(scenario, tick)))
         (by_a,), (by_b,) = one.contacts, other.contacts
         assert (by_a.peer, by_b.peer) == ("b", "a")
         assert by_a.range == by_b.range
@@ -301,8 +301,8 @@ def test_a_range_that_is_dropped_leaves_the_contact() -> None:
     scenario = near("drop_outs = 0.5")
     world, dropped = release(scenario), 0
     for tick in range(100):
-        for sense in senses(replace(world, truth=at_tick(scenario, tick))):
-            (contact,) = sense.contacts
+        for observation in observations(replace(world, truth=at_tick(scenario, tick))):
+            (contact,) = observation.contacts
             assert contact.heard == (tick,)
             assert contact.range in (None, APART)
             dropped += contact.range is None
@@ -315,7 +315,7 @@ def test_reports_are_heard_where_the_range_was_dropped(tmp_path: Path) -> None:
         seed for seed in range(1000) if mutual(near("drop_outs = 0.5", seed=seed), 4) == [None] * 4
     )
     record = in_process.play(near("drop_outs = 0.5", seed=dropping, max_ticks=3), tmp_path)
-    said = record.farewells
+    said = record.final_reports
     assert (said["a"].mutual_ranges, said["b"].mutual_ranges) == (0, 0)
     assert said["a"].reports_sent >= 1
     assert said["a"].reports_heard == said["b"].reports_sent
@@ -355,8 +355,8 @@ def test_actuation_noise_moves_the_robot_and_an_exact_odometry_says_how() -> Non
     world = release(near(f"actuation = {DRIFT}"))
     onward = advance(world, {"a": sent(1.0, 0.5)})
     assert isinstance(onward, World)
-    (sense, _), period = senses(onward), world.scenario.mission.period
-    asked, done = Controls(1.0, 0.5), sense.executed
+    (observation, _), period = observations(onward), world.scenario.mission.period
+    asked, done = Controls(1.0, 0.5), observation.executed
     assert done is not None
     assert done.v != asked.v
     assert done.omega != asked.omega
@@ -368,11 +368,11 @@ def test_odometry_noise_moves_nobody() -> None:
     world = release(near(f"odometry = {DRIFT}"))
     onward = advance(world, {"a": sent(1.0, 0.5)})
     assert isinstance(onward, World)
-    (sense, _), period = senses(onward), world.scenario.mission.period
+    (observation, _), period = observations(onward), world.scenario.mission.period
     assert onward.truth.local[0] == step(world.truth.local[0], 1.0, 0.5, period)
-    assert sense.executed is not None
-    assert sense.executed.v != 1.0
-    assert sense.executed.omega != 0.5
+    assert observation.executed is not None
+    assert observation.executed.v != 1.0
+    assert observation.executed.omega != 0.5
 
 
 @pytest.mark.parametrize("act", [executed, odometry], ids=["actuation", "odometry"])
@@ -432,8 +432,8 @@ def test_the_fastest_robot_with_the_worst_wheels_can_be_told_what_it_did() -> No
     fastest = 0.0
     for tick in range(2000):
         done = odometry(executed(Controls(1e6, 1e6), scenario, "a", tick), scenario, "a", tick + 1)
-        sense = Observation(tick, "a", done, anchor_ranges(at_tick(scenario, tick), scenario)[0])
-        assert decode(encode(sense), Observation) == sense
+        observation = Observation(tick, "a", done, anchor_ranges(at_tick(scenario, tick), scenario)[0])
+        assert decode(encode(observation), Observation) == observation
         fastest = max(fastest, abs(done.v))
     assert fastest > 3e6
 
@@ -445,8 +445,8 @@ def claims(tick: int, robot: str, pose: Pose, covariance: Covariance | None = No
     return Command(tick, robot, 0.0, 0.0, 3, "localised", Localised(pose, covariance))
 
 
-def moved_on(world: World, drives: dict[str, Command]) -> World:
-    onward = advance(world, drives)
+def moved_on(world: World, commands: dict[str, Command]) -> World:
+    onward = advance(world, commands)
     assert isinstance(onward, World)
     return onward
 
@@ -529,9 +529,9 @@ def driven(scenario: Scenario, folder: Path, ticks: int) -> tuple[list[Truth], l
         truths, told = [], []
         for tick in range(ticks):
             truths.append(course.world.truth)
-            told.append(course.senses())
+            told.append(course.observations())
             v, omega = math.cos(tick), math.sin(3.0 * tick)
-            ended = course.drive({robot.id: sent(v, omega, robot.id, tick) for robot in scenario.robots})
+            ended = course.command({robot.id: sent(v, omega, robot.id, tick) for robot in scenario.robots})
             assert ended is None
         course.end(Judgement("undecided", "enough"))
     return truths, told
@@ -559,9 +559,9 @@ def test_ticks_gives_what_was_driven_and_measured(noise: str, tmp_path: Path) ->
     assert len(rows) == 2 * len(told)
     for i in range(2):
         own, senses_of = rows[i::2], [sensed[i] for sensed in told]
-        for row, sense in zip(own, senses_of, strict=True):
-            peer = sense.contacts[0].range if sense.contacts else None
-            assert row["anchor_range"] == shortest(sense.anchor_range)
+        for row, observation in zip(own, senses_of, strict=True):
+            peer = observation.contacts[0].range if observation.contacts else None
+            assert row["anchor_range"] == shortest(observation.anchor_range)
             assert row["mutual_range"] == shortest(peer)
         for now, after in pairwise(own):
             start = Pose(*(float(now[name]) for name in ("x", "y", "heading")))

@@ -44,10 +44,10 @@ def test_what_becomes_known_of_a_tick_later_is_on_the_time_line_and_in_the_log(
     with ExitStack() as stack:
         growing = {name: stack.enter_context(Journal(tmp_path / name)) for name in whole}
 
-        def grow(robots: int, drives: int) -> None:
+        def grow(robots: int, commands: int) -> None:
             """The robots have journaled what comes before that tick, the world all Commands before that."""
             goals = {name: frames_to(paper_1 / name, robots) for name in whole if name != WORLD_JOURNAL}
-            goals[WORLD_JOURNAL] = frames_to(paper_1 / WORLD_JOURNAL, drives, Command)
+            goals[WORLD_JOURNAL] = frames_to(paper_1 / WORLD_JOURNAL, commands, Command)
             for name, goal in goals.items():
                 growing[name].write(*whole[name][told[name] : goal])
                 told[name] = goal

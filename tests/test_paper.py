@@ -46,11 +46,11 @@ def played(name: str) -> Record:
 
 
 def first_tick(record: Record, robot: str, state: str) -> int:
-    return next(moment.truth.tick for moment in record.moments if moment.drives[robot].state == state)
+    return next(moment.truth.tick for moment in record.moments if moment.commands[robot].state == state)
 
 
-def drive(record: Record, robot: str, tick: int) -> Command:
-    return record.moments[tick].drives[robot]
+def command(record: Record, robot: str, tick: int) -> Command:
+    return record.moments[tick].commands[robot]
 
 
 def optional(cell: str) -> float | None:
@@ -94,19 +94,19 @@ def test_a_robot_senses_the_references_ranges_and_what_it_drove(
     play(load(name), tmp_path)
     kinds = Environment | RobotConfig | Observation | Report | Command | Estimate | MissionEnd | FinalReport
     frames = [decode(frame, kinds) for frame in journal_file.read(tmp_path / f"agent-{robot}.journal")]
-    senses = [frame for frame in frames if isinstance(frame, Observation)]
+    observations = [frame for frame in frames if isinstance(frame, Observation)]
     controls = reference.u_a if robot == "a" else reference.u_b
     ranges = reference.range_a if robot == "a" else reference.range_b
 
-    assert [sense.tick for sense in senses] == list(range(reference.k_last + 1))
-    assert senses[0].executed is None
-    for sense, driven in zip(senses[1:], controls, strict=True):
-        assert sense.executed is not None
-        assert (sense.executed.v, sense.executed.omega) == pytest.approx(driven, abs=EXACT)
-    for sense in senses:
-        assert sense.anchor_range == pytest.approx(ranges[sense.tick], abs=EXACT)
-        mutual = reference.mutual[sense.tick]
-        heard = [contact.range for contact in sense.contacts]
+    assert [observation.tick for observation in observations] == list(range(reference.k_last + 1))
+    assert observations[0].executed is None
+    for observation, driven in zip(observations[1:], controls, strict=True):
+        assert observation.executed is not None
+        assert (observation.executed.v, observation.executed.omega) == pytest.approx(driven, abs=EXACT)
+    for observation in observations:
+        assert observation.anchor_range == pytest.approx(ranges[observation.tick], abs=EXACT)
+        mutual = reference.mutual[observation.tick]
+        heard = [contact.range for contact in observation.contacts]
         assert heard == ([pytest.approx(mutual, abs=EXACT)] if mutual is not None else [])
 
 
@@ -139,21 +139,21 @@ ROWS = (
 @pytest.mark.parametrize("row", ROWS, ids=[f"{row.scenario}-{row.robot}" for row in ROWS])
 def test_phases_1_and_2_go_as_the_table_says(row: Row) -> None:
     record = played(row.scenario)
-    farewell = record.farewells[row.robot]
+    final_report = record.final_reports[row.robot]
     reference = SIMULATIONS[row.scenario]
     ranges = reference.range_a if row.robot == "a" else reference.range_b
-    assert farewell.branch == row.branch
-    assert farewell.alpha == pytest.approx(row.alpha, abs=5.1e-7)
+    assert final_report.branch == row.branch
+    assert final_report.alpha == pytest.approx(row.alpha, abs=5.1e-7)
     assert first_tick(record, row.robot, "aligning") == row.located
     assert sum(rho is not None for rho in ranges[: row.located + 1]) == row.anchor_ranges
-    aligning = drive(record, row.robot, row.located)
+    aligning = command(record, row.robot, row.located)
     assert (aligning.v, -aligning.omega) == pytest.approx((0.0, row.mu), abs=5.1e-7)
     assert first_tick(record, row.robot, "orbiting") == row.orbits
 
 
 def test_in_simulation_1_a_leaves_its_anchors_range_and_circles_for_three_ticks() -> None:
     record = played("paper-1")
-    assert [drive(record, "a", tick).state for tick in range(6)] == [
+    assert [command(record, "a", tick).state for tick in range(6)] == [
         "straight",
         "turning",
         "circling",
@@ -164,7 +164,7 @@ def test_in_simulation_1_a_leaves_its_anchors_range_and_circles_for_three_ticks(
 
 
 def test_in_simulation_2_a_drives_its_third_manoeuvre_at_the_optimum_and_full_speed() -> None:
-    third = drive(played("paper-2"), "a", 1)
+    third = command(played("paper-2"), "a", 1)
     assert (third.state, third.v) == ("third-point", 1.0)
     assert third.omega == pytest.approx(2.331122, abs=5.1e-7)
 
@@ -185,10 +185,10 @@ def test_a_takes_its_second_mutual_range_while_b_stands(
     assert list(mutual) == [first, second, record.moments[-1].truth.tick]
     assert mutual[first] == pytest.approx(first_range, abs=5.1e-7)
     assert mutual[second] == pytest.approx(second_range, abs=5.1e-7)
-    assert [drive(record, "a", tick).state for tick in range(first, second)] == way
-    assert {drive(record, "b", tick).state for tick in range(first, second)} == {"standing"}
-    assert drive(record, "a", second).state == "waiting"
-    assert drive(record, "b", second).state == "last-manoeuvre"
+    assert [command(record, "a", tick).state for tick in range(first, second)] == way
+    assert {command(record, "b", tick).state for tick in range(first, second)} == {"standing"}
+    assert command(record, "a", second).state == "waiting"
+    assert command(record, "b", second).state == "last-manoeuvre"
     assert summary(record, "in-process", None)["first_contact_tick"] == first
 
 
@@ -204,15 +204,15 @@ def test_b_chooses_the_last_manoeuvre_that_the_table_says(
 ) -> None:
     record = played(name)
     reference = SIMULATIONS[name]
-    b = record.farewells["b"]
+    b = record.final_reports["b"]
     assert b.candidates == solutions
-    assert record.farewells["a"].candidates == solutions
+    assert record.final_reports["a"].candidates == solutions
     assert b.last_turn_rate == pytest.approx(omega, abs=5.1e-5)
     assert b.last_turn_rate == pytest.approx(reference.w2, abs=EXACT)
     assert b.separation_m2 == pytest.approx(separation, abs=5.1e-6)
     assert b.separation_m2 == pytest.approx(reference.J, abs=EXACT)
     assert record.moments[-1].truth.tick == last == reference.k_last
-    assert drive(record, "b", last - 1).v == 1.0
+    assert command(record, "b", last - 1).v == 1.0
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -249,20 +249,20 @@ BRANCHES = {
 @pytest.mark.parametrize("case", REFERENCE.phase1, ids=lambda case: f"{case.start[0]:+.3f}")
 def test_phase_1_finds_the_references_branch_and_orientation(case: Phase1) -> None:
     record = mission_of(case.start, variant="paper")
-    farewell = record.farewells["a"]
+    final_report = record.final_reports["a"]
     for tick, controls in enumerate(case.u):
-        driven = drive(record, "a", tick)
+        driven = command(record, "a", tick)
         assert (driven.v, driven.omega) == pytest.approx(controls, abs=EXACT)
     measured = [math.hypot(*_place(record, tick)) for tick in range(case.k_end + 1)]
     assert [rho if rho <= 3.0 else None for rho in measured] == pytest.approx(case.ranges, abs=EXACT)
     assert measured[0] == pytest.approx(case.rho0, abs=EXACT)
     assert measured[-1] == pytest.approx(case.r_end, abs=EXACT)
-    assert farewell.branch == BRANCHES[case.branch]
-    assert farewell.alpha == pytest.approx(case.alpha_signed, abs=EXACT)
+    assert final_report.branch == BRANCHES[case.branch]
+    assert final_report.alpha == pytest.approx(case.alpha_signed, abs=EXACT)
     assert first_tick(record, "a", "aligning") == case.k_end
-    aligning = drive(record, "a", case.k_end)
+    aligning = command(record, "a", case.k_end)
     assert (aligning.v, -aligning.omega) == pytest.approx((0.0, case.mu), abs=EXACT)
-    radial = [moment.drives["a"].v for moment in record.moments if moment.drives["a"].state == "radial"]
+    radial = [moment.commands["a"].v for moment in record.moments if moment.commands["a"].state == "radial"]
     assert sum(radial) == pytest.approx(6.5 - case.r_end, abs=EXACT)
 
 

@@ -182,23 +182,23 @@ def alive(mission: Played) -> None:
 def running(mission: Played) -> None:
     alive(mission)
     mission.frames = {
-        keys.sense("r", "a"): encode(Observation(7, "a", None, None)),
-        keys.drive("r", "a"): encode(Command(7, "a", 0.0, 0.0, 2, "orbiting")),
+        keys.observation("r", "a"): encode(Observation(7, "a", None, None)),
+        keys.command("r", "a"): encode(Command(7, "a", 0.0, 0.0, 2, "orbiting")),
     }
 
 
 def over(mission: Played) -> None:
     alive(mission)
     mission.frames = {
-        keys.sense("r", "a"): encode(MissionEnd(9, "undecided", "it was dark")),
-        keys.drive("r", "a"): encode(Command(9, "a", 0.0, 0.0, 3, "undecided")),
+        keys.observation("r", "a"): encode(MissionEnd(9, "undecided", "it was dark")),
+        keys.command("r", "a"): encode(Command(9, "a", 0.0, 0.0, 3, "undecided")),
     }
 
 
 def driven(mission: Played) -> None:
     """As where a driver stands in the world's place for a: of b only the briefing tells."""
     running(mission)
-    session.answer(mission.link, keys.briefing("r", "a"), lambda _: load("paper-1").briefing("a"))
+    session.answer(mission.link, keys.config("r", "a"), lambda _: load("paper-1").config("a"))
 
 
 def foreign(mission: Played) -> None:

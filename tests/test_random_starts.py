@@ -35,7 +35,7 @@ def test_assured_localises_every_random_start_to_a_micrometre(number: int) -> No
         assert record.end.outcome == "localised", f"seed {seed}: {record.end}"
         last = record.moments[-1]
         for robot, truth in zip(record.scenario.robots, last.truth.poses, strict=True):
-            verdict = last.drives[robot.id].verdict
+            verdict = last.commands[robot.id].verdict
             assert isinstance(verdict, Localised)
             position, heading = errors(verdict.pose, truth)
             assert position < 1e-6, f"seed {seed}"

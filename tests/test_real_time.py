@@ -57,14 +57,14 @@ def robots_at(endpoint: str, answers: Callable[[Observation], bool]) -> Iterator
     """Robots a and b of run r, which rest in the ticks that `answers` picks; b leaves when it is closed."""
     with session.open_client(at(endpoint), lambda: None) as a, ExitStack() as leaves:
         b = leaves.enter_context(session.open_client(at(endpoint), lambda: None))
-        drives = {one: session.publisher(a, keys.drive("r", one)) for one in "ab"}
+        commands = {one: session.publisher(a, keys.command("r", one)) for one in "ab"}
 
         def answer(sample: zenoh.Sample) -> None:
-            sense = decode(sample.payload.to_bytes(), Observation | MissionEnd)
-            if isinstance(sense, Observation) and answers(sense):
-                drives[sense.robot].put(encode(Command(sense.tick, sense.robot, 0.0, 0.0, 1, "straight")))
+            observation = decode(sample.payload.to_bytes(), Observation | MissionEnd)
+            if isinstance(observation, Observation) and answers(observation):
+                commands[observation.robot].put(encode(Command(observation.tick, observation.robot, 0.0, 0.0, 1, "straight")))
 
-        subscribed = [a.declare_subscriber(keys.sense("r", one), answer) for one in "ab"]
+        subscribed = [a.declare_subscriber(keys.observation("r", one), answer) for one in "ab"]
         tokens = [session.show_alive(link, keys.robot_alive("r", one)) for link, one in ((a, "a"), (b, "b"))]
         yield leaves
         assert subscribed
@@ -118,10 +118,10 @@ def test_a_world_says_why_there_is_no_farewell_of_a_robot(tmp_path: Path) -> Non
     (tmp_path / "short.toml").write_text("max_ticks = 9\n" + ASSURED.partition("\n")[2])
     second = threading.Event()
 
-    def answers(sense: Observation) -> bool:
-        if sense.tick:
+    def answers(observation: Observation) -> bool:
+        if observation.tick:
             second.set()
-        return sense.tick == 0
+        return observation.tick == 0
 
     with (
         world(tmp_path / "short.toml", "--rate", "20", "--run", "r", "--out", out) as (clock, endpoint),

@@ -136,22 +136,22 @@ def test_the_first_difference_is_shown_with_tick_robot_field_and_both_values(rec
 
 def test_a_value_is_shown_however_deep_it_stands(record: Path) -> None:
     told = [decode(frame, KINDS, MAX_FRAME_BYTES) for frame in journal_file.read(record / A)]
-    sense = next(one for one in told if isinstance(one, Observation) and one.contacts)
-    (contact,) = sense.contacts
+    observation = next(one for one in told if isinstance(one, Observation) and one.contacts)
+    (contact,) = observation.contacts
     assert contact.range is not None
-    planted(record, A, Observation, sense.tick, contacts=(replace(contact, range=contact.range + 1e-15),))
+    planted(record, A, Observation, observation.tick, contacts=(replace(contact, range=contact.range + 1e-15),))
     (first, *_) = tandem("replay", record).out.splitlines()[1:]
     assert first == (
-        f"tick {sense.tick}, a, Observation contacts[0].range: "
+        f"tick {observation.tick}, a, Observation contacts[0].range: "
         f"recorded {contact.range + 1e-15!r}, recomputed {contact.range!r}"
     )
 
 
 def test_a_record_whose_drives_the_world_has_otherwise_is_found_there(record: Path) -> None:
     frames = list(journal_file.read(record / WORLD_JOURNAL))
-    drive = decode(frames[2 + 2 * 20 + 1], Command)
-    assert (drive.robot, drive.tick) == ("b", 20)
-    frames[2 + 2 * 20 + 1] = encode(replace(drive, omega=drive.omega + 1e-9))
+    command = decode(frames[2 + 2 * 20 + 1], Command)
+    assert (command.robot, command.tick) == ("b", 20)
+    frames[2 + 2 * 20 + 1] = encode(replace(command, omega=command.omega + 1e-9))
     (record / WORLD_JOURNAL).write_bytes(journal_file.packed(frames))
     ended = tandem("replay", record)
     assert ended.status == 1

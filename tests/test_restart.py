@@ -163,7 +163,7 @@ def test_in_real_time_whoever_is_away_stands_still_and_is_told_what_it_missed(tm
     assert sum(isinstance(message, DeadlineMissed) for message in messages) == len(away)
     for robot in ("a", "b"):
         lived = past(journal_file.read(out / f"agent-{robot}.journal"), robot)
-        assert [step.sense.tick for step in lived.steps] == list(range(len(lived.steps)))
+        assert [step.observation.tick for step in lived.steps] == list(range(len(lived.steps)))
 
 
 # --- what is typed ------------------------------------------------------------------------------------
@@ -238,17 +238,17 @@ def test_an_agents_journal_torn_anywhere_is_finished_with_the_same_bytes(
         book, lost = old.go_on()
         assert torn.stat().st_size >= cut - lost
         with book:
-            body = Robot(whole.briefing, book) if memory is None else memory.robot
+            body = Robot(whole.config, book) if memory is None else memory.robot
             body.keep(book)
-            known = memory.sense.tick if memory is not None and memory.sense is not None else -1
+            known = memory.observation.tick if memory is not None and memory.observation is not None else -1
             for step in whole.steps[max(known, 0) :]:
-                if step.sense.tick > known:
-                    body.sense(step.sense, step.frame)
-                if body.drive is None:
+                if step.observation.tick > known:
+                    body.observation(step.observation, step.frame)
+                if body.command is None:
                     body.decide(step.heard)
                     body.estimate()
-            if memory is None or memory.farewell is None:
-                body.farewell(whole.end)
+            if memory is None or memory.final_report is None:
+                body.final_report(whole.end)
         assert torn.read_bytes() == data, cut
 
 
@@ -268,8 +268,8 @@ def test_a_worlds_journal_torn_anywhere_is_finished_with_the_same_bytes(
             course.keep(book)
             for tick in whole.ticks[course.tick :]:
                 if course.over is None:
-                    course.drive(tick.drives)
-            course.farewells(whole.farewells.values())
+                    course.command(tick.commands)
+            course.final_reports(whole.final_reports.values())
         assert torn.read_bytes() == data, cut
 
 
@@ -366,9 +366,9 @@ def test_an_agent_says_farewell_until_a_world_has_it_on_record(tmp_path: Path) -
     there = Inbox("test")
 
     def farewell_of(link: zenoh.Session) -> bytes:
-        session.subscribe(link, keys.drive(run, "a"), there, "drive")
+        session.subscribe(link, keys.command(run, "a"), there, "drive")
         session.watch_liveliness(link, keys.robot_alive(run, "*"), there)
-        publisher = session.publisher(link, keys.sense(run, "a"))
+        publisher = session.publisher(link, keys.observation(run, "a"))
         _token = session.show_alive(link, keys.world_alive(run))
         while True:
             arrival = there.next(REPEAT_S)
@@ -379,7 +379,7 @@ def test_an_agent_says_farewell_until_a_world_has_it_on_record(tmp_path: Path) -
 
     with ExitStack() as folder:
         with session.open_router(listening(endpoint)) as link:
-            session.answer(link, keys.briefing(run, "*"), lambda _: scenario.briefing("a"))
+            session.answer(link, keys.config(run, "*"), lambda _: scenario.config("a"))
             _token = session.show_alive(link, keys.world_alive(run))
             agent = folder.enter_context(
                 TandemProcess("agent", "a", "--connect", endpoint, "--out", tmp_path)
@@ -390,7 +390,7 @@ def test_an_agent_says_farewell_until_a_world_has_it_on_record(tmp_path: Path) -
         with session.open_router(listening(endpoint), BOUND_S) as link:
             assert farewell_of(link) == first
             assert agent.running
-            session.publisher(link, keys.sense(run, "a")).put(first)
+            session.publisher(link, keys.observation(run, "a")).put(first)
             assert agent.ended(AT_ONCE_S).status == 1
 
 
@@ -401,35 +401,35 @@ def test_a_repeated_sense_makes_an_agent_say_all_its_latest_reports_again(tmp_pa
     scenario, endpoint, run = load("paper-1"), free_endpoint(), "mine"
     reports: SimpleQueue[int] = SimpleQueue()
     there = Inbox("test")
-    senses = [Observation(tick, "a", None, 2.5, (Contact("b", 2.0, ()),)) for tick in range(70)]
-    senses[1:] = [replace(sense, executed=None) for sense in senses[1:]]
+    observations = [Observation(tick, "a", None, 2.5, (Contact("b", 2.0, ()),)) for tick in range(70)]
+    observations[1:] = [replace(observation, executed=None) for observation in observations[1:]]
     latest = list(range(69 - 59, 70))
 
     def heard(ticks: list[int]) -> None:
         assert [next_of(reports) for _ in ticks] == ticks
 
     with session.open_router(listening(endpoint)) as link:
-        session.answer(link, keys.briefing(run, "*"), lambda _: scenario.briefing("a"))
+        session.answer(link, keys.config(run, "*"), lambda _: scenario.config("a"))
         session.watch_liveliness(link, keys.robot_alive(run, "*"), there)
         link.declare_subscriber(
             keys.report(run, "a", "b"),
             lambda sample: reports.put(decode(sample.payload.to_bytes(), Report).tick),
         )
-        publisher = session.publisher(link, keys.sense(run, "a"))
+        publisher = session.publisher(link, keys.observation(run, "a"))
         _token = session.show_alive(link, keys.world_alive(run))
         part = ("agent", "a", "--connect", endpoint, "--out", tmp_path)
         with TandemProcess(*part) as agent:
             assert there.next(BOUND_S).topic == "alive"
-            for sense in senses:
-                publisher.put(encode(sense))
+            for observation in observations:
+                publisher.put(encode(observation))
             heard(list(range(70)))
-            publisher.put(encode(senses[-1]))
+            publisher.put(encode(observations[-1]))
             heard(latest)
             os.kill(agent.pid, SIGKILL)
         assert there.next(BOUND_S).topic == "gone"
         with TandemProcess(*part):
             assert there.next(BOUND_S).topic == "alive"
-            publisher.put(encode(senses[-1]))
+            publisher.put(encode(observations[-1]))
             heard(latest)
     assert reports.empty()
 
@@ -534,9 +534,9 @@ def test_a_record_on_which_it_decided_otherwise_is_refused(record: Path) -> None
     path = record / "agent-a.journal"
     frames = list(journal_file.read(path))
     place = next(i for i, frame in enumerate(frames) if frame[5:].find(b"drive\x0c") > 0)
-    drive = decode(frames[place], Command)
-    assert drive.tick == 12
-    frames[place] = encode(replace(drive, v=drive.v / 2.0))
+    command = decode(frames[place], Command)
+    assert command.tick == 12
+    frames[place] = encode(replace(command, v=command.v / 2.0))
     path.write_bytes(journal_file.packed(frames))
     says = f"{path}: on record it decided otherwise at tick 12: the journal is another version's"
     refuses(record, "agent", "a", "--connect", free_endpoint(), says=says)
@@ -563,7 +563,7 @@ def test_a_journal_is_locked_as_long_as_it_is_open(tmp_path: Path) -> None:
 def test_a_world_that_has_lost_its_record_is_told_so(record: Path, paper_1: str) -> None:
     with TandemProcess("agent", "b", "--connect", paper_1):
         ended = tandem("agent", "a", "--connect", paper_1, "--out", record)
-    tick = past(journal_file.read(record / "agent-a.journal"), "a").steps[-1].sense.tick
+    tick = past(journal_file.read(record / "agent-a.journal"), "a").steps[-1].observation.tick
     assert ended.status == 3
     said = f"started again without its record: the world is at tick 0, a knows it up to {tick}"
     assert ended.err.splitlines()[-1] == f"tandem agent a: {said}"  # it may have told of a torn write before
@@ -595,9 +595,9 @@ def test_a_mission_under_noise_is_folded_to_the_bit(tmp_path: Path) -> None:
         with closing(Retrace(tmp_path / f"agent-{robot}.journal")) as old:
             memory = remember(old)
             assert memory is not None
-            assert memory.farewell is not None
+            assert memory.final_report is not None
     with closing(Retrace(tmp_path / "world.journal")) as old:
-        assert again(scenario, old).parted.keys() == {"a", "b"}
+        assert again(scenario, old).phase1_done_tick.keys() == {"a", "b"}
 
 
 @pytest.mark.long

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from agent.planning.state import WORDS
+from agent.planning.state import MODE_NAMES
 from compose.launch import in_process
 from compose.recording.run import read as read_record
 from compose.scenario.scenario_file import load
@@ -40,17 +40,17 @@ def test_a_scene_shows_where_everyone_is_and_what_everyone_does(paper_1: Path) -
     assert [one.tick for one in shown.scenes] == [moment.truth.tick for moment in record.moments]
     for moment, one in zip(record.moments, shown.scenes, strict=True):
         for player, pose in zip(one.players, moment.truth.poses, strict=True):
-            drive = moment.drives[player.robot]
+            command = moment.commands[player.robot]
             assert player.pose == replace(pose, heading=wrap(pose.heading))
-            assert player.drive is not None
-            assert (player.drive.v, player.drive.state) == (drive.v, drive.state)
+            assert player.command is not None
+            assert (player.command.v, player.command.state) == (command.v, command.state)
 
 
 def test_the_first_contact_of_paper_1_is_told_at_tick_46(paper_1: Path) -> None:
     shown = read(paper_1)
     assert said(shown, "contact") == [(46, "a and b are in range of each other: 2.95 m")]
     assert said(shown, "anchor")[0] == (0, "a is in its anchor's range: 2.68 m")
-    assert shown.scenes[46].player("b").doing == "b stands still; waits for a's second range"
+    assert shown.scenes[46].player("b").mode_name == "b stands still; waits for a's second range"
     assert said(shown, "candidates")[-1] == (48, "b's candidates fall from 4 to 1")
     assert said(shown, "end") == [(48, "The mission ends: localised")]
 
@@ -100,7 +100,7 @@ def test_a_torn_record_is_shown_up_to_the_tear(paper_1: Path, tmp_path: Path, sh
     known = [
         one
         for one in shown.scenes
-        if all(player.held and player.pose and player.drive for player in one.players)
+        if all(player.held and player.pose and player.command for player in one.players)
     ]
     assert known == [one for one in whole.scenes if one.tick in {other.tick for other in known}]
 
@@ -165,8 +165,8 @@ def test_whose_process_is_gone_is_down_in_every_tick_until_it_is_back(paper_1: P
     assert stage is not None
 
     def begin(tick: int) -> None:
-        for drive in journals.known.ticks[tick].drives.values():
-            known.take(drive, 0)
+        for command in journals.known.ticks[tick].commands.values():
+            known.take(command, 0)
 
     def present(**there: bool) -> None:
         for robot, one in there.items():
@@ -187,11 +187,11 @@ def test_whose_process_is_gone_is_down_in_every_tick_until_it_is_back(paper_1: P
     begin(3)
     present(b=False)
     present(b=True)
-    known.take(journals.known.farewells["a"], 0)
+    known.take(journals.known.final_reports["a"], 0)
     present(a=False)  # it has done its part
     shown = scenes(stage, known)
     assert [one.player("a").down for one in shown] == [False, True, False, False]
-    assert shown[1].player("a").doing == "a is down: its process is gone"
+    assert shown[1].player("a").mode_name == "a is down: its process is gone"
     assert [
         (event.tick, event.kind, event.robot)
         for one in shown
@@ -216,7 +216,7 @@ def test_the_process_that_writes_a_journal_is_known_by_its_lock(tmp_path: Path) 
 
 
 def test_every_state_has_its_sentence() -> None:
-    assert set(WORDS.values()) | {"localised"} == {*DOING, *SEEKING}
+    assert set(MODE_NAMES.values()) | {"localised"} == {*DOING, *SEEKING}
     seat = of_scenario(load("paper-1")).seat("b")
     for phase in (1, 2, 3):
         for state in (*DOING, *SEEKING):

@@ -158,10 +158,10 @@ def test_stopped_for_longer_than_the_patience_a_process_fails_the_run(
 
 
 def test_a_link_over_which_nothing_comes_is_replaced_by_another() -> None:
-    endpoint, briefing, inbox = free_endpoint(), load("paper-1").briefing("a", None), Inbox("a mute world")
+    endpoint, config, inbox = free_endpoint(), load("paper-1").config("a", None), Inbox("a mute world")
     with session.open_router(listening(endpoint)) as link:
         session.watch_liveliness(link, keys.robot_alive("mute", "a"), inbox)
-        session.answer(link, keys.briefing("mute", "*"), lambda _key: briefing)
+        session.answer(link, keys.config("mute", "*"), lambda _key: config)
         _token = session.show_alive(link, keys.world_alive("mute"))
         with TandemProcess("agent", "a", "--connect", endpoint, "--patience", "20") as agent:
             for topic in ("alive", "gone", "alive"):

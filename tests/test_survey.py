@@ -28,7 +28,7 @@ from tests.series import series
 from tests.surveys import ODOMETRY, SIGMA, WHEELS, assert_localised, scenario_of, states, survey
 from world.scenario import Scenario
 from world.sensors import anchor_ranges, mutual_ranges
-from world.tick import World, advance, release, senses
+from world.tick import World, advance, release, observations
 
 NOISES = {
     "ranges": SIGMA,
@@ -119,10 +119,10 @@ def test_a_mission_that_is_cut_short_is_undecided_and_says_what_was_left() -> No
             assert robot["position_sigma_m"] is None
         assert len({(robot["hypotheses"], robot["odds"]) for robot in robots}) == 1, "both hold the same"
         left.append((robots[0]["hypotheses"], robots[0]["odds"]))
-    many = [(count, odds) for count, odds in left if count is not None]
+    many = [(count, probability) for count, probability in left if count is not None]
     assert max(count for count, _ in many) > 1, "at first there are several"
-    assert all(1.0 / count <= odds <= 1.0 for count, odds in many)
-    assert all((count == 1) == (odds == 1.0) for count, odds in many)
+    assert all(1.0 / count <= probability <= 1.0 for count, probability in many)
+    assert all((count == 1) == (probability == 1.0) for count, probability in many)
 
 
 # --- where they drive ---------------------------------------------------------------------------------
@@ -136,7 +136,7 @@ def test_the_robots_keep_apart_and_b_stays_in_range_of_its_anchor(noise: str) ->
         for moment in record.moments:
             a, b = moment.truth.poses
             assert apart(a, b) > 0.1 * reach, (seed, moment.truth.tick)
-            if moment.drives["b"].phase == 3:
+            if moment.commands["b"].phase == 3:
                 assert apart(b, Pose(anchor.anchor.x, anchor.anchor.y, 0.0)) <= reach
 
 
@@ -149,7 +149,7 @@ def test_a_lost_contact_is_found_again() -> None:
         met = next(
             tick
             for tick, moment in enumerate(record.moments)
-            if moment.drives["a"].state == "surveying" and moment.drives["a"].phase == 3
+            if moment.commands["a"].state == "surveying" and moment.commands["a"].phase == 3
         )
         lost += not all(contact[met:])
         assert contact[-1]
@@ -201,17 +201,17 @@ SHORT = 6
 def ticks(scenario: Scenario) -> Iterator[tuple[World, dict[str, RobotState], dict[str, RobotState]]]:
     """The world, the minds before and those that have observed; each step checked against a copy's."""
     world = release(scenario)
-    minds = {robot.id: RobotState(scenario.briefing(robot.id)) for robot in scenario.robots}
+    states = {robot.id: RobotState(scenario.config(robot.id)) for robot in scenario.robots}
     while isinstance(world, World):
-        sensed = senses(world)
-        observed = {sense.robot: planner.observe(minds[sense.robot], sense) for sense in sensed}
-        yield world, minds, observed
-        told = {robot: planner.report(mind) for robot, mind in observed.items()}
-        minds = {
-            sense.robot: planner.decide(observed[sense.robot], [told[one.peer] for one in sense.contacts])
-            for sense in sensed
+        sensed = observations(world)
+        observed = {observation.robot: planner.observe(states[observation.robot], observation) for observation in sensed}
+        yield world, states, observed
+        told = {robot: planner.report(state) for robot, state in observed.items()}
+        states = {
+            observation.robot: planner.decide(observed[observation.robot], [told[one.peer] for one in observation.contacts])
+            for observation in sensed
         }
-        onward = advance(world, {robot: planner.drive(mind) for robot, mind in minds.items()})
+        onward = advance(world, {robot: planner.command(state) for robot, state in states.items()})
         if not isinstance(onward, World):
             assert onward.outcome == "localised"
             return
@@ -221,39 +221,39 @@ def ticks(scenario: Scenario) -> Iterator[tuple[World, dict[str, RobotState], di
 @pytest.mark.long
 def test_the_same_mind_takes_the_same_step_and_is_left_as_it_was() -> None:
     for world, before, observed in ticks(scenario_of(NOISES["everything"], SHORT)):
-        told = {robot: planner.report(mind) for robot, mind in observed.items()}
-        for sense in senses(world):
-            mind, once = before[sense.robot], observed[sense.robot]
-            was = repr(mind)
-            again = planner.observe(copy.deepcopy(mind), sense)
+        told = {robot: planner.report(state) for robot, state in observed.items()}
+        for observation in observations(world):
+            state, once = before[observation.robot], observed[observation.robot]
+            was = repr(state)
+            again = planner.observe(copy.deepcopy(state), observation)
             assert once == again
             assert repr(once) == repr(again)
-            assert repr(mind) == was
-            heard = [told[contact.peer] for contact in sense.contacts]
+            assert repr(state) == was
+            heard = [told[contact.peer] for contact in observation.contacts]
             was = repr(once)
             decided, anew = planner.decide(once, heard), planner.decide(copy.deepcopy(again), list(heard))
             assert decided == anew
             assert repr(decided) == repr(anew)
             assert repr(once) == was
-            for say in (planner.drive, planner.report, planner.estimate):
+            for say in (planner.command, planner.report, planner.estimate):
                 assert encode(say(decided)) == encode(say(anew))
 
 
 def test_both_hold_the_same_of_each_other_while_they_hear_each_other() -> None:
     """From the same logs, by the same arithmetic: a claim of one is never waited for by the other."""
     held = 0
-    for _, minds, _ in ticks(scenario_of(SIGMA, 4)):
-        a, b = minds["a"], minds["b"]
-        if a.findings.pair and b.findings.pair:
-            assert a.findings.pair == b.findings.pair
-            assert a.findings.missing == b.findings.missing
+    for _, states, _ in ticks(scenario_of(SIGMA, 4)):
+        a, b = states["a"], states["b"]
+        if a.belief.pair and b.belief.pair:
+            assert a.belief.pair == b.belief.pair
+            assert a.belief.blocking_reason == b.belief.blocking_reason
             held += 1
     assert held > 3
 
 
 def test_a_robot_whose_peer_gives_up_under_noise_gives_up_too() -> None:
     for world, _, observed in ticks(scenario_of(SIGMA, 4)):
-        (by_a, _) = senses(world)
+        (by_a, _) = observations(world)
         if by_a.contacts:
             told = replace(planner.report(observed["b"]), verdict=Undecided("no way"))
             assert planner.decide(observed["a"], [told]).verdict == Undecided("b says: no way")
@@ -286,21 +286,21 @@ def test_drop_outs_that_add_up_do_not_keep_a_robot_in_phase_1() -> None:
 def test_a_robot_that_turns_out_to_head_off_its_radius_turns_onto_it_again() -> None:
     """Set off as if it were aligned, a robot finds by its next range which way it heads."""
     world = release(scenario_of(SIGMA, SHORT))
-    minds = {robot.id: RobotState(world.scenario.briefing(robot.id)) for robot in world.scenario.robots}
+    states = {robot.id: RobotState(world.scenario.config(robot.id)) for robot in world.scenario.robots}
     misled = False
     while isinstance(world, World):
-        for sense in senses(world):
-            mind = planner.observe(minds[sense.robot], sense)
-            if sense.robot == "b" and not misled and isinstance(mind.state, Aligning):
-                off = abs(orientation(mind.local_pose))
+        for observation in observations(world):
+            state = planner.observe(states[observation.robot], observation)
+            if observation.robot == "b" and not misled and isinstance(state.mode, Aligning):
+                off = abs(orientation(state.local_pose))
                 assert off > 2.0 * OFF_RADIUS, "it has to turn, and is not let"
-                mind, misled = replace(mind, state=Radial()), True
-            minds[sense.robot] = planner.decide(mind)
-            if misled and sense.robot == "b":
-                assert isinstance(mind.state, Radial | Aligning), "neither lost nor on its circle"
-                if isinstance(mind.state, Aligning):
+                state, misled = replace(state, mode=Radial()), True
+            states[observation.robot] = planner.decide(state)
+            if misled and observation.robot == "b":
+                assert isinstance(state.mode, Radial | Aligning), "neither lost nor on its circle"
+                if isinstance(state.mode, Aligning):
                     return
-        onward = advance(world, {robot: planner.drive(mind) for robot, mind in minds.items()})
+        onward = advance(world, {robot: planner.command(state) for robot, state in states.items()})
         assert isinstance(onward, World)
         world = onward
 
@@ -321,4 +321,4 @@ def test_nothing_is_claimed_by_a_fit_that_still_moves(monkeypatch: pytest.Monkey
     monkeypatch.setattr(agent.planning.assured, "search", searched)
     record = play(scenario_of(SIGMA, SHORT, max_ticks=ticks + 2))
     assert summary(record, "in-process", None)["outcome"] == "undecided"
-    assert all("still moves" in (farewell.missing or "") for farewell in record.farewells.values())
+    assert all("still moves" in (final_report.blocking_reason or "") for final_report in record.final_reports.values())

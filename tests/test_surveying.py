@@ -37,15 +37,15 @@ missions = st.builds(
 )
 
 
-def after(pose: Pose, drive: Controls, mission: Mission = MISSION) -> Pose:
+def after(pose: Pose, command: Controls, mission: Mission = MISSION) -> Pose:
     """Where a manoeuvre leads that is driven for as long as manoeuvres last."""
     for _ in range(stride(mission)):
-        pose = step(pose, drive.v, drive.omega, mission.period)
+        pose = step(pose, command.v, command.omega, mission.period)
     return pose
 
 
-def held(pose: Pose, odds: float = 1.0, covariance: Array = SETTLED) -> PlanningHypothesis:
-    return PlanningHypothesis(odds, np.array([pose.x, pose.y, pose.heading]), covariance)
+def held(pose: Pose, probability: float = 1.0, covariance: Array = SETTLED) -> PlanningHypothesis:
+    return PlanningHypothesis(probability, np.array([pose.x, pose.y, pose.heading]), covariance)
 
 
 # --- manoeuvres ---------------------------------------------------------------------------------------
@@ -100,10 +100,10 @@ def test_of_mirror_images_a_robot_drives_where_their_ranges_differ(along: float,
     """Ahead and behind the two are alike, and standing tells nothing either."""
     one, other = Pose(along, aside, 0.0), Pose(along, -aside, 0.0)
     tight = np.eye(2) * 1e-6
-    drive = alone([held(one, 0.5, tight), held(other, 0.5, tight)], MISSION)
+    command = alone([held(one, 0.5, tight), held(other, 0.5, tight)], MISSION)
     gaps = []
     for _ in range(AHEAD):
-        one, other = after(one, drive), after(other, drive)
+        one, other = after(one, command), after(other, command)
         gaps.append(math.hypot(one.x, one.y) - math.hypot(other.x, other.y))
     assert math.hypot(*gaps) > 4.0 * SIGMA
 
@@ -130,24 +130,24 @@ def test_together_robots_keep_in_range_and_apart(
 
 
 @given(st.floats(2.0, 20.0), angles, st.sampled_from([1.0, -1.0]))
-def test_from_the_circle_itself_pursuit_is_eq_6(radius: float, bearing: float, sense: float) -> None:
-    orbit = Orbit(radius, 1.0, sense / radius)
-    local = Pose(radius * math.cos(bearing), radius * math.sin(bearing), bearing + sense * math.pi / 2)
-    drive = pursuit(local, orbit, MISSION)
-    assert (drive.v, drive.omega) == pytest.approx((orbit.v, orbit.omega), abs=1e-9)
+def test_from_the_circle_itself_pursuit_is_eq_6(radius: float, bearing: float, observation: float) -> None:
+    orbit = Orbit(radius, 1.0, observation / radius)
+    local = Pose(radius * math.cos(bearing), radius * math.sin(bearing), bearing + observation * math.pi / 2)
+    command = pursuit(local, orbit, MISSION)
+    assert (command.v, command.omega) == pytest.approx((orbit.v, orbit.omega), abs=1e-9)
 
 
 @given(st.floats(4.0, 20.0), st.floats(-0.8, 0.8), st.floats(-0.5, 0.5), st.sampled_from([1.0, -1.0]))
 def test_from_beside_the_circle_pursuit_leads_back_to_it(
-    radius: float, off: float, askew: float, sense: float
+    radius: float, off: float, askew: float, observation: float
 ) -> None:
-    orbit = Orbit(radius, 1.0, sense / radius)
-    local = Pose(radius + off, 0.0, sense * math.pi / 2 + askew)
+    orbit = Orbit(radius, 1.0, observation / radius)
+    local = Pose(radius + off, 0.0, observation * math.pi / 2 + askew)
     for _ in range(40):
-        drive = pursuit(local, orbit, MISSION)
-        assert drive.v == orbit.v
-        assert abs(drive.omega) <= MISSION.max_turn_rate
-        local = step(local, drive.v, drive.omega, MISSION.period)
+        command = pursuit(local, orbit, MISSION)
+        assert command.v == orbit.v
+        assert abs(command.omega) <= MISSION.max_turn_rate
+        local = step(local, command.v, command.omega, MISSION.period)
     assert math.hypot(local.x, local.y) == pytest.approx(radius, abs=1e-3)
 
 
@@ -164,12 +164,12 @@ def test_from_anywhere_a_robot_finds_home(
     far = math.hypot(x - 1.0, y + 2.0)
     legs = far / (mission.max_speed * mission.period) + math.pi / (mission.max_turn_rate * mission.period)
     for _ in range(math.ceil(1.2 * legs) + 10):
-        drive = homeward(home, pose, mission)
-        if drive is None:
+        command = homeward(home, pose, mission)
+        if command is None:
             break
-        assert abs(drive.v) <= mission.max_speed
-        assert abs(drive.omega) <= mission.max_turn_rate
-        pose = step(pose, drive.v, drive.omega, mission.period)
+        assert abs(command.v) <= mission.max_speed
+        assert abs(command.omega) <= mission.max_turn_rate
+        pose = step(pose, command.v, command.omega, mission.period)
     assert math.hypot(pose.x - 1.0, pose.y + 2.0) <= arrived(mission)[0]
 
 

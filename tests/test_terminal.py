@@ -35,7 +35,7 @@ ESCAPED = one_line(REASON)
 HARMFUL = ("\x1b[2J", "\x9b", "\x07", "\x7f", "\u202e", "\u2028")
 
 
-def farewell(robot: str) -> FinalReport:
+def final_report(robot: str) -> FinalReport:
     [found] = [one for one in EXAMPLES if isinstance(one, FinalReport) and not one.anchor_ranges]
     return FinalReport(robot, *[getattr(found, name) for name in found.__struct_fields__[1:]])
 
@@ -44,8 +44,8 @@ def play_hostile(endpoint: str, pause: Callable[[], object] = lambda: None) -> N
     """Robot b, which says such things, and gives up in tick 3; calls `pause` in tick 2."""
     heard, paused = Inbox("test"), False
     with session.open_client(at(endpoint), lambda: None) as link:
-        drive = session.publisher(link, keys.drive(RUN, "b"))
-        session.subscribe(link, keys.sense(RUN, "b"), heard, "sense")
+        command = session.publisher(link, keys.command(RUN, "b"))
+        session.subscribe(link, keys.observation(RUN, "b"), heard, "sense")
         token = session.show_alive(link, keys.robot_alive(RUN, "b"))
         while True:
             arrival = heard.next(BOUND_S)
@@ -56,12 +56,12 @@ def play_hostile(endpoint: str, pause: Callable[[], object] = lambda: None) -> N
             match message:
                 case Observation(tick):
                     verdict = Undecided(REASON) if tick == 3 else None
-                    drive.put(encode(Command(tick, "b", 0.0, 0.0, 1, STATE, verdict)))
+                    command.put(encode(Command(tick, "b", 0.0, 0.0, 1, STATE, verdict)))
                     if tick == 2 and not paused:
                         paused = True
                         pause()
                 case MissionEnd():
-                    drive.put(encode(farewell("b")))
+                    command.put(encode(final_report("b")))
                 case FinalReport():
                     break
         del token

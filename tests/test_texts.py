@@ -12,7 +12,7 @@ import pytest
 from msgspec.inspect import StrType, StructType, type_info
 from msgspec.structs import replace
 
-from agent.planning.state import WORDS
+from agent.planning.state import MODE_NAMES
 from agent.process.agent_journal import past
 from agent.process.robot import Robot
 from compose.scenario.scenario_file import load
@@ -155,9 +155,9 @@ def _taken(message: Message, path: tuple[object, ...], value: str) -> bool:
 
 
 def test_every_word_for_a_state_is_within_its_bound() -> None:
-    for word in (*WORDS.values(), "localised", "undecided", "alarm"):
-        drive = Command(0, "a", 0.0, 0.0, 1, word)
-        assert decode(encode(drive), Command) == drive
+    for word in (*MODE_NAMES.values(), "localised", "undecided", "alarm"):
+        command = Command(0, "a", 0.0, 0.0, 1, word)
+        assert decode(encode(command), Command) == command
 
 
 # --- journals -----------------------------------------------------------------------------------------
@@ -176,14 +176,14 @@ def test_a_world_whose_reason_is_too_long_leaves_a_journal_that_is_read_and_take
 def test_an_agent_that_gives_up_at_length_leaves_a_journal_that_is_read(tmp_path: Path) -> None:
     scenario, path = load("paper-1"), tmp_path / "agent-a.journal"
     with Journal(path) as journal:
-        robot = Robot(scenario.briefing("a"), journal)
-        robot.sense(Observation(0, "a", None, 1.0))
+        robot = Robot(scenario.config("a"), journal)
+        robot.observation(Observation(0, "a", None, 1.0))
         robot.mind = robot.mind.undecided("\U0001f600" * 1000)
-        drive = robot.decide()
+        command = robot.decide()
         robot.estimate()
-        robot.farewell(MissionEnd(1, "undecided", f"a: {'x' * 1000}"))
-    assert drive.verdict == Undecided("\U0001f600" * MAX_TEXT)
-    assert past(read(path), path).farewell is not None
+        robot.final_report(MissionEnd(1, "undecided", f"a: {'x' * 1000}"))
+    assert command.verdict == Undecided("\U0001f600" * MAX_TEXT)
+    assert past(read(path), path).final_report is not None
     for frame in read(path):
         decode(frame, OfRobot, MAX_FRAME_BYTES)
 
@@ -198,8 +198,8 @@ def test_a_verdict_of_as_many_words_as_there_may_be_ends_a_run_whose_record_is_r
         world(scenario, "--run", RUN, "--out", out) as (clock, endpoint),
         session.open_client(at(endpoint), lambda: None) as link,
     ):
-        drives = {robot: session.publisher(link, keys.drive(RUN, robot)) for robot in "ab"}
-        session.subscribe(link, keys.sense(RUN, "*"), heard, "sense")
+        commands = {robot: session.publisher(link, keys.command(RUN, robot)) for robot in "ab"}
+        session.subscribe(link, keys.observation(RUN, "*"), heard, "sense")
         tokens = [session.show_alive(link, keys.robot_alive(RUN, robot)) for robot in "ab"]
         parted = set[str]()
         while len(parted) < 2:
@@ -211,12 +211,12 @@ def test_a_verdict_of_as_many_words_as_there_may_be_ends_a_run_whose_record_is_r
             )
             match message:
                 case Observation(tick):
-                    drives[robot].put(encode(Command(tick, robot, 0.0, 0.0, 1, "undecided", gives_up)))
+                    commands[robot].put(encode(Command(tick, robot, 0.0, 0.0, 1, "undecided", gives_up)))
                 case MissionEnd(_, outcome, reason):
                     assert (outcome, reason) == ("undecided", f"a: {gives_up.reason}"[:MAX_TEXT])
                     said = replace(example_of(FinalReport), robot=robot)
                     assert isinstance(said, FinalReport)
-                    drives[robot].put(encode(said))
+                    commands[robot].put(encode(said))
                 case FinalReport():
                     parted.add(robot)
         assert clock.ended().status == 1, clock.err

@@ -140,7 +140,7 @@ class Setting(NamedTuple):
         return found, True
 
 
-def drive(start: Pose, controls: Sequence[Controls]) -> list[Pose]:
+def command(start: Pose, controls: Sequence[Controls]) -> list[Pose]:
     """Q: the start, and where each manoeuvre ends."""
     poses = [start]
     for control in controls:
@@ -181,7 +181,7 @@ def test_for_any_n_a_rotation_about_the_anchor_is_indistinguishable(
     start: Pose, controls: list[Controls], beta: float
 ) -> None:
     """Proposition 1 (1)."""
-    truth, rotated = drive(start, controls), drive(compose(Pose(0.0, 0.0, beta), start), controls)
+    truth, rotated = command(start, controls), command(compose(Pose(0.0, 0.0, beta), start), controls)
     for one, other in zip(truth, rotated, strict=True):
         assert abs(place(other)) == pytest.approx(abs(place(one)), abs=1e-12)
         assert place(other) == pytest.approx(cmath.rect(1.0, beta) * place(one), abs=1e-12)
@@ -193,9 +193,9 @@ def test_three_points_or_more_that_are_not_collinear_leave_rotations_only(
     rho0: float, heading: float, controls: list[Controls]
 ) -> None:
     """Proposition 1 is necessary too, and "any measurement beyond the third adds no further information"."""
-    odometry = [place(pose) for pose in drive(ORIGIN, controls)]
+    odometry = [place(pose) for pose in command(ORIGIN, controls)]
     assume(off_the_line(odometry) > 0.1)
-    rho = [abs(place(pose)) for pose in drive(Pose(rho0, 0.0, heading), controls)]
+    rho = [abs(place(pose)) for pose in command(Pose(rho0, 0.0, heading), controls)]
     found, is_complete = headings_that_fit(rho0, odometry, rho)
     assume(is_complete)
     assert len(found) == 1
@@ -220,9 +220,9 @@ def test_two_points_or_collinear_ones_leave_the_mirror_image_too_and_nothing_els
 
     The points are mirrored, by a turn about q_0: what the robot drove between them is turned.
     """
-    poses = drive(ORIGIN, controls)
+    poses = command(ORIGIN, controls)
     odometry = [place(pose) for pose in poses]
-    truth = [place(pose) for pose in drive(Pose(rho0, 0.0, heading), controls)]
+    truth = [place(pose) for pose in command(Pose(rho0, 0.0, heading), controls)]
     rho = [abs(point) for point in truth]
     found, is_complete = headings_that_fit(rho0, odometry, rho)
     assume(is_complete)
@@ -247,8 +247,8 @@ def test_a_third_range_tells_the_branches_apart_unless_omega_1_makes_full_turns(
     """Below eq. (3) the paper excludes omega_1 = j pi. But it is omega_1 T_s = 2 j pi that leaves q_2 on the
     line of q_0 and q_1; half a turn tells the branches apart, and Section IV allows it (omega_max = pi)."""
     controls = [Controls(1.0, 0.0), Controls(1.0, half_turns * math.pi / PERIOD)]
-    odometry = [place(pose) for pose in drive(ORIGIN, controls)]
-    rho = [abs(place(pose)) for pose in drive(Pose(2.0, 0.0, 1.2), controls)]
+    odometry = [place(pose) for pose in command(ORIGIN, controls)]
+    rho = [abs(place(pose)) for pose in command(Pose(2.0, 0.0, 1.2), controls)]
     found, is_complete = headings_that_fit(2.0, odometry, rho)
     assert is_complete
     assert len(found) == classes

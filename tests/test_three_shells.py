@@ -158,13 +158,13 @@ def test_whatever_a_stranger_answers_an_agent_finds_its_world(stranger: str) -> 
         world("paper-1", "--run", "mine") as (_, endpoint),
         session.open_client(at(endpoint), unanswered) as link,
     ):
-        key = keys.briefing("*", "*")
+        key = keys.config("*", "*")
 
         def reply(query: zenoh.Query) -> None:
             if stranger == "refuses":
                 query.reply_err(b"go away", encoding=session.REFUSAL)
             else:
-                frame = b"junk" if stranger == "answers nonsense" else encode(load("paper-1").briefing("b"))
+                frame = b"junk" if stranger == "answers nonsense" else encode(load("paper-1").config("b"))
                 query.reply(query.key_expr, frame)
 
         if stranger == "shows a world":
@@ -178,7 +178,7 @@ def test_whatever_a_stranger_answers_an_agent_finds_its_world(stranger: str) -> 
 def test_an_agent_that_is_answered_nonsense_alone_looks_on_and_says_why() -> None:
     with session.open_router(listening(endpoint := free_endpoint())) as link:
         _token = session.show_alive(link, keys.world_alive("mine"))
-        link.declare_queryable(keys.briefing("mine", "*"), lambda query: query.reply(query.key_expr, b"junk"))
+        link.declare_queryable(keys.config("mine", "*"), lambda query: query.reply(query.key_expr, b"junk"))
         ended = tandem("agent", "a", "--connect", endpoint, "--wait", "1")
     assert ended.status == 3
     assert "gave up after 1 s: the world's briefing is not understood: 4 bytes" in ended.err
@@ -190,7 +190,7 @@ def test_an_agent_that_meets_several_runs_must_be_told_which() -> None:
         session.open_client(at(endpoint), unanswered) as link,
     ):
         _token = session.show_alive(link, keys.world_alive("yours"))
-        session.answer(link, keys.briefing("yours", "a"), lambda _: load("paper-1").briefing("a"))
+        session.answer(link, keys.config("yours", "a"), lambda _: load("paper-1").config("a"))
         ended = tandem("agent", "a", "--connect", endpoint)
         says = "tandem agent: several runs are alive: mine, yours; choose one with --run\n"
         assert ended == (2, "", says)

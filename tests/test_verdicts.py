@@ -46,10 +46,10 @@ def test_a_reason_handed_on_stays_within_what_a_message_can_hold() -> None:
 
 def test_a_wrong_claim_cannot_be_taken_back() -> None:
     step = next(steps("paper-1"))
-    claim = replace(step.drives["a"], verdict=Localised(replace(ORIGIN, x=5.0)))
-    world = advance(step.world, step.drives | {"a": claim})
+    claim = replace(step.commands["a"], verdict=Localised(replace(ORIGIN, x=5.0)))
+    world = advance(step.world, step.commands | {"a": claim})
     assert isinstance(world, World)
-    world = advance(world, step.drives)
+    world = advance(world, step.commands)
     assert isinstance(world, World)
     judgement = judge(world.scenario, world.truth, world.verdicts | {"b": GAVE_UP})
     assert judgement is not None
@@ -66,7 +66,7 @@ def test_the_letter_gives_up_where_the_third_mutual_range_settles_nothing(
     assert record.end is not None
     assert record.end.outcome == "undecided"
     assert record.end.reason == "b: the third mutual range does not settle where they are"
-    states = [(moment.drives["a"].state, moment.drives["b"].state) for moment in record.moments]
+    states = [(moment.commands["a"].state, moment.commands["b"].state) for moment in record.moments]
     assert states[-3:] == [("straight", "standing"), ("waiting", "last-manoeuvre"), ("waiting", "undecided")]
 
 
@@ -121,14 +121,14 @@ def test_no_sigma_excuses_a_claim_that_is_farther_off_than_the_accuracy_allows()
 
 @pytest.mark.parametrize("whose", ["its own", "its peer's"])
 def test_without_a_world_a_claim_less_accurate_than_was_asked_does_not_end_localised(whose: str) -> None:
-    briefing = parse(NOISY, "noisy", seed=1).briefing("a")
+    config = parse(NOISY, "noisy", seed=1).config("a")
     good, vague = (Localised(ORIGIN, covariance(sigma, 0.01)) for sigma in (0.05, 4.5e7))
     own, peers = (vague, good) if whose == "its own" else (good, vague)
     for mine, other, outcome in ((own, peers, "undecided"), (good, good, "localised")):
-        ending = Ending(briefing, 100, 30.0)
+        ending = Ending(config, 100, 30.0)
         ending.told(Report(0, "b", 3, "localised", ORIGIN, 0, 0, (), 0, (), 0, 0, other))
-        drive = Command(0, "a", 0.0, 0.0, 3, "localised", mine)
-        ends = [ending.after(tick, drive, peer_there=True) for tick in range(LAST_WORDS + 1)]
+        command = Command(0, "a", 0.0, 0.0, 3, "localised", mine)
+        ends = [ending.after(tick, command, peer_there=True) for tick in range(LAST_WORDS + 1)]
         assert ends[-1] is not None
         assert ends[-1].outcome == outcome
 
@@ -142,10 +142,10 @@ def honest_claims(variant: str, sigmas: Sequence[float], seeds: Sequence[int], o
             record = play(scenario_of(noise, seed, variant=variant))
             assert record.end is not None
             for moment in record.moments:
-                for drive in moment.drives.values():
-                    if isinstance(drive.verdict, Localised):
+                for command in moment.commands.values():
+                    if isinstance(command.verdict, Localised):
                         claims += 1
-                        assert inaccuracy(drive.verdict, record.scenario.mission) is None, (sigma, seed)
+                        assert inaccuracy(command.verdict, record.scenario.mission) is None, (sigma, seed)
             assert "claims a" not in (record.end.reason or ""), (sigma, seed, record.end)
     return claims
 

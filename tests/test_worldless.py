@@ -68,7 +68,7 @@ def test_an_export_has_what_was_measured_and_believed_and_no_truth(folders: tupl
         assert [told[name] for name in MEASURED] == [known[name] for name in MEASURED]
         past, after = pasts[told["robot"]], int(told["tick"]) + 1
         assert past is not None
-        driven = past.steps[after].sense.executed if after < len(past.steps) else None
+        driven = past.steps[after].observation.executed if after < len(past.steps) else None
         assert told["v"] == (
             "" if driven is None else repr(driven.v)
         )  # where the world knows what was driven
@@ -103,12 +103,12 @@ def test_what_needs_no_truth_is_drawn_as_with_a_world(folders: tuple[Path, Path]
     known, told = pair_of(whole), alone_of(alone)
     assert told.mutual == known.mutual
     assert told.contacts == known.contacts
-    assert told.met == known.met
+    assert told.encounter_tick == known.encounter_tick
     roles: tuple[Role, Role] = ("a", "b")
     for role in roles:
         assert told.robot(role).anchor_ranges == known.robot(role).anchor_ranges
-        assert told.robot(role).drives == known.robot(role).drives
-        assert told.minds(role) == known.minds(role)
+        assert told.robot(role).commands == known.robot(role).commands
+        assert told.states(role) == known.states(role)
         drawn_alone, drawn_whole = drawn(phase_one.draw(told, role)), drawn(phase_one.draw(known, role))
         lines = [
             [np.asarray(one.get_xydata()).tolist() for one in f.axes[0].lines]
@@ -179,9 +179,9 @@ def test_whose_journal_is_shorter_takes_nothing_from_its_peer(
     (tmp_path / "agent-b.journal").write_bytes(b"".join([msgpack.packb(frame) for frame in frames]))
     known, told = pair_of(whole), alone_of(tmp_path)
     assert told.a.anchor_ranges == known.a.anchor_ranges
-    assert told.minds("a") == known.minds("a")
+    assert told.states("a") == known.states("a")
     assert len(told.a.path) == len(known.a.path)
-    assert len(told.b.drives) < len(known.b.drives)
+    assert len(told.b.commands) < len(known.b.commands)
     assert trajectory.draw(told) == steps.draw(told) == Absent(NO_PLACES)
     mutual = line(drawn(over_time.ranges(told)), "mutual-range")
     assert mutual == line(drawn(over_time.ranges(known)), "mutual-range")

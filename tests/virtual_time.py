@@ -34,8 +34,8 @@ MODULES: tuple[ModuleType, ...] = (exercise, rover, broken_drivers)
 class Rover(RealRover):
     """The example, in a process where time is virtual from now on."""
 
-    def __init__(self, briefing: RobotConfig, manoeuvre_s: float) -> None:
+    def __init__(self, config: RobotConfig, manoeuvre_s: float) -> None:
         clock = Clock()
         for module in MODULES:
             module.time = clock  # type: ignore[attr-defined]
-        super().__init__(briefing, manoeuvre_s)
+        super().__init__(config, manoeuvre_s)

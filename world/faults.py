@@ -88,7 +88,7 @@ class Fault(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=
         return share * min(1.0, self.reports_per_tick or 1.0)
 
 
-def hold_up(plan: Sequence[Fault]) -> int:
+def delivery_time_bound(plan: Sequence[Fault]) -> int:
     """Ticks within which a report gets through that is told again every tick; hardly ever it takes more.
 
     Windows of no contact are counted whole; what never lets anything through is not waited for.

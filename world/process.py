@@ -55,17 +55,17 @@ class WorldProcess:
         *,
         rate: float | None = None,
         patience: float = 30.0,
-        reached: Callable[[str, int], None] | None = None,
+        on_kill_point: Callable[[str, int], None] | None = None,
     ) -> None:
         """`course` may have come some way. `rate` is real time's speed, lockstep without.
 
-        `patience` (s) bounds every wait for an answer; `reached` is told how far each tick has come.
+        `patience` (s) bounds every wait for an answer; `on_kill_point` is told how far each tick has come.
         """
         self._run = run
         scenario = course.world.scenario
         self._scenario = scenario
         self._course = course
-        self._reached = reached
+        self._on_kill_point = on_kill_point
         self._period = scenario.mission.period / rate if rate is not None else None
         self._tick_s = self._period or 0.0
         self._patience = patience
@@ -98,12 +98,12 @@ class WorldProcess:
         run, inbox = self._run, self._inbox
         self._silence = SILENCE_S + self._tick_s if replaceable else math.inf
         self._mute = time.monotonic() + self._silence
-        self._sense = {robot: session.publisher(link, keys.sense(run, robot)) for robot in self._robots}
+        self._observation = {robot: session.publisher(link, keys.observation(run, robot)) for robot in self._robots}
         self._truth = session.publisher(link, keys.truth(run))
         session.on_matching(self._truth, self._want_truth)
-        session.subscribe(link, keys.drive(run, "*"), inbox, "drive")
+        session.subscribe(link, keys.command(run, "*"), inbox, "drive")
         session.watch_liveliness(link, keys.robot_alive(run, "*"), inbox)
-        session.answer(link, keys.briefing(run, "*"), self._brief)
+        session.answer(link, keys.config(run, "*"), self._brief)
         self._token = session.show_alive(link, keys.world_alive(run))
 
     def play(self) -> MissionEnd:
@@ -119,13 +119,13 @@ class WorldProcess:
             due = time.monotonic() + self._period
         try:
             while end is None:
-                drives = self._answers(course.senses(), due)
-                if self._reached is not None:
-                    self._reached("drive", course.tick)
-                course.record(drives)
-                if self._reached is not None:
-                    self._reached("journal", course.tick)
-                end = course.advance(drives)
+                commands = self._answers(course.observations(), due)
+                if self._on_kill_point is not None:
+                    self._on_kill_point("drive", course.tick)
+                course.record(commands)
+                if self._on_kill_point is not None:
+                    self._on_kill_point("journal", course.tick)
+                end = course.advance(commands)
                 self._began = time.monotonic() if self._began is None else self._began
                 if self._period is not None:
                     due = max((due or self._began) + self._period, time.monotonic())
@@ -133,9 +133,9 @@ class WorldProcess:
             end = course.end(Judgement("failed", str(silence)))
         self._parting = time.monotonic() if self._parting is None else self._parting
         self.playing_s = self._parting - self._began if self._began is not None else 0.0
-        course.farewells(self._farewells(end, expected))
+        course.final_reports(self._farewells(end, expected))
         self._say_who_gave_none()
-        self._put({robot: encode(farewell) for robot, farewell in course.parted.items()})
+        self._put({robot: encode(final_report) for robot, final_report in course.phase1_done_tick.items()})
         if refused := self._inbox.refused.total():
             late = f", and left aside {self._late} of ticks past" if self._late else ""
             self._inbox.say(f"refused {refused} frames in all{late}")
@@ -143,41 +143,41 @@ class WorldProcess:
 
     # --- a tick ---
 
-    def _answers(self, senses: list[Observation], due: float | None) -> dict[str, Command]:
+    def _answers(self, observations: list[Observation], due: float | None) -> dict[str, Command]:
         """Everyone's Command; in real time, where `due` is when the tick ends, those that came until then."""
         tick = self._course.tick
-        frames = {sense.robot: encode(sense) for sense in senses}
-        if self._reached is not None:
-            self._reached("sense", tick)
+        frames = {observation.robot: encode(observation) for observation in observations}
+        if self._on_kill_point is not None:
+            self._on_kill_point("sense", tick)
         self._put(frames)
-        if self._reached is not None:
-            self._reached("report", tick)
+        if self._on_kill_point is not None:
+            self._on_kill_point("report", tick)
         self._show_truth()
-        drives: dict[str, Command] = {}
+        commands: dict[str, Command] = {}
         now = time.monotonic()
         self._set_repeat(now)
-        while due is not None or len(drives) < len(self._robots):
+        while due is not None or len(commands) < len(self._robots):
             arrival = self._next((self._repeat if due is None else due) - now)
             now = time.monotonic()
             if arrival.topic == "drive":
-                drive = self._answer(arrival)
-                if drive is not None and drive.robot not in drives:
-                    drives[drive.robot] = drive
+                command = self._answer(arrival)
+                if command is not None and command.robot not in commands:
+                    commands[command.robot] = command
                     self._answered = now
             if arrival.topic == "alive" and arrival.source.robot in self._alive:
                 self._tell_missed(arrival.source.robot)
                 self._put_again(frames, [arrival.source.robot])
             if due is None and now >= self._repeat:
-                self._put_all_again(frames, frames.keys() - drives.keys(), now)
-            if len(drives) < len(self._robots) and now - self._answered > self._patience + self._tick_s:
-                raise NoAnswer(self._who_is_missing(drives))
+                self._put_all_again(frames, frames.keys() - commands.keys(), now)
+            if len(commands) < len(self._robots) and now - self._answered > self._patience + self._tick_s:
+                raise NoAnswer(self._who_is_missing(commands))
             if due is not None and now >= due and (arrival is NOTHING or now >= due + self._tick_s):
                 break
-        return drives
+        return commands
 
     def _put(self, frames: Mapping[str, bytes]) -> None:
         for robot, frame in frames.items():
-            self._sense[robot].put(frame)
+            self._observation[robot].put(frame)
 
     def _put_again(self, frames: Mapping[str, bytes], robots: Iterable[str]) -> None:
         """To `robots`, and to their peers, whose reports they may have lost."""
@@ -190,7 +190,7 @@ class WorldProcess:
         self._repeat, self._repeat_to_all = now + REPEAT_S, now + REPEAT_TO_ALL_S
 
     def _put_all_again(self, frames: Mapping[str, bytes], missing: Iterable[str], now: float) -> None:
-        """To those that are `missing`, and to everyone where the last time is long ago."""
+        """To those that are `blocking_reason`, and to everyone where the last time is long ago."""
         self._repeat = now + REPEAT_S
         if now < self._repeat_to_all:
             self._put_again(frames, missing)
@@ -200,8 +200,8 @@ class WorldProcess:
 
     def _tell_missed(self, robot: str) -> None:
         """In real time, what the others have been told while `robot` was away."""
-        for sense in self._course.missed.get(robot, ()):
-            self._sense[robot].put(encode(sense))
+        for observation in self._course.missed.get(robot, ()):
+            self._observation[robot].put(encode(observation))
 
     def _next(self, timeout: float) -> Arrival:
         now = time.monotonic()
@@ -233,21 +233,21 @@ class WorldProcess:
 
     def _answer(self, arrival: Arrival) -> Command | None:
         """The Command that arrived, if it is of this tick."""
-        drive = self._accepted(arrival, Command)
-        if not isinstance(drive, Command):
+        command = self._accepted(arrival, Command)
+        if not isinstance(command, Command):
             return None
-        if drive.tick <= self._course.tick:
-            self._latest[drive.robot] = drive.tick
-        if drive.tick == self._course.tick:
-            return drive
-        if drive.tick > self._course.tick:
+        if command.tick <= self._course.tick:
+            self._latest[command.robot] = command.tick
+        if command.tick == self._course.tick:
+            return command
+        if command.tick > self._course.tick:
             self._inbox.refuse(arrival, "it is of a tick to come")
         else:
             self._late += 1
         return None
 
-    def _who_is_missing(self, drives: Mapping[str, Command]) -> str:
-        missing = [robot for robot in self._robots if robot not in drives]
+    def _who_is_missing(self, commands: Mapping[str, Command]) -> str:
+        missing = [robot for robot in self._robots if robot not in commands]
         names = ", ".join(robot if robot in self._alive else f"{robot} (not there)" for robot in missing)
         return f"no answer from {names} at tick {self._course.tick} for {self._patience:g} s"
 
@@ -255,7 +255,7 @@ class WorldProcess:
         """Tell of which robots there is no FinalReport, and why."""
         reasons: dict[str, list[str]] = {}
         for robot in self._robots:
-            if robot not in self._course.parted:
+            if robot not in self._course.phase1_done_tick:
                 reasons.setdefault(self._why_none(robot), []).append(robot)
         for reason, robots in reasons.items():
             self._inbox.say(f"no FinalReport of {', '.join(robots)}: {reason}")
@@ -286,7 +286,7 @@ class WorldProcess:
         if robot not in self._robots:
             near = did_you_mean(robot, self._robots)
             return f"this world has no robot '{robot}'; it has {', '.join(self._robots)}{near}"
-        return self._scenario.briefing(robot, self._period)
+        return self._scenario.config(robot, self._period)
 
     def _farewells(self, end: MissionEnd, expected: Collection[str]) -> list[FinalReport]:
         """Tell everyone that it is over, until everyone has answered or left.
@@ -295,7 +295,7 @@ class WorldProcess:
         whoever else is there, for FAREWELL_S.
         """
         frames = dict.fromkeys(self._robots, encode(end))
-        said = self._last_words = {**self._course.parted, **self._last_words}
+        said = self._last_words = {**self._course.phase1_done_tick, **self._last_words}
         now = time.monotonic()
         began = self._parting or now
         self._repeat = self._repeat_to_all = now

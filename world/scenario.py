@@ -22,7 +22,7 @@ class RobotSpec(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fie
     anchor: Anchor
     start: Pose
     rendezvous: Rendezvous
-    lie: Attack | None = None
+    attack: Attack | None = None
 
 
 class Scenario(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="scenario"):
@@ -49,12 +49,12 @@ class Scenario(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fiel
                 return placed
         raise KeyError(robot)
 
-    def is_of(self, briefing: RobotConfig) -> bool:
+    def is_of(self, config: RobotConfig) -> bool:
         """Whether that is what one of its robots is told, be it in real time or in lockstep."""
-        known = any(placed.id == briefing.robot for placed in self.robots)
-        return known and self.briefing(briefing.robot, briefing.tick_s) == briefing
+        known = any(placed.id == config.robot for placed in self.robots)
+        return known and self.config(config.robot, config.tick_s) == config
 
-    def briefing(self, robot: str, tick_s: float | None = None) -> RobotConfig:
+    def config(self, robot: str, tick_s: float | None = None) -> RobotConfig:
         """What `robot` is told; nothing of where it is. `tick_s` is set in real time only."""
         own = self.robot(robot)
         return RobotConfig(
@@ -66,6 +66,6 @@ class Scenario(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fiel
             mission=self.mission,
             variant=self.variant,
             rendezvous=own.rendezvous,
-            lie=own.lie,
+            attack=own.attack,
             tick_s=tick_s,
         )

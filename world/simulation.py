@@ -11,7 +11,7 @@ from protocol.messages import Command, DeadlineMissed, Environment, FinalReport,
 from protocol.wire import encode
 from world.referee import Judgement
 from world.scenario import Scenario
-from world.tick import advance, release, senses
+from world.tick import advance, release, observations
 from world.world_journal import history
 
 
@@ -27,7 +27,7 @@ class Course:
         """once the run is"""
         self.witnesses: tuple[str, ...] = ()
         """who answered in the tick that was the last, if they ended the run"""
-        self.parted: dict[str, FinalReport] = {}
+        self.phase1_done_tick: dict[str, FinalReport] = {}
         """what they said to that, as far as it is on record"""
         self.missed: dict[str, list[Observation]] = {}
         """what robots have sensed since they last answered in time; a process that comes back may not know"""
@@ -40,46 +40,46 @@ class Course:
         """k"""
         return self.world.truth.tick
 
-    def senses(self) -> list[Observation]:
+    def observations(self) -> list[Observation]:
         """What every robot senses now, in the order of the scenario."""
-        return senses(self.world)
+        return observations(self.world)
 
     def keep(self, journal: Sink) -> None:
         """Go on journaling there."""
         self._journal = journal
 
-    def drive(self, drives: Mapping[str, Command]) -> MissionEnd | None:
-        """One tick on; or the end. A robot that is not in `drives` stands still."""
-        self.record(drives)
-        return self.advance(drives)
+    def command(self, commands: Mapping[str, Command]) -> MissionEnd | None:
+        """One tick on; or the end. A robot that is not in `commands` stands still."""
+        self.record(commands)
+        return self.advance(commands)
 
-    def record(self, drives: Mapping[str, Command]) -> None:
-        """First half of `drive`: the tick is on record."""
+    def record(self, commands: Mapping[str, Command]) -> None:
+        """First half of `command`: the tick is on record."""
         if self._journal is not None:
             self._journal.write(
                 *[
-                    encode(drives[robot.id] if robot.id in drives else DeadlineMissed(self.tick, robot.id))
+                    encode(commands[robot.id] if robot.id in commands else DeadlineMissed(self.tick, robot.id))
                     for robot in self.world.scenario.robots
                 ]
             )
 
-    def advance(self, drives: Mapping[str, Command]) -> MissionEnd | None:
-        """Second half of `drive`: everyone has moved."""
-        if self.missed or len(drives) < len(self.world.scenario.robots):
-            self._note_missed(drives)
-        onward = advance(self.world, drives)
+    def advance(self, commands: Mapping[str, Command]) -> MissionEnd | None:
+        """Second half of `command`: everyone has moved."""
+        if self.missed or len(commands) < len(self.world.scenario.robots):
+            self._note_missed(commands)
+        onward = advance(self.world, commands)
         if isinstance(onward, Judgement):
-            self.witnesses = tuple(drives)
+            self.witnesses = tuple(commands)
             return self.end(onward)
         self.world = onward
         return None
 
-    def _note_missed(self, drives: Mapping[str, Command]) -> None:
-        for sense in self.senses():
-            if sense.robot in drives:
-                self.missed.pop(sense.robot, None)
+    def _note_missed(self, commands: Mapping[str, Command]) -> None:
+        for observation in self.observations():
+            if observation.robot in commands:
+                self.missed.pop(observation.robot, None)
             else:
-                self.missed.setdefault(sense.robot, []).append(sense)
+                self.missed.setdefault(observation.robot, []).append(observation)
 
     def end(self, judgement: Judgement) -> MissionEnd:
         """The run is over."""
@@ -88,15 +88,15 @@ class Course:
             self._journal.write(encode(self.over))
         return self.over
 
-    def farewells(self, farewells: Iterable[FinalReport]) -> None:
+    def final_reports(self, final_reports: Iterable[FinalReport]) -> None:
         """What the robots answered to the MissionEnd; those that answered."""
-        said = {farewell.robot: farewell for farewell in farewells}
+        said = {final_report.robot: final_report for final_report in final_reports}
         ids = [robot.id for robot in self.world.scenario.robots]
-        latest = max([ids.index(robot) for robot in self.parted], default=-1)
+        latest = max([ids.index(robot) for robot in self.phase1_done_tick], default=-1)
         new = [said[robot] for robot in ids[latest + 1 :] if robot in said]
-        self.parted |= {farewell.robot: farewell for farewell in new}
+        self.phase1_done_tick |= {final_report.robot: final_report for final_report in new}
         if self._journal is not None and new:
-            self._journal.write(*[encode(farewell) for farewell in new])
+            self._journal.write(*[encode(final_report) for final_report in new])
 
 
 def again(scenario: Scenario, record: Retrace) -> Course:
@@ -123,10 +123,10 @@ def _retrace(course: Course, record: Retrace, named: Environment | None) -> None
     try:
         record.write(*[encode(one) for one in (named, lived.scenario) if one is not None])
         for tick in lived.ticks:
-            course.drive(tick.drives)
+            course.command(tick.commands)
         if lived.end is not None and course.over is None:
             course.end(Judgement(lived.end.outcome, lived.end.reason))
-        course.farewells(lived.farewells.values())
+        course.final_reports(lived.final_reports.values())
     except ReplayMismatch:
         raise CorruptJournal(
             f"{record.path}: on record the world went on otherwise at tick {course.tick}: "

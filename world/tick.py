@@ -45,7 +45,7 @@ def release(scenario: Scenario) -> World:
     return World(scenario, truth, None, {}, {}, pairs, _carried(still, scenario, truth, pairs))
 
 
-def senses(world: World) -> list[Observation]:
+def observations(world: World) -> list[Observation]:
     """What every robot's sensors say now, in the order of the scenario."""
     scenario, truth, driven = world.scenario, world.truth, world.executed
     tick, robots = truth.tick, scenario.robots
@@ -67,19 +67,19 @@ def senses(world: World) -> list[Observation]:
     ]
 
 
-def advance(world: World, drives: Mapping[str, Command]) -> World | Judgement:
+def advance(world: World, commands: Mapping[str, Command]) -> World | Judgement:
     """The world one tick later, or how the run ended. A robot without a Command stands still."""
     scenario, truth = world.scenario, world.truth
     verdicts, claimed = world.verdicts, world.claimed
     driven = []
     exact = scenario.mission.noise.exact
     for place, robot in enumerate(scenario.robots):
-        drive = drives.get(robot.id)
-        done = asked(drive, scenario.mission)
+        command = commands.get(robot.id)
+        done = asked(command, scenario.mission)
         driven.append(done if exact else executed(done, scenario, robot.id, truth.tick))
-        if drive is not None and drive.verdict is not None and robot.id not in verdicts:
-            verdicts = verdicts | {robot.id: drive.verdict}
-            if isinstance(drive.verdict, Localised):
+        if command is not None and command.verdict is not None and robot.id not in verdicts:
+            verdicts = verdicts | {robot.id: command.verdict}
+            if isinstance(command.verdict, Localised):
                 claimed = claimed | {robot.id: truth.poses[place]}
     if verdicts or truth.tick >= scenario.max_ticks:
         judgement = judge(scenario, truth, verdicts, claimed)

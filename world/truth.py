@@ -53,11 +53,11 @@ class Truth(msgspec.Struct, frozen=True):
         return Truth(self.tick + 1, tuple(local), self.origins, tuple(legs))
 
 
-def asked(drive: Command | None, mission: Mission) -> Controls:
+def asked(command: Command | None, mission: Mission) -> Controls:
     """The command that a Command gives: it saturates at v_max and omega_max; without a Command it is to rest."""
-    if drive is None:
+    if command is None:
         return REST
     return Controls(
-        min(max(drive.v, -mission.max_speed), mission.max_speed),
-        min(max(drive.omega, -mission.max_turn_rate), mission.max_turn_rate),
+        min(max(command.v, -mission.max_speed), mission.max_speed),
+        min(max(command.omega, -mission.max_turn_rate), mission.max_turn_rate),
     )

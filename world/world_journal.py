@@ -20,7 +20,7 @@ class Tick(msgspec.Struct, frozen=True):
     """One tick of which every robot's Command is on record."""
 
     world: World
-    drives: dict[str, Command]
+    commands: dict[str, Command]
     """none of a robot whose Command did not come in time"""
 
 
@@ -41,7 +41,7 @@ class History(msgspec.Struct, frozen=True):
     judgement: Judgement | None
     """the referee's, by the truth"""
     end: MissionEnd | None = None
-    farewells: dict[str, FinalReport] = {}
+    final_reports: dict[str, FinalReport] = {}
     disorder: UnexpectedFrame | None = None
     environment: Environment | None = None
     """where it was written; none of an older recording"""
@@ -87,7 +87,7 @@ class JournalReading:
         self.ticks: list[Tick] = []
         self.judgement: Judgement | None = None
         self.end: MissionEnd | None = None
-        self.farewells: dict[str, FinalReport] = {}
+        self.final_reports: dict[str, FinalReport] = {}
         self.disorder: UnexpectedFrame | None = None
 
     def take(self, frame: bytes) -> bool:
@@ -105,19 +105,19 @@ class JournalReading:
             case MissionEnd() if message.tick == tick and self.end is None and not self._said:
                 self.end = message
             case FinalReport() if self.end is not None and message.robot in _still_to_come(
-                self._ids, self.farewells
+                self._ids, self.final_reports
             ):
-                self.farewells[message.robot] = message
+                self.final_reports[message.robot] = message
             case _:
                 self.disorder = UnexpectedFrame(getattr(message, "tick", None), _named(message))
                 return False
         return True
 
     def _go_on(self) -> None:
-        drives = {robot: drive for robot, drive in self._said.items() if isinstance(drive, Command)}
-        self.ticks.append(Tick(self.world, drives))
+        commands = {robot: command for robot, command in self._said.items() if isinstance(command, Command)}
+        self.ticks.append(Tick(self.world, commands))
         self._said = {}
-        onward = advance(self.world, drives)
+        onward = advance(self.world, commands)
         if isinstance(onward, Judgement):
             self.judgement = onward
         else:
@@ -132,7 +132,7 @@ class JournalReading:
             ahead,
             self.judgement,
             self.end,
-            dict(self.farewells),
+            dict(self.final_reports),
             self.disorder,
         )
 
@@ -163,9 +163,9 @@ def _unpaired(scenario: Scenario) -> str | None:
     return None
 
 
-def _still_to_come(ids: list[str], farewells: Iterable[str]) -> list[str]:
+def _still_to_come(ids: list[str], final_reports: Iterable[str]) -> list[str]:
     """Who may say FinalReport next: they stand in the order of the scenario, and some may be lacking."""
-    last = [ids.index(robot) for robot in farewells][-1:]
+    last = [ids.index(robot) for robot in final_reports][-1:]
     return ids[last[0] + 1 :] if last else ids
 
 

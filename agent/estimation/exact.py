@@ -161,15 +161,15 @@ RangedPair = tuple[Pose, Pose, float]
 
 
 def weigh_placements(
-    candidates: Iterable[Placement], sightings: Sequence[PairObservation], sensing_range: float, floor: float
+    candidates: Iterable[Placement], pair_observations: Sequence[PairObservation], sensing_range: float, floor: float
 ) -> tuple[Placement, ...]:
     """Return those of `candidates` that explain every sighting, be it a range or silence.
 
     `floor` is by how much (m) rounding, that of phase 1 included, may put a predicted range off.
     """
     left: list[Placement] = []
-    ranged = [(seen.a, seen.b, seen.range) for seen in sightings if seen.range is not None]
-    silent = [(seen.a, seen.b) for seen in sightings if seen.range is None]
+    ranged = [(seen.a, seen.b, seen.range) for seen in pair_observations if seen.range is not None]
+    silent = [(seen.a, seen.b) for seen in pair_observations if seen.range is None]
     for candidate in candidates:
         placement = _polished_placement(candidate, ranged) if len(ranged) > 2 else candidate
         same = same_turn(math.hypot(placement.x, placement.y) + sensing_range)
@@ -203,15 +203,15 @@ def _explains_silence(placement: Placement, silent: Iterable[tuple[Pose, Pose]],
 
 
 def turn_error(
-    placement: Placement, sightings: Sequence[PairObservation], floor: float, anchors: float
+    placement: Placement, pair_observations: Sequence[PairObservation], floor: float, anchors: float
 ) -> float:
     """Return how far (rad), at the most, either robot may be turned about its anchor off `placement`.
 
-    To first order, of least squares over all ranges in `sightings`: each is off by `floor` m on its own,
+    To first order, of least squares over all ranges in `pair_observations`: each is off by `floor` m on its own,
     and all of them together by the two anchors, which are off by `anchors` m in all. Infinite where they
     leave a turn open, next to a double root of eq. (7).
     """
-    slopes = tuple(_slopes(placement, sightings))
+    slopes = tuple(_slopes(placement, pair_observations))
     pp, pq, qq = _information(slopes)
     determinant = pp * qq - pq * pq
     if determinant <= SINGULAR * pp * qq:
@@ -227,12 +227,12 @@ def turn_error(
     return max(turned_a, turned_b) / determinant
 
 
-def information(placement: Placement, sightings: Sequence[PairObservation]) -> tuple[float, float, float]:
-    """What the ranges in `sightings` tell of phi and of psi, the bearing of M1 in <b(M2)>.
+def information(placement: Placement, pair_observations: Sequence[PairObservation]) -> tuple[float, float, float]:
+    """What the ranges in `pair_observations` tell of phi and of psi, the bearing of M1 in <b(M2)>.
 
     The Fisher information for ranges of 1 m standard deviation, in 1 / rad^2: of phi, mixed, of psi.
     """
-    return _information(_slopes(placement, sightings))
+    return _information(_slopes(placement, pair_observations))
 
 
 def _information(slopes: Iterable[tuple[float, float, float, float]]) -> tuple[float, float, float]:
@@ -245,15 +245,15 @@ def _information(slopes: Iterable[tuple[float, float, float, float]]) -> tuple[f
 
 
 def _slopes(
-    placement: Placement, sightings: Sequence[PairObservation]
+    placement: Placement, pair_observations: Sequence[PairObservation]
 ) -> Iterator[tuple[float, float, float, float]]:
     """Yield, for each range, its derivatives by phi and by psi (m / rad), and the direction from b to a."""
     tx, ty = placement.x, placement.y
-    for sighting in sightings:
-        if sighting.range is None:
+    for pair_observation in pair_observations:
+        if pair_observation.range is None:
             continue
-        there = placement.place(sighting.a)
-        x, y = there.x - sighting.b.x, there.y - sighting.b.y
+        there = placement.place(pair_observation.a)
+        x, y = there.x - pair_observation.b.x, there.y - pair_observation.b.y
         apart = math.hypot(x, y)
         if apart > 0.0:
             ux, uy = x / apart, y / apart

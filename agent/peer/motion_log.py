@@ -11,21 +11,21 @@ from protocol.messages import MAX_REPORT_RANGES, MAX_REPORT_RUNS, Ranged
 from protocol.motion import Pose, Segment, arc, follow
 
 
-class Logbook(msgspec.Struct, frozen=True):
+class MotionLog(msgspec.Struct, frozen=True):
     """What was executed over [0, through], never what was asked, and the ranges taken on the way."""
 
     through: int = 0
     runs: tuple[Segment, ...] = ()
     ranges: tuple[Ranged, ...] = ()
 
-    def moved(self, unrest: tuple[float, float] = (0.0, 0.0)) -> int:
+    def moved(self, standstill_bound: tuple[float, float] = (0.0, 0.0)) -> int:
         """The tick by which the last manoeuvre that was no rest had ended.
 
-        A robot at rest may measure up to `unrest`, in m/s and rad/s.
+        A robot at rest may measure up to `standstill_bound`, in m/s and rad/s.
         """
         at_rest = 0
         for run in reversed(self.runs):
-            if abs(run.v) > unrest[0] or abs(run.omega) > unrest[1]:
+            if abs(run.v) > standstill_bound[0] or abs(run.omega) > standstill_bound[1]:
                 break
             at_rest += run.ticks
         return self.through - at_rest
@@ -34,21 +34,21 @@ class Logbook(msgspec.Struct, frozen=True):
         """Return what was driven over [0, tick]."""
         return self.runs if tick >= self.through else _between(self.runs, 0, tick)
 
-    def drove(self, v: float, omega: float, ticks: int = 1) -> Logbook:
+    def drove(self, v: float, omega: float, ticks: int = 1) -> MotionLog:
         """The log after `ticks` more of one manoeuvre."""
         runs = self.runs
         if runs:
             last = runs[-1]
             if last.v == v and last.omega == omega:
                 runs, ticks_in_all = runs[:-1], last.ticks + ticks
-                return Logbook(self.through + ticks, (*runs, Segment(ticks_in_all, v, omega)), self.ranges)
-        return Logbook(self.through + ticks, (*runs, Segment(ticks, v, omega)), self.ranges)
+                return MotionLog(self.through + ticks, (*runs, Segment(ticks_in_all, v, omega)), self.ranges)
+        return MotionLog(self.through + ticks, (*runs, Segment(ticks, v, omega)), self.ranges)
 
-    def ranged(self, distance: float) -> Logbook:
+    def ranged(self, distance: float) -> MotionLog:
         """The log with an anchor range (m) at its last tick."""
-        return Logbook(self.through, self.runs, (*self.ranges, Ranged(self.through, distance)))
+        return MotionLog(self.through, self.runs, (*self.ranges, Ranged(self.through, distance)))
 
-    def after(self, since: int, ranges_since: int) -> Logbook:
+    def after(self, since: int, ranges_since: int) -> MotionLog:
         """What a peer lacks that knows the manoeuvres through `since`, and the first `ranges_since` ranges.
 
         No more than one report can carry. Its runs begin at tick `since`.
@@ -56,9 +56,9 @@ class Logbook(msgspec.Struct, frozen=True):
         fresh = [begin for begin, run in _dated(self.runs) if begin + run.ticks > since]
         through = fresh[MAX_REPORT_RUNS] if len(fresh) > MAX_REPORT_RUNS else self.through
         ranges = self.ranges[ranges_since : ranges_since + MAX_REPORT_RANGES]
-        return Logbook(through, _between(self.runs, since, through), ranges)
+        return MotionLog(through, _between(self.runs, since, through), ranges)
 
-    def extended(self, since: int, ranges_since: int, told: Logbook) -> Logbook:
+    def extended(self, since: int, ranges_since: int, told: MotionLog) -> MotionLog:
         """The log with what `told` (see `after`) adds; of what would leave a gap, nothing."""
         book = self
         if since <= self.through:
@@ -66,14 +66,14 @@ class Logbook(msgspec.Struct, frozen=True):
                 book = book.drove(run.v, run.omega, run.ticks)
         known = len(self.ranges)
         news = told.ranges[known - ranges_since :] if ranges_since <= known else ()
-        return Logbook(book.through, book.runs, self.ranges + news)
+        return MotionLog(book.through, book.runs, self.ranges + news)
 
     def between(self, first: int, last: int) -> tuple[Segment, ...]:
         """What was driven over [first, last], as few runs."""
         runs = _between(self.runs, first, last)
         if all(one.v != other.v or one.omega != other.omega for one, other in pairwise(runs)):
             return runs
-        return Logbook().extended(0, 0, Logbook(last - first, runs)).runs
+        return MotionLog().extended(0, 0, MotionLog(last - first, runs)).runs
 
     def pose(self, start: Pose, tick: int, period: float) -> Pose:
         """Where the robot was at `tick`, if it was at `start` at tick 0."""

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import msgspec
 
-from agent.peer.motion_log import Logbook
+from agent.peer.motion_log import MotionLog
 from protocol.messages import MAX_REPORT_RANGES, Report, Verdict
 from protocol.motion import Pose
 
 
-class Radio(msgspec.Struct, frozen=True):
+class PeerState(msgspec.Struct, frozen=True):
     """All that is known of the peer, and how much of its own log a robot need not repeat."""
 
-    peer: Logbook = Logbook()
+    peer: MotionLog = MotionLog()
     start: Pose | None = None
     """where tick 0 of the peer's odometry lies in the frame of the peer's anchor"""
     phase: int = 1
@@ -50,15 +50,15 @@ def contradiction(report: Report) -> str | None:
     return None
 
 
-def hear(radio: Radio, report: Report) -> Radio:
+def hear(radio: PeerState, report: Report) -> PeerState:
     """Late, repeated and overtaken reports change nothing but the count."""
     newer = report.tick > radio.latest
     known = len(radio.peer.ranges) >= report.ranges_since
     whole = len(report.ranges) < MAX_REPORT_RANGES
     told_through = report.tick if whole else report.ranges[-1].tick
-    return Radio(
+    return PeerState(
         peer=radio.peer.extended(
-            report.since, report.ranges_since, Logbook(report.through, report.runs, report.ranges)
+            report.since, report.ranges_since, MotionLog(report.through, report.runs, report.ranges)
         ),
         start=radio.start or report.start,
         phase=report.phase if newer else radio.phase,

@@ -54,19 +54,19 @@ class Surveying(msgspec.Struct, frozen=True):
     """Drives where the next ranges are expected to tell most."""
 
     beacon: Beacon
-    drive: Controls = REST
+    command: Controls = REST
 
 
 class Listening(msgspec.Struct, frozen=True):
     """Stands in the peer's range, and waits for what it has not been told of it yet."""
 
-    drive: Controls = REST
+    command: Controls = REST
 
 
 class Retreating(msgspec.Struct, frozen=True):
     """Has left the peer's range: drives back as it came, and as far again, not to do the same once more."""
 
-    drive: Controls
+    command: Controls
     since: int
     """the tick in which it found itself alone"""
 
@@ -125,7 +125,7 @@ def choice(mission: Mission) -> Choice:
 class PlanningHypothesis(NamedTuple):
     """A hypothesis, as far as planning needs it."""
 
-    odds: float
+    probability: float
     poses: Array
     """x, y in m and heading: (3,) of one robot, relative to its anchor; or (6,) of a and b, relative to M1"""
     covariance: Array
@@ -156,10 +156,10 @@ def alone(held: Sequence[PlanningHypothesis], mission: Mission, within: float | 
     cost += _confusion(held, distances, sigma, reach)
     limit = within if within is not None else reach
     for one, distance in zip(held, distances, strict=True):
-        cost += one.odds * LOSS * np.maximum(0.0, ASIDE * reach - distance[:, 0])
+        cost += one.probability * LOSS * np.maximum(0.0, ASIDE * reach - distance[:, 0])
         margin = math.sqrt(max(0.0, float(np.trace(one.covariance)))) if within is None else 0.0
         loss = LOSS if within is not None else ASTRAY
-        cost += one.odds * loss * np.maximum(0.0, distance[:, 0] + min(margin, 0.1 * reach) - limit)
+        cost += one.probability * loss * np.maximum(0.0, distance[:, 0] + min(margin, 0.1 * reach) - limit)
     i = int(np.argmin(cost))
     return Controls(float(ways.v[i]), float(ways.omega[i]))
 
@@ -214,7 +214,7 @@ def _best_of(
             APART * reach - np.min(distance, 1),
             ASIDE * reach - off_anchor,
         ):
-            cost += one.odds * LOSS * np.maximum(0.0, beyond)
+            cost += one.probability * LOSS * np.maximum(0.0, beyond)
         if one is not held[0]:
             continue
         rows = np.zeros((count, 3 * AHEAD, 6))
@@ -292,7 +292,7 @@ def _confusion(
     first = np.minimum(distances[0], RIM * reach)
     for one, distance in zip(held[1:], distances[1:], strict=True):
         gap = np.square((np.minimum(distance, RIM * reach) - first) / (COARSE * sigma))
-        left += math.sqrt(held[0].odds * one.odds) * np.exp(-np.minimum(np.sum(gap, 1), SURE) / 8.0)
+        left += math.sqrt(held[0].probability * one.probability) * np.exp(-np.minimum(np.sum(gap, 1), SURE) / 8.0)
     return CONFUSION * left
 
 

@@ -49,217 +49,217 @@ ENOUGH = 60
 """mutual ranges, after which it is ranges to the anchor that are lacking"""
 
 
-def sensed(mind: RobotState, anchor_range: float | None) -> RobotState:
-    """`mind` in the state that its own senses lead to."""
-    match mind.state:
+def sensed(state: RobotState, anchor_range: float | None) -> RobotState:
+    """`state` in the state that its own senses lead to."""
+    match state.mode:
         case Straight("anchor") | Backing("anchor") | Turning("anchor") | Circling("anchor"):
-            mission, variant = mind.briefing.mission, mind.briefing.variant
+            mission, variant = state.config.mission, state.config.variant
             onward = range_seeking.onward(
-                mind.state, mind.odometry, anchor_range is not None, mission, variant
+                state.mode, state.odometry, anchor_range is not None, mission, variant
             )
-            return _surveyed(mind) if onward is None else replace(mind, state=onward)
+            return _surveyed(state) if onward is None else replace(state, mode=onward)
         case Surveying("anchor"):
-            return _surveyed(mind) if decides(mind) else mind
+            return _surveyed(state) if decides(state) else state
         case Homing():
             if anchor_range is not None:
-                return _surveyed(mind)
-            there = range_seeking.homeward(mind.state, mind.odometry, mind.briefing.mission) is None
-            return replace(mind, state=Straight("anchor", mind.odometry, 0.0)) if there else mind
+                return _surveyed(state)
+            there = range_seeking.homeward(state.mode, state.odometry, state.config.mission) is None
+            return replace(state, mode=Straight("anchor", state.odometry, 0.0)) if there else state
         case Aligning() | Radial() | Tangent() | Orbiting():
-            return _under_way(mind, anchor_range is not None)
+            return _under_way(state, anchor_range is not None)
         case Surveying("peer") | Listening() | Retreating():
-            return _beside(mind)
+            return _beside(state)
         case _:
-            return mind
+            return state
 
 
-def decides(mind: RobotState) -> bool:
+def decides(state: RobotState) -> bool:
     """Whether this is a tick for a new manoeuvre; the same for both robots, so that they choose together."""
-    return mind.tick % active_sensing.stride(mind.briefing.mission) == 0
+    return state.tick % active_sensing.stride(state.config.mission) == 0
 
 
-def _surveyed(mind: RobotState) -> RobotState:
+def _surveyed(state: RobotState) -> RobotState:
     """Phase 1: what the ranges to the anchor leave possible, and whether that is enough.
 
     Where no hypothesis explains in which places the anchor was silent, its ranges mislead: then more of them
     are taken about the place of the last, as at first.
     """
-    ranged = mind.log.ranges[-1].tick == mind.tick
-    weighed = inference.own_anchor(mind)
-    if weighed:
-        mind = inference.with_own(mind, weighed)
-    if _silent(mind) >= LOST * active_sensing.stride(mind.briefing.mission):
-        return _homeward(mind)
-    if not weighed or weighed[0].silence < MISLED + _by_drop_outs(mind):
+    ranged = state.log.ranges[-1].tick == state.tick
+    scored = inference.own_anchor(state)
+    if scored:
+        state = inference.with_own(state, scored)
+    if _silent(state) >= LOST * active_sensing.stride(state.config.mission):
+        return _homeward(state)
+    if not scored or scored[0].silence < MISLED + _by_drop_outs(state):
         if not ranged:
-            return _homeward(mind)
-        return replace(mind, state=Straight("anchor", mind.odometry, mind.log.ranges[-1].range))
-    mission = mind.briefing.mission
-    if inference.settled(weighed, mission):
-        kind: BranchKind = "circle" if len(mind.log.ranges) == 2 else "three-ranges"
-        parted = mind.tick if mind.findings.parted is None else mind.findings.parted
-        mind = replace(mind, findings=replace(mind.findings, branch_kind=kind, parted=parted))
-        return _parted(mind)
-    drive = active_sensing.alone(inference.held_alone(weighed), mission)
-    return replace(mind, state=Surveying("anchor", drive))
+            return _homeward(state)
+        return replace(state, mode=Straight("anchor", state.odometry, state.log.ranges[-1].range))
+    mission = state.config.mission
+    if inference.settled(scored, mission):
+        kind: BranchKind = "circle" if len(state.log.ranges) == 2 else "three-ranges"
+        parted = state.tick if state.belief.phase1_done_tick is None else state.belief.phase1_done_tick
+        state = replace(state, belief=replace(state.belief, branch_kind=kind, phase1_done_tick=parted))
+        return _parted(state)
+    command = active_sensing.alone(inference.held_alone(scored), mission)
+    return replace(state, mode=Surveying("anchor", command))
 
 
-def _by_drop_outs(mind: RobotState) -> float:
+def _by_drop_outs(state: RobotState) -> float:
     """In log-likelihood: what as many drop-outs cost as there may be by now."""
-    p = mind.briefing.mission.noise.drop_outs
-    expected = p * (mind.tick + 1)
+    p = state.config.mission.noise.drop_outs
+    expected = p * (state.tick + 1)
     return (expected + UNLUCKY * math.sqrt(expected)) * math.log(p) if p else 0.0
 
 
-def _silent(mind: RobotState) -> int:
+def _silent(state: RobotState) -> int:
     """Ticks since the anchor was ranged."""
-    return mind.tick - mind.log.ranges[-1].tick
+    return state.tick - state.log.ranges[-1].tick
 
 
-def _homeward(mind: RobotState) -> RobotState:
+def _homeward(state: RobotState) -> RobotState:
     """Back to where the anchor was ranged last; all that is held of where it is, is doubted."""
-    last = mind.log.ranges[-1].tick
-    place = mind.log.pose(ORIGIN, last, mind.briefing.mission.period)
-    findings = replace(mind.findings, own=(), met=None, pair=(), returns=mind.findings.returns + 1)
-    return replace(mind, state=Homing(place), findings=findings)
+    last = state.log.ranges[-1].tick
+    place = state.log.pose(ORIGIN, last, state.config.mission.period)
+    findings = replace(state.belief, own=(), encounter_tick=None, pair=(), returns=state.belief.returns + 1)
+    return replace(state, mode=Homing(place), belief=findings)
 
 
-def _parted(mind: RobotState) -> RobotState:
+def _parted(state: RobotState) -> RobotState:
     """To the rendezvous, for the first time or again."""
-    mu = phase2_orbit.orientation(mind.local_pose)
-    return _under_way(replace(mind, state=Aligning(mind.odometry.heading - mu)), False)
+    mu = phase2_orbit.orientation(state.local_pose)
+    return _under_way(replace(state, mode=Aligning(state.odometry.heading - mu)), False)
 
 
-def _under_way(mind: RobotState, ranged: bool) -> RobotState:
+def _under_way(state: RobotState, ranged: bool) -> RobotState:
     """Phase 2, with what another range to the anchor adds; b goes on to survey where it waits."""
-    mission = mind.briefing.mission
-    weighed: Sequence[ScoredHypothesis] = ()
-    if ranged and decides(mind) and (weighed := inference.own_anchor(mind)):
-        mind = inference.with_own(mind, weighed)
-        if isinstance(mind.state, Radial) and abs(phase2_orbit.orientation(mind.local_pose)) > OFF_RADIUS:
-            return _parted(mind)
-    assert isinstance(mind.state, Aligning | Radial | Tangent | Orbiting)
-    state = phase2_orbit.onward(mind.state, mind.odometry, mind.start, mind.orbit, mission)
+    mission = state.config.mission
+    scored: Sequence[ScoredHypothesis] = ()
+    if ranged and decides(state) and (scored := inference.own_anchor(state)):
+        state = inference.with_own(state, scored)
+        if isinstance(state.mode, Radial) and abs(phase2_orbit.orientation(state.local_pose)) > OFF_RADIUS:
+            return _parted(state)
+    assert isinstance(state.mode, Aligning | Radial | Tangent | Orbiting)
+    mode = phase2_orbit.onward(state.mode, state.odometry, state.start, state.orbit, mission)
     patience: float = LOST * active_sensing.stride(mission)
-    if mind.orbit.v == 0.0 and isinstance(state, Radial | Orbiting) and _silent(mind) >= patience:
-        return _homeward(mind)
-    if isinstance(state, Orbiting):
-        since = state.since or mind.tick
-        patience += mind.briefing.rendezvous.bound / mission.period
-        if mind.orbit.v != 0.0 and mind.tick - since > patience and not mind.in_contact:
-            return _homeward(mind)
-        if mind.orbit.v != 0.0:
-            drive = phase2_orbit.pursuit(mind.local_pose, mind.orbit, mission)
-        elif weighed:
-            drive = active_sensing.alone(inference.held_alone(weighed), mission, mind.orbit.radius)
+    if state.orbit.v == 0.0 and isinstance(mode, Radial | Orbiting) and _silent(state) >= patience:
+        return _homeward(state)
+    if isinstance(mode, Orbiting):
+        since = mode.since or state.tick
+        patience += state.config.rendezvous.bound / mission.period
+        if state.orbit.v != 0.0 and state.tick - since > patience and not state.in_contact:
+            return _homeward(state)
+        if state.orbit.v != 0.0:
+            command = phase2_orbit.pursuit(state.local_pose, state.orbit, mission)
+        elif scored:
+            command = active_sensing.alone(inference.held_alone(scored), mission, state.orbit.radius)
         else:
-            drive = REST if decides(mind) else state.drive or REST
-        state = Orbiting(drive, since)
-    return replace(mind, state=state)
+            command = REST if decides(state) else mode.command or REST
+        mode = Orbiting(command, since)
+    return replace(state, mode=mode)
 
 
 # --- with the peer ------------------------------------------------------------------------------------
 
 
-def _beside(mind: RobotState) -> RobotState:
+def _beside(state: RobotState) -> RobotState:
     """Phase 3, by whether the peer, and for b its anchor, are in range."""
-    stride = active_sensing.stride(mind.briefing.mission)
-    match mind.state:
-        case Retreating(_, since) if mind.tick - since < 2 * stride:
-            return mind
+    stride = active_sensing.stride(state.config.mission)
+    match state.mode:
+        case Retreating(_, since) if state.tick - since < 2 * stride:
+            return state
         case Retreating():
-            return replace(mind, state=Surveying("peer")) if mind.in_contact else _parted(mind)
-        case _ if mind.briefing.role == "b" and _silent(mind) >= LOST_TOGETHER * stride:
-            return _homeward(mind)
-        case Surveying(_, drive) | Listening(drive) if not mind.in_contact:
-            return replace(mind, state=Retreating(Controls(0.0 - drive.v, 0.0 - drive.omega), mind.tick))
+            return replace(state, mode=Surveying("peer")) if state.in_contact else _parted(state)
+        case _ if state.config.role == "b" and _silent(state) >= LOST_TOGETHER * stride:
+            return _homeward(state)
+        case Surveying(_, command) | Listening(command) if not state.in_contact:
+            return replace(state, mode=Retreating(Controls(0.0 - command.v, 0.0 - command.omega), state.tick))
         case _:
-            return mind
+            return state
 
 
-def heard(mind: RobotState) -> RobotState:
+def heard(state: RobotState) -> RobotState:
     """What the robot is set to do once it has heard its peer, in range."""
-    match mind.state:
+    match state.mode:
         case Done() | Asleep():
-            return mind
+            return state
         case Surveying("anchor") | Straight() | Backing() | Turning() | Circling() | Homing():
-            return mind
-        case _ if mind.radio.start is None:
-            return mind
+            return state
+        case _ if state.peer_state.start is None:
+            return state
         case Retreating():
-            return mind
-        case Surveying("peer") | Listening() if not decides(mind):
-            return mind
-        case _ if not inference.answered(mind):
-            return replace(mind, state=Listening())
+            return state
+        case Surveying("peer") | Listening() if not decides(state):
+            return state
+        case _ if not inference.answered(state):
+            return replace(state, mode=Listening())
         case _:
-            return _considered(mind)
+            return _considered(state)
 
 
-def _considered(mind: RobotState) -> RobotState:
+def _considered(state: RobotState) -> RobotState:
     """Both logs in hand: weigh the hypotheses; then claim, or plan what both do next."""
-    mission, role = mind.briefing.mission, mind.briefing.role
-    if mind.findings.met is None:
-        mind = replace(mind, findings=replace(mind.findings, met=mind.tick))
-    pair = inference.pair_of(mind)
+    mission, role = state.config.mission, state.config.role
+    if state.belief.encounter_tick is None:
+        state = replace(state, belief=replace(state.belief, encounter_tick=state.tick))
+    pair = inference.pair_of(state)
     mutual = pair.ranges.counts[2]
     if mutual < FEW:
-        return _blindly(mind)
-    known = mind.findings.pair
-    searched = not known or any(mind.findings.sought < count <= mutual for count in SEARCHED)
-    weighed = search(pair) if searched else follow(known, pair)
+        return _blindly(state)
+    known = state.belief.pair
+    searched = not known or any(state.belief.ranges_at_last_search < count <= mutual for count in SEARCHED)
+    scored = search(pair) if searched else follow(known, pair)
     if searched:
-        mind = replace(mind, findings=replace(mind.findings, sought=mutual))
+        state = replace(state, belief=replace(state.belief, ranges_at_last_search=mutual))
     checked = CHECKED_WITH_OUTLIERS if mission.noise.outliers else CHECKED
-    judged = inference.with_pair(mind, weighed, pair, checked)
-    if (judged.findings.missing is None or _against(judged, DOUBTFUL)) and not searched:
-        weighed, searched = search(pair), True
-        judged = inference.with_pair(mind, weighed, pair, checked)
-    judged = inference.finished(judged, weighed)
+    judged = inference.with_pair(state, scored, pair, checked)
+    if (judged.belief.blocking_reason is None or _against(judged, DOUBTFUL)) and not searched:
+        scored, searched = search(pair), True
+        judged = inference.with_pair(state, scored, pair, checked)
+    judged = inference.finished(judged, scored)
     if searched:
         judged = _doubted(judged)
     if judged.verdict is not None:
         return judged
     few = len(pair.places) < 2 * checked
-    if judged.findings.missing is None and not (few and _against(judged, WARY)):
+    if judged.belief.blocking_reason is None and not (few and _against(judged, WARY)):
         return claimed(judged)
-    if role == "a" and len(pair.places) >= ENOUGH * (1 + mind.findings.returns):
+    if role == "a" and len(pair.places) >= ENOUGH * (1 + state.belief.returns):
         return _homeward(judged)
-    if not weighed:
+    if not scored:
         return _blindly(judged)
     a, b = active_sensing.together(
-        inference.held_together(weighed, pair), pair.apart, mind.mutual[-1].range, mission
+        inference.held_together(scored, pair), pair.apart, state.mutual[-1].range, mission
     )
     return replace(judged, state=Surveying("peer", a if role == "a" else b))
 
 
-def _against(mind: RobotState, bound: float) -> bool:
+def _against(state: RobotState, bound: float) -> bool:
     """Whether what most speaks against the likeliest hypothesis is less probable than `bound`."""
-    against = mind.findings.against
+    against = state.belief.against
     return against is not None and against.p_value < bound
 
 
-def _doubted(mind: RobotState) -> RobotState:
-    """`mind`, after a search of the whole plane; alarmed, if its peer is beyond belief over and over."""
-    findings = mind.findings
+def _doubted(state: RobotState) -> RobotState:
+    """`state`, after a search of the whole plane; alarmed, if its peer is beyond belief over and over."""
+    findings = state.belief
     against = findings.against
     if against is None:
-        return mind
+        return state
     least = min(against.p_value, findings.p_value if findings.p_value is not None else 1.0)
     doubts = findings.doubts + 1 if against.p_value < UNBELIEVABLE else 0
-    mind = replace(mind, findings=replace(findings, doubts=doubts, p_value=least))
-    return mind.alarmed(against.alarm) if doubts >= LOOKS else mind
+    state = replace(state, belief=replace(findings, doubts=doubts, p_value=least))
+    return state.alarmed(against.alarm) if doubts >= LOOKS else state
 
 
-def _blindly(mind: RobotState) -> RobotState:
+def _blindly(state: RobotState) -> RobotState:
     """While nothing is known of how the two lie: b stands, a goes straight on (Section III.C.a)."""
-    mission = mind.briefing.mission
-    if mind.briefing.role == "b" or not mind.mutual:
-        return replace(mind, state=Surveying("peer"))
-    step = range_seeking.stretch("peer", mind.mutual[-1].range, mission)
-    return replace(mind, state=Surveying("peer", Controls(step / mission.period, 0.0)))
+    mission = state.config.mission
+    if state.config.role == "b" or not state.mutual:
+        return replace(state, mode=Surveying("peer"))
+    step = range_seeking.stretch("peer", state.mutual[-1].range, mission)
+    return replace(state, mode=Surveying("peer", Controls(step / mission.period, 0.0)))
 
 
-def claimed(mind: RobotState) -> RobotState:
+def claimed(state: RobotState) -> RobotState:
     """The likeliest hypothesis is the one."""
-    return replace(mind, state=Done(3, Localised(mind.findings.poses[0], mind.findings.covariance)))
+    return replace(state, mode=Done(3, Localised(state.belief.poses[0], state.belief.covariance)))

@@ -11,126 +11,126 @@ from agent.planning import paper, phase3_last_manoeuvre, precision
 from agent.planning.phase2_orbit import Orbiting, off_anchor
 from agent.planning.phase3_last_manoeuvre import LastManoeuvre, Standing, Waiting
 from agent.planning.range_seeking import Straight, stretch
-from agent.planning.state import WORDS, Done, RobotState
+from agent.planning.state import MODE_NAMES, Done, RobotState
 from protocol.messages import Inconsistent, Localised
 from protocol.mission import SHORTEST_STEP
 
-PEER_RESTS = (WORDS[Standing], WORDS[Waiting])
+PEER_RESTS = (MODE_NAMES[Standing], MODE_NAMES[Waiting])
 """what it says then: two that move at once may do so in mirror image, and learn nothing"""
 
 
-def meets(mind: RobotState) -> bool:
+def meets(state: RobotState) -> bool:
     """Whether phase 3 begins, once in contact: by the letter when both orbit, else as soon as it can."""
-    if mind.briefing.variant == "paper":
-        return isinstance(mind.state, Orbiting) and (mind.radio.phase == 3 or mind.radio.state == mind.doing)
-    return mind.radio.phase == 3 or (mind.radio.start is not None and mind.off_anchor)
+    if state.config.variant == "paper":
+        return isinstance(state.mode, Orbiting) and (state.peer_state.phase == 3 or state.peer_state.state == state.mode_name)
+    return state.peer_state.phase == 3 or (state.peer_state.start is not None and state.off_anchor)
 
 
-def lingers(mind: RobotState) -> bool:
+def lingers(state: RobotState) -> bool:
     """Whether the robot stands still so as not to lose a peer with which phase 3 cannot begin yet.
 
     The peer is in phase 1, or has not been heard; or it is b, and too near its anchor.
     """
     return (
-        mind.briefing.variant == "assured"
-        and mind.in_contact
-        and (mind.radio.start is None or mind.briefing.role == "a")
+        state.config.variant == "assured"
+        and state.in_contact
+        and (state.peer_state.start is None or state.config.role == "a")
     )
 
 
-def met(mind: RobotState) -> RobotState:
+def met(state: RobotState) -> RobotState:
     """Phase 3 begins: b stops, a goes straight on (Section III.C.a)."""
-    findings = replace(mind.findings, met=mind.tick)
-    if mind.briefing.role == "b":
-        return replace(mind, state=Standing(), findings=findings)
-    rho = mind.mutual[-1].range if mind.mutual else mind.briefing.mission.sensing_range  # a drop-out
-    if mind.briefing.mission.safety_distance and not _may_go(mind):
-        return mind
-    straight = Straight("peer", mind.odometry, rho)
-    return replace(mind, state=straight, findings=findings)
+    findings = replace(state.belief, encounter_tick=state.tick)
+    if state.config.role == "b":
+        return replace(state, mode=Standing(), belief=findings)
+    rho = state.mutual[-1].range if state.mutual else state.config.mission.sensing_range  # a drop-out
+    if state.config.mission.safety_distance and not _may_go(state):
+        return state
+    straight = Straight("peer", state.odometry, rho)
+    return replace(state, mode=straight, belief=findings)
 
 
-def _may_go(mind: RobotState) -> bool:
+def _may_go(state: RobotState) -> bool:
     """Whether a knows that b stands, and is far enough from it to go straight on."""
-    now = bool(mind.mutual) and mind.mutual[-1].tick == mind.tick == mind.radio.peer.through
-    return now and stretch("peer", mind.mutual[-1].range, mind.briefing.mission) >= SHORTEST_STEP
+    now = bool(state.mutual) and state.mutual[-1].tick == state.tick == state.peer_state.peer.through
+    return now and stretch("peer", state.mutual[-1].range, state.config.mission) >= SHORTEST_STEP
 
 
-def considered(mind: RobotState) -> RobotState:
+def considered(state: RobotState) -> RobotState:
     """Both logs in hand: weigh the placements; then claim, plan the last manoeuvre, or go on.
 
     Not before the peer has told of everything up to where this robot stands; and not twice of the same.
     """
-    if not mind.briefing.mission.noise.exact:
-        return mind if paper.waits(mind) else paper.considered(mind)
-    assert isinstance(mind.state, Standing | Waiting)
-    last = min(mind.tick, mind.radio.peer.through)
-    if last < mind.log.moved() or last == mind.state.through:
-        return mind
-    return _settled(replace(mind, state=replace(mind.state, through=last)))
+    if not state.config.mission.noise.exact:
+        return state if paper.waits(state) else paper.considered(state)
+    assert isinstance(state.mode, Standing | Waiting)
+    last = min(state.tick, state.peer_state.peer.through)
+    if last < state.log.moved() or last == state.mode.through:
+        return state
+    return _settled(replace(state, mode=replace(state.mode, through=last)))
 
 
-def _settled(mind: RobotState) -> RobotState:
+def _settled(state: RobotState) -> RobotState:
     """The same, where sensors are exact.
 
     The letter looks at the encounter alone; `assured` also at what was ranged, and what was silent, before.
     """
-    mission, variant, began = mind.briefing.mission, mind.briefing.variant, mind.findings.met
+    mission, variant, began = state.config.mission, state.config.variant, state.belief.encounter_tick
     assert began is not None
-    sightings = mind.sightings(began if variant == "paper" else 0)
-    ranged = [at for at in sightings if at.range is not None]
-    away = [at for at in ranged if off_anchor(at.b, mind.briefing.rendezvous.b)]
-    base = phase3_last_manoeuvre.base(away, precision.drift(mind))
+    pair_observations = state.pair_observations(began if variant == "paper" else 0)
+    ranged = [at for at in pair_observations if at.range is not None]
+    away = [at for at in ranged if off_anchor(at.b, state.config.rendezvous.b)]
+    base = phase3_last_manoeuvre.base(away, precision.drift(state))
     if base is None:  # yet; or, where a report was missed, b was still driving as a went straight
-        again = isinstance(mind.state, Waiting) and mind.radio.state == WORDS[Standing]
-        return met(mind) if again and variant == "assured" else mind
-    if mind.findings.peer_anchor is None:
-        mind = replace(mind, findings=replace(mind.findings, peer_anchor=precision.peer_anchor(mind)))
-    off = precision.apart(mind)
-    mind = _weighed(mind, sightings, base, off)
-    left = mind.findings.placements
+        again = isinstance(state.mode, Waiting) and state.peer_state.state == MODE_NAMES[Standing]
+        return met(state) if again and variant == "assured" else state
+    if state.belief.peer_anchor is None:
+        state = replace(state, belief=replace(state.belief, peer_anchor=precision.peer_anchor(state)))
+    off = precision.apart(state)
+    state = _weighed(state, pair_observations, base, off)
+    left = state.belief.placements
     checked = phase3_last_manoeuvre.redundant(ranged, base)
     if not left:
-        return mind.alarmed(Inconsistent("a path that no placement brings together with the mutual ranges"))
-    if checked and len(left) == 1 and precision.pinned_down(mind, left[0], ranged, off):
-        return replace(mind, state=Done(3, Localised(mind.world_pose(left[0]))))
-    mover = mind.briefing.role
-    alone = variant == "assured" and isinstance(mind.radio.verdict, Localised)  # the peer stands for good
+        return state.alarmed(Inconsistent("a path that no placement brings together with the mutual ranges"))
+    if checked and len(left) == 1 and precision.pinned_down(state, left[0], ranged, off):
+        return replace(state, mode=Done(3, Localised(state.world_pose(left[0]))))
+    mover = state.config.role
+    alone = variant == "assured" and isinstance(state.peer_state.verdict, Localised)  # the peer stands for good
     if not alone and mover != (
-        phase3_last_manoeuvre.turn(sightings) if checked and variant == "assured" else "b"
+        phase3_last_manoeuvre.turn(pair_observations) if checked and variant == "assured" else "b"
     ):
-        return mind
-    if variant == "assured" and not alone and mind.radio.state not in PEER_RESTS:
-        return mind
-    if variant == "paper" and mind.findings.plan is not None:
+        return state
+    if variant == "assured" and not alone and state.peer_state.state not in PEER_RESTS:
+        return state
+    if variant == "paper" and state.belief.plan is not None:
         failure = "does not settle where they are" if checked else "could not be taken: b left a's range"
-        return mind.undecided(f"the third mutual range {failure}")
-    a, b = sightings[-1].a, sightings[-1].b
+        return state.undecided(f"the third mutual range {failure}")
+    a, b = pair_observations[-1].a, pair_observations[-1].b
     if checked and len(left) == 1:
-        plan = phase3_last_manoeuvre.survey(mover, a, b, left[0], sightings, mission)
+        plan = phase3_last_manoeuvre.survey(mover, a, b, left[0], pair_observations, mission)
     else:
         plan = phase3_last_manoeuvre.last_manoeuvre(mover, a, b, left, mission, variant)
     if plan is None:
-        return mind if variant == "assured" else mind.undecided("no manoeuvre keeps the safety distance")
+        return state if variant == "assured" else state.undecided("no manoeuvre keeps the safety distance")
     return replace(
-        mind,
-        state=LastManoeuvre(plan.drive, mind.odometry),
-        findings=replace(mind.findings, plan=plan),
+        state,
+        state=LastManoeuvre(plan.command, state.odometry),
+        belief=replace(state.belief, plan=plan),
     )
 
 
 def _weighed(
-    mind: RobotState,
-    sightings: Sequence[PairObservation],
+    state: RobotState,
+    pair_observations: Sequence[PairObservation],
     base: tuple[PairObservation, PairObservation],
     floor: float,
 ) -> RobotState:
-    """The placements of eq. (7) that every range and every silent tick in `sightings` leave."""
-    reach, findings = mind.briefing.mission.sensing_range, mind.findings
+    """The placements of eq. (7) that every range and every silent tick in `pair_observations` leave."""
+    reach, findings = state.config.mission.sensing_range, state.belief
     if findings.candidates is None:
-        solutions = phase3_last_manoeuvre.solve(mind.briefing.anchor_distance, base)
-        silence = [sighting for sighting in sightings if sighting.range is None]
+        solutions = phase3_last_manoeuvre.solve(state.config.anchor_distance, base)
+        silence = [pair_observation for pair_observation in pair_observations if pair_observation.range is None]
         unheard = weigh_placements(solutions, silence, reach, floor)
         findings = replace(findings, placements=tuple(solutions), candidates=(len(solutions), len(unheard)))
-    left = weigh_placements(findings.placements, sightings, reach, floor)
-    return replace(mind, findings=replace(findings, placements=left))
+    left = weigh_placements(findings.placements, pair_observations, reach, floor)
+    return replace(state, belief=replace(findings, placements=left))

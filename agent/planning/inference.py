@@ -14,14 +14,14 @@ from agent.estimation.gaussian.hypotheses import ScoredHypothesis, missing, of_a
 from agent.estimation.gaussian.least_squares import deviation, poses
 from agent.estimation.gaussian.odometry_noise import Array, Track, track
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, Ranges
-from agent.peer.motion_log import Logbook
+from agent.peer.motion_log import MotionLog
 from agent.planning.active_sensing import PlanningHypothesis
 from agent.planning.state import RobotState
 from protocol.mission import HEADING_ACCURACY, Mission
 from protocol.motion import Covariance, Pose, compose, inverse, wrap
 
 
-def path_of(log: Logbook, through: int, period: float) -> Track:
+def path_of(log: MotionLog, through: int, period: float) -> Track:
     """The odometry of a log up to tick `through`."""
     runs = log.runs
     ticks = [run.ticks for run in runs]
@@ -30,59 +30,59 @@ def path_of(log: Logbook, through: int, period: float) -> Track:
     return track(v, omega, period)
 
 
-def own_anchor(mind: RobotState) -> tuple[ScoredHypothesis, ...]:
+def own_anchor(state: RobotState) -> tuple[ScoredHypothesis, ...]:
     """Where the robot's anchor may lie in the frame of its odometry."""
-    mission = mind.briefing.mission
-    path = path_of(mind.log, mind.tick, mission.period)
-    ranges = Ranges.of_lists(_told(mind.log, mind.tick), (), (), mission.noise)
+    mission = state.config.mission
+    path = path_of(state.log, state.tick, mission.period)
+    ranges = Ranges.of_lists(_told(state.log, state.tick), (), (), mission.noise)
     possible = ranges.within(mission.sensing_range)
     if not len(possible.rho):
         return ()
-    silent = missing(ranges.tick, mind.tick + 1)
-    return of_anchor(mind.findings.own, path, possible, silent, mission.sensing_range, mission.noise)
+    silent = missing(ranges.tick, state.tick + 1)
+    return of_anchor(state.belief.own, path, possible, silent, mission.sensing_range, mission.noise)
 
 
-def _told(log: Logbook, through: int) -> list[tuple[int, float]]:
+def _told(log: MotionLog, through: int) -> list[tuple[int, float]]:
     return [(ranged.tick, ranged.range) for ranged in log.ranges if ranged.tick <= through]
 
 
-def with_own(mind: RobotState, weighed: Sequence[ScoredHypothesis]) -> RobotState:
-    """`mind`, with these hypotheses of its anchor; where it stands now follows from the likeliest."""
-    own = tuple([one.hypothesis for one in weighed])
-    branches = tuple([branch_of(mind, one) for one in weighed])
-    return replace(mind, findings=replace(mind.findings, own=own, branches=branches, branch=branches[0]))
+def with_own(state: RobotState, scored: Sequence[ScoredHypothesis]) -> RobotState:
+    """`state`, with these hypotheses of its anchor; where it stands now follows from the likeliest."""
+    own = tuple([one.hypothesis for one in scored])
+    branches = tuple([branch_of(state, one) for one in scored])
+    return replace(state, belief=replace(state.belief, own=own, branches=branches, branch=branches[0]))
 
 
-def branch_of(mind: RobotState, weighed: ScoredHypothesis) -> Branch:
+def branch_of(state: RobotState, scored: ScoredHypothesis) -> Branch:
     """The likeliest trajectory; its start is such that the odometry leads to where the robot is now."""
-    mx, my = weighed.hypothesis.guess[:2]
-    path = weighed.fit.paths[0]
+    mx, my = scored.hypothesis.guess[:2]
+    path = scored.fit.paths[0]
     frame = math.atan2(-my, -mx)
     c, s = math.cos(frame), math.sin(frame)
     x, y = float(path.x[-1]) - mx, float(path.y[-1]) - my
     now = Pose(c * x + s * y, c * y - s * x, float(path.heading[-1]) - frame)
-    start = compose(now, inverse(mind.odometry))
+    start = compose(now, inverse(state.odometry))
     return Branch(wrap(-frame), start)
 
 
-def held_alone(weighed: Sequence[ScoredHypothesis]) -> list[PlanningHypothesis]:
+def held_alone(scored: Sequence[ScoredHypothesis]) -> list[PlanningHypothesis]:
     """For planning: the robot, relative to its anchor."""
     held = []
-    for one in weighed:
+    for one in scored:
         mx, my = one.hypothesis.guess[:2]
         path = one.fit.paths[0]
         now = np.array((path.x[-1] - mx, path.y[-1] - my, path.heading[-1]))
-        held.append(PlanningHypothesis(one.hypothesis.odds, now, one.fit.covariance))
+        held.append(PlanningHypothesis(one.hypothesis.probability, now, one.fit.covariance))
     return held
 
 
-def settled(weighed: Sequence[ScoredHypothesis], mission: Mission) -> bool:
+def settled(scored: Sequence[ScoredHypothesis], mission: Mission) -> bool:
     """Whether what is left to know of the anchor is worth less than moving on."""
-    best = weighed[0]
+    best = scored[0]
     enough = ANCHOR_RANGES_WITH_OUTLIERS if mission.noise.outliers else ANCHOR_RANGES
     return (
         int(np.count_nonzero(best.fit.weights > 0.5)) >= enough
-        and best.hypothesis.odds >= SURE_OF_BRANCH
+        and best.hypothesis.probability >= SURE_OF_BRANCH
         and deviation(float(np.trace(best.fit.covariance))) <= mission.foothold
     )
 
@@ -94,30 +94,30 @@ ANCHOR_RANGES, ANCHOR_RANGES_WITH_OUTLIERS = 5, 7
 """to its anchor at the least, before a robot goes: two unknowns, and three that check them"""
 
 
-def known_through(mind: RobotState) -> int:
+def known_through(state: RobotState) -> int:
     """The last tick that both logs cover."""
-    return min(mind.tick, mind.radio.peer.through, mind.radio.ranges_through)
+    return min(state.tick, state.peer_state.peer.through, state.peer_state.ranges_through)
 
 
-def answered(mind: RobotState) -> bool:
+def answered(state: RobotState) -> bool:
     """Whether the peer has told of everything up to where this robot has come to rest, or is now."""
-    return known_through(mind) >= mind.log.moved(mind.briefing.mission.noise.unrest)
+    return known_through(state) >= state.log.moved(state.config.mission.noise.standstill_bound)
 
 
-def pair_of(mind: RobotState) -> PairRanges:
+def pair_of(state: RobotState) -> PairRanges:
     """All that both have measured: its own up to now, the peer's up to the last tick that both logs cover."""
-    peer, briefing = mind.radio.peer, mind.briefing
-    mission, last = briefing.mission, known_through(mind)
-    logs, ends = ((mind.log, peer), (mind.tick, last, last))
-    if briefing.role == "b":
-        logs, ends = ((peer, mind.log), (last, mind.tick, last))
-    mutual = [(ranged.tick, ranged.range) for ranged in mind.mutual if ranged.tick <= last]
+    peer, config = state.peer_state.peer, state.config
+    mission, last = config.mission, known_through(state)
+    logs, ends = ((state.log, peer), (state.tick, last, last))
+    if config.role == "b":
+        logs, ends = ((peer, state.log), (last, state.tick, last))
+    mutual = [(ranged.tick, ranged.range) for ranged in state.mutual if ranged.tick <= last]
     lists = [_told(log, end) for log, end in zip(logs, ends, strict=False)]
     ranges = Ranges.of_lists(lists[0], lists[1], mutual, mission.noise)
     silent = [missing(ranges.tick[ranges.rows(kind)], ends[kind] + 1) for kind in range(3)]
     ranges = ranges.within(mission.sensing_range)
-    own, other = briefing.anchor, briefing.peer_anchor
-    sign = 1.0 if briefing.role == "a" else -1.0
+    own, other = config.anchor, config.peer_anchor
+    sign = 1.0 if config.role == "a" else -1.0
     return PairRanges(
         (path_of(logs[0], ends[0], mission.period), path_of(logs[1], ends[1], mission.period)),
         ranges,
@@ -128,13 +128,13 @@ def pair_of(mind: RobotState) -> PairRanges:
     )
 
 
-def held_together(weighed: Sequence[ScoredHypothesis], pair: PairRanges) -> list[PlanningHypothesis]:
+def held_together(scored: Sequence[ScoredHypothesis], pair: PairRanges) -> list[PlanningHypothesis]:
     """For planning: both poses relative to M1, and their covariance."""
-    return [PlanningHypothesis(one.hypothesis.odds, *poses(one.fit, pair.apart)) for one in weighed]
+    return [PlanningHypothesis(one.hypothesis.probability, *poses(one.fit, pair.apart)) for one in scored]
 
 
 def missing_for(
-    weighed: Sequence[ScoredHypothesis],
+    scored: Sequence[ScoredHypothesis],
     held: Sequence[PlanningHypothesis],
     against: Inconsistency | None,
     pair: PairRanges,
@@ -143,10 +143,10 @@ def missing_for(
     """What is lacking before a claim, there being ranges enough; None if it is nothing."""
     if against is None:
         return "no hypothesis explains the ranges"
-    odds = weighed[0].hypothesis.odds
-    if odds < mission.confidence:
+    probability = scored[0].hypothesis.probability
+    if probability < mission.confidence:
         return (
-            f"the likeliest of {len(weighed)} hypotheses has the odds {odds:.6f}, of {mission.confidence:g}"
+            f"the likeliest of {len(scored)} hypotheses has the odds {probability:.6f}, of {mission.confidence:g}"
         )
     if not against.p_value >= DOUBTFUL:
         return f"the likeliest hypothesis is in doubt: {against.what}"
@@ -161,36 +161,36 @@ def missing_for(
     return None
 
 
-def finished(mind: RobotState, weighed: Sequence[ScoredHypothesis]) -> RobotState:
-    """`mind`, which claims nothing by a fit that has not found its minimum."""
-    if mind.findings.missing is not None or weighed[0].fit.last_step <= FINISHED:
-        return mind
-    missing = f"the likeliest hypothesis still moves, by {weighed[0].fit.last_step:.3g} sigmas"
-    return replace(mind, findings=replace(mind.findings, missing=missing))
+def finished(state: RobotState, scored: Sequence[ScoredHypothesis]) -> RobotState:
+    """`state`, which claims nothing by a fit that has not found its minimum."""
+    if state.belief.blocking_reason is not None or scored[0].fit.last_step <= FINISHED:
+        return state
+    missing = f"the likeliest hypothesis still moves, by {scored[0].fit.last_step:.3g} sigmas"
+    return replace(state, belief=replace(state.belief, blocking_reason=missing))
 
 
 def with_pair(
-    mind: RobotState, weighed: Sequence[ScoredHypothesis], pair: PairRanges, mutual: int
+    state: RobotState, scored: Sequence[ScoredHypothesis], pair: PairRanges, mutual: int
 ) -> RobotState:
-    """`mind`, with these hypotheses of how both lie in <W>; a claim needs `mutual` mutual ranges."""
-    briefing = mind.briefing
-    robot, m1 = (0, briefing.anchor) if briefing.role == "a" else (1, briefing.peer_anchor)
-    held = held_together(weighed, pair)
+    """`state`, with these hypotheses of how both lie in <W>; a claim needs `mutual` mutual ranges."""
+    config = state.config
+    robot, m1 = (0, config.anchor) if config.role == "a" else (1, config.peer_anchor)
+    held = held_together(scored, pair)
     enough = len(pair.places) >= mutual
-    against = doubt(weighed[0].fit, pair) if enough and weighed else None
-    missing = missing_for(weighed, held, against, pair, briefing.mission)
+    against = doubt(scored[0].fit, pair) if enough and scored else None
+    missing = missing_for(scored, held, against, pair, config.mission)
     claims = [claim(one, robot, pair) for one in held]
-    first, _ = mind.findings.candidates or (len(weighed), 0)
+    first, _ = state.belief.candidates or (len(scored), 0)
     findings = replace(
-        mind.findings,
-        pair=tuple(one.hypothesis for one in weighed),
+        state.belief,
+        pair=tuple(one.hypothesis for one in scored),
         poses=tuple(Pose(m1.x + pose.x, m1.y + pose.y, pose.heading) for pose, _ in claims),
         covariance=claims[0][1] if claims else None,
-        candidates=(first, len(weighed)),
+        candidates=(first, len(scored)),
         against=against,
-        missing=missing if enough else f"{len(pair.places)} mutual ranges, of {mutual}",
+        blocking_reason=missing if enough else f"{len(pair.places)} mutual ranges, of {mutual}",
     )
-    return replace(mind, findings=findings)
+    return replace(state, belief=findings)
 
 
 def claim(held: PlanningHypothesis, robot: int, pair: PairRanges) -> tuple[Pose, Covariance]:

@@ -17,7 +17,7 @@ from agent.planning import inference, phase3_last_manoeuvre
 from agent.planning.active_sensing import PlanningHypothesis
 from agent.planning.assured import CHECKED_WITH_OUTLIERS, claimed
 from agent.planning.phase3_last_manoeuvre import LastManoeuvre, Standing, Waiting
-from agent.planning.state import WORDS, RobotState
+from agent.planning.state import MODE_NAMES, RobotState
 from protocol.motion import ORIGIN, wrap
 
 CHECKED = 3
@@ -27,49 +27,49 @@ LIKELY = 0.05
 """odds from which on a branch is worth a manoeuvre that tells it from others"""
 
 
-def with_branches(mind: RobotState) -> tuple[RobotState, tuple[Branch, ...]]:
-    """The branches that are likely, the likeliest first; and `mind`, which takes the first."""
-    weighed = inference.own_anchor(mind)
-    if not weighed:
-        return mind, ()
-    mind = inference.with_own(mind, weighed)
-    likely = zip(mind.findings.branches, mind.findings.own, strict=True)
-    return mind, tuple([branch for branch, one in likely if one.odds >= LIKELY])
+def with_branches(state: RobotState) -> tuple[RobotState, tuple[Branch, ...]]:
+    """The branches that are likely, the likeliest first; and `state`, which takes the first."""
+    scored = inference.own_anchor(state)
+    if not scored:
+        return state, ()
+    state = inference.with_own(state, scored)
+    likely = zip(state.belief.branches, state.belief.own, strict=True)
+    return state, tuple([branch for branch, one in likely if one.probability >= LIKELY])
 
 
-def considered(mind: RobotState) -> RobotState:
+def considered(state: RobotState) -> RobotState:
     """Phase 3, after a's second range and again after b's last manoeuvre."""
-    pair = inference.pair_of(mind)
+    pair = inference.pair_of(state)
     mutual = pair.ranges.counts[2]
-    if inference.known_through(mind) < mind.tick or mutual < CHECKED - 1:
-        return mind
-    weighed = search(pair)
-    checked = CHECKED_WITH_OUTLIERS if mind.briefing.mission.noise.outliers else CHECKED
-    mind = inference.finished(inference.with_pair(mind, weighed, pair, checked), weighed)
-    missing = mind.findings.missing
+    if inference.known_through(state) < state.tick or mutual < CHECKED - 1:
+        return state
+    scored = search(pair)
+    checked = CHECKED_WITH_OUTLIERS if state.config.mission.noise.outliers else CHECKED
+    state = inference.finished(inference.with_pair(state, scored, pair, checked), scored)
+    missing = state.belief.blocking_reason
     if missing is None:
-        return claimed(mind)
-    if mind.findings.plan is not None or not weighed:
-        return mind.undecided(f"the letter takes no more ranges: {missing}")
-    if mind.briefing.role == "a":
-        return mind
-    placements = [_seen_from_b(held) for held in inference.held_together(weighed, pair)]
+        return claimed(state)
+    if state.belief.plan is not None or not scored:
+        return state.undecided(f"the letter takes no more ranges: {missing}")
+    if state.config.role == "a":
+        return state
+    placements = [_seen_from_b(held) for held in inference.held_together(scored, pair)]
     plan = phase3_last_manoeuvre.last_manoeuvre(
-        "b", ORIGIN, ORIGIN, placements, mind.briefing.mission, "paper"
+        "b", ORIGIN, ORIGIN, placements, state.config.mission, "paper"
     )
     if plan is None:
-        return mind.undecided("no manoeuvre keeps the safety distance")
+        return state.undecided("no manoeuvre keeps the safety distance")
     return replace(
-        mind,
-        state=LastManoeuvre(plan.drive, mind.odometry),
-        findings=replace(mind.findings, plan=plan),
+        state,
+        state=LastManoeuvre(plan.command, state.odometry),
+        belief=replace(state.belief, plan=plan),
     )
 
 
-def waits(mind: RobotState) -> bool:
+def waits(state: RobotState) -> bool:
     """Whether b has yet to hear that a has its second range."""
     return (
-        isinstance(mind.state, Standing) and mind.findings.plan is None and mind.radio.state != WORDS[Waiting]
+        isinstance(state.mode, Standing) and state.belief.plan is None and state.peer_state.state != MODE_NAMES[Waiting]
     )
 
 

@@ -26,7 +26,7 @@ class ThirdPoint(msgspec.Struct, frozen=True):
 
     branches: tuple[Branch, ...]
     origin: Pose
-    drive: Controls
+    command: Controls
 
 
 def third_point(

@@ -33,7 +33,7 @@ class Tangent(msgspec.Struct, frozen=True):
 class Orbiting(msgspec.Struct, frozen=True):
     """Drives round its anchor, eq. (6); or waits there, where that is its part of the plan."""
 
-    drive: Controls | None = None
+    command: Controls | None = None
     """under noise: what leads back to the circle; or tells more, where it waits"""
     since: int = 0
     """under noise: the tick in which it got there"""
@@ -88,8 +88,8 @@ def controls(state: Meeting, odometry: Pose, start: Pose, orbit: Orbit, mission:
             return turn(odometry, heading, mission)
         case Radial():
             return straight(left_to_orbit(odometry, start, orbit), mission)
-        case Orbiting(drive):
-            return drive or Controls(orbit.v, orbit.omega)
+        case Orbiting(command):
+            return command or Controls(orbit.v, orbit.omega)
 
 
 def pursuit(local: Pose, orbit: Orbit, mission: Mission) -> Controls:

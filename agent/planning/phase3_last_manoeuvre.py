@@ -56,14 +56,14 @@ class Waiting(msgspec.Struct, frozen=True):
 class LastManoeuvre(msgspec.Struct, frozen=True):
     """Drives to where the placements that are left predict different ranges."""
 
-    drive: Controls
+    command: Controls
     origin: Pose
 
 
 class Returning(msgspec.Struct, frozen=True):
     """Has left the peer's range, and drives the same arc backwards to tell it."""
 
-    drive: Controls
+    command: Controls
     origin: Pose
 
 
@@ -85,7 +85,7 @@ class Question(NamedTuple):
 class Plan(NamedTuple):
     """A last manoeuvre, and what it is expected to tell."""
 
-    drive: Controls
+    command: Controls
     separation_m2: float | None
     """J of eq. (8): the least difference of two predicted squared ranges; none for one candidate"""
     question: Question
@@ -114,7 +114,7 @@ class Compared(NamedTuple):
 
 
 def base(
-    sightings: Sequence[PairObservation], floor: float
+    pair_observations: Sequence[PairObservation], floor: float
 ) -> tuple[PairObservation, PairObservation] | None:
     """The two ranges that eq. (7) is solved from: the first two between which only a has moved.
 
@@ -122,11 +122,11 @@ def base(
     which b may stand on M1: there any turn of a about it would do.
     """
     ranged: list[PairObservation] = []
-    for sighting in sightings:
-        if sighting.range is not None and not (
-            ranged and (ranged[-1].a, ranged[-1].b) == (sighting.a, sighting.b)  # both have stood since
+    for pair_observation in pair_observations:
+        if pair_observation.range is not None and not (
+            ranged and (ranged[-1].a, ranged[-1].b) == (pair_observation.a, pair_observation.b)  # both have stood since
         ):
-            ranged.append(sighting)
+            ranged.append(pair_observation)
     for first in ranged:
         for second in ranged:
             stood, moved = travelled(first.b, second.b) <= floor, travelled(first.a, second.a) > ELSEWHERE
@@ -137,10 +137,10 @@ def base(
     return None
 
 
-def _as_far(sighting: PairObservation, near: float) -> bool:
+def _as_far(pair_observation: PairObservation, near: float) -> bool:
     """Return whether a is as far from its own anchor as from b, to `near` m."""
-    assert sighting.range is not None
-    return abs(math.hypot(sighting.a.x, sighting.a.y) - sighting.range) <= near
+    assert pair_observation.range is not None
+    return abs(math.hypot(pair_observation.a.x, pair_observation.a.y) - pair_observation.range) <= near
 
 
 def solve(distance: float, base: tuple[PairObservation, PairObservation]) -> list[Placement]:
@@ -151,21 +151,21 @@ def solve(distance: float, base: tuple[PairObservation, PairObservation]) -> lis
     return placements(distance, first.b, first.a, second.a, first.range, second.range)
 
 
-def redundant(sightings: Sequence[PairObservation], base: tuple[PairObservation, PairObservation]) -> bool:
+def redundant(pair_observations: Sequence[PairObservation], base: tuple[PairObservation, PairObservation]) -> bool:
     """Whether there is a range more, from elsewhere, than the two that the placements were made from."""
     return any(
-        sighting.range is not None
+        pair_observation.range is not None
         and all(
-            travelled(sighting.a, used.a) > ELSEWHERE or travelled(sighting.b, used.b) > ELSEWHERE
+            travelled(pair_observation.a, used.a) > ELSEWHERE or travelled(pair_observation.b, used.b) > ELSEWHERE
             for used in base
         )
-        for sighting in sightings
+        for pair_observation in pair_observations
     )
 
 
-def turn(sightings: Sequence[PairObservation]) -> Role:
+def turn(pair_observations: Sequence[PairObservation]) -> Role:
     """Whose move it is: the other's than whose was the last. b moves first."""
-    for before, now in pairwise(reversed(sightings)):
+    for before, now in pairwise(reversed(pair_observations)):
         if travelled(before.b, now.b) > 0.0:
             return "a"
         if travelled(before.a, now.a) > 0.0:
@@ -176,8 +176,8 @@ def turn(sightings: Sequence[PairObservation]) -> Role:
 def advanced(state: LastManoeuvre | Returning, pose: Pose, in_contact: bool, rest: Resting) -> State:
     """The state after a tick that led to `pose`; in the end it is `rest`."""
     match state:
-        case LastManoeuvre(drive) if not in_contact:
-            return Returning(Controls(-drive.v, -drive.omega), pose)
+        case LastManoeuvre(command) if not in_contact:
+            return Returning(Controls(-command.v, -command.omega), pose)
         case _:
             return rest
 
@@ -200,8 +200,8 @@ def last_manoeuvre(
     row, column = _best(value)
     if value[row, column] == -np.inf:
         return None
-    drive = Controls(float(reach.v[row, 0]), float(reach.omega[column]))
-    return Plan(drive, float(gap[row, column]) if len(candidates) > 1 else None, question)
+    command = Controls(float(reach.v[row, 0]), float(reach.omega[column]))
+    return Plan(command, float(gap[row, column]) if len(candidates) > 1 else None, question)
 
 
 def compared(question: Question, mission: Mission, variant: Variant) -> Compared:
@@ -231,12 +231,12 @@ def survey(
     a: Pose,
     b: Pose,
     placement: Placement,
-    sightings: Sequence[PairObservation],
+    pair_observations: Sequence[PairObservation],
     mission: Mission,
 ) -> Plan | None:
     """The manoeuvre of `mover` after which one more range would pin down `placement` best; none as above.
 
-    For a placement that alone fits, and that the ranges in `sightings` do not determine: both robots and
+    For a placement that alone fits, and that the ranges in `pair_observations` do not determine: both robots and
     their anchors on one line. By the determinant of the information, which takes both robots to raise.
     """
     question = Question(mover, a, b, (placement,))
@@ -246,7 +246,7 @@ def survey(
     apart = np.maximum(np.hypot(dx, dy), ELSEWHERE)
     by_phi = (dy * (ax - placement.x) - dx * (ay - placement.y)) / apart
     by_psi = (dy * placement.x - dx * placement.y) / apart
-    pp, pq, qq = information(placement, sightings)
+    pp, pq, qq = information(placement, pair_observations)
     distance = math.hypot(placement.x, placement.y)
     faint_p, faint_q = FAINT * (distance + mission.sensing_range) ** 2, FAINT * distance**2
     value = (pp + by_phi**2 + faint_p) * (qq + by_psi**2 + faint_q) - (pq + by_phi * by_psi) ** 2

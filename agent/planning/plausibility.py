@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import math
 
-from agent.peer.motion_log import Logbook
-from agent.peer.peer_state import Radio
+from agent.peer.motion_log import MotionLog
+from agent.peer.peer_state import PeerState
 from agent.planning.phase2_orbit import Orbiting
-from agent.planning.state import WORDS
+from agent.planning.state import MODE_NAMES
 from protocol.messages import Inconsistent, Report, RobotConfig
 from protocol.mission import Mission
 from protocol.motion import wrap
@@ -25,21 +25,21 @@ EXACT = 1e-6
 """m and rad: where sensors are exact, what is told of one tick agrees so far"""
 
 
-def objection(before: Radio, after: Radio, report: Report, briefing: RobotConfig) -> Inconsistent | None:
+def objection(before: PeerState, after: PeerState, report: Report, config: RobotConfig) -> Inconsistent | None:
     """What in `report` cannot be so, which led from `before` to `after`; None if all of it may be."""
     return (
-        _second_story(before, report, briefing.mission)
-        or _impossible_drive(report, briefing.mission)
-        or (_ranges_off_path(before, after, briefing.mission) if briefing.mission.noise.exact else None)
-        or (_off_orbit(after, report, briefing) if briefing.mission.noise.exact else None)
+        _second_story(before, report, config.mission)
+        or _impossible_drive(report, config.mission)
+        or (_ranges_off_path(before, after, config.mission) if config.mission.noise.exact else None)
+        or (_off_orbit(after, report, config) if config.mission.noise.exact else None)
     )
 
 
-def _second_story(before: Radio, report: Report, mission: Mission) -> Inconsistent | None:
+def _second_story(before: PeerState, report: Report, mission: Mission) -> Inconsistent | None:
     """What was told once is told the same ever after."""
     last = min(report.through, before.peer.through)
     if report.since < last:
-        told = Logbook(report.through - report.since, report.runs)
+        told = MotionLog(report.through - report.since, report.runs)
         if told.between(0, last - report.since) != before.peer.between(report.since, last):
             return Inconsistent(f"manoeuvres over [{report.since}, {last}] that it told otherwise before")
     known = before.peer.ranges[report.ranges_since :][: len(report.ranges)]
@@ -53,8 +53,8 @@ def _second_story(before: Radio, report: Report, mission: Mission) -> Inconsiste
 def _impossible_drive(report: Report, mission: Mission) -> Inconsistent | None:
     """Nobody drives faster than v_max, or turns faster than omega_max."""
     noise = mission.noise
-    speed = _most(mission.max_speed, noise.actuation.v, noise.odometry.v, noise.unrest[0])
-    rate = _most(mission.max_turn_rate, noise.actuation.omega, noise.odometry.omega, noise.unrest[1])
+    speed = _most(mission.max_speed, noise.actuation.v, noise.odometry.v, noise.standstill_bound[0])
+    rate = _most(mission.max_turn_rate, noise.actuation.omega, noise.odometry.omega, noise.standstill_bound[1])
     for run in report.runs:
         for what, value, most in (("v", abs(run.v), speed), ("omega", abs(run.omega), rate)):
             if value > most:
@@ -67,7 +67,7 @@ def _most(asked: float, by_wheels: float, by_odometry: float, floor: float) -> f
     return asked * (1.0 + SLACK + NOISY * math.hypot(by_wheels, by_odometry)) + floor
 
 
-def _ranges_off_path(before: Radio, after: Radio, mission: Mission) -> Inconsistent | None:
+def _ranges_off_path(before: PeerState, after: PeerState, mission: Mission) -> Inconsistent | None:
     """Its ranges to its anchor are those of the path that it tells; those that are news are looked at."""
     book, start = after.peer, after.start
     if start is None:
@@ -85,13 +85,13 @@ def _ranges_off_path(before: Radio, after: Radio, mission: Mission) -> Inconsist
     return None
 
 
-def _off_orbit(after: Radio, report: Report, briefing: RobotConfig) -> Inconsistent | None:
+def _off_orbit(after: PeerState, report: Report, config: RobotConfig) -> Inconsistent | None:
     """Who orbits is on its circle, and heads along it."""
-    plan = briefing.rendezvous
-    orbit = plan.b if briefing.role == "a" else plan.a
-    if report.state != WORDS[Orbiting] or after.start is None or after.peer.through != report.tick:
+    plan = config.rendezvous
+    orbit = plan.b if config.role == "a" else plan.a
+    if report.state != MODE_NAMES[Orbiting] or after.start is None or after.peer.through != report.tick:
         return None
-    pose = after.peer.pose(after.start, report.tick, briefing.mission.period)
+    pose = after.peer.pose(after.start, report.tick, config.mission.period)
     off = abs(math.hypot(pose.x, pose.y) - orbit.radius)
     if off > EXACT * max(1.0, orbit.radius):
         return Inconsistent(f"a place off the orbit that it is on at tick {report.tick}", off)

@@ -13,21 +13,21 @@ from msgspec.structs import replace
 
 from agent.estimation.closed_forms import Placement
 from agent.estimation.exact import FITTED, Branch, PairObservation, anchor_error, polished, turn_error
-from agent.peer.motion_log import Logbook
+from agent.peer.motion_log import MotionLog
 from agent.planning.state import RobotState
 from protocol.mission import RANGE_MARGIN, Mission
 from protocol.motion import ORIGIN, Pose, Segment, follow
-from protocol.rounding import BETTER, OUT_AND_BACK, SAME, SURE, WELL, foothold, rounding
+from protocol.rounding import BETTER, OUT_AND_BACK, SAME, SURE, WELL, required_anchor_error, rounding
 
 
-def size(mind: RobotState) -> float:
+def size(state: RobotState) -> float:
     """Return D + R in m: the largest coordinate in the computations of the robots and the world."""
-    return mind.briefing.anchor_distance + mind.briefing.mission.sensing_range
+    return state.config.anchor_distance + state.config.mission.sensing_range
 
 
-def drifted(mind: RobotState, log: Logbook, tick: int) -> float:
+def drifted(state: RobotState, log: MotionLog, tick: int) -> float:
     """Return the bound in m on the rounding error of a range at `tick`, from the odometry of `log`."""
-    return _rounded(size(mind), log.until(tick), mind.briefing.mission.period)
+    return _rounded(size(state), log.until(tick), state.config.mission.period)
 
 
 def _rounded(extent: float, runs: Sequence[Segment], period: float) -> float:
@@ -59,17 +59,17 @@ class Known(msgspec.Struct, frozen=True):
     """whether phase 1 may end"""
 
 
-def anchor(mind: RobotState, start: Pose, log: Logbook) -> Known:
+def anchor(state: RobotState, start: Pose, log: MotionLog) -> Known:
     """Return the smallest anchor error of the robot of `log`, whose branch begins at `start`.
 
-    Phase 1 may end in three cases. Either the error is at most WELL of `foothold`; or it is at most
-    `foothold`, and the last range hardly reduced it (BETTER); or OUT_AND_BACK ranges did not reduce it. In
+    Phase 1 may end in three cases. Either the error is at most WELL of `required_anchor_error`; or it is at most
+    `required_anchor_error`, and the last range hardly reduced it (BETTER); or OUT_AND_BACK ranges did not reduce it. In
     the last case rounding grows faster than the ranges inform, and `pinned_down` decides in the encounter
     whether the error is small enough. Later ranges are ignored, so that both robots of a pair, which have
     the same ranges, compute the same result.
     """
-    mission, extent = mind.briefing.mission, size(mind)
-    enough = foothold(extent, mind.briefing.anchor_distance, mission.sensing_range)
+    mission, extent = state.config.mission, size(state)
+    enough = required_anchor_error(extent, state.config.anchor_distance, mission.sensing_range)
     known = least = error = math.inf
     ranges = 0
     ranged: list[tuple[Pose, float, float]] = []
@@ -100,53 +100,53 @@ Next to a double root, rounding may end the two fits on either side of it.
 """
 
 
-def merged(mind: RobotState, branches: tuple[Branch, ...]) -> tuple[Branch, ...]:
+def merged(state: RobotState, branches: tuple[Branch, ...]) -> tuple[Branch, ...]:
     """Return `branches` without those that no range distinguishes from the first (see NEXT_TO)."""
-    if len(branches) < 2 or len(mind.log.ranges) < FITTED:
+    if len(branches) < 2 or len(state.log.ranges) < FITTED:
         return branches
     first = branches[0]
-    near = NEXT_TO * anchor(mind, first.start, mind.log).error
+    near = NEXT_TO * anchor(state, first.start, state.log).error
     return (first, *(other for other in branches[1:] if math.dist(other.anchor, first.anchor) >= near))
 
 
-def fitted(mind: RobotState, branch: Branch) -> tuple[Branch, Known]:
+def fitted(state: RobotState, branch: Branch) -> tuple[Branch, Known]:
     """Return `branch` fitted to the ranges with the smallest anchor error, and that error."""
-    known = anchor(mind, branch.start, mind.log)
-    if known.ranges == len(mind.log.ranges):
+    known = anchor(state, branch.start, state.log)
+    if known.ranges == len(state.log.ranges):
         return branch, known
-    ranged = [(pose, rho) for pose, rho in mind.seen() if rho is not None]
+    ranged = [(pose, rho) for pose, rho in state.seen() if rho is not None]
     branch = polished(branch, ranged[: known.ranges])
-    return branch, replace(known, error=anchor(mind, branch.start, mind.log).error)
+    return branch, replace(known, error=anchor(state, branch.start, state.log).error)
 
 
-def peer_anchor(mind: RobotState) -> float:
+def peer_anchor(state: RobotState) -> float:
     """Return the anchor error of the peer in m."""
-    assert mind.radio.start is not None
-    return anchor(mind, mind.radio.start, mind.radio.peer).error
+    assert state.peer_state.start is not None
+    return anchor(state, state.peer_state.start, state.peer_state.peer).error
 
 
-def drift(mind: RobotState) -> float:
+def drift(state: RobotState) -> float:
     """Return the bound in m on both odometries' rounding, added up until now."""
-    return _drift(mind, min(mind.tick, mind.radio.peer.through))
+    return _drift(state, min(state.tick, state.peer_state.peer.through))
 
 
-def _drift(mind: RobotState, tick: int) -> float:
-    return drifted(mind, mind.log, tick) + drifted(mind, mind.radio.peer, tick)
+def _drift(state: RobotState, tick: int) -> float:
+    return drifted(state, state.log, tick) + drifted(state, state.peer_state.peer, tick)
 
 
-def apart(mind: RobotState) -> float:
+def apart(state: RobotState) -> float:
     """Return the bound in m on both anchors' errors and both odometries' rounding, added up until now."""
-    return _apart(mind, min(mind.tick, mind.radio.peer.through))
+    return _apart(state, min(state.tick, state.peer_state.peer.through))
 
 
-def _apart(mind: RobotState, tick: int) -> float:
-    own, peers = mind.findings.own_anchor, mind.findings.peer_anchor
+def _apart(state: RobotState, tick: int) -> float:
+    own, peers = state.belief.own_anchor, state.belief.peer_anchor
     assert peers is not None
-    return own + peers + _drift(mind, tick)
+    return own + peers + _drift(state, tick)
 
 
 def pinned_down(
-    mind: RobotState, placement: Placement, ranged: Sequence[PairObservation], off: float
+    state: RobotState, placement: Placement, ranged: Sequence[PairObservation], off: float
 ) -> bool:
     """Return whether the sightings in `ranged` determine `placement` to SURE; `off` is `apart`.
 
@@ -154,9 +154,9 @@ def pinned_down(
     before the first one shifts all ranges alike, as an anchor error does.
     """
     first, last = ranged[0].tick, ranged[-1].tick
-    period, extent = mind.briefing.mission.period, size(mind)
+    period, extent = state.config.mission.period, size(state)
     floor = 0.0
-    for log in (mind.log, mind.radio.peer):
+    for log in (state.log, state.peer_state.peer):
         floor += 0.5 * _rounded(extent, log.between(first, last), period)
-    turned = turn_error(placement, ranged, floor, _apart(mind, first))
+    turned = turn_error(placement, ranged, floor, _apart(state, first))
     return off + turned * max(1.0, extent) <= SURE

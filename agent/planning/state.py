@@ -11,8 +11,8 @@ from agent.estimation.closed_forms import Placement
 from agent.estimation.exact import Branch, PairObservation
 from agent.estimation.gaussian.consistency import Inconsistency
 from agent.estimation.gaussian.hypotheses import Hypothesis
-from agent.peer.motion_log import Logbook
-from agent.peer.peer_state import Radio
+from agent.peer.motion_log import MotionLog
+from agent.peer.peer_state import PeerState
 from agent.planning.active_sensing import Listening, Retreating, Surveying
 from agent.planning.phase1_anchor import ThirdPoint
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent, off_anchor
@@ -39,9 +39,9 @@ Phase1 = Straight | Backing | Turning | Circling | ThirdPoint | Surveying | Homi
 Phase2 = Aligning | Radial | Tangent | Orbiting
 Phase3 = Straight | Backing | Turning | Circling | Standing | Waiting | LastManoeuvre | Returning
 Noisy3 = Surveying | Listening | Retreating
-State = Asleep | Phase1 | Phase2 | Phase3 | Noisy3 | Done
+Mode = Asleep | Phase1 | Phase2 | Phase3 | Noisy3 | Done
 
-WORDS: dict[type, str] = {
+MODE_NAMES: dict[type, str] = {
     Asleep: "asleep",
     Straight: "straight",
     Backing: "backing",
@@ -71,9 +71,9 @@ class Belief(msgspec.Struct, frozen=True):
     branch: Branch | None = None
     """the one that is left after phase 1"""
     branch_kind: messages.BranchKind | None = None
-    parted: int | None = None
+    phase1_done_tick: int | None = None
     """the tick in which phase 1 was over, for the first time"""
-    met: int | None = None
+    encounter_tick: int | None = None
     """the tick in which phase 3 began"""
     placements: tuple[Placement, ...] = ()
     """those of eq. (7) that are left"""
@@ -94,9 +94,9 @@ class Belief(msgspec.Struct, frozen=True):
     """in <W>, by each of these"""
     covariance: Covariance | None = None
     """of the first"""
-    missing: str | None = None
+    blocking_reason: str | None = None
     """under noise: what there is to know yet, before it can claim"""
-    sought: int = 0
+    ranges_at_last_search: int = 0
     """under noise: how many mutual ranges there were when the whole plane was last searched"""
     against: Inconsistency | None = None
     """under noise: what most speaks against the first"""
@@ -111,15 +111,15 @@ class Belief(msgspec.Struct, frozen=True):
 class RobotState(msgspec.Struct, frozen=True):
     """Everything that a robot knows."""
 
-    briefing: RobotConfig
-    state: State = Asleep()
+    config: RobotConfig
+    mode: Mode = Asleep()
     tick: int = -1
     odometry: Pose = ORIGIN
     """now, in the frame of tick 0"""
-    log: Logbook = Logbook()
+    log: MotionLog = MotionLog()
     mutual: tuple[Ranged, ...] = ()
-    findings: Belief = Belief()
-    radio: Radio = Radio()
+    belief: Belief = Belief()
+    peer_state: PeerState = PeerState()
     in_contact: bool = False
     """whether the peer is in range in this tick"""
     leg: Pose = ORIGIN
@@ -128,22 +128,22 @@ class RobotState(msgspec.Struct, frozen=True):
     @property
     def orbit(self) -> Orbit:
         """This robot's part of the rendezvous."""
-        return self.briefing.rendezvous.of(self.briefing.role)
+        return self.config.rendezvous.of(self.config.role)
 
     @property
     def off_anchor(self) -> bool:
         """Whether b, be it this robot or the peer, is where it can be met; phase 1 is done by both."""
-        assert self.radio.start is not None
-        if self.briefing.role == "b":
+        assert self.peer_state.start is not None
+        if self.config.role == "b":
             local = self.local_pose
         else:
-            local = self.radio.peer.pose(self.radio.start, self.tick, self.briefing.mission.period)
-        return off_anchor(local, self.briefing.rendezvous.b)
+            local = self.peer_state.peer.pose(self.peer_state.start, self.tick, self.config.mission.period)
+        return off_anchor(local, self.config.rendezvous.b)
 
     @property
     def phase(self) -> int:
         """The paper's: 1, 2 or 3."""
-        match self.state:
+        match self.mode:
             case Orbiting() | Aligning() | Radial() | Tangent():
                 return 2
             case Asleep() | ThirdPoint():
@@ -158,36 +158,36 @@ class RobotState(msgspec.Struct, frozen=True):
                 return 3
 
     @property
-    def doing(self) -> str:
+    def mode_name(self) -> str:
         """The state in a word."""
-        match self.state:
+        match self.mode:
             case Done(_, Localised()):
                 return "localised"
             case Done(_, Inconsistent()):
                 return "alarm"
             case Done(_, Undecided()):
                 return "undecided"
-            case state:
-                return WORDS[type(state)]
+            case mode:
+                return MODE_NAMES[type(mode)]
 
     @property
     def verdict(self) -> messages.Verdict | None:
         """What it has come to, if it has."""
-        return self.state.verdict if isinstance(self.state, Done) else None
+        return self.mode.verdict if isinstance(self.mode, Done) else None
 
     def undecided(self, reason: str) -> RobotState:
         """It cannot go on, and does not guess."""
-        return replace(self, state=Done(self.phase, Undecided(reason)))
+        return replace(self, mode=Done(self.phase, Undecided(reason)))
 
     def alarmed(self, alarm: Inconsistent) -> RobotState:
         """The peer tells what cannot be so."""
-        return replace(self, state=Done(self.phase, alarm))
+        return replace(self, mode=Done(self.phase, alarm))
 
     @property
     def start(self) -> Pose:
         """Where tick 0 lies in the frame of its anchor; known from phase 2 on."""
-        assert self.findings.branch is not None
-        return self.findings.branch.start
+        assert self.belief.branch is not None
+        return self.belief.branch.start
 
     @property
     def local_pose(self) -> Pose:
@@ -196,10 +196,10 @@ class RobotState(msgspec.Struct, frozen=True):
 
     def world_pose(self, placement: Placement) -> Pose:
         """Where it is in <W>, if that is how <a(M1)> lies in <b(M2)>."""
-        own, peer = self.briefing.anchor, self.briefing.peer_anchor
-        m1, m2 = (own, peer) if self.briefing.role == "a" else (peer, own)
+        own, peer = self.config.anchor, self.config.peer_anchor
+        m1, m2 = (own, peer) if self.config.role == "a" else (peer, own)
         turn = math.atan2(m1.y - m2.y, m1.x - m2.x) - math.atan2(placement.y, placement.x)
-        if self.briefing.role == "a":
+        if self.config.role == "a":
             turn += placement.phi
         return compose(Pose(own.x, own.y, turn), self.local_pose)
 
@@ -209,18 +209,18 @@ class RobotState(msgspec.Struct, frozen=True):
         Not beyond: from phase 2 on the log leaves out the ranges that say nothing new.
         """
         ranges = {ranged.tick: ranged.range for ranged in self.log.ranges}
-        track = self.log.track(ORIGIN, 0, self.tick, self.briefing.mission.period)
+        track = self.log.track(ORIGIN, 0, self.tick, self.config.mission.period)
         return [(pose, ranges.get(tick)) for tick, pose in enumerate(track)]
 
-    def sightings(self, first: int) -> list[PairObservation]:
+    def pair_observations(self, first: int) -> list[PairObservation]:
         """Every tick from `first` on that both robots' logs cover: where both were, and the range between."""
-        last = min(self.tick, self.radio.peer.through)
-        if self.radio.start is None or last < first:
+        last = min(self.tick, self.peer_state.peer.through)
+        if self.peer_state.start is None or last < first:
             return []
-        period = self.briefing.mission.period
+        period = self.config.mission.period
         own = self.log.track(self.start, first, last, period)
-        peer = self.radio.peer.track(self.radio.start, first, last, period)
-        a, b = (own, peer) if self.briefing.role == "a" else (peer, own)
+        peer = self.peer_state.peer.track(self.peer_state.start, first, last, period)
+        a, b = (own, peer) if self.config.role == "a" else (peer, own)
         ranges = {ranged.tick: ranged.range for ranged in self.mutual}
         return [
             PairObservation(tick, at_a, at_b, ranges.get(tick))

@@ -33,7 +33,7 @@ from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 class Step(msgspec.Struct, frozen=True):
     """One tick, in the order of the journal; what is none or empty did not come, or not any more."""
 
-    sense: Observation
+    observation: Observation
     frame: bytes
     """that the Observation came in"""
     report: FramedReport | None = None
@@ -41,17 +41,17 @@ class Step(msgspec.Struct, frozen=True):
     heard: tuple[FramedReport, ...] = ()
     missed: tuple[str, ...] = ()
     """peers whose report did not come in time"""
-    drive: Command | None = None
+    command: Command | None = None
     estimate: Estimate | None = None
 
 
 class Past(msgspec.Struct, frozen=True):
     """A journal, whole or up to where it breaks off."""
 
-    briefing: RobotConfig
+    config: RobotConfig
     steps: tuple[Step, ...]
     end: MissionEnd | None = None
-    farewell: FinalReport | None = None
+    final_report: FinalReport | None = None
     environment: Environment | None = None
     """where it was written; none of an older recording"""
 
@@ -64,16 +64,16 @@ class Past(msgspec.Struct, frozen=True):
     def claim(self) -> tuple[int, Localised] | None:
         """The first that it made, and in which tick."""
         for step in self.steps:
-            if step.drive is not None and isinstance(step.drive.verdict, Localised):
-                return step.sense.tick, step.drive.verdict
+            if step.command is not None and isinstance(step.command.verdict, Localised):
+                return step.observation.tick, step.command.verdict
         return None
 
     @property
     def odometry(self) -> tuple[Pose, ...]:
         """Its poses in the frame of tick 0, dead-reckoned from what it measured itself to have driven."""
-        poses, period = [ORIGIN], self.briefing.mission.period
+        poses, period = [ORIGIN], self.config.mission.period
         for step in self.steps[1:]:
-            done = step.sense.executed or REST
+            done = step.observation.executed or REST
             poses.append(motion.step(poses[-1], done.v, done.omega, period))
         return tuple(poses[: len(self.steps)])
 
@@ -89,7 +89,7 @@ class Past(msgspec.Struct, frozen=True):
 
     def contact(self, tick: int) -> Contact | None:
         """With its peer, as it sensed it at `tick`; none, too, where that is not on record."""
-        contacts = self.steps[tick].sense.contacts if tick < len(self.steps) else ()
+        contacts = self.steps[tick].observation.contacts if tick < len(self.steps) else ()
         return contacts[0] if contacts else None
 
 
@@ -111,39 +111,39 @@ def past(frames: Iterable[bytes], source: object) -> Past:
     frames = list(frames)
     environment = named_in(frames)
     first = int(environment is not None)
-    briefing: RobotConfig | None = None
+    config: RobotConfig | None = None
     steps: list[Step] = []
     end: MissionEnd | None = None
-    farewell: FinalReport | None = None
+    final_report: FinalReport | None = None
     for place, frame in enumerate(frames[first:], first):
         message = _message(frame, source)
         if place == first and not isinstance(message, RobotConfig):
             raise CorruptJournal(f"{source}: an agent's journal begins with its Briefing")
         match message:
             case RobotConfig() if place == first:
-                briefing = message
+                config = message
             case MissionEnd() if end is None:
                 end = message
-            case FinalReport() if end is not None and farewell is None:
-                farewell = message
+            case FinalReport() if end is not None and final_report is None:
+                final_report = message
             case Observation(tick) if end is None and tick == len(steps) and _answered(steps):
                 steps.append(Step(message, frame))
             case Report() | DeadlineMissed() | Command() | Estimate() if steps and end is None:
-                assert briefing is not None
-                onward = _with(steps[-1], message, frame, briefing.robot)
+                assert config is not None
+                onward = _with(steps[-1], message, frame, config.robot)
                 if onward is None:
                     raise OutOfOrder(message, place, source)
                 steps[-1] = onward
             case _:
                 raise OutOfOrder(message, place, source)
-    if briefing is None:
+    if config is None:
         raise CorruptJournal(f"{source}: there is no RobotConfig in it")
-    return Past(briefing, tuple(steps), end, farewell, environment)
+    return Past(config, tuple(steps), end, final_report, environment)
 
 
 def _answered(steps: Sequence[Step]) -> bool:
     """Whether the latest of them has come to its Command, so that the next may come."""
-    return not steps or steps[-1].drive is not None
+    return not steps or steps[-1].command is not None
 
 
 def _message(frame: bytes, source: object) -> Any:
@@ -156,15 +156,15 @@ def _message(frame: bytes, source: object) -> Any:
 def _with(step: Step, message: object, frame: bytes, robot: str) -> Step | None:
     """`step`, and what came next in it; none where that cannot come next."""
     match message:
-        case Estimate(tick=step.sense.tick) if step.drive is not None and step.estimate is None:
+        case Estimate(tick=step.observation.tick) if step.command is not None and step.estimate is None:
             return replace(step, estimate=message)
-        case Command(tick=step.sense.tick) if step.drive is None:
-            return replace(step, drive=message)
-        case DeadlineMissed(tick=step.sense.tick) if step.drive is None:
+        case Command(tick=step.observation.tick) if step.command is None:
+            return replace(step, command=message)
+        case DeadlineMissed(tick=step.observation.tick) if step.command is None:
             return replace(step, missed=(*step.missed, message.robot))
-        case Report(tick=step.sense.tick) if message.robot == robot and step.report is None:
+        case Report(tick=step.observation.tick) if message.robot == robot and step.report is None:
             return replace(step, report=FramedReport(message, frame))
-        case Report() if message.robot != robot and step.drive is None:
+        case Report() if message.robot != robot and step.command is None:
             return replace(step, heard=(*step.heard, FramedReport(message, frame)))
         case _:
             return None

@@ -76,7 +76,7 @@ class Search:
 class _Offers(NamedTuple):
     """The answers to a robot of the worlds that are alive."""
 
-    briefings: dict[str, RobotConfig]
+    configs: dict[str, RobotConfig]
     """by run"""
     played: str | None
     """a run in which the robot is there already"""
@@ -100,10 +100,10 @@ def join(link: zenoh.Session, run: str | None, robot: str, search: Search) -> tu
     while time.monotonic() < until:
         worlds = [key.run for key in session.alive(link, keys.world_alive(run or "*"), QUERY_S)]
         offers = _offers(link, worlds[:MOST_WORLDS], robot)
-        if len(offers.briefings) > 1:
-            raise Unwelcome(f"several runs are alive: {', '.join(offers.briefings)}; choose one with --run")
-        for found, briefing in offers.briefings.items():
-            return found, briefing
+        if len(offers.configs) > 1:
+            raise Unwelcome(f"several runs are alive: {', '.join(offers.configs)}; choose one with --run")
+        for found, config in offers.configs.items():
+            return found, config
         played = offers.played
         if offers.refused is None:
             refused = None
@@ -127,7 +127,7 @@ def _offers(link: zenoh.Session, worlds: Sequence[str], robot: str) -> _Offers:
         if session.alive(link, keys.robot_alive(world, robot), QUERY_S):
             played = world
             continue
-        key = keys.briefing(world, robot)
+        key = keys.config(world, robot)
         answer = session.ask(
             link, key, QUERY_S, lambda frame: isinstance(_briefing(frame, robot), RobotConfig)
         )
@@ -145,9 +145,9 @@ def _offers(link: zenoh.Session, worlds: Sequence[str], robot: str) -> _Offers:
 def _briefing(answer: bytes, robot: str) -> RobotConfig | str:
     """Return the briefing of `robot` in a world's answer, or why there is none in it."""
     try:
-        briefing = decode(answer, RobotConfig)
+        config = decode(answer, RobotConfig)
     except MalformedFrame as error:
         return f"the world's briefing is not understood: {error}"
-    if briefing.robot != robot:
-        return f"the world's briefing is for '{briefing.robot}', not for '{robot}'"
-    return briefing
+    if config.robot != robot:
+        return f"the world's briefing is for '{config.robot}', not for '{robot}'"
+    return config

@@ -24,23 +24,23 @@ class WorldLinkLost(Exception):
 class AgentLink:
     """One robot's in one run. Nothing is heard or said before a session is attached."""
 
-    def __init__(self, briefing: RobotConfig, run: str, inbox: Inbox) -> None:
-        self._id = briefing.robot
-        self._peer = briefing.peer
+    def __init__(self, config: RobotConfig, run: str, inbox: Inbox) -> None:
+        self._id = config.robot
+        self._peer = config.peer
         self._run = run
         self._inbox = inbox
-        self._silence = SILENCE_S + (briefing.tick_s or 0.0)
+        self._silence = SILENCE_S + (config.tick_s or 0.0)
         self.estimate_wanted = False
         """whether anybody listens to estimates"""
 
     def attach(self, link: zenoh.Session) -> None:
         """From now on, this is the session over which it hears and is heard."""
         me, peer, run = self._id, self._peer, self._run
-        self._drive = session.publisher(link, keys.drive(run, me))
+        self._command = session.publisher(link, keys.command(run, me))
         self._report = session.publisher(link, keys.report(run, me, peer))
         self._estimate = session.publisher(link, keys.estimate(run, me))
         session.on_matching(self._estimate, self._want_estimate)
-        session.subscribe(link, keys.sense(run, me), self._inbox, "sense")
+        session.subscribe(link, keys.observation(run, me), self._inbox, "sense")
         session.subscribe(link, keys.report(run, peer, me), self._inbox, "report")
         session.watch_liveliness(link, keys.world_alive(run), self._inbox)
         self._show_alive = partial(session.show_alive, link, keys.robot_alive(run, me))
@@ -63,9 +63,9 @@ class AgentLink:
         gone.undeclare()
         self._token = self._show_alive()
 
-    def drive(self, frame: bytes) -> None:
+    def command(self, frame: bytes) -> None:
         """Say a Command, or a FinalReport, to the world."""
-        self._drive.put(frame)
+        self._command.put(frame)
 
     def report(self, frame: bytes) -> None:
         """Say a Report to the peer."""

@@ -46,27 +46,27 @@ class AgentProcess:
         inbox: Inbox,
         *,
         patience: float = 30.0,
-        reached: Callable[[str, int], None] | None = None,
+        on_kill_point: Callable[[str, int], None] | None = None,
     ) -> None:
-        """`patience` (s) bounds the wait for the world; `reached` is told how far each tick has come."""
-        briefing = memory.briefing
-        self._id = briefing.robot
+        """`patience` (s) bounds the wait for the world; `on_kill_point` is told how far each tick has come."""
+        config = memory.config
+        self._id = config.robot
         self._inbox = inbox
         self._patience = patience
-        self._tick_s = briefing.tick_s
+        self._tick_s = config.tick_s
         self._silence = patience + (self._tick_s or 0.0)
         """how long to wait for something new from the world"""
         self._give_up = time.monotonic() + self._silence
-        self._reached = reached
+        self._on_kill_point = on_kill_point
         self._robot = memory.robot
-        self._sense = memory.sense
+        self._observation = memory.observation
         """the latest"""
         self._due: float | None = None
         """in real time: when to go on without the reports that it lists"""
-        if self._sense is not None and self._robot.drive is None:
+        if self._observation is not None and self._robot.command is None:
             self._set_due()
         real_time = self._tick_s is not None
-        self._link = AgentLink(briefing, run, inbox)
+        self._link = AgentLink(config, run, inbox)
         self._disorder = OutOfStep(self._id, inbox, self._link.appear, real_time=real_time)
         self._post = Post(inbox, memory.heard, real_time=real_time)
         self._gone = False
@@ -77,9 +77,9 @@ class AgentProcess:
         """when to do so once more, if it was asked for too soon"""
         self._told = deque(memory.told, maxlen=REPORTS_TOLD)
         """its own latest reports"""
-        self.end: MissionEnd | None = memory.end if memory.farewell is not None else None
+        self.end: MissionEnd | None = memory.end if memory.final_report is not None else None
         """once the world has said it"""
-        self._farewell = memory.farewell
+        self._final_report = memory.final_report
 
     def play(self) -> MissionEnd:
         """The run over the link that it is attached to, to its MissionEnd.
@@ -139,7 +139,7 @@ class AgentProcess:
     @property
     def _known(self) -> int:
         """The tick of its latest Observation."""
-        return self._sense.tick if self._sense is not None else -1
+        return self._observation.tick if self._observation is not None else -1
 
     # --- what arrives ---
 
@@ -157,46 +157,46 @@ class AgentProcess:
     def _is_over(self, end: MissionEnd) -> bool:
         return end.tick == self._known or self._disorder.persists(end, ENDED_S)
 
-    def _on_sense(self, sense: Observation, frame: bytes) -> bool:
+    def _on_sense(self, observation: Observation, frame: bytes) -> bool:
         """Whether it is in step. Raises NoWorld."""
-        if sense.tick == self._known + 1:
-            if self._reached is not None:
-                self._reached("sense", sense.tick)
+        if observation.tick == self._known + 1:
+            if self._on_kill_point is not None:
+                self._on_kill_point("sense", observation.tick)
             if self._due is not None:  # the world goes on; what has not come is missed
                 self._due = 0.0
                 self._decide_when_all_is_heard()
             self._disorder.over()
-            self._sense = sense
+            self._observation = observation
             self._set_due()
-            told = self._robot.sense(sense, frame)
+            told = self._robot.observation(observation, frame)
             if told is not None:
                 self._told.append(told)
                 self._send_report(told)
             return True
-        if sense == self._sense:
+        if observation == self._observation:
             self._disorder.over()
             self._say_again()
             return True
-        self._disorder.sense(sense, self._known)
+        self._disorder.observation(observation, self._known)
         return False
 
     def _set_due(self) -> None:
-        if self._tick_s is not None and self._sense is not None:
-            in_field = any(contact.heard is None for contact in self._sense.contacts)
+        if self._tick_s is not None and self._observation is not None:
+            in_field = any(contact.heard is None for contact in self._observation.contacts)
             self._due = time.monotonic() + (FIELD_SHARE if in_field else REPORT_SHARE) * self._tick_s
 
     # --- what is done about it ---
 
     def _decide_when_all_is_heard(self) -> None:
-        if self._sense is None or self._robot.drive is not None:
+        if self._observation is None or self._robot.command is not None:
             return
         heard: list[FramedReport] = []
         missed: list[str] = []
-        for contact in self._sense.contacts:
+        for contact in self._observation.contacts:
             listed = contact.heard
             if listed is None:
-                heard += self._post.waiting(self._sense.tick)
-                listed = () if self._post.of(self._sense.tick) else (self._sense.tick,)
+                heard += self._post.waiting(self._observation.tick)
+                listed = () if self._post.of(self._observation.tick) else (self._observation.tick,)
             for tick in listed:
                 told = self._post.of(tick)
                 if told is not None:
@@ -205,29 +205,29 @@ class AgentProcess:
                     return
                 else:
                     missed.append(contact.peer)
-        drive = self._robot.decide(heard, missed)
+        command = self._robot.decide(heard, missed)
         self._due = None
-        self._send_drive(drive.tick)
+        self._send_drive(command.tick)
         if self._robot.journaled or self._link.estimate_wanted:
             estimate = self._robot.estimate()
             if self._link.estimate_wanted:
                 self._link.estimate(estimate)
         self._post.list(told.report.tick for told in heard)
-        for contact in self._sense.contacts:
+        for contact in self._observation.contacts:
             self._post.list(contact.damaged)
-        self._post.forget(drive.tick - REPORTS_KEPT, self._robot.unheard)
+        self._post.forget(command.tick - REPORTS_KEPT, self._robot.unheard)
 
     def _send_report(self, told: FramedReport) -> None:
         self._link.report(told.frame)
-        if self._reached is not None:
-            self._reached("report", told.report.tick)
+        if self._on_kill_point is not None:
+            self._on_kill_point("report", told.report.tick)
 
     def _send_drive(self, tick: int) -> None:
-        if self._reached is not None:
-            self._reached("journal", tick)
-        self._link.drive(self._robot.drive_frame)
-        if self._reached is not None:
-            self._reached("drive", tick)
+        if self._on_kill_point is not None:
+            self._on_kill_point("journal", tick)
+        self._link.command(self._robot.drive_frame)
+        if self._on_kill_point is not None:
+            self._on_kill_point("drive", tick)
 
     def _say_again(self) -> None:
         """All that whoever was started again may have lost: earlier reports, too, if the peer is near."""
@@ -241,12 +241,12 @@ class AgentProcess:
             for told in self._told:
                 if told.report.tick > oldest:
                     self._send_report(told)
-        if self._robot.drive is not None:
-            self._send_drive(self._robot.drive.tick)
+        if self._robot.command is not None:
+            self._send_drive(self._robot.command.tick)
 
     def _conclude(self, end: MissionEnd) -> None:
         self._post.forget(end.tick + REPORTS_KEPT + 1, self._robot.unheard)
-        self._farewell = self._robot.farewell(
+        self._final_report = self._robot.final_report(
             end,
             reports_refused=self._inbox.refused["report"],
             reports_unheard=self._post.unheard,
@@ -257,9 +257,9 @@ class AgentProcess:
 
     def _part(self, end: MissionEnd) -> MissionEnd:
         """Answer the MissionEnd, as often as it is said, until the world says that it has the answer on record."""
-        assert self._farewell is not None
-        frame = encode(self._farewell)
-        self._link.drive(frame)
+        assert self._final_report is not None
+        frame = encode(self._final_report)
+        self._link.command(frame)
         self._disorder.over()
         gone = False
         while (now := time.monotonic()) < self._give_up:
@@ -269,10 +269,10 @@ class AgentProcess:
                     break
                 message = self._accepted(arrival)
                 if isinstance(message, Observation):
-                    self._disorder.sense(message, end.tick)
+                    self._disorder.observation(message, end.tick)
                 elif message is not None:
                     self._disorder.over()
-                    self._link.drive(frame)
+                    self._link.command(frame)
             elif arrival.topic == "alive":
                 self._disorder.world(there=True)
             elif arrival.topic == "gone":

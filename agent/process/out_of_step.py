@@ -35,17 +35,17 @@ class OutOfStep:
         """The world has come, or gone; while it is gone, nobody is believed."""
         self._world_there, self._odd = there, None
 
-    def sense(self, sense: Observation, known: int) -> None:
+    def observation(self, observation: Observation, known: int) -> None:
         """The world is elsewhere, if it stays there: one of the two has lost its past, or comes too late.
 
         `known` is the latest tick in step. In real time it tells what lies between. Raises NoWorld.
         """
-        tick = sense.tick
+        tick = observation.tick
         if self._real_time and tick < known:
             return  # told once more of what was missed
         if self._real_time and tick > known and self._odd is None:
             self._appear()  # who appears is told what it has missed
-        if not self.persists(sense, BEHIND_S):
+        if not self.persists(observation, BEHIND_S):
             return
         if tick == known:
             raise NoWorld(

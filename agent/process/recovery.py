@@ -26,16 +26,16 @@ REPORTS_TOLD = REPORTS_KEPT - 4
 class Memory(msgspec.Struct, frozen=True):
     """A robot and what its process must know beside its mind; of a new robot, nothing."""
 
-    briefing: RobotConfig
+    config: RobotConfig
     robot: Robot
-    sense: Observation | None = None
+    observation: Observation | None = None
     """the latest"""
     told: tuple[FramedReport, ...] = ()
     """its latest reports"""
     heard: tuple[FramedReport, ...] = ()
     """the peer's latest"""
     end: MissionEnd | None = None
-    farewell: FinalReport | None = None
+    final_report: FinalReport | None = None
     """what it has answered to the MissionEnd"""
 
 
@@ -48,34 +48,34 @@ def remember(record: Retrace) -> Memory | None:
         return None
     named = environment.named_in(record.frames)
     lived = past(record.frames, record.path)
-    robot = Robot(lived.briefing)
+    robot = Robot(lived.config)
     robot.keep(record)
-    record.write(*[encode(one) for one in (named, lived.briefing) if one is not None])
+    record.write(*[encode(one) for one in (named, lived.config) if one is not None])
     told: deque[FramedReport] = deque(maxlen=REPORTS_TOLD)
     for step in lived.steps:
         try:
-            report = robot.sense(step.sense, step.frame)
+            report = robot.observation(step.observation, step.frame)
             if report is not None:  # though it be torn on record
                 told.append(report)
-            if step.drive is not None:
+            if step.command is not None:
                 robot.decide(step.heard, step.missed)
                 robot.estimate()
         except ReplayMismatch:
             raise CorruptJournal(
-                f"{record.path}: on record it decided otherwise at tick {step.sense.tick}: "
+                f"{record.path}: on record it decided otherwise at tick {step.observation.tick}: "
                 + (environment.otherwise(named, environment.of_robot()) or "the journal is another version's")
             ) from None
-    if lived.farewell is not None:  # counts what the wire brought, too, which no fold can
+    if lived.final_report is not None:  # counts what the wire brought, too, which no fold can
         record.write(*record.frames[-2:])
-    sense = lived.steps[-1].sense if lived.steps else None
-    now = sense.tick if sense is not None else 0
+    observation = lived.steps[-1].observation if lived.steps else None
+    now = observation.tick if observation is not None else 0
     latest = lived.steps[-REPORTS_KEPT:]
     return Memory(
-        briefing=lived.briefing,
+        config=lived.config,
         robot=robot,
-        sense=sense,
+        observation=observation,
         told=tuple(told),
         heard=tuple([one for step in latest for one in step.heard if now - one.report.tick <= REPORTS_KEPT]),
-        end=lived.end if lived.farewell is not None else None,
-        farewell=lived.farewell,
+        end=lived.end if lived.final_report is not None else None,
+        final_report=lived.final_report,
     )

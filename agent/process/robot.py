@@ -35,11 +35,11 @@ class FramedReport(msgspec.Struct, frozen=True):
 class Robot:
     """One robot's mind, and the record of what went in and came out of it."""
 
-    def __init__(self, briefing: RobotConfig, journal: Sink | None = None) -> None:
-        self.mind = RobotState(briefing)
+    def __init__(self, config: RobotConfig, journal: Sink | None = None) -> None:
+        self.mind = RobotState(config)
         self.told: FramedReport | None = None
         """the report of this tick, if there was anyone to hear it"""
-        self.drive: Command | None = None
+        self.command: Command | None = None
         """the Command of this tick; none before it is decided"""
         self.reports_sent = 0
         self.damaged = 0
@@ -52,7 +52,7 @@ class Robot:
         """a Observation that nothing has followed from yet; journaled with the Command, before that is sent"""
         self._journal = journal
         if journal is not None:
-            journal.write(encode(environment.of_robot()), encode(briefing))
+            journal.write(encode(environment.of_robot()), encode(config))
 
     def keep(self, journal: Sink | None) -> None:
         """Go on journaling there."""
@@ -67,34 +67,34 @@ class Robot:
     def drive_frame(self) -> bytes:
         """What to send of this tick's Command, once there is one."""
         if self._frame is None:
-            assert self.drive is not None
-            self._frame = encode(self.drive)
+            assert self.command is not None
+            self._frame = encode(self.command)
         return self._frame
 
-    def sense(self, sense: Observation, frame: bytes | None = None) -> FramedReport | None:
+    def observation(self, observation: Observation, frame: bytes | None = None) -> FramedReport | None:
         """Fold in what was sensed (it came in `frame`); the report to send, if anyone is there to hear it."""
-        self.mind = planner.observe(self.mind, sense)
-        self.told = self.drive = self._frame = None
-        for contact in sense.contacts:
-            self.unheard.add(sense.tick)
+        self.mind = planner.observe(self.mind, observation)
+        self.told = self.command = self._frame = None
+        for contact in observation.contacts:
+            self.unheard.add(observation.tick)
             self.unheard.difference_update(contact.heard or (), contact.damaged)
             self.damaged += len(contact.damaged)
-        if sense.contacts:
+        if observation.contacts:
             report = planner.report(self.mind)
             self.told = FramedReport(report, encode(report))
             self.reports_sent += 1
             self.bytes_sent += len(self.told.frame)
             if self._journal is not None:
-                self._journal.write(frame or encode(sense), self.told.frame)
+                self._journal.write(frame or encode(observation), self.told.frame)
         elif self._journal is not None:
-            self._unwritten = frame or encode(sense)
+            self._unwritten = frame or encode(observation)
         return self.told
 
     def decide(self, heard: Sequence[FramedReport] = (), missed: Sequence[str] = ()) -> Command:
         """Fold in what was heard; the drive for the tick. `missed` are peers whose report did not come."""
         self.mind = planner.decide(self.mind, [told.report for told in heard])
         self.unheard.difference_update([told.report.tick for told in heard])
-        self.drive = planner.drive(self.mind)
+        self.command = planner.command(self.mind)
         if self._journal is not None:
             frames = [told.frame for told in heard]
             frames += [encode(DeadlineMissed(self.mind.tick, peer)) for peer in missed]
@@ -102,7 +102,7 @@ class Robot:
                 frames.insert(0, self._unwritten)
                 self._unwritten = None
             self._journal.write(*frames, self.drive_frame)
-        return self.drive
+        return self.command
 
     def estimate(self) -> bytes:
         """The frame of what the robot holds possible, for whoever watches; once a tick, after the Command.
@@ -114,29 +114,29 @@ class Robot:
             self._journal.write(frame)
         return frame
 
-    def farewell(
+    def final_report(
         self, end: MissionEnd, *, reports_refused: int = 0, reports_unheard: int = 0, frames_refused: int = 0
     ) -> FinalReport:
         """The mission is over: how it went, seen from inside, and what the wire brought that was no use."""
-        mind, findings = self.mind, self.mind.findings
+        state, findings = self.mind, self.mind.belief
         plan = findings.plan
-        farewell = FinalReport(
-            robot=mind.briefing.robot,
-            anchor_ranges=len(mind.log.ranges),
-            mutual_ranges=len(mind.mutual),
+        final_report = FinalReport(
+            robot=state.config.robot,
+            anchor_ranges=len(state.log.ranges),
+            mutual_ranges=len(state.mutual),
             branch=findings.branch_kind,
             alpha=findings.branch.alpha if findings.branch is not None else None,
             candidates=findings.candidates,
-            last_turn_rate=plan.drive.omega if plan is not None else None,
+            last_turn_rate=plan.command.omega if plan is not None else None,
             separation_m2=plan.separation_m2 if plan is not None else None,
             hypotheses=(
                 len(findings.pair or findings.placements) if findings.candidates is not None else None
             ),
-            odds=findings.pair[0].odds if findings.pair else None,
-            missing=findings.missing,
+            probability=findings.pair[0].probability if findings.pair else None,
+            blocking_reason=findings.blocking_reason,
             p_value=findings.p_value,
             reports_sent=self.reports_sent,
-            reports_heard=mind.radio.heard,
+            reports_heard=state.peer_state.heard,
             reports_refused=reports_refused + self.damaged,
             reports_unheard=reports_unheard,
             reports_lost=len(self.unheard),
@@ -144,5 +144,5 @@ class Robot:
             bytes_sent=self.bytes_sent,
         )
         if self._journal is not None:
-            self._journal.write(encode(end), encode(farewell))
-        return farewell
+            self._journal.write(encode(end), encode(final_report))
+        return final_report

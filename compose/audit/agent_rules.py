@@ -23,12 +23,12 @@ def decision(case: Testified) -> Checks:
     for robot, past in case.pasts.items():
         tick = None
         try:
-            again = Robot(past.briefing)
+            again = Robot(past.config)
             for step in past.steps:
-                tick = step.sense.tick
+                tick = step.observation.tick
                 yield from _answers(again, robot, step, cut=step is past.steps[-1] and past.end is None)
-            if past.end is not None and past.farewell is not None:
-                yield _last_word(again, robot, past.end, past.farewell)
+            if past.end is not None and past.final_report is not None:
+                yield _last_word(again, robot, past.end, past.final_report)
         except Exception as error:  # noqa: BLE001  # whatever the inputs on record do to it, is a finding
             what = f"the planner cannot go on from its inputs: {type(error).__name__}: {error}"
             yield Violation("decision", tick, robot, what)
@@ -36,17 +36,17 @@ def decision(case: Testified) -> Checks:
 
 def _answers(again: Robot, robot: str, step: Step, *, cut: bool) -> Checks:
     """What `again` does in that tick, held against the record, which lacks its end if it is `cut`."""
-    tick = step.sense.tick
-    told = again.sense(step.sense, step.frame)
+    tick = step.observation.tick
+    told = again.observation(step.observation, step.frame)
     if told is not None and step.report is not None:
         yield _same(tick, robot, step.report.report, told.frame)
-    elif told is not None and not (cut and step.drive is None):
+    elif told is not None and not (cut and step.command is None):
         yield Violation("decision", tick, robot, "it sent no Report, expected one")
     elif step.report is not None:
         yield Violation("decision", tick, robot, "it sent a Report, expected none: nobody is in contact")
-    if step.drive is not None:
+    if step.command is not None:
         again.decide(step.heard, step.missed)
-        yield _same(tick, robot, step.drive, again.drive_frame)
+        yield _same(tick, robot, step.command, again.drive_frame)
     if step.estimate is not None:
         yield _same(tick, robot, step.estimate, again.estimate())
 
@@ -62,7 +62,7 @@ def _same(tick: int, robot: str, found: Message, expected: bytes) -> Violation |
 
 def _last_word(again: Robot, robot: str, end: MissionEnd, found: FinalReport) -> Violation | None:
     """The FinalReport; what the wire brought that was no use, only the process knows."""
-    expected = again.farewell(
+    expected = again.final_report(
         end,
         reports_refused=found.reports_refused - again.damaged,
         reports_unheard=found.reports_unheard,
@@ -77,11 +77,11 @@ def limits(case: Testified) -> Checks:
     With noise nobody knows what was driven but the world, whose wheels add it to what was asked.
     """
     for robot, past in case.pasts.items():
-        mission = past.briefing.mission
+        mission = past.config.mission
         for step in past.steps:
-            tick, drive, driven = step.sense.tick, step.drive, step.sense.executed
-            if drive is not None:
-                yield _within(tick, robot, "asked for", Controls(drive.v, drive.omega), mission)
+            tick, command, driven = step.observation.tick, step.command, step.observation.executed
+            if command is not None:
+                yield _within(tick, robot, "asked for", Controls(command.v, command.omega), mission)
             if driven is not None and mission.noise.exact:
                 yield _within(tick, robot, "drove", driven, mission)
 
@@ -103,13 +103,13 @@ def log(case: Testified) -> Checks:
     Who was told to lie tells, to the bit, what its lie makes of that; to which `decision` holds it.
     """
     for robot, past in case.pasts.items():
-        if past.briefing.lie is not None:
+        if past.config.attack is not None:
             continue
-        driven = [step.sense.executed for step in past.steps]
-        ranged = [step.sense.anchor_range for step in past.steps]
+        driven = [step.observation.executed for step in past.steps]
+        ranged = [step.observation.anchor_range for step in past.steps]
         for step in past.steps:
             if step.report is not None:
-                yield _as_it_was(step.sense.tick, robot, step.report.report, driven, ranged)
+                yield _as_it_was(step.observation.tick, robot, step.report.report, driven, ranged)
 
 
 def _as_it_was(

@@ -35,7 +35,7 @@ def claim(case: Evidence) -> Checks:
         vague = inaccuracy(made, mission)
         yield None if vague is None else Violation("claim", tick, placed.id, f"it {vague}")
         past = case.pasts.get(placed.id)
-        if past is not None and tick < len(past.steps) and past.steps[tick].drive is not None:
+        if past is not None and tick < len(past.steps) and past.steps[tick].command is not None:
             yield _redundant(case, placed, past, tick)
     yield from outcome(case)
 
@@ -43,9 +43,9 @@ def claim(case: Evidence) -> Checks:
 def _first_claim(case: Evidence, robot: str) -> tuple[int, Localised | None]:
     """What it claimed, and when; whatever it says later, it has said that."""
     for tick, one in enumerate(case.history.ticks):
-        drive = one.drives.get(robot)
-        if drive is not None and isinstance(drive.verdict, Localised):
-            return tick, drive.verdict
+        command = one.commands.get(robot)
+        if command is not None and isinstance(command.verdict, Localised):
+            return tick, command.verdict
     return 0, None
 
 
@@ -76,9 +76,9 @@ def _too_few(tick: int, placed: RobotSpec, what: str, found: int, expected: int)
 def _ranged(past: Past, through: int) -> list[int]:
     """The ticks of its mutual ranges."""
     return [
-        step.sense.tick
+        step.observation.tick
         for step in past.steps[: through + 1]
-        if any(contact.range is not None for contact in step.sense.contacts)
+        if any(contact.range is not None for contact in step.observation.contacts)
     ]
 
 

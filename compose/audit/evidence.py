@@ -12,7 +12,7 @@ from compose.recording.run import WORLD_JOURNAL, agent_journal
 from protocol.journal.environment import is_blank, of_robot, otherwise
 from protocol.journal.journal_file import CorruptJournal
 from protocol.messages import Command, Contact, Observation
-from world.tick import senses
+from world.tick import observations
 from world.world_journal import History, history
 
 
@@ -40,7 +40,7 @@ class Evidence(msgspec.Struct, frozen=True):
     """A run, before the judge."""
 
     history: History
-    senses: tuple[dict[str, Observation], ...]
+    observations: tuple[dict[str, Observation], ...]
     """what every robot senses, tick by tick, where the Commands on record have led it"""
     testimonies: dict[str, AgentLog]
     """of every robot of the scenario"""
@@ -54,17 +54,17 @@ class Evidence(msgspec.Struct, frozen=True):
     def forced(self) -> bool:
         """Whether the world did not wait for every answer: in real time, or with its patience lost."""
         failed = self.history.end is not None and self.history.end.outcome == "failed"
-        return failed or any(past.briefing.tick_s is not None for past in self.pasts.values())
+        return failed or any(past.config.tick_s is not None for past in self.pasts.values())
 
     def contact(self, robot: str, tick: int) -> Contact | None:
         """The contact that `robot` truly had at that tick; none, too, where that is not on record."""
-        if not 0 <= tick < len(self.senses):
+        if not 0 <= tick < len(self.observations):
             return None
-        return next(iter(self.senses[tick][robot].contacts), None)
+        return next(iter(self.observations[tick][robot].contacts), None)
 
-    def drive(self, robot: str, tick: int) -> Command | None:
+    def command(self, robot: str, tick: int) -> Command | None:
         """What the world had of `robot` at that tick."""
-        return self.history.ticks[tick].drives.get(robot)
+        return self.history.ticks[tick].commands.get(robot)
 
 
 def case_of(journals: Mapping[str, Iterable[bytes]], folder: object) -> Evidence:
@@ -78,10 +78,10 @@ def case_of(journals: Mapping[str, Iterable[bytes]], folder: object) -> Evidence
         name = agent_journal(robot.id)
         frames = list(journals.get(name, ()))
         testimony = testimony_of(frames, f"{folder}/{name}") if name in journals else _NONE
-        if testimony.past is not None and testimony.past.briefing.robot != robot.id:
-            raise CorruptJournal(f"{folder}/{name} is the journal of {testimony.past.briefing.robot}")
+        if testimony.past is not None and testimony.past.config.robot != robot.id:
+            raise CorruptJournal(f"{folder}/{name} is the journal of {testimony.past.config.robot}")
         testimonies[robot.id] = testimony
-    sensed = tuple([{sense.robot: sense for sense in senses(world)} for world in told.worlds])
+    sensed = tuple([{observation.robot: observation for observation in observations(world)} for world in told.worlds])
     return Evidence(told, sensed, testimonies)
 
 

@@ -12,17 +12,17 @@ def faults(case: Evidence) -> Checks:
     if not case.history.scenario.faults:
         return
     for robot, past in case.pasts.items():
-        for step in past.steps[: len(case.senses)]:
-            expected = case.contact(robot, step.sense.tick)
+        for step in past.steps[: len(case.observations)]:
+            expected = case.contact(robot, step.observation.tick)
             if expected is None:
                 continue
-            for found in step.sense.contacts:
+            for found in step.observation.contacts:
                 listed, planned = (found.heard, found.damaged), (expected.heard, expected.damaged)
                 if listed == planned:
                     yield None
                 else:
                     what = f"heard and damaged are {said(listed)}, expected {said(planned)}"
-                    yield Violation("faults", step.sense.tick, robot, what)
+                    yield Violation("faults", step.observation.tick, robot, what)
 
 
 def befallen(case: Evidence) -> tuple[LinkStatistics, ...]:
@@ -34,12 +34,12 @@ def befallen(case: Evidence) -> tuple[LinkStatistics, ...]:
 
 def _befallen(past: Past) -> LinkStatistics:
     """Of the link to this robot."""
-    contacts = [(step.sense.tick, contact) for step in past.steps for contact in step.sense.contacts]
+    contacts = [(step.observation.tick, contact) for step in past.steps for contact in step.observation.contacts]
     heard = [(now, tick) for now, contact in contacts for tick in contact.heard or ()]
     damaged = [tick for _, contact in contacts for tick in contact.damaged]
     ticks = [tick for _, tick in heard]
     return LinkStatistics(
-        link=f"{past.briefing.peer}->{past.briefing.robot}",
+        link=f"{past.config.peer}->{past.config.robot}",
         sent=len(contacts),
         heard=len(heard),
         late=sum([tick < now for now, tick in heard]),

@@ -88,7 +88,7 @@ class Findings(msgspec.Struct, frozen=True):
     """a rule each"""
     violations: tuple[Violation, ...]
     """the earliest first"""
-    radio: tuple[LinkStatistics, ...] = ()
+    links: tuple[LinkStatistics, ...] = ()
     """of each link, under a fault plan"""
     rounding: tuple[Violation, ...] = ()
     """what differs by rounding alone, in a recording that was made with other versions: no violations"""

@@ -16,7 +16,7 @@ from compose.audit.delivery_rules import report
 from compose.audit.evidence import AgentLog, other_versions, testimony_of
 from compose.audit.findings import Checks, Findings, findings_of
 from compose.audit.journal_rules import broken_off, whole
-from compose.audit.scenario_rules import briefing
+from compose.audit.scenario_rules import config
 from compose.recording.robots import agree
 from protocol.journal.journal_file import CorruptJournal
 
@@ -42,7 +42,7 @@ def order(alone: Alone) -> Checks:
             yield whole(robot, testimony.past, step, excused=True)
 
 
-RULES: tuple[Callable[[Alone], Checks], ...] = (order, briefing, report, decision, limits, log)
+RULES: tuple[Callable[[Alone], Checks], ...] = (order, config, report, decision, limits, log)
 """each by its name; where one violation follows from another, it comes later"""
 
 
@@ -59,11 +59,11 @@ def judge_alone(
     for name, frames in journals.items():
         testimony = testimony_of(list(frames), f"{folder}/{name}")
         robot = name.removeprefix("agent-").removesuffix(".journal")
-        if testimony.past is not None and testimony.past.briefing.robot != robot:
-            raise CorruptJournal(f"{folder}/{name} is the journal of {testimony.past.briefing.robot}")
+        if testimony.past is not None and testimony.past.config.robot != robot:
+            raise CorruptJournal(f"{folder}/{name} is the journal of {testimony.past.config.robot}")
         testimonies[robot] = testimony
     alone = Alone(testimonies)
-    agree({robot: past.briefing for robot, past in alone.pasts.items()}, folder)
+    agree({robot: past.config for robot, past in alone.pasts.items()}, folder)
     return findings_of(
         rules,
         alone,

@@ -57,8 +57,8 @@ def broken_off(robot: str, testimony: AgentLog) -> Violation | None:
     past = testimony.past
     if testimony.disorder is not None:
         return Violation("order", testimony.disorder_tick, robot, testimony.disorder)
-    if past is None or past.farewell is None:
-        last = past.steps[-1].sense.tick if past is not None and past.steps else None
+    if past is None or past.final_report is None:
+        last = past.steps[-1].observation.tick if past is not None and past.steps else None
         what = "its journal breaks off here, expected MissionEnd and Farewell"
         return Violation("order", last, robot, what, breaks_off=True)
     return None
@@ -66,25 +66,25 @@ def broken_off(robot: str, testimony: AgentLog) -> Violation | None:
 
 def whole(robot: str, past: Past, step: Step, *, excused: bool) -> Violation | None:
     """Every Observation was answered, but for the last: that may have come too late, or been the last of all."""
-    tick, last = step.sense.tick, step is past.steps[-1]
-    if last and (past.end is None or (excused and step.drive is None)):
+    tick, last = step.observation.tick, step is past.steps[-1]
+    if last and (past.end is None or (excused and step.command is None)):
         return None
-    if step.drive is None:
+    if step.command is None:
         return Violation("order", tick, robot, "no Command follows its Sense")
     if step.estimate is None:
         return Violation("order", tick, robot, "no Estimate follows its Drive")
-    if step.missed and past.briefing.tick_s is None:
+    if step.missed and past.config.tick_s is None:
         return Violation("order", tick, robot, "it went without a report, expected it to wait: no real time")
     return None
 
 
 def _same_drive(case: Evidence, robot: str, past: Past, step: Step) -> Violation | None:
     """The world had the Command that the robot gave."""
-    tick = step.sense.tick
+    tick = step.observation.tick
     if tick >= len(case.history.ticks):
         return None
-    had, gave = case.drive(robot, tick), step.drive
-    if had is None and past.briefing.tick_s is None:
+    had, gave = case.command(robot, tick), step.command
+    if had is None and past.config.tick_s is None:
         return Violation("order", tick, robot, "the world went without its Command, expected it to wait")
     if had is None or (gave is None and past.end is None):
         return None
@@ -109,7 +109,7 @@ def _same_end(case: Evidence, robot: str, past: Past) -> Violation | None:
 def _same_farewell(case: Evidence, robot: str, past: Past) -> Violation | None:
     """The world has heard the robot's last word."""
     assert past.end is not None
-    said, heard = past.farewell, case.history.farewells.get(robot)
+    said, heard = past.final_report, case.history.final_reports.get(robot)
     if said is None:
         return None
     if heard is None:
@@ -120,13 +120,13 @@ def _same_farewell(case: Evidence, robot: str, past: Past) -> Violation | None:
     return Violation("order", past.end.tick, robot, what, between(heard, said))
 
 
-def briefing(case: Evidence) -> Checks:
+def config(case: Evidence) -> Checks:
     """Every robot was told what the scenario says, and all of them the same duration of a tick."""
-    tick_s = next((past.briefing.tick_s for past in case.pasts.values()), None)
+    tick_s = next((past.config.tick_s for past in case.pasts.values()), None)
     for robot, past in case.pasts.items():
-        expected = case.history.scenario.briefing(robot, tick_s)
-        if encode(past.briefing) == encode(expected):
+        expected = case.history.scenario.config(robot, tick_s)
+        if encode(past.config) == encode(expected):
             yield None
         else:
-            what = difference(past.briefing, expected)
-            yield Violation("briefing", None, robot, what, between(past.briefing, expected))
+            what = difference(past.config, expected)
+            yield Violation("briefing", None, robot, what, between(past.config, expected))

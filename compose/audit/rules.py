@@ -8,12 +8,12 @@ from pathlib import Path
 from compose.audit import hardware_rules
 from compose.audit.agent_rules import decision, limits, log
 from compose.audit.claim_rules import claim
-from compose.audit.delivery_rules import contact, report, sense
+from compose.audit.delivery_rules import contact, report, observation
 from compose.audit.evidence import Evidence, case_of, other_versions
 from compose.audit.fault_rules import befallen, faults
 from compose.audit.findings import Checks, Findings, findings_of
 from compose.audit.hardware_rules import Alone, judge_alone
-from compose.audit.journal_rules import briefing, order
+from compose.audit.journal_rules import config, order
 from compose.audit.scenario_rules import scenario
 from compose.recording.run import WORLD_JOURNAL, books
 from protocol.journal.environment import of_world, otherwise
@@ -21,8 +21,8 @@ from protocol.journal.environment import of_world, otherwise
 RULES: tuple[Callable[[Evidence], Checks], ...] = (
     order,
     scenario,
-    briefing,
-    sense,
+    config,
+    observation,
     faults,
     contact,
     report,
@@ -75,5 +75,5 @@ def judge(
         otherwise(told.environment, of_world()) or other_versions(case.pasts),
         scenario=told.scenario.name,
         ticks=len(told.ticks),
-        radio=befallen(case),
+        links=befallen(case),
     )

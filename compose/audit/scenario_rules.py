@@ -8,7 +8,7 @@ from compose.audit.evidence import Evidence, Testified
 from compose.audit.findings import Checks, Violation, difference
 from compose.scenario.scenario_file import NEAREST_ANCHORS
 from protocol.attack import OF_THE_START
-from protocol.mission import Anchor, Mission, Variant, noise_obstacle, obstacle, safety_obstacle
+from protocol.mission import Anchor, Mission, Variant, noise_infeasibility, infeasibility, safety_infeasibility
 from protocol.orbits import Rendezvous, rendezvous
 from world.scenario import RobotSpec
 
@@ -16,7 +16,7 @@ from world.scenario import RobotSpec
 def scenario(case: Evidence) -> Checks:
     """Check that `tandem run` accepts the scenario, and that its orbits follow from the rest of it."""
     told = case.history.scenario
-    for why in (noise_obstacle(told.mission), safety_obstacle(told.mission)):
+    for why in (noise_infeasibility(told.mission), safety_infeasibility(told.mission)):
         yield _violation(None, why and f"mission.{why}")
     place = {robot.id: place for place, robot in enumerate(told.robots)}
     for robot in told.robots:
@@ -30,13 +30,13 @@ def scenario(case: Evidence) -> Checks:
             yield _violation(robot.id, why)
 
 
-def briefing(case: Testified) -> Checks:
+def config(case: Testified) -> Checks:
     """Check that the orbits in each robot's briefing follow from the mission and the anchors in it.
 
-    This is for hardware mode. With a world, `journals.briefing` compares the briefing with the scenario.
+    This is for hardware mode. With a world, `journals.config` compares the briefing with the scenario.
     """
     for robot, past in case.pasts.items():
-        told = past.briefing
+        told = past.config
         why = _off_plan(told.rendezvous, told.mission, told.variant, told.anchor, told.peer_anchor)
         yield Violation("briefing", None, robot, why) if why is not None else None
 
@@ -52,7 +52,7 @@ def _off_range(robot: RobotSpec, mission: Mission) -> str | None:
 
 
 def _off_lie(robot: RobotSpec) -> str | None:
-    early = robot.lie is not None and robot.lie.kind in OF_THE_START and robot.lie.part != "all"
+    early = robot.attack is not None and robot.attack.kind in OF_THE_START and robot.attack.part != "all"
     return "its lie is of the start, and not of all" if early else None
 
 
@@ -63,7 +63,7 @@ def _off_plan(
     distance = math.dist((anchor.x, anchor.y), (peer.x, peer.y))
     if distance < NEAREST_ANCHORS:
         return f"its anchor is {distance:.3g} m from its peer's, expected {NEAREST_ANCHORS:g} m at the least"
-    if (why := obstacle(mission, distance)) is not None:
+    if (why := infeasibility(mission, distance)) is not None:
         return f"mission: {why}"
     expected = rendezvous(mission, distance, variant)
     return None if found == expected else f"rendezvous.{difference(found, expected)}"

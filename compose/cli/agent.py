@@ -82,18 +82,18 @@ def _play(options: argparse.Namespace, inbox: Inbox) -> MissionEnd:
                     joined = join(link, options.run, options.id, search)
                     if joined is None:  # a session that has lost its link finds nothing; a new one may
                         continue
-                    run, briefing = joined
-                    if memory is not None and old is not None and memory.briefing != briefing:
+                    run, config = joined
+                    if memory is not None and old is not None and memory.config != config:
                         raise CorruptJournal(f"{old.path}: another run's: its briefing is not this world's")
-                    memory = _ready(options, briefing, old, memory, inbox)
+                    memory = _ready(options, config, old, memory, inbox)
                     process = AgentProcess(
-                        memory, run, inbox, patience=patience, reached=kills.taker(options.kill)
+                        memory, run, inbox, patience=patience, on_kill_point=kills.taker(options.kill)
                     )
                     process.attach(link)
                     if not (options.quiet or options.launched):
-                        again = memory.sense
+                        again = memory.observation
                         where = f", again, from tick {again.tick} on" if again is not None else ""
-                        say(f"{options.id}: in run {run}, with {briefing.peer}{where}")
+                        say(f"{options.id}: in run {run}, with {config.peer}{where}")
                 else:
                     process.attach(link)
                 return _left(options, process.play())
@@ -125,7 +125,7 @@ def _endpoints(options: argparse.Namespace) -> Endpoints:
 
 def _ready(
     options: argparse.Namespace,
-    briefing: RobotConfig,
+    config: RobotConfig,
     old: Retrace | None,
     memory: Memory | None,
     inbox: Inbox,
@@ -137,6 +137,6 @@ def _ready(
     elif options.out is not None:
         journal = Journal(options.out / f"agent-{options.id}.journal", fsync=options.fsync)
     if memory is None:
-        return Memory(briefing, Robot(briefing, journal))
+        return Memory(config, Robot(config, journal))
     memory.robot.keep(journal)
     return memory

@@ -30,10 +30,10 @@ def _show(findings: Findings) -> None:
     say(f"{'rule':10}{'checks':>8}{'violations':>12}")
     for one in findings.counts:
         say(f"{one.rule:10}{one.checks:>8}{one.violations:>12}")
-    if findings.radio:
+    if findings.links:
         from compose.terminal import tables  # noqa: PLC0415  # rich takes time to import
 
-        rows = [[str(value) for value in astuple(link)] for link in findings.radio]
+        rows = [[str(value) for value in astuple(link)] for link in findings.links]
         made = tables.table(["link"], LinkStatistics.__struct_fields__[1:], rows)
         say("", *tables.lines(made, text_width.room()))
     if findings.rounding:

@@ -122,13 +122,13 @@ def _ticks(rounds: int, done: Callable[[], None]) -> Table:
 def _frame_sizes(played: Scenario) -> tuple[int, int]:
     """Bytes of a typical Observation, and of a typical Command."""
     course = Course(played)
-    senses: list[int] = []
-    drives: list[int] = []
+    observations: list[int] = []
+    commands: list[int] = []
     for moment in in_process.play(played).moments:
-        senses += [len(encode(sense)) for sense in course.senses()]
-        drives += [len(encode(drive)) for drive in moment.drives.values()]
-        course.drive(moment.drives)
-    return int(median(senses)), int(median(drives))
+        observations += [len(encode(observation)) for observation in course.observations()]
+        commands += [len(encode(command)) for command in moment.commands.values()]
+        course.command(moment.commands)
+    return int(median(observations)), int(median(commands))
 
 
 @contextmanager
@@ -230,8 +230,8 @@ def _world_alone(played: run.Record) -> float:
     began = time.perf_counter()
     course = Course(played.scenario)
     for moment in played.moments:
-        course.senses()
-        course.drive(moment.drives)
+        course.observations()
+        course.command(moment.commands)
     return time.perf_counter() - began
 
 
@@ -269,20 +269,20 @@ def _parts(scenarios: Sequence[Scenario]) -> tuple[float, float, float]:
     sensing = deciding = world = 0.0
     for one in scenarios:
         course = Course(one)
-        robots = {robot.id: Robot(one.briefing(robot.id)) for robot in one.robots}
+        robots = {robot.id: Robot(one.config(robot.id)) for robot in one.robots}
         end = None
         while end is None:
             began = time.perf_counter()
-            senses = course.senses()
+            observations = course.observations()
             sensed = time.perf_counter()
-            told = {sense.robot: robots[sense.robot].sense(sense) for sense in senses}
+            told = {observation.robot: robots[observation.robot].observation(observation) for observation in observations}
             heard = time.perf_counter()
-            drives = {}
-            for sense in senses:
-                reports = [told[contact.peer] for contact in sense.contacts for _ in contact.heard or ()]
-                drives[sense.robot] = robots[sense.robot].decide([one for one in reports if one is not None])
+            commands = {}
+            for observation in observations:
+                reports = [told[contact.peer] for contact in observation.contacts for _ in contact.heard or ()]
+                commands[observation.robot] = robots[observation.robot].decide([one for one in reports if one is not None])
             decided = time.perf_counter()
-            end = course.drive(drives)
+            end = course.command(commands)
             world += sensed - began + time.perf_counter() - decided
             sensing += heard - sensed
             deciding += decided - heard

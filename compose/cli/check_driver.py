@@ -22,10 +22,10 @@ def main(options: argparse.Namespace) -> int:
     rate = options.rate or 1.0
     check_rate(scenario, rate)
     manoeuvre_s = scenario.mission.period / rate
-    briefing = briefed(scenario, options.robot, manoeuvre_s)
+    config = briefed(scenario, options.robot, manoeuvre_s)
     maker, given = driver_class(options.driver), options_of(options.option)
-    with closing(made(maker, options.driver, briefing, manoeuvre_s, given)) as driver:
-        trial = ExerciseRun(driver, briefing, manoeuvre_s)
+    with closing(made(maker, options.driver, config, manoeuvre_s, given)) as driver:
+        trial = ExerciseRun(driver, config, manoeuvre_s)
         try:
             trial.go_through()
         except Broken as broken:

@@ -72,7 +72,7 @@ def main(options: argparse.Namespace) -> int:
     rate = options.rate or 1.0
     check_rate(scenario, rate)
     manoeuvre_s = scenario.mission.period / rate
-    briefing = briefed(scenario, options.id, manoeuvre_s)
+    config = briefed(scenario, options.id, manoeuvre_s)
     maker, given = driver_class(options.driver), options_of(options.option)
     reached = reach(options, "world")
     inbox = Inbox(f"tandem robot {options.id}")
@@ -82,12 +82,12 @@ def main(options: argparse.Namespace) -> int:
     try:
         with (
             folder_for(options.out) as folder,
-            recorded(folder, briefing, inbox, fsync=options.fsync) as record,
-            closing(made(maker, options.driver, briefing, manoeuvre_s, given)) as driver,
+            recorded(folder, config, inbox, fsync=options.fsync) as record,
+            closing(made(maker, options.driver, config, manoeuvre_s, given)) as driver,
         ):
             field = Field(
                 driver,
-                briefing,
+                config,
                 options.run or scenario.name,
                 inbox,
                 max_ticks=scenario.max_ticks,

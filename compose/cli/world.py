@@ -165,7 +165,7 @@ def _play(options: argparse.Namespace, course: Course, way: _Way, folder: Path, 
         inbox,
         rate=options.rate,
         patience=options.patience,
-        reached=kills.taker(options.kill),
+        on_kill_point=kills.taker(options.kill),
     )
     if not (options.quiet or options.launched):
         robots = ", ".join(robot.id for robot in scenario.robots)

@@ -127,12 +127,12 @@ def _overheard(pair: SessionPair, run: str, me: str, wait: float) -> Iterator[Fi
             f"rules: reading the truth of {run}: {me} has no part in it; try by a robot's keys that has"
         )
         return
-    forbidden = {_short(key): key for key in (keys.truth(run), keys.drive(run, peer), keys.sense(run, peer))}
+    forbidden = {_short(key): key for key in (keys.truth(run), keys.command(run, peer), keys.observation(run, peer))}
     latest: Any = zenoh.handlers.RingChannel(RING)
     ears: dict[str, Any] = {
         name: pair.hearer.declare_subscriber(key, latest) for name, key in forbidden.items()
     }
-    own: Any = pair.hearer.declare_subscriber(keys.sense(run, me), latest)
+    own: Any = pair.hearer.declare_subscriber(keys.observation(run, me), latest)
     came: set[str] = set()
     ticks: set[int] = set()
     now = time.monotonic()
@@ -140,7 +140,7 @@ def _overheard(pair: SessionPair, run: str, me: str, wait: float) -> Iterator[Fi
     while len(ticks) < TICKS and len(came) < len(ears) and now < until:
         time.sleep(LOOK_AGAIN_S)
         now = time.monotonic()
-        if (sample := _under(keys.sense(run, me), own)) is not None and now >= matched:
+        if (sample := _under(keys.observation(run, me), own)) is not None and now >= matched:
             ticks |= _ticks(sample.payload.to_bytes())
         came |= {name for name, ear in ears.items() if _under(forbidden[name], ear) is not None}
     for one in (own, *ears.values()):
@@ -157,7 +157,7 @@ def _overheard(pair: SessionPair, run: str, me: str, wait: float) -> Iterator[Fi
 
 
 def _peer(link: zenoh.Session, run: str, me: str) -> str | None:
-    answer = session.ask(link, keys.briefing(run, me), ASK_S)
+    answer = session.ask(link, keys.config(run, me), ASK_S)
     try:
         return decode(answer, RobotConfig).peer if isinstance(answer, bytes) else None
     except MalformedFrame:

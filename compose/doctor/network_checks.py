@@ -104,7 +104,7 @@ def _foreign(run: str, version: int) -> Finding:
 def _of_robot(link: zenoh.Session, robot: str) -> Iterator[Finding]:
     """A robot is told of worlds, of what they have for it, and of itself."""
     for run in [key.run for key in session.alive(link, keys.world_alive("*"), ASK_S)]:
-        answer = session.ask(link, keys.briefing(run, robot), ASK_S)
+        answer = session.ask(link, keys.config(run, robot), ASK_S)
         if answer is None:
             yield fix(f"alive: {run}: its world does not answer; check that it runs, and is not stopped")
         elif isinstance(answer, str):

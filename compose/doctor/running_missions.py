@@ -102,7 +102,7 @@ class _Ear:
         declared: list[Any] = [
             self._link.declare_subscriber(key(run, "*"), self._hand_over)
             for run in self._there
-            for key in (keys.sense, keys.drive)
+            for key in (keys.observation, keys.command)
         ]
         until = time.monotonic() + wait
         while not all(map(self._is_heard, self._there)) and time.monotonic() < until:
@@ -124,8 +124,8 @@ class _Ear:
         robots = self._there[run] - {""}
         if "" not in self._there[run]:
             return True
-        again = any(self._count[Key(keys.sense, run, one)] > 1 for one in self.named(run, keys.sense))
-        return again and robots <= self.named(run, keys.drive)
+        again = any(self._count[Key(keys.observation, run, one)] > 1 for one in self.named(run, keys.observation))
+        return again and robots <= self.named(run, keys.command)
 
     def named(self, run: str, kind: Any) -> set[str]:
         """The robots under whose key of this kind something came."""
@@ -140,15 +140,15 @@ class _Ear:
 def _mission(link: zenoh.Session, ear: _Ear, run: str, there: frozenset[str]) -> RunningMission:
     frames = [
         ear.latest[Key(kind, run, robot)]
-        for kind in (keys.sense, keys.drive)
+        for kind in (keys.observation, keys.command)
         for robot in ear.named(run, kind)
     ]
-    answers = _briefings(link, run, ear.named(run, keys.sense) | there - {""}) if "" in there else {}
+    answers = _briefings(link, run, ear.named(run, keys.observation) | there - {""}) if "" in there else {}
     frames += answers.values()
     briefed = [one for frame in answers.values() if (one := _said(frame, RobotConfig)) is not None]
-    named = there - {""} | ear.named(run, keys.sense) | ear.named(run, keys.drive)
+    named = there - {""} | ear.named(run, keys.observation) | ear.named(run, keys.command)
     named |= {one.peer for one in briefed}
-    said = [ear.said(Key(keys.sense, run, robot), Observation | MissionEnd | FinalReport) for robot in named]
+    said = [ear.said(Key(keys.observation, run, robot), Observation | MissionEnd | FinalReport) for robot in named]
     ends = [one for one in said if isinstance(one, MissionEnd)]
     tick = max((one.tick for one in said if isinstance(one, Observation | MissionEnd)), default=None)
     return RunningMission(
@@ -159,7 +159,7 @@ def _mission(link: zenoh.Session, ear: _Ear, run: str, there: frozenset[str]) ->
         tuple(sorted({version for frame in frames if (version := version_of(frame)) is not None})),
         tuple(
             _participant(
-                robot, robot in there, tick, ear.said(Key(keys.drive, run, robot), Command | FinalReport)
+                robot, robot in there, tick, ear.said(Key(keys.command, run, robot), Command | FinalReport)
             )
             for robot in sorted(named)
         ),
@@ -174,22 +174,22 @@ def _briefings(link: zenoh.Session, run: str, robots: set[str]) -> dict[str, byt
     for robot in sorted(robots):
         if robot not in paired and time.monotonic() < until:
             answer = session.ask(
-                link, keys.briefing(run, robot), ASK_S, lambda frame: _said(frame, RobotConfig) is not None
+                link, keys.config(run, robot), ASK_S, lambda frame: _said(frame, RobotConfig) is not None
             )
             if isinstance(answer, bytes):
                 found[robot] = answer
-                briefing = _said(answer, RobotConfig)
-                paired |= {briefing.peer} if briefing is not None else set()
+                config = _said(answer, RobotConfig)
+                paired |= {config.peer} if config is not None else set()
     return found
 
 
 def _participant(
-    robot: str, there: bool, latest: int | None, drive: Command | FinalReport | None
+    robot: str, there: bool, latest: int | None, command: Command | FinalReport | None
 ) -> Participant:
-    """As `drive` tells it, unless that is of a tick to come: the world is in tick `latest`."""
-    if not isinstance(drive, Command) or (latest is not None and drive.tick > latest + AHEAD):
+    """As `command` tells it, unless that is of a tick to come: the world is in tick `latest`."""
+    if not isinstance(command, Command) or (latest is not None and command.tick > latest + AHEAD):
         return Participant(robot, there)
-    return Participant(robot, there, drive.tick, drive.phase, drive.state)
+    return Participant(robot, there, command.tick, command.phase, command.state)
 
 
 def _said(frame: bytes | None, kind: Any) -> Any:

@@ -19,7 +19,7 @@ class Account(msgspec.Struct, frozen=True):
 
     past: Past | None
     """none if it was killed before it was briefed"""
-    minds: tuple[RobotState, ...] = ()
+    states: tuple[RobotState, ...] = ()
     """after each tick, from 0 on, as far as it decided in it"""
     broken: str | None = None
     """why minds end before the record does, if they do"""
@@ -41,20 +41,20 @@ def account(folder: Path, robot: str) -> Account:
 
 def _again(told: Past) -> Account:
     """Every decision once more, which must be the one on record."""
-    robot = Robot(told.briefing)
-    minds: list[RobotState] = []
+    robot = Robot(told.config)
+    states: list[RobotState] = []
     for step in told.steps:
-        tick = step.sense.tick
+        tick = step.observation.tick
         try:
-            robot.sense(step.sense, step.frame)
-            if step.drive is None:
+            robot.observation(step.observation, step.frame)
+            if step.command is None:
                 break
             robot.decide(step.heard, step.missed)
         except Exception as error:  # noqa: BLE001  # whatever the inputs on record do to it
             why = f"the planner cannot go on from its inputs of tick {tick}: {type(error).__name__}: {error}"
-            return Account(told, tuple(minds), why)
-        if robot.drive_frame != encode(step.drive):
+            return Account(told, tuple(states), why)
+        if robot.drive_frame != encode(step.command):
             why = f"on record it decided otherwise at tick {tick}: the journal is another version's"
-            return Account(told, tuple(minds), why)
-        minds.append(robot.mind)
-    return Account(told, tuple(minds))
+            return Account(told, tuple(states), why)
+        states.append(robot.mind)
+    return Account(told, tuple(states))

@@ -132,7 +132,7 @@ def _draw_odds(axes: Axes, story: Story) -> None:
         for placed in (False, True):
             _odds_of(axes, story, rank, placed, edge)
     axes.plot([], [], "-D", ms=3, lw=1.4, color=AGES(1.0), label="the likeliest hypothesis")
-    if any(len(one.odds) > 1 for one, _ in story.estimates):
+    if any(len(one.probability) > 1 for one, _ in story.estimates):
         axes.plot([], [], "-x", ms=3, lw=0.8, color=GHOST, label=name_of_others(story))
     axes.axhline(
         confidence, color="k", lw=0.9, ls="-.", gid="confidence", label=f"asked for: {percent(confidence)}"
@@ -148,21 +148,21 @@ def _draw_odds(axes: Axes, story: Story) -> None:
 def _odds_of(axes: Axes, story: Story, rank: int, placed: bool, edge: float) -> None:
     """Those of the hypothesis that is so likely, before or after they are about the plane."""
     points = [
-        (one.tick, min(max(one.odds[rank], edge), 1.0 - edge) if rank < len(one.odds) else math.nan)
+        (one.tick, min(max(one.probability[rank], edge), 1.0 - edge) if rank < len(one.probability) else math.nan)
         for one, _ in story.estimates
         if bool(one.world) == placed
     ]
-    if all(math.isnan(odds) for _, odds in points):
+    if all(math.isnan(probability) for _, probability in points):
         return
-    ticks, odds = zip(*points, strict=True)
+    ticks, probability = zip(*points, strict=True)
     gid = f"odds-{rank + 1}-{'plane' if placed else 'anchor'}"
     if rank:
-        axes.plot(ticks, odds, "-x", ms=3, mew=0.8, lw=0.8, color=GHOST, gid=gid)
+        axes.plot(ticks, probability, "-x", ms=3, mew=0.8, lw=0.8, color=GHOST, gid=gid)
     else:
         marked = _marked(story, ticks)
         axes.plot(
             ticks,
-            odds,
+            probability,
             "-D",
             ms=3,
             lw=1.4,
@@ -183,9 +183,9 @@ def _marked(story: Story, ticks: Sequence[int]) -> list[int]:
     return [i for i, tick in enumerate(ticks) if tick in sparse]
 
 
-def percent(odds: float) -> str:
+def percent(probability: float) -> str:
     """In as many digits as tell it from certainty."""
-    return f"{round(100.0 * odds, 10):.12g} %"
+    return f"{round(100.0 * probability, 10):.12g} %"
 
 
 def _draw_count(axes: Axes, story: Story) -> None:

@@ -29,7 +29,7 @@ class PairDecision(NamedTuple):
     """A tick in which a robot weighed what it holds possible of both, and chose a manoeuvre."""
 
     tick: int
-    minds: dict[Role, RobotState]
+    states: dict[Role, RobotState]
     """of those robots that decided in it"""
 
 
@@ -38,10 +38,10 @@ def decisions(pair: PairRecord) -> list[PairDecision]:
     found: dict[int, dict[Role, RobotState]] = {}
     for role in ROLES:
         before: object = ()
-        for mind in pair.minds(role):
-            held, surveys = mind.findings.pair, isinstance(mind.state, Surveying) and mind.phase == 3
-            if held and held is not before and (surveys or mind.verdict is not None):
-                found.setdefault(mind.tick, {})[role] = mind
+        for state in pair.states(role):
+            held, surveys = state.belief.pair, isinstance(state.mode, Surveying) and state.phase == 3
+            if held and held is not before and (surveys or state.verdict is not None):
+                found.setdefault(state.tick, {})[role] = state
             before = held
     return [PairDecision(tick, found[tick]) for tick in sorted(found)]
 
@@ -51,7 +51,7 @@ def draw(pair: PairRecord) -> Figure | Absent:
     told = decisions(pair)
     if not told:
         why = pair.unknown or "they never weighed how both lie in the plane"
-        return Absent(NO_ENCOUNTER if pair.met is None else why)
+        return Absent(NO_ENCOUNTER if pair.encounter_tick is None else why)
     shown = some(told)
     many = (
         f"{len(shown)} of {len(told)} decisions" if len(shown) < len(told) else f"all {len(told)} decisions"
@@ -70,24 +70,24 @@ def _window(pair: PairRecord, shown: list[PairDecision]) -> Window:
     points = [
         (pose.x, pose.y)
         for one in shown
-        for mind in one.minds.values()
-        for pose, held in zip(mind.findings.poses, mind.findings.pair, strict=True)
-        if held.odds >= LIKELY
+        for state in one.states.values()
+        for pose, held in zip(state.belief.poses, state.belief.pair, strict=True)
+        if held.probability >= LIKELY
     ]
     for one in shown:
         ends = list(_places(pair, one.tick).values())
-        ends += [end for mind in one.minds.values() for end in _ends(mind, pair)]
+        ends += [end for state in one.states.values() for end in _ends(state, pair)]
         points += [(end.x, end.y) for end in ends]
     return square(points, 0.16, 0.5 * pair.mission.sensing_range)
 
 
 def _said(one: PairDecision, number: int) -> str:
-    mind = next(iter(one.minds.values()))
-    count, odds = len(mind.findings.pair), mind.findings.pair[0].odds
+    state = next(iter(one.states.values()))
+    count, probability = len(state.belief.pair), state.belief.pair[0].probability
     held = f"{count} hypotheses" if count > 1 else "one hypothesis"
-    surest = f"{math.floor(1e4 * odds) / 100:g} %"
-    end = "; claims" if any(mind.verdict is not None for mind in one.minds.values()) else ""
-    return f"({number}) $k$ = {one.tick}, {len(mind.mutual)} mutual ranges\n{held}, first {surest}{end}"
+    surest = f"{math.floor(1e4 * probability) / 100:g} %"
+    end = "; claims" if any(state.verdict is not None for state in one.states.values()) else ""
+    return f"({number}) $k$ = {one.tick}, {len(state.mutual)} mutual ranges\n{held}, first {surest}{end}"
 
 
 def _panel(axes: Axes, pair: PairRecord, one: PairDecision) -> None:
@@ -104,14 +104,14 @@ def _panel(axes: Axes, pair: PairRecord, one: PairDecision) -> None:
             zorder=1,
         )
     _ties(axes, one)
-    for role, mind in one.minds.items():
-        for i, (pose, held) in enumerate(zip(mind.findings.poses, mind.findings.pair, strict=True)):
+    for role, state in one.states.items():
+        for i, (pose, held) in enumerate(zip(state.belief.poses, state.belief.pair, strict=True)):
             axes.plot(
-                pose.x, pose.y, MARKS[role]["marker"], ms=3.0 + 5.0 * math.sqrt(held.odds),
+                pose.x, pose.y, MARKS[role]["marker"], ms=3.0 + 5.0 * math.sqrt(held.probability),
                 mfc=COLOURS[role] if i == 0 else "white", mec=COLOURS[role], mew=0.9, zorder=4 + (i == 0),
                 gid=f"hypothesis-{one.tick}-{role}-{i + 1}",
             )  # fmt: skip
-        _drive(axes, pair, role, mind)
+        _drive(axes, pair, role, state)
     for role, truth in _places(pair, one.tick).items():
         axes.plot(truth.x, truth.y, "+", ms=9, mew=1.2, color=INK, zorder=6, gid=f"truth-{one.tick}-{role}")
 
@@ -124,15 +124,15 @@ def _places(pair: PairRecord, tick: int) -> dict[Role, Pose]:
 
 def _ties(axes: Axes, one: PairDecision) -> None:
     """Between places of a and b that belong to one hypothesis, where both hold the same."""
-    if len(one.minds) < 2 or one.minds["a"].findings.pair != one.minds["b"].findings.pair:
+    if len(one.states) < 2 or one.states["a"].belief.pair != one.states["b"].belief.pair:
         return
-    for p, q in zip(one.minds["a"].findings.poses, one.minds["b"].findings.poses, strict=True):
+    for p, q in zip(one.states["a"].belief.poses, one.states["b"].belief.poses, strict=True):
         axes.plot([p.x, q.x], [p.y, q.y], "-", lw=0.7, color=PALER, zorder=3)
 
 
-def _drive(axes: Axes, pair: PairRecord, role: Role, mind: RobotState) -> None:
+def _drive(axes: Axes, pair: PairRecord, role: Role, state: RobotState) -> None:
     """Where the manoeuvre leads from the likeliest pose."""
-    ends = _ends(mind, pair)
+    ends = _ends(state, pair)
     if not ends:
         return
     axes.plot([p.x for p in ends], [p.y for p in ends], "-", lw=1.6, color=COLOURS[role], zorder=3)
@@ -144,19 +144,19 @@ def _drive(axes: Axes, pair: PairRecord, role: Role, mind: RobotState) -> None:
         mew=1.5,
         color=COLOURS[role],
         zorder=5,
-        gid=f"chosen-{mind.tick}-{role}",
+        gid=f"chosen-{state.tick}-{role}",
     )
 
 
-def _ends(mind: RobotState, pair: PairRecord) -> list[Pose]:
+def _ends(state: RobotState, pair: PairRecord) -> list[Pose]:
     """Along the manoeuvre that was chosen, from the likeliest pose; none, where none was."""
-    if not isinstance(mind.state, Surveying) or not mind.findings.poses:
+    if not isinstance(state.mode, Surveying) or not state.belief.poses:
         return []
-    drive, ticks = mind.state.drive, stride(pair.mission)
+    command, ticks = state.mode.command, stride(pair.mission)
     pieces = FINE * ticks
     period = ticks * pair.mission.period
     return [
-        step(mind.findings.poses[0], drive.v, drive.omega, period * i / pieces) for i in range(pieces + 1)
+        step(state.belief.poses[0], command.v, command.omega, period * i / pieces) for i in range(pieces + 1)
     ]
 
 

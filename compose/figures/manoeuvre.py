@@ -42,11 +42,11 @@ class Planned(NamedTuple):
 def planned(pair: PairRecord, role: Role) -> Iterator[Planned]:
     """Every last manoeuvre of one robot, in order."""
     before = None
-    for mind in pair.minds(role):
-        if mind.findings.plan is not before and isinstance(mind.state, LastManoeuvre):
-            before = mind.findings.plan
+    for state in pair.states(role):
+        if state.belief.plan is not before and isinstance(state.mode, LastManoeuvre):
+            before = state.belief.plan
             assert before is not None
-            yield Planned(mind.tick, before)
+            yield Planned(state.tick, before)
 
 
 def draw(pair: PairRecord) -> dict[str, Figure | Absent]:
@@ -57,7 +57,7 @@ def draw(pair: PairRecord) -> dict[str, Figure | Absent]:
             found[f"{pair.robot(role).id}-{one.tick}"] = _figure(pair, one)
     if not found:
         why = pair.unknown or "no last manoeuvre was planned"
-        found[pair.name] = Absent(NO_ENCOUNTER if pair.met is None else why)
+        found[pair.name] = Absent(NO_ENCOUNTER if pair.encounter_tick is None else why)
     return found
 
 
@@ -126,7 +126,7 @@ def _title(pair: PairRecord, one: Planned) -> str:
         if _framed_by_itself(one.plan)
         else rf"$\langle {mover}({ANCHORS[mover]})\rangle$"
     )
-    v, omega = one.plan.drive.v, one.plan.drive.omega
+    v, omega = one.plan.command.v, one.plan.command.omega
     chosen = rf"$v_2$ = {v:g} m/s, $\omega_2$ = {omega:+.4f} rad/s"
     count = len(one.plan.question.candidates)
     told = f"{count} candidates" if count > 1 else "one candidate, to be checked"
@@ -193,7 +193,7 @@ def _bisector(axes: Axes, one: Pose, other: Pose, length: float, gid: str) -> No
 
 
 def _end(seen: ManoeuvreView, plan: Plan, mission: Mission) -> Pose:
-    return step(seen.mover, plan.drive.v, plan.drive.omega, mission.period)
+    return step(seen.mover, plan.command.v, plan.command.omega, mission.period)
 
 
 def _reach(axes: Axes, pair: PairRecord, plan: Plan, seen: ManoeuvreView, ways: Compared) -> None:
@@ -216,7 +216,7 @@ def _reach(axes: Axes, pair: PairRecord, plan: Plan, seen: ManoeuvreView, ways: 
         gid="reach", label=f"within reach with $v_2$ = {v:g} m/s",
     )  # fmt: skip
     ends = [
-        step(seen.mover, plan.drive.v, plan.drive.omega, pair.mission.period * i / FINE)
+        step(seen.mover, plan.command.v, plan.command.omega, pair.mission.period * i / FINE)
         for i in range(FINE + 1)
     ]
     axes.plot([p.x for p in ends], [p.y for p in ends], "-", lw=2.0, color=colour, zorder=4, gid="chosen")
@@ -229,7 +229,7 @@ def _reach(axes: Axes, pair: PairRecord, plan: Plan, seen: ManoeuvreView, ways: 
 
 def chosen_row(plan: Plan, ways: Compared) -> int:
     """Which of the speeds was chosen."""
-    return int(np.argmin(abs(ways.reach.v[:, 0] - plan.drive.v)))
+    return int(np.argmin(abs(ways.reach.v[:, 0] - plan.command.v)))
 
 
 def draw_cost(axes: Axes, plan: Plan, ways: Compared, mission: Mission) -> None:
@@ -254,10 +254,10 @@ def draw_cost(axes: Axes, plan: Plan, ways: Compared, mission: Mission) -> None:
         gid="cost",
         zorder=2,
     )
-    best = float(ways.gap[chosen, int(np.argmin(abs(omega - plan.drive.omega)))])
+    best = float(ways.gap[chosen, int(np.argmin(abs(omega - plan.command.omega)))])
     colour = COLOURS[plan.question.mover]
-    axes.plot([plan.drive.omega], [best], "x", ms=9, mew=2.0, color=colour, zorder=4, gid="cost-chosen")
-    axes.axvline(plan.drive.omega, lw=0.8, ls="--", color=colour, zorder=1)
+    axes.plot([plan.command.omega], [best], "x", ms=9, mew=2.0, color=colour, zorder=4, gid="cost-chosen")
+    axes.axvline(plan.command.omega, lw=0.8, ls="--", color=colour, zorder=1)
     axes.set_xlim(-mission.max_turn_rate, mission.max_turn_rate)
     if math.isclose(mission.max_turn_rate, math.pi):
         axes.set_xticks(

@@ -53,7 +53,7 @@ def ranges(pair: PairRecord) -> Figure:
         _shade(axes, pair)
         _ranges(axes, pair)
     for axes in panels[1:]:
-        highest = max(pair.separations[max(0, (pair.met or 0) - BEFORE) :], default=0.0)
+        highest = max(pair.separations[max(0, (pair.encounter_tick or 0) - BEFORE) :], default=0.0)
         axes.set_ylim(0.0, 1.1 * max(pair.mission.sensing_range, highest))
     panels[0].set_ylabel("distance [m]")
     sheet.key(panels[0], LEFT, key, columns=3)
@@ -66,12 +66,12 @@ def _width() -> float:
 
 def _panels(sheet: Sheet, pair: PairRecord, bottom: float, tall: float, *, named: bool = True) -> list[Axes]:
     """Of all ticks; and of those of the encounter, if there was one."""
-    width = WHOLE if pair.met is not None else WHOLE + APART + NEAR
+    width = WHOLE if pair.encounter_tick is not None else WHOLE + APART + NEAR
     panels = [sheet.panel(LEFT, bottom, width, tall)]
     panels[0].set_xlim(-0.5, pair.last + 0.5)
-    if pair.met is not None:
+    if pair.encounter_tick is not None:
         near = sheet.panel(LEFT + WHOLE + APART, bottom, NEAR, tall)
-        near.set_xlim(max(0, pair.met - BEFORE) - 0.4, pair.last + 0.4)
+        near.set_xlim(max(0, pair.encounter_tick - BEFORE) - 0.4, pair.last + 0.4)
         panels.append(near)
     for i, axes in enumerate(panels):
         axes.tick_params(labelsize=SMALL)
@@ -184,11 +184,11 @@ def _errors(axes: Axes, pair: PairRecord, role: Role, name: str, off: Callable[[
     ]  # fmt: skip
     _line(axes, alone, ls=ALONE[role], lw=1.1, color=colour, gid=f"{name}-alone-{role}",
           label=f"{robot.id}, seen from its anchor")  # fmt: skip
-    single = [one for one in held if one[0].world and (one[0].odds or len(one[0].world) == 1)]
+    single = [one for one in held if one[0].world and (one[0].probability or len(one[0].world) == 1)]
     others = [
         (one.tick, off(pose, truth))
         for one, truth in held
-        for pose in (one.world[1:] if one.odds or len(one.world) == 1 else one.world)
+        for pose in (one.world[1:] if one.probability or len(one.world) == 1 else one.world)
     ]
     _line(axes, others, ls="", marker="x" if role == "a" else "+", ms=5, mew=0.9, color=colour, alpha=0.75,
           gid=f"{name}-others-{role}", label=f"{robot.id}, others held possible")  # fmt: skip

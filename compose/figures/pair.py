@@ -32,7 +32,7 @@ class Side(msgspec.Struct, frozen=True):
     orbit: Orbit
     path: tuple[Pose, ...]
     """where it was; without a world, as it claims, and empty if it never did"""
-    drives: tuple[Command | None, ...]
+    commands: tuple[Command | None, ...]
     """what it set out to do; none, where that did not come"""
     anchor_ranges: tuple[float | None, ...]
     """m, as measured"""
@@ -87,10 +87,10 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
         """Who plays it."""
         return self.a if role == "a" else self.b
 
-    def drive(self, role: Role, tick: int) -> Command | None:
+    def command(self, role: Role, tick: int) -> Command | None:
         """What it set out to do then; none, if that did not come."""
-        drives = self.robot(role).drives
-        return drives[tick] if tick < len(drives) else None
+        commands = self.robot(role).commands
+        return commands[tick] if tick < len(commands) else None
 
     @property
     def unknown(self) -> str | None:
@@ -109,10 +109,10 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
         """Those whose journal can be read."""
         return [role for role in ROLES if self.robot(role).account is not None]
 
-    def minds(self, role: Role) -> tuple[RobotState, ...]:
+    def states(self, role: Role) -> tuple[RobotState, ...]:
         """After each tick, as far as the rest of the record goes."""
         account = self.robot(role).account
-        return account.minds[: max(1, len(self.mutual))] if account is not None else ()
+        return account.states[: max(1, len(self.mutual))] if account is not None else ()
 
     @cached_property
     def separations(self) -> list[float]:
@@ -131,11 +131,11 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
         return spans
 
     @cached_property
-    def met(self) -> int | None:
+    def encounter_tick(self) -> int | None:
         """The first tick in which one of them is in phase 3."""
         for tick in range(len(self.mutual)):
-            drives = [self.drive(role, tick) for role in ROLES]
-            if any(drive is not None and drive.phase == 3 for drive in drives):
+            commands = [self.command(role, tick) for role in ROLES]
+            if any(command is not None and command.phase == 3 for command in commands):
                 return tick
         return None
 
@@ -155,7 +155,7 @@ def of_record(record: Record, places: tuple[int, int], accounts: Mapping[str, Ac
             anchor=robot.anchor,
             orbit=robot.rendezvous.of(role),
             path=tuple([one.truth.poses[place] for one in moments] or [robot.start]),
-            drives=tuple([one.drives.get(robot.id) for one in moments]),
+            commands=tuple([one.commands.get(robot.id) for one in moments]),
             anchor_ranges=tuple([each[place] for each in ranges]),
             account=accounts.get(robot.id),
             claim=first_claim(record, place),
@@ -175,32 +175,32 @@ def of_record(record: Record, places: tuple[int, int], accounts: Mapping[str, Ac
 def of_robots(accounts: Mapping[str, Account]) -> PairRecord:
     """Without a world: of one or both of a pair, each of whom was briefed."""
     told = {robot: one.past for robot, one in accounts.items() if one.past is not None}
-    briefing = next(iter(told.values())).briefing
-    in_order = sorted(told.values(), key=lambda past: past.briefing.role)
+    config = next(iter(told.values())).config
+    in_order = sorted(told.values(), key=lambda past: past.config.role)
     mutual: list[tuple[bool, float | None]] = []
     for tick in range(max([len(past.steps) for past in told.values()])):
         met = [one for past in in_order if (one := past.contact(tick)) is not None]
         mutual.append((bool(met), next((one.range for one in met if one.range is not None), None)))
 
     def side(role: Role) -> Side:
-        own = briefing.role == role
-        robot = briefing.robot if own else briefing.peer
+        own = config.role == role
+        robot = config.robot if own else config.peer
         past = told.get(robot)
         steps = past.steps if past is not None else ()
         return Side(
             id=robot,
-            anchor=briefing.anchor if own else briefing.peer_anchor,
-            orbit=briefing.rendezvous.of(role),
+            anchor=config.anchor if own else config.peer_anchor,
+            orbit=config.rendezvous.of(role),
             path=past.path if past is not None else (),
-            drives=tuple([step.drive for step in steps]),
-            anchor_ranges=tuple([step.sense.anchor_range for step in steps]),
+            commands=tuple([step.command for step in steps]),
+            anchor_ranges=tuple([step.observation.anchor_range for step in steps]),
             account=accounts.get(robot),
         )
 
     pair = PairRecord(
-        title=f"{' and '.join(told)} without a world, {briefing.variant}: {outcome(told)}",
-        mission=briefing.mission,
-        variant=briefing.variant,
+        title=f"{' and '.join(told)} without a world, {config.variant}: {outcome(told)}",
+        mission=config.mission,
+        variant=config.variant,
         a=side("a"),
         b=side("b"),
         mutual=tuple(mutual),

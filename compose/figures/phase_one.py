@@ -45,30 +45,30 @@ class DrawnBranch(NamedTuple):
 
 def draw(pair: PairRecord, role: Role) -> Figure | Absent:
     """The branches, the rings of the ranges, and the sensing range."""
-    mind = _at_its_end(pair.minds(role))
-    if mind is None:
+    state = _at_its_end(pair.states(role))
+    if state is None:
         return Absent("there is no tick of it on record")
-    told = _told(pair.minds(role), mind)
+    told = _told(pair.states(role), state)
     if not told:
         why = (
-            "it began on its anchor" if mind.findings.branch_kind == "on-anchor" else "it has no second range"
+            "it began on its anchor" if state.belief.branch_kind == "on-anchor" else "it has no second range"
         )
         return Absent(why)
-    seen = mind.seen()
+    seen = state.seen()
     reach = pair.mission.sensing_range
     points = [(x, y) for x in (-reach, reach) for y in (-reach, reach)]
     for one in told:
         points += [(place.x, place.y) for place in _places(one.branch, seen)]
-    if mind.findings.branch_kind == "three-ranges-virtual":
-        virtual = told[0].branch.distance(mind.odometry)
+    if state.belief.branch_kind == "three-ranges-virtual":
+        virtual = told[0].branch.distance(state.odometry)
         points += [(x, y) for x in (-virtual, virtual) for y in (-virtual, virtual)]
     window = around(points, 0.05)
     width, height = fitted(window, WIDTH, TALLEST)
-    sheet = Sheet(0.6 + width + BESIDE, 0.5 + height, [pair.title, _title(pair, role, mind)])
+    sheet = Sheet(0.6 + width + BESIDE, 0.5 + height, [pair.title, _title(pair, role, state)])
     axes = sheet.panel(0.55, 0.42, width, height)
     circle(axes, (0, 0), reach, lw=1.2, ls="-", color="k", gid="range", label=f"$R$ = {reach:g} m")
     axes.plot(0, 0, "x", color="k", ms=7, mew=1.6, ls="", gid="anchor", label=f"anchor ${ANCHORS[role]}$")
-    _rings(axes, seen, told[0].branch, mind.findings.branch_kind)
+    _rings(axes, seen, told[0].branch, state.belief.branch_kind)
     for i, one in enumerate(told):
         _draw(axes, role, one, seen, pair.exact, named=i < 2 or pair.exact)
         if one.fate == "rejected" and pair.exact:
@@ -81,25 +81,25 @@ def draw(pair: PairRecord, role: Role) -> Figure | Absent:
     return sheet.figure
 
 
-def _at_its_end(minds: Sequence[RobotState]) -> RobotState | None:
+def _at_its_end(states: Sequence[RobotState]) -> RobotState | None:
     """The mind in the tick in which phase 1 is over; or the last there is of it."""
-    for mind in minds:
-        if mind.findings.parted is not None:
-            return mind
-    alone = [mind for mind in minds if mind.phase == 1]
+    for state in states:
+        if state.belief.phase1_done_tick is not None:
+            return state
+    alone = [state for state in states if state.phase == 1]
     return alone[-1] if alone else None
 
 
-def _told(minds: Sequence[RobotState], end: RobotState) -> list[DrawnBranch]:
+def _told(states: Sequence[RobotState], end: RobotState) -> list[DrawnBranch]:
     """The branches that were held, the one that was kept first."""
-    if end.briefing.mission.noise.exact:
-        held = list(end.findings.possible)
-        kept = end.findings.branch
+    if end.config.mission.noise.exact:
+        held = list(end.belief.possible)
+        kept = end.belief.branch
     else:
-        most = max([len(mind.findings.branches) for mind in minds if mind.tick <= end.tick], default=0)
-        first = next((m for m in minds if len(m.findings.branches) == most and m.tick <= end.tick), end)
-        held = list(first.findings.branches)
-        kept = end.findings.branches[0] if end.findings.parted is not None else None
+        most = max([len(state.belief.branches) for state in states if state.tick <= end.tick], default=0)
+        first = next((m for m in states if len(m.belief.branches) == most and m.tick <= end.tick), end)
+        held = list(first.belief.branches)
+        kept = end.belief.branches[0] if end.belief.phase1_done_tick is not None else None
     if not held:
         return []
     if kept is not None:
@@ -115,25 +115,25 @@ def _told(minds: Sequence[RobotState], end: RobotState) -> list[DrawnBranch]:
 
 def _name(branch: Branch, held: Sequence[Branch], end: RobotState) -> str:
     sign = "+" if branch.alpha >= 0.0 else "-"
-    if end.briefing.mission.noise.exact:
+    if end.config.mission.noise.exact:
         return rf"${sign}\alpha$, $\alpha = {abs(branch.alpha):.4f}$ rad"
     others = "another" if len(held) == 2 else f"{len(held) - 1} others"
     return "the likeliest" if branch is held[0] else others
 
 
-def _title(pair: PairRecord, role: Role, mind: RobotState) -> str:
+def _title(pair: PairRecord, role: Role, state: RobotState) -> str:
     robot = pair.robot(role).id
     frame = rf"$\langle {role}({ANCHORS[role]})\rangle$"
-    if mind.findings.parted is None:
-        how = f"not over at $k$ = {mind.tick}"
+    if state.belief.phase1_done_tick is None:
+        how = f"not over at $k$ = {state.tick}"
     else:
-        how = f"{_how(mind)}, over at $k$ = {mind.findings.parted}"
+        how = f"{_how(state)}, over at $k$ = {state.belief.phase1_done_tick}"
     return f"Phase 1 of {robot} in {frame}: {how}"
 
 
-def _how(mind: RobotState) -> str:
-    ranges = f"{len(mind.log.ranges)} ranges"
-    match mind.findings.branch_kind:
+def _how(state: RobotState) -> str:
+    ranges = f"{len(state.log.ranges)} ranges"
+    match state.belief.branch_kind:
         case "three-ranges-virtual":
             return f"{ranges} and a virtual one"
         case "circle":

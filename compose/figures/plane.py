@@ -57,11 +57,11 @@ def draw(axes: Axes, story: Story) -> None:
         _anchor(axes, one, story)
     _path(axes, story, story.own)
     _path(axes, story, story.peer)
-    if story.met is not None:
-        ends = [story.truth(one.id)[story.met] for one in (story.own, story.peer)]
+    if story.encounter_tick is not None:
+        ends = [story.truth(one.id)[story.encounter_tick] for one in (story.own, story.peer)]
         axes.plot(
             [p.x for p in ends], [p.y for p in ends], ":", color="0.1", lw=1.3, gid="met",
-            label=f"where they met, tick {story.met}",
+            label=f"where they met, tick {story.encounter_tick}",
         )  # fmt: skip
     _ghosts(axes, story, seen)
     _estimates(axes, story)

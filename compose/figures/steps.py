@@ -30,7 +30,7 @@ def draw(pair: PairRecord) -> Figure | Absent:
         return Absent(NO_PLACES)
     ticks = steps(pair)
     if not ticks:
-        return Absent(NO_ENCOUNTER if pair.met is None else "no mutual range was measured in it")
+        return Absent(NO_ENCOUNTER if pair.encounter_tick is None else "no mutual range was measured in it")
     shown = some(ticks)
     window = _window(pair, ticks[0], shown[-1])
     series = Series(len(shown), window, WIDTH, NARROWEST, [pair.title, _title(ticks, shown)])
@@ -44,10 +44,10 @@ def draw(pair: PairRecord) -> Figure | Absent:
 
 def steps(pair: PairRecord) -> list[int]:
     """The ticks of phase 3 with a mutual range that is taken from elsewhere than the one before."""
-    if pair.met is None:
+    if pair.encounter_tick is None:
         return []
     told: list[int] = []
-    for tick in range(pair.met, min(pair.last + 1, pair.placed)):
+    for tick in range(pair.encounter_tick, min(pair.last + 1, pair.placed)):
         if pair.mutual[tick][1] is None:
             continue
         if told and all(pair.robot(role).path[told[-1]] == pair.robot(role).path[tick] for role in ROLES):
@@ -75,8 +75,8 @@ def _said(pair: PairRecord, tick: int, number: int) -> str:
     rho = pair.mutual[tick][1]
     doing = []
     for role in ROLES:
-        drive = pair.drive(role, tick)
-        doing.append(f"{pair.robot(role).id}: {drive.state if drive is not None else 'no answer'}")
+        command = pair.command(role, tick)
+        doing.append(f"{pair.robot(role).id}: {command.state if command is not None else 'no answer'}")
     return f"({number}) $k$ = {tick}, " + rf"$\rho$ = {rho:.4f} m" + "\n" + ", ".join(doing)
 
 

@@ -74,16 +74,16 @@ class Story(msgspec.Struct, frozen=True, dict=True):
     @cached_property
     def weighed(self) -> bool:
         """Whether it held one pose for likelier than another, as it does where sensors are not exact."""
-        return any(one.odds for one in self.held)
+        return any(one.probability for one in self.held)
 
     @cached_property
     def likeliest(self) -> list[tuple[Estimate, Pose]]:
         """Those of `placed` whose first pose is likelier than others, or the only one."""
-        return [(one, truth) for one, truth in self.placed if one.odds or len(one.world) == 1]
+        return [(one, truth) for one, truth in self.placed if one.probability or len(one.world) == 1]
 
     def others(self, estimate: Estimate) -> tuple[Pose, ...]:
         """Where else in the plane it may be than at the likeliest pose; all of them, where none is that."""
-        return estimate.world[1:] if estimate.odds or len(estimate.world) == 1 else estimate.world
+        return estimate.world[1:] if estimate.probability or len(estimate.world) == 1 else estimate.world
 
     @cached_property
     def claim(self) -> Claim | None:
@@ -95,8 +95,8 @@ class Story(msgspec.Struct, frozen=True, dict=True):
         """In order, over all ticks on record; one in which no Command came goes with those before."""
         told, phase = [], 1
         for moment in self.record.moments:
-            drive = moment.drives.get(self.own.id)
-            phase = drive.phase if drive is not None else phase
+            command = moment.commands.get(self.own.id)
+            phase = command.phase if command is not None else phase
             told.append((phase, moment.truth.tick))
         spans = []
         for phase, ticks in groupby(told, key=lambda one: one[0]):
@@ -105,7 +105,7 @@ class Story(msgspec.Struct, frozen=True, dict=True):
         return tuple(spans) or (Span(1, 0, 0),)
 
     @property
-    def met(self) -> int | None:
+    def encounter_tick(self) -> int | None:
         """The tick in which phase 3 began."""
         return next((span.first for span in self.phases if span.phase == 3), None)
 

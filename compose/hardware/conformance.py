@@ -21,7 +21,7 @@ from protocol.motion import ORIGIN, REST, Controls, Pose, step
 from world.hardware.driver import SENSING
 
 PROMPT = 0.05
-"""of a manoeuvre: how long `drive` may take to return"""
+"""of a manoeuvre: how long `command` may take to return"""
 LIKE = 0.25
 """of what was asked for: by how much what is measured may differ, where the wheels take time to turn"""
 STILL = 0.02
@@ -166,7 +166,7 @@ CHECKS: tuple[Check, ...] = (prompt, stands, drives, lasts, stops, fresh, ranges
 
 def judged(trial: ExerciseRun) -> list[Found]:
     """What each check came to."""
-    return [Found(str(check.__doc__), check(trial.briefing.mission, trial.tries)) for check in CHECKS]
+    return [Found(str(check.__doc__), check(trial.config.mission, trial.tries)) for check in CHECKS]
 
 
 def _said(controls: Controls) -> str:
@@ -175,7 +175,7 @@ def _said(controls: Controls) -> str:
 
 def _slack(mission: Mission) -> tuple[float, float]:
     """m/s and rad/s: what noise may make of rest."""
-    v, omega = mission.noise.unrest
+    v, omega = mission.noise.standstill_bound
     return STILL * mission.max_speed + v, STILL * mission.max_turn_rate + omega
 
 

@@ -49,32 +49,32 @@ class DriverRecord(msgspec.Struct, frozen=True):
 
 
 @contextmanager
-def recorded(folder: Path, briefing: RobotConfig, inbox: Inbox, *, fsync: bool) -> Iterator[DriverRecord]:
-    """Yield the recording in `folder` of the robot with `briefing`; a new one if there is none.
+def recorded(folder: Path, config: RobotConfig, inbox: Inbox, *, fsync: bool) -> Iterator[DriverRecord]:
+    """Yield the recording in `folder` of the robot with `config`; a new one if there is none.
 
     Raises CannotRecord, and CorruptJournal if the journals are not of the same robot and run, or if Reports
     that the robot has sent may be missing in them.
     """
     start = ProcessStart(boot(), fsync)
-    path = folder / driver_journal(briefing.robot)
-    agents = folder / agent_journal(briefing.robot)
+    path = folder / driver_journal(config.robot)
+    agents = folder / agent_journal(config.robot)
     if not path.exists():
         if _frames(agents, inbox):
             raise CannotRecord(f"{agents} is there already, and {path.name} is not; choose another folder")
         with Journal(path, fsync=fsync) as journal:
-            journal.write(encode(briefing))
+            journal.write(encode(config))
             yield DriverRecord(journal, DriverPast(), -1, again=False, start=start)
         return
     old = Retrace(path, fsync=fsync)
     try:
-        past = driver_past(old.frames, briefing, path)
+        past = driver_past(old.frames, config, path)
         if past.may_lack:
             raise CorruptJournal(
                 f"{path} was written without --fsync, and this computer has been started again since: "
                 "what the robot has told its peer may be missing in it"
             )
         known = _known(_frames(agents, inbox), past, agents)
-        old.write(*(old.frames or [encode(briefing)]))
+        old.write(*(old.frames or [encode(config)]))
     except BaseException:
         old.close()
         raise

@@ -37,8 +37,8 @@ class Broken(Exception):
 class ExerciseRun:
     """An exercise, as it is gone through."""
 
-    def __init__(self, driver: Driver, briefing: RobotConfig, manoeuvre_s: float) -> None:
-        self.briefing = briefing
+    def __init__(self, driver: Driver, config: RobotConfig, manoeuvre_s: float) -> None:
+        self.config = config
         self.tries: list[Try] = []
         self._driver = driver
         self._manoeuvre_s = manoeuvre_s
@@ -47,11 +47,11 @@ class ExerciseRun:
 
     def go_through(self) -> None:
         """All of it. Raises Broken. The robot stands afterwards."""
-        mission = self.briefing.mission
+        mission = self.config.mission
         v = 0.5 * mission.first_straight / mission.period
         omega = min(mission.max_turn_rate, 1.0 / mission.period)
         try:
-            self._sense("stands at first", REST, 1.0)
+            self._observation("stands at first", REST, 1.0)
             for what, asked in (
                 ("stands, as nobody says anything", REST),
                 ("straight", Controls(v, 0.0)),
@@ -63,18 +63,18 @@ class ExerciseRun:
                 ("straight", Controls(0.9 * v, 0.0)),
             ):
                 self._try(what, asked)
-            self._drive(asked := Controls(v, 0.0))
+            self._command(asked := Controls(v, 0.0))
             self._wait(0.5)
-            self._sense("half of a straight", asked, self._share())
+            self._observation("half of a straight", asked, self._share())
             before = self.tries[-1].share
             self._wait(1.0)
-            self._sense("the rest of it", asked, 1.0 - before)
-            self._drive(asked := Controls(-v, 0.0))
+            self._observation("the rest of it", asked, 1.0 - before)
+            self._command(asked := Controls(-v, 0.0))
             self._wait(0.5)
             share = self._share()
             self._driver.stop()
             self._wait(1.0)
-            self._sense("stopped half-way", asked, share)
+            self._observation("stopped half-way", asked, share)
             self._try("stands after the stop", REST)
             for _ in range(math.ceil(2.0 * mission.sensing_range / (v * mission.period)) + 2):
                 self._try("away", Controls(v, 0.0))
@@ -90,11 +90,11 @@ class ExerciseRun:
         if asked == REST:
             self._began, took = time.monotonic(), 0.0
         else:
-            took = self._drive(asked)
+            took = self._command(asked)
         self._wait(1.0)
-        self._sense(what, asked, 1.0, took)
+        self._observation(what, asked, 1.0, took)
 
-    def _drive(self, asked: Controls) -> float:
+    def _command(self, asked: Controls) -> float:
         self._began = time.monotonic()
         self._driver.drive(asked.v, asked.omega)
         return time.monotonic() - self._began
@@ -106,7 +106,7 @@ class ExerciseRun:
         until = self._began + (share + (SETTLED if share == 1.0 else 0.0)) * self._manoeuvre_s
         time.sleep(max(0.0, until - time.monotonic()))
 
-    def _sense(self, what: str, asked: Controls, share: float, driving_s: float = 0.0) -> None:
+    def _observation(self, what: str, asked: Controls, share: float, driving_s: float = 0.0) -> None:
         tick, began = len(self.tries), time.monotonic()
         reading = self._driver.sense(tick)
         took = time.monotonic() - began
@@ -114,12 +114,12 @@ class ExerciseRun:
             raise Broken(f"sense({tick}) gives {type(reading).__name__}, expected a Reading")
         try:
             decode(
-                encode(Observation(tick, self.briefing.robot, reading.executed, reading.anchor_range)),
+                encode(Observation(tick, self.config.robot, reading.executed, reading.anchor_range)),
                 Observation,
             )
             if reading.mutual_range is not None:
                 decode(
-                    encode(Observation(tick, self.briefing.robot, None, reading.mutual_range)), Observation
+                    encode(Observation(tick, self.config.robot, None, reading.mutual_range)), Observation
                 )
         except (MalformedFrame, TypeError) as error:
             raise Broken(f"sense({tick}): {error}") from None

@@ -43,11 +43,11 @@ def driver_class(name: str) -> Maker:
 
 
 def made(
-    maker: Maker, name: str, briefing: RobotConfig, manoeuvre_s: float, given: Mapping[str, str]
+    maker: Maker, name: str, config: RobotConfig, manoeuvre_s: float, given: Mapping[str, str]
 ) -> Driver:
     """The driver itself. Raises UserError, by whatever it raised."""
     try:
-        return maker(briefing, manoeuvre_s, **given)
+        return maker(config, manoeuvre_s, **given)
     except Exception as error:  # noqa: BLE001  # as above
         raise UserError(f"{name}: cannot be made: {type(error).__name__}: {error}") from None
 
@@ -88,4 +88,4 @@ def mission(source: str, robot: str) -> Scenario:
 
 def briefed(scenario: Scenario, robot: str, manoeuvre_s: float) -> RobotConfig:
     """What `robot` is told; a tick lasts a manoeuvre and what thinking takes."""
-    return scenario.briefing(robot, (1.0 + THINKING) * manoeuvre_s)
+    return scenario.config(robot, (1.0 + THINKING) * manoeuvre_s)

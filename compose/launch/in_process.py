@@ -37,27 +37,27 @@ def played(scenario: Scenario, sinks: Mapping[str, Sink]) -> Record:
     """The run of `scenario`, whose journals go to `sinks`, by name: all of them, or none."""
     ids = [robot.id for robot in scenario.robots]
     course = Course(scenario, sinks.get(WORLD_JOURNAL))
-    robots = {robot: Robot(scenario.briefing(robot), sinks.get(agent_journal(robot))) for robot in ids}
+    robots = {robot: Robot(scenario.config(robot), sinks.get(agent_journal(robot))) for robot in ids}
     moments: list[TickRecord] = []
     end: MissionEnd | None = None
     told: dict[tuple[str, int], FramedReport] = {}
     while end is None:
-        senses = course.senses()
-        for sense in senses:
-            report = robots[sense.robot].sense(sense)
+        observations = course.observations()
+        for observation in observations:
+            report = robots[observation.robot].observation(observation)
             if report is not None:
-                told[sense.robot, sense.tick] = report
-        drives: dict[str, Command] = {}
-        for sense in senses:
-            heard = [told[contact.peer, tick] for contact in sense.contacts for tick in contact.heard or ()]
-            drives[sense.robot] = robots[sense.robot].decide(heard)
-            if robots[sense.robot].journaled:
-                robots[sense.robot].estimate()
+                told[observation.robot, observation.tick] = report
+        commands: dict[str, Command] = {}
+        for observation in observations:
+            heard = [told[contact.peer, tick] for contact in observation.contacts for tick in contact.heard or ()]
+            commands[observation.robot] = robots[observation.robot].decide(heard)
+            if robots[observation.robot].journaled:
+                robots[observation.robot].estimate()
         if told:
             for robot in ids:  # nobody hears it any more
                 told.pop((robot, course.tick - LATEST), None)
-        moments.append(TickRecord(course.world.truth, drives))
-        end = course.drive(drives)
-    farewells: dict[str, FinalReport] = {robot: robots[robot].farewell(end) for robot in ids}
-    course.farewells(farewells.values())
-    return Record(scenario, tuple(moments), end, farewells)
+        moments.append(TickRecord(course.world.truth, commands))
+        end = course.command(commands)
+    final_reports: dict[str, FinalReport] = {robot: robots[robot].final_report(end) for robot in ids}
+    course.final_reports(final_reports.values())
+    return Record(scenario, tuple(moments), end, final_reports)

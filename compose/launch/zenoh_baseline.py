@@ -34,8 +34,8 @@ def world(link: zenoh.Session, robots: Sequence[str], size: int, ticks: int) -> 
     """
     frames: SimpleQueue[bytes] = SimpleQueue()
     there = Inbox("barrier")
-    link.declare_subscriber(keys.drive(RUN, "*"), lambda sample: drop(frames, sample))
-    publishers = [session.publisher(link, keys.sense(RUN, robot)) for robot in robots]
+    link.declare_subscriber(keys.command(RUN, "*"), lambda sample: drop(frames, sample))
+    publishers = [session.publisher(link, keys.observation(RUN, robot)) for robot in robots]
     session.watch_liveliness(link, keys.robot_alive(RUN, "*"), there)
     for _ in robots:
         there.next(PATIENCE_S)
@@ -59,8 +59,8 @@ def robot(endpoint: str, name: str, size: int, ticks: int) -> None:
             sys.exit(1)
 
     with session.open_client(at(endpoint), unanswered) as link:
-        link.declare_subscriber(keys.sense(RUN, name), lambda sample: drop(frames, sample))
-        publisher = session.publisher(link, keys.drive(RUN, name))
+        link.declare_subscriber(keys.observation(RUN, name), lambda sample: drop(frames, sample))
+        publisher = session.publisher(link, keys.command(RUN, name))
         _token = session.show_alive(link, keys.robot_alive(RUN, name))
         frame = bytes(size)
         for _ in range(ticks):

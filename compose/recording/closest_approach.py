@@ -38,7 +38,7 @@ def _way(record: Record, moment: TickRecord, place: int) -> list[Pose]:
     if moment is record.moments[-1]:
         return [pose] * (INSTANTS + 1)
     robot = scenario.robots[place].id
-    drive = moment.drives.get(robot)
-    done = executed(asked(drive, scenario.mission), scenario, robot, moment.truth.tick)
+    command = moment.commands.get(robot)
+    done = executed(asked(command, scenario.mission), scenario, robot, moment.truth.tick)
     period = scenario.mission.period
     return [step(pose, done.v, done.omega, period * i / INSTANTS) for i in range(INSTANTS + 1)]

@@ -65,7 +65,7 @@ def _driven(record: Record, place: int, tick: int) -> Track:
     scenario = record.scenario
     robot = scenario.robots[place].id
     done: Sequence[Controls] = [
-        executed(asked(moment.drives.get(robot), scenario.mission), scenario, robot, moment.truth.tick)
+        executed(asked(moment.commands.get(robot), scenario.mission), scenario, robot, moment.truth.tick)
         for moment in record.moments[:tick]
     ]
     v, omega = np.array([one.v for one in done]), np.array([one.omega for one in done])

@@ -35,7 +35,7 @@ def pasts(folder: Path) -> dict[str, Past]:
     """
     told = {robot: past_of(folder, robot) for robot in map(robot_of, journals_in(folder))}
     found = {robot: past for robot, past in told.items() if past is not None}
-    agree({robot: past.briefing for robot, past in found.items()}, folder)
+    agree({robot: past.config for robot, past in found.items()}, folder)
     return found
 
 
@@ -46,9 +46,9 @@ def casts(folder: Path) -> list[tuple[str, ...]]:
     """
     robots = [robot_of(path) for path in journals_in(folder)]
     told = {
-        robot: briefing
+        robot: config
         for robot in robots
-        if (briefing := _briefing(folder / agent_journal(robot))) is not None and briefing.robot == robot
+        if (config := _briefing(folder / agent_journal(robot))) is not None and config.robot == robot
     }
     agree(told, folder)
     pairs = [(one.robot, one.peer) if one.role == "a" else (one.peer, one.robot) for one in told.values()]
@@ -66,18 +66,18 @@ def agree(told: Mapping[str, RobotConfig], folder: object) -> None:
             )
 
 
-def _shared(briefing: RobotConfig, robot: str) -> tuple[object, ...]:
+def _shared(config: RobotConfig, robot: str) -> tuple[object, ...]:
     """What both of a pair are told, seen from `robot`."""
-    own = briefing.robot == robot
+    own = config.robot == robot
     return (
-        briefing.robot if own else briefing.peer,
-        (briefing.role == "a") == own,
-        briefing.anchor if own else briefing.peer_anchor,
-        briefing.peer_anchor if own else briefing.anchor,
-        briefing.mission,
-        briefing.variant,
-        briefing.rendezvous,
-        briefing.tick_s,
+        config.robot if own else config.peer,
+        (config.role == "a") == own,
+        config.anchor if own else config.peer_anchor,
+        config.peer_anchor if own else config.anchor,
+        config.mission,
+        config.variant,
+        config.rendezvous,
+        config.tick_s,
     )
 
 

@@ -71,7 +71,7 @@ class TickRecord(msgspec.Struct, frozen=True):
     """One tick: where everyone was, and what everyone then set out to do."""
 
     truth: Truth
-    drives: dict[str, Command]
+    commands: dict[str, Command]
 
 
 class Record(msgspec.Struct, frozen=True):
@@ -81,7 +81,7 @@ class Record(msgspec.Struct, frozen=True):
     moments: tuple[TickRecord, ...]
     end: MissionEnd | None
     """none if the record breaks off"""
-    farewells: dict[str, FinalReport]
+    final_reports: dict[str, FinalReport]
 
 
 class JournalFile(msgspec.Struct, frozen=True):
@@ -113,8 +113,8 @@ def read(folder: Path) -> Record:
     told = history(journal_file.read(path), path)
     if told.disorder is not None:
         raise journal_file.CorruptJournal(f"{path}: {told.disorder.what}")
-    moments = tuple([TickRecord(tick.world.truth, tick.drives) for tick in told.ticks])
-    return Record(told.scenario, moments, told.end, told.farewells)
+    moments = tuple([TickRecord(tick.world.truth, tick.commands) for tick in told.ticks])
+    return Record(told.scenario, moments, told.end, told.final_reports)
 
 
 def estimates(folder: Path, robot: str) -> tuple[Estimate, ...]:
@@ -138,11 +138,11 @@ def past_of(folder: Path, robot: str) -> Past | None:
     if is_blank(frames):
         return None
     told = past(frames, path)
-    if told.briefing.robot != robot:
-        raise journal_file.CorruptJournal(f"{path} is the journal of {told.briefing.robot}")
+    if told.config.robot != robot:
+        raise journal_file.CorruptJournal(f"{path} is the journal of {told.config.robot}")
     world = folder / WORLD_JOURNAL
     head = list(islice(journal_file.read(world), 2)) if world.exists() else []
-    if not is_blank(head) and not opened(head, world)[0].is_of(told.briefing):
+    if not is_blank(head) and not opened(head, world)[0].is_of(told.config):
         raise journal_file.CorruptJournal(f"{path}: another run's: its briefing is not this world's")
     return told
 

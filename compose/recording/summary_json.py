@@ -70,15 +70,15 @@ def first_claim(record: Record, place: int) -> Claim | None:
     """The first claim to know its pose of the robot at that place in the scenario."""
     robot = record.scenario.robots[place].id
     for moment in record.moments:
-        drive = moment.drives.get(robot)
-        if drive is not None and isinstance(drive.verdict, Localised):
-            return claim(moment.truth.tick, drive.verdict, moment.truth.poses[place])
+        command = moment.commands.get(robot)
+        if command is not None and isinstance(command.verdict, Localised):
+            return claim(moment.truth.tick, command.verdict, moment.truth.poses[place])
     return None
 
 
 def _robot_summary(record: Record, place: int) -> dict[str, Any]:
     robot = record.scenario.robots[place].id
-    farewell = record.farewells.get(robot)
+    final_report = record.final_reports.get(robot)
     claimed = first_claim(record, place)
     covariance = claimed.covariance if claimed is not None else None
     return {
@@ -92,9 +92,9 @@ def _robot_summary(record: Record, place: int) -> dict[str, Any]:
         "position_sigma_m": covariance.position_sigma if covariance is not None else None,
         "heading_sigma_rad": covariance.heading_sigma if covariance is not None else None,
         "nees": claimed.nees if claimed is not None else None,
-        **{field: getattr(farewell, field, None) for field in _SAID},
-        "no_farewell": None if farewell is not None else _why_none(record, robot),
-        "deadlines_missed": sum([robot not in moment.drives for moment in record.moments[:-1]]),
+        **{field: getattr(final_report, field, None) for field in _SAID},
+        "no_farewell": None if final_report is not None else _why_none(record, robot),
+        "deadlines_missed": sum([robot not in moment.commands for moment in record.moments[:-1]]),
     }
 
 
@@ -102,7 +102,7 @@ def _why_none(record: Record, robot: str) -> str:
     """Why there is no FinalReport of `robot`, as far as the world's journal tells."""
     if record.end is None:
         return "the record breaks off"
-    latest = max([moment.truth.tick for moment in record.moments if robot in moment.drives], default=None)
+    latest = max([moment.truth.tick for moment in record.moments if robot in moment.commands], default=None)
     if latest is None:
         return "no Command of it came in time"
     if latest < record.end.tick:

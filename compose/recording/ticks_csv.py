@@ -55,15 +55,15 @@ def rows(record: Record) -> Iterator[TickRow]:
         anchor = anchor_ranges(moment.truth, scenario)
         mutual = _mutual(scenario, moment.truth)
         for i, (robot, pose) in enumerate(zip(scenario.robots, moment.truth.poses, strict=True)):
-            drive = moment.drives.get(robot.id)
+            command = moment.commands.get(robot.id)
             v = omega = None
             if tick != last:
-                done = executed(asked(drive, scenario.mission), scenario, robot.id, tick)
+                done = executed(asked(command, scenario.mission), scenario, robot.id, tick)
                 v, omega = done.v, done.omega
             yield TickRow(
                 *(tick, robot.id, pose.x, pose.y, wrap(pose.heading), v, omega),
                 *(anchor[i], mutual.get(robot.id)),
-                *((drive.phase, drive.state) if drive is not None else (None, None)),
+                *((command.phase, command.state) if command is not None else (None, None)),
             )
 
 
@@ -73,8 +73,8 @@ def rows_of(told: Mapping[str, Past]) -> Iterator[TickRow]:
         for robot, past in told.items():
             if tick >= len(past.steps):
                 continue
-            sense, drive = past.steps[tick].sense, past.steps[tick].drive
-            after = past.steps[tick + 1].sense.executed if tick + 1 < len(past.steps) else None
+            observation, command = past.steps[tick].observation, past.steps[tick].command
+            after = past.steps[tick + 1].observation.executed if tick + 1 < len(past.steps) else None
             contact = past.contact(tick)
             yield TickRow(
                 tick,
@@ -84,10 +84,10 @@ def rows_of(told: Mapping[str, Past]) -> Iterator[TickRow]:
                 heading=None,
                 v=after.v if after is not None else None,
                 omega=after.omega if after is not None else None,
-                anchor_range=sense.anchor_range,
+                anchor_range=observation.anchor_range,
                 mutual_range=contact.range if contact is not None else None,
-                phase=drive.phase if drive is not None else None,
-                state=drive.state if drive is not None else None,
+                phase=command.phase if command is not None else None,
+                state=command.state if command is not None else None,
             )
 
 

@@ -118,13 +118,13 @@ def taker(kills: Sequence[Kill]) -> Callable[[str, int], None] | None:
         return None
     fatal: dict[tuple[str, int], Kill] = {(kill.point, kill.tick): kill for kill in kills}
 
-    def reached(point: str, tick: int) -> None:
+    def on_kill_point(point: str, tick: int) -> None:
         kill = fatal.get((point, tick))
         if kill is not None:
             os.write(2, f"{kill.last_words}\n".encode())
             os.kill(os.getpid(), signal.SIGKILL)
 
-    return reached
+    return on_kill_point
 
 
 def taken(kills: Sequence[Kill], said: str) -> Kill | None:

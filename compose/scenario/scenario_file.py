@@ -22,14 +22,14 @@ from compose.scenario.kills import DRAWN, POINTS, BadKill, Kill, KillTable, draw
 from compose.scenario.toml_file import field_first, read_text, table_in
 from protocol.attack import OF_THE_START, Attack, Kind, Part
 from protocol.messages import RobotConfig
-from protocol.mission import Anchor, Mission, Role, Variant, noise_obstacle, obstacle, safety_obstacle
+from protocol.mission import Anchor, Mission, Role, Variant, noise_infeasibility, infeasibility, safety_infeasibility
 from protocol.motion import TAU, Pose, wrap
 from protocol.orbits import Rendezvous, rendezvous, tick_budget
 from protocol.rounding import TOLERANCE
 from protocol.spelling import did_you_mean
 from protocol.units import NAME, RobotId
 from protocol.wire import MalformedFrame, decode, encode
-from world.faults import Fault, hold_up
+from world.faults import Fault, delivery_time_bound
 from world.scenario import RobotSpec, Scenario
 
 MAX_TICKS = 10**9
@@ -83,7 +83,7 @@ class RobotTable(_Table, frozen=True):
     """x, y in m, heading in rad; drawn from the seed inside the sensing range where it is left out"""
     peer: RobotId | None = None
     """needed only with more than two robots"""
-    lie: Attack | None = None
+    attack: Attack | None = None
     """what it tells its peer instead of the truth"""
 
 
@@ -236,17 +236,17 @@ def _validated(file: ScenarioFile, source: str, told: Sequence[str]) -> Scenario
                 f"{source}: robot[{i}].start: '{robot.id}' is {rho0:.9g} m from its anchor, "
                 f"outside mission.sensing_range = {file.mission.sensing_range:.9g} m"
             )
-        if robot.lie is not None and robot.lie.kind in OF_THE_START and robot.lie.part != "all":
+        if robot.attack is not None and robot.attack.kind in OF_THE_START and robot.attack.part != "all":
             raise BadScenario(
-                f"{source}: robot[{i}].lie.part: a lie of the {robot.lie.kind} is of the beginning, "
+                f"{source}: robot[{i}].lie.part: a lie of the {robot.attack.kind} is of the beginning, "
                 "and so of all"
             )
         placed.append(
-            RobotSpec(robot.id, peer, role, Anchor(*robot.anchor), start, plans[robot.id], robot.lie)
+            RobotSpec(robot.id, peer, role, Anchor(*robot.anchor), start, plans[robot.id], robot.attack)
         )
     faults = _faults(file, told, list(peers.items()), source)
     budget = max(tick_budget(file.mission, plan) for plan in plans.values())
-    held_up = EXCHANGES * hold_up(faults) if faults else 0
+    held_up = EXCHANGES * delivery_time_bound(faults) if faults else 0
     if file.max_ticks is None and budget + held_up > MAX_TICKS:
         what = "mission: to meet" if budget > MAX_TICKS else "fault: what befalls the reports"
         raise Unworkable(f"{source}: {what} could take {budget + held_up} ticks, more than {MAX_TICKS}")
@@ -261,7 +261,7 @@ def _validated(file: ScenarioFile, source: str, told: Sequence[str]) -> Scenario
     )
     try:
         for one in scenario.robots:
-            decode(encode(scenario.briefing(one.id)), RobotConfig)
+            decode(encode(scenario.config(one.id)), RobotConfig)
     except MalformedFrame as error:
         raise Unworkable(f"{source}: mission: no robot could be told of it: {error}") from None
     return scenario
@@ -293,7 +293,7 @@ def _check_noise(mission: Mission, source: str) -> None:
             f"{source}: mission.noise.outlier_bias: the least, {least:.6g} m, is more than the most, "
             f"{most:.6g} m"
         )
-    why = noise_obstacle(mission) or safety_obstacle(mission)
+    why = noise_infeasibility(mission) or safety_infeasibility(mission)
     if why is not None:
         raise Unworkable(f"{source}: mission.{why}")
 
@@ -306,7 +306,7 @@ def _plan(file: ScenarioFile, first: int, second: int, source: str) -> Rendezvou
             f"{source}: robot[{second}].anchor: less than {NEAREST_ANCHORS:g} m from that of its peer "
             f"'{file.robot[first].id}'"
         )
-    why = obstacle(file.mission, distance)
+    why = infeasibility(file.mission, distance)
     if why is not None:
         raise Unworkable(f"{source}: mission: {why}")
     return rendezvous(file.mission, distance, file.planner.variant)

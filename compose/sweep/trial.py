@@ -55,7 +55,7 @@ class RobotRow(msgspec.Struct, frozen=True, array_like=True):
     heading_error_rad: float | None = None
     hypotheses: int | None = None
     """left, about the poses of both"""
-    odds: float | None = None
+    probability: float | None = None
     """of the likeliest of them"""
     p_value: float | None = None
     """the least with which the ranges spoke against what its peer told"""
@@ -153,7 +153,7 @@ def play(trial: Trial) -> TrialRow:
         played = as_processes(trial.scenario, audit=trial.audit, kills=trial.kills)
     else:
         played = run_in_process(trial.scenario, audit=trial.audit)
-    found = row(trial, played.record, played.wall_s, played.findings)
+    found = row(trial, played.record, played.wall_s, played.belief)
     if played.kills is None:
         return found
     found = replace(found, kills=played.kills, same_record=not played.otherwise)
@@ -173,7 +173,7 @@ def row(trial: Trial, record: Record, wall_s: float, findings: Findings | None =
         robots |= _bounded(robots, record, pair)
     t_max_s = max(robot.rendezvous.bound for robot in scenario.robots)
     met = [_meeting(record, scenario.robots[a].id, scenario.robots[b].id) for a, b in scenario.pairs()]
-    said = record.farewells.values()
+    said = record.final_reports.values()
     errors = [robot.position_error_m for robot in robots.values() if robot.position_error_m is not None]
     nees = [robot.nees for robot in robots.values() if robot.nees is not None]
     return TrialRow(
@@ -198,11 +198,11 @@ def row(trial: Trial, record: Record, wall_s: float, findings: Findings | None =
         claims=len(errors),
         claims_within=sum([error <= WITHIN * scenario.mission.accuracy for error in errors]),
         nees=sum(nees) / len(nees) if nees else None,
-        reports_sent=sum([farewell.reports_sent for farewell in said]),
-        reports_heard=sum([farewell.reports_heard for farewell in said]),
-        reports_refused=sum([farewell.reports_refused for farewell in said]),
-        reports_lost=sum([farewell.reports_lost for farewell in said]),
-        bytes_sent=sum([farewell.bytes_sent for farewell in said]),
+        reports_sent=sum([final_report.reports_sent for final_report in said]),
+        reports_heard=sum([final_report.reports_heard for final_report in said]),
+        reports_refused=sum([final_report.reports_refused for final_report in said]),
+        reports_lost=sum([final_report.reports_lost for final_report in said]),
+        bytes_sent=sum([final_report.bytes_sent for final_report in said]),
         violations=len(findings.violations) if findings is not None else None,
         first_violation=findings.violations[0].line if findings is not None and findings.violations else None,
         wall_s=round(wall_s, 6),
@@ -212,22 +212,22 @@ def row(trial: Trial, record: Record, wall_s: float, findings: Findings | None =
 
 def _robot_row(record: Record, place: int) -> RobotRow:
     robot = record.scenario.robots[place].id
-    return _claimed(_said(record.farewells.get(robot)), first_claim(record, place))
+    return _claimed(_said(record.final_reports.get(robot)), first_claim(record, place))
 
 
-def _said(farewell: FinalReport | None) -> RobotRow:
+def _said(final_report: FinalReport | None) -> RobotRow:
     """What the robot says of itself in the end."""
-    if farewell is None:
+    if final_report is None:
         return RobotRow()
-    before, left = farewell.candidates if farewell.candidates is not None else (None, None)
+    before, left = final_report.candidates if final_report.candidates is not None else (None, None)
     return RobotRow(
-        branch=farewell.branch,
-        alpha=farewell.alpha,
+        branch=final_report.branch,
+        alpha=final_report.alpha,
         candidates=before,
         candidates_left=left,
-        hypotheses=farewell.hypotheses,
-        odds=farewell.odds,
-        p_value=farewell.p_value,
+        hypotheses=final_report.hypotheses,
+        probability=final_report.probability,
+        p_value=final_report.p_value,
     )
 
 
@@ -265,10 +265,10 @@ def _meeting(record: Record, a: str, b: str) -> tuple[int | None, int | None]:
     """The tick from which both of a pair orbit, and that at which their phase 3 begins."""
     orbiting = None
     for moment in record.moments:
-        drives = [drive for drive in (moment.drives.get(a), moment.drives.get(b)) if drive is not None]
-        if any(drive.phase == 3 for drive in drives):
+        commands = [command for command in (moment.commands.get(a), moment.commands.get(b)) if command is not None]
+        if any(command.phase == 3 for command in commands):
             return orbiting, moment.truth.tick
-        if orbiting is None and len(drives) == 2 and all(drive.state == "orbiting" for drive in drives):
+        if orbiting is None and len(commands) == 2 and all(command.state == "orbiting" for command in commands):
             orbiting = moment.truth.tick
     return orbiting, None
 

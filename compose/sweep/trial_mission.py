@@ -28,7 +28,7 @@ class Played(msgspec.Struct, frozen=True):
     """A mission to its end."""
 
     record: Record
-    findings: Findings | None
+    belief: Findings | None
     """of its audit, if there was one"""
     wall_s: float
     """with its audit"""

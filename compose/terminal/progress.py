@@ -46,7 +46,7 @@ NAMED = 10
 def live(scenario: Scenario, folder: Path) -> Iterator[None]:
     """Show the run whose record grows in `folder`, ten times a second."""
     journal = Tail(folder / WORLD_JOURNAL)
-    drives: dict[str, Command] = {}
+    commands: dict[str, Command] = {}
 
     def update() -> None:
         with suppress(OSError, ValueError):
@@ -55,22 +55,22 @@ def live(scenario: Scenario, folder: Path) -> Iterator[None]:
                     frame, Scenario | Command | DeadlineMissed | MissionEnd | FinalReport, MAX_FRAME_BYTES
                 )
                 if isinstance(message, Command):
-                    drives[message.robot] = message
+                    commands[message.robot] = message
 
     def table() -> Table:
         update()
         ids = [robot.id for robot in scenario.robots]
-        latest = max((drive.tick for drive in drives.values()), default=0)
+        latest = max((command.tick for command in commands.values()), default=0)
         rows = Table(title=f"{scenario.name}, tick {latest} of {scenario.max_ticks} at most")
         for heading in ("robot", "phase", "state", "v m/s", "omega rad/s"):
             rows.add_column(heading, no_wrap=True)
         for robot in ids:
-            drive = drives.get(robot)
-            if drive is None:
+            command = commands.get(robot)
+            if command is None:
                 rows.add_row(robot, "", "awaited", "", "")
             else:
                 rows.add_row(
-                    robot, str(drive.phase), one_line(drive.state), f"{drive.v:.3f}", f"{drive.omega:.3f}"
+                    robot, str(command.phase), one_line(command.state), f"{command.v:.3f}", f"{command.omega:.3f}"
                 )
         return rows
 

@@ -25,7 +25,7 @@ class Seat(msgspec.Struct, frozen=True):
     role: Role
     anchor: Anchor
     orbit: Orbit
-    lie: Attack | None = None
+    attack: Attack | None = None
     """what it is told to tell its peer instead of the truth"""
     frame: Pose | None = None
     """that of its own anchor, in the world's: the x-axis leads from the anchor to where the robot was
@@ -82,7 +82,7 @@ def of_scenario(scenario: Scenario, mode: str | None = None, tick_s: float | Non
                     robot.role,
                     robot.anchor,
                     robot.rendezvous.of(robot.role),
-                    robot.lie,
+                    robot.attack,
                     frame(robot.anchor, robot.start),
                 )
                 for robot in scenario.robots
@@ -106,7 +106,7 @@ def of_briefings(name: str, briefings: Mapping[str, RobotConfig]) -> Stage:
         name=name,
         robots=tuple(
             [
-                Seat(one.robot, one.peer, one.role, one.anchor, one.rendezvous.of(one.role), one.lie)
+                Seat(one.robot, one.peer, one.role, one.anchor, one.rendezvous.of(one.role), one.attack)
                 for one in told
             ]
         ),

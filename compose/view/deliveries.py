@@ -45,5 +45,5 @@ def passages(stage: Stage, before: Facts | None, now: Facts) -> Iterator[Passage
 
 def contact_of(now: Facts, robot: str, peer: str) -> Contact | None:
     """With `peer`, of `robot`, if they are in range and that is known."""
-    sense = now.senses.get(robot)
-    return next((one for one in sense.contacts if one.peer == peer), None) if sense is not None else None
+    observation = now.observations.get(robot)
+    return next((one for one in observation.contacts if one.peer == peer), None) if observation is not None else None

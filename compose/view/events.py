@@ -77,17 +77,17 @@ def _radio(tick: int, passages: Sequence[Passage]) -> Iterator[Event]:
 
 def _sensing(seat: Seat, before: Facts | None, now: Facts) -> Iterator[Event]:
     robot, peer, tick = seat.id, seat.peer, now.tick
-    sense = now.senses.get(robot)
-    earlier = before.senses.get(robot) if before is not None else None
-    if sense is None or (before is not None and earlier is None):
+    observation = now.observations.get(robot)
+    earlier = before.observations.get(robot) if before is not None else None
+    if observation is None or (before is not None and earlier is None):
         return
     was = earlier.anchor_range if earlier is not None else None
-    if was is None and sense.anchor_range is not None:
-        text = f"{robot} is in its anchor's range: {metres(sense.anchor_range)}"
+    if was is None and observation.anchor_range is not None:
+        text = f"{robot} is in its anchor's range: {metres(observation.anchor_range)}"
         yield Event(tick, "anchor", robot, text)
-    if was is not None and sense.anchor_range is None:
+    if was is not None and observation.anchor_range is None:
         yield Event(tick, "anchor-lost", robot, f"{robot} has no range to its anchor any more")
-    if seat.role == "b" and peer in now.senses:  # of a pair, a tells it
+    if seat.role == "b" and peer in now.observations:  # of a pair, a tells it
         return
     contact = contact_of(now, robot, peer)
     near = before is not None and contact_of(before, robot, peer) is not None
@@ -106,21 +106,21 @@ def _deciding(seat: Seat, before: Facts | None, now: Facts) -> Iterator[Event]:
         yield Event(
             tick, "late", robot, f"{robot} goes without {seat.peer}'s report, which did not come in time"
         )
-    drive = now.drives.get(robot)
-    earlier = before.drives.get(robot) if before is not None else None
-    if drive is None or (before is not None and earlier is None):
+    command = now.commands.get(robot)
+    earlier = before.commands.get(robot) if before is not None else None
+    if command is None or (before is not None and earlier is None):
         return
-    if earlier is None or drive.phase != earlier.phase:
-        yield Event(tick, "phase", robot, f"{robot} begins phase {drive.phase}: {PHASES[drive.phase]}")
-    if (earlier is None or drive.state != earlier.state) and drive.verdict is None:
-        yield Event(tick, "state", robot, doing(seat, drive.phase, drive.state, None))
-    if drive.verdict is not None and (earlier is None or earlier.verdict is None):
-        yield _verdict(seat, drive, now)
+    if earlier is None or command.phase != earlier.phase:
+        yield Event(tick, "phase", robot, f"{robot} begins phase {command.phase}: {PHASES[command.phase]}")
+    if (earlier is None or command.state != earlier.state) and command.verdict is None:
+        yield Event(tick, "state", robot, doing(seat, command.phase, command.state, None))
+    if command.verdict is not None and (earlier is None or earlier.verdict is None):
+        yield _verdict(seat, command, now)
 
 
-def _verdict(seat: Seat, drive: Command, now: Facts) -> Event:
+def _verdict(seat: Seat, command: Command, now: Facts) -> Event:
     robot = seat.id
-    match drive.verdict:
+    match command.verdict:
         case Localised(pose):
             x, y, heading = pose.x, pose.y, wrap(pose.heading)
             text = f"{robot} claims to be at ({x:.2f}, {y:.2f}) m, heading {heading:+.2f} rad"
@@ -130,7 +130,7 @@ def _verdict(seat: Seat, drive: Command, now: Facts) -> Event:
             return Event(now.tick, "claim", robot, text)
         case verdict:
             kind: Kind = "alarm" if isinstance(verdict, Inconsistent) else "undecided"
-            return Event(now.tick, kind, robot, doing(seat, drive.phase, drive.state, verdict))
+            return Event(now.tick, kind, robot, doing(seat, command.phase, command.state, verdict))
 
 
 PHASES = {1: "its own anchor", 2: "the search for its peer", 3: "the encounter"}

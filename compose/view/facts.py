@@ -34,10 +34,10 @@ class Facts(msgspec.Struct, frozen=True):
 
     tick: int
     truth: dict[str, Pose] = msgspec.field(default_factory=dict)
-    senses: dict[str, Observation] = msgspec.field(default_factory=dict)
+    observations: dict[str, Observation] = msgspec.field(default_factory=dict)
     reports: dict[str, Said] = msgspec.field(default_factory=dict)
     """by who says them"""
-    drives: dict[str, Command] = msgspec.field(default_factory=dict)
+    commands: dict[str, Command] = msgspec.field(default_factory=dict)
     estimates: dict[str, Estimate] = msgspec.field(default_factory=dict)
     late: set[str] = msgspec.field(default_factory=set)
     """robots whose Command did not come in time"""
@@ -56,8 +56,8 @@ class Gathering:
 
     def __init__(self) -> None:
         self.ticks: dict[int, Facts] = {}
-        self.briefings: dict[str, RobotConfig] = {}
-        self.farewells: dict[str, FinalReport] = {}
+        self.configs: dict[str, RobotConfig] = {}
+        self.final_reports: dict[str, FinalReport] = {}
         self.end: MissionEnd | None = None
         self.last = -1
         """the latest tick of which anything is known"""
@@ -92,7 +92,7 @@ class Gathering:
             if who in self.gone:
                 self.gone.remove(who)
                 self.at(self.last).back.add(who)
-        elif who in self._seen - self.gone and self.end is None and who not in self.farewells:
+        elif who in self._seen - self.gone and self.end is None and who not in self.final_reports:
             self.gone.add(who)
             now = self.at(self.last)
             now.down.add(who)
@@ -105,9 +105,9 @@ class Gathering:
         """
         match message:
             case Observation(tick, robot):
-                self.at(tick).senses.setdefault(robot, message)
+                self.at(tick).observations.setdefault(robot, message)
             case Command(tick, robot):
-                self.at(tick).drives.setdefault(robot, message)
+                self.at(tick).commands.setdefault(robot, message)
             case Estimate(tick, robot):
                 self.at(tick).estimates.setdefault(robot, message)
             case Report(tick, robot):
@@ -124,8 +124,8 @@ class Gathering:
     def _take_once(self, message: Message) -> None:
         match message:
             case RobotConfig(robot):
-                self.briefings.setdefault(robot, message)
+                self.configs.setdefault(robot, message)
             case FinalReport(robot):
-                self.farewells.setdefault(robot, message)
+                self.final_reports.setdefault(robot, message)
             case MissionEnd():
                 self.end = self.end or message

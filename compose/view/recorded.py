@@ -16,7 +16,7 @@ from protocol.journal.environment import is_blank
 from protocol.journal.journal_file import CorruptJournal, Tail
 from protocol.messages import FinalReport, MissionEnd, OfRobot
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
-from world.tick import World, senses
+from world.tick import World, observations
 from world.world_journal import JournalReading, opened
 
 
@@ -28,7 +28,7 @@ class Performance(msgspec.Struct, frozen=True):
     """one a tick, from the first that is known on"""
     end: MissionEnd | None
     """none where the record breaks off"""
-    farewells: dict[str, FinalReport]
+    final_reports: dict[str, FinalReport]
     notes: tuple[str, ...]
     """what could not be read, a line each"""
 
@@ -44,7 +44,7 @@ def read(folder: Path) -> Performance:
     stage, known = journals.stage, journals.known
     if stage is None:
         raise FileNotFoundError("; ".join(journals.notes) or f"{folder} holds no journal")
-    return Performance(stage, scenes(stage, known), known.end, known.farewells, tuple(journals.notes))
+    return Performance(stage, scenes(stage, known), known.end, known.final_reports, tuple(journals.notes))
 
 
 def scenes(stage: Stage, known: Gathering, first: int = 0, last: int | None = None) -> tuple[Scene, ...]:
@@ -88,7 +88,7 @@ class Journals:
             except (CorruptJournal, MalformedFrame) as error:
                 text = str(error)
                 self._note(text if text.startswith(str(path)) else f"{path}: {text}")
-        told = self.known.briefings
+        told = self.known.configs
         if self._world is not None:
             for robot in [robot for robot, one in told.items() if not self._world.world.scenario.is_of(one)]:
                 path = self.folder / agent_journal(robot)
@@ -102,9 +102,9 @@ class Journals:
             return
         for world in self._world.told().worlds:
             facts = self.known.at(world.truth.tick)
-            if len(facts.senses) < len(world.scenario.robots):
-                for sense in senses(world):
-                    facts.senses.setdefault(sense.robot, sense)
+            if len(facts.observations) < len(world.scenario.robots):
+                for observation in observations(world):
+                    facts.observations.setdefault(observation.robot, observation)
 
     def _note(self, text: str) -> None:
         if text not in self.notes:
@@ -137,13 +137,13 @@ class Journals:
         for tick in reading.ticks[told:]:
             self._show(tick.world)
             facts = self.known.at(tick.world.truth.tick)
-            for drive in tick.drives.values():
-                self.known.take(drive, 0)
-            facts.late.update({robot.id for robot in tick.world.scenario.robots} - tick.drives.keys())
+            for command in tick.commands.values():
+                self.known.take(command, 0)
+            facts.late.update({robot.id for robot in tick.world.scenario.robots} - tick.commands.keys())
         if reading.judgement is None:
             self._show(reading.world)
         self.known.end = reading.end or self.known.end
-        self.known.farewells.update(reading.farewells)
+        self.known.final_reports.update(reading.final_reports)
 
     def _show(self, world: World) -> None:
         """The truth at a tick, and the air."""

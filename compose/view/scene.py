@@ -41,7 +41,7 @@ class HeldPoses(msgspec.Struct, frozen=True):
     local: tuple[Pose, ...]
     """in the frame of its own anchor; `Seat.frame` says where that lies"""
     world: tuple[Pose, ...]
-    odds: tuple[Probability, ...]
+    probability: tuple[Probability, ...]
     """of each of `world`, or, while there is none, of `local`; none where each is equally possible"""
     covariance: Covariance | None
     """of the first of `world`"""
@@ -52,7 +52,7 @@ class Player(msgspec.Struct, frozen=True, omit_defaults=True):
     """One robot in one tick; none is what did not happen, or is not known."""
 
     robot: str
-    doing: str
+    mode_name: str
     """in a sentence"""
     pose: Pose | None = None
     """the true one; its heading is wrapped"""
@@ -65,7 +65,7 @@ class Player(msgspec.Struct, frozen=True, omit_defaults=True):
     anchor_range: float | None = None
     contacts: tuple[Contact, ...] = ()
     sent: Sent | None = None
-    drive: Decision | None = None
+    command: Decision | None = None
     held: HeldPoses | None = None
 
 
@@ -95,37 +95,37 @@ def scene(stage: Stage, before: Facts | None, now: Facts, end: MissionEnd | None
 
 def _player(seat: Seat, now: Facts) -> Player:
     robot = seat.id
-    pose, sense, said = now.truth.get(robot), now.senses.get(robot), now.reports.get(robot)
-    drive, estimate = now.drives.get(robot), now.estimates.get(robot)
+    pose, observation, said = now.truth.get(robot), now.observations.get(robot), now.reports.get(robot)
+    command, estimate = now.commands.get(robot), now.estimates.get(robot)
     sentence = f"{robot} has not answered"
     down = robot in now.down - now.back
     if down:
         sentence = f"{robot} is down: its process is gone"
-    elif drive is not None:
-        sentence = doing(seat, drive.phase, drive.state, drive.verdict)
+    elif command is not None:
+        sentence = doing(seat, command.phase, command.state, command.verdict)
     elif robot in now.late:
         sentence = f"{robot} has not answered in time, and stands still"
     return Player(
         robot=robot,
-        doing=sentence,
+        mode_name=sentence,
         pose=Pose(pose.x, pose.y, wrap(pose.heading)) if pose is not None else None,
-        sensed=sense is not None,
+        sensed=observation is not None,
         down=down,
-        executed=sense.executed if sense is not None else None,
-        anchor_range=sense.anchor_range if sense is not None else None,
-        contacts=sense.contacts if sense is not None else (),
+        executed=observation.executed if observation is not None else None,
+        anchor_range=observation.anchor_range if observation is not None else None,
+        contacts=observation.contacts if observation is not None else (),
         sent=(
             Sent(said.bytes, said.report.phase, said.report.state, said.report.through, said.report.heard)
             if said is not None
             else None
         ),
-        drive=(
-            Decision(drive.v, drive.omega, drive.phase, drive.state, drive.verdict)
-            if drive is not None
+        command=(
+            Decision(command.v, command.omega, command.phase, command.state, command.verdict)
+            if command is not None
             else None
         ),
         held=(
-            HeldPoses(estimate.local, estimate.world, estimate.odds, estimate.covariance, estimate.localised)
+            HeldPoses(estimate.local, estimate.world, estimate.probability, estimate.covariance, estimate.localised)
             if estimate is not None
             else None
         ),

@@ -22,12 +22,12 @@ def truth(run: str) -> str:
     return f"{ROOT}/{run}/world/truth"
 
 
-def briefing(run: str, robot: str) -> str:
+def config(run: str, robot: str) -> str:
     """Return the key of the world's queryable for that robot's RobotConfig; the world declares it for "*"."""
     return f"{ROOT}/{run}/world/briefing/{robot}"
 
 
-def sense(run: str, robot: str) -> str:
+def observation(run: str, robot: str) -> str:
     """Return the key on which the world sends each Observation to that robot, and MissionEnd after the last.
 
     The world then sends the robot's FinalReport back, once it is in the recording.
@@ -35,7 +35,7 @@ def sense(run: str, robot: str) -> str:
     return f"{ROOT}/{run}/robot/{robot}/sense"
 
 
-def drive(run: str, robot: str) -> str:
+def command(run: str, robot: str) -> str:
     """Return the key on which that robot sends each Command to the world, and FinalReport after the mission."""
     return f"{ROOT}/{run}/robot/{robot}/drive"
 
@@ -45,7 +45,7 @@ def report(run: str, robot: str, peer: str) -> str:
     return f"{ROOT}/{run}/robot/{robot}/to/{peer}"
 
 
-def beat(run: str, robot: str) -> str:
+def tick_start(run: str, robot: str) -> str:
     """Return the key on which a robot's driver sends the start of a tick to its peer's, in hardware mode."""
     return f"{ROOT}/{run}/robot/{robot}/beat"
 
@@ -83,11 +83,11 @@ class Rule(NamedTuple):
 RULES: Mapping[Callable[..., str], Rule] = MappingProxyType(
     {
         truth: Rule("put", "world", ("viewer",)),
-        briefing: Rule("answer", "world", ("robot", "viewer")),
-        sense: Rule("put", "world", ("robot", "viewer")),
-        drive: Rule("put", "robot", ("world", "viewer")),
+        config: Rule("answer", "world", ("robot", "viewer")),
+        observation: Rule("put", "world", ("robot", "viewer")),
+        command: Rule("put", "robot", ("world", "viewer")),
         report: Rule("put", "robot", ("peer", "viewer")),
-        beat: Rule("put", "world", ("world",)),
+        tick_start: Rule("put", "world", ("world",)),
         estimate: Rule("put", "robot", ("viewer",)),
         world_alive: Rule("show", "world", ("robots", "viewer")),
         robot_alive: Rule("show", "robot", ("robot", "world", "viewer")),

@@ -68,7 +68,7 @@ class Field:
     def __init__(
         self,
         driver: Driver,
-        briefing: RobotConfig,
+        config: RobotConfig,
         run: str,
         inbox: Inbox,
         *,
@@ -82,8 +82,8 @@ class Field:
         What is measured and driven goes to `journal`, which begins with the briefing.
         """
         self._driver = driver
-        self._briefing = briefing
-        self._id, self._peer = briefing.robot, briefing.peer
+        self._config = config
+        self._id, self._peer = config.robot, config.peer
         self.run = run
         self._inbox = inbox
         self._manoeuvre_s = manoeuvre_s
@@ -92,7 +92,7 @@ class Field:
         self._ended: Callable[[], None] = lambda: None
         self._journal = journal
         self._max_ticks = max_ticks
-        self._ending = Ending(briefing, max_ticks, self._patience)
+        self._ending = Ending(config, max_ticks, self._patience)
         self._end: MissionEnd | None = None
         """once it is on record"""
         self._again = False
@@ -120,11 +120,11 @@ class Field:
         for one in past.ticks:
             for report in one.reports:
                 self._ending.told(report)
-            self._end = self._ending.after(one.sense.tick, one.drive, peer_there=True)
-            self.missed += one.drive is None
+            self._end = self._ending.after(one.observation.tick, one.command, peer_there=True)
+            self.missed += one.command is None
         self._end = past.end or self._end
         self._tick, self._resumed, self._astray = past.tick, past.tick >= 0, self._max_ticks + 1
-        self._unanswered.extend((one.sense.tick, one.frame) for one in past.ticks[known + 1 :])
+        self._unanswered.extend((one.observation.tick, one.frame) for one in past.ticks[known + 1 :])
 
     @property
     def tick(self) -> int:
@@ -139,13 +139,13 @@ class Field:
     def attach(self, link: zenoh.Session) -> None:
         """This is the session over which the agent and the peer are reached."""
         me, run, inbox = self._id, self.run, self._inbox
-        self._sense = session.publisher(link, keys.sense(run, me))
-        self._beat = session.publisher(link, keys.beat(run, me))
-        session.subscribe(link, keys.drive(run, me), inbox, "drive")
-        session.subscribe(link, keys.beat(run, self._peer), inbox, "beat")
+        self._observation = session.publisher(link, keys.observation(run, me))
+        self._beat = session.publisher(link, keys.tick_start(run, me))
+        session.subscribe(link, keys.command(run, me), inbox, "drive")
+        session.subscribe(link, keys.tick_start(run, self._peer), inbox, "beat")
         session.subscribe(link, keys.report(run, self._peer, me), inbox, "report")
         session.watch_liveliness(link, keys.robot_alive(run, "*"), inbox)
-        session.answer(link, keys.briefing(run, me), lambda _: self._briefing)
+        session.answer(link, keys.config(run, me), lambda _: self._config)
         self._token = session.show_alive(link, keys.world_alive(run))
 
     def play(self, wait: float, ended: Callable[[], None]) -> MissionEnd:
@@ -200,7 +200,7 @@ class Field:
             return False
         if self._resumed:
             return True
-        return self._next != UNKNOWN if self._briefing.role == "b" else self._peer in self._alive
+        return self._next != UNKNOWN if self._config.role == "b" else self._peer in self._alive
 
     def _play_tick(self) -> MissionEnd | None:
         self._tick += 1
@@ -210,15 +210,15 @@ class Field:
         if not self._resumed or self._next > now:  # one that catches up says so once it is there
             self._beat.put(encode(TickStart(tick, self._id)))
         reading = self._reading(tick)
-        sense = _sense(reading, tick, self._briefing)
-        self._write(*_mark(reading, tick, self._id), sense)
-        self._unanswered.append((tick, sense))
-        self._sense.put(sense)
-        drive = self._awaited(tick)
+        observation = _sense(reading, tick, self._config)
+        self._write(*_mark(reading, tick, self._id), observation)
+        self._unanswered.append((tick, observation))
+        self._observation.put(observation)
+        command = self._awaited(tick)
         until = time.monotonic()
-        if drive is not None:
-            self._write(encode(drive))
-            self._set_off(drive)
+        if command is not None:
+            self._write(encode(command))
+            self._set_off(command)
             until = time.monotonic() + self._manoeuvre_s
         else:
             self.missed += 1
@@ -227,7 +227,7 @@ class Field:
         self._take_waiting()
         if self._unanswered and now - self._answered > self._patience:
             return MissionEnd(tick, "failed", f"no answer from {self._id}'s agent for {self._patience:g} s")
-        return self._ending.after(tick, drive, peer_there=self._peer in self._alive)
+        return self._ending.after(tick, command, peer_there=self._peer in self._alive)
 
     def _reading(self, tick: int) -> Reading:
         try:
@@ -244,11 +244,11 @@ class Field:
         except Exception as error:  # noqa: BLE001  # as above; and there is an MissionEnd to be told
             self._inbox.say(f"the driver does not stop: {type(error).__name__}: {error}")
 
-    def _set_off(self, drive: Command) -> None:
+    def _set_off(self, command: Command) -> None:
         """At v_max and omega_max at the most."""
-        mission = self._briefing.mission
-        v = min(max(drive.v, -mission.max_speed), mission.max_speed)
-        omega = min(max(drive.omega, -mission.max_turn_rate), mission.max_turn_rate)
+        mission = self._config.mission
+        v = min(max(command.v, -mission.max_speed), mission.max_speed)
+        omega = min(max(command.omega, -mission.max_turn_rate), mission.max_turn_rate)
         try:
             self._driver.drive(v, omega)
         except Exception as error:  # as above
@@ -257,15 +257,15 @@ class Field:
     def _awaited(self, tick: int) -> Command | None:
         """The Command of this tick, if it comes before the manoeuvre would outlast the tick."""
         while (left := self._next - self._manoeuvre_s - time.monotonic()) > 0.0:
-            drive = self._take(self._inbox.next(left))
-            if drive is not None and drive.tick == tick:
-                return drive
+            command = self._take(self._inbox.next(left))
+            if command is not None and command.tick == tick:
+                return command
         return None
 
     # --- what arrives ---
 
     def _take_waiting(self) -> None:
-        """Take what has arrived by now: with a driver whose `sense` lasts for a tick, nobody else looks."""
+        """Take what has arrived by now: with a driver whose `observation` lasts for a tick, nobody else looks."""
         for _ in range(AT_ONCE):
             arrival = self._inbox.next(0.0)
             if arrival is NOTHING:
@@ -285,7 +285,7 @@ class Field:
                 self._alive.add(arrival.source.robot)
                 if arrival.source.robot == self._id:
                     for _, frame in self._unanswered:  # while it was away
-                        self._sense.put(frame)
+                        self._observation.put(frame)
             case "gone":
                 self._alive.discard(arrival.source.robot)
             case "ended":
@@ -307,15 +307,15 @@ class Field:
         return message
 
     def _on_drive(self, arrival: Arrival) -> Command | None:
-        drive = self._accepted(arrival, Command)
-        if drive is None or drive.tick > self._tick:
-            if drive is not None:
+        command = self._accepted(arrival, Command)
+        if command is None or command.tick > self._tick:
+            if command is not None:
                 self._inbox.refuse(arrival, "it is of a tick to come")
             return None
-        while self._unanswered and self._unanswered[0][0] <= drive.tick:
+        while self._unanswered and self._unanswered[0][0] <= command.tick:
             self._unanswered.popleft()
             self._answered = time.monotonic()
-        return drive
+        return command
 
     def _on_beat(self, arrival: Arrival) -> None:
         """b's next tick begins as many ticks after that of a's as it is farther on: at once, if it is not.
@@ -326,7 +326,7 @@ class Field:
         if beat is None:
             return
         left = self._tick + 1 - beat.tick
-        if self._briefing.role == "a" and (left >= 0 or not self._resumed):
+        if self._config.role == "a" and (left >= 0 or not self._resumed):
             return
         if -self._astray <= left <= (2 if self._resumed or self._astray == ASTRAY else ASTRAY):
             self._astray = ASTRAY
@@ -345,26 +345,26 @@ class Field:
         """Tell the agent that it is over, until it has said its last word, and that this has been heard."""
         give_up = time.monotonic() + FAREWELL_S
         while (now := time.monotonic()) < give_up and self._id in self._alive:
-            self._sense.put(encode(end))
+            self._observation.put(encode(end))
             repeat = min(now + REPEAT_S, give_up)
             while (left := repeat - time.monotonic()) > 0.0:
                 arrival = self._inbox.next(left)
                 if arrival.topic == "gone":
                     self._alive.discard(arrival.source.robot)
                 elif arrival.topic == "drive" and _is_farewell(arrival.frame, self._id):
-                    self._sense.put(arrival.frame)
+                    self._observation.put(arrival.frame)
                     return
         why = "no answer to the MissionEnd" if self._id in self._alive else "its agent has gone"
         self._inbox.say(f"no FinalReport of {self._id}: {why}")
 
 
-def _sense(reading: Reading, tick: int, briefing: RobotConfig) -> bytes:
+def _sense(reading: Reading, tick: int, config: RobotConfig) -> bytes:
     """The frame of the Observation that `reading` makes. Raises DriverFailed if it is none."""
     ranged = reading.mutual_range is not None
-    contacts = (Contact(briefing.peer, reading.mutual_range, None),) if ranged or reading.contact else ()
+    contacts = (Contact(config.peer, reading.mutual_range, None),) if ranged or reading.contact else ()
     executed = reading.executed if tick > 0 else None
     try:
-        frame = encode(Observation(tick, briefing.robot, executed, reading.anchor_range, contacts))
+        frame = encode(Observation(tick, config.robot, executed, reading.anchor_range, contacts))
         decode(frame, Observation)
     except (MalformedFrame, TypeError, msgspec.MsgspecError) as error:
         raise DriverFailed(f"sense({tick}): {error}") from None

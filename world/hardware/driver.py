@@ -16,7 +16,7 @@ from protocol.motion import Controls
 THINKING = 0.25
 """of T_s: by how much a tick lasts longer than its manoeuvre, for sensing, hearing and deciding at rest"""
 SENSING = 0.1
-"""of T_s: how long `sense` may take, so that there is time left to decide"""
+"""of T_s: how long `observation` may take, so that there is time left to decide"""
 
 
 class Reading(msgspec.Struct, frozen=True):
@@ -38,7 +38,7 @@ class Reading(msgspec.Struct, frozen=True):
 class Driver(Protocol):
     """Made of the robot's RobotConfig, the seconds that a manoeuvre lasts, and the user's options, as strings.
 
-    The laws: a robot moves only by `drive`, for one manoeuvre at the most, and then stands until told
+    The laws: a robot moves only by `command`, for one manoeuvre at the most, and then stands until told
     otherwise, whatever becomes of whoever told it; over a manoeuvre that was not interrupted,
     `step(before, v, omega, T_s) = after`, within the mission's noise. One thread calls.
     """
@@ -64,7 +64,7 @@ class Resumable(Driver, Protocol):
     """A driver that goes on from a record after its process was killed; without `resume` none can."""
 
     def resume(self, tick: int, mark: tuple[float, ...]) -> None:
-        """Comes once after a restart, after `stop` and before the first `sense`.
+        """Comes once after a restart, after `stop` and before the first `observation`.
 
         The latest reading on record is that of `tick`, and carried `mark`. One that was taken after it is
         lost, and is taken again: the next `executed` is what was driven since the reading on record.

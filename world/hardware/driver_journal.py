@@ -59,10 +59,10 @@ BOOT = Path("/proc/sys/kernel/random/boot_id")
 class DrivenTick(msgspec.Struct, frozen=True):
     """One tick of a driver's journal."""
 
-    sense: Observation
+    observation: Observation
     frame: bytes
     """the encoded Sense"""
-    drive: Command | None = None
+    command: Command | None = None
     """None if the agent missed the deadline"""
     reports: tuple[Report, ...] = ()
     """the peer's Reports that affect when the mission is over"""
@@ -90,10 +90,10 @@ class DriverPast(msgspec.Struct, frozen=True):
         return self.end is None and start is not None and not start.synced and start.boot != boot()
 
 
-def driver_past(frames: Sequence[bytes], briefing: RobotConfig, path: Path) -> DriverPast:
+def driver_past(frames: Sequence[bytes], config: RobotConfig, path: Path) -> DriverPast:
     """Return the content of the journal at `path` from its `frames`.
 
-    Raises CorruptJournal if a frame is malformed or out of order, or if it is not the mission of `briefing`.
+    Raises CorruptJournal if a frame is malformed or out of order, or if it is not the mission of `config`.
     """
     ticks: list[DrivenTick] = []
     mark: tuple[float, ...] = ()
@@ -104,7 +104,7 @@ def driver_past(frames: Sequence[bytes], briefing: RobotConfig, path: Path) -> D
         message = _message(frame, path)
         match message:
             case RobotConfig() if place == 0:
-                if message != briefing:
+                if message != config:
                     raise CorruptJournal(f"{path}: another run's: its briefing is not this mission's")
             case ProcessStart() if place > 0 and end is None:
                 start = message
@@ -113,8 +113,8 @@ def driver_past(frames: Sequence[bytes], briefing: RobotConfig, path: Path) -> D
             case Observation(tick) if tick == len(ticks) and place > 0:
                 ticks.append(DrivenTick(message, frame))
                 mark = marked.mark if marked is not None and marked.tick == tick else ()
-            case Command() if ticks and message.tick == ticks[-1].sense.tick and ticks[-1].drive is None:
-                ticks[-1] = msgspec.structs.replace(ticks[-1], drive=message)
+            case Command() if ticks and message.tick == ticks[-1].observation.tick and ticks[-1].command is None:
+                ticks[-1] = msgspec.structs.replace(ticks[-1], command=message)
             case Report() if ticks:
                 ticks[-1] = msgspec.structs.replace(ticks[-1], reports=(*ticks[-1].reports, message))
             case MissionEnd() if end is None:

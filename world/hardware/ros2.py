@@ -75,7 +75,7 @@ class Ros2:
 
     def __init__(
         self,
-        briefing: RobotConfig,
+        config: RobotConfig,
         manoeuvre_s: float,
         *,
         connect: str = "tcp/127.0.0.1:7448",
@@ -85,7 +85,7 @@ class Ros2:
         peer_range: str = "peer_range",
     ) -> None:
         """`connect` is the bridge's Zenoh endpoint, the rest are topics. Raises TimeoutError."""
-        self._mission = briefing.mission
+        self._mission = config.mission
         self._manoeuvre_s = manoeuvre_s
         self._changed = threading.Condition()
         self._pose: tuple[Pose, float] | None = None
@@ -95,8 +95,8 @@ class Ros2:
         self._last: Pose | None = None
         """at the reading before"""
         self._rest_since = time.monotonic()
-        self._drive = threading.Event()
-        self._drive.set()  # nothing to be ended
+        self._command = threading.Event()
+        self._command.set()  # nothing to be ended
         self._anchor, self._peer = anchor_range, peer_range
         self._open = ExitStack()
         give_up = time.monotonic() + CONNECT_S
@@ -130,7 +130,7 @@ class Ros2:
     def drive(self, v: float, omega: float) -> None:
         """Say it over and over, for the time of a manoeuvre; then to rest."""
         self._end_drive()
-        ended = self._drive = threading.Event()
+        ended = self._command = threading.Event()
         faster = self._mission.period / self._manoeuvre_s  # 1 in real time
         payload, until = twist(v * faster, omega * faster), time.monotonic() + self._manoeuvre_s
         self._rest_since = until
@@ -164,8 +164,8 @@ class Ros2:
         self._open.close()
 
     def _end_drive(self) -> None:
-        if not self._drive.is_set():
-            self._drive.set()
+        if not self._command.is_set():
+            self._command.set()
             self._saying.join()
 
     # --- what arrives, on threads of Zenoh's ---

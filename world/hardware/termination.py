@@ -27,10 +27,10 @@ LAST_WORDS = 4
 class Ending:
     """What is known of both verdicts."""
 
-    def __init__(self, briefing: RobotConfig, max_ticks: int, patience: float) -> None:
-        self._peer = briefing.peer
-        self._me = briefing.robot
-        self._mission = briefing.mission
+    def __init__(self, config: RobotConfig, max_ticks: int, patience: float) -> None:
+        self._peer = config.peer
+        self._me = config.robot
+        self._mission = config.mission
         self._max_ticks = max_ticks
         self._patience = patience
         self.verdict: Verdict | None = None
@@ -57,10 +57,10 @@ class Ending:
         """Whether the peer knows this robot's verdict."""
         return self.verdict is not None and self._acknowledged >= self._at
 
-    def after(self, tick: int, drive: Command | None, *, peer_there: bool) -> MissionEnd | None:
-        """The MissionEnd, if `tick` was the last, in which the robot gave `drive`; else none."""
-        if self.verdict is None and drive is not None and drive.verdict is not None:
-            self.verdict, self._at, self._since = drive.verdict, tick, time.monotonic()
+    def after(self, tick: int, command: Command | None, *, peer_there: bool) -> MissionEnd | None:
+        """The MissionEnd, if `tick` was the last, in which the robot gave `command`; else none."""
+        if self.verdict is None and command is not None and command.verdict is not None:
+            self.verdict, self._at, self._since = command.verdict, tick, time.monotonic()
         if self.verdict is None:
             if tick >= self._max_ticks:
                 return MissionEnd(tick, "undecided", f"max_ticks: {self._me} not localised by then")

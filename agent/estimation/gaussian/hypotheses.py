@@ -37,7 +37,7 @@ class Hypothesis(NamedTuple):
     guess: tuple[float, ...]
     """see `ranging.predict`: of each robot, where its anchor lies in the frame of its odometry, and how
     that frame is turned in <W>"""
-    odds: float
+    probability: float
     """the probability that it is the true one; of all that are left they sum to 1"""
 
 
@@ -52,18 +52,18 @@ class ScoredHypothesis(NamedTuple):
 
 def with_odds(fits: Sequence[tuple[Fit, float]]) -> tuple[ScoredHypothesis, ...]:
     """The likeliest first, each once; of those that are left. A fit comes with what silence says of it."""
-    weighed = [(one.log_likelihood + 0.5 * _log_volume(one) + silent, one, silent) for one, silent in fits]
-    weighed.sort(key=lambda one: -one[0])
+    scored = [(one.log_likelihood + 0.5 * _log_volume(one) + silent, one, silent) for one, silent in fits]
+    scored.sort(key=lambda one: -one[0])
     left: list[tuple[float, Fit, float]] = []
-    for weight, one, silent in weighed:
-        if weighed[0][0] - weight > -math.log(ODDS_KEPT) or len(left) == MOST:
+    for weight, one, silent in scored:
+        if scored[0][0] - weight > -math.log(ODDS_KEPT) or len(left) == MOST:
             break
         if not any(_same(one, other) for _, other, _ in left):
-            left.append((math.exp(weight - weighed[0][0]), one, silent))
-    total = sum([odds for odds, _, _ in left])
+            left.append((math.exp(weight - scored[0][0]), one, silent))
+    total = sum([probability for probability, _, _ in left])
     return tuple(
-        ScoredHypothesis(Hypothesis(tuple(one.guess.tolist()), odds / total), one, silent)
-        for odds, one, silent in left
+        ScoredHypothesis(Hypothesis(tuple(one.guess.tolist()), probability / total), one, silent)
+        for probability, one, silent in left
     )
 
 

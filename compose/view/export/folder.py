@@ -35,7 +35,7 @@ class _Ticks(NamedTuple):
     """What goes into the tables of ticks."""
 
     rows: list[TickRow]
-    drives: dict[At, Command]
+    commands: dict[At, Command]
     held: dict[At, Estimate]
     period: float
 
@@ -67,7 +67,7 @@ def export(
         mcap: lambda path: write_mcap(books, shown, path, check),
         frames: lambda path: path.write_text(frames_csv(in_time(books), check), encoding="utf-8"),
         ticks: lambda path: path.write_text(table(told.rows), encoding="utf-8"),
-        parquet: lambda path: write_ticks(told.rows, told.drives, told.held, told.period, path),
+        parquet: lambda path: write_ticks(told.rows, told.commands, told.held, told.period, path),
     }
     try:
         for path, write in writers.items():
@@ -94,7 +94,7 @@ def _of_world(folder: Path, books: Collection[str]) -> tuple[list[str], _Ticks]:
     there = [robot for robot in ids if run.agent_journal(robot) in books]
     return ids, _Ticks(
         list(rows(told)),
-        {(robot, at.truth.tick): drive for at in told.moments for robot, drive in at.drives.items()},
+        {(robot, at.truth.tick): command for at in told.moments for robot, command in at.commands.items()},
         {(robot, one.tick): one for robot in there for one in run.estimates(folder, robot)},
         told.scenario.mission.period,
     )
@@ -105,14 +105,14 @@ def _of_robots(folder: Path) -> tuple[list[str], _Ticks]:
     told = pasts(folder)
     if not told:
         raise UserError(f"{folder}: there is no {WORLD_JOURNAL}, and no robot in it was briefed")
-    briefings = [past.briefing for past in told.values()]
+    briefings = [past.config for past in told.values()]
     return sorted({*told, *[one.peer for one in briefings]}), _Ticks(
         list(rows_of(told)),
         {
-            (robot, step.sense.tick): step.drive
+            (robot, step.observation.tick): step.command
             for robot, past in told.items()
             for step in past.steps
-            if step.drive is not None
+            if step.command is not None
         },
         {(robot, one.tick): one for robot, past in told.items() for one in past.estimates},
         briefings[0].mission.period,

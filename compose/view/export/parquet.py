@@ -47,7 +47,7 @@ At = tuple[str, int]
 
 def write_ticks(
     rows: Iterable[TickRow],
-    drives: Mapping[At, Command],
+    commands: Mapping[At, Command],
     held: Mapping[At, Estimate],
     period: float,
     path: Path,
@@ -59,7 +59,7 @@ def write_ticks(
     lines = []
     for row in rows:
         at = row.robot, row.tick
-        verdict = drives[at].verdict if at in drives else None
+        verdict = commands[at].verdict if at in commands else None
         said = {"time_s": row.tick * period, "verdict": _tag(verdict)}
         lines.append(asdict(row) | said | _estimate(held.get(at), row.pose))
     schema = pa.schema([pa.field(name, _KINDS.get(name, pa.float64())) for name in COLUMNS])
@@ -77,7 +77,7 @@ def _estimate(held: Estimate | None, truth: Pose | None) -> dict[str, Any]:
     told: dict[str, Any] = {
         "local": [asdict(pose) for pose in held.local],
         "world": [asdict(pose) for pose in held.world],
-        "odds": list(held.odds),
+        "odds": list(held.probability),
     }
     if not held.world:
         return told

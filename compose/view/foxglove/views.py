@@ -159,7 +159,7 @@ class Views:
         """The robot, what it does in words, and its anchor's range while it has one."""
         assert player.pose is not None
         colour = shapes.colour(COLOURS[seat.role])
-        lines, texts = [], [shapes.words(f"{seat.id}: {player.doing}", player.pose, self._unit, colour)]
+        lines, texts = [], [shapes.words(f"{seat.id}: {player.mode_name}", player.pose, self._unit, colour)]
         trail = self._trails[seat.id].points
         if len(trail) > 1:
             lines.append(shapes.line(trail, colour, 2.0))
@@ -226,16 +226,16 @@ class Views:
     ) -> fox.SceneEntity:
         """An arrow for each hypothesis, the paler the less probable, and the ellipse of the first."""
         colour = COLOURS[seat.role]
-        odds = held.odds or (1.0 / max(1, len(poses)),) * len(poses)
+        probability = held.probability or (1.0 / max(1, len(poses)),) * len(poses)
         lines = []
         if held.covariance is not None and held.world:
             lines.append(
                 shapes.strip(shapes.ellipse(held.world[0], held.covariance), shapes.colour(colour), 1.5)
             )
-        shades = [shapes.colour(colour, max(LEAST, share)) for share in odds]
+        shades = [shapes.colour(colour, max(LEAST, share)) for share in probability]
         texts = [
             shapes.words(f"{share:.3g}", pose, self._unit, shade)
-            for pose, share, shade in zip(poses, odds, shades, strict=False)
+            for pose, share, shade in zip(poses, probability, shades, strict=False)
             if len(poses) > 1
         ]
         return fox.SceneEntity(

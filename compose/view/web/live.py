@@ -32,21 +32,21 @@ from protocol.wire import MalformedFrame, decode
 
 LISTENED = (
     keys.truth("*"),
-    keys.sense("*", "*"),
-    keys.drive("*", "*"),
+    keys.observation("*", "*"),
+    keys.command("*", "*"),
     keys.report("*", "*", "*"),
     keys.estimate("*", "*"),
 )
 CARRIED: Mapping[Callable[..., str] | None, Any] = {
     keys.truth: GroundTruth,
-    keys.briefing: RobotConfig,
-    keys.sense: Observation | MissionEnd | FinalReport,
-    keys.drive: Command | FinalReport,
+    keys.config: RobotConfig,
+    keys.observation: Observation | MissionEnd | FinalReport,
+    keys.command: Command | FinalReport,
     keys.report: Report,
     keys.estimate: Estimate,
 }
 """the messages that each kind of key carries"""
-OF_WORLD = (keys.truth, keys.sense)
+OF_WORLD = (keys.truth, keys.observation)
 """keys under which the world speaks"""
 AHEAD = UNANSWERED - 1
 """ticks by which a robot's frame may be ahead of the world's latest, which may come by another way"""
@@ -95,11 +95,11 @@ class Heard(Show):
         tick: int | None = getattr(message, "tick", None)
         if tick is not None and not self._timely(tick, by_world=source.kind in OF_WORLD):
             return
-        briefed = len(self.known.briefings)
+        briefed = len(self.known.configs)
         self.known.take(message, len(frame))
-        if len(self.known.briefings) > briefed:
-            order = sorted(self.known.briefings)
-            self.stage = of_briefings(self.name, {robot: self.known.briefings[robot] for robot in order})
+        if len(self.known.configs) > briefed:
+            order = sorted(self.known.configs)
+            self.stage = of_briefings(self.name, {robot: self.known.configs[robot] for robot in order})
         if self.known.end is not None:
             self.live = False
 
@@ -119,7 +119,7 @@ class Heard(Show):
             del self.known.ticks[next(iter(self.known.ticks))]
         if not self.live:  # without its world, which may be the router, nobody is heard of
             self._robots.clear()
-        for robot in self._robots.keys() & self.known.briefings.keys():
+        for robot in self._robots.keys() & self.known.configs.keys():
             self.known.present(robot, self._robots.pop(robot))
         self.revised()
 
@@ -247,9 +247,9 @@ class Listener:
 
     def _ask(self, link: zenoh.Session, run: str, robot: str) -> None:
         known = self.shows.get(run)
-        if known is not None and robot in known.known.briefings:
+        if known is not None and robot in known.known.configs:
             return
-        asked = keys.briefing(run, robot)
+        asked = keys.config(run, robot)
         answer = session.ask(link, asked, QUERY_S)
         if isinstance(answer, bytes):
-            self._answers.put(Arrival("drive", asked, answer, Key(keys.briefing, run, robot)))
+            self._answers.put(Arrival("drive", asked, answer, Key(keys.config, run, robot)))

@@ -169,7 +169,7 @@ def _state(show: Show) -> dict[str, Any]:
         "live": show.live,
         "has_truth": show.known.has_truth,
         "end": show.known.end,
-        "farewells": show.known.farewells,
+        "farewells": show.known.final_reports,
         "notes": show.notes,
     }
 

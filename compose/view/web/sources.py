@@ -67,7 +67,7 @@ class Show(ABC):
         robots = len(self.stage.robots)
         for tick in range(last, max(last - UNANSWERED, -1), -1):
             facts = self.known.ticks.get(tick)
-            if facts is not None and len(facts.drives) + len(facts.late) >= robots:
+            if facts is not None and len(facts.commands) + len(facts.late) >= robots:
                 return tick
         return last
 
