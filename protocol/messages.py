@@ -28,7 +28,7 @@ from protocol.units import (
     Velocity,
 )
 
-Outcome = Literal["localised", "undecided", "alarm", "wrong", "failed"]
+Outcome = Literal["localised", "undecided", "inconsistent", "wrong", "failed"]
 """How a run ended; only the first is a success."""
 
 BranchKind = Literal["three-ranges", "three-ranges-virtual", "circle", "on-anchor"]
@@ -101,7 +101,7 @@ class Undecided(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fie
         _cut(self, "reason")
 
 
-class Inconsistent(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="alarm"):
+class Inconsistent(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="inconsistent"):
     """The peer tells what cannot be so."""
 
     claim: Text
@@ -217,7 +217,7 @@ class Estimate(Message, frozen=True):
     world: tuple[Pose, ...]
     """its pose in the world frame, one for each placement that is left"""
     localised: bool
-    probability: tuple[Probability, ...] = ()
+    probabilities: tuple[Probability, ...] = ()
     """of each in `world`, or while there is none of each in `local`, the likeliest first; they sum to 1.
     None where sensors are exact: what is possible there is equally so"""
     covariance: Covariance | None = None

@@ -166,13 +166,13 @@ class Storm:
         """others of the mission, and nothing put on them changes anything"""
         self.ghost = keys.command(RUN, "ghost")
         self.wild = [
-            *("**", "tandem/**", f"tandem/{RUN}/**", "tandem/*/robot/*/drive", f"tandem/{RUN}/robot/*/drive"),
-            *(f"tandem/{RUN}/robot/a/*", f"tandem/{RUN}/r$*/a/sense", "*/*/*/*/*", "**/to/*"),
+            *("**", "tandem/**", f"tandem/{RUN}/**", "tandem/*/robot/*/command", f"tandem/{RUN}/robot/*/command"),
+            *(f"tandem/{RUN}/robot/a/*", f"tandem/{RUN}/r$*/a/observation", "*/*/*/*/*", "**/to/*"),
             *(f"{keys.command(RUN, 'a')}/**", f"tandem/{RUN}/robot/*/**/b"),
         ]
         """wildcards, each of which covers keys by which somebody acts on frames"""
         self.odd = [
-            *("tandem", "drive", f"tandem/{RUN}", f"tandem/{RUN}/robot", f"tandem/{RUN}/robot/a"),
+            *("tandem", "command", f"tandem/{RUN}", f"tandem/{RUN}/robot", f"tandem/{RUN}/robot/a"),
             *(f"{key}/more" for key in self.acted_on),
         ]
         """keys of too few chunks, and of too many: nobody listens"""
@@ -227,7 +227,7 @@ class Storm:
         if tick < 2 or (topic == "report" and not old):
             return self.truncated(key, tick)
         past = self._draw.choice(old) if old else self._draw.randrange(tick - 1)
-        fate: Fate = "refused" if topic == "sense" else "passed over"
+        fate: Fate = "refused" if topic == "observation" else "passed over"
         return Shot(f"{topic} replayed", key, self._genuine[key][past], fate)
 
     def old(self, key: str, tick: int) -> Shot:
@@ -248,7 +248,7 @@ class Storm:
         """By the key of one robot, from another; or for it."""
         robot = _robot(key)
         message = replace(self._forged(key, tick, end=False), robot="c" if robot == "a" else "a")
-        if _topic(key) == "drive" and self._draw.random() < 0.3:
+        if _topic(key) == "command" and self._draw.random() < 0.3:
             return Shot("from another", self.ghost, encode(replace(message, robot="ghost")), "refused")
         return Shot("from another", key, encode(message), "refused")
 
@@ -281,11 +281,11 @@ class Storm:
         """Of `tick`, and nothing that is ever said."""
         robot, some = _robot(key), self._draw.uniform(0.01, 3.0)
         match _topic(key):
-            case "sense" if end and self._draw.random() < 0.3:
+            case "observation" if end and self._draw.random() < 0.3:
                 return MissionEnd(tick, "localised" if some < 1.0 else "failed", None)
-            case "sense":
+            case "observation":
                 return Observation(tick, robot, Controls(some / 3.0, some), some)
-            case "drive":
+            case "command":
                 return Command(tick, robot, some / 3.0, -some, 2, "storming")
             case _:
                 return Report(tick, robot, 1, "storming", None, 0, 0, (), 0, (), 0, self._draw.randint(0, 1))
@@ -298,7 +298,7 @@ def _robot(key: str) -> str:
 
 
 def _topic(key: str) -> str:
-    return {"sense": "sense", "drive": "drive"}.get(key.split("/")[4], "report")
+    return {"observation": "observation", "command": "command"}.get(key.split("/")[4], "report")
 
 
 class Tally:
@@ -441,7 +441,7 @@ def _ticks(endpoint: str, genuine: Genuine) -> Iterator[Iterator[int]]:
     with session.open_client(at(endpoint), nobody) as link:
         commands = {robot: session.publisher(link, keys.command(RUN, robot)) for robot in PUPPETS}
         for robot in PUPPETS:
-            session.subscribe(link, keys.observation(RUN, robot), inbox, "sense")
+            session.subscribe(link, keys.observation(RUN, robot), inbox, "observation")
         tokens = [session.show_alive(link, keys.robot_alive(RUN, robot)) for robot in PUPPETS]
         yield _played(inbox, commands, genuine)
         del tokens
@@ -452,7 +452,7 @@ def _played(inbox: Inbox, commands: dict[str, zenoh.Publisher], genuine: Genuine
     parted: set[str] = set()
     while len(parted) < len(PUPPETS):
         arrival = inbox.next(BOUND_S)
-        assert arrival.topic == "sense", "the world is silent"
+        assert arrival.topic == "observation", "the world is silent"
         robot = arrival.source.robot
         message: Observation | MissionEnd | FinalReport = decode(
             arrival.frame, Observation | MissionEnd | FinalReport
@@ -479,7 +479,7 @@ def _look(processes: dict[str, TandemProcess], tally: Tally) -> None:
 
 def tables(tally: Tally) -> Sequence[Table]:
     """What was put, and what became of it."""
-    topics = ("sense", "drive", "report", "others")
+    topics = ("observation", "command", "report", "others")
     put = Table("kind", *topics, title="frames put, by what they were put on")
     for kind in sorted({kind for kind, _ in tally.kinds}):
         put.add_row(kind, *[f"{count:,}" if (count := tally.kinds[kind, topic]) else "" for topic in topics])

@@ -215,7 +215,7 @@ def test_the_router_lets_pass_what_the_matrix_says_and_nothing_else(name: str, n
     assert found == MAY[name]
 
 
-@pytest.mark.parametrize("key", ["tandem/**", "**", "tandem/*/world/truth", "tandem/*/robot/*/sense"])
+@pytest.mark.parametrize("key", ["tandem/**", "**", "tandem/*/world/truth", "tandem/*/robot/*/observation"])
 def test_a_robot_that_listens_to_everything_hears_nothing_of_it(key: str, network: Network) -> None:
     robot = Participant(network, "agent-b")
     declared = robot.session.declare_subscriber(key)
@@ -226,7 +226,7 @@ def test_a_robot_that_listens_to_everything_hears_nothing_of_it(key: str, networ
     assert heard(declared) == set()
 
 
-@pytest.mark.parametrize("key", ["tandem/r/robot/*/drive", "tandem/r/robot/**", "tandem/**"])
+@pytest.mark.parametrize("key", ["tandem/r/robot/*/command", "tandem/r/robot/**", "tandem/**"])
 def test_a_robot_that_speaks_for_everybody_speaks_for_nobody(key: str, network: Network) -> None:
     robot = Participant(network, "agent-b")
     declared = network.world.declare_subscriber("tandem/r/**")
@@ -241,7 +241,7 @@ def test_a_robot_that_speaks_for_everybody_speaks_for_nobody(key: str, network: 
 
 def test_the_answer_of_a_robot_that_may_not_answer_is_not_asked_for(network: Network) -> None:
     robot = Participant(network, "agent-b")
-    declared: Any = robot.session.declare_queryable("tandem/r/world/briefing/**", partial(answer, "agent-b"))
+    declared: Any = robot.session.declare_queryable("tandem/r/world/config/**", partial(answer, "agent-b"))
     robot._settled()
     a = Participant(network, "agent-a")
     assert answers(a.session, keys.config("r", "a")) == ["world"]

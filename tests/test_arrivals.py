@@ -101,13 +101,13 @@ def test_any_text_is_a_key_of_ours_or_none(text: str) -> None:
 # --- processes ----------------------------------------------------------------------------------------
 
 WILD = [
-    *("**", "tandem/**", "*/**", f"tandem/{RUN}/**", "tandem/*/robot/*/drive", "*/*/*/*/*", "**/drive"),
+    *("**", "tandem/**", "*/**", f"tandem/{RUN}/**", "tandem/*/robot/*/command", "*/*/*/*/*", "**/command"),
     *(f"tandem/{RUN}/robot/*/*", f"tandem/{RUN}/robot/*/to/*", f"tandem/{RUN}/robot/a/**", "tandem/r$*/**"),
     *("tandem/*/alive/**", f"tandem/{RUN}/alive/*", "tandem/*/alive/robot/*", "tandem/*/world/**"),
 ]
 ODD = [
     *("tandem", "a", f"tandem/{RUN}", f"tandem/{RUN}/robot", f"tandem/{RUN}/robot/a", f"tandem/{RUN}/alive"),
-    *(f"tandem/{RUN}/robot/ä\u202e/drive", f"tandem/{RUN}/robot/{'x' * 5000}/drive"),
+    *(f"tandem/{RUN}/robot/ä\u202e/command", f"tandem/{RUN}/robot/{'x' * 5000}/command"),
     *(f"{key}/more" for key in KEYS.values()),
 ]
 FRAMES = [
@@ -201,9 +201,9 @@ def test_a_flood_of_keys_that_are_none_is_counted_and_told_of_a_bounded_number(
 ) -> None:
     inbox = Inbox("test")
     for number in range(10 * COMPLAINTS):
-        inbox.turn_away("drive", f"tandem/*/{number}/{'x' * 1000}", session.NO_KEY)
+        inbox.turn_away("command", f"tandem/*/{number}/{'x' * 1000}", session.NO_KEY)
     assert inbox.next(0.0) is NOTHING
-    assert inbox.refused == {"drive": 10 * COMPLAINTS}
+    assert inbox.refused == {"command": 10 * COMPLAINTS}
     said = capsys.readouterr().err.splitlines()
     assert len(said) <= COMPLAINTS
     assert max(map(len, said)) < 500
@@ -212,7 +212,7 @@ def test_a_flood_of_keys_that_are_none_is_counted_and_told_of_a_bounded_number(
 def test_what_comes_under_a_wildcard_is_delivered_to_nobody(capsys: pytest.CaptureFixture[str]) -> None:
     inbox = Inbox("test")
     with session.open_router(listening("tcp/127.0.0.1:0")) as link:
-        session.subscribe(link, keys.command(RUN, "*"), inbox, "drive")
+        session.subscribe(link, keys.command(RUN, "*"), inbox, "command")
         session.watch_liveliness(link, keys.robot_alive(RUN, "*"), inbox)
         link.put("tandem/**", FRAMES[2])
         link.delete(keys.command(RUN, "a"))
@@ -220,13 +220,13 @@ def test_what_comes_under_a_wildcard_is_delivered_to_nobody(capsys: pytest.Captu
         link.put(keys.command(RUN, "a"), FRAMES[2])
         arrival = inbox.next(BOUND_S)
         assert (arrival.topic, arrival.source, arrival.frame) == (
-            "drive",
+            "command",
             keys.Key(keys.command, RUN, "a"),
             FRAMES[2],
         )
         token.undeclare()
         until(
-            lambda: inbox.next(0.0) is NOTHING and inbox.refused == {"drive": 2, "alive": 1, "gone": 1},
+            lambda: inbox.next(0.0) is NOTHING and inbox.refused == {"command": 2, "alive": 1, "gone": 1},
             "all told",
         )
     assert "tandem/**: not a key of one mission and robot" in capsys.readouterr().err

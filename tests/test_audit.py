@@ -123,8 +123,8 @@ def test_an_honest_run_keeps_every_rule(scenario: Scenario) -> None:
     assert findings.violations == ()
     made, ticks, robots = checks(findings), findings.ticks, len(scenario.robots)
     assert list(made) == [rule.__name__ for rule in RULES]
-    assert made["briefing"] == robots
-    assert made["sense"] == robots * ticks
+    assert made["config"] == robots
+    assert made["observation"] == robots * ticks
     assert (
         made["decision"] == 2 * robots * ticks + made["log"] + robots
     )  # Commands, Estimates; Reports; FinalReports
@@ -150,7 +150,7 @@ def test_a_run_as_processes_keeps_every_rule_and_the_command_says_so(tmp_path: P
     assert lines[:3] == [f"noisy: no violations in {ticks} ticks", "", "rule        checks  violations"]
     assert [line.split()[0] for line in lines[3:]] == [rule.__name__ for rule in RULES]
     assert [line.split()[2] for line in lines[3:]] == ["0"] * len(RULES)
-    assert lines[6].split() == ["sense", str(2 * ticks), "0"]
+    assert lines[6].split() == ["observation", str(2 * ticks), "0"]
 
 
 def test_a_run_in_real_time_in_which_drives_were_missed_keeps_every_rule(tmp_path: Path) -> None:
@@ -328,9 +328,9 @@ def test_a_drive_that_the_world_was_not_given_is_found(folder: Path) -> None:
 def test_a_drive_that_the_world_has_changed_is_found_and_leads_elsewhere(folder: Path) -> None:
     plant(folder / WORLD_JOURNAL, (of(Command, 40, "b"), to(v=0.5)))
     findings = audit(folder)
-    assert found(findings)[:2] == [(40, "b", "order"), (41, "b", "sense")]
+    assert found(findings)[:2] == [(40, "b", "order"), (41, "b", "observation")]
     assert {(robot, rule) for tick, robot, rule in found(findings)[1:]} <= {
-        ("a", "sense"), ("b", "sense"), ("a", "contact"), ("b", "contact"), (None, "claim"), ("b", "claim")
+        ("a", "observation"), ("b", "observation"), ("a", "contact"), ("b", "contact"), (None, "claim"), ("b", "claim")
     }  # fmt: skip
 
 
@@ -388,7 +388,7 @@ def test_a_briefing_that_is_not_the_scenarios_is_found(folder: Path) -> None:
         folder / B, (of(RobotConfig), lambda told: replace(told, mission=replace(told.mission, accuracy=0.2)))
     )
     findings = audit(folder)
-    assert found(findings) == [(None, "b", "briefing")]
+    assert found(findings) == [(None, "b", "config")]
     assert findings.violations[0].line.startswith("no tick, b, briefing: mission is ")
 
 
@@ -400,7 +400,7 @@ def test_how_long_a_tick_lasts_is_not_the_scenarios_to_say(folder: Path) -> None
 
 def test_robots_that_were_told_different_durations_of_a_tick_are_found(folder: Path) -> None:
     plant(folder / B, (of(RobotConfig), to(tick_s=0.5)))
-    assert found(audit(folder)) == [(None, "b", "briefing")]
+    assert found(audit(folder)) == [(None, "b", "config")]
 
 
 def plant_scenario(folder: Path, change: Callable[[Scenario], Scenario]) -> None:
@@ -423,7 +423,7 @@ def test_an_orbit_that_does_not_follow_from_the_mission_is_found(folder: Path) -
     findings = audit(folder)
     assert {(robot, rule) for _, robot, rule in found(findings)} >= {("a", "scenario"), ("b", "scenario")}
     assert what(findings, "scenario")[0].startswith("rendezvous.a is [6.5")
-    assert "briefing" not in {rule for _, _, rule in found(findings)}
+    assert "config" not in {rule for _, _, rule in found(findings)}
 
 
 def test_an_orbit_that_does_not_follow_from_the_mission_is_found_without_a_world(folder: Path) -> None:
@@ -431,7 +431,7 @@ def test_an_orbit_that_does_not_follow_from_the_mission_is_found_without_a_world
     (folder / WORLD_JOURNAL).unlink()
     for name in (A, B):
         plant(folder / name, (of(RobotConfig), to(rendezvous=replace(plan, bound=plan.bound + 1.0))))
-    assert found(audit(folder)) == [(None, "a", "briefing"), (None, "b", "briefing")]
+    assert found(audit(folder)) == [(None, "a", "config"), (None, "b", "config")]
 
 
 def test_a_robot_that_starts_outside_the_range_of_its_anchor_is_found(tmp_path: Path) -> None:
@@ -468,8 +468,8 @@ def test_a_sense_that_is_off_in_its_last_bit_is_found(folder: Path) -> None:
     off = math.nextafter(measured, 0.0)
     plant(folder / A, (of(Observation, 47), to(contacts=(Contact("b", off, (47,)),))))
     findings = audit(folder)
-    assert found(findings) == [(47, "a", "sense")]
-    assert what(findings, "sense") == [
+    assert found(findings) == [(47, "a", "observation")]
+    assert what(findings, "observation") == [
         f'contacts is [["b",{off},[47],[]]], expected [["b",{measured},[47],[]]]'
     ]
 
@@ -479,10 +479,10 @@ def test_a_sense_that_tells_of_another_manoeuvre_is_found(folder: Path) -> None:
     (before,) = [one for one in sensed if of(Observation, 30)(one)]
     plant(folder / A, (of(Observation, 30), to(executed=replace(before.executed, v=-0.0, omega=0.0))))
     findings = audit(folder)
-    assert found(findings)[0] == (30, "a", "sense")
-    assert len(what(findings, "sense")) == 1
+    assert found(findings)[0] == (30, "a", "observation")
+    assert len(what(findings, "observation")) == 1
     assert {(robot, rule) for _, robot, rule in found(findings)} == {
-        ("a", "sense"), ("a", "decision"), ("a", "log")
+        ("a", "observation"), ("a", "decision"), ("a", "log")
     }  # fmt: skip
 
 
@@ -525,7 +525,7 @@ def test_a_late_report_from_out_of_contact_is_found(folder: Path) -> None:
     assert heard.line == (
         "tick 46, b, contact: it heard the report of tick 45, expected none: out of contact at tick 45"
     )
-    assert (46, "b", "sense") in found(findings)
+    assert (46, "b", "observation") in found(findings)
 
 
 def test_a_report_that_no_sense_has_listed_is_found(folder: Path) -> None:
@@ -582,7 +582,7 @@ def test_a_planner_that_fails_on_its_inputs_is_a_violation_and_no_crash(
         return command(state)
 
     command = planner.command
-    monkeypatch.setattr(planner, "drive", fails)
+    monkeypatch.setattr(planner, "command", fails)
     assert [one.line for one in audit(folder).violations] == [
         "tick 12, a, decision: the planner cannot go on from its inputs: ZeroDivisionError: 12"
     ]
@@ -605,7 +605,7 @@ def test_a_manoeuvre_beyond_the_limits_is_found(folder: Path) -> None:
     findings = audit(folder)
     assert what(findings, "limits") == ["it drove v = 1, expected 1 at the most"]
     assert {(tick, robot) for tick, robot, _ in found(findings)} == {(LAST, "b")}
-    assert {rule for _, _, rule in found(findings)} == {"sense", "decision", "limits", "log"}
+    assert {rule for _, _, rule in found(findings)} == {"observation", "decision", "limits", "log"}
 
 
 def lied(folder: Path, change: Callable[[Report], Report]) -> Findings:
@@ -826,7 +826,7 @@ def test_what_befell_the_reports_is_listed_and_another_plan_is_found(tmp_path: P
     in_process.play(parse(text, "random", faults=["b->a: loss=0.5, delay=0..2, corrupt=0.2"]), tmp_path)
     findings = audit(tmp_path)
     assert found(findings) == []
-    to_a, to_b = findings.peer_state
+    to_a, to_b = findings.links
     assert (to_a.link, to_b.link) == ("b->a", "a->b")
     assert to_b.heard == to_b.sent == to_a.sent
     assert to_b.late == to_b.twice == to_b.damaged == to_b.lost == 0

@@ -48,15 +48,15 @@ STORM = 3000
 SETTLED_MB = 8.0
 
 GENUINE = {
-    "sense": (Observation(0, "a", None, 1.0), 1 << 20),
-    "drive": (Command(0, "a", 0.5, 0.5, 1, "straight"), 1 << 20),
+    "observation": (Observation(0, "a", None, 1.0), 1 << 20),
+    "command": (Command(0, "a", 0.5, 0.5, 1, "straight"), 1 << 20),
     "report": (Report(0, "b", 1, "straight", ORIGIN, 0, 0, (), 0, (), 0, 0), 4096),
 }
 """by topic: what robot a gets, says, and is told by its peer, b; and the longest frame in bytes"""
 
 TRUSTED = {
-    "sense": keys.observation(RUN, "a"),
-    "drive": keys.command(RUN, "a"),
+    "observation": keys.observation(RUN, "a"),
+    "command": keys.command(RUN, "a"),
     "report": keys.report(RUN, "b", "a"),
 }
 """the keys that somebody acts on"""
@@ -89,7 +89,7 @@ def bad_frames(topic: str) -> dict[bytes, str]:
         return framed([*said[:place], value, *said[place + 1 :]])
 
     def with_number(value: float) -> bytes:
-        field = {"sense": "anchor_range", "drive": "v", "report": "start"}[topic]
+        field = {"observation": "anchor_range", "command": "v", "report": "start"}[topic]
         place = 1 + message.__struct_fields__.index(field)  # the tag comes first
         return with_field(place, [value, 0.0, 0.0] if topic == "report" else value)
 
@@ -116,7 +116,7 @@ def bad_frames(topic: str) -> dict[bytes, str]:
         framed(b"\xc1"): "malformed",
         framed(b"\x91" * 4000): "Expected",
     }
-    if topic == "sense":  # it costs the robot its link, and never arrives: see below
+    if topic == "observation":  # it costs the robot its link, and never arrives: see below
         del frames[bytes(limit + 1)]
     return frames
 
@@ -172,7 +172,7 @@ def test_nonsense_before_the_first_tick_is_refused_told_once_and_counted(tmp_pat
         stranger = publishers(link)
         for _ in range(TIMES):
             volley(stranger, nonsense)
-            volley(stranger, dict.fromkeys(WATCHED, bad_frames("sense")))
+            volley(stranger, dict.fromkeys(WATCHED, bad_frames("observation")))
             stranger[GHOST].put(encode(Command(0, "ghost", 1.0, 0.0, 1, "haunting")))
             stranger[OTHER].put(encode(Command(0, "a", 1.0, 0.0, 1, "posing")))
         clock.until_says(f"refused a frame on {OTHER}")
@@ -181,8 +181,8 @@ def test_nonsense_before_the_first_tick_is_refused_told_once_and_counted(tmp_pat
         assert clock.ended().status == 0
         assert [agent.ended().status for agent in agents] == [0] * 4
 
-        refused_on(TRUSTED["drive"], clock, nonsense[TRUSTED["drive"]])
-        for topic in ("sense", "report"):
+        refused_on(TRUSTED["command"], clock, nonsense[TRUSTED["command"]])
+        for topic in ("observation", "report"):
             refused_on(TRUSTED[topic], agents[0], nonsense[TRUSTED[topic]])
         assert complaints(clock, GHOST) == ["it says it is from 'ghost'"]
         assert complaints(clock, OTHER) == ["it says it is from 'a'"]
@@ -191,7 +191,7 @@ def test_nonsense_before_the_first_tick_is_refused_told_once_and_counted(tmp_pat
     assert tandem("run", scenario, "--in-process", "-q", "--out", alone).status == 0
     assert (out / "ticks.csv").read_bytes() == (alone / "ticks.csv").read_bytes()
     robots = json.loads((out / "summary.json").read_text())["robots"]
-    observations, reports = (TIMES * len(nonsense[TRUSTED[topic]]) for topic in ("sense", "report"))
+    observations, reports = (TIMES * len(nonsense[TRUSTED[topic]]) for topic in ("observation", "report"))
     assert [robots[name]["reports_refused"] for name in "abcd"] == [reports, 0, 0, 0]
     assert [robots[name]["frames_refused"] for name in "abcd"] == [observations + reports, 0, 0, 0]
 
@@ -201,7 +201,7 @@ def test_a_mission_under_fire_goes_on_as_if_nothing_happened(tmp_path: Path) -> 
     scenario.write_text(LONG)
     nonsense = {key: bad_frames(topic) for topic, key in TRUSTED.items()}
     for key in WATCHED:
-        nonsense[key] = bad_frames("sense")
+        nonsense[key] = bad_frames("observation")
     fired = 0
     with world(scenario, "--run", RUN, "--out", out) as (clock, endpoint), ExitStack() as others:
         agents = [
@@ -214,7 +214,7 @@ def test_a_mission_under_fire_goes_on_as_if_nothing_happened(tmp_path: Path) -> 
             volley(stranger, nonsense)
             fired += 1
             if fired == VOLLEYS // 2:
-                stranger[TRUSTED["sense"]].put(bytes((1 << 20) + 1))
+                stranger[TRUSTED["observation"]].put(bytes((1 << 20) + 1))
         assert fired == VOLLEYS
         assert clock.ended().status == 0
         assert [agent.ended().status for agent in agents] == [0, 0]
@@ -265,7 +265,7 @@ def test_a_robot_refuses_what_is_out_of_step_and_hears_a_repeated_report_once(tm
 
     with session.open_router(listening(endpoint)) as link:
         session.answer(link, keys.config(RUN, "*"), lambda _: scenario.config("a"))
-        session.subscribe(link, keys.command(RUN, "a"), said, "drive")
+        session.subscribe(link, keys.command(RUN, "a"), said, "command")
         session.watch_liveliness(link, keys.robot_alive(RUN, "*"), said)
         world_says = session.publisher(link, keys.observation(RUN, "a"))
         peer_says = session.publisher(link, keys.report(RUN, "b", "a"))
@@ -300,7 +300,7 @@ def test_a_robot_refuses_what_is_out_of_step_and_hears_a_repeated_report_once(tm
 
 def answer(said: Inbox, kind: type[Message]) -> Any:
     arrival = said.next(BOUND_S)
-    assert arrival.topic == "drive"
+    assert arrival.topic == "command"
     return decode(arrival.frame, kind)
 
 
@@ -333,15 +333,15 @@ def test_what_floods_a_topic_is_bounded_counted_and_told_once(
 
 def test_a_flood_leaves_other_topics_their_room() -> None:
     full, _ = flooded("report", "some/key", 1000)
-    full.put("sense", "another", b"needed")
+    full.put("observation", "another", b"needed")
     full.put("stop", "SIGTERM")
     came: list[Arrival] = []
     with pytest.raises(Interrupted, match="SIGTERM"):
         came.extend(iter(partial(full.next, 0.0), inbox.NOTHING))
-    assert came[-1] == Arrival("sense", "another", b"needed")
+    assert came[-1] == Arrival("observation", "another", b"needed")
 
 
 def test_one_frame_larger_than_all_the_room_is_told_of() -> None:
     alone = Inbox("test")
-    alone.put("sense", "key", bytes(inbox.ROOM_BYTES + 1))
+    alone.put("observation", "key", bytes(inbox.ROOM_BYTES + 1))
     assert len(alone.next(0.0).frame) == inbox.ROOM_BYTES + 1

@@ -159,15 +159,15 @@ def test_what_does_not_apply_is_null(tmp_path: Path) -> None:
         assert [told[robot][field] for field in of_covariance] == [None] * 4
     assert told["a"]["position_error_m"] == 0.0
     told = robots(claimed(NOISY, SURE), tmp_path)
-    for field in (*of_covariance, "estimate", "position_error_m", "hypotheses", "odds"):
+    for field in (*of_covariance, "estimate", "position_error_m", "hypotheses", "probability"):
         assert told["b"][field] is None, field
 
 
-def test_the_papers_missions_leave_one_hypothesis_and_no_odds(tmp_path: Path) -> None:
+def test_the_papers_missions_leave_one_hypothesis_and_no_probability(tmp_path: Path) -> None:
     assert tandem("run", "paper-1", "--in-process", "-q", "--out", tmp_path / "out").status == 0
     told = json.loads((tmp_path / "out" / "summary.json").read_text())["robots"]
     for robot in ("a", "b"):
-        assert (told[robot]["hypotheses"], told[robot]["odds"]) == (1, None)
+        assert (told[robot]["hypotheses"], told[robot]["probability"]) == (1, None)
 
 
 # --- a campaign's rows and figures ---------------------------------------------------------------------

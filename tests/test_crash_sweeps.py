@@ -40,7 +40,7 @@ values = [46, 49]                # of 48
 name = "where"
 fields = ["kill[0].who", "kill[0].point"]
 labels = ["nobody", "everyone"]
-values = [[[], "sense"], [["a", "b", "world"], "report"]]
+values = [[[], "observation"], [["a", "b", "world"], "report"]]
 """
 DRAWN = '[[kill]]\ntick = [3, 40]\npoint = "?"\n[[kill]]\nwho = ["a", "b"]\ntick = [0, 48]\nafter = 0.25\n'
 HUNG = 'name = "hung"\nscenario = "endless.toml"\ntrials = 2\ntrial_timeout = '
@@ -103,7 +103,7 @@ def test_a_trial_that_leaves_another_record_has_failed_and_says_where(
 
 def test_a_process_that_is_never_started_again_ends_its_trial() -> None:
     kills = drawn([KillTable("b", 2, after="never")], 1, ("a", "b"))
-    with pytest.raises(ChildFailed, match=r"agent b was killed at tick 2 \(--kill b@2:sense\+never\)"):
+    with pytest.raises(ChildFailed, match=r"agent b was killed at tick 2 \(--kill b@2:observation\+never\)"):
         play(Trial(0, 0, load("paper-1"), processes=False, kills=kills))
 
 
@@ -139,7 +139,7 @@ def test_what_a_scenario_leaves_open_follows_from_the_seed() -> None:
     assert set(product(("a", "b", WORLD), POINTS)) == {(one.who, one.point) for one, _, _ in found}
     assert all([(a.who, b.who), a.tick] == [("a", "b"), b.tick] for _, a, b in found)
     assert {(a.point, a.after, a.text) for _, a, _ in found} == {
-        ("sense", 0.25, f"a@{tick}:sense+0.250000s") for tick in range(49)
+        ("observation", 0.25, f"a@{tick}:observation+0.250000s") for tick in range(49)
     }
 
 
@@ -167,10 +167,10 @@ def test_a_run_takes_the_kills_of_its_file_and_those_of_the_command_line(tmp_pat
         ("tick = [5, 2]", "kill[0].tick: from 5 to 2 is backwards"),
         ("tick = [5]", "kill[0].tick: "),
         ('tick = "?"', "kill[0].tick: "),
-        ('point = "drives"', "kill[0].point: "),
+        ('point = "commands"', "kill[0].point: "),
         ("after = -1.0", "kill[0].after: "),
         ('after = "later"', "kill[0].after: "),
-        ('where = "sense"', "kill[0]: unknown field 'where'"),
+        ('where = "observation"', "kill[0]: unknown field 'where'"),
         ("tick = 5\n[[kill]]\ntick = [2, 1]", "kill[1].tick: from 2 to 1 is backwards"),
     ],
 )

@@ -365,9 +365,9 @@ def start(
     return stack.enter_context(TandemProcess(*arguments, *where))
 
 
-FORGED = "robot/a/beat, robot/a/sense, robot/b/drive, robot/b/estimate, robot/b/to/a, world/truth"
-FORGED_BY_VIEWER = "robot/a/beat, robot/a/drive, robot/a/estimate, robot/a/sense, robot/a/to/a, world/truth"
-READ = "robot/b/drive, robot/b/sense, world/truth"
+FORGED = "robot/a/tick-start, robot/a/observation, robot/b/command, robot/b/estimate, robot/b/to/a, world/truth"
+FORGED_BY_VIEWER = "robot/a/tick-start, robot/a/command, robot/a/estimate, robot/a/observation, robot/a/to/a, world/truth"
+READ = "robot/b/command, robot/b/observation, world/truth"
 
 
 @pytest.mark.parametrize(
@@ -410,7 +410,7 @@ def test_a_page_that_could_speak_is_told(
         only_fix(ended, f"rules: viewer can put {FORGED_BY_VIEWER};")
     else:
         assert findings(ended, "fix") == []
-        assert any("robot/a/drive" in one and "does not pass" in one for one in findings(ended, "ok"))
+        assert any("robot/a/command" in one and "does not pass" in one for one in findings(ended, "ok"))
 
 
 def test_rules_that_do_not_name_the_robot_are_told(keys: Path, tmp_path: Path) -> None:

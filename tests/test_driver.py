@@ -105,10 +105,10 @@ def played(stage: Stage) -> Play:
             match decode(frame, Observation | MissionEnd | FinalReport):
                 case Observation(tick):
                     for one in answer(tick):
-                        stage.comes("drive", keys.command("r", "a"), one, after)
+                        stage.comes("command", keys.command("r", "a"), one, after)
                 case MissionEnd() as end:
                     ends.append(end)
-                    stage.comes("drive", keys.command("r", "a"), encode(FAREWELL))
+                    stage.comes("command", keys.command("r", "a"), encode(FAREWELL))
 
         stage.answer = said
         stage.alive("a", "b")
@@ -246,8 +246,8 @@ LOCALISED = Localised(ORIGIN)
         (LOCALISED, report(12, 11, None), 25, "undecided", "a is localised; b was not heard to be"),
         (LOCALISED, None, 25, "undecided", "a is localised; b was not heard to be"),
         (LOCALISED, report(12, 11, Undecided("why")), 12 + LAST_WORDS, "undecided", "b: why"),
-        (LOCALISED, report(12, 11, Inconsistent("lies")), 12 + LAST_WORDS, "alarm", "b: a tells lies"),
-        (Inconsistent("lies"), report(12, 11, LOCALISED), 12 + LAST_WORDS, "alarm", "a: b tells lies"),
+        (LOCALISED, report(12, 11, Inconsistent("lies")), 12 + LAST_WORDS, "inconsistent", "b: a tells lies"),
+        (Inconsistent("lies"), report(12, 11, LOCALISED), 12 + LAST_WORDS, "inconsistent", "a: b tells lies"),
         (Undecided("why"), report(12, 11, None), 25, "undecided", "a: why"),
         (None, report(12, 11, LOCALISED), 25, "undecided", "max_ticks: a not localised by then"),
     ],
@@ -280,13 +280,13 @@ def test_b_begins_when_a_does_and_counts_a_s_ticks(stage: Stage) -> None:
         if key == keys.observation("r", "b"):
             observation = decode(frame, Observation | MissionEnd | FinalReport)
             said = command(observation.tick, "b") if isinstance(observation, Observation) else FAREWELL
-            stage.comes("drive", keys.command("r", "b"), encode(said), 0.001)
+            stage.comes("command", keys.command("r", "b"), encode(said), 0.001)
 
     stage.answer = answer
     stage.alive("b")
     later = 0.5 + 2.5 * MANOEUVRE_S
     for tick, after in ((7, 0.5), (0, later), (500, later)):  # 0 is of an a that lost its past
-        stage.comes("beat", keys.tick_start("r", "a"), encode(TickStart(tick, "a")), after)
+        stage.comes("tick-start", keys.tick_start("r", "a"), encode(TickStart(tick, "a")), after)
     field.attach(LINK)
     end = field.play(10.0, lambda: None)
     assert end.tick == 12
@@ -294,7 +294,7 @@ def test_b_begins_when_a_does_and_counts_a_s_ticks(stage: Stage) -> None:
     assert [tick for tick, _ in driver.ticks] == list(range(13))
     assert driver.ticks[7][1] == pytest.approx(0.5)
     assert field.missed == 7
-    assert stage.refused["beat"] == 2
+    assert stage.refused["tick-start"] == 2
     assert len(driver.commands) == 6
 
 
@@ -328,11 +328,11 @@ def test_a_robot_that_was_down_catches_up_with_its_peer_standing(robot: str, pee
             said = (
                 command(observation.tick, robot) if isinstance(observation, Observation) else replace(FAREWELL, robot=robot)
             )
-            stage.comes("drive", keys.command("r", robot), encode(said), 0.001)
+            stage.comes("command", keys.command("r", robot), encode(said), 0.001)
 
     stage.answer = answer
     stage.alive(robot)
-    stage.comes("beat", keys.tick_start("r", peer), encode(TickStart(300, peer)), 0.01)
+    stage.comes("tick-start", keys.tick_start("r", peer), encode(TickStart(300, peer)), 0.01)
     field.attach(LINK)
     end = field.play(10.0, lambda: None)
     assert end.tick == 305
@@ -346,7 +346,7 @@ def test_a_robot_that_was_down_catches_up_with_its_peer_standing(robot: str, pee
 
 def test_an_a_that_was_not_down_does_not_go_by_its_peers_ticks(stage: Stage, played: Play) -> None:
     driver = Recorded()
-    stage.comes("beat", keys.tick_start("r", "b"), encode(TickStart(4, "b")), 0.05)
+    stage.comes("tick-start", keys.tick_start("r", "b"), encode(TickStart(4, "b")), 0.05)
     played(driver, lambda tick: [encode(command(tick))])
     assert driver.ticks[-1][1] - driver.ticks[0][1] == pytest.approx(5 * (1 + THINKING) * MANOEUVRE_S)
 
@@ -360,7 +360,7 @@ def test_a_b_that_was_killed_before_tick_0_begins_though_a_waits_for_it(stage: S
     field.resume(DriverPast(), known=-1)
     stage.alive("a", "b")
     tick_s = (1.0 + THINKING) * MANOEUVRE_S
-    stage.comes("beat", keys.tick_start("r", "a"), encode(TickStart(0, "a")), 9.5 * tick_s)
+    stage.comes("tick-start", keys.tick_start("r", "a"), encode(TickStart(0, "a")), 9.5 * tick_s)
     field.attach(LINK)
     end = field.play(10.0, lambda: None)
     times = dict(driver.ticks)
@@ -411,7 +411,7 @@ def test_a_robot_whose_driver_takes_a_whole_tick_to_sense_hears_its_agent(stage:
             message = decode(frame, Observation | MissionEnd | FinalReport)
             if isinstance(message, Observation):
                 command = Command(message.tick, "a", 1.0, 0.0, 1, "straight")
-                stage.comes("drive", keys.command("r", "a"), encode(command), 0.001)
+                stage.comes("command", keys.command("r", "a"), encode(command), 0.001)
 
     stage.answer = answer
     stage.alive("a", "b")

@@ -74,7 +74,7 @@ def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def noisy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Hypotheses have odds and covariances."""
+    """Hypotheses have probability and covariances."""
     return exported(load("noisy"), tmp_path_factory.mktemp("noisy"))
 
 
@@ -185,7 +185,7 @@ def test_times_are_those_of_the_simulation_and_of_when_a_frame_was_journaled(fau
     for _, channel, message in told(faulty / "run.mcap"):
         tick = round(message.log_time / 1e9 / period)
         assert message.log_time == message.publish_time == round(tick * period * 1e9)
-        if channel.topic.endswith(("/sense", "/drive", "/estimate")):
+        if channel.topic.endswith(("/observation", "/command", "/estimate")):
             assert msgpack.unpackb(message.data)[1] == tick
         if channel.topic.endswith("/report"):
             late += msgpack.unpackb(message.data)[1] < tick
@@ -238,7 +238,7 @@ def test_viewers_see_an_ellipse_where_there_is_a_covariance(noisy: Path) -> None
     for one, belief in zip(held, shown, strict=True):
         (entity,) = belief.entities
         assert len(entity.arrows) == len(one.world or one.local)
-        assert [arrow.color.a for arrow in entity.arrows] == [max(LEAST, share) for share in one.probability]
+        assert [arrow.color.a for arrow in entity.arrows] == [max(LEAST, share) for share in one.probabilities]
         assert bool(entity.lines) == (one.covariance is not None and bool(one.world))
         for point in entity.lines[0].points if one.covariance is not None and entity.lines else ():
             assert one.covariance is not None
@@ -311,7 +311,7 @@ def test_frames_are_rows_with_their_fields_by_name(faulty: Path) -> None:
         frame = frames[row["journal"]][int(row["place"])]
         assert int(row["bytes"]) == len(frame)
         assert row["kind"] == msgpack.unpackb(frame[5:])[0]
-        if row["kind"] == "sense":
+        if row["kind"] == "observation":
             said, observation = json.loads(row["message"]), decode(frame, Observation)
             assert (said["robot"], said["anchor_range"]) == (observation.robot, observation.anchor_range)
 
@@ -451,7 +451,7 @@ def test_ctrl_c_ends_an_export_and_leaves_nothing_half_written(paper_1: Path, tm
         assert {path.name for path in (tmp_path / "out").iterdir()} == left
 
 
-STANDING = {"/stage", "/a/pose", "/b/trail", "/contact", "/a/belief", "/journal/world/drive"}
+STANDING = {"/stage", "/a/pose", "/b/trail", "/contact", "/a/belief", "/journal/world/command"}
 """on which there is something, whenever one comes"""
 
 
@@ -511,7 +511,7 @@ def test_a_viewer_sees_a_run_while_it_is_played_and_to_its_end(tmp_path: Path) -
     assert ended.status in OVER
     assert re.search(r"\n(localised|undecided) after ", ended.out)
     assert topics["/tf"] == "foxglove.FrameTransforms"
-    assert topics["/journal/agent-a/sense"] == "tandem.Sense"
+    assert topics["/journal/agent-a/observation"] == "tandem.Sense"
     again, _ = replay(out)
     assert again.differences == ()
 

@@ -141,7 +141,7 @@ def test_a_picture_says_what_the_robot_claimed_and_how_far_off_it_was(
 
 def test_a_picture_names_its_axes_with_units_and_what_was_asked_for(drawn: Path) -> None:
     words = texts(drawn / "robot-a.svg")
-    assert {"x [m]", "y [m]", "error of position [m]", "odds of a hypothesis"} <= words
+    assert {"x [m]", "y [m]", "error of position [m]", "probability of a hypothesis"} <= words
     assert {"sigma asked for: 0.1 m", "asked for: 99.99 %", "its sensing range, 3 m"} <= words
     assert {"1: alone with its anchor", "2: looking for its peer", "3: together"} <= words
     assert {"anchor of a", "anchor of b", "true path of a", "true path of b"} <= words
@@ -152,7 +152,7 @@ def test_each_part_of_a_noisy_mission_is_in_its_picture(noisy: Path, drawn: Path
     found = ids(drawn / "robot-a.svg")
     assert {"path-a", "path-b", "anchor-a", "range-b", "met", "final", "estimates"} <= found
     assert {"error", "sigma", "envelope", "accuracy", "claim", "phase-1", "phase-2", "phase-3"} <= found
-    assert {"odds-1-anchor", "odds-1-plane", "confidence", "near-truth"} <= found
+    assert {"probability-1-anchor", "probability-1-plane", "confidence", "near-truth"} <= found
     assert ("ghosts" in found) == any(len(one.world) > 1 for one in held)
     assert {f"ellipse-{held[-1].tick}", f"near-{held[-1].tick}"} <= found
     ellipses = {int(name.removeprefix("ellipse-")) for name in found if name.startswith("ellipse-")}
@@ -167,14 +167,14 @@ def test_what_is_drawn_over_time_is_what_the_robot_said_held_against_the_truth(n
     off = [math.hypot(one.world[0].x - truth[one.tick].x, one.world[0].y - truth[one.tick].y) for one in said]
     errors, probability = Figure().subplots(2)
     belief.draw_error(errors, story)
-    belief.draw_odds(probability, story)
+    belief.draw_probability(probability, story)
     assert line(errors, "error") == ([one.tick for one in said], off)
     assert line(errors, "sigma")[1] == [one.covariance.position_sigma for one in said if one.covariance]
-    likeliest = line(probability, "odds-1-plane")
+    likeliest = line(probability, "probability-1-plane")
     assert likeliest[0] == [one.tick for one in said]
-    assert likeliest[1] == pytest.approx([one.probability[0] for one in said], abs=1e-5)  # 99.9995 % is the edge
+    assert likeliest[1] == pytest.approx([one.probabilities[0] for one in said], abs=1e-5)  # 99.9995 % is the edge
     assert max(likeliest[1]) < 1.0
-    before = line(probability, "odds-1-anchor")
+    before = line(probability, "probability-1-anchor")
     assert before[0] == [one.tick for one in story.held if not one.world]
     (claimed,) = line(errors, "claim")[0][:1]
     assert story.held[claimed].localised
@@ -223,7 +223,7 @@ def test_an_exact_record_has_counts_for_odds_and_no_ellipse(tmp_path: Path) -> N
     assert {"poses held possible", "one is left", "wrong, if more: 1e-6 m"} <= words
     assert {"count", "tolerance", "error", "ghosts", "near-truth"} <= found
     assert not {"envelope", "sigma", "confidence", "accuracy"} & found
-    assert not [name for name in found if name.startswith(("ellipse-", "odds-"))]
+    assert not [name for name in found if name.startswith(("ellipse-", "probability-"))]
 
 
 def test_seconds_stand_below_the_ticks_where_a_tick_is_no_second(tmp_path: Path) -> None:
@@ -234,7 +234,7 @@ def test_seconds_stand_below_the_ticks_where_a_tick_is_no_second(tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    ("odds", "said"), [(0.5, "50 %"), (0.9999, "99.99 %"), (0.999999, "99.9999 %"), (1e-4, "0.01 %")]
+    ("probability", "said"), [(0.5, "50 %"), (0.9999, "99.99 %"), (0.999999, "99.9999 %"), (1e-4, "0.01 %")]
 )
 def test_odds_are_said_in_as_many_digits_as_they_have(probability: float, said: str) -> None:
     assert belief.percent(probability) == said

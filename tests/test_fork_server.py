@@ -312,7 +312,7 @@ def test_who_has_answered_is_not_told_again_as_often_as_who_has_not(tmp_path: Pa
         c.until_answered("c", tmp_path / "c")
         d.until_answered("d", tmp_path / "d")
         inbox = Inbox("a bystander")
-        session.subscribe(link, keys.observation("mine", "*"), inbox, "sense")
+        session.subscribe(link, keys.observation("mine", "*"), inbox, "observation")
         while heard["a"] < 12:
             heard[inbox.next(10.0).source.robot] += 1
     assert heard["b"] >= 11

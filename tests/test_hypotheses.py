@@ -1,4 +1,4 @@
-"""What is possible under noise: nothing true is lost, what is alike stays alike, odds are probabilities."""
+"""What is possible under noise: nothing true is lost, what is alike stays alike, probability are probabilities."""
 
 from __future__ import annotations
 

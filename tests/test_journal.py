@@ -52,7 +52,7 @@ def test_any_msgpack_library_reads_a_journal(tmp_path: Path) -> None:
     assert messages[:2] == [of_world(), load("paper-1")]
     assert [type(message) for message in messages[-3:]] == [MissionEnd, FinalReport, FinalReport]
     assert len(messages) == 2 + 2 * 49 + 3
-    assert msgpack.unpackb(frames[2][5:])[:3] == ["drive", 0, "a"]
+    assert msgpack.unpackb(frames[2][5:])[:3] == ["command", 0, "a"]
 
 
 def test_a_journal_cut_anywhere_reads_back_every_whole_frame(tmp_path: Path) -> None:

@@ -14,14 +14,14 @@ from protocol.attack import Attack
 from protocol.network.inbox import Inbox
 
 SPEC = """
-name = "few-lies"
+name = "few-attacks"
 scenario = "random"
 trials = 4
 seed = 3
 
 [[axis]]
-name = "lie"
-field = "robot.a.lie"
+name = "attack"
+field = "robot.a.attack"
 paired = true
 labels = ["honest", "scale orbit 0.5", "rotate encounter 15 deg"]
 values = [
@@ -42,7 +42,7 @@ values = [[0.0, 0.0], [0.01, 0.01]]
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> execution.Results:
     """A few missions with a few lies, played."""
-    folder = tmp_path_factory.mktemp("lies")
+    folder = tmp_path_factory.mktemp("attacks")
     (folder / "few.toml").write_text(SPEC)
     progress = execution.Progress(say=lambda _: None, begin=lambda *_: None, done=lambda _: None)
     campaign = spec.load(str(folder / "few.toml"))
@@ -52,7 +52,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> execution.Results:
 
 
 def test_the_campaign_that_ships_tells_the_lies_of_its_labels() -> None:
-    campaign = spec.load("lies")
+    campaign = spec.load("attacks")
     seen: dict[str, Attack | None] = {}
     for cell in cells(campaign):
         setting = setting_of(campaign, cell)
@@ -73,13 +73,13 @@ def test_honest_missions_localise_and_lies_are_alarms(results: execution.Results
     places = {cell.index: cell.place for cell in results.cells}
     for row in results.table.to_pylist():
         outcomes[places[row["cell"]]].add(row["outcome"])
-    assert outcomes == {(i, j): {"alarm" if i else "localised"} for i in range(3) for j in range(2)}
+    assert outcomes == {(i, j): {"inconsistent" if i else "localised"} for i in range(3) for j in range(2)}
 
 
 @pytest.mark.long
 def test_the_pictures_show_what_became_of_each_lie(results: execution.Results, tmp_path: Path) -> None:
     axis_figures.draw(results, tmp_path)
-    assert {f"{name}.{kind}" for name in ("lies", "roc") for kind in ("svg", "pdf", "png")} <= {
+    assert {f"{name}.{kind}" for name in ("attacks", "roc") for kind in ("svg", "pdf", "png")} <= {
         path.name for path in tmp_path.iterdir()
     }
     place = attack_figures.axis_of_lies(results)

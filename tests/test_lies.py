@@ -50,14 +50,14 @@ def outcome(record: Record) -> str:
 
 @pytest.mark.parametrize("liar", ["a", "b"])
 @pytest.mark.parametrize(
-    "lie", [*OF_DRIVES, *OF_STARTS], ids=lambda attack: f"{attack.kind}-{attack.part}-{attack.size:.2g}"
+    "attack", [*OF_DRIVES, *OF_STARTS], ids=lambda attack: f"{attack.kind}-{attack.part}-{attack.size:.2g}"
 )
 def test_every_lie_about_a_drive_or_a_start_is_an_alarm(attack: Attack, liar: str) -> None:
     for seed in range(6):
         record = mission(seed, {liar: attack})
         if not _tells_otherwise(record, liar, attack):
             continue
-        assert outcome(record) == "alarm", seed
+        assert outcome(record) == "inconsistent", seed
         assert record.end is not None
         peer = "b" if liar == "a" else "a"
         assert (record.end.reason or "").startswith(f"{peer}: {liar} tells "), record.end.reason
@@ -82,7 +82,7 @@ def test_turning_its_whole_story_about_its_anchor_tells_nothing_false() -> None:
 
 def test_two_liars_are_no_more_believed_than_one() -> None:
     for seed in range(6):
-        assert outcome(mission(seed, {"a": Attack("heading", 0.1), "b": Attack("radius", 0.2)})) == "alarm"
+        assert outcome(mission(seed, {"a": Attack("heading", 0.1), "b": Attack("radius", 0.2)})) == "inconsistent"
 
 
 def test_the_liar_hears_that_it_is_not_believed_and_gives_up() -> None:
@@ -99,7 +99,7 @@ def test_the_liar_hears_that_it_is_not_believed_and_gives_up() -> None:
 
 
 @pytest.mark.parametrize(
-    "lie",
+    "attack",
     [
         Attack("scale", 0.5, "orbit"),
         Attack("scale", 0.5, "encounter"),
@@ -111,7 +111,7 @@ def test_under_noise_a_lie_that_is_large_beside_it_is_an_alarm(attack: Attack) -
     """Of a, whose way from its anchor to the encounter stands in no range of its own."""
     for seed in range(3):
         record = mission(seed, {"a": attack}, FINE)
-        assert outcome(record) == "alarm", seed
+        assert outcome(record) == "inconsistent", seed
         alarm = next(
             command.verdict
             for moment in record.moments
@@ -125,7 +125,7 @@ def test_under_noise_a_lie_that_is_large_beside_it_is_an_alarm(attack: Attack) -
 
 @pytest.mark.parametrize("seed", [30, 49, 109])
 def test_who_plans_by_a_lie_and_loses_its_peer_finds_other_places_to_range_from(seed: int) -> None:
-    assert outcome(mission(seed, {"a": Attack("scale", 0.5, "phase-1")}, FINE)) == "alarm"
+    assert outcome(mission(seed, {"a": Attack("scale", 0.5, "phase-1")}, FINE)) == "inconsistent"
 
 
 def test_under_noise_the_honest_are_believed() -> None:
@@ -260,12 +260,12 @@ def test_a_scenario_says_who_lies_and_how() -> None:
 
 
 @pytest.mark.parametrize(
-    ("lie", "words"),
+    ("attack", "words"),
     [
-        ('{kind = "boast", size = 1.0}', ("robot[1].lie.kind", "boast")),
-        ('{kind = "scale"}', ("robot[1].lie", "size")),
-        ('{kind = "scale", size = 1e9}', ("robot[1].lie.size",)),
-        ('{kind = "shift", size = 1.0, part = "lunch"}', ("robot[1].lie.part", "lunch")),
+        ('{kind = "boast", size = 1.0}', ("robot[1].attack.kind", "boast")),
+        ('{kind = "scale"}', ("robot[1].attack", "size")),
+        ('{kind = "scale", size = 1e9}', ("robot[1].attack.size",)),
+        ('{kind = "shift", size = 1.0, part = "lunch"}', ("robot[1].attack.part", "lunch")),
     ],
 )
 def test_a_lie_that_cannot_be_told_is_refused_by_its_field(attack: str, words: tuple[str, ...]) -> None:

@@ -159,7 +159,7 @@ def test_what_a_robot_believes_moves_between_ticks_as_it_does(opened: Open, addr
 
 HELD = """async ([now, next, share]) => {
   const { held_now } = await import('/page/held.js');
-  const held = (one) => ({ local: [], odds: [], covariance: null, ...one });
+  const held = (one) => ({ local: [], probability: [], covariance: null, ...one });
   const scenes = [now, next].map((one) => ({ players: [{ held: held(one), executed: one.executed }] }));
   const store = {
     places: new Map([['a', 0]]), stage: { mission: { period: 1, sensing_range: 3 } },
@@ -173,10 +173,10 @@ HELD = """async ([now, next, share]) => {
 def test_a_hypothesis_that_goes_on_moves_to_where_it_is_next_and_others_as_driven(
     opened: Open, address: str
 ) -> None:
-    """The order is by odds, and differs from tick to tick."""
+    """The order is by probability, and differs from tick to tick."""
     page = opened(address)
-    now = {"world": [[0, 0, 0], [5, 5, 0]], "odds": [0.7, 0.3], "covariance": [4, 0, 0, 4, 0, 0]}
-    next_ = {"world": [[6.1, 5, 0], [1, 0.1, 0]], "odds": [0.9, 0.1], "covariance": [2, 0, 0, 2, 0, 0]}
+    now = {"world": [[0, 0, 0], [5, 5, 0]], "probability": [0.7, 0.3], "covariance": [4, 0, 0, 4, 0, 0]}
+    next_ = {"world": [[6.1, 5, 0], [1, 0.1, 0]], "probability": [0.9, 0.1], "covariance": [2, 0, 0, 2, 0, 0]}
     found = page.evaluate(HELD, [now, next_ | {"executed": [1, 0]}, 0.5])
     assert found["poses"] == [[0.5, pytest.approx(0.05), 0], [pytest.approx(5.55), 5, 0]]
     assert found["covariance"] == now["covariance"]  # its hypothesis is not the first any more

@@ -87,13 +87,13 @@ def options(kills: str) -> list[str]:
 @pytest.mark.parametrize(
     "kills",
     [
-        "a@7 a@46:report a@20:journal a@31:drive",
-        "b@0:drive b@47:report b@33 b@48:journal",
-        "world@0 world@46:report world@30:drive world@48:journal",
+        "a@7 a@46:report a@20:journal a@31:command",
+        "b@0:command b@47:report b@33 b@48:journal",
+        "world@0 world@46:report world@30:command world@48:journal",
         "a@47:report b@47:report",
-        "a@12 world@12:report b@48:drive",
-        "b@46 b@46 b@46:drive",
-        "a@48:journal b@48:drive world@48:drive",
+        "a@12 world@12:report b@48:command",
+        "b@46 b@46 b@46:command",
+        "a@48:journal b@48:command world@48:command",
     ],
 )
 def test_a_run_whose_processes_are_killed_ends_with_the_same_record(
@@ -113,7 +113,7 @@ def test_a_run_whose_processes_are_killed_ends_with_the_same_record(
 def test_a_robot_that_comes_back_later_is_waited_for_even_after_the_last_tick(
     undisturbed: Path, tmp_path: Path
 ) -> None:
-    ended = tandem("run", "paper-1", "-q", "--out", tmp_path / "out", "--kill", "a@48:drive+0.5s")
+    ended = tandem("run", "paper-1", "-q", "--out", tmp_path / "out", "--kill", "a@48:command+0.5s")
     said = "tandem run: agent a was killed at tick 48, and is started again in 0.5 s\n"
     assert ended[:2] == (0, LOCALISED), ended
     assert ended.err.startswith(said)
@@ -121,13 +121,13 @@ def test_a_robot_that_comes_back_later_is_waited_for_even_after_the_last_tick(
 
 
 def test_a_point_that_never_comes_is_told(undisturbed: Path, tmp_path: Path) -> None:
-    kills = options("b@900 a@3:report world@49:drive+never")
+    kills = options("b@900 a@3:report world@49:command+never")
     ended = tandem("run", "paper-1", "-q", "--out", tmp_path / "out", *kills)
     assert ended[:2] == (0, LOCALISED)
     assert sorted(ended.err.splitlines()) == [
         "tandem run: --kill a@3:report: never came",
         "tandem run: --kill b@900: never came",
-        "tandem run: --kill world@49:drive+never: never came",
+        "tandem run: --kill world@49:command+never: never came",
     ]
     same(tmp_path / "out", undisturbed)
 
@@ -171,21 +171,21 @@ def test_in_real_time_whoever_is_away_stands_still_and_is_told_what_it_missed(tm
 
 def test_a_kill_is_read_as_it_is_written() -> None:
     fields = [(kill.who, kill.tick, kill.point, kill.after) for kill in map(parse, (
-        "a@17", "b-2@0:report", "world@30:journal+5s", "a@1:drive+never", "a@1+0.25s"
+        "a@17", "b-2@0:report", "world@30:journal+5s", "a@1:command+never", "a@1+0.25s"
     ))]  # fmt: skip
     assert fields == [
-        ("a", 17, "sense", 0.0),
+        ("a", 17, "observation", 0.0),
         ("b-2", 0, "report", 0.0),
         ("world", 30, "journal", 5.0),
-        ("a", 1, "drive", None),
-        ("a", 1, "sense", 0.25),
+        ("a", 1, "command", None),
+        ("a", 1, "observation", 0.25),
     ]
 
 
 @pytest.mark.parametrize(
     "text",
     ["", "a", "a@", "@17", "a17", "a@-1", "a@1.5", "a@17:", "a@17:drives", "a@17+", "a@17+5", "a@17+5m"]
-    + ["a@17+-1s", "a@17+nans", "a@17+never:drive", " a@17", "a@17\n", "a b@17", "a@²", "a@17:sense:sense"],
+    + ["a@17+-1s", "a@17+nans", "a@17+never:command", " a@17", "a@17\n", "a b@17", "a@²", "a@17:observation:observation"],
 )
 def test_a_mistyped_kill_is_none(text: str) -> None:
     with pytest.raises(BadKill, match="is no kill"):
@@ -366,13 +366,13 @@ def test_an_agent_says_farewell_until_a_world_has_it_on_record(tmp_path: Path) -
     there = Inbox("test")
 
     def farewell_of(link: zenoh.Session) -> bytes:
-        session.subscribe(link, keys.command(run, "a"), there, "drive")
+        session.subscribe(link, keys.command(run, "a"), there, "command")
         session.watch_liveliness(link, keys.robot_alive(run, "*"), there)
         publisher = session.publisher(link, keys.observation(run, "a"))
         _token = session.show_alive(link, keys.world_alive(run))
         while True:
             arrival = there.next(REPEAT_S)
-            if arrival.topic == "drive":
+            if arrival.topic == "command":
                 assert isinstance(decode(arrival.frame, FinalReport), FinalReport)
                 return arrival.frame
             publisher.put(encode(MissionEnd(0, "undecided", "for a test")))

@@ -117,8 +117,8 @@ def test_a_mission_that_is_cut_short_is_undecided_and_says_what_was_left() -> No
         for robot in robots:
             assert not robot["localised"]
             assert robot["position_sigma_m"] is None
-        assert len({(robot["hypotheses"], robot["odds"]) for robot in robots}) == 1, "both hold the same"
-        left.append((robots[0]["hypotheses"], robots[0]["odds"]))
+        assert len({(robot["hypotheses"], robot["probability"]) for robot in robots}) == 1, "both hold the same"
+        left.append((robots[0]["hypotheses"], robots[0]["probability"]))
     many = [(count, probability) for count, probability in left if count is not None]
     assert max(count for count, _ in many) > 1, "at first there are several"
     assert all(1.0 / count <= probability <= 1.0 for count, probability in many)

@@ -435,7 +435,7 @@ def test_results_are_left_in_a_folder_named_for_the_campaign(folder: Path) -> No
     assert [row["trials"] for row in summary] == ["2"] * 4
     assert list(summary[0])[:9] == [
         *("cell", "robot.b.anchor[0]", "planner.variant"),
-        *("trials", "localised", "undecided", "alarm", "wrong", "failed"),
+        *("trials", "localised", "undecided", "inconsistent", "wrong", "failed"),
     ]
     assert ended.out.splitlines()[-1] == "results: sweep-both"
 

@@ -45,11 +45,11 @@ def play_hostile(endpoint: str, pause: Callable[[], object] = lambda: None) -> N
     heard, paused = Inbox("test"), False
     with session.open_client(at(endpoint), lambda: None) as link:
         command = session.publisher(link, keys.command(RUN, "b"))
-        session.subscribe(link, keys.observation(RUN, "b"), heard, "sense")
+        session.subscribe(link, keys.observation(RUN, "b"), heard, "observation")
         token = session.show_alive(link, keys.robot_alive(RUN, "b"))
         while True:
             arrival = heard.next(BOUND_S)
-            assert arrival.topic == "sense"
+            assert arrival.topic == "observation"
             message: Observation | MissionEnd | FinalReport = decode(
                 arrival.frame, Observation | MissionEnd | FinalReport
             )

@@ -155,7 +155,7 @@ def _taken(message: Message, path: tuple[object, ...], value: str) -> bool:
 
 
 def test_every_word_for_a_state_is_within_its_bound() -> None:
-    for word in (*MODE_NAMES.values(), "localised", "undecided", "alarm"):
+    for word in (*MODE_NAMES.values(), "localised", "undecided", "inconsistent"):
         command = Command(0, "a", 0.0, 0.0, 1, word)
         assert decode(encode(command), Command) == command
 
@@ -199,12 +199,12 @@ def test_a_verdict_of_as_many_words_as_there_may_be_ends_a_run_whose_record_is_r
         session.open_client(at(endpoint), lambda: None) as link,
     ):
         commands = {robot: session.publisher(link, keys.command(RUN, robot)) for robot in "ab"}
-        session.subscribe(link, keys.observation(RUN, "*"), heard, "sense")
+        session.subscribe(link, keys.observation(RUN, "*"), heard, "observation")
         tokens = [session.show_alive(link, keys.robot_alive(RUN, robot)) for robot in "ab"]
         parted = set[str]()
         while len(parted) < 2:
             arrival = heard.next(BOUND_S)
-            assert arrival.topic == "sense", clock.err
+            assert arrival.topic == "observation", clock.err
             robot = arrival.source.robot
             message: Observation | MissionEnd | FinalReport = decode(
                 arrival.frame, Observation | MissionEnd | FinalReport

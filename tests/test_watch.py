@@ -267,7 +267,7 @@ def test_lost_late_and_damaged_reports_are_told(opened: Open, tmp_path: Path) ->
         until_shown(page, 26)
         expect(page.locator("#log")).to_contain_text("is lost")
         expect(page.locator("#log")).to_contain_text("ticks late")
-        expect(page.locator(".odds li").first).to_contain_text("%")
+        expect(page.locator(".probability li").first).to_contain_text("%")
         page.keyboard.press("n")
         shot(page, "faults")
         page.locator("#radio").uncheck()

@@ -130,10 +130,10 @@ def test_an_oversized_frame_is_refused_even_if_it_is_sound() -> None:
     assert decode(frame, ANY, len(frame)) == EXAMPLES[1]
     with pytest.raises(MalformedFrame, match=f"{len(frame)} bytes"):
         decode(frame, ANY, len(frame) - 1)
-    refuses(framed(packed(["drive", 3, "b" * MAX_FRAME_BYTES, 0.5, 0.25, 3, "localised", None]), VERSION))
+    refuses(framed(packed(["command", 3, "b" * MAX_FRAME_BYTES, 0.5, 0.25, 3, "localised", None]), VERSION))
 
 
-@pytest.mark.parametrize("tag", ["teleport", "Sense", "", 3, None, ["sense"]])
+@pytest.mark.parametrize("tag", ["teleport", "Sense", "", 3, None, ["observation"]])
 def test_an_unknown_tag_is_refused(tag: object) -> None:
     refuses(framed(packed([tag, *plain(EXAMPLES[1])[1:]])))
 
@@ -221,7 +221,7 @@ def test_an_extra_field_is_refused_wherever_it_stands(message: Message) -> None:
 
 @pytest.mark.parametrize("robot", ["", "a/b", "a b", "*", "a" * 33, "a\n", "ä", "a\x00", "$"])
 def test_a_robot_that_is_no_single_chunk_of_a_key_is_refused(robot: str) -> None:
-    refuses(framed(packed(["missed", 8, robot])))
+    refuses(framed(packed(["deadline-missed", 8, robot])))
 
 
 def test_too_many_entries_and_too_long_words_are_refused() -> None:

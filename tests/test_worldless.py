@@ -74,7 +74,7 @@ def test_an_export_has_what_was_measured_and_believed_and_no_truth(folders: tupl
         )  # where the world knows what was driven
         assert told["omega"] == ("" if driven is None else repr(driven.omega))
     rows, truly = (pq.read_table(folder / "ticks.parquet").to_pylist() for folder in (alone, whole))
-    for name in ("world", "local", "odds", "estimate_x", "cov_xx", "verdict", "time_s"):
+    for name in ("world", "local", "probability", "estimate_x", "cov_xx", "verdict", "time_s"):
         assert [row[name] for row in rows] == [row[name] for row in truly]
     assert {row["position_error_m"] for row in rows} == {None}
     assert any(row["position_error_m"] is not None for row in truly)

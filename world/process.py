@@ -101,7 +101,7 @@ class WorldProcess:
         self._observation = {robot: session.publisher(link, keys.observation(run, robot)) for robot in self._robots}
         self._truth = session.publisher(link, keys.truth(run))
         session.on_matching(self._truth, self._want_truth)
-        session.subscribe(link, keys.command(run, "*"), inbox, "drive")
+        session.subscribe(link, keys.command(run, "*"), inbox, "command")
         session.watch_liveliness(link, keys.robot_alive(run, "*"), inbox)
         session.answer(link, keys.config(run, "*"), self._brief)
         self._token = session.show_alive(link, keys.world_alive(run))
@@ -121,7 +121,7 @@ class WorldProcess:
             while end is None:
                 commands = self._answers(course.observations(), due)
                 if self._on_kill_point is not None:
-                    self._on_kill_point("drive", course.tick)
+                    self._on_kill_point("command", course.tick)
                 course.record(commands)
                 if self._on_kill_point is not None:
                     self._on_kill_point("journal", course.tick)
@@ -148,7 +148,7 @@ class WorldProcess:
         tick = self._course.tick
         frames = {observation.robot: encode(observation) for observation in observations}
         if self._on_kill_point is not None:
-            self._on_kill_point("sense", tick)
+            self._on_kill_point("observation", tick)
         self._put(frames)
         if self._on_kill_point is not None:
             self._on_kill_point("report", tick)
@@ -159,7 +159,7 @@ class WorldProcess:
         while due is not None or len(commands) < len(self._robots):
             arrival = self._next((self._repeat if due is None else due) - now)
             now = time.monotonic()
-            if arrival.topic == "drive":
+            if arrival.topic == "command":
                 command = self._answer(arrival)
                 if command is not None and command.robot not in commands:
                     commands[command.robot] = command
@@ -315,7 +315,7 @@ class WorldProcess:
             arrival = self._next(min(self._repeat, give_up) - now)
             if arrival.topic == "alive":
                 self._put_again(frames, [arrival.source.robot])
-            if arrival.topic == "drive":
+            if arrival.topic == "command":
                 last = self._accepted(arrival, Command | FinalReport)
                 if isinstance(last, FinalReport):
                     said[last.robot] = last

@@ -98,7 +98,7 @@ def _no_better(scenario: Scenario, verdicts: Mapping[str, Verdict], open_cases: 
     for robot in scenario.robots:
         verdict = verdicts.get(robot.id)
         if isinstance(verdict, Inconsistent):
-            return Judgement("alarm", f"{robot.id}: {robot.peer} tells {verdict.claim}")
+            return Judgement("inconsistent", f"{robot.id}: {robot.peer} tells {verdict.claim}")
     for robot in scenario.robots:
         match verdicts.get(robot.id):
             case Undecided(reason):

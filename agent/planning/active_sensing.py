@@ -1,6 +1,6 @@
 """Under noise: where to drive so that the next ranges tell most, alone with the anchor or with the peer.
 
-A manoeuvre is worth what it is expected to leave: the odds of taking the wrong hypothesis (Bhattacharyya's
+A manoeuvre is worth what it is expected to leave: the probability of taking the wrong hypothesis (Bhattacharyya's
 bound, by how many sigmas apart the ranges are that they predict), and the variance of the positions.
 """
 
@@ -287,7 +287,7 @@ def _information(covariance: Array, mission: Mission) -> Array:
 def _confusion(
     held: Sequence[PlanningHypothesis], distances: Sequence[Array], sigma: float, reach: float
 ) -> Array:
-    """What is left of the odds of taking the first hypothesis for another."""
+    """What is left of the probability of taking the first hypothesis for another."""
     left = np.zeros(len(distances[0]))
     first = np.minimum(distances[0], RIM * reach)
     for one, distance in zip(held[1:], distances[1:], strict=True):

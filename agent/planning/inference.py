@@ -88,7 +88,7 @@ def settled(scored: Sequence[ScoredHypothesis], mission: Mission) -> bool:
 
 
 SURE_OF_BRANCH = 0.999
-"""the odds at which a robot takes a branch for the right one and goes to meet its peer"""
+"""the probability at which a robot takes a branch for the right one and goes to meet its peer"""
 
 ANCHOR_RANGES, ANCHOR_RANGES_WITH_OUTLIERS = 5, 7
 """to its anchor at the least, before a robot goes: two unknowns, and three that check them"""
@@ -146,7 +146,7 @@ def missing_for(
     probability = scored[0].hypothesis.probability
     if probability < mission.confidence:
         return (
-            f"the likeliest of {len(scored)} hypotheses has the odds {probability:.6f}, of {mission.confidence:g}"
+            f"the likeliest of {len(scored)} hypotheses has the probability {probability:.6f}, of {mission.confidence:g}"
         )
     if not against.p_value >= DOUBTFUL:
         return f"the likeliest hypothesis is in doubt: {against.what}"

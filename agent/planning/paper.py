@@ -24,7 +24,7 @@ CHECKED = 3
 """mutual ranges before a claim; where there are outliers as many as in `survey`, and it takes fewer"""
 
 LIKELY = 0.05
-"""odds from which on a branch is worth a manoeuvre that tells it from others"""
+"""probability from which on a branch is worth a manoeuvre that tells it from others"""
 
 
 def with_branches(state: RobotState) -> tuple[RobotState, tuple[Branch, ...]]:

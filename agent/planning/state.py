@@ -164,7 +164,7 @@ class RobotState(msgspec.Struct, frozen=True):
             case Done(_, Localised()):
                 return "localised"
             case Done(_, Inconsistent()):
-                return "alarm"
+                return "inconsistent"
             case Done(_, Undecided()):
                 return "undecided"
             case mode:

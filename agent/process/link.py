@@ -40,7 +40,7 @@ class AgentLink:
         self._report = session.publisher(link, keys.report(run, me, peer))
         self._estimate = session.publisher(link, keys.estimate(run, me))
         session.on_matching(self._estimate, self._want_estimate)
-        session.subscribe(link, keys.observation(run, me), self._inbox, "sense")
+        session.subscribe(link, keys.observation(run, me), self._inbox, "observation")
         session.subscribe(link, keys.report(run, peer, me), self._inbox, "report")
         session.watch_liveliness(link, keys.world_alive(run), self._inbox)
         self._show_alive = partial(session.show_alive, link, keys.robot_alive(run, me))
@@ -51,7 +51,7 @@ class AgentLink:
         """What arrives next, NOTHING after `until`, by the clock. Raises LinkLost after long silence."""
         lost = self._heard_at + self._silence
         arrival = self._inbox.next(min(until, lost) - time.monotonic())
-        if arrival.topic == "sense":
+        if arrival.topic == "observation":
             self._heard_at = time.monotonic()
         elif arrival is NOTHING and time.monotonic() >= lost:
             raise WorldLinkLost

@@ -89,7 +89,7 @@ class AgentProcess:
         while self.end is None:
             arrival = self._next(self._due)
             match arrival.topic:
-                case "sense":
+                case "observation":
                     message = self._accepted(arrival)
                     if isinstance(message, MissionEnd) and self._is_over(message):
                         self._conclude(message)
@@ -161,7 +161,7 @@ class AgentProcess:
         """Whether it is in step. Raises NoWorld."""
         if observation.tick == self._known + 1:
             if self._on_kill_point is not None:
-                self._on_kill_point("sense", observation.tick)
+                self._on_kill_point("observation", observation.tick)
             if self._due is not None:  # the world goes on; what has not come is missed
                 self._due = 0.0
                 self._decide_when_all_is_heard()
@@ -227,7 +227,7 @@ class AgentProcess:
             self._on_kill_point("journal", tick)
         self._link.command(self._robot.drive_frame)
         if self._on_kill_point is not None:
-            self._on_kill_point("drive", tick)
+            self._on_kill_point("command", tick)
 
     def _say_again(self) -> None:
         """All that whoever was started again may have lost: earlier reports, too, if the peer is near."""
@@ -264,7 +264,7 @@ class AgentProcess:
         gone = False
         while (now := time.monotonic()) < self._give_up:
             arrival = self._next(now + LAST_WORD_S if gone else None)
-            if arrival.topic == "sense":
+            if arrival.topic == "observation":
                 if arrival.frame == frame:
                     break
                 message = self._accepted(arrival)

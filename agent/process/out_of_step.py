@@ -66,5 +66,5 @@ class OutOfStep:
         if self._world_there and now - self._odd[1] >= bound_s:
             return True
         if not goes_on:
-            self._inbox.refused["sense"] += 1  # it is told once it is believed
+            self._inbox.refused["observation"] += 1  # it is told once it is believed
         return False

@@ -21,7 +21,7 @@ def observation(case: Evidence) -> Checks:
                 yield None
             else:
                 what = difference(step.observation, expected)
-                yield Violation("sense", step.observation.tick, robot, what, between(step.observation, expected))
+                yield Violation("observation", step.observation.tick, robot, what, between(step.observation, expected))
 
 
 def contact(case: Evidence) -> Checks:

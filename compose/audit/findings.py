@@ -9,7 +9,7 @@ import msgspec
 
 ROUNDING = 1e-6
 """of a value, or of 1 where it is less: how far apart two computations may come by rounding alone"""
-RECOMPUTED = ("sense", "decision", "briefing")
+RECOMPUTED = ("observation", "decision", "config")
 """rules that hold the recording against what is computed here"""
 MAX_VALUE = 60
 """characters of a value that is quoted"""
@@ -106,7 +106,7 @@ def findings_of(
     *,
     scenario: str,
     ticks: int,
-    radio: tuple[LinkStatistics, ...] = (),
+    links: tuple[LinkStatistics, ...] = (),
 ) -> Findings:
     """Return what each of `rules`, counted by its name, finds in `case`; `versions` says which differ."""
     checks = {rule.__name__: list(rule(case)) for rule in rules}
@@ -119,7 +119,7 @@ def findings_of(
     counts = [
         Count(rule, len(some), sum([one.rule == rule for one in violations])) for rule, some in checks.items()
     ]
-    return Findings(scenario, ticks, tuple(counts), tuple(violations), radio, tuple(rounding), versions)
+    return Findings(scenario, ticks, tuple(counts), tuple(violations), links, tuple(rounding), versions)
 
 
 def _by_rounding(one: Violation) -> bool:

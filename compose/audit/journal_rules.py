@@ -129,4 +129,4 @@ def config(case: Evidence) -> Checks:
             yield None
         else:
             what = difference(past.config, expected)
-            yield Violation("briefing", None, robot, what, between(past.config, expected))
+            yield Violation("config", None, robot, what, between(past.config, expected))

@@ -38,7 +38,7 @@ def config(case: Testified) -> Checks:
     for robot, past in case.pasts.items():
         told = past.config
         why = _off_plan(told.rendezvous, told.mission, told.variant, told.anchor, told.peer_anchor)
-        yield Violation("briefing", None, robot, why) if why is not None else None
+        yield Violation("config", None, robot, why) if why is not None else None
 
 
 def _off_role(robot: RobotSpec, *, first: bool) -> str | None:

@@ -145,7 +145,7 @@ def parser() -> argparse.ArgumentParser:
         default=[],
         metavar="WHO@TICK",
         help="kill that robot's process, or the world, in that tick, and start it again; "
-        "WHO@TICK[:sense|report|journal|drive][+5s|+never]",
+        "WHO@TICK[:observation|report|journal|command][+5s|+never]",
     )
 
     world = command("world", "Play the world's part; robots join from wherever they reach it.")

@@ -91,7 +91,7 @@ def _another(endpoints: Endpoints, me: str | None) -> str:
 
 
 def _others(run: str, me: str, other: str) -> Iterator[tuple[str, str]]:
-    """A key of each kind under which `me` puts nothing, such as robot/b/drive, and the whole of it."""
+    """A key of each kind under which `me` puts nothing, such as robot/b/command, and the whole of it."""
     for key, rule in keys.RULES.items():
         if rule.way == "put":
             named = {"run": run, "robot": other if rule.by == "robot" else me, "peer": me}

@@ -20,7 +20,7 @@ LEAST = 1e-16
 RANKS = 6
 """hypotheses of which each has a line"""
 BEYOND = 0.05
-"""of the doubt that is allowed: how far the scale of odds goes"""
+"""of the doubt that is allowed: how far the scale of probability goes"""
 SUREST = 1e-12
 """the least doubt on that scale"""
 SHORT = 20.0
@@ -108,11 +108,11 @@ def _envelope(axes: Axes, sigmas: Sequence[tuple[int, float]]) -> None:
     axes.set_ylim(low, high)
 
 
-def draw_odds(axes: Axes, story: Story) -> None:
+def draw_probability(axes: Axes, story: Story) -> None:
     """How likely each hypothesis was; or how many poses were possible, where none is likelier."""
     over_time(axes, story)
     if story.weighed:
-        _draw_odds(axes, story)
+        _draw_probability(axes, story)
     else:
         _draw_count(axes, story)
     placed = next((one.tick for one, _ in story.placed), None)
@@ -123,7 +123,7 @@ def draw_odds(axes: Axes, story: Story) -> None:
         axes.text(1.0, 1.05, f"from tick {placed}: of how both lie in the plane", ha="right", **words)
 
 
-def _draw_odds(axes: Axes, story: Story) -> None:
+def _draw_probability(axes: Axes, story: Story) -> None:
     """On a scale on which 99.99 % is as far from 99 % as that from evens."""
     confidence = story.record.scenario.mission.confidence
     edge = max(SUREST, BEYOND * (1.0 - confidence))
@@ -132,7 +132,7 @@ def _draw_odds(axes: Axes, story: Story) -> None:
         for placed in (False, True):
             _odds_of(axes, story, rank, placed, edge)
     axes.plot([], [], "-D", ms=3, lw=1.4, color=AGES(1.0), label="the likeliest hypothesis")
-    if any(len(one.probability) > 1 for one, _ in story.estimates):
+    if any(len(one.probabilities) > 1 for one, _ in story.estimates):
         axes.plot([], [], "-x", ms=3, lw=0.8, color=GHOST, label=name_of_others(story))
     axes.axhline(
         confidence, color="k", lw=0.9, ls="-.", gid="confidence", label=f"asked for: {percent(confidence)}"
@@ -142,20 +142,20 @@ def _draw_odds(axes: Axes, story: Story) -> None:
     axes.set_yticks([edge, *ticks, 1.0 - edge], ["less", *map(percent, ticks), "more"])
     axes.yaxis.set_minor_locator(NullLocator())
     axes.set_ylim(edge, 1.0 - edge)
-    axes.set_ylabel("odds of a hypothesis")
+    axes.set_ylabel("probability of a hypothesis")
 
 
 def _odds_of(axes: Axes, story: Story, rank: int, placed: bool, edge: float) -> None:
     """Those of the hypothesis that is so likely, before or after they are about the plane."""
     points = [
-        (one.tick, min(max(one.probability[rank], edge), 1.0 - edge) if rank < len(one.probability) else math.nan)
+        (one.tick, min(max(one.probabilities[rank], edge), 1.0 - edge) if rank < len(one.probabilities) else math.nan)
         for one, _ in story.estimates
         if bool(one.world) == placed
     ]
     if all(math.isnan(probability) for _, probability in points):
         return
     ticks, probability = zip(*points, strict=True)
-    gid = f"odds-{rank + 1}-{'plane' if placed else 'anchor'}"
+    gid = f"probability-{rank + 1}-{'plane' if placed else 'anchor'}"
     if rank:
         axes.plot(ticks, probability, "-x", ms=3, mew=0.8, lw=0.8, color=GHOST, gid=gid)
     else:

@@ -22,7 +22,7 @@ WIDTH, NARROWEST = 2.3, 5.6
 FINE = 12
 """pieces that a manoeuvre is drawn in, a tick"""
 LIKELY = 1e-3
-"""odds from which on a hypothesis is within what is seen"""
+"""probability from which on a hypothesis is within what is seen"""
 
 
 class PairDecision(NamedTuple):

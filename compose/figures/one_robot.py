@@ -21,7 +21,7 @@ NEAR, KEY, KEYS, ERROR, ODDS, REST = 2.7, 0.9, 2.2, 1.9, 1.9, 0.6
 panels over time; of the title"""
 WIDE = 3.9
 """inches: a plane that is lower leaves room for the keys below it"""
-OVER_TIME: list[Any] = [["error", "error key"], ["odds", "odds key"]]
+OVER_TIME: list[Any] = [["error", "error key"], ["probability", "probability key"]]
 RIGHT: list[Any] = [["plane", "near"], ["plane", "key"], *OVER_TIME]
 BELOW: list[Any] = [["plane", "near"], ["key", "key"], *OVER_TIME]
 LINE = 100
@@ -38,12 +38,12 @@ def figure_of(story: Story) -> Figure:
         layout, heights = RIGHT, [NEAR, max(tall, NEAR + KEYS) - NEAR, ERROR, ODDS]
     figure = Figure(figsize=(WIDTH, sum(heights) + REST), layout="constrained")
     panels = figure.subplot_mosaic(layout, height_ratios=heights, width_ratios=[PLANE, BESIDE])
-    for key in ("key", "error key", "odds key"):
+    for key in ("key", "error key", "probability key"):
         panels[key].set_axis_off()
     plane.draw(panels["plane"], story)
     plane.draw_near(panels["near"], story)
     belief.draw_error(panels["error"], story)
-    belief.draw_odds(panels["odds"], story)
+    belief.draw_probability(panels["probability"], story)
     columns = 1 if layout is RIGHT else 3
     signs = key_of(panels["key"], panels["plane"], "upper left", columns)
     if story.likeliest:
@@ -51,7 +51,7 @@ def figure_of(story: Story) -> Figure:
         corner: Corner = "lower left" if layout is RIGHT else "upper right"
         key_of(panels["key"], panels["near"], corner, 3, title="closer, by tick")
     key_of(panels["error key"], panels["error"], "upper left")
-    key_of(panels["odds key"], panels["odds"], "upper left")
+    key_of(panels["probability key"], panels["probability"], "upper left")
     figure.suptitle(_title(story), x=0.012, ha="left", fontsize=9.5)
     return figure
 

@@ -184,11 +184,11 @@ def _errors(axes: Axes, pair: PairRecord, role: Role, name: str, off: Callable[[
     ]  # fmt: skip
     _line(axes, alone, ls=ALONE[role], lw=1.1, color=colour, gid=f"{name}-alone-{role}",
           label=f"{robot.id}, seen from its anchor")  # fmt: skip
-    single = [one for one in held if one[0].world and (one[0].probability or len(one[0].world) == 1)]
+    single = [one for one in held if one[0].world and (one[0].probabilities or len(one[0].world) == 1)]
     others = [
         (one.tick, off(pose, truth))
         for one, truth in held
-        for pose in (one.world[1:] if one.probability or len(one.world) == 1 else one.world)
+        for pose in (one.world[1:] if one.probabilities or len(one.world) == 1 else one.world)
     ]
     _line(axes, others, ls="", marker="x" if role == "a" else "+", ms=5, mew=0.9, color=colour, alpha=0.75,
           gid=f"{name}-others-{role}", label=f"{robot.id}, others held possible")  # fmt: skip

@@ -74,16 +74,16 @@ class Story(msgspec.Struct, frozen=True, dict=True):
     @cached_property
     def weighed(self) -> bool:
         """Whether it held one pose for likelier than another, as it does where sensors are not exact."""
-        return any(one.probability for one in self.held)
+        return any(one.probabilities for one in self.held)
 
     @cached_property
     def likeliest(self) -> list[tuple[Estimate, Pose]]:
         """Those of `placed` whose first pose is likelier than others, or the only one."""
-        return [(one, truth) for one, truth in self.placed if one.probability or len(one.world) == 1]
+        return [(one, truth) for one, truth in self.placed if one.probabilities or len(one.world) == 1]
 
     def others(self, estimate: Estimate) -> tuple[Pose, ...]:
         """Where else in the plane it may be than at the likeliest pose; all of them, where none is that."""
-        return estimate.world[1:] if estimate.probability or len(estimate.world) == 1 else estimate.world
+        return estimate.world[1:] if estimate.probabilities or len(estimate.world) == 1 else estimate.world
 
     @cached_property
     def claim(self) -> Claim | None:

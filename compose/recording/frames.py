@@ -45,7 +45,7 @@ class Journaled(msgspec.Struct, frozen=True):
 
     @property
     def kind(self) -> str:
-        """Such as "sense"."""
+        """Such as "observation"."""
         return kind_of(type(self.message))
 
     @property

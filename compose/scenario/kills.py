@@ -14,7 +14,7 @@ from msgspec import Meta
 
 from protocol.spelling import did_you_mean
 
-Point = Literal["sense", "report", "journal", "drive"]
+Point = Literal["observation", "report", "journal", "command"]
 """How far a tick has come. An agent's: its Observation is there, and nothing on record; its Report is sent; its
 Command is on record, and not sent; it is sent. The world's: no Observation is sent; all are; all Commands are on
 record, and nobody has moved; all Commands are there, and not on record."""
@@ -64,7 +64,7 @@ class KillTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """a robot, or WORLD; or several, all of them in the one tick"""
     tick: _Tick | Annotated[list[_Tick], Meta(min_length=2, max_length=2)] = 0
     """or drawn between two, both included"""
-    point: Literal["sense", "report", "journal", "drive", "?"] = "sense"
+    point: Literal["observation", "report", "journal", "command", "?"] = "observation"
     """of each that is killed, where it is drawn"""
     after: Annotated[float, Meta(ge=0.0, le=999_999.0)] | Literal["never"] = 0.0
     """s until each is started again"""
@@ -104,11 +104,11 @@ def parse(text: str) -> Kill:
     match = _FORM.fullmatch(text)
     if match is None:
         raise BadKill(
-            f"'{text}' is no kill; one is a@17, b@20:report, world@30:journal+5s or a@17:drive+never, "
-            "and the points of a tick are sense, report, journal, drive"
+            f"'{text}' is no kill; one is a@17, b@20:report, world@30:journal+5s or a@17:command+never, "
+            "and the points of a tick are observation, report, journal, command"
         )
     after = None if match["never"] else float(match["after"] or 0.0)
-    point = cast(Point, match["point"] or "sense")
+    point = cast(Point, match["point"] or "observation")
     return Kill(match["who"], int(match["tick"]), point, after, text)
 
 

@@ -238,7 +238,7 @@ def _validated(file: ScenarioFile, source: str, told: Sequence[str]) -> Scenario
             )
         if robot.attack is not None and robot.attack.kind in OF_THE_START and robot.attack.part != "all":
             raise BadScenario(
-                f"{source}: robot[{i}].lie.part: a lie of the {robot.attack.kind} is of the beginning, "
+                f"{source}: robot[{i}].attack.part: a lie of the {robot.attack.kind} is of the beginning, "
                 "and so of all"
             )
         placed.append(

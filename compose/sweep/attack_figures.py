@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from compose.sweep.execution import Results
 from compose.sweep.spec import Axis
 
-FIELD = ".lie"
+FIELD = ".attack"
 """how the path of the field ends that is varied"""
 
 HONEST = "honest"
 """the label of the truth, against which lies are held"""
 
-OUTCOMES = (("alarm", "#0b3c6f", ""), ("undecided", "#c9c9c9", ""), ("localised", "#9fc8a9", ".."))
+OUTCOMES = (("inconsistent", "#0b3c6f", ""), ("undecided", "#c9c9c9", ""), ("localised", "#9fc8a9", ".."))
 """outcome, colour, hatch; what is left is wrong"""
 
 WRONG = "#d9541e"
@@ -124,7 +124,7 @@ def _least(table: pa.Table) -> NDArray[np.float64]:
     rows = zip(table["outcome"].to_pylist(), *columns, strict=True)
     return np.array(
         [
-            min([value for value in values if value is not None], default=0.0 if outcome == "alarm" else 1.0)
+            min([value for value in values if value is not None], default=0.0 if outcome == "inconsistent" else 1.0)
             for outcome, *values in rows
         ]
     )

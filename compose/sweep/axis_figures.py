@@ -52,7 +52,7 @@ def draw(results: Results, folder: Path) -> None:
                 save(ticks_against(results, place), folder / f"ticks-{name}")
         save(_meeting(results), folder / "meeting")
         if (of_lies := attack_figures.axis_of_lies(results)) is not None:
-            save(attack_figures.outcomes(results, of_lies), folder / "lies")
+            save(attack_figures.outcomes(results, of_lies), folder / "attacks")
             if (roc := attack_figures.roc(results, of_lies)) is not None:
                 save(roc, folder / "roc")
         if (of_ticks := crash_figures.axis_of_ticks(results)) is not None:

@@ -20,7 +20,7 @@ from protocol.output import say
 
 RATE_OVER_S = 10.0
 """what the rate is averaged over"""
-OUTCOMES = ("localised", "undecided", "alarm", "wrong", "failed")
+OUTCOMES = ("localised", "undecided", "inconsistent", "wrong", "failed")
 NOTES = (
     ("rate_low", "rate: 95 % interval (Wilson)"),
     ("p50", "p50, p95, max: ticks of trials that localised"),

@@ -30,7 +30,7 @@ CONFIDENCE = 0.95
 """of an interval"""
 NEES_CONFIDENCE = 0.99
 """of the band of a mean NEES"""
-WORSE = ("wrong", "alarm", "failed", "undecided")
+WORSE = ("wrong", "inconsistent", "failed", "undecided")
 """outcomes that call for a look, the worst first"""
 
 

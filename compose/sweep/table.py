@@ -30,7 +30,7 @@ _KINDS: dict[str, pa.DataType] = {
     "same_record": pa.bool_(),
     **dict.fromkeys(("period_s", "t_max_s", "wall_s", "position_error_m", "nearest_m"), pa.float64()),
     **dict.fromkeys(
-        ("heading_error_rad", "alpha", "odds", "p_value", "position_sigma_m", "nees", "bound_m"), pa.float64()
+        ("heading_error_rad", "alpha", "probability", "p_value", "position_sigma_m", "nees", "bound_m"), pa.float64()
     ),
     **dict.fromkeys([f"cov_{name}" for name in Covariance.__struct_fields__], pa.float64()),
 }

@@ -19,7 +19,7 @@ from protocol.messages import FinalReport
 from protocol.motion import Covariance
 from world.scenario import Scenario
 
-TrialOutcome = Literal["localised", "undecided", "alarm", "wrong", "failed", "refused"]
+TrialOutcome = Literal["localised", "undecided", "inconsistent", "wrong", "failed", "refused"]
 """a mission's, or `refused`: no mission can be played in the setting that the trial has drawn"""
 N = TypeVar("N", int, float)
 WITHIN = 3.0

@@ -18,7 +18,7 @@ from protocol.motion import wrap
 
 Kind = Literal[
     "anchor", "anchor-lost", "contact", "contact-lost", "phase", "state", "branch", "candidates",
-    "claim", "undecided", "alarm", "report-lost", "report-damaged", "report-late", "report-doubled",
+    "claim", "undecided", "inconsistent", "report-lost", "report-damaged", "report-late", "report-doubled",
     "late", "down", "back", "end",
 ]  # fmt: skip
 
@@ -129,7 +129,7 @@ def _verdict(seat: Seat, command: Command, now: Facts) -> Event:
                 text += f"; it is {metres(math.hypot(x - truth.x, y - truth.y))} off"
             return Event(now.tick, "claim", robot, text)
         case verdict:
-            kind: Kind = "alarm" if isinstance(verdict, Inconsistent) else "undecided"
+            kind: Kind = "inconsistent" if isinstance(verdict, Inconsistent) else "undecided"
             return Event(now.tick, kind, robot, doing(seat, command.phase, command.state, verdict))
 
 

@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 from protocol.network.keys import NOWHERE, Key
 from protocol.output import say
 
-Topic = Literal["sense", "drive", "report", "beat", "alive", "gone", "ended", "stop", "nothing"]
+Topic = Literal["observation", "command", "report", "tick-start", "alive", "gone", "ended", "stop", "nothing"]
 
 COMPLAINTS = 100
 """kinds of malformed frames that are told, each once; the rest is only counted"""

@@ -24,7 +24,7 @@ def truth(run: str) -> str:
 
 def config(run: str, robot: str) -> str:
     """Return the key of the world's queryable for that robot's RobotConfig; the world declares it for "*"."""
-    return f"{ROOT}/{run}/world/briefing/{robot}"
+    return f"{ROOT}/{run}/world/config/{robot}"
 
 
 def observation(run: str, robot: str) -> str:
@@ -32,12 +32,12 @@ def observation(run: str, robot: str) -> str:
 
     The world then sends the robot's FinalReport back, once it is in the recording.
     """
-    return f"{ROOT}/{run}/robot/{robot}/sense"
+    return f"{ROOT}/{run}/robot/{robot}/observation"
 
 
 def command(run: str, robot: str) -> str:
     """Return the key on which that robot sends each Command to the world, and FinalReport after the mission."""
-    return f"{ROOT}/{run}/robot/{robot}/drive"
+    return f"{ROOT}/{run}/robot/{robot}/command"
 
 
 def report(run: str, robot: str, peer: str) -> str:
@@ -47,7 +47,7 @@ def report(run: str, robot: str, peer: str) -> str:
 
 def tick_start(run: str, robot: str) -> str:
     """Return the key on which a robot's driver sends the start of a tick to its peer's, in hardware mode."""
-    return f"{ROOT}/{run}/robot/{robot}/beat"
+    return f"{ROOT}/{run}/robot/{robot}/tick-start"
 
 
 def estimate(run: str, robot: str) -> str:

@@ -141,8 +141,8 @@ class Field:
         me, run, inbox = self._id, self.run, self._inbox
         self._observation = session.publisher(link, keys.observation(run, me))
         self._beat = session.publisher(link, keys.tick_start(run, me))
-        session.subscribe(link, keys.command(run, me), inbox, "drive")
-        session.subscribe(link, keys.tick_start(run, self._peer), inbox, "beat")
+        session.subscribe(link, keys.command(run, me), inbox, "command")
+        session.subscribe(link, keys.tick_start(run, self._peer), inbox, "tick-start")
         session.subscribe(link, keys.report(run, self._peer, me), inbox, "report")
         session.watch_liveliness(link, keys.robot_alive(run, "*"), inbox)
         session.answer(link, keys.config(run, me), lambda _: self._config)
@@ -275,9 +275,9 @@ class Field:
     def _take(self, arrival: Arrival) -> Command | None:
         """Do what is to be done about it; the agent's Command, if it is one, of whichever tick."""
         match arrival.topic:
-            case "drive":
+            case "command":
                 return self._on_drive(arrival)
-            case "beat":
+            case "tick-start":
                 self._on_beat(arrival)
             case "report":
                 self._on_report(arrival)
@@ -351,7 +351,7 @@ class Field:
                 arrival = self._inbox.next(left)
                 if arrival.topic == "gone":
                     self._alive.discard(arrival.source.robot)
-                elif arrival.topic == "drive" and _is_farewell(arrival.frame, self._id):
+                elif arrival.topic == "command" and _is_farewell(arrival.frame, self._id):
                     self._observation.put(arrival.frame)
                     return
         why = "no answer to the MissionEnd" if self._id in self._alive else "its agent has gone"

@@ -1,7 +1,7 @@
-"""What a robot, or the pair, still holds possible under noise: hypotheses, each a fit, with their odds.
+"""What a robot, or the pair, still holds possible under noise: hypotheses, each a fit, with their probability.
 
 Each begins at a seed (see `seeding`) and is fitted to all ranges; ranges and silence weigh it. A hypothesis
-dies of its odds, never of one measurement.
+dies of its probability, never of one measurement.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class ScoredHypothesis(NamedTuple):
     """the log of how likely it makes it to have been in range where it was, and out of it where it was not"""
 
 
-def with_odds(fits: Sequence[tuple[Fit, float]]) -> tuple[ScoredHypothesis, ...]:
+def with_probability(fits: Sequence[tuple[Fit, float]]) -> tuple[ScoredHypothesis, ...]:
     """The likeliest first, each once; of those that are left. A fit comes with what silence says of it."""
     scored = [(one.log_likelihood + 0.5 * _log_volume(one) + silent, one, silent) for one, silent in fits]
     scored.sort(key=lambda one: -one[0])
@@ -128,7 +128,7 @@ def of_anchor(
         starts = [np.array([*point, 0.0]) for point in anchors(path, ranges, sensing_range, noise, places)]
         steps = STEPS
     fits = [fit(guess, [path], ranges, noise, steps=steps) for guess in starts]
-    return with_odds([(one, _within(one, 0, silent, ranges.tick, sensing_range, noise)) for one in fits])
+    return with_probability([(one, _within(one, 0, silent, ranges.tick, sensing_range, noise)) for one in fits])
 
 
 def _within(
@@ -204,7 +204,7 @@ def follow(before: Sequence[Hypothesis], pair: PairRanges) -> tuple[ScoredHypoth
 
 def _fitted(guesses: Sequence[Array], pair: PairRanges, steps: int) -> tuple[ScoredHypothesis, ...]:
     fits = [fit(guess, pair.paths, pair.ranges, pair.noise, pair.apart, steps) for guess in guesses]
-    return with_odds([(one, _silence(one, pair)) for one in fits])
+    return with_probability([(one, _silence(one, pair)) for one in fits])
 
 
 def _silence(one: Fit, pair: PairRanges) -> float:

@@ -27,7 +27,7 @@ _KINDS: dict[str, pa.DataType] = {
     **dict.fromkeys(("robot", "state", "verdict"), pa.string()),
     "phase": pa.int32(),
     **dict.fromkeys(("local", "world"), pa.list_(_POSE)),
-    "odds": pa.list_(pa.float64()),
+    "probability": pa.list_(pa.float64()),
 }
 """the rest are floats"""
 _MEASURES = ["position_error_m", "heading_error_rad", "position_sigma_m", "heading_sigma_rad", "nees"]
@@ -35,7 +35,7 @@ _COVARIANCE = [f"cov_{name}" for name in Covariance.__struct_fields__]
 COLUMNS = [
     *("tick", "time_s"),
     *TickRow.__struct_fields__[1:],
-    *("verdict", "local", "world", "odds"),
+    *("verdict", "local", "world", "probability"),
     *("estimate_x", "estimate_y", "estimate_heading"),
     *_COVARIANCE,
     *_MEASURES,
@@ -77,7 +77,7 @@ def _estimate(held: Estimate | None, truth: Pose | None) -> dict[str, Any]:
     told: dict[str, Any] = {
         "local": [asdict(pose) for pose in held.local],
         "world": [asdict(pose) for pose in held.world],
-        "odds": list(held.probability),
+        "probability": list(held.probabilities),
     }
     if not held.world:
         return told

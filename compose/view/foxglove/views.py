@@ -31,7 +31,7 @@ GREY = (0.5, 0.5, 0.5)
 GREEN = (0.0, 0.5, 0.35)
 LEVELS = {
     **dict.fromkeys(("report-lost", "report-damaged", "late", "undecided"), fox.LogLevel.Warning),
-    "alarm": fox.LogLevel.Error,
+    "inconsistent": fox.LogLevel.Error,
 }
 """of an event's kind; of all others Info"""
 

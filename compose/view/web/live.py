@@ -241,7 +241,7 @@ class Listener:
     def _hand_over(self, heard: threading.Event) -> Callable[[zenoh.Sample], None]:
         def hand_over(sample: zenoh.Sample) -> None:
             heard.set()
-            session.deliver(sample, self._inbox, "drive")
+            session.deliver(sample, self._inbox, "command")
 
         return hand_over
 
@@ -252,4 +252,4 @@ class Listener:
         asked = keys.config(run, robot)
         answer = session.ask(link, asked, QUERY_S)
         if isinstance(answer, bytes):
-            self._answers.put(Arrival("drive", asked, answer, Key(keys.config, run, robot)))
+            self._answers.put(Arrival("command", asked, answer, Key(keys.config, run, robot)))

@@ -3,7 +3,7 @@
 import { between, compose, distance, ellipse, frame_of, step, TAU } from "./geometry.js";
 import { held_now } from "./held.js";
 import { cross, label, shape } from "./pen.js";
-import { odds } from "./words.js";
+import { probability } from "./words.js";
 
 const FADING = 3;
 const SIGMAS = 3;
@@ -21,7 +21,7 @@ export class Beliefs {
     this.#ruled_out(view, robot);
     if (!held.world.length && !truth) this.#any_bearing(view, robot, poses[0]);
     poses.slice(0, 60).forEach((pose, place) => {
-      const chance = held.odds[place] ?? 1 / poses.length;
+      const chance = held.probability[place] ?? 1 / poses.length;
       const [x, y] = this.plane.at(pose);
       pen.globalAlpha = 0.3 + 0.7 * Math.sqrt(chance);
       if (place === 0 && covariance && held.world.length) this.#ellipse(pose, covariance, look);
@@ -36,8 +36,8 @@ export class Beliefs {
       pen.setLineDash(held.world.length || !truth ? [] : [3, 3]);
       pen.stroke();
       pen.setLineDash([]);
-      if (held.odds.length > 1 && place < 6 && chance > 0.01 && size > 6) {
-        label(pen, odds(chance), x - grown - 4, y + grown + 8, look.ghost, "right", look);
+      if (held.probability.length > 1 && place < 6 && chance > 0.01 && size > 6) {
+        label(pen, probability(chance), x - grown - 4, y + grown + 8, look.ghost, "right", look);
       }
       if (!truth && place === 0 && player.down) cross(pen, x, y, grown, look);
       if (!truth && place === 0) label(pen, player.down ? `${robot.id} is down` : robot.id, x + grown + 3, y - grown, look.ink, "left", look, look.bold);

@@ -36,7 +36,7 @@ export async function campaign(root) {
 
 const FIGURES = [
   ["trials", "trials"], ["rate", "localised"], ["ticks_p50", "ticks, median"], ["ticks_p95", "95 %"], ["ticks_max", "most"],
-  ["undecided", "undecided"], ["alarm", "alarm"], ["wrong", "wrong"], ["failed", "failed"], ["error_max_m", "worst error, m"],
+  ["undecided", "undecided"], ["inconsistent", "inconsistent"], ["wrong", "wrong"], ["failed", "failed"], ["error_max_m", "worst error, m"],
   ["nees_mean", "NEES"], ["violations", "violations"], ["reports_lost", "reports lost"], ["refused", "refused"],
 ];
 

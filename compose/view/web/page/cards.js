@@ -2,9 +2,9 @@
 
 import { distance, wrap } from "./geometry.js";
 import { leads } from "./held.js";
-import { metres, odds, PHASES, place, plural, rad, speed, turning } from "./words.js";
+import { metres, probability, PHASES, place, plural, rad, speed, turning } from "./words.js";
 
-const MOST_ODDS = 5;
+const MOST_PROBABILITIES = 5;
 const MANY = 4;
 
 export class Cards {
@@ -69,8 +69,8 @@ class Card {
     this.error = make("span", { className: "error" });
     this.doing = make("p", { className: "doing" });
     this.rows = make("dl", {});
-    this.odds = make("ol", { className: "odds" });
-    this.root.append(make("div", { className: "line" }, this.name, this.phase, this.error), this.doing, this.rows, this.odds);
+    this.probability = make("ol", { className: "probability" });
+    this.root.append(make("div", { className: "line" }, this.name, this.phase, this.error), this.doing, this.rows, this.probability);
     this.fields = new Map();
   }
 
@@ -99,7 +99,7 @@ class Card {
     const [off, range] = truth && player.pose && held?.world.length ? error(held, player.pose) : ["", ""];
     this.error.textContent = off;
     this.error.title = range;
-    this.#row("senses", inputs(player, this.robot));
+    this.#row("observations", inputs(player, this.robot));
     this.#row("hears", hears(player, this.robot));
     this.#row("decides", drive ? decides(drive) : "–");
     this.#row("says", player.sent ? `a report of ${player.sent.bytes} bytes, its log through tick ${player.sent.through}` : "nothing");
@@ -108,17 +108,17 @@ class Card {
     else if (this.fields.has("is at")) this.#row("is at", "hidden");
     const counted = store.counted(this.robot.id, tick);
     this.#row("so far", counted ? counts(counted) : "…");
-    this.#odds(held);
+    this.#probability(held);
   }
 
-  #odds(held) {
-    const bars = held?.odds.length > 1 ? held.odds.slice(0, MOST_ODDS) : [];
-    this.odds.hidden = !bars.length;
-    while (this.odds.children.length > bars.length) this.odds.lastChild.remove();
+  #probability(held) {
+    const bars = held?.probability.length > 1 ? held.probability.slice(0, MOST_PROBABILITIES) : [];
+    this.probability.hidden = !bars.length;
+    while (this.probability.children.length > bars.length) this.probability.lastChild.remove();
     bars.forEach((chance, i) => {
-      const bar = this.odds.children[i] ?? this.odds.appendChild(make("li", {}, make("i", {}), make("span", {})));
+      const bar = this.probability.children[i] ?? this.probability.appendChild(make("li", {}, make("i", {}), make("span", {})));
       bar.firstChild.style.width = `${100 * chance}%`;
-      bar.lastChild.textContent = odds(chance);
+      bar.lastChild.textContent = probability(chance);
     });
   }
 }
@@ -150,7 +150,7 @@ function hears(player, robot) {
 
 const decides = ({ v, omega, state }) => `${state}: ${v === 0 && omega === 0 ? "stands" : `${speed(v)}, ${turning(omega)}`}`;
 
-function holds({ local, world, odds: chances, covariance, localised }) {
+function holds({ local, world, probability: chances, covariance, localised }) {
   const sigma = covariance && world.length ? `, sigma ${metres(Math.sqrt(Math.max(0, covariance[0] + covariance[3])))}` : "";
   if (world.length === 1) {
     const at = `${place(world[0])}, ${rad(wrap(world[0][2]))}${sigma}`;

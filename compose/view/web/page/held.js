@@ -6,7 +6,7 @@ import { between, compose, distance, frame_of, wrap } from "./geometry.js";
 const NEAR = 0.05, TURNED = 0.5;
 
 /** Whether the first pose is the only one, or likelier than all others together. */
-export const leads = ({ world, local, odds }) => (world.length || local.length) === 1 || odds[0] > 0.5;
+export const leads = ({ world, local, probability }) => (world.length || local.length) === 1 || probability[0] > 0.5;
 
 /** The poses that a robot holds possible, on the plane, and the covariance of the first; none if it holds none. */
 export function held_now({ store, scene, truth, tick, share, moving }, robot) {

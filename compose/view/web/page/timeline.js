@@ -3,7 +3,7 @@
 import { unit } from "./pen.js";
 import { FAULTS, SIGNS } from "./words.js";
 
-const MARKED = Object.fromEntries(["contact", "claim", "alarm", "undecided", "down", "back"].map((kind) => [kind, SIGNS[kind]]));
+const MARKED = Object.fromEntries(["contact", "claim", "inconsistent", "undecided", "down", "back"].map((kind) => [kind, SIGNS[kind]]));
 const MOST_BANDS = 6;
 const MARKS = 15;
 

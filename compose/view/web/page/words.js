@@ -17,7 +17,7 @@ export const speed = (value) => `${number(value, 2)} m/s`;
 export const turning = (value) => `${value < 0 ? "" : "+"}${number(value, 2)} rad/s`;
 export const place = ([x, y]) => `${number(x, 2)}, ${number(y, 2)} m`;
 
-export function odds(value) {
+export function probability(value) {
   if (value > 0.9999) return "> 99.99 %";
   if (value >= 0.995) return `${(100 * value).toFixed(2)} %`;
   if (value < 0.001) return "< 0.1 %";
@@ -36,7 +36,7 @@ export const SIGNS = {
 export const KIND_NAMES = {
   anchor: "anchor in range", "anchor-lost": "anchor out of range", contact: "contact", "contact-lost": "contact lost",
   phase: "phase", state: "state", branch: "branch chosen", candidates: "candidates", claim: "claim",
-  undecided: "undecided", alarm: "alarm", late: "late", end: "end", down: "process gone", back: "process runs again", "report-lost": "report lost",
+  undecided: "undecided", alarm: "inconsistent", late: "late", end: "end", down: "process gone", back: "process runs again", "report-lost": "report lost",
   "report-damaged": "report damaged", "report-late": "report late", "report-doubled": "report doubled",
 };
 
