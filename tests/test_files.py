@@ -137,11 +137,11 @@ def test_every_file_of_a_run_and_an_export_is_whole_or_absent_however_little_roo
     recording: Path, tmp_path: Path, no_room: Callable[[int], None]
 ) -> None:
     pytest.importorskip("foxglove")
-    record = in_process.play(load("paper-1"))
-    told = summary_json.summary(record, "in-process", None)
+    played = in_process.play(load("paper-1"))
+    told = summary_json.summary(played, "in-process", None)
     whole = tmp_path / "whole"
     whole.mkdir()
-    summary_json.leave(record, told, whole)
+    summary_json.leave(played, told, whole)
     export.export(recording, whole)
     wanted = {path.name: path.read_bytes() for path in whole.iterdir()}
     for room in (0, 5_000, 12_000):
@@ -149,7 +149,7 @@ def test_every_file_of_a_run_and_an_export_is_whole_or_absent_however_little_roo
         out.mkdir()
         no_room(room)
         with suppress(OSError):
-            summary_json.leave(record, told, out)
+            summary_json.leave(played, told, out)
         with pytest.raises(UserError, match="too large"):
             export.export(recording, out)
         left = {path.name: path.read_bytes() for path in out.iterdir()}
@@ -194,8 +194,8 @@ def test_what_is_written_replaces_a_link_and_leaves_what_it_led_to(recording: Pa
     names = ("summary.json", *export.FILES)
     for name in names:
         (out / name).symlink_to(kept)
-    record = in_process.play(load("paper-1"))
-    summary_json.leave(record, summary_json.summary(record, "in-process", None), out)
+    played = in_process.play(load("paper-1"))
+    summary_json.leave(played, summary_json.summary(played, "in-process", None), out)
     export.export(recording, out)
     assert kept.read_text() == "kept"
     assert not [name for name in names if (out / name).is_symlink()]

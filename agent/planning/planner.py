@@ -155,7 +155,7 @@ def estimate(state: RobotState) -> Estimate:
         local=tuple(phase1_anchor.local(left, state.odometry)),
         world=world,
         localised=isinstance(state.verdict, Localised),
-        probability=tuple(one.probability for one in state.belief.pair or state.belief.own),
+        probabilities=tuple(one.probability for one in state.belief.pair or state.belief.own),
         covariance=state.belief.covariance,
     )
 
