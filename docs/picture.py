@@ -43,9 +43,9 @@ def main() -> None:
 
 def draw(name: str, shown: Mapping[str, str], folder: Path) -> None:
     """Play the scenario, and take those pictures of it that are `shown`."""
-    record = in_process.play(scenario_file.load(name), folder)
-    robots = [robot.id for robot in record.scenario.robots]
-    pair = of_record(record, (0, 1), {robot: account(folder, robot) for robot in robots})
+    recording = in_process.play(scenario_file.load(name), folder)
+    robots = [robot.id for robot in recording.scenario.robots]
+    pair = of_record(recording, (0, 1), {robot: account(folder, robot) for robot in robots})
     for kind in PICTURES:
         with catalogue.settings(kind):
             for title, figure in catalogue.pictures(pair, kind):

@@ -41,12 +41,12 @@ class Rover:
         start: str = "",
         beacon: str = "",
         state: str = "",
-        patience: str = "10",
+        timeout: str = "10",
     ) -> None:
         """`start` is x,y,heading in <W>, which no agent is told; `beacon` HOST:PORT, or there is no peer.
 
         `state` is a file that stands for the robot's body, which outlasts this process: where it is, and what
-        its wheels are at. `patience` (s) bounds the wait for the peer to stand in the same tick: this robot
+        its wheels are at. `timeout` (s) bounds the wait for the peer to stand in the same tick: this robot
         has no drop-outs, and rather than call silence what is none, it gives up.
         """
         self._config = config
@@ -67,7 +67,7 @@ class Rover:
         self._executed = REST
         """what that told"""
         self._tick = 0
-        self._give_up_s = float(patience)
+        self._give_up_s = float(timeout)
         self._state = Path(state) if state else None
         self._found = self._state is not None and self._state.exists()
         """whether where the body is has been found, and not made up"""

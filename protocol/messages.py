@@ -15,7 +15,7 @@ from msgspec import Meta
 from msgspec.structs import force_setattr
 
 from protocol.attack import Attack
-from protocol.mission import Anchor, Mission, Role, Variant
+from protocol.mission import Anchor, Mission, PlannerName, Role
 from protocol.motion import Controls, Covariance, Pose, Segment
 from protocol.orbits import Rendezvous
 from protocol.units import (
@@ -101,7 +101,9 @@ class Undecided(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fie
         _cut(self, "reason")
 
 
-class Inconsistent(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="inconsistent"):
+class Inconsistent(
+    msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="inconsistent"
+):
     """The peer tells what cannot be so."""
 
     claim: Text
@@ -142,7 +144,7 @@ class RobotConfig(Message, frozen=True):
     """its own"""
     peer_anchor: Anchor
     mission: Mission
-    variant: Variant
+    planner_name: PlannerName
     rendezvous: Rendezvous
     attack: Attack | None
     """what it is told to tell its peer, instead of the truth"""

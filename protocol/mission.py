@@ -13,7 +13,7 @@ from protocol.noise import Noise
 from protocol.rounding import EPSILON, SAME, SURE, required_anchor_error, rounding
 from protocol.units import Clearance, Coordinate, Duration, Length, Speed, TurnRate
 
-Variant = Literal["assured", "paper"]
+PlannerName = Literal["assured", "paper"]
 """`paper` plays the paper to the letter; `assured` also cures what fails in it."""
 
 Role = Literal["a", "b"]

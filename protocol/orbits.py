@@ -12,7 +12,7 @@ from functools import cache
 
 import msgspec
 
-from protocol.mission import RANGE_MARGIN, Mission, Role, Variant
+from protocol.mission import RANGE_MARGIN, Mission, PlannerName, Role
 from protocol.motion import TAU
 from protocol.units import AngularVelocity, Range, Time, Velocity
 
@@ -50,9 +50,9 @@ class Rendezvous(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fi
 
 
 @cache
-def rendezvous(mission: Mission, distance: float, variant: Variant) -> Rendezvous:
+def rendezvous(mission: Mission, distance: float, planner_name: PlannerName) -> Rendezvous:
     """The plan for anchors `distance` m (D) apart."""
-    return orbiting(mission, distance) if variant == "paper" else searching(mission, distance)
+    return orbiting(mission, distance) if planner_name == "paper" else searching(mission, distance)
 
 
 def tick_budget(mission: Mission, plan: Rendezvous) -> int:

@@ -40,7 +40,7 @@ name = "paper-1"
 seed = 1
 {SECTION_IV}
 [planner]
-variant = "paper"
+name = "paper"
 [[robot]]
 id = "a"
 anchor = [0.0, 0.0]
@@ -55,7 +55,7 @@ name = "long"
 seed = 1
 {SECTION_IV}
 [planner]
-variant = "paper"
+name = "paper"
 [[robot]]
 id = "a"
 anchor = [0.0, 0.0]
@@ -162,9 +162,9 @@ class TandemProcess:
         """Wait until the file at `path` has at least `amount` bytes."""
         self.until(lambda: size(path) >= amount, f"{path.name} holds {amount} bytes")
 
-    def until_answered(self, robot: str, record: Path) -> None:
+    def until_answered(self, robot: str, recording: Path) -> None:
         """Wait until `robot` has answered tick 0: its Observation, Command and Estimate are in the recording."""
-        path = record / f"agent-{robot}.journal"
+        path = recording / f"agent-{robot}.journal"
         self.until(
             lambda: path.exists() and len(list(journal_file.read(path))) >= 5, f"{robot} answers tick 0"
         )

@@ -128,7 +128,7 @@ class Mission:
         """What it said."""
         return self._podman("logs", self.container(service))
 
-    def record(self, folder: Path) -> Path:
+    def recording(self, folder: Path) -> Path:
         """All journals, in one folder."""
         for name in ("world", "agent-a", "agent-b"):
             self._podman("cp", f"{self.container(name)}:/journal/{name}.journal", folder)
@@ -213,7 +213,7 @@ def play(podman: Podman, killed: str, folder: Path) -> bool:
         until(lambda: all(mission.ended(one) is not None for one in services), "all have ended", 120.0)
         statuses = {one: mission.ended(one) for one in services}
         outcome = next((line for line in mission.logs("agent-b").splitlines() if " after " in line), "?")
-        audit = tandem("audit", mission.record(Path(tempfile.mkdtemp(dir=folder))))
+        audit = tandem("audit", mission.recording(Path(tempfile.mkdtemp(dir=folder))))
         page = mission.tick()
         mission.compose(*up)
         until(lambda: all(mission.ended(one) is not None for one in services), "all have ended again", 300.0)

@@ -18,7 +18,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from compose.recording.run import Record, read
+from compose.recording.run import Recording, read
 from tests.commands import ENDLESS, TandemProcess, process_of
 
 RATES = (1, 10, 100)
@@ -35,11 +35,11 @@ def main() -> int:
         for stopped in (0.0, STOPPED_S):
             with tempfile.TemporaryDirectory(prefix="tandem-") as folder:
                 began = time.monotonic()
-                record = played(Path(folder), rate, stopped)
+                recording = played(Path(folder), rate, stopped)
                 wall = time.monotonic() - began
-            ticks = record.moments[-1].truth.tick
-            missed = {robot: late(record, robot) for robot in "ab"}
-            moved = max([drifted(record, tick) for tick in missed["a"]], default=0.0)
+            ticks = recording.moments[-1].truth.tick
+            missed = {robot: late(recording, robot) for robot in "ab"}
+            moved = max([drifted(recording, tick) for tick in missed["a"]], default=0.0)
             well &= ticks == rate * LASTS_S and moved == 0.0
             well &= not stopped or len(missed["a"]) >= (STOPPED_S - 1.0) * rate
             share = [f"{len(ticks_)} ({len(ticks_) / ticks:.2%})" for ticks_ in missed.values()]
@@ -48,7 +48,7 @@ def main() -> int:
     return 0 if well else 1
 
 
-def played(folder: Path, rate: int, stopped: float) -> Record:
+def played(folder: Path, rate: int, stopped: float) -> Recording:
     """The record of 10 s at that rate, with a's agent stopped in the middle."""
     scenario, out = folder / "mission.toml", folder / "out"
     scenario.write_text(f"max_ticks = {rate * LASTS_S}\n" + ENDLESS.replace("max_ticks", "# max_ticks"))
@@ -63,14 +63,14 @@ def played(folder: Path, rate: int, stopped: float) -> Record:
     return read(out)
 
 
-def late(record: Record, robot: str) -> list[int]:
+def late(recording: Recording, robot: str) -> list[int]:
     """The ticks for which its drive did not come."""
-    return [moment.truth.tick for moment in record.moments[:-1] if robot not in moment.commands]
+    return [moment.truth.tick for moment in recording.moments[:-1] if robot not in moment.commands]
 
 
-def drifted(record: Record, tick: int) -> float:
+def drifted(recording: Recording, tick: int) -> float:
     """m: how far a moved in that tick."""
-    before, after = record.moments[tick].truth.poses[0], record.moments[tick + 1].truth.poses[0]
+    before, after = recording.moments[tick].truth.poses[0], recording.moments[tick + 1].truth.poses[0]
     return abs(after.x - before.x) + abs(after.y - before.y)
 
 

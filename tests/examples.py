@@ -64,5 +64,7 @@ EXAMPLES: tuple[Message, ...] = (
     Mark(4, "a", (0.5, -1.0)),
     ProcessStart("6f1c2a", synced=True),
     TickStart(7, "a"),
-    Command(4, "b", 0.0, 0.0, 3, "inconsistent", Inconsistent("a start that it told otherwise before", 0.5, 0.25)),
+    Command(
+        4, "b", 0.0, 0.0, 3, "inconsistent", Inconsistent("a start that it told otherwise before", 0.5, 0.25)
+    ),
 )

@@ -5,22 +5,22 @@ from __future__ import annotations
 import math
 
 from compose.launch.in_process import play
-from compose.recording.run import Record
+from compose.recording.run import Recording
 from compose.scenario.scenario_file import parse
 
 
 def mission_of(
     start: tuple[float, float, float],
     *,
-    variant: str = "assured",
+    planner_name: str = "assured",
     reach: float = 3.0,
     speed: float = 1.0,
     turn_rate: float = math.pi,
-) -> Record:
+) -> Recording:
     """Played in this process; the peer starts half a metre from its own anchor."""
     text = f"""
         name = "mission"
-        planner = {{variant = "{variant}"}}
+        planner = {{name = "{planner_name}"}}
         [mission]
         sensing_range = {reach}
         period = 1.0

@@ -58,7 +58,7 @@ def played(text: str, folder: Path) -> tuple[list[str], list[dict[str, bytes]]]:
 def scenario(draw: random.Random) -> str:
     """A scenario with a plan of one to four faults; a third of them under noise, a fifth with two pairs."""
     noise = draw.choice((EXACT, EXACT, EXACT, EXACT, RANGES, ALL_NOISE))
-    variant = draw.choice(("assured", "assured", "assured", "paper"))
+    planner_name = draw.choice(("assured", "assured", "assured", "paper"))
     pairs = 2 if draw.random() < 0.2 and not noise else 1
     anchors = [(10.0 * (i % 2), 40.0 * (i // 2)) for i in range(2 * pairs)]
     robots = "".join(
@@ -69,7 +69,7 @@ def scenario(draw: random.Random) -> str:
     table = f"[mission.noise]\n{noise}\n" if noise else ""
     return (
         f'name = "plan"\nseed = {draw.randrange(2**32)}\nmax_ticks = {MAX_TICKS}\n'
-        f'planner = {{variant = "{variant}"}}\n{SECTION_IV}{table}{robots}{faults}'
+        f'planner = {{name = "{planner_name}"}}\n{SECTION_IV}{table}{robots}{faults}'
     )
 
 
@@ -95,11 +95,11 @@ def fault(draw: random.Random, pairs: int) -> str:
 
 def said(text: str) -> str:
     """The plan, in a line."""
-    variant = "paper" if '"paper"' in text else "assured"
+    planner_name = "paper" if '"paper"' in text else "assured"
     noise = "noisy" if "mission.noise" in text else "exact"
     pairs = text.count("[[robot]]") // 2
     faults = [" ".join(part.split()) for part in text.split("[[fault]]")[1:]]
-    return f"{variant}, {noise}, {pairs} pair{'s' if pairs > 1 else ''}; {' | '.join(faults)}"
+    return f"{planner_name}, {noise}, {pairs} pair{'s' if pairs > 1 else ''}; {' | '.join(faults)}"
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from agent.planning import planner
 from agent.planning.state import RobotState
 from compose.scenario.scenario_file import load
 from protocol.messages import Command, Observation, Report
-from world.tick import World, advance, release, observations
+from world.tick import World, advance, observations, release
 
 
 class Step(NamedTuple):
@@ -29,12 +29,18 @@ def steps(name: str) -> Iterator[Step]:
     states = {robot.id: RobotState(world.scenario.config(robot.id)) for robot in world.scenario.robots}
     while True:
         sensed = observations(world)
-        observed = {observation.robot: planner.observe(states[observation.robot], observation) for observation in sensed}
+        observed = {
+            observation.robot: planner.observe(states[observation.robot], observation)
+            for observation in sensed
+        }
         heard = {
             observation.robot: [planner.report(observed[contact.peer]) for contact in observation.contacts]
             for observation in sensed
         }
-        before, states = states, {robot: planner.decide(state, heard[robot]) for robot, state in observed.items()}
+        before, states = (
+            states,
+            {robot: planner.decide(state, heard[robot]) for robot, state in observed.items()},
+        )
         commands = {robot: planner.command(state) for robot, state in states.items()}
         yield Step(world, sensed, before, observed, heard, commands)
         onward = advance(world, commands)

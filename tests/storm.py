@@ -111,10 +111,12 @@ class Genuine:
     """Every frame of a mission, by key and tick, as it was played undisturbed in one process."""
 
     def __init__(self, played: Scenario, folder: Path) -> None:
-        record = in_process.play(played, folder)
-        leave(record, summary(record, "in-process", None), folder)
-        self.ticks = record.moments[-1].truth.tick
-        self.final_reports = {robot: encode(final_report) for robot, final_report in record.final_reports.items()}
+        recording = in_process.play(played, folder)
+        leave(recording, summary(recording, "in-process", None), folder)
+        self.ticks = recording.moments[-1].truth.tick
+        self.final_reports = {
+            robot: encode(final_report) for robot, final_report in recording.final_reports.items()
+        }
         self.by_key: dict[str, dict[int, bytes]] = {}
         peers = {robot.id: robot.peer for robot in played.robots}
         for robot, peer in peers.items():
@@ -166,7 +168,13 @@ class Storm:
         """others of the mission, and nothing put on them changes anything"""
         self.ghost = keys.command(RUN, "ghost")
         self.wild = [
-            *("**", "tandem/**", f"tandem/{RUN}/**", "tandem/*/robot/*/command", f"tandem/{RUN}/robot/*/command"),
+            *(
+                "**",
+                "tandem/**",
+                f"tandem/{RUN}/**",
+                "tandem/*/robot/*/command",
+                f"tandem/{RUN}/robot/*/command",
+            ),
             *(f"tandem/{RUN}/robot/a/*", f"tandem/{RUN}/r$*/a/observation", "*/*/*/*/*", "**/to/*"),
             *(f"{keys.command(RUN, 'a')}/**", f"tandem/{RUN}/robot/*/**/b"),
         ]

@@ -6,7 +6,7 @@ import math
 from functools import cache
 
 from compose.launch.in_process import play
-from compose.recording.run import Record
+from compose.recording.run import Recording
 from compose.recording.summary_json import summary
 from compose.scenario.scenario_file import parse
 from world.scenario import Scenario
@@ -20,7 +20,7 @@ def scenario_of(
     noise: str,
     seed: int,
     *,
-    variant: str = "assured",
+    planner_name: str = "assured",
     reach: float = 3.0,
     period: float = 1.0,
     turn_rate: float = math.pi,
@@ -31,7 +31,7 @@ def scenario_of(
     text = f"""
         name = "survey"
         {f"max_ticks = {max_ticks}" if max_ticks is not None else ""}
-        planner = {{variant = "{variant}"}}
+        planner = {{name = "{planner_name}"}}
         [mission]
         sensing_range = {reach}
         period = {period}
@@ -51,22 +51,22 @@ def scenario_of(
 
 
 @cache
-def survey(noise: str, seed: int, variant: str = "assured", accuracy: float = 0.1) -> Record:
+def survey(noise: str, seed: int, planner_name: str = "assured", accuracy: float = 0.1) -> Recording:
     """The mission of `scenario_of`, played in this process."""
-    return play(scenario_of(noise, seed, variant=variant, accuracy=accuracy))
+    return play(scenario_of(noise, seed, planner_name=planner_name, accuracy=accuracy))
 
 
-def assert_localised(record: Record) -> None:
+def assert_localised(recording: Recording) -> None:
     """As well as was asked for, in the same tick, and nobody farther off than the claim allows for."""
-    said = summary(record, "in-process", None)
-    assert said["outcome"] == "localised", (record.scenario.seed, said["reason"])
+    said = summary(recording, "in-process", None)
+    assert said["outcome"] == "localised", (recording.scenario.seed, said["reason"])
     robots = said["robots"]
     assert robots["a"]["localised_tick"] == robots["b"]["localised_tick"] == said["ticks"]
-    accuracy = record.scenario.mission.accuracy
+    accuracy = recording.scenario.mission.accuracy
     for robot in robots.values():
         off, sigma = robot["position_error_m"], robot["position_sigma_m"]
         assert sigma <= accuracy
-        assert off <= min(3.0 * accuracy, 5.0 * sigma + ROUNDING), (record.scenario.seed, off, sigma)
+        assert off <= min(3.0 * accuracy, 5.0 * sigma + ROUNDING), (recording.scenario.seed, off, sigma)
         assert robot["heading_error_rad"] <= 5.0 * robot["heading_sigma_rad"] + ROUNDING
 
 
@@ -74,6 +74,6 @@ ROUNDING = 1e-6
 """m and rad: what the referee allows for"""
 
 
-def states(record: Record, robot: str) -> list[str]:
+def states(recording: Recording, robot: str) -> list[str]:
     """What the robot did, tick by tick."""
-    return [moment.commands[robot].state for moment in record.moments]
+    return [moment.commands[robot].state for moment in recording.moments]

@@ -55,7 +55,7 @@ id = "b"
 anchor = [10.0, 0.0]
 """
 LETTER = RANDOM.replace("seed = 3", "seed = 5").replace(
-    "[[robot]]", f'{NOISE}[planner]\nvariant = "paper"\n[[robot]]', 1
+    "[[robot]]", f'{NOISE}[planner]\nname = "paper"\n[[robot]]', 1
 )
 BRIEF = PAPER_1.replace("seed = 1", "seed = 1\nmax_ticks = 4")
 
@@ -77,12 +77,12 @@ def scenario_of(name: str) -> Scenario:
 
 
 @pytest.fixture(scope="session")
-def records(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("records")
 
 
-def recorded(name: str, records: Path) -> Path:
-    folder = records / name
+def recorded(name: str, recordings: Path) -> Path:
+    folder = recordings / name
     if not (folder / "world.journal").exists():
         folder.mkdir(exist_ok=True)
         play(scenario_of(name), folder)
@@ -90,10 +90,10 @@ def recorded(name: str, records: Path) -> Path:
 
 
 def pair(folder: Path, number: int = 0) -> PairRecord:
-    record = read(folder)
-    places = record.scenario.pairs()[number]
-    robots = [record.scenario.robots[place].id for place in places]
-    return of_record(record, places, {robot: account(folder, robot) for robot in robots})
+    recording = read(folder)
+    places = recording.scenario.pairs()[number]
+    robots = [recording.scenario.robots[place].id for place in places]
+    return of_record(recording, places, {robot: account(folder, robot) for robot in robots})
 
 
 def found(figure: Figure, gid: str) -> list[Artist]:
@@ -134,12 +134,12 @@ def copied(folder: Path, there: Path) -> Path:
 
 @pytest.mark.parametrize(("name", "simulation"), [("paper-1", 0), ("paper-2", 1)])
 def test_a_plan_shows_each_candidate_and_the_axis_of_each_two_and_the_choice(
-    name: str, simulation: int, records: Path
+    name: str, simulation: int, recordings: Path
 ) -> None:
-    told, computed = pair(recorded(name, records)), REFERENCE.sims[simulation]
+    told, computed = pair(recorded(name, recordings)), REFERENCE.sims[simulation]
     (figure,) = [drawn(one) for one in manoeuvre.draw(told).values()]
-    assert told.record is not None
-    final_report = told.record.final_reports["b"]
+    assert told.recording is not None
+    final_report = told.recording.final_reports["b"]
     assert final_report.candidates is not None
     count = final_report.candidates[1]
     assert len(found(figure, r"candidate-\d+")) == count == len(computed.d_i)
@@ -163,22 +163,26 @@ def test_a_plan_shows_each_candidate_and_the_axis_of_each_two_and_the_choice(
     assert min(math.dist(end, point) for point in line(figure, "reach")) < 1e-9
 
 
-def test_what_is_compared_is_what_was_chosen_from(records: Path) -> None:
-    told = pair(recorded("assured", records))
+def test_what_is_compared_is_what_was_chosen_from(recordings: Path) -> None:
+    told = pair(recorded("assured", recordings))
     (one,) = [one for role in ("b", "a") for one in manoeuvre.planned(told, role)][:1]
     ways = compared(one.plan.question, told.mission, "assured")
     row, column = np.unravel_index(np.argmax(ways.value), ways.value.shape)
     assert (ways.reach.v[row, 0], ways.reach.omega[column]) == (one.plan.command.v, one.plan.command.omega)
     command = told.command(one.plan.question.mover, one.tick)
     assert command is not None
-    assert (command.v, command.omega, command.state) == (one.plan.command.v, one.plan.command.omega, "last-manoeuvre")
+    assert (command.v, command.omega, command.state) == (
+        one.plan.command.v,
+        one.plan.command.omega,
+        "last-manoeuvre",
+    )
     (figure,) = [drawn(one) for one in manoeuvre.draw(told).values()][:1]
     assert len(found(figure, r"reach-\d+")) == len(ways.reach.v) - 1
 
 
-def test_a_plan_of_a_is_seen_from_a(records: Path) -> None:
+def test_a_plan_of_a_is_seen_from_a(recordings: Path) -> None:
     """A distance is the same from either end: b's candidates about a, and a's about b."""
-    told = pair(recorded("paper-1", records))
+    told = pair(recorded("paper-1", recordings))
     ((_, plan),) = manoeuvre.planned(told, "b")
     turned = manoeuvre.scene(plan._replace(question=plan.question._replace(mover="a")))
     straight = manoeuvre.scene(plan)
@@ -199,9 +203,9 @@ def test_a_plan_of_a_is_seen_from_a(records: Path) -> None:
     ],
 )
 def test_phase_1_shows_both_branches_the_rings_and_what_rules_one_out(
-    name: str, role: Role, ranges: Sequence[int], against: str, records: Path
+    name: str, role: Role, ranges: Sequence[int], against: str, recordings: Path
 ) -> None:
-    told = pair(recorded(name, records))
+    told = pair(recorded(name, recordings))
     figure = drawn(phase_one.draw(told, role))
     rho = told.robot(role).anchor_ranges
     assert radii(figure, r"rho-\d") == [rho[tick] for tick in ranges]
@@ -220,8 +224,10 @@ def test_phase_1_shows_both_branches_the_rings_and_what_rules_one_out(
 
 
 @pytest.mark.parametrize(("name", "ticks"), [("paper-1", [46, 47, 48]), ("paper-2", [106, 109, 110])])
-def test_the_encounter_has_a_panel_for_each_mutual_range(name: str, ticks: list[int], records: Path) -> None:
-    told = pair(recorded(name, records))
+def test_the_encounter_has_a_panel_for_each_mutual_range(
+    name: str, ticks: list[int], recordings: Path
+) -> None:
+    told = pair(recorded(name, recordings))
     assert steps.steps(told) == ticks
     figure = drawn(steps.draw(told))
     assert len(figure.axes) == 3
@@ -253,8 +259,8 @@ def test_the_key_of_an_encounter_is_on_the_paper_however_few_ranges_it_has(
         assert signs.y1 <= panel.y0
 
 
-def test_the_trajectory_has_both_paths_the_ranges_and_the_orbits(records: Path) -> None:
-    told = pair(recorded("paper-1", records))
+def test_the_trajectory_has_both_paths_the_ranges_and_the_orbits(recordings: Path) -> None:
+    told = pair(recorded("paper-1", recordings))
     figure = drawn(trajectory.draw(told))
     arrows = [one for one in figure.findobj(Annotation) if isinstance(one, Annotation)]
     for role in ("a", "b"):
@@ -270,8 +276,8 @@ def test_the_trajectory_has_both_paths_the_ranges_and_the_orbits(records: Path) 
     assert axes.get_aspect() == 1.0
 
 
-def test_ranges_are_those_that_were_measured_and_contact_is_shaded(records: Path) -> None:
-    told = pair(recorded("paper-2", records))
+def test_ranges_are_those_that_were_measured_and_contact_is_shaded(recordings: Path) -> None:
+    told = pair(recorded("paper-2", recordings))
     figure = over_time.ranges(told)
     assert line(figure, "mutual-range") == [
         (k, rho) for k, (_, rho) in enumerate(told.mutual) if rho is not None
@@ -284,12 +290,12 @@ def test_ranges_are_those_that_were_measured_and_contact_is_shaded(records: Path
 
 
 @pytest.mark.parametrize("name", ["paper-1", "noisy"])
-def test_the_last_error_is_that_of_the_claim(name: str, records: Path) -> None:
-    told = pair(recorded(name, records))
-    assert told.record is not None
+def test_the_last_error_is_that_of_the_claim(name: str, recordings: Path) -> None:
+    told = pair(recorded(name, recordings))
+    assert told.recording is not None
     figure = drawn(over_time.errors(told))
     for place, role in enumerate("ab"):
-        claim = first_claim(told.record, place)
+        claim = first_claim(told.recording, place)
         assert claim is not None
         for what, error in (("position", claim.position_error), ("heading", claim.heading_error)):
             tick, value = line(figure, f"{what}-{role}")[-1]
@@ -305,9 +311,9 @@ def test_the_last_error_is_that_of_the_claim(name: str, records: Path) -> None:
 
 
 def test_in_grey_no_line_of_errors_looks_like_one_of_the_other_robot_or_of_something_else(
-    records: Path,
+    recordings: Path,
 ) -> None:
-    figure = drawn(over_time.errors(pair(recorded("noisy", records))))
+    figure = drawn(over_time.errors(pair(recorded("noisy", recordings))))
     dashes: dict[str, Any] = {}
     for gid in (f"position-{what}{role}" for what in ("", "alone-", "sigma-") for role in "ab"):
         (one,) = found(figure, gid)[:1]
@@ -315,8 +321,8 @@ def test_in_grey_no_line_of_errors_looks_like_one_of_the_other_robot_or_of_somet
     assert len(set(dashes.values())) == len(dashes) == 6
 
 
-def test_under_noise_a_panel_has_each_hypothesis_that_the_journal_tells_of(records: Path) -> None:
-    folder = recorded("noisy", records)
+def test_under_noise_a_panel_has_each_hypothesis_that_the_journal_tells_of(recordings: Path) -> None:
+    folder = recorded("noisy", recordings)
     told = pair(folder)
     figure = drawn(decisions.draw(told))
     shown = {int(one.get_gid().split("-")[1]) for one in found(figure, r"truth-.*")}  # type: ignore[union-attr]
@@ -338,8 +344,8 @@ def test_under_noise_a_panel_has_each_hypothesis_that_the_journal_tells_of(recor
                 assert line(figure, f"chosen-{tick}-{role}") == [(goal.x, goal.y)]
 
 
-def test_the_letters_plan_under_noise_is_drawn_in_bs_own_frame(records: Path) -> None:
-    told = pair(recorded("letter", records))
+def test_the_letters_plan_under_noise_is_drawn_in_bs_own_frame(recordings: Path) -> None:
+    told = pair(recorded("letter", recordings))
     ((_, plan),) = manoeuvre.planned(told, "b")
     (figure,) = [drawn(one) for one in manoeuvre.draw(told).values()]
     assert len(found(figure, r"candidate-\d+")) == len(plan.question.candidates)
@@ -353,9 +359,9 @@ ABSENT = {"undecided": {"phase-1-a", "plan-a-b", "encounter-a-b"}}
 
 @pytest.mark.parametrize("name", ["assured", "faulty", "noisy", "letter", "undecided"])
 def test_each_kind_is_drawn_of_each_run_or_says_why_not(
-    name: str, records: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    name: str, recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told = pair(recorded(name, records))
+    told = pair(recorded(name, recordings))
     kinds = [kind for kind in PICTURES if kind != "robot"]
     done: list[None] = []
     draw_all(told, kinds, ["svg"], tmp_path, lambda: done.append(None), torn=False)
@@ -371,8 +377,8 @@ def test_each_kind_is_drawn_of_each_run_or_says_why_not(
     assert sorted(out.splitlines()) == sorted(map(str, tmp_path.iterdir()))
 
 
-def test_every_pair_has_figures_of_its_own(records: Path) -> None:
-    folder = recorded("pairs", records)
+def test_every_pair_has_figures_of_its_own(recordings: Path) -> None:
+    folder = recorded("pairs", recordings)
     names = []
     with look(symbols=True):
         for number in range(2):
@@ -382,8 +388,8 @@ def test_every_pair_has_figures_of_its_own(records: Path) -> None:
 
 
 @pytest.mark.parametrize("ticks", [0, 1, 30, 47])
-def test_a_torn_record_is_drawn_to_the_tear(ticks: int, records: Path, tmp_path: Path) -> None:
-    folder = copied(recorded("paper-1", records), tmp_path)
+def test_a_torn_record_is_drawn_to_the_tear(ticks: int, recordings: Path, tmp_path: Path) -> None:
+    folder = copied(recorded("paper-1", recordings), tmp_path)
     cut(folder / "world.journal", 2 + 2 * ticks)
     cut(folder / "agent-b.journal", 2 + 3 * min(ticks, 20))
     told = pair(folder)
@@ -399,9 +405,9 @@ def test_a_torn_record_is_drawn_to_the_tear(ticks: int, records: Path, tmp_path:
 
 
 def test_a_journal_of_another_version_is_followed_to_where_it_decides_otherwise(
-    records: Path, tmp_path: Path
+    recordings: Path, tmp_path: Path
 ) -> None:
-    folder = copied(recorded("paper-1", records), tmp_path)
+    folder = copied(recorded("paper-1", recordings), tmp_path)
     path = folder / "agent-b.journal"
     path.write_bytes(b"".join([msgpack.packb(_turned(frame, 20)) for frame in frames(path)]))
     assert len(pair(folder).states("b")) == 20
@@ -414,11 +420,11 @@ def test_a_journal_of_another_version_is_followed_to_where_it_decides_otherwise(
     )
 
 
-def test_no_plan_is_said_to_be_none_where_only_a_journal_is_missing(records: Path, tmp_path: Path) -> None:
+def test_no_plan_is_said_to_be_none_where_only_a_journal_is_missing(recordings: Path, tmp_path: Path) -> None:
     for name, whole in (("paper-1", "no last manoeuvre was planned"), ("noisy", "they never weighed")):
         folder = tmp_path / name
         folder.mkdir()
-        copied(recorded(name, records), folder)
+        copied(recorded(name, recordings), folder)
         (folder / "agent-b.journal").unlink()
         cut(folder / "agent-a.journal", 4)
         ended = tandem("figures", folder, "--only", "plan", "--format", "svg")
@@ -439,8 +445,8 @@ def _turned(frame: bytes, tick: int) -> bytes:
 
 
 @pytest.mark.long
-def test_the_same_record_gives_the_same_bytes_in_each_format(records: Path, tmp_path: Path) -> None:
-    folder = copied(recorded("paper-1", records), tmp_path)
+def test_the_same_record_gives_the_same_bytes_in_each_format(recordings: Path, tmp_path: Path) -> None:
+    folder = copied(recorded("paper-1", recordings), tmp_path)
     runs: list[dict[str, bytes]] = []
     for _ in range(2):
         ended = tandem("figures", folder, "--only", "plan", "--only", "robot")
@@ -462,11 +468,11 @@ def test_the_same_record_gives_the_same_bytes_in_each_format(records: Path, tmp_
 
 
 def test_a_terminal_shows_how_far_it_is_and_each_file_on_a_line_of_its_own(
-    records: Path, tmp_path: Path
+    recordings: Path, tmp_path: Path
 ) -> None:
     folder = tmp_path / f"{'long' * 20}"
     folder.mkdir()
-    copied(recorded("undecided", records), folder)
+    copied(recorded("undecided", recordings), folder)
     status, shown = on_a_terminal(
         "figures", folder, "--only", "ranges", "--only", "errors", "--format", "svg"
     )

@@ -112,7 +112,7 @@ def test_the_paper_is_never_wrong_either() -> None:
     for trial in range(60):
         table = trial_table(ANYWHERE, CELL, trial)
         try:
-            setting = validate({**table, "planner": {"variant": "paper"}}, "anywhere")
+            setting = validate({**table, "planner": {"name": "paper"}}, "anywhere")
         except Unworkable:
             continue
         if setting.scenario.max_ticks < 3000:

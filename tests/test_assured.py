@@ -22,7 +22,7 @@ from agent.planning.phase3_last_manoeuvre import SPEEDS, TURN_RATES, LastManoeuv
 from agent.planning.precision import apart, drift
 from agent.planning.state import RobotState
 from compose.launch.in_process import play
-from compose.recording.run import Record, TickRecord
+from compose.recording.run import Recording, TickRecord
 from compose.scenario.scenario_file import parse
 from protocol.messages import Localised
 from protocol.mission import Mission, infeasibility
@@ -60,7 +60,7 @@ def text_of(
     b: Pose | None = None,
     *,
     seed: int = 0,
-    variant: str = "assured",
+    planner_name: str = "assured",
     frame: Pose = ORIGIN,
     max_ticks: int | None = None,
 ) -> str:
@@ -75,7 +75,7 @@ def text_of(
         return text + f"start = [{there.x!r}, {there.y!r}, {there.heading!r}]\n"
 
     return (
-        f'name = "assured"\nseed = {seed}\nplanner = {{variant = "{variant}"}}\n'
+        f'name = "assured"\nseed = {seed}\nplanner = {{name = "{planner_name}"}}\n'
         + (f"max_ticks = {max_ticks}\n" if max_ticks is not None else "")
         + f"[mission]\nsensing_range = {setting.reach!r}\nperiod = {setting.period!r}\n"
         + f"max_speed = {setting.speed!r}\nmax_turn_rate = {setting.turn_rate!r}\n"
@@ -85,12 +85,12 @@ def text_of(
 
 
 @cache
-def drawn(setting: Setting, seed: int, variant: str = "assured") -> Record:
+def drawn(setting: Setting, seed: int, planner_name: str = "assured") -> Recording:
     """The mission with starts drawn from `seed`."""
-    return play(parse(text_of(setting, seed=seed, variant=variant), "assured"))
+    return play(parse(text_of(setting, seed=seed, planner_name=planner_name), "assured"))
 
 
-def released(setting: Setting, a: Pose | None, b: Pose | None, frame: Pose = ORIGIN) -> Record:
+def released(setting: Setting, a: Pose | None, b: Pose | None, frame: Pose = ORIGIN) -> Recording:
     """The mission with these starts; one that is left out is drawn."""
     return play(parse(text_of(setting, a, b, seed=11, frame=frame), "assured"))
 
@@ -102,36 +102,36 @@ def steps_of(folder: Path, setting: Setting, seed: int) -> Iterator[Step]:
     return steps(str(path))
 
 
-def assert_localised(record: Record) -> None:
-    starts = [robot.start for robot in record.scenario.robots]
-    assert record.end is not None
-    assert record.end.outcome == "localised", (record.end, starts)
-    last = record.moments[-1]
-    for robot, truth in zip(record.scenario.robots, last.truth.poses, strict=True):
+def assert_localised(recording: Recording) -> None:
+    starts = [robot.start for robot in recording.scenario.robots]
+    assert recording.end is not None
+    assert recording.end.outcome == "localised", (recording.end, starts)
+    last = recording.moments[-1]
+    for robot, truth in zip(recording.scenario.robots, last.truth.poses, strict=True):
         verdict = last.commands[robot.id].verdict
         assert isinstance(verdict, Localised)
         assert max(errors(verdict.pose, truth)) < 1e-6, starts
 
 
-def in_contact(record: Record, moment: TickRecord) -> bool:
+def in_contact(recording: Recording, moment: TickRecord) -> bool:
     a, b = moment.truth.local
-    return math.hypot(a.x - b.x, a.y - b.y) <= record.scenario.mission.sensing_range
+    return math.hypot(a.x - b.x, a.y - b.y) <= recording.scenario.mission.sensing_range
 
 
-def met(record: Record) -> int:
+def met(recording: Recording) -> int:
     """The tick in which phase 3 begins."""
-    return next(m.truth.tick for m in record.moments if any(d.phase == 3 for d in m.commands.values()))
+    return next(m.truth.tick for m in recording.moments if any(d.phase == 3 for d in m.commands.values()))
 
 
-def claimed(record: Record) -> int:
+def claimed(recording: Recording) -> int:
     """The tick of the first claim."""
-    return next(m.truth.tick for m in record.moments if any(d.verdict for d in m.commands.values()))
+    return next(m.truth.tick for m in recording.moments if any(d.verdict for d in m.commands.values()))
 
 
-def states(record: Record, robot: str) -> list[tuple[int, str]]:
+def states(recording: Recording, robot: str) -> list[tuple[int, str]]:
     """Phase and state of `robot`, one after the other."""
     found: list[tuple[int, str]] = []
-    for moment in record.moments:
+    for moment in recording.moments:
         command = moment.commands[robot]
         if not found or found[-1] != (command.phase, command.state):
             found.append((command.phase, command.state))
@@ -141,10 +141,12 @@ def states(record: Record, robot: str) -> list[tuple[int, str]]:
 # --- phase 3 begins as soon as it can -----------------------------------------------------------------
 
 
-def off_anchor(record: Record, moment: TickRecord) -> bool:
+def off_anchor(recording: Recording, moment: TickRecord) -> bool:
     """Whether b is at least half way to where it waits, R / 8 from its anchor."""
-    anchor, place = record.scenario.robots[1].anchor, moment.truth.local[1]
-    return math.hypot(place.x - anchor.x, place.y - anchor.y) >= record.scenario.mission.sensing_range / 16.0
+    anchor, place = recording.scenario.robots[1].anchor, moment.truth.local[1]
+    return (
+        math.hypot(place.x - anchor.x, place.y - anchor.y) >= recording.scenario.mission.sensing_range / 16.0
+    )
 
 
 @pytest.mark.parametrize(
@@ -156,17 +158,17 @@ def test_phase_3_begins_in_the_first_tick_of_contact_in_which_both_know_their_an
     """Whether they are in orbit or not: at least `on_the_way` of 60 are not."""
     before_orbit = 0
     for seed in range(60):
-        record = drawn(setting, seed)
+        recording = drawn(setting, seed)
         first = next(
             moment
-            for moment in record.moments
-            if in_contact(record, moment)
+            for moment in recording.moments
+            if in_contact(recording, moment)
             and all(command.phase > 1 for command in moment.commands.values())
-            and off_anchor(record, moment)
+            and off_anchor(recording, moment)
         )
-        assert met(record) == first.truth.tick, seed
+        assert met(recording) == first.truth.tick, seed
         assert [command.phase for command in first.commands.values()] == [3, 3], seed
-        last = record.moments[first.truth.tick - 1]
+        last = recording.moments[first.truth.tick - 1]
         before_orbit += any(command.state != "orbiting" for command in last.commands.values())
     assert before_orbit >= on_the_way
 
@@ -175,11 +177,11 @@ def test_phase_3_begins_in_the_first_tick_of_contact_in_which_both_know_their_an
 def test_who_is_done_with_phase_1_stands_still_while_a_peer_in_range_is_not(setting: Setting) -> None:
     waited = 0
     for seed in range(100):
-        record = drawn(setting, seed)
-        for moment in record.moments:
+        recording = drawn(setting, seed)
+        for moment in recording.moments:
             for one, other in (("a", "b"), ("b", "a")):
                 command = moment.commands[one]
-                if in_contact(record, moment) and command.phase == 2 and moment.commands[other].phase == 1:
+                if in_contact(recording, moment) and command.phase == 2 and moment.commands[other].phase == 1:
                     assert (command.v, command.omega) == (0.0, 0.0), seed
                     waited += 1
     assert waited >= 8
@@ -187,27 +189,28 @@ def test_who_is_done_with_phase_1_stands_still_while_a_peer_in_range_is_not(sett
 
 def test_a_stands_still_while_b_in_range_drives_off_its_anchor() -> None:
     """On its anchor, b's ranges would not tell how it is turned."""
-    record = released(CLOSE._replace(speed=0.1), Pose(4.0, 0.5, 1.0), Pose(7.0, 0.0, 2.0))
+    recording = released(CLOSE._replace(speed=0.1), Pose(4.0, 0.5, 1.0), Pose(7.0, 0.0, 2.0))
     waited = [
         moment.commands["a"]
-        for moment in record.moments
-        if [moment.commands[robot].phase for robot in "ab"] == [2, 2] and not off_anchor(record, moment)
+        for moment in recording.moments
+        if [moment.commands[robot].phase for robot in "ab"] == [2, 2] and not off_anchor(recording, moment)
     ]
     assert len(waited) >= 3
     assert {(command.v, command.omega) for command in waited} == {(0.0, 0.0)}
-    assert off_anchor(record, record.moments[met(record)])
-    assert not off_anchor(record, record.moments[met(record) - 1])
-    assert_localised(record)
+    assert off_anchor(recording, recording.moments[met(recording)])
+    assert not off_anchor(recording, recording.moments[met(recording) - 1])
+    assert_localised(recording)
 
 
 @pytest.mark.parametrize("setting", [SECTION_IV, CLOSE, SECTION_IV._replace(distance=30.0), SLOW])
 def test_once_both_orbit_phase_3_begins_within_the_bound(setting: Setting) -> None:
     for seed in range(60):
-        record = drawn(setting, seed)
+        recording = drawn(setting, seed)
         orbits = sum(
-            all(command.state == "orbiting" for command in moment.commands.values()) for moment in record.moments
+            all(command.state == "orbiting" for command in moment.commands.values())
+            for moment in recording.moments
         )
-        bound = record.scenario.robots[0].rendezvous.bound
+        bound = recording.scenario.robots[0].rendezvous.bound
         assert orbits * setting.period <= bound + 1e-9, seed
 
 
@@ -233,9 +236,9 @@ def test_however_long_b_has_waited_the_first_report_tells_the_whole_way(
 # --- what was sensed before phase 3 counts ------------------------------------------------------------
 
 
-def encounter(record: Record) -> list[TickRecord]:
+def encounter(recording: Recording) -> list[TickRecord]:
     """The ticks from the beginning of phase 3 until b sets out on its last manoeuvre, or the claim."""
-    moments = record.moments[met(record) :]
+    moments = recording.moments[met(recording) :]
     end = next(
         i
         for i, moment in enumerate(moments)
@@ -248,11 +251,11 @@ def test_silence_before_phase_3_rules_placements_out() -> None:
     """Of missions in which there was none since."""
     fewer = 0
     for seed in range(150):
-        record = drawn(CLOSE, seed)
-        if all(in_contact(record, moment) for moment in encounter(record)):
-            candidates = record.final_reports["b"].candidates
+        recording = drawn(CLOSE, seed)
+        if all(in_contact(recording, moment) for moment in encounter(recording)):
+            candidates = recording.final_reports["b"].candidates
             assert candidates is not None
-            assert candidates == record.final_reports["a"].candidates
+            assert candidates == recording.final_reports["a"].candidates
             fewer += candidates[1] < candidates[0]
     assert fewer >= 15
 
@@ -261,13 +264,13 @@ def test_ranges_before_phase_3_make_a_last_manoeuvre_needless() -> None:
     """Who has them claims after the two ranges that eq. (7) is made from."""
     spared = 0
     for seed in range(150):
-        record = drawn(CLOSE, seed)
-        ranged = [moment.truth.tick for moment in record.moments if in_contact(record, moment)]
-        since = [tick for tick in ranged if met(record) <= tick <= claimed(record)]
+        recording = drawn(CLOSE, seed)
+        ranged = [moment.truth.tick for moment in recording.moments if in_contact(recording, moment)]
+        since = [tick for tick in ranged if met(recording) <= tick <= claimed(recording)]
         if len(since) < 3:
             assert len(since) == 2
-            assert len([tick for tick in ranged if tick <= claimed(record)]) >= 3
-            assert all(moment.commands["b"].state != "last-manoeuvre" for moment in record.moments)
+            assert len([tick for tick in ranged if tick <= claimed(recording)]) >= 3
+            assert all(moment.commands["b"].state != "last-manoeuvre" for moment in recording.moments)
             spared += 1
     assert spared >= 15
 
@@ -301,35 +304,35 @@ def places(moment: TickRecord) -> tuple[float, ...]:
 def test_nobody_claims_before_ranges_from_three_different_places(setting: Setting) -> None:
     single = 0
     for seed in range(100):
-        record = drawn(setting, seed)
-        assert_localised(record)
+        recording = drawn(setting, seed)
+        assert_localised(recording)
         different: list[tuple[float, ...]] = []
-        for moment in record.moments[: claimed(record) + 1]:
+        for moment in recording.moments[: claimed(recording) + 1]:
             here = places(moment)
-            if in_contact(record, moment) and all(math.dist(here, there) > 1e-6 for there in different):
+            if in_contact(recording, moment) and all(math.dist(here, there) > 1e-6 for there in different):
                 different.append(here)
         assert len(different) >= 3, seed
-        single += record.final_reports["b"].candidates in {(2, 1), (4, 1), (1, 1)}
+        single += recording.final_reports["b"].candidates in {(2, 1), (4, 1), (1, 1)}
     assert single >= 5 or setting != CLOSE
 
 
 # --- a second range: straight ahead, straight behind, round a circle ----------------------------------
 
 
-def sought(record: Record, robot: str, phase: int) -> list[str]:
+def sought(recording: Recording, robot: str, phase: int) -> list[str]:
     """What `robot` did in `phase` to get a second range."""
     words = ("straight", "backing", "turning", "circling")
-    return [word for of, word in states(record, robot) if of == phase and word in words]
+    return [word for of, word in states(recording, robot) if of == phase and word in words]
 
 
 @pytest.mark.parametrize("setting", [SECTION_IV, SLOW, WIDE, SHORTENED])
 def test_who_leaves_the_range_straight_ahead_looks_behind_before_it_circles(setting: Setting) -> None:
     ways = set()
     for seed in range(100):
-        record = drawn(setting, seed)
+        recording = drawn(setting, seed)
         for robot, phase in (("a", 1), ("b", 1), ("a", 3)):
-            ways.add((phase, *sought(record, robot, phase)))
-        for moment in record.moments:
+            ways.add((phase, *sought(recording, robot, phase)))
+        for moment in recording.moments:
             for command in moment.commands.values():
                 assert command.state != "backing" or (command.v < 0.0 and command.omega == 0.0)
     whole = ("straight", "backing", "turning", "circling")
@@ -341,13 +344,15 @@ def test_who_leaves_the_range_straight_ahead_looks_behind_before_it_circles(sett
 
 def test_the_letter_never_looks_behind() -> None:
     for seed in range(100):
-        record = drawn(SECTION_IV, seed, "paper")
-        assert all(command.state != "backing" for moment in record.moments for command in moment.commands.values())
+        recording = drawn(SECTION_IV, seed, "paper")
+        assert all(
+            command.state != "backing" for moment in recording.moments for command in moment.commands.values()
+        )
 
 
-def known(record: Record, robot: str) -> int:
+def known(recording: Recording, robot: str) -> int:
     """The tick at which phase 1 ends."""
-    return next(moment.truth.tick for moment in record.moments if moment.commands[robot].phase > 1)
+    return next(moment.truth.tick for moment in recording.moments if moment.commands[robot].phase > 1)
 
 
 @pytest.mark.parametrize("reach", [1.0, 3.0, 5.0])
@@ -445,7 +450,9 @@ def sighted(placement: Placement, a: Pose, b: Pose) -> PairObservation:
     return PairObservation(0, a, b, math.hypot(there.x - b.x, there.y - b.y))
 
 
-def ranges_of(distance: float, phi: float, psi: float, pair_observations: list[PairObservation]) -> list[float]:
+def ranges_of(
+    distance: float, phi: float, psi: float, pair_observations: list[PairObservation]
+) -> list[float]:
     """m: as predicted where M1 lies in the direction psi of M2, and <a(M1)> is turned by phi."""
     placement = Placement(phi, distance * math.cos(psi), distance * math.sin(psi))
     found = [sighted(placement, one.a, one.b).range for one in pair_observations if one.range is not None]

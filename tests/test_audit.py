@@ -71,7 +71,7 @@ noise.drop_outs = 0.1
 noise.actuation = {{v = 0.01, omega = 0.01, v_floor = 1e-4, omega_floor = 1e-4}}
 noise.odometry = {{v = 0.01, omega = 0.01, v_floor = 1e-4, omega_floor = 1e-4}}
 [planner]
-variant = "VARIANT"
+name = "VARIANT"
 [[robot]]
 id = "a"
 anchor = [0.0, 0.0]
@@ -84,8 +84,8 @@ LAST = 48
 A, B = agent_journal("a"), agent_journal("b")
 
 
-def noise(seed: int, variant: str) -> Scenario:
-    return parse(NOISE.replace("SEED", str(seed)).replace("VARIANT", variant), "noise")
+def noise(seed: int, planner_name: str) -> Scenario:
+    return parse(NOISE.replace("SEED", str(seed)).replace("VARIANT", planner_name), "noise")
 
 
 def kept(scenario: Scenario) -> dict[str, list[bytes]]:
@@ -516,7 +516,9 @@ def test_a_late_report_from_out_of_contact_is_found(folder: Path) -> None:
         folder / B,
         (
             of(Observation, 46),
-            lambda observation: replace(observation, contacts=(Contact("a", observation.contacts[0].range, (46, 45)),)),
+            lambda observation: replace(
+                observation, contacts=(Contact("a", observation.contacts[0].range, (46, 45)),)
+            ),
         ),
         (of(Report, 46, "a"), lambda report: [report, late]),
     )
@@ -700,17 +702,17 @@ def test_ranges_taken_twice_in_the_same_place_are_not_redundant(folder: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("variant", "says"),
+    ("planner_name", "says"),
     [
         ("assured", "mutual ranges, expected 12 at the least"),
         ("paper", "ranges, expected 12 at the least"),
     ],
 )
-def test_a_claim_by_too_few_noisy_ranges_is_found(variant: str, says: str, tmp_path: Path) -> None:
-    in_process.play(noise(1, variant), tmp_path)
-    record = read(tmp_path)
+def test_a_claim_by_too_few_noisy_ranges_is_found(planner_name: str, says: str, tmp_path: Path) -> None:
+    in_process.play(noise(1, planner_name), tmp_path)
+    recording = read(tmp_path)
     first = next(one.tick for one in messages(tmp_path / A) if isinstance(one, Observation) and one.contacts)
-    pose = record.moments[first].truth.poses[0]
+    pose = recording.moments[first].truth.poses[0]
     sure = Covariance(1e-6, 0.0, 0.0, 1e-6, 0.0, 1e-6)
     for name in (A, WORLD_JOURNAL):
         plant(tmp_path / name, (of(Command, first, "a"), claims(pose, sure)))

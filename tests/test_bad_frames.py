@@ -283,7 +283,13 @@ def test_a_robot_refuses_what_is_out_of_step_and_hears_a_repeated_report_once(tm
             play(0, told(0), told(0), told(0, robot="a"), told(0, robot="c"), told(0, state="otherwise"))
             play(1, told(1), told(2, state="too early"), told(0), told(0))
             play(2, told(2, state="as it is"), told(900), told(0, heard=1))
-            for odd in (observation(0), observation(1), observation(4), observation(900), MissionEnd(1, "failed", None)):
+            for odd in (
+                observation(0),
+                observation(1),
+                observation(4),
+                observation(900),
+                MissionEnd(1, "failed", None),
+            ):
                 world_says.put(encode(odd))
             world_says.put(encode(replace(observation(2), anchor_range=1.0)))
             world_says.put(encode(MissionEnd(900, "localised", None)))

@@ -64,7 +64,7 @@ def test_a_file_that_is_not_toml_is_refused(text: bytes, says: str, tmp_path: Pa
         ("seed = 1", "sede = 1", "unknown field 'sede'"),
         ("[planner]", "[planer]", "unknown field 'planer'"),
         ("period =", "peroid =", "mission: unknown field 'peroid'"),
-        ("variant =", "varaint =", "planner: unknown field 'varaint'"),
+        ('name = "paper"', 'nmae = "paper"', "planner: unknown field 'nmae'"),
         ("start = [11", "statr = [11", "robot[1]: unknown field 'statr'"),
         ("seed = 1", '"two\\nlines" = 1', "unknown field 'two"),
     ],
@@ -76,8 +76,12 @@ def test_an_unknown_field_is_named(was: str, typo: str, field: str, tmp_path: Pa
 @pytest.mark.parametrize(
     ("was", "new", "says"),
     [
-        ('"paper"', '"papers"', "planner.variant: there is no 'papers'; there are assured, paper"),
-        ('id = "a"', 'id = "a"\nlie = {kind = "scal", size = 2}', "robot[0].attack.kind: there is no 'scal'; "),
+        ('"paper"', '"papers"', "planner.name: there is no 'papers'; there are assured, paper"),
+        (
+            'id = "a"',
+            'id = "a"\nlie = {kind = "scal", size = 2}',
+            "robot[0].attack.kind: there is no 'scal'; ",
+        ),
         (
             'id = "a"',
             'id = "a"\nlie = {kind = "radius", size = 0.1, part = "orbit"}',
@@ -132,7 +136,7 @@ def test_what_must_be_a_positive_quantity_is(line: str, value: str, tmp_path: Pa
         *((GOOD.split('"')[1], v, "name: ") for v in ("", "a b", "a/b", "*", "é", "x" * 65, "x\\n")),
         *(('id = "a"', f'id = "{v}"', "robot[0].id: ") for v in ("", "a b", "a/b", "*", "x" * 33, "a\\n")),
         *(('id = "a"', f"id = {v}", "robot[0].id: ") for v in ("1", "[]")),
-        *(('"paper"', v, "planner.variant: ") for v in ('"Paper"', '""', "1", '"two\\nlines"')),
+        *(('"paper"', v, "planner.name: ") for v in ('"Paper"', '""', "1", '"two\\nlines"')),
         ("[0.0, 0.0]", "[0.0]", "robot[0].anchor: "),
         ("[0.0, 0.0]", "[0.0, nan]", "robot[0].anchor[1]: "),
         ("[0.0, 0.0]", "[1e300, 0.0]", "robot[0].anchor[0]: "),
@@ -157,12 +161,12 @@ def test_a_value_out_of_bounds_is_named(was: str, new: str, field: str, tmp_path
         ("anchor = [10.0", "anchor = [1e6", "manoeuvres of 1 m are too short for a pose to be sure"),
     ],
 )
-@pytest.mark.parametrize("variant", ["paper", "assured"])
+@pytest.mark.parametrize("planner_name", ["paper", "assured"])
 def test_a_setting_in_which_no_pose_could_be_sure_is_refused(
-    was: str, new: str, why: str, variant: str, tmp_path: Path
+    was: str, new: str, why: str, planner_name: str, tmp_path: Path
 ) -> None:
     text = changed(changed(GOOD, was, new), "start = [11.3, -0.4, 3.6]", "")
-    text = changed(text, '"paper"', f'"{variant}"')
+    text = changed(text, '"paper"', f'"{planner_name}"')
     refused_scenario(text, tmp_path, "mission: ")
     refused(tandem("run", "mine.toml", cwd=tmp_path), why)
 
@@ -363,7 +367,7 @@ def test_an_unknown_scenario_is_refused(
         (["run", "paper-1", "--port", "8080"], "--port: of the page, and there is none without --watch"),
         (["replay", ""], "'' is no folder"),
         *((["run", "paper-1", "--rate", v], "--rate: ") for v in ("0", "-1", "nan", "inf", "fast", "1e400")),
-        *((["run", "paper-1", "--patience", v], "--patience: ") for v in ("0", "-1", "nan", "inf", "x")),
+        *((["run", "paper-1", "--timeout", v], "--timeout: ") for v in ("0", "-1", "nan", "inf", "x")),
         *((["run", "paper-1", "--seed", v], "--seed: ") for v in ("-1", "1.5", "x", "nan", "²", str(2**63))),
         *((["agent", "a", *CONNECT, "--wait", v], "--wait: ") for v in ("0", "-1", "nan", "inf", "soon")),
         *((["agent", v, *CONNECT], "ID: ") for v in ("", "a/b", "*", "a\n", "x" * 65)),

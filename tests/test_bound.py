@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from agent.estimation.gaussian.odometry_noise import Array
 from compose.recording.cramer_rao import position_bounds
-from compose.recording.run import Record
+from compose.recording.run import Recording
 from compose.recording.summary_json import summary
 from protocol.motion import Controls, Pose, step
 from protocol.noise import Noise
@@ -22,29 +22,29 @@ PAIR = (0, 1)
 SEEDS = range(4, 9)
 
 
-def bounds(record: Record, tick: int | None = None) -> tuple[float, float]:
-    found = position_bounds(record, PAIR, record.moments[-1].truth.tick if tick is None else tick)
+def bounds(recording: Recording, tick: int | None = None) -> tuple[float, float]:
+    found = position_bounds(recording, PAIR, recording.moments[-1].truth.tick if tick is None else tick)
     assert found is not None
     return found
 
 
-def with_noise(record: Record, noise: Noise) -> Record:
+def with_noise(recording: Recording, noise: Noise) -> Recording:
     """The same trajectories, as if they had been driven with these sensors."""
-    scenario = record.scenario
-    return replace(record, scenario=replace(scenario, mission=replace(scenario.mission, noise=noise)))
+    scenario = recording.scenario
+    return replace(recording, scenario=replace(scenario, mission=replace(scenario.mission, noise=noise)))
 
 
-def ends_and_ranges(record: Record, starts: Sequence[float]) -> tuple[Array, Array]:
+def ends_and_ranges(recording: Recording, starts: Sequence[float]) -> tuple[Array, Array]:
     """x, y of a and b in the end, and every true range, had they started there and driven the same."""
-    scenario = record.scenario
+    scenario = recording.scenario
     poses = [[Pose(*starts[:3])], [Pose(*starts[3:])]]
-    for moment in record.moments[:-1]:
+    for moment in recording.moments[:-1]:
         for path, robot in zip(poses, scenario.robots, strict=True):
             asked = moment.commands[robot.id]
             done = executed(Controls(asked.v, asked.omega), scenario, robot.id, moment.truth.tick)
             path.append(step(path[-1], done.v, done.omega, scenario.mission.period))
     reach, ranges = scenario.mission.sensing_range, []
-    for moment, a, b in zip(record.moments, *poses, strict=True):
+    for moment, a, b in zip(recording.moments, *poses, strict=True):
         true = moment.truth.poses
         (m1, m2) = (robot.anchor for robot in scenario.robots)
         for seen, now in (
@@ -58,14 +58,16 @@ def ends_and_ranges(record: Record, starts: Sequence[float]) -> tuple[Array, Arr
     return np.array([a.x, a.y, b.x, b.y]), np.array(ranges)
 
 
-def by_differences(record: Record, sigma: float) -> tuple[float, float]:
+def by_differences(recording: Recording, sigma: float) -> tuple[float, float]:
     """The bound from the Fisher information of the six unknowns of the start, by finite differences."""
     starts = np.array(
-        [value for pose in record.moments[0].truth.poses for value in (pose.x, pose.y, pose.heading)]
+        [value for pose in recording.moments[0].truth.poses for value in (pose.x, pose.y, pose.heading)]
     )
     ends, ranges = [], []
     for i in range(6):
-        there = [ends_and_ranges(record, list(starts + sign * 1e-5 * np.eye(6)[i])) for sign in (1.0, -1.0)]
+        there = [
+            ends_and_ranges(recording, list(starts + sign * 1e-5 * np.eye(6)[i])) for sign in (1.0, -1.0)
+        ]
         ends.append((there[0][0] - there[1][0]) / 2e-5)
         ranges.append((there[0][1] - there[1][1]) / 2e-5)
     rows = np.array(ranges).T / sigma
@@ -77,35 +79,35 @@ def by_differences(record: Record, sigma: float) -> tuple[float, float]:
 
 def test_the_bound_is_that_of_the_fisher_information_of_all_ranges() -> None:
     for seed in SEEDS:
-        record = survey(SIGMA, seed)
-        assert bounds(record) == pytest.approx(by_differences(record, 0.1), rel=1e-3)
+        recording = survey(SIGMA, seed)
+        assert bounds(recording) == pytest.approx(by_differences(recording, 0.1), rel=1e-3)
 
 
 def test_the_bound_shrinks_as_sigma_does() -> None:
     for seed in SEEDS:
-        record = survey(SIGMA, seed)
-        at_first = bounds(record)
+        recording = survey(SIGMA, seed)
+        at_first = bounds(recording)
         for part in (0.5, 0.1, 0.01):
-            finer = with_noise(record, Noise(0.1 * part, 0.1 * part))
+            finer = with_noise(recording, Noise(0.1 * part, 0.1 * part))
             assert bounds(finer) == pytest.approx([part * one for one in at_first], rel=1e-3)
 
 
 def test_the_bound_grows_with_the_odometrys_noise() -> None:
-    record = survey(SIGMA, 4)
-    drifting = with_noise(record, survey(f"{SIGMA}\n{ODOMETRY}", 4).scenario.mission.noise)
-    assert all(one > other for one, other in zip(bounds(drifting), bounds(record), strict=True))
+    recording = survey(SIGMA, 4)
+    drifting = with_noise(recording, survey(f"{SIGMA}\n{ODOMETRY}", 4).scenario.mission.noise)
+    assert all(one > other for one, other in zip(bounds(drifting), bounds(recording), strict=True))
 
 
 @pytest.mark.parametrize("noise", [SIGMA, f"{SIGMA}\n{WHEELS}\n{ODOMETRY}"], ids=["ranges", "odometry"])
 def test_claims_are_as_wide_as_the_bound(noise: str) -> None:
     for seed in SEEDS:
-        record = survey(noise, seed)
-        robots = summary(record, "in-process", None)["robots"]
+        recording = survey(noise, seed)
+        robots = summary(recording, "in-process", None)["robots"]
         claimed = [robots[robot]["position_sigma_m"] for robot in ("a", "b")]
-        assert claimed == pytest.approx(bounds(record), rel=0.3), seed
+        assert claimed == pytest.approx(bounds(recording), rel=0.3), seed
 
 
 def test_there_is_none_for_exact_sensors_nor_for_outliers() -> None:
-    record = survey(SIGMA, 4)
+    recording = survey(SIGMA, 4)
     for noise in (Noise(), Noise(0.1, 0.1, outliers=0.05)):
-        assert position_bounds(with_noise(record, noise), PAIR, 10) is None
+        assert position_bounds(with_noise(recording, noise), PAIR, 10) is None

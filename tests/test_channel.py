@@ -14,7 +14,16 @@ from msgspec.structs import replace
 
 from tests.test_noise import Z, has_share
 from world.channel import LinkState, carried, of_plan
-from world.faults import LATEST, MAX_DELAY, MAX_FAULTS, UNLUCKY, Fault, LinkSelector, Window, delivery_time_bound
+from world.faults import (
+    LATEST,
+    MAX_DELAY,
+    MAX_FAULTS,
+    UNLUCKY,
+    Fault,
+    LinkSelector,
+    Window,
+    delivery_time_bound,
+)
 
 N = 10_000
 """ticks, where a statistic is looked at"""

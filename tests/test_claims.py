@@ -17,7 +17,7 @@ from scipy.stats import chi2  # type: ignore[import-untyped]
 
 from compose.launch.in_process import play
 from compose.recording.claim import matrix, nees
-from compose.recording.run import Record, TickRecord
+from compose.recording.run import Recording, TickRecord
 from compose.recording.summary_json import leave, summary
 from compose.scenario.scenario_file import load, parse
 from compose.sweep import execution, report, spec, trial
@@ -64,7 +64,7 @@ def off(pose: Pose, by: float) -> Pose:
     return Pose(pose.x + by, pose.y, pose.heading)
 
 
-def claimed(text: str, covariance: Covariance | None, *, by: float = 0.03) -> Record:
+def claimed(text: str, covariance: Covariance | None, *, by: float = 0.03) -> Recording:
     """Robot a claims at once, `by` so many metres off; b never does, and time is up a tick later."""
     scenario = parse("max_ticks = 1\n" + text, "noisy")
     world = release(scenario)
@@ -77,7 +77,7 @@ def claimed(text: str, covariance: Covariance | None, *, by: float = 0.03) -> Re
     judgement = advance(onward, {})
     assert isinstance(judgement, Judgement)
     end = MissionEnd(1, judgement.outcome, judgement.reason)
-    return Record(scenario, (TickRecord(world.truth, first), TickRecord(onward.truth, {})), end, {})
+    return Recording(scenario, (TickRecord(world.truth, first), TickRecord(onward.truth, {})), end, {})
 
 
 # --- NEES ---------------------------------------------------------------------------------------------
@@ -124,8 +124,8 @@ def test_nees_of_a_singular_covariance_counts_no_sigma_below_a_micrometre() -> N
 # --- summary.json -------------------------------------------------------------------------------------
 
 
-def robots(record: Record, folder: Path) -> dict[str, dict[str, Any]]:
-    leave(record, summary(record, "in-process", 0.5), folder)
+def robots(recording: Recording, folder: Path) -> dict[str, dict[str, Any]]:
+    leave(recording, summary(recording, "in-process", 0.5), folder)
     told: dict[str, dict[str, Any]] = json.loads((folder / "summary.json").read_text())["robots"]
     return told
 
@@ -145,9 +145,9 @@ def test_summary_says_what_was_claimed_and_what_it_was_worth(tmp_path: Path) -> 
 
 
 def test_an_error_is_that_of_the_tick_of_the_claim(tmp_path: Path) -> None:
-    record = claimed(NOISY, SURE)
-    told = robots(record, tmp_path)["a"]
-    last = record.moments[-1].truth.poses[0]
+    recording = claimed(NOISY, SURE)
+    told = robots(recording, tmp_path)["a"]
+    last = recording.moments[-1].truth.poses[0]
     assert told["truth"][:2] == [last.x, last.y]
     assert abs(math.dist(told["estimate"][:2], told["truth"][:2]) - told["position_error_m"]) > 1e-3
 
@@ -176,25 +176,28 @@ HONEST = ["cov_xx", "cov_xy", "cov_xh", "cov_yy", "cov_yh", "cov_hh"]
 SWEEP = 'name = "noisy"\nscenario = "noisy.toml"\ntrials = 3\n'
 
 
-def row_of(record: Record, number: int = 0) -> trial.TrialRow:
-    return trial.row(trial.Trial(0, number, record.scenario, processes=False), record, 0.5)
+def row_of(recording: Recording, number: int = 0) -> trial.TrialRow:
+    return trial.row(trial.Trial(0, number, recording.scenario, processes=False), recording, 0.5)
 
 
 def final_report(robot: str, hypotheses: int, probability: float) -> FinalReport:
     counts = (3, 4, 0, 0, 0, 0, 600)
-    return FinalReport(robot, 5, 3, "circle", -2.5, (4, 2), 0.5, 1.5, hypotheses, probability, None, None, *counts)
+    return FinalReport(
+        robot, 5, 3, "circle", -2.5, (4, 2), 0.5, 1.5, hypotheses, probability, None, None, *counts
+    )
 
 
 def test_a_row_has_what_each_robot_claimed() -> None:
-    record = replace(
-        claimed(NOISY, SURE), final_reports={"a": final_report("a", 1, 0.99995), "b": final_report("b", 3, 0.6)}
+    recording = replace(
+        claimed(NOISY, SURE),
+        final_reports={"a": final_report("a", 1, 0.99995), "b": final_report("b", 3, 0.6)},
     )
-    row = row_of(record)
+    row = row_of(recording)
     a, b = row.robots["a"], row.robots["b"]
     assert [getattr(a, name) for name in HONEST] == [0.0009, 0.0002, -0.0001, 0.0016, 0.0003, 0.0004]
     assert (a.hypotheses, a.probability, b.hypotheses, b.probability) == (1, 0.99995, 3, 0.6)
     assert a.position_sigma_m == pytest.approx(0.05)
-    assert a.nees == row.nees == pytest.approx(summary(record, "in-process", 0.5)["robots"]["a"]["nees"])
+    assert a.nees == row.nees == pytest.approx(summary(recording, "in-process", 0.5)["robots"]["a"]["nees"])
     assert [getattr(b, name) for name in (*HONEST, "nees", "position_sigma_m", "position_error_m")] == [
         None
     ] * 9
@@ -212,10 +215,10 @@ def results_of(rows: list[trial.TrialRow], folder: Path) -> execution.Results:
     """Of a campaign of one cell."""
     (folder / "noisy.toml").write_text(NOISY)
     (folder / "sweep.toml").write_text(SWEEP)
-    campaign = spec.load(str(folder / "sweep.toml"))
-    (cell,) = cells(campaign)
-    table = of_rows(rows, campaign, {0: cell}, schema_of(campaign, [cell]))
-    return execution.Results(campaign, (cell,), table, {0: counted(table)}, None, False, len(rows))
+    sweep = spec.load(str(folder / "sweep.toml"))
+    (cell,) = cells(sweep)
+    table = of_rows(rows, sweep, {0: cell}, schema_of(sweep, [cell]))
+    return execution.Results(sweep, (cell,), table, {0: counted(table)}, None, False, len(rows))
 
 
 def figures_of(rows: list[trial.TrialRow], folder: Path) -> CellSummary:
@@ -253,7 +256,9 @@ def test_a_trial_with_two_claims_counts_once_in_the_mean_nees() -> None:
         robot: claims(0, robot, off(pose, by), SURE)
         for robot, pose, by in zip("ab", poses, (0.01, 0.05), strict=True)
     }
-    row = row_of(Record(scenario, (TickRecord(world.truth, commands),), MissionEnd(0, "localised", None), {}))
+    row = row_of(
+        Recording(scenario, (TickRecord(world.truth, commands),), MissionEnd(0, "localised", None), {})
+    )
     each = [nees(off(pose, by), pose, SURE) for pose, by in zip(poses, (0.01, 0.05), strict=True)]
     assert row.claims == 2
     assert row.nees == pytest.approx(sum(each) / 2)
@@ -279,24 +284,24 @@ def test_the_table_of_a_campaign_gives_the_nees_where_covariances_are_claimed(
 PLAYED = play(load("paper-1"))
 
 
-def missing_at(record: Record, robot: str, ticks: Container[int]) -> Record:
+def missing_at(recording: Recording, robot: str, ticks: Container[int]) -> Recording:
     """The record without that robot's Commands of `ticks`, and without its FinalReport."""
     moments = [
         replace(one, commands={who: command for who, command in one.commands.items() if who != robot})
         if one.truth.tick in ticks
         else one
-        for one in record.moments
+        for one in recording.moments
     ]
-    final_reports = {who: said for who, said in record.final_reports.items() if who != robot}
-    return replace(record, moments=tuple(moments), final_reports=final_reports)
+    final_reports = {who: said for who, said in recording.final_reports.items() if who != robot}
+    return replace(recording, moments=tuple(moments), final_reports=final_reports)
 
 
 def test_the_end_says_how_many_deadlines_each_robot_missed_and_suggests_a_lower_rate(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    record = missing_at(missing_at(PLAYED, "a", range(3, 10)), "b", [5])
-    result(summary(record, "processes", 0.5), 40.0)
-    last = record.moments[-1].truth.tick
+    recording = missing_at(missing_at(PLAYED, "a", range(3, 10)), "b", [5])
+    result(summary(recording, "processes", 0.5), 40.0)
+    last = recording.moments[-1].truth.tick
     said = capsys.readouterr().out.splitlines()[-1]
     assert said == (
         f"deadlines missed, of {last}: a 7, b 1; a lower --rate, such as --rate 20, leaves more time for each"
@@ -312,12 +317,12 @@ def test_the_end_says_how_many_deadlines_each_robot_missed_and_suggests_a_lower_
     ],
 )
 def test_the_summary_says_why_a_robot_has_no_farewell(ticks: Container[int], why: str) -> None:
-    record = missing_at(PLAYED, "a", ticks)
-    told = summary(record, "processes", 0.5)["robots"]
-    assert told["a"]["no_farewell"] == why.replace("LAST", str(record.moments[-1].truth.tick))
+    recording = missing_at(PLAYED, "a", ticks)
+    told = summary(recording, "processes", 0.5)["robots"]
+    assert told["a"]["no_farewell"] == why.replace("LAST", str(recording.moments[-1].truth.tick))
     assert told["b"]["no_farewell"] is None
     assert told["a"]["reports_sent"] is None
-    cut = summary(replace(record, end=None), "processes", 0.5)["robots"]
+    cut = summary(replace(recording, end=None), "processes", 0.5)["robots"]
     assert cut["a"]["no_farewell"] == "the record breaks off"
 
 
@@ -339,8 +344,8 @@ def test_the_table_of_many_robots_fits_a_narrow_terminal_and_explains_only_its_c
         assert (column in heading) == (note in notes)
 
 
-def table(record: Record, capsys: pytest.CaptureFixture[str]) -> list[str]:
-    result(summary(record, "in-process", 0.5))
+def table(recording: Recording, capsys: pytest.CaptureFixture[str]) -> list[str]:
+    result(summary(recording, "in-process", 0.5))
     return capsys.readouterr().out.splitlines()
 
 

@@ -17,7 +17,7 @@ from msgspec.structs import replace
 
 from compose.launch import in_process
 from compose.launch.processes import ChildFailed
-from compose.recording.run import WORLD_JOURNAL, Record, agent_journal
+from compose.recording.run import WORLD_JOURNAL, Recording, agent_journal
 from compose.scenario.kills import POINTS, WORLD, KillTable, drawn
 from compose.scenario.scenario_file import BadScenario, load, parse, validate
 from compose.scenario.toml_file import table_in
@@ -88,12 +88,12 @@ def test_a_trial_that_leaves_another_record_has_failed_and_says_where(
 ) -> None:
     real = in_process.played
 
-    def otherwise(scenario: Scenario, sinks: dict[str, MemoryJournal]) -> Record:
-        record = real(scenario, sinks)
+    def otherwise(scenario: Scenario, sinks: dict[str, MemoryJournal]) -> Recording:
+        recording = real(scenario, sinks)
         if name == "ticks.csv":
-            return replace(record, moments=record.moments[:-1])
+            return replace(recording, moments=recording.moments[:-1])
         sinks[name].frames[-1] += b"!"
-        return record
+        return recording
 
     monkeypatch.setattr(in_process, "played", otherwise)
     found = play(Trial(0, 0, load("paper-1"), processes=False, kills=()))

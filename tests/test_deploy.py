@@ -67,15 +67,15 @@ def test_the_compose_file_is_valid_by_the_compose_specification(tmp_path: Path) 
 
 
 def test_every_service_has_a_command_that_there_is_and_a_record_of_its_own() -> None:
-    records = []
+    recordings = []
     for name, service in ours().items():
         options = parser().parse_args(service["command"])
         if options.command == "watch":
             continue
         assert options.out == Path("/journal")
         assert service["volumes"] == [f"{name}:/journal"]
-        records.append(name)
-    assert records == ["world", "agent-a", "agent-b"]
+        recordings.append(name)
+    assert recordings == ["world", "agent-a", "agent-b"]
 
 
 def test_who_connects_does_so_to_a_service_that_listens_on_that_port_in_the_same_network() -> None:
@@ -154,8 +154,10 @@ def test_the_services_commands_play_a_mission_though_one_is_killed_and_started_a
         playing = {name: stack.enter_context(TandemProcess(*line)) for name, line in commands.items()}
         for robot in ("a", "b"):
             playing[f"agent-{robot}"].until_answered(robot, tmp_path / f"agent-{robot}")
-        record = tmp_path / "world" / "world.journal"
-        playing["world"].until(lambda: len(list(journal_file.read(record))) >= 4, "three ticks are on record")
+        recording = tmp_path / "world" / "world.journal"
+        playing["world"].until(
+            lambda: len(list(journal_file.read(recording))) >= 4, "three ticks are on record"
+        )
         playing[killed].tell(SIGKILL)
         playing[killed] = stack.enter_context(TandemProcess(*commands[killed]))
         ended = {name: command.ended() for name, command in playing.items()}

@@ -94,7 +94,7 @@ def played(stage: Stage) -> Play:
     """
 
     def play(
-        driver: Recorded, answer: Answer, ticks: int = 5, patience: float = 60.0, after: float = 0.001
+        driver: Recorded, answer: Answer, ticks: int = 5, timeout: float = 60.0, after: float = 0.001
     ) -> tuple[Field, MissionEnd, list[MissionEnd]]:
         driver.clock = stage.monotonic
         ends: list[MissionEnd] = []
@@ -112,9 +112,7 @@ def played(stage: Stage) -> Play:
 
         stage.answer = said
         stage.alive("a", "b")
-        field = Field(
-            driver, BRIEFING, "r", stage, max_ticks=ticks, manoeuvre_s=MANOEUVRE_S, patience=patience
-        )
+        field = Field(driver, BRIEFING, "r", stage, max_ticks=ticks, manoeuvre_s=MANOEUVRE_S, timeout=timeout)
         field.attach(LINK)
         return field, field.play(10.0, lambda: None), ends
 
@@ -194,7 +192,7 @@ def test_a_driver_that_cannot_go_on_ends_the_mission_and_stands(
 
 
 def test_an_agent_that_never_answers_ends_the_mission_after_the_patience(played: Play) -> None:
-    _, end, _ = played(Recorded(), lambda _: [], ticks=1000, patience=1.0)
+    _, end, _ = played(Recorded(), lambda _: [], ticks=1000, timeout=1.0)
     assert end.outcome == "failed"
     assert end.reason is not None
     assert end.reason.startswith("no answer from a's agent for 1.")
@@ -206,7 +204,7 @@ def test_an_agent_that_only_appears_over_and_over_ends_the_mission_after_the_pat
     """One that dies at once is started again each time, and has answered nothing."""
     for second in range(1000):
         stage.comes("alive", keys.robot_alive("r", "a"), after=float(second))
-    _, end, _ = played(Recorded(), lambda _: [], ticks=1000, patience=3.0)
+    _, end, _ = played(Recorded(), lambda _: [], ticks=1000, timeout=3.0)
     assert end.outcome == "failed"
     assert end.reason is not None
     assert end.reason.startswith("no answer from a's agent for ")
@@ -221,10 +219,10 @@ def report(tick: int, heard: int, verdict: Verdict | None) -> Report:
 
 
 def ended(
-    own: Verdict | None, said: Report | None, patience: float = 60.0, ticks: int = 30
+    own: Verdict | None, said: Report | None, timeout: float = 60.0, ticks: int = 30
 ) -> MissionEnd | None:
     """The End of a mission in which a comes to `own` at tick 10, and hears `said` at tick 12."""
-    ending = Ending(BRIEFING, 25, patience)
+    ending = Ending(BRIEFING, 25, timeout)
     for tick in range(ticks):
         if tick == 12 and said is not None:
             ending.told(said)
@@ -261,7 +259,7 @@ def test_it_is_over_when_each_knows_that_the_other_knows(
 
 
 def test_it_is_over_when_the_peer_is_silent_for_too_long() -> None:
-    end = ended(LOCALISED, None, patience=-1.0)
+    end = ended(LOCALISED, None, timeout=-1.0)
     assert end is not None
     assert (end.tick, end.outcome) == (10, "undecided")
 
@@ -326,7 +324,9 @@ def test_a_robot_that_was_down_catches_up_with_its_peer_standing(robot: str, pee
             observation = decode(frame, Observation | MissionEnd | FinalReport)
             sent.extend([observation.tick] if isinstance(observation, Observation) else [])
             said = (
-                command(observation.tick, robot) if isinstance(observation, Observation) else replace(FAREWELL, robot=robot)
+                command(observation.tick, robot)
+                if isinstance(observation, Observation)
+                else replace(FAREWELL, robot=robot)
             )
             stage.comes("command", keys.command("r", robot), encode(said), 0.001)
 
@@ -404,7 +404,7 @@ def test_a_robot_whose_driver_takes_a_whole_tick_to_sense_hears_its_agent(stage:
 
     driver = Slow()
     driver.clock = stage.monotonic
-    field = Field(driver, BRIEFING, "r", stage, max_ticks=100, manoeuvre_s=MANOEUVRE_S, patience=1.0)
+    field = Field(driver, BRIEFING, "r", stage, max_ticks=100, manoeuvre_s=MANOEUVRE_S, timeout=1.0)
 
     def answer(key: str, frame: bytes) -> None:
         if key == keys.observation("r", "a"):

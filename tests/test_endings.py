@@ -41,7 +41,7 @@ AT_ONCE_S = 15.0
 """half the patience of 30 s: who ends within it was told to, or saw why, and did not wait for an answer"""
 SOON_S = 25.0
 """for what has a patience of PATIENCE seconds; less than the 30 s of who was not told of it"""
-PATIENCE = "5"
+TIMEOUT = "5"
 """s; longer than a busy machine takes to connect a process"""
 
 draw = Random(7).random
@@ -191,40 +191,40 @@ def test_a_process_that_dies_ends_the_run_at_once_and_is_named(
 
 def test_a_robot_that_falls_silent_fails_the_run_within_the_patience(endless: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    with TandemProcess("run", endless, "--out", out, "--patience", PATIENCE, "-q") as run:
+    with TandemProcess("run", endless, "--out", out, "--timeout", TIMEOUT, "-q") as run:
         run.until_written(out / "world.journal", 10_000)
         os.kill(process_of(out, "agent", "b"), SIGSTOP)
         ended = run.ended(SOON_S)
     assert ended.status != 0
     assert re.search(r"no answer from b( \(not there\))? at tick ", ended.out + ended.err)
-    assert f"for {PATIENCE} s" in ended.out + ended.err
+    assert f"for {TIMEOUT} s" in ended.out + ended.err
     assert not processes_of(out)
 
 
 def test_an_agent_whose_world_dies_ends_within_its_patience(tmp_path: Path) -> None:
     with world("paper-1", "--run", "mine") as (clock, endpoint):
-        patience = ("--patience", PATIENCE, "--out", tmp_path)
-        with TandemProcess("agent", "a", "--connect", endpoint, *patience) as agent:
+        timeout = ("--timeout", TIMEOUT, "--out", tmp_path)
+        with TandemProcess("agent", "a", "--connect", endpoint, *timeout) as agent:
             agent.until_answered("a", tmp_path)
             clock.tell(SIGKILL)
             ended = agent.ended(SOON_S)
     assert ended.status == 3
     assert ended.err.splitlines() == [
-        f"tandem agent a: the world has gone; waiting {PATIENCE} s for it",
-        f"tandem agent a: nothing heard from the world for {PATIENCE} s",
+        f"tandem agent a: the world has gone; waiting {TIMEOUT} s for it",
+        f"tandem agent a: nothing heard from the world for {TIMEOUT} s",
     ]
 
 
 @pytest.mark.parametrize("comes", ["nobody", "a"])
 def test_a_world_whose_robot_never_comes_fails_and_says_who_was_missing(comes: str, tmp_path: Path) -> None:
     missing = {"nobody": "a (not there), b (not there)", "a": "b (not there)"}[comes]
-    reason = f"no answer from {missing} at tick 0 for {PATIENCE} s"
+    reason = f"no answer from {missing} at tick 0 for {TIMEOUT} s"
     endpoint = free_endpoint()
     with ExitStack() as stack:
         if comes == "a":
             agent = stack.enter_context(TandemProcess("agent", "a", "--connect", endpoint))
             agent.until(lambda: agent.catches(SIGTERM), "it looks for its world")
-        arguments = ("--listen", endpoint, "--patience", PATIENCE, "--out", tmp_path)
+        arguments = ("--listen", endpoint, "--timeout", TIMEOUT, "--out", tmp_path)
         clock = stack.enter_context(TandemProcess("world", "paper-1", *arguments))
         ended = clock.ended(SOON_S)
         if comes == "a":

@@ -27,7 +27,7 @@ OLDER = "0.0.9"
 
 
 @pytest.fixture
-def record(tmp_path: Path) -> Path:
+def recording(tmp_path: Path) -> Path:
     in_process.play(load("paper-1"), tmp_path)
     return tmp_path
 
@@ -65,17 +65,17 @@ def turned(by: float) -> Callable[[Estimate], Estimate]:
     return turn
 
 
-def test_a_journals_first_frame_names_versions_and_instruction_set(record: Path) -> None:
+def test_a_journals_first_frame_names_versions_and_instruction_set(recording: Path) -> None:
     import numpy as np  # noqa: PLC0415
 
-    told = decode(next(journal_file.read(record / A)), Environment)
+    told = decode(next(journal_file.read(recording / A)), Environment)
     assert told.numpy is not None
     assert told.numpy.startswith(np.__version__)
     assert told.linear_algebra
     assert told.c_library
     assert told.instruction_set
     assert told == environment.of_robot()
-    world = decode(next(journal_file.read(record / WORLD)), Environment)
+    world = decode(next(journal_file.read(recording / WORLD)), Environment)
     assert world == replace(told, numpy=None, linear_algebra=None)
 
 
@@ -96,10 +96,10 @@ def test_a_robot_names_the_instructions_that_numpy_and_linear_algebra_really_use
 
 
 @pytest.mark.parametrize("command", ["replay", "audit"])
-def test_last_bits_under_other_versions_are_told_as_such(command: str, record: Path) -> None:
-    elsewhere(record / A)
-    changed(record / A, Estimate, turned(1e-13), first=20)
-    ended = tandem(command, record)
+def test_last_bits_under_other_versions_are_told_as_such(command: str, recording: Path) -> None:
+    elsewhere(recording / A)
+    changed(recording / A, Estimate, turned(1e-13), first=20)
+    ended = tandem(command, recording)
     assert ended.status == 0, ended
     assert f"recorded with tandem {OLDER}; here is tandem {environment.of_robot().tandem}" in ended.out
     assert "by rounding alone" in ended.out
@@ -107,36 +107,36 @@ def test_last_bits_under_other_versions_are_told_as_such(command: str, record: P
 
 
 @pytest.mark.parametrize("command", ["replay", "audit"])
-def test_last_bits_under_the_same_versions_are_a_difference(command: str, record: Path) -> None:
-    changed(record / A, Estimate, turned(1e-13), first=20)
-    ended = tandem(command, record)
+def test_last_bits_under_the_same_versions_are_a_difference(command: str, recording: Path) -> None:
+    changed(recording / A, Estimate, turned(1e-13), first=20)
+    ended = tandem(command, recording)
     assert ended.status == 1
     assert "rounding" not in ended.out
 
 
 @pytest.mark.parametrize("command", ["replay", "audit"])
-def test_more_than_last_bits_is_a_difference_whatever_the_versions(command: str, record: Path) -> None:
-    elsewhere(record / A)
-    changed(record / A, Estimate, turned(1e-3), first=20)
-    ended = tandem(command, record)
+def test_more_than_last_bits_is_a_difference_whatever_the_versions(command: str, recording: Path) -> None:
+    elsewhere(recording / A)
+    changed(recording / A, Estimate, turned(1e-3), first=20)
+    ended = tandem(command, recording)
     assert ended.status == 1
     assert f"recorded with tandem {OLDER}" in ended.out
     assert "can lead to other decisions" in ended.out
 
 
 @pytest.mark.parametrize("command", ["replay", "audit", "figures", "export"])
-def test_older_recordings_that_name_no_versions_are_read(command: str, record: Path) -> None:
+def test_older_recordings_that_name_no_versions_are_read(command: str, recording: Path) -> None:
     def read() -> Ended:
-        return tandem(command, record, *(["--only", "ranges"] if command == "figures" else []))
+        return tandem(command, recording, *(["--only", "ranges"] if command == "figures" else []))
 
-    for path in record.glob("*.journal"):
+    for path in recording.glob("*.journal"):
         changed(path, Environment, lambda _: None)
     ended = read()
     assert ended.status == 0, ended
 
 
-def test_a_robot_goes_on_elsewhere_where_it_decides_the_same_and_says_why_where_not(record: Path) -> None:
-    path = record / A
+def test_a_robot_goes_on_elsewhere_where_it_decides_the_same_and_says_why_where_not(recording: Path) -> None:
+    path = recording / A
     elsewhere(path)
     before = path.read_bytes()
     with closing(Retrace(path)) as retrace:

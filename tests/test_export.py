@@ -109,17 +109,17 @@ def on_disk(folder: Path) -> dict[str, bytes]:
 # --- run.mcap -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("record", ["paper_1", "faulty"])
+@pytest.mark.parametrize("recording", ["paper_1", "faulty"])
 def test_every_journaled_frame_is_there_and_the_journals_can_be_made_anew(
-    record: str, request: pytest.FixtureRequest
+    recording: str, request: pytest.FixtureRequest
 ) -> None:
-    folder: Path = request.getfixturevalue(record)
+    folder: Path = request.getfixturevalue(recording)
     assert journals_of(folder / "run.mcap") == on_disk(folder)
 
 
-@pytest.mark.parametrize("record", ["paper_1", "faulty"])
-def test_the_doctor_has_no_complaint(record: str, request: pytest.FixtureRequest) -> None:
-    assert complaints(request.getfixturevalue(record) / "run.mcap") == []
+@pytest.mark.parametrize("recording", ["paper_1", "faulty"])
+def test_the_doctor_has_no_complaint(recording: str, request: pytest.FixtureRequest) -> None:
+    assert complaints(request.getfixturevalue(recording) / "run.mcap") == []
 
 
 def test_the_doctor_finds_what_is_wrong(tmp_path: Path) -> None:
@@ -193,11 +193,11 @@ def test_times_are_those_of_the_simulation_and_of_when_a_frame_was_journaled(fau
 
 
 def test_viewers_see_robots_where_they_were_and_their_trails(paper_1: Path) -> None:
-    record = read(paper_1)
+    recording = read(paper_1)
     poses, trails = seen(paper_1 / "run.mcap", "/b/pose"), seen(paper_1 / "run.mcap", "/b/trail")
     transforms = seen(paper_1 / "run.mcap", "/tf")
-    assert len(poses) == len(trails) == len(transforms) == len(record.moments)
-    for moment, pose, trail, tf in zip(record.moments, poses, trails, transforms, strict=True):
+    assert len(poses) == len(trails) == len(transforms) == len(recording.moments)
+    for moment, pose, trail, tf in zip(recording.moments, poses, trails, transforms, strict=True):
         truth = moment.truth.poses[1]
         assert (pose.frame_id, pose.pose.position.x, pose.pose.position.y) == ("world", truth.x, truth.y)
         turn = pose.pose.orientation
@@ -238,7 +238,9 @@ def test_viewers_see_an_ellipse_where_there_is_a_covariance(noisy: Path) -> None
     for one, belief in zip(held, shown, strict=True):
         (entity,) = belief.entities
         assert len(entity.arrows) == len(one.world or one.local)
-        assert [arrow.color.a for arrow in entity.arrows] == [max(LEAST, share) for share in one.probabilities]
+        assert [arrow.color.a for arrow in entity.arrows] == [
+            max(LEAST, share) for share in one.probabilities
+        ]
         assert bool(entity.lines) == (one.covariance is not None and bool(one.world))
         for point in entity.lines[0].points if one.covariance is not None and entity.lines else ():
             assert one.covariance is not None

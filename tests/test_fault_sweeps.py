@@ -27,11 +27,11 @@ WINDOWS = (0, 1, 5, 10, 20, 50)
 
 def scenarios(name: str) -> list[Scenario]:
     """One for each cell of the campaign `name`, with the same seed; all of them face the same starts."""
-    campaign = spec.load(name)
+    sweep = spec.load(name)
     found = []
-    for cell in cells(campaign):
+    for cell in cells(sweep):
         assert cell.key == "{}"
-        setting = setting_of(campaign, cell)
+        setting = setting_of(sweep, cell)
         assert not isinstance(setting, RefusedCell)
         found.append(setting.seeded(7))
     assert len({tuple(robot.start for robot in scenario.robots) for scenario in found}) == 1
@@ -86,9 +86,9 @@ def test_a_fault_may_be_varied_that_the_base_scenario_leaves_out() -> None:
 
 def test_a_row_counts_what_was_lost_and_refused() -> None:
     scenario = load("random", faults=["loss=0.5, corrupt=0.3"])
-    record = in_process.play(scenario)
-    found = row(Trial(0, 0, scenario, processes=False), record, 0.1)
-    said = record.final_reports.values()
+    recording = in_process.play(scenario)
+    found = row(Trial(0, 0, scenario, processes=False), recording, 0.1)
+    said = recording.final_reports.values()
     assert found.reports_lost == sum([one.reports_lost for one in said]) > 0
     assert found.reports_refused == sum([one.reports_refused for one in said]) > 0
     heard = sum([one.reports_heard for one in said])
@@ -110,10 +110,10 @@ values = [[0.0], [0.5]]
 @pytest.mark.parametrize(("labels", "curve"), [('["0", "0.5"]', True), ('["none", "half"]', False)])
 def test_labels_that_are_numbers_make_a_curve_with_a_band(labels: str, curve: bool, tmp_path: Path) -> None:
     (tmp_path / "small.toml").write_text(SMALL.replace("LABELS", labels))
-    campaign = spec.load(str(tmp_path / "small.toml"))
+    sweep = spec.load(str(tmp_path / "small.toml"))
     silent = execution.Progress(say=print, begin=lambda *_: None, done=lambda _: None)
     results = execution.sweep(
-        campaign, tmp_path / "out", execution.ExecutionOptions(workers=1), Inbox("test"), silent
+        sweep, tmp_path / "out", execution.ExecutionOptions(workers=1), Inbox("test"), silent
     )
     (axes,) = axis_figures.ticks_against(results, 0).axes
     median = axes.lines[0]

@@ -10,7 +10,7 @@ import pytest
 from msgspec.structs import replace
 
 from compose.launch import in_process
-from compose.recording.run import Record
+from compose.recording.run import Recording
 from compose.recording.summary_json import summary
 from compose.scenario.scenario_file import load
 from protocol.journal import journal_file
@@ -54,10 +54,10 @@ PLANS: dict[str, list[str]] = {
 NOISE = "anchor_sigma = 0.1\nmutual_sigma = 0.1\nactuation = {v = 0.001}\nodometry = {omega = 0.001}"
 
 
-def localises(record: Record) -> bool:
+def localises(recording: Recording) -> bool:
     """Everyone has claimed, and nobody wrongly."""
-    assert record.end is not None
-    return record.end.outcome == "localised"
+    assert recording.end is not None
+    return recording.end.outcome == "localised"
 
 
 # --- what missions make of them -----------------------------------------------------------------------
@@ -113,9 +113,11 @@ def test_a_delay_costs_three_times_what_it_lasts(delay: int) -> None:
 
 def test_under_noise_a_robot_that_has_not_been_answered_stands_and_listens() -> None:
     quiet = scenario_of(NOISE, 1)
-    record = in_process.play(replace(quiet, faults=load("random", faults=["delay=6"]).faults, max_ticks=3000))
-    assert localises(record)
-    commands = [moment.commands[robot] for moment in record.moments for robot in "ab"]
+    recording = in_process.play(
+        replace(quiet, faults=load("random", faults=["delay=6"]).faults, max_ticks=3000)
+    )
+    assert localises(recording)
+    commands = [moment.commands[robot] for moment in recording.moments for robot in "ab"]
     listening = [command for command in commands if command.state == "listening"]
     assert len(listening) > 20
     assert all((command.phase, command.v, command.omega) == (3, 0.0, 0.0) for command in listening)
@@ -123,32 +125,36 @@ def test_under_noise_a_robot_that_has_not_been_answered_stands_and_listens() -> 
 
 def test_two_that_never_hear_each_other_claim_nothing() -> None:
     scenario = load("random", faults=["partition"])
-    record = in_process.play(replace(scenario, max_ticks=300))
-    assert record.end is not None
-    assert record.end.outcome == "undecided"
-    told = summary(record, "in-process", None)["robots"]
+    recording = in_process.play(replace(scenario, max_ticks=300))
+    assert recording.end is not None
+    assert recording.end.outcome == "undecided"
+    told = summary(recording, "in-process", None)["robots"]
     assert all(robot["reports_heard"] == 0 and not robot["localised"] for robot in told.values())
     assert all(robot["reports_lost"] == robot["reports_sent"] > 200 for robot in told.values())
 
 
 def test_one_that_is_never_heard_keeps_both_from_a_claim() -> None:
     scenario = load("random", faults=["a->b: partition"])
-    record = in_process.play(replace(scenario, max_ticks=300))
-    assert record.end is not None
-    assert record.end.outcome == "undecided"
-    assert record.final_reports["a"].reports_lost == 0 < record.final_reports["a"].reports_heard
-    assert record.final_reports["b"].reports_heard == 0 < record.final_reports["b"].reports_lost
+    recording = in_process.play(replace(scenario, max_ticks=300))
+    assert recording.end is not None
+    assert recording.end.outcome == "undecided"
+    assert recording.final_reports["a"].reports_lost == 0 < recording.final_reports["a"].reports_heard
+    assert recording.final_reports["b"].reports_heard == 0 < recording.final_reports["b"].reports_lost
 
 
 @pytest.mark.parametrize("plan", ["a delay", "all together", "duplication", "damage"])
 def test_what_was_heard_refused_and_lost_adds_up_to_what_the_world_let_through(
     plan: str, tmp_path: Path
 ) -> None:
-    record = in_process.play(load("random", seed=3, faults=PLANS[plan]), tmp_path)
+    recording = in_process.play(load("random", seed=3, faults=PLANS[plan]), tmp_path)
     for robot, peer in (("a", "b"), ("b", "a")):
-        contacts = [(observation.tick, contact) for observation in observations(tmp_path, robot) for contact in observation.contacts]
+        contacts = [
+            (observation.tick, contact)
+            for observation in observations(tmp_path, robot)
+            for contact in observation.contacts
+        ]
         came = {tick for _, contact in contacts for tick in (*(contact.heard or ()), *contact.damaged)}
-        said, peers = record.final_reports[robot], record.final_reports[peer]
+        said, peers = recording.final_reports[robot], recording.final_reports[peer]
         assert peers.reports_sent == said.reports_sent == len(contacts) > 0
         assert said.reports_heard == sum([len(contact.heard or ()) for _, contact in contacts])
         assert said.reports_refused == sum([len(contact.damaged) for _, contact in contacts])

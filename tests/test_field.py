@@ -56,7 +56,7 @@ def pair(out: Path, *more: str | Path, protocol: str = "tcp") -> Iterator[dict[s
         def robot(name: str, flag: str) -> TandemProcess:
             return TandemProcess(
                 *("robot", name, "--mission", out / "field.toml", "--driver", "docs.rover:Rover"),
-                *("--rate", "4", flag, endpoint, *more, "--out", out / name, "--patience", "20"),
+                *("--rate", "4", flag, endpoint, *more, "--out", out / name, "--timeout", "20"),
                 *("--option", f"start={STARTS[name]}", "--option", f"beacon={air}"),
             )
 
@@ -142,7 +142,10 @@ def test_a_decision_that_does_not_follow_is_found_without_a_world(tmp_path: Path
         changed.write(*frames)
     replayed = tandem("replay", tmp_path / "a")
     assert replayed.status == 1
-    assert f"tick {command.tick}, a, Command v: recorded {0.5 * command.v}, recomputed {command.v}" in replayed.out
+    assert (
+        f"tick {command.tick}, a, Command v: recorded {0.5 * command.v}, recomputed {command.v}"
+        in replayed.out
+    )
 
 
 @pytest.mark.parametrize("killed", series(["b", "a"]))
@@ -156,7 +159,11 @@ def test_a_robot_whose_agent_is_killed_stands_still_and_goes_on_from_its_record(
         os.kill(process_of(tmp_path / killed, "agent", killed), SIGKILL)
         robots[killed].until_says("was killed by signal 9, and is started again")
         both_have_ended(tmp_path, robots)
-    stood = [step for step in told(tmp_path, killed).steps if step.observation.executed == REST and step.observation.tick]
+    stood = [
+        step
+        for step in told(tmp_path, killed).steps
+        if step.observation.executed == REST and step.observation.tick
+    ]
     assert stood
     assert [step.observation.tick for step in told(tmp_path, killed).steps] == list(
         range(len(told(tmp_path, killed).steps))
@@ -198,7 +205,7 @@ def test_a_robot_without_a_beacon_waits_for_it_idle_and_gives_up() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as nobody:
         nobody.bind(("127.0.0.1", 0))
         where = f"127.0.0.1:{nobody.getsockname()[1]}"
-    rover = Rover(load("paper-1").config("a"), 0.25, beacon=where, patience="1")
+    rover = Rover(load("paper-1").config("a"), 0.25, beacon=where, timeout="1")
     busy = time.process_time()
     with pytest.raises(TimeoutError, match="no answer of the beacon for 1 s"):
         rover.sense(0)
@@ -237,7 +244,7 @@ def test_a_mistake_is_one_line(tmp_path: Path, arguments: tuple[str, ...], said:
     (tmp_path / "faults.toml").write_text(f"{PAPER_1}\n[[fault]]\nloss = 0.5\n")
     with journal_file.Journal(tmp_path / "agent-a.journal") as old:
         old.write(encode(load("paper-1").config("a")))
-    words = [word.format(faults=tmp_path / "faults.toml", record=tmp_path) for word in arguments]
+    words = [word.format(faults=tmp_path / "faults.toml", recording=tmp_path) for word in arguments]
     ended = tandem("robot", *words, "--driver", "docs.rover:Rover")
     assert ended.status == 2
     assert said in ended.err

@@ -81,7 +81,9 @@ def all_is_well(out: Path, pair: Pair) -> None:
     """Both come to their end; each tick is on record once; neither audit nor replay finds anything."""
     both_have_ended(out, pair.robots)
     for name in "ab":
-        assert [step.observation.tick for step in told(out, name).steps] == list(range(len(told(out, name).steps)))
+        assert [step.observation.tick for step in told(out, name).steps] == list(
+            range(len(told(out, name).steps))
+        )
     both = out / "both"
     both.mkdir()
     for name in "ab":
@@ -146,11 +148,13 @@ def test_a_recording_that_a_power_cut_may_have_shortened_is_refused(
     field: Any = SimpleNamespace(resume=lambda *_: None)
 
     def taken_up() -> DriverPast:
-        with recorded(tmp_path, config, inbox, fsync=fsync) as record:
-            record.take_up(driver, "any", field)
-            observation = Observation(record.past.tick + 1, "a", REST if record.again else None, 1.0, ())
-            record.journal.write(encode(observation))
-            return record.past
+        with recorded(tmp_path, config, inbox, fsync=fsync) as recording:
+            recording.take_up(driver, "any", field)
+            observation = Observation(
+                recording.past.tick + 1, "a", REST if recording.again else None, 1.0, ()
+            )
+            recording.journal.write(encode(observation))
+            return recording.past
 
     assert [taken_up().tick for _ in range(3)] == [-1, 0, 1]
     monkeypatch.setattr(driver_journal, "BOOT", tmp_path / "boot")

@@ -32,9 +32,7 @@ from tests.series import series
 from world.scenario import Scenario
 
 NOISE = "[mission.noise]\nanchor_sigma = 0.05\nmutual_sigma = 0.05\n"
-BRIEF = PAPER_1.replace('variant = "paper"', 'variant = "assured"').replace(
-    "seed = 1", "seed = 1\nmax_ticks = 4"
-)
+BRIEF = PAPER_1.replace('name = "paper"', 'name = "assured"').replace("seed = 1", "seed = 1\nmax_ticks = 4")
 
 
 @pytest.fixture(scope="session")
@@ -56,8 +54,8 @@ def recorded(scenario: Scenario, folder: Path) -> Path:
     return folder
 
 
-def copied(record: Path, folder: Path) -> Path:
-    return Path(shutil.copytree(record, folder, dirs_exist_ok=True))
+def copied(recording: Path, folder: Path) -> Path:
+    return Path(shutil.copytree(recording, folder, dirs_exist_ok=True))
 
 
 def draw(folder: Path) -> Ended:
@@ -66,9 +64,9 @@ def draw(folder: Path) -> Ended:
 
 def picture(folder: Path, robot: str) -> Path:
     """That of one robot, drawn in this process."""
-    record = read(folder)
-    place = [one.id for one in record.scenario.robots].index(robot)
-    story = Story(record, place, estimates(folder, robot))
+    recording = read(folder)
+    place = [one.id for one in recording.scenario.robots].index(robot)
+    story = Story(recording, place, estimates(folder, robot))
     (folder / "figures").mkdir(exist_ok=True)
     with look():
         svg, *_ = save(figure_of(story), folder / "figures" / f"robot-{robot}")
@@ -126,17 +124,19 @@ def test_a_run_draws_nothing_by_itself(tmp_path: Path) -> None:
 def test_a_picture_says_what_the_robot_claimed_and_how_far_off_it_was(
     place: int, noisy: Path, drawn: Path
 ) -> None:
-    record = read(noisy)
-    claim = first_claim(record, place)
+    recording = read(noisy)
+    claim = first_claim(recording, place)
     assert claim is not None
     assert claim.covariance is not None
-    robot = record.scenario.robots[place].id
+    robot = recording.scenario.robots[place].id
     words = texts(drawn / f"robot-{robot}.svg")
     (said,) = [line for line in words if line.startswith("It claims")]
     assert f"in tick {claim.tick}: off by {claim.position_error:.2g} m" in said
     assert f"(sigmas {claim.covariance.position_sigma:.2g} m" in said
     assert f"it claims, tick {claim.tick}" in words
-    assert f"Robot {robot} of noisy, seed {record.scenario.seed}: localised after {claim.tick} ticks" in words
+    assert (
+        f"Robot {robot} of noisy, seed {recording.scenario.seed}: localised after {claim.tick} ticks" in words
+    )
 
 
 def test_a_picture_names_its_axes_with_units_and_what_was_asked_for(drawn: Path) -> None:
@@ -162,7 +162,7 @@ def test_each_part_of_a_noisy_mission_is_in_its_picture(noisy: Path, drawn: Path
 
 def test_what_is_drawn_over_time_is_what_the_robot_said_held_against_the_truth(noisy: Path) -> None:
     story = Story(read(noisy), 0, estimates(noisy, "a"))
-    truth = [moment.truth.poses[0] for moment in story.record.moments]
+    truth = [moment.truth.poses[0] for moment in story.recording.moments]
     said = [one for one in story.held if one.world]
     off = [math.hypot(one.world[0].x - truth[one.tick].x, one.world[0].y - truth[one.tick].y) for one in said]
     errors, probability = Figure().subplots(2)
@@ -172,7 +172,9 @@ def test_what_is_drawn_over_time_is_what_the_robot_said_held_against_the_truth(n
     assert line(errors, "sigma")[1] == [one.covariance.position_sigma for one in said if one.covariance]
     likeliest = line(probability, "probability-1-plane")
     assert likeliest[0] == [one.tick for one in said]
-    assert likeliest[1] == pytest.approx([one.probabilities[0] for one in said], abs=1e-5)  # 99.9995 % is the edge
+    assert likeliest[1] == pytest.approx(
+        [one.probabilities[0] for one in said], abs=1e-5
+    )  # 99.9995 % is the edge
     assert max(likeliest[1]) < 1.0
     before = line(probability, "probability-1-anchor")
     assert before[0] == [one.tick for one in story.held if not one.world]
@@ -244,12 +246,12 @@ def test_odds_are_said_in_as_many_digits_as_they_have(probability: float, said: 
 
 
 @pytest.mark.parametrize("noise", ["", NOISE])
-@pytest.mark.parametrize("variant", series(["assured", "paper"]))
-def test_a_mission_that_ends_undecided_is_drawn(noise: str, variant: str, tmp_path: Path) -> None:
-    text = BRIEF.replace("assured", variant).replace("[planner]", f"{noise}[planner]")
-    record = play(parse(text, "brief"), tmp_path)
-    assert record.end is not None
-    assert record.end.outcome == "undecided"
+@pytest.mark.parametrize("planner_name", series(["assured", "paper"]))
+def test_a_mission_that_ends_undecided_is_drawn(noise: str, planner_name: str, tmp_path: Path) -> None:
+    text = BRIEF.replace("assured", planner_name).replace("[planner]", f"{noise}[planner]")
+    recording = play(parse(text, "brief"), tmp_path)
+    assert recording.end is not None
+    assert recording.end.outcome == "undecided"
     svg = picture(tmp_path, "b")
     words = texts(svg)
     assert "It never claimed to know where it is." in words

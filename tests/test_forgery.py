@@ -68,7 +68,12 @@ OF_A = (Key(keys.command, RUN, "a"), Key(keys.report, RUN, "a", "b"), Key(keys.e
 def told(heard: Heard) -> dict[str, Any]:
     """All that is known, as text."""
     known = heard.known
-    return {"ticks": repr(known.ticks), "end": known.end, "last": known.last, "farewells": known.final_reports}
+    return {
+        "ticks": repr(known.ticks),
+        "end": known.end,
+        "last": known.last,
+        "farewells": known.final_reports,
+    }
 
 
 @pytest.fixture

@@ -469,7 +469,9 @@ def test_a_third_range_leaves_the_true_placement_as_it_was(
     assert nearest(left, encounter.truth) < EXACT
     for placement in weigh_placements(encounter.solutions(), pair_observations, 1000.0, FLOOR):
         assert encounter.residual(placement) < 2e-7
-        assert separation(placement, encounter.p2a, third) == pytest.approx(pair_observations[2].range, abs=2e-7)
+        assert separation(placement, encounter.p2a, third) == pytest.approx(
+            pair_observations[2].range, abs=2e-7
+        )
 
 
 @given(encounters())
@@ -488,13 +490,19 @@ def test_a_third_range_drops_the_placements_that_predict_another(
     third = step(Pose(encounter.p1b.x, encounter.p1b.y, course), way, 0.0, 1.0)
     pair_observations = sightings_of(encounter, third)
     wrong = [p for p in encounter.solutions() if nearest([p], encounter.truth) > 0.1]
-    told = [p for p in wrong if abs(separation(p, encounter.p2a, third) - (pair_observations[2].range or 0.0)) > 0.1]
+    told = [
+        p
+        for p in wrong
+        if abs(separation(p, encounter.p2a, third) - (pair_observations[2].range or 0.0)) > 0.1
+    ]
     left = weigh_placements(told, pair_observations, 1000.0, FLOOR)
     assert all(nearest([placement], encounter.truth) < 1e-3 for placement in left) or all(
         encounter.residual(placement) < 2e-7 for placement in left
     )
     assert (
-        weigh_placements(told, [*pair_observations[:2], PairObservation(2, encounter.p2a, third, 5e3)], 1e4, FLOOR)
+        weigh_placements(
+            told, [*pair_observations[:2], PairObservation(2, encounter.p2a, third, 5e3)], 1e4, FLOOR
+        )
         == ()
     )
 

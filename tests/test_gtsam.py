@@ -115,9 +115,9 @@ def recorded(number: int, folder: Path) -> None:
     """Play a mission; its record goes to `folder`."""
     scenario, noise = parse(TEXT.format(seed=number), "recorded"), noisy(number)
     mission = replace(scenario.mission, noise=noise, accuracy=accuracy(noise))
-    record = play(replace(scenario, mission=mission), folder)
-    assert record.end is not None
-    assert record.end.outcome == "localised", record.end
+    recording = play(replace(scenario, mission=mission), folder)
+    assert recording.end is not None
+    assert recording.end.outcome == "localised", recording.end
 
 
 def said(folder: Path, robot: str) -> Iterator[Observation | Report | Command]:
@@ -140,7 +140,11 @@ def measured(folder: Path, robot: str) -> Measured:
     assert [observation.tick for observation in observations] == list(range(len(observations)))
     return Measured(
         [observation.executed for observation in observations if observation.executed is not None],
-        [(observation.tick, observation.anchor_range) for observation in observations if observation.anchor_range is not None],
+        [
+            (observation.tick, observation.anchor_range)
+            for observation in observations
+            if observation.anchor_range is not None
+        ],
         [
             (observation.tick, contact.range)
             for observation in observations

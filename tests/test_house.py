@@ -18,7 +18,7 @@ from agent.planning.state import RobotState
 from compose.scenario.scenario_file import load
 from protocol.wire import encode
 from tests.steps import steps
-from world.tick import advance, release, observations
+from world.tick import advance, observations, release
 
 HOUSE = Path(__file__).parents[1]
 BELOW = {
@@ -228,7 +228,10 @@ def test_the_same_values_give_the_same_step_and_are_left_as_they_were(name: str)
         for observation in sensed:
             state, heard = before[observation.robot], reports[observation.robot]
             was = frozen((state, observation))
-            once, again = planner.observe(state, observation), planner.observe(copy.deepcopy(state), observation)
+            once, again = (
+                planner.observe(state, observation),
+                planner.observe(copy.deepcopy(state), observation),
+            )
             assert once == again == observed[observation.robot]
             assert frozen(once) == frozen(again)
             assert frozen((state, observation)) == was
@@ -238,7 +241,9 @@ def test_the_same_values_give_the_same_step_and_are_left_as_they_were(name: str)
             assert decided == anew
             assert frozen(decided) == frozen(anew)
             assert (
-                encode(planner.command(decided)) == encode(planner.command(anew)) == encode(commands[observation.robot])
+                encode(planner.command(decided))
+                == encode(planner.command(anew))
+                == encode(commands[observation.robot])
             )
             assert encode(planner.report(decided)) == encode(planner.report(anew))
             assert encode(planner.estimate(decided)) == encode(planner.estimate(anew))
@@ -253,7 +258,16 @@ def test_the_same_values_give_the_same_step_and_are_left_as_they_were(name: str)
 def test_a_mind_and_a_world_cannot_be_changed() -> None:
     scenario = load("paper-1")
     state, world = RobotState(scenario.config("a")), release(scenario)
-    for value in (state, state.log, state.peer_state, state.belief, state.config, world, world.truth, scenario):
+    for value in (
+        state,
+        state.log,
+        state.peer_state,
+        state.belief,
+        state.config,
+        world,
+        world.truth,
+        scenario,
+    ):
         assert isinstance(value, msgspec.Struct)
         field = value.__struct_fields__[0]
         with pytest.raises(AttributeError, match="immutable"):

@@ -102,7 +102,9 @@ APART = (4.0, 0.0)
 class Driven:
     """A robot that has driven at random, and what its odometry says of it."""
 
-    def __init__(self, start: Pose, commands: Array, drift: VelocityNoise, draws: np.random.Generator) -> None:
+    def __init__(
+        self, start: Pose, commands: Array, drift: VelocityNoise, draws: np.random.Generator
+    ) -> None:
         self.poses = [start]
         spread = []
         for v, omega in commands.tolist():

@@ -20,8 +20,8 @@ ITS_OWN = {
 @pytest.mark.parametrize("noise", [FINE, SIGMA], ids=["fine", "coarse"])
 def test_the_letter_drives_its_own_manoeuvres_only(noise: str) -> None:
     for seed in SEEDS:
-        record = survey(noise, seed, "paper")
-        assert {*states(record, "a"), *states(record, "b")} <= ITS_OWN
+        recording = survey(noise, seed, "paper")
+        assert {*states(recording, "a"), *states(recording, "b")} <= ITS_OWN
 
 
 def test_with_fine_ranges_the_letter_mostly_localises() -> None:
@@ -67,8 +67,8 @@ def test_the_letter_claims_nothing_that_is_wrong(noise: str) -> None:
 )
 def test_where_there_are_outliers_the_letters_ranges_are_never_enough(sigma: float, seed: int) -> None:
     noise = f"anchor_sigma = {sigma}\nmutual_sigma = {sigma}\noutliers = 0.05"
-    record = play(scenario_of(noise, seed, variant="paper", accuracy=0.03))
-    said = summary(record, "in-process", None)
+    recording = play(scenario_of(noise, seed, planner_name="paper", accuracy=0.03))
+    said = summary(recording, "in-process", None)
     assert said["outcome"] == "undecided"
     assert "the letter takes no more ranges: " in said["reason"]
     assert "mutual ranges, of 12" in said["reason"]

@@ -45,21 +45,21 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> execution.Results:
     folder = tmp_path_factory.mktemp("attacks")
     (folder / "few.toml").write_text(SPEC)
     progress = execution.Progress(say=lambda _: None, begin=lambda *_: None, done=lambda _: None)
-    campaign = spec.load(str(folder / "few.toml"))
+    sweep = spec.load(str(folder / "few.toml"))
     return execution.sweep(
-        campaign, folder / "out", execution.ExecutionOptions(workers=1), Inbox("test"), progress
+        sweep, folder / "out", execution.ExecutionOptions(workers=1), Inbox("test"), progress
     )
 
 
 def test_the_campaign_that_ships_tells_the_lies_of_its_labels() -> None:
-    campaign = spec.load("attacks")
+    sweep = spec.load("attacks")
     seen: dict[str, Attack | None] = {}
-    for cell in cells(campaign):
-        setting = setting_of(campaign, cell)
+    for cell in cells(sweep):
+        setting = setting_of(sweep, cell)
         assert not isinstance(setting, RefusedCell)
         a, b = setting.scenario.robots
         assert b.attack is None
-        seen[campaign.axes[0].label(cell.place[0])] = a.attack
+        seen[sweep.axes[0].label(cell.place[0])] = a.attack
     assert seen.pop("honest") == Attack("scale", 1.0), "which is no lie"
     for label, attack in seen.items():
         assert attack is not None
@@ -98,9 +98,9 @@ def test_the_pictures_show_what_became_of_each_lie(results: execution.Results, t
 def test_a_campaign_without_lies_has_no_such_pictures(tmp_path: Path) -> None:
     (tmp_path / "few.toml").write_text('name = "few"\nscenario = "random"\ntrials = 2\nseed = 1\n')
     progress = execution.Progress(say=lambda _: None, begin=lambda *_: None, done=lambda _: None)
-    campaign = spec.load(str(tmp_path / "few.toml"))
+    sweep = spec.load(str(tmp_path / "few.toml"))
     results = execution.sweep(
-        campaign, tmp_path / "out", execution.ExecutionOptions(workers=1), Inbox("test"), progress
+        sweep, tmp_path / "out", execution.ExecutionOptions(workers=1), Inbox("test"), progress
     )
     assert attack_figures.axis_of_lies(results) is None
     axis_figures.draw(results, tmp_path / "figures")

@@ -13,7 +13,7 @@ from agent.peer import false_reports, peer_state
 from agent.peer.motion_log import MotionLog
 from agent.planning import planner, plausibility
 from compose.launch.in_process import play
-from compose.recording.run import Record
+from compose.recording.run import Recording
 from compose.recording.summary_json import summary
 from compose.scenario.scenario_file import BadScenario, parse, shipped
 from protocol.attack import Attack, Kind, Part
@@ -33,7 +33,7 @@ OF_STARTS = [Attack("radius", 0.01), Attack("radius", 0.3), Attack("heading", DE
 FINE = "noise = {anchor_sigma = 0.01, mutual_sigma = 0.01}\n"
 
 
-def mission(seed: int, lies: dict[str, Attack], noise: str = "") -> Record:
+def mission(seed: int, lies: dict[str, Attack], noise: str = "") -> Recording:
     """A random mission, in which those robots tell those lies."""
     text = shipped()["random"].read_text().replace("[mission]\n", f"[mission]\n{noise}")
     scenario = parse(text, "random", seed=seed)
@@ -41,8 +41,8 @@ def mission(seed: int, lies: dict[str, Attack], noise: str = "") -> Record:
     return play(replace(scenario, robots=robots, max_ticks=400))
 
 
-def outcome(record: Record) -> str:
-    return str(summary(record, "in-process", None)["outcome"])
+def outcome(recording: Recording) -> str:
+    return str(summary(recording, "in-process", None)["outcome"])
 
 
 # --- exact sensors ------------------------------------------------------------------------------------
@@ -54,21 +54,22 @@ def outcome(record: Record) -> str:
 )
 def test_every_lie_about_a_drive_or_a_start_is_an_alarm(attack: Attack, liar: str) -> None:
     for seed in range(6):
-        record = mission(seed, {liar: attack})
-        if not _tells_otherwise(record, liar, attack):
+        recording = mission(seed, {liar: attack})
+        if not _tells_otherwise(recording, liar, attack):
             continue
-        assert outcome(record) == "inconsistent", seed
-        assert record.end is not None
+        assert outcome(recording) == "inconsistent", seed
+        assert recording.end is not None
         peer = "b" if liar == "a" else "a"
-        assert (record.end.reason or "").startswith(f"{peer}: {liar} tells "), record.end.reason
+        assert (recording.end.reason or "").startswith(f"{peer}: {liar} tells "), recording.end.reason
 
 
-def _tells_otherwise(record: Record, liar: str, attack: Attack) -> bool:
+def _tells_otherwise(recording: Recording, liar: str, attack: Attack) -> bool:
     """Whether there was anything to lie about: in that part of its log the robot has driven."""
     phases = {"phase-1": 1, "orbit": 2, "encounter": 3}
     return attack.part == "all" or any(
-        command.phase == phases[attack.part] and (command.v if attack.kind == "scale" else command.v or command.omega)
-        for moment in record.moments
+        command.phase == phases[attack.part]
+        and (command.v if attack.kind == "scale" else command.v or command.omega)
+        for moment in recording.moments
         for command in [moment.commands[liar]]
     )
 
@@ -82,12 +83,15 @@ def test_turning_its_whole_story_about_its_anchor_tells_nothing_false() -> None:
 
 def test_two_liars_are_no_more_believed_than_one() -> None:
     for seed in range(6):
-        assert outcome(mission(seed, {"a": Attack("heading", 0.1), "b": Attack("radius", 0.2)})) == "inconsistent"
+        assert (
+            outcome(mission(seed, {"a": Attack("heading", 0.1), "b": Attack("radius", 0.2)}))
+            == "inconsistent"
+        )
 
 
 def test_the_liar_hears_that_it_is_not_believed_and_gives_up() -> None:
-    record = mission(0, {"a": Attack("scale", 0.5)})
-    last = record.moments[-1].commands
+    recording = mission(0, {"a": Attack("scale", 0.5)})
+    last = recording.moments[-1].commands
     assert isinstance(last["b"].verdict, Inconsistent)
     met = next(step for step in steps("paper-1") if step.heard["a"])
     told = [replace(report, verdict=Inconsistent("a tall story")) for report in met.heard["a"]]
@@ -110,11 +114,11 @@ def test_the_liar_hears_that_it_is_not_believed_and_gives_up() -> None:
 def test_under_noise_a_lie_that_is_large_beside_it_is_an_alarm(attack: Attack) -> None:
     """Of a, whose way from its anchor to the encounter stands in no range of its own."""
     for seed in range(3):
-        record = mission(seed, {"a": attack}, FINE)
-        assert outcome(record) == "inconsistent", seed
+        recording = mission(seed, {"a": attack}, FINE)
+        assert outcome(recording) == "inconsistent", seed
         alarm = next(
             command.verdict
-            for moment in record.moments
+            for moment in recording.moments
             for command in moment.commands.values()
             if isinstance(command.verdict, Inconsistent)
         )
@@ -224,7 +228,9 @@ def test_a_liar_tells_the_same_story_as_it_grows(
     known = [tick if tick is not None and tick <= seen else None for tick in (parted, met)]
     whole = false_reports.told(log, attack, parted, met, 1.0)
     assert whole.through == log.through
-    assert false_reports.told(young, attack, known[0], known[1], 1.0).between(0, seen) == whole.between(0, seen)
+    assert false_reports.told(young, attack, known[0], known[1], 1.0).between(0, seen) == whole.between(
+        0, seen
+    )
 
 
 @settings(max_examples=50)

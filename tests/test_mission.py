@@ -15,10 +15,10 @@ from agent.planning import planner
 from agent.planning.phase1_anchor import third_point
 from agent.planning.phase3_last_manoeuvre import SPEEDS, TURN_RATES, last_manoeuvre
 from compose.launch.in_process import play
-from compose.recording.run import Record, TickRecord
+from compose.recording.run import Recording, TickRecord
 from compose.scenario.scenario_file import load, parse
 from protocol.messages import Localised
-from protocol.mission import OPTIMAL_TURN, Mission, Variant, third_point_turn_rate
+from protocol.mission import OPTIMAL_TURN, Mission, PlannerName, third_point_turn_rate
 from protocol.motion import Pose, compose, step
 from protocol.orbits import rendezvous, tick_budget
 from tests.missions import mission_of
@@ -28,7 +28,7 @@ from world.truth import Truth
 
 SECTION_IV = Mission(3.0, 1.0, 1.0, math.pi)
 D = 10.0
-VARIANTS: tuple[Variant, ...] = ("paper", "assured")
+VARIANTS: tuple[PlannerName, ...] = ("paper", "assured")
 
 missions = st.builds(
     Mission, st.floats(1.0, 8.0), st.floats(0.1, 2.0), st.floats(0.3, 2.0), st.floats(0.3, math.pi)
@@ -55,9 +55,9 @@ def test_the_papers_orbits_are_eq_6(mission: Mission, distance: float) -> None:
 
 @given(missions, st.floats(5.0, 40.0), st.sampled_from(VARIANTS))
 def test_the_tick_budget_leaves_room_beyond_the_bound(
-    mission: Mission, distance: float, variant: Variant
+    mission: Mission, distance: float, planner_name: PlannerName
 ) -> None:
-    plan = rendezvous(mission, distance, variant)
+    plan = rendezvous(mission, distance, planner_name)
     assert tick_budget(mission, plan) > 2 * plan.bound / mission.period
 
 
@@ -104,15 +104,17 @@ def after(place: Pose, v: float, omega: float, mission: Mission) -> float:
 @settings(max_examples=300)
 @given(second_points(), st.sampled_from(VARIANTS))
 @example((SECTION_IV, [Pose(0.7, 2.8, 1.25), Pose(0.7, -2.8, -1.25)]), "paper")
-def test_eq_5_keeps_the_nearer_branch_in_range(case: tuple[Mission, list[Pose]], variant: Variant) -> None:
+def test_eq_5_keeps_the_nearer_branch_in_range(
+    case: tuple[Mission, list[Pose]], planner_name: PlannerName
+) -> None:
     mission, places = case
-    controls = third_point(places, mission, variant)
+    controls = third_point(places, mission, planner_name)
     if controls is None:
-        assert variant == "paper"
+        assert planner_name == "paper"
         return
     assert 0.0 < abs(controls.v) <= mission.max_speed
     assert abs(controls.omega) <= mission.max_turn_rate
-    assert variant == "assured" or controls.v > 0.0
+    assert planner_name == "assured" or controls.v > 0.0
     nearer = min(after(place, controls.v, controls.omega, mission) for place in places)
     assert nearer <= mission.sensing_range - 0.9e-6
 
@@ -171,31 +173,31 @@ def test_a_range_is_taken_up_to_r_and_at_r() -> None:
 # --- missions whose parameters bite -------------------------------------------------------------------
 
 
-def turns(record: Record, state: str) -> list[float]:
+def turns(recording: Recording, state: str) -> list[float]:
     """The turns that a makes on the spot, before it meets b."""
-    commands = [moment.commands["a"] for moment in record.moments if moment.commands["a"].phase < 3]
+    commands = [moment.commands["a"] for moment in recording.moments if moment.commands["a"].phase < 3]
     assert all(command.v == 0.0 for command in commands if command.state == state)
     return [command.omega for command in commands if command.state == state]
 
 
 def test_a_small_omega_max_makes_every_turn_take_several_ticks() -> None:
-    record = mission_of((2.4, -1.2, 4.8), turn_rate=0.5, variant="paper")
-    outward = turns(record, "turning")
+    recording = mission_of((2.4, -1.2, 4.8), turn_rate=0.5, planner_name="paper")
+    outward = turns(recording, "turning")
     assert outward == pytest.approx([0.5, 0.5, 0.5, math.pi / 2 - 1.5])
-    onto_orbit = turns(record, "tangent")
+    onto_orbit = turns(recording, "tangent")
     assert onto_orbit == pytest.approx([0.5, 0.5, 0.5, math.pi / 2 - 1.5])
-    aligning = turns(record, "aligning")
+    aligning = turns(recording, "aligning")
     assert len(aligning) > 1
     assert aligning[:-1] == pytest.approx([math.copysign(0.5, aligning[0])] * (len(aligning) - 1))
     assert abs(sum(aligning)) <= math.pi
-    assert record.end is not None
-    assert record.end.outcome == "localised"
+    assert recording.end is not None
+    assert recording.end.outcome == "localised"
 
 
 def test_no_robot_ever_asks_for_more_than_its_actuators_give() -> None:
-    for record in (mission_of((2.4, -1.2, 4.8), turn_rate=0.5), mission_of((0.5, 0.2, 2.0), reach=1.0)):
-        mission = record.scenario.mission
-        for moment in record.moments:
+    for recording in (mission_of((2.4, -1.2, 4.8), turn_rate=0.5), mission_of((0.5, 0.2, 2.0), reach=1.0)):
+        mission = recording.scenario.mission
+        for moment in recording.moments:
             for command in moment.commands.values():
                 assert abs(command.v) <= mission.max_speed * (1 + 1e-12)
                 assert abs(command.omega) <= mission.max_turn_rate
@@ -207,31 +209,33 @@ def test_no_robot_ever_asks_for_more_than_its_actuators_give() -> None:
 def test_the_first_straight_is_shortened_where_it_would_come_near_the_range(
     reach: float, speed: float, straight: float
 ) -> None:
-    record = mission_of((0.5, 0.2, 2.0), reach=reach, speed=speed)
-    first = record.moments[0].commands["a"]
+    recording = mission_of((0.5, 0.2, 2.0), reach=reach, speed=speed)
+    first = recording.moments[0].commands["a"]
     assert first.state == "straight"
     assert (first.v, first.omega) == pytest.approx((straight, 0.0))
-    assert record.scenario.mission.first_straight == pytest.approx(straight)
-    assert record.end is not None
-    assert record.end.outcome == "localised"
+    assert recording.scenario.mission.first_straight == pytest.approx(straight)
+    assert recording.end is not None
+    assert recording.end.outcome == "localised"
 
 
 def test_a_robot_released_on_its_anchor_knows_its_branch_at_once() -> None:
-    record = mission_of((0.0, 0.0, 2.0))
-    assert record.final_reports["a"].branch == "on-anchor"
-    assert record.moments[0].commands["a"].phase == 2
-    assert record.end is not None
-    assert record.end.outcome == "localised"
+    recording = mission_of((0.0, 0.0, 2.0))
+    assert recording.final_reports["a"].branch == "on-anchor"
+    assert recording.moments[0].commands["a"].phase == 2
+    assert recording.end is not None
+    assert recording.end.outcome == "localised"
 
 
 def test_nobody_claims_before_a_third_mutual_range() -> None:
     for seed in range(40):
-        record = play(load("random", seed=seed))
-        assert record.end is not None
-        assert record.end.outcome == "localised"
-        ranged = [moment.truth.tick for moment in record.moments if math.dist(*_places(moment)) <= 3.0]
+        recording = play(load("random", seed=seed))
+        assert recording.end is not None
+        assert recording.end.outcome == "localised"
+        ranged = [moment.truth.tick for moment in recording.moments if math.dist(*_places(moment)) <= 3.0]
         for robot in "ab":
-            claims = [m.truth.tick for m in record.moments if isinstance(m.commands[robot].verdict, Localised)]
+            claims = [
+                m.truth.tick for m in recording.moments if isinstance(m.commands[robot].verdict, Localised)
+            ]
             assert sum(tick <= claims[0] for tick in ranged) >= 3
 
 

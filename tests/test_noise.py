@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from compose.launch import in_process
-from compose.recording.run import WORLD_JOURNAL, Record, TickRecord, read
+from compose.recording.run import WORLD_JOURNAL, Recording, TickRecord, read
 from compose.recording.ticks_csv import ticks_csv
 from compose.scenario.scenario_file import load, parse
 from protocol.journal import journal_file
@@ -32,7 +32,7 @@ from world.referee import Judgement
 from world.scenario import Scenario
 from world.sensors import Mutual, anchor_ranges, executed, mutual_ranges, odometry
 from world.simulation import Course
-from world.tick import World, advance, release, observations
+from world.tick import World, advance, observations, release
 from world.truth import Truth
 
 Floats = NDArray[np.float64]
@@ -314,8 +314,8 @@ def test_reports_are_heard_where_the_range_was_dropped(tmp_path: Path) -> None:
     dropping = next(
         seed for seed in range(1000) if mutual(near("drop_outs = 0.5", seed=seed), 4) == [None] * 4
     )
-    record = in_process.play(near("drop_outs = 0.5", seed=dropping, max_ticks=3), tmp_path)
-    said = record.final_reports
+    recording = in_process.play(near("drop_outs = 0.5", seed=dropping, max_ticks=3), tmp_path)
+    said = recording.final_reports
     assert (said["a"].mutual_ranges, said["b"].mutual_ranges) == (0, 0)
     assert said["a"].reports_sent >= 1
     assert said["a"].reports_heard == said["b"].reports_sent
@@ -578,8 +578,8 @@ def test_ticks_gives_what_a_robot_did_of_which_no_drive_came() -> None:
     scenario = near("actuation = {v_floor = 0.1}", max_ticks=1)
     world = release(scenario)
     onward = moved_on(world, {})
-    record = Record(scenario, (TickRecord(world.truth, {}), TickRecord(onward.truth, {})), None, {})
-    first, *_, last = csv.DictReader(ticks_csv(record).splitlines())
+    recording = Recording(scenario, (TickRecord(world.truth, {}), TickRecord(onward.truth, {})), None, {})
+    first, *_, last = csv.DictReader(ticks_csv(recording).splitlines())
     assert onward.executed is not None
     assert float(first["v"]) == onward.executed[0].v != 0.0
     assert last["v"] == ""

@@ -88,16 +88,16 @@ def marks(page: Page) -> int:
 def test_a_killed_robot_keeps_its_phase_and_is_shown_as_down_until_it_is_back(
     opened: Open, tmp_path: Path
 ) -> None:
-    scenario, record = tmp_path / "endless.toml", tmp_path / "record"
+    scenario, recording = tmp_path / "endless.toml", tmp_path / "record"
     scenario.write_text(ENDLESS)
-    patient = ("--patience", "600")
+    patient = ("--timeout", "600")
     with (
-        world(scenario, "--out", record, *patient) as (_, endpoint),
-        TandemProcess("agent", "b", "--connect", endpoint, "--out", record, *patient),
-        watching(record) as (_, of_journals),
+        world(scenario, "--out", recording, *patient) as (_, endpoint),
+        TandemProcess("agent", "b", "--connect", endpoint, "--out", recording, *patient),
+        watching(recording) as (_, of_journals),
         watching("--connect", endpoint) as (_, of_network),
     ):
-        a = ("agent", "a", "--connect", endpoint, "--out", record, *patient)
+        a = ("agent", "a", "--connect", endpoint, "--out", recording, *patient)
         with TandemProcess(*a) as killed:
             pages = [opened(of_journals), opened(of_network, dark=True)]
             for page in pages:

@@ -13,7 +13,7 @@ import pytest
 
 from agent.estimation.closed_forms import Placement, placements
 from compose.launch.in_process import play
-from compose.recording.run import Record
+from compose.recording.run import Recording
 from compose.recording.summary_json import summary
 from compose.recording.ticks_csv import ticks_csv
 from compose.scenario.scenario_file import load
@@ -41,16 +41,16 @@ EXACT = 1e-9
 
 
 @cache
-def played(name: str) -> Record:
+def played(name: str) -> Recording:
     return play(load(name))
 
 
-def first_tick(record: Record, robot: str, state: str) -> int:
-    return next(moment.truth.tick for moment in record.moments if moment.commands[robot].state == state)
+def first_tick(recording: Recording, robot: str, state: str) -> int:
+    return next(moment.truth.tick for moment in recording.moments if moment.commands[robot].state == state)
 
 
-def command(record: Record, robot: str, tick: int) -> Command:
-    return record.moments[tick].commands[robot]
+def command(recording: Recording, robot: str, tick: int) -> Command:
+    return recording.moments[tick].commands[robot]
 
 
 def optional(cell: str) -> float | None:
@@ -138,22 +138,22 @@ ROWS = (
 
 @pytest.mark.parametrize("row", ROWS, ids=[f"{row.scenario}-{row.robot}" for row in ROWS])
 def test_phases_1_and_2_go_as_the_table_says(row: Row) -> None:
-    record = played(row.scenario)
-    final_report = record.final_reports[row.robot]
+    recording = played(row.scenario)
+    final_report = recording.final_reports[row.robot]
     reference = SIMULATIONS[row.scenario]
     ranges = reference.range_a if row.robot == "a" else reference.range_b
     assert final_report.branch == row.branch
     assert final_report.alpha == pytest.approx(row.alpha, abs=5.1e-7)
-    assert first_tick(record, row.robot, "aligning") == row.located
+    assert first_tick(recording, row.robot, "aligning") == row.located
     assert sum(rho is not None for rho in ranges[: row.located + 1]) == row.anchor_ranges
-    aligning = command(record, row.robot, row.located)
+    aligning = command(recording, row.robot, row.located)
     assert (aligning.v, -aligning.omega) == pytest.approx((0.0, row.mu), abs=5.1e-7)
-    assert first_tick(record, row.robot, "orbiting") == row.orbits
+    assert first_tick(recording, row.robot, "orbiting") == row.orbits
 
 
 def test_in_simulation_1_a_leaves_its_anchors_range_and_circles_for_three_ticks() -> None:
-    record = played("paper-1")
-    assert [command(record, "a", tick).state for tick in range(6)] == [
+    recording = played("paper-1")
+    assert [command(recording, "a", tick).state for tick in range(6)] == [
         "straight",
         "turning",
         "circling",
@@ -179,17 +179,17 @@ def test_in_simulation_2_a_drives_its_third_manoeuvre_at_the_optimum_and_full_sp
 def test_a_takes_its_second_mutual_range_while_b_stands(
     name: str, first: int, first_range: float, second: int, second_range: float, way: list[str]
 ) -> None:
-    record = played(name)
-    rows = list(csv.DictReader(io.StringIO(ticks_csv(record))))
+    recording = played(name)
+    rows = list(csv.DictReader(io.StringIO(ticks_csv(recording))))
     mutual = {int(row["tick"]): float(row["mutual_range"]) for row in rows if row["mutual_range"]}
-    assert list(mutual) == [first, second, record.moments[-1].truth.tick]
+    assert list(mutual) == [first, second, recording.moments[-1].truth.tick]
     assert mutual[first] == pytest.approx(first_range, abs=5.1e-7)
     assert mutual[second] == pytest.approx(second_range, abs=5.1e-7)
-    assert [command(record, "a", tick).state for tick in range(first, second)] == way
-    assert {command(record, "b", tick).state for tick in range(first, second)} == {"standing"}
-    assert command(record, "a", second).state == "waiting"
-    assert command(record, "b", second).state == "last-manoeuvre"
-    assert summary(record, "in-process", None)["first_contact_tick"] == first
+    assert [command(recording, "a", tick).state for tick in range(first, second)] == way
+    assert {command(recording, "b", tick).state for tick in range(first, second)} == {"standing"}
+    assert command(recording, "a", second).state == "waiting"
+    assert command(recording, "b", second).state == "last-manoeuvre"
+    assert summary(recording, "in-process", None)["first_contact_tick"] == first
 
 
 @pytest.mark.parametrize(
@@ -202,23 +202,23 @@ def test_a_takes_its_second_mutual_range_while_b_stands(
 def test_b_chooses_the_last_manoeuvre_that_the_table_says(
     name: str, solutions: tuple[int, int], omega: float, separation: float, last: int
 ) -> None:
-    record = played(name)
+    recording = played(name)
     reference = SIMULATIONS[name]
-    b = record.final_reports["b"]
+    b = recording.final_reports["b"]
     assert b.candidates == solutions
-    assert record.final_reports["a"].candidates == solutions
+    assert recording.final_reports["a"].candidates == solutions
     assert b.last_turn_rate == pytest.approx(omega, abs=5.1e-5)
     assert b.last_turn_rate == pytest.approx(reference.w2, abs=EXACT)
     assert b.separation_m2 == pytest.approx(separation, abs=5.1e-6)
     assert b.separation_m2 == pytest.approx(reference.J, abs=EXACT)
-    assert record.moments[-1].truth.tick == last == reference.k_last
-    assert command(record, "b", last - 1).v == 1.0
+    assert recording.moments[-1].truth.tick == last == reference.k_last
+    assert command(recording, "b", last - 1).v == 1.0
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_both_robots_end_knowing_their_pose(name: str) -> None:
-    record = played(name)
-    told = summary(record, "in-process", None)
+    recording = played(name)
+    told = summary(recording, "in-process", None)
     assert told["outcome"] == "localised"
     for robot in told["robots"].values():
         assert robot["localised"]
@@ -248,26 +248,28 @@ BRANCHES = {
 
 @pytest.mark.parametrize("case", REFERENCE.phase1, ids=lambda case: f"{case.start[0]:+.3f}")
 def test_phase_1_finds_the_references_branch_and_orientation(case: Phase1) -> None:
-    record = mission_of(case.start, variant="paper")
-    final_report = record.final_reports["a"]
+    recording = mission_of(case.start, planner_name="paper")
+    final_report = recording.final_reports["a"]
     for tick, controls in enumerate(case.u):
-        driven = command(record, "a", tick)
+        driven = command(recording, "a", tick)
         assert (driven.v, driven.omega) == pytest.approx(controls, abs=EXACT)
-    measured = [math.hypot(*_place(record, tick)) for tick in range(case.k_end + 1)]
+    measured = [math.hypot(*_place(recording, tick)) for tick in range(case.k_end + 1)]
     assert [rho if rho <= 3.0 else None for rho in measured] == pytest.approx(case.ranges, abs=EXACT)
     assert measured[0] == pytest.approx(case.rho0, abs=EXACT)
     assert measured[-1] == pytest.approx(case.r_end, abs=EXACT)
     assert final_report.branch == BRANCHES[case.branch]
     assert final_report.alpha == pytest.approx(case.alpha_signed, abs=EXACT)
-    assert first_tick(record, "a", "aligning") == case.k_end
-    aligning = command(record, "a", case.k_end)
+    assert first_tick(recording, "a", "aligning") == case.k_end
+    aligning = command(recording, "a", case.k_end)
     assert (aligning.v, -aligning.omega) == pytest.approx((0.0, case.mu), abs=EXACT)
-    radial = [moment.commands["a"].v for moment in record.moments if moment.commands["a"].state == "radial"]
+    radial = [
+        moment.commands["a"].v for moment in recording.moments if moment.commands["a"].state == "radial"
+    ]
     assert sum(radial) == pytest.approx(6.5 - case.r_end, abs=EXACT)
 
 
-def _place(record: Record, tick: int) -> tuple[float, float]:
-    pose = record.moments[tick].truth.poses[0]
+def _place(recording: Recording, tick: int) -> tuple[float, float]:
+    pose = recording.moments[tick].truth.poses[0]
     return pose.x, pose.y
 
 

@@ -18,9 +18,9 @@ SHARES = 10
 """tests, so that several processes divide the work"""
 
 
-def started(seed: int, variant: str) -> Scenario:
+def started(seed: int, planner_name: str) -> Scenario:
     text = scenario_file.shipped()["random"].read_text()
-    return scenario_file.parse(f'{text}\n[planner]\nvariant = "{variant}"\n', "random", seed=seed)
+    return scenario_file.parse(f'{text}\n[planner]\nname = "{planner_name}"\n', "random", seed=seed)
 
 
 def share(number: int) -> range:
@@ -30,11 +30,11 @@ def share(number: int) -> range:
 @pytest.mark.parametrize("number", series(range(SHARES)))
 def test_assured_localises_every_random_start_to_a_micrometre(number: int) -> None:
     for seed in share(number):
-        record = in_process.play(started(seed, "assured"))
-        assert record.end is not None
-        assert record.end.outcome == "localised", f"seed {seed}: {record.end}"
-        last = record.moments[-1]
-        for robot, truth in zip(record.scenario.robots, last.truth.poses, strict=True):
+        recording = in_process.play(started(seed, "assured"))
+        assert recording.end is not None
+        assert recording.end.outcome == "localised", f"seed {seed}: {recording.end}"
+        last = recording.moments[-1]
+        for robot, truth in zip(recording.scenario.robots, last.truth.poses, strict=True):
             verdict = last.commands[robot.id].verdict
             assert isinstance(verdict, Localised)
             position, heading = errors(verdict.pose, truth)
@@ -46,9 +46,9 @@ def test_assured_localises_every_random_start_to_a_micrometre(number: int) -> No
 def test_the_letter_localises_most_random_starts_and_guesses_at_none(number: int) -> None:
     outcomes = Counter[str]()
     for seed in share(number):
-        record = in_process.play(started(seed, "paper"))
-        assert record.end is not None
-        outcomes[record.end.outcome] += 1
+        recording = in_process.play(started(seed, "paper"))
+        assert recording.end is not None
+        outcomes[recording.end.outcome] += 1
     # 93 to 95 % of all 5000; a tenth of them spreads three standard deviations, 3.2 %, about 94 %
     assert set(outcomes) <= {"localised", "undecided"}
     assert 0.905 <= outcomes["localised"] / outcomes.total() <= 0.975

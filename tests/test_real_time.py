@@ -62,7 +62,9 @@ def robots_at(endpoint: str, answers: Callable[[Observation], bool]) -> Iterator
         def answer(sample: zenoh.Sample) -> None:
             observation = decode(sample.payload.to_bytes(), Observation | MissionEnd)
             if isinstance(observation, Observation) and answers(observation):
-                commands[observation.robot].put(encode(Command(observation.tick, observation.robot, 0.0, 0.0, 1, "straight")))
+                commands[observation.robot].put(
+                    encode(Command(observation.tick, observation.robot, 0.0, 0.0, 1, "straight"))
+                )
 
         subscribed = [a.declare_subscriber(keys.observation("r", one), answer) for one in "ab"]
         tokens = [session.show_alive(link, keys.robot_alive("r", one)) for link, one in ((a, "a"), (b, "b"))]
@@ -75,7 +77,7 @@ def test_a_tick_may_last_longer_than_the_patience(tmp_path: Path) -> None:
     scenario = tmp_path / "slow.toml"
     scenario.write_text("max_ticks = 2\n" + PAPER_1)
     with (
-        world(scenario, "--rate", "0.5", "--patience", "1", "--run", "r") as (clock, endpoint),
+        world(scenario, "--rate", "0.5", "--timeout", "1", "--run", "r") as (clock, endpoint),
         robots_at(endpoint, lambda _: True),
     ):
         ended = clock.ended()

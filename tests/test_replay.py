@@ -67,13 +67,13 @@ def test_what_was_played_as_processes_is_replayed_to_the_bit(tmp_path: Path) -> 
 # --- one bit --------------------------------------------------------------------------------------------
 
 
-def flips(record: dict[str, list[bytes]], tries: int) -> Iterator[tuple[str, int, bytes]]:
+def flips(recording: dict[str, list[bytes]], tries: int) -> Iterator[tuple[str, int, bytes]]:
     """Frames with one bit of their message's values flipped and a good CRC, each with where it stands."""
     draw = random.Random(6)
-    places = [(name, i) for name, frames in record.items() for i in range(len(frames))]
+    places = [(name, i) for name, frames in recording.items() for i in range(len(frames))]
     while tries:
         name, place = draw.choice(places)
-        frame = record[name][place]
+        frame = recording[name][place]
         body = bytearray(frame[HEAD:])
         body[draw.randrange(len(body))] ^= 1 << draw.randrange(8)
         flipped = frame[:1] + zlib.crc32(body).to_bytes(4, "big") + bytes(body)
@@ -97,11 +97,11 @@ def _matters(frame: bytes, flipped: bytes) -> bool:
 
 @pytest.mark.parametrize("name", ["paper-1", "paper-2"])
 def test_one_flipped_bit_in_any_value_that_matters_is_found(name: str) -> None:
-    record = kept(load(name))
-    for book, place, flipped in flips(record, TRIES // 2):
-        frames = [*record[book][:place], flipped, *record[book][place + 1 :]]
-        again = replayed(record | {book: frames})
-        was, now = (decode(one, KINDS, MAX_FRAME_BYTES) for one in (record[book][place], flipped))
+    recording = kept(load(name))
+    for book, place, flipped in flips(recording, TRIES // 2):
+        frames = [*recording[book][:place], flipped, *recording[book][place + 1 :]]
+        again = replayed(recording | {book: frames})
+        was, now = (decode(one, KINDS, MAX_FRAME_BYTES) for one in (recording[book][place], flipped))
         assert again.differences, (book, place, was, now)
 
 
@@ -117,14 +117,14 @@ def planted(folder: Path, name: str, kind: type, tick: int, **fields: Any) -> tu
 
 
 @pytest.fixture
-def record(tmp_path: Path) -> Path:
+def recording(tmp_path: Path) -> Path:
     in_process.play(load("paper-1"), tmp_path / "record")
     return tmp_path / "record"
 
 
-def test_the_first_difference_is_shown_with_tick_robot_field_and_both_values(record: Path) -> None:
-    before, after = planted(record, A, Command, 12, v=0.125)
-    ended = tandem("replay", record)
+def test_the_first_difference_is_shown_with_tick_robot_field_and_both_values(recording: Path) -> None:
+    before, after = planted(recording, A, Command, 12, v=0.125)
+    ended = tandem("replay", recording)
     assert (ended.status, ended.err) == (1, "")
     lines = ended.out.splitlines()
     assert lines[:2] == [
@@ -134,35 +134,37 @@ def test_the_first_difference_is_shown_with_tick_robot_field_and_both_values(rec
     assert lines[2] == "and 1 more, which `tandem audit` tells"
 
 
-def test_a_value_is_shown_however_deep_it_stands(record: Path) -> None:
-    told = [decode(frame, KINDS, MAX_FRAME_BYTES) for frame in journal_file.read(record / A)]
+def test_a_value_is_shown_however_deep_it_stands(recording: Path) -> None:
+    told = [decode(frame, KINDS, MAX_FRAME_BYTES) for frame in journal_file.read(recording / A)]
     observation = next(one for one in told if isinstance(one, Observation) and one.contacts)
     (contact,) = observation.contacts
     assert contact.range is not None
-    planted(record, A, Observation, observation.tick, contacts=(replace(contact, range=contact.range + 1e-15),))
-    (first, *_) = tandem("replay", record).out.splitlines()[1:]
+    planted(
+        recording, A, Observation, observation.tick, contacts=(replace(contact, range=contact.range + 1e-15),)
+    )
+    (first, *_) = tandem("replay", recording).out.splitlines()[1:]
     assert first == (
         f"tick {observation.tick}, a, Observation contacts[0].range: "
         f"recorded {contact.range + 1e-15!r}, recomputed {contact.range!r}"
     )
 
 
-def test_a_record_whose_drives_the_world_has_otherwise_is_found_there(record: Path) -> None:
-    frames = list(journal_file.read(record / WORLD_JOURNAL))
+def test_a_record_whose_drives_the_world_has_otherwise_is_found_there(recording: Path) -> None:
+    frames = list(journal_file.read(recording / WORLD_JOURNAL))
     command = decode(frames[2 + 2 * 20 + 1], Command)
     assert (command.robot, command.tick) == ("b", 20)
     frames[2 + 2 * 20 + 1] = encode(replace(command, omega=command.omega + 1e-9))
-    (record / WORLD_JOURNAL).write_bytes(journal_file.packed(frames))
-    ended = tandem("replay", record)
+    (recording / WORLD_JOURNAL).write_bytes(journal_file.packed(frames))
+    ended = tandem("replay", recording)
     assert ended.status == 1
     assert ended.out.splitlines()[1].startswith("tick 20, b, Command omega: recorded ")
 
 
-def changed(record: dict[str, list[bytes]], name: str, was: Any, **fields: Any) -> dict[str, list[bytes]]:
-    """`record` with that message of a journal otherwise."""
-    frames = [encode(replace(was, **fields)) if one == encode(was) else one for one in record[name]]
-    assert frames != record[name]
-    return record | {name: frames}
+def changed(recording: dict[str, list[bytes]], name: str, was: Any, **fields: Any) -> dict[str, list[bytes]]:
+    """`recording` with that message of a journal otherwise."""
+    frames = [encode(replace(was, **fields)) if one == encode(was) else one for one in recording[name]]
+    assert frames != recording[name]
+    return recording | {name: frames}
 
 
 def test_a_report_that_is_heard_otherwise_than_it_was_told_is_found(paper_1: dict[str, list[bytes]]) -> None:
@@ -186,10 +188,10 @@ def test_an_end_that_does_not_follow_is_found_though_all_say_the_same(
     end = next(
         one for frame in paper_1[A] if isinstance(one := decode(frame, KINDS, MAX_FRAME_BYTES), MissionEnd)
     )
-    record = paper_1
+    recording = paper_1
     for name in paper_1:
-        record = changed(record, name, end, outcome="undecided")
-    assert [(one.rule, one.tick) for one in replayed(record).differences] == [("claim", end.tick)]
+        recording = changed(recording, name, end, outcome="undecided")
+    assert [(one.rule, one.tick) for one in replayed(recording).differences] == [("claim", end.tick)]
 
 
 # --- what breaks off ------------------------------------------------------------------------------------
@@ -211,11 +213,11 @@ def test_a_record_that_is_torn_anywhere_is_replayed_to_the_tear(
         assert again.tears
 
 
-def test_where_it_tears_is_told(record: Path) -> None:
-    rest = cut(record / A, 4000)
-    last = [decode(frame, KINDS, MAX_FRAME_BYTES) for frame in journal_file.read(record / A)][-1]
-    (record / B).unlink()
-    ended = tandem("replay", record)
+def test_where_it_tears_is_told(recording: Path) -> None:
+    rest = cut(recording / A, 4000)
+    last = [decode(frame, KINDS, MAX_FRAME_BYTES) for frame in journal_file.read(recording / A)][-1]
+    (recording / B).unlink()
+    ended = tandem("replay", recording)
     assert (ended.status, ended.err) == (0, "")
     as_recorded, *tears = ended.out.splitlines()
     assert as_recorded.startswith("paper-1: as recorded, to the bit, in 49 ticks ")
@@ -227,14 +229,14 @@ def test_where_it_tears_is_told(record: Path) -> None:
     ]
 
 
-def test_a_frame_of_a_wrong_length_is_no_tear(record: Path) -> None:
-    frames = list(journal_file.read(record / A))
-    data = bytearray((record / A).read_bytes())
+def test_a_frame_of_a_wrong_length_is_no_tear(recording: Path) -> None:
+    frames = list(journal_file.read(recording / A))
+    data = bytearray((recording / A).read_bytes())
     data[len(journal_file.packed(frames[:20])) + 1] = 0xFF
-    (record / A).write_bytes(data)
-    ended = tandem("replay", record)
+    (recording / A).write_bytes(data)
+    ended = tandem("replay", recording)
     assert (ended.status, ended.out) == (2, "")
-    assert ended.err.startswith(f"tandem replay: {record / A}: damaged at byte ")
+    assert ended.err.startswith(f"tandem replay: {recording / A}: damaged at byte ")
 
 
 def test_what_is_no_record_is_refused(tmp_path: Path) -> None:

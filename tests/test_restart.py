@@ -142,7 +142,7 @@ def test_a_process_that_is_never_started_again_ends_the_run_at_once(who: str, tm
 
 @pytest.mark.long
 def test_a_robot_that_comes_back_too_late_fails_the_run_by_the_patience(tmp_path: Path) -> None:
-    kill = ("--kill", "a@17+600s", "--patience", "5")
+    kill = ("--kill", "a@17+600s", "--timeout", "5")
     ended = tandem("run", "paper-1", "-q", "--out", tmp_path / "out", *kill)
     assert ended[:2] == (3, "failed after 16 ticks (no answer from a (not there) at tick 17 for 5 s)\n")
     assert not processes_of(tmp_path / "out")
@@ -185,7 +185,16 @@ def test_a_kill_is_read_as_it_is_written() -> None:
 @pytest.mark.parametrize(
     "text",
     ["", "a", "a@", "@17", "a17", "a@-1", "a@1.5", "a@17:", "a@17:drives", "a@17+", "a@17+5", "a@17+5m"]
-    + ["a@17+-1s", "a@17+nans", "a@17+never:command", " a@17", "a@17\n", "a b@17", "a@²", "a@17:observation:observation"],
+    + [
+        "a@17+-1s",
+        "a@17+nans",
+        "a@17+never:command",
+        " a@17",
+        "a@17\n",
+        "a b@17",
+        "a@²",
+        "a@17:observation:observation",
+    ],
 )
 def test_a_mistyped_kill_is_none(text: str) -> None:
     with pytest.raises(BadKill, match="is no kill"):
@@ -445,7 +454,7 @@ def next_of(queue: SimpleQueue[int]) -> int:
 
 
 @pytest.fixture
-def record(undisturbed: Path, tmp_path: Path) -> Path:
+def recording(undisturbed: Path, tmp_path: Path) -> Path:
     """One to be spoilt: a copy of the undisturbed run's, without its end."""
     for name in PARTS:
         frames = list(journal_file.read(undisturbed / f"{name}.journal"))
@@ -477,20 +486,20 @@ def spoil(path: Path) -> None:
     path.write_bytes(data)
 
 
-def test_a_corrupt_journal_is_refused(record: Path) -> None:
+def test_a_corrupt_journal_is_refused(recording: Path) -> None:
     for name in ("agent-a", "world"):
-        spoil(record / f"{name}.journal")
+        spoil(recording / f"{name}.journal")
     unused = free_endpoint()
-    file = f"{record / 'agent-a.journal'}: "
-    refuses(record, "agent", "a", "--connect", unused, says=file)
-    refuses(record, "world", "paper-1", "--listen", unused, says=f"{record / 'world.journal'}: ")
+    file = f"{recording / 'agent-a.journal'}: "
+    refuses(recording, "agent", "a", "--connect", unused, says=file)
+    refuses(recording, "world", "paper-1", "--listen", unused, says=f"{recording / 'world.journal'}: ")
 
 
 def test_a_journal_that_is_damaged_anywhere_is_not_mistaken_for_a_torn_one(
-    record: Path, tmp_path: Path
+    recording: Path, tmp_path: Path
 ) -> None:
-    good = (record / "agent-b.journal").read_bytes()
-    frames = list(journal_file.read(record / "agent-b.journal"))
+    good = (recording / "agent-b.journal").read_bytes()
+    frames = list(journal_file.read(recording / "agent-b.journal"))
     last = len(journal_file.packed(frames[:-1]))
     path = tmp_path / "damaged.journal"
     for place in range(0, last, 11):
@@ -508,30 +517,30 @@ def _remembered(path: Path) -> None:
         remember(old)
 
 
-def test_the_worlds_record_of_another_scenario_is_refused(record: Path) -> None:
-    says = f"{record / 'world.journal'}: the record of another scenario, paper-1"
-    refuses(record, "world", "paper-2", "--listen", free_endpoint(), says=says)
+def test_the_worlds_record_of_another_scenario_is_refused(recording: Path) -> None:
+    says = f"{recording / 'world.journal'}: the record of another scenario, paper-1"
+    refuses(recording, "world", "paper-2", "--listen", free_endpoint(), says=says)
 
 
-def test_an_agents_record_of_another_briefing_is_refused(record: Path, tmp_path: Path) -> None:
+def test_an_agents_record_of_another_briefing_is_refused(recording: Path, tmp_path: Path) -> None:
     scenario = tmp_path / "farther.toml"
     scenario.write_text(PAPER_1.replace("anchor = [10.0", "anchor = [10.5"))
-    says = f"{record / 'agent-a.journal'}: another run's: its briefing is not this world's"
+    says = f"{recording / 'agent-a.journal'}: another run's: its briefing is not this world's"
     with world(scenario) as (_, endpoint):
-        refuses(record, "agent", "a", "--connect", endpoint, says=says)
+        refuses(recording, "agent", "a", "--connect", endpoint, says=says)
 
 
-def test_an_agents_record_in_which_it_sensed_otherwise_is_no_use(record: Path, paper_2: str) -> None:
-    path = record / "agent-a.journal"
+def test_an_agents_record_in_which_it_sensed_otherwise_is_no_use(recording: Path, paper_2: str) -> None:
+    path = recording / "agent-a.journal"
     path.write_bytes(journal_file.packed(list(journal_file.read(path))[:4]))
     with TandemProcess("agent", "b", "--connect", paper_2):  # whose briefings are those of paper-1
-        ended = tandem("agent", "a", "--connect", paper_2, "--out", record)
+        ended = tandem("agent", "a", "--connect", paper_2, "--out", recording)
     said = "the record is another run's: in this one, a senses otherwise at tick 0"
     assert (ended.status, ended.err) == (3, f"tandem agent a: {said}\n")
 
 
-def test_a_record_on_which_it_decided_otherwise_is_refused(record: Path) -> None:
-    path = record / "agent-a.journal"
+def test_a_record_on_which_it_decided_otherwise_is_refused(recording: Path) -> None:
+    path = recording / "agent-a.journal"
     frames = list(journal_file.read(path))
     place = next(i for i, frame in enumerate(frames) if frame[5:].find(b"drive\x0c") > 0)
     command = decode(frames[place], Command)
@@ -539,16 +548,16 @@ def test_a_record_on_which_it_decided_otherwise_is_refused(record: Path) -> None
     frames[place] = encode(replace(command, v=command.v / 2.0))
     path.write_bytes(journal_file.packed(frames))
     says = f"{path}: on record it decided otherwise at tick 12: the journal is another version's"
-    refuses(record, "agent", "a", "--connect", free_endpoint(), says=says)
+    refuses(recording, "agent", "a", "--connect", free_endpoint(), says=says)
 
 
-def test_a_journal_that_another_process_has_is_refused(record: Path) -> None:
-    with closing(Retrace(record / "agent-a.journal")), closing(Retrace(record / "world.journal")):
+def test_a_journal_that_another_process_has_is_refused(recording: Path) -> None:
+    with closing(Retrace(recording / "agent-a.journal")), closing(Retrace(recording / "world.journal")):
         for name, part in (
             ("agent-a", ("agent", "a", "--connect", free_endpoint())),
             ("world", ("world", "paper-1", "--listen", free_endpoint())),
         ):
-            refuses(record, *part, says=f"{record / name}.journal is in use by another process")
+            refuses(recording, *part, says=f"{recording / name}.journal is in use by another process")
 
 
 def test_a_journal_is_locked_as_long_as_it_is_open(tmp_path: Path) -> None:
@@ -560,20 +569,20 @@ def test_a_journal_is_locked_as_long_as_it_is_open(tmp_path: Path) -> None:
     Retrace(path).close()
 
 
-def test_a_world_that_has_lost_its_record_is_told_so(record: Path, paper_1: str) -> None:
+def test_a_world_that_has_lost_its_record_is_told_so(recording: Path, paper_1: str) -> None:
     with TandemProcess("agent", "b", "--connect", paper_1):
-        ended = tandem("agent", "a", "--connect", paper_1, "--out", record)
-    tick = past(journal_file.read(record / "agent-a.journal"), "a").steps[-1].observation.tick
+        ended = tandem("agent", "a", "--connect", paper_1, "--out", recording)
+    tick = past(journal_file.read(recording / "agent-a.journal"), "a").steps[-1].observation.tick
     assert ended.status == 3
     said = f"started again without its record: the world is at tick 0, a knows it up to {tick}"
     assert ended.err.splitlines()[-1] == f"tandem agent a: {said}"  # it may have told of a torn write before
 
 
-def test_a_run_is_a_new_one(record: Path) -> None:
-    before = journals(record)
-    ended = tandem("run", "paper-1", "--out", record)
-    refused(ended, f"--out: {record} holds a record already; choose another folder")
-    assert journals(record) == before
+def test_a_run_is_a_new_one(recording: Path) -> None:
+    before = journals(recording)
+    ended = tandem("run", "paper-1", "--out", recording)
+    refused(ended, f"--out: {recording} holds a record already; choose another folder")
+    assert journals(recording) == before
 
 
 def test_an_empty_journal_is_begun(tmp_path: Path) -> None:
@@ -607,7 +616,7 @@ def test_who_has_ended_waits_for_no_world_that_has_gone_however_patient(
     shutil.copy(undisturbed / "agent-a.journal", tmp_path)
     with ExitStack() as stack:
         playing, endpoint = stack.enter_context(world("paper-1"))
-        reach = ("--connect", endpoint, "--out", tmp_path, "--patience", "600")
+        reach = ("--connect", endpoint, "--out", tmp_path, "--timeout", "600")
         agent = stack.enter_context(TandemProcess("agent", "a", *reach))
         agent.until_says("again, from tick 48 on")
         playing.tell(SIGKILL)

@@ -95,7 +95,7 @@ def test_summary_says_everything_that_is_promised_of_a_run(played: tuple[str, Pa
             "outlier_bias": [0.3, 2.0],
             **dict.fromkeys(("actuation", "odometry"), EXACT_WHEELS),
         },
-        "variant": "paper",
+        "planner": "paper",
         "max_ticks": told["parameters"]["max_ticks"],
     }
     assert told["parameters"]["max_ticks"] > 2 * 226

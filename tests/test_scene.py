@@ -36,9 +36,9 @@ def said(shown: Performance, kind: str) -> list[tuple[int, str]]:
 
 
 def test_a_scene_shows_where_everyone_is_and_what_everyone_does(paper_1: Path) -> None:
-    record, shown = read_record(paper_1), read(paper_1)
-    assert [one.tick for one in shown.scenes] == [moment.truth.tick for moment in record.moments]
-    for moment, one in zip(record.moments, shown.scenes, strict=True):
+    recording, shown = read_record(paper_1), read(paper_1)
+    assert [one.tick for one in shown.scenes] == [moment.truth.tick for moment in recording.moments]
+    for moment, one in zip(recording.moments, shown.scenes, strict=True):
         for player, pose in zip(one.players, moment.truth.poses, strict=True):
             command = moment.commands[player.robot]
             assert player.pose == replace(pose, heading=wrap(pose.heading))

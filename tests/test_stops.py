@@ -143,7 +143,7 @@ def test_stopped_for_longer_than_the_patience_a_process_fails_the_run(
     name: str, undisturbed: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    with TandemProcess("run", undisturbed, "--out", out, "-q", "--patience", str(PATIENCE_S)) as run:
+    with TandemProcess("run", undisturbed, "--out", out, "-q", "--timeout", str(PATIENCE_S)) as run:
         run.until_written(out / "world.journal", 2_000)
         stop(process_of(out, *name.split()))
         ended = run.ended()
@@ -163,7 +163,7 @@ def test_a_link_over_which_nothing_comes_is_replaced_by_another() -> None:
         session.watch_liveliness(link, keys.robot_alive("mute", "a"), inbox)
         session.answer(link, keys.config("mute", "*"), lambda _key: config)
         _token = session.show_alive(link, keys.world_alive("mute"))
-        with TandemProcess("agent", "a", "--connect", endpoint, "--patience", "20") as agent:
+        with TandemProcess("agent", "a", "--connect", endpoint, "--timeout", "20") as agent:
             for topic in ("alive", "gone", "alive"):
                 until(lambda topic=topic: inbox.next(0.1).topic == topic, f"a is {topic}")  # type: ignore[misc]
                 assert agent.running

@@ -18,7 +18,7 @@ from agent.planning.assured import OFF_RADIUS
 from agent.planning.phase2_orbit import Aligning, Radial, orientation
 from agent.planning.state import RobotState
 from compose.launch.in_process import play
-from compose.recording.run import Record
+from compose.recording.run import Recording
 from compose.recording.summary_json import summary
 from protocol.messages import Undecided
 from protocol.motion import Pose
@@ -28,7 +28,7 @@ from tests.series import series
 from tests.surveys import ODOMETRY, SIGMA, WHEELS, assert_localised, scenario_of, states, survey
 from world.scenario import Scenario
 from world.sensors import anchor_ranges, mutual_ranges
-from world.tick import World, advance, release, observations
+from world.tick import World, advance, observations, release
 
 NOISES = {
     "ranges": SIGMA,
@@ -59,10 +59,10 @@ def biases(scenario: Scenario, robot: int, ticks: int) -> list[float]:
     return [(one or 0.0) - (other or 0.0) for one, other in zip(measured, true, strict=True)]
 
 
-def in_contact(record: Record) -> list[bool]:
+def in_contact(recording: Recording) -> list[bool]:
     """Whether the two were in range of each other, tick by tick."""
-    pairs = record.scenario.pairs()
-    return [mutual_ranges(moment.truth, record.scenario, pairs) != [None] for moment in record.moments]
+    pairs = recording.scenario.pairs()
+    return [mutual_ranges(moment.truth, recording.scenario, pairs) != [None] for moment in recording.moments]
 
 
 def apart(one: Pose, other: Pose) -> float:
@@ -117,7 +117,9 @@ def test_a_mission_that_is_cut_short_is_undecided_and_says_what_was_left() -> No
         for robot in robots:
             assert not robot["localised"]
             assert robot["position_sigma_m"] is None
-        assert len({(robot["hypotheses"], robot["probability"]) for robot in robots}) == 1, "both hold the same"
+        assert len({(robot["hypotheses"], robot["probability"]) for robot in robots}) == 1, (
+            "both hold the same"
+        )
         left.append((robots[0]["hypotheses"], robots[0]["probability"]))
     many = [(count, probability) for count, probability in left if count is not None]
     assert max(count for count, _ in many) > 1, "at first there are several"
@@ -131,9 +133,9 @@ def test_a_mission_that_is_cut_short_is_undecided_and_says_what_was_left() -> No
 @pytest.mark.parametrize("noise", [SIGMA, NOISES["odometry"]], ids=["ranges", "odometry"])
 def test_the_robots_keep_apart_and_b_stays_in_range_of_its_anchor(noise: str) -> None:
     for seed in SEEDS:
-        record = survey(noise, seed)
-        reach, (_, anchor) = record.scenario.mission.sensing_range, record.scenario.robots
-        for moment in record.moments:
+        recording = survey(noise, seed)
+        reach, (_, anchor) = recording.scenario.mission.sensing_range, recording.scenario.robots
+        for moment in recording.moments:
             a, b = moment.truth.poses
             assert apart(a, b) > 0.1 * reach, (seed, moment.truth.tick)
             if moment.commands["b"].phase == 3:
@@ -144,31 +146,31 @@ def test_a_lost_contact_is_found_again() -> None:
     """Tick by tick: after one without contact there is another with it, and the mission ends well."""
     lost = 0
     for seed in (*SEEDS, 3, 20):
-        record = survey(NOISES["drop-outs"], seed)
-        contact = in_contact(record)
+        recording = survey(NOISES["drop-outs"], seed)
+        contact = in_contact(recording)
         met = next(
             tick
-            for tick, moment in enumerate(record.moments)
+            for tick, moment in enumerate(recording.moments)
             if moment.commands["a"].state == "surveying" and moment.commands["a"].phase == 3
         )
         lost += not all(contact[met:])
         assert contact[-1]
-        assert_localised(record)
+        assert_localised(recording)
     assert lost
 
 
 def test_who_hears_nothing_where_its_anchor_should_be_goes_back() -> None:
     """Seed 4 of the drop-outs, as a scan of some found."""
-    record = survey(NOISES["drop-outs"], 4)
-    homing = [robot for robot in ("a", "b") if "homing" in states(record, robot)]
+    recording = survey(NOISES["drop-outs"], 4)
+    homing = [robot for robot in ("a", "b") if "homing" in states(recording, robot)]
     assert homing
     for robot in homing:
-        done = states(record, robot)
+        done = states(recording, robot)
         back = len(done) - 1 - done[::-1].index("homing")
         assert done[back + 1] in ("straight", "surveying", "aligning"), "and is ranged again"
         place = ("a", "b").index(robot)
-        assert anchor_ranges(record.moments[back + 1].truth, record.scenario)[place] is not None
-    assert_localised(record)
+        assert anchor_ranges(recording.moments[back + 1].truth, recording.scenario)[place] is not None
+    assert_localised(recording)
 
 
 # --- outliers at the start ----------------------------------------------------------------------------
@@ -204,11 +206,16 @@ def ticks(scenario: Scenario) -> Iterator[tuple[World, dict[str, RobotState], di
     states = {robot.id: RobotState(scenario.config(robot.id)) for robot in scenario.robots}
     while isinstance(world, World):
         sensed = observations(world)
-        observed = {observation.robot: planner.observe(states[observation.robot], observation) for observation in sensed}
+        observed = {
+            observation.robot: planner.observe(states[observation.robot], observation)
+            for observation in sensed
+        }
         yield world, states, observed
         told = {robot: planner.report(state) for robot, state in observed.items()}
         states = {
-            observation.robot: planner.decide(observed[observation.robot], [told[one.peer] for one in observation.contacts])
+            observation.robot: planner.decide(
+                observed[observation.robot], [told[one.peer] for one in observation.contacts]
+            )
             for observation in sensed
         }
         onward = advance(world, {robot: planner.command(state) for robot, state in states.items()})
@@ -307,9 +314,9 @@ def test_a_robot_that_turns_out_to_head_off_its_radius_turns_onto_it_again() -> 
 
 def test_a_robot_that_left_its_peers_range_does_not_go_there_again() -> None:
     """Both planned to stay in range, by a belief that an outlier misled; going back is not enough."""
-    record = play(scenario_of("outliers = 0.05", 4253053381025039869, accuracy=0.03))
-    assert "retreating" in states(record, "a")
-    assert_localised(record)
+    recording = play(scenario_of("outliers = 0.05", 4253053381025039869, accuracy=0.03))
+    assert "retreating" in states(recording, "a")
+    assert_localised(recording)
 
 
 def test_nothing_is_claimed_by_a_fit_that_still_moves(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -319,6 +326,9 @@ def test_nothing_is_claimed_by_a_fit_that_still_moves(monkeypatch: pytest.Monkey
         return tuple([one._replace(fit=one.fit._replace(last_step=0.5)) for one in search(pair)])
 
     monkeypatch.setattr(agent.planning.assured, "search", searched)
-    record = play(scenario_of(SIGMA, SHORT, max_ticks=ticks + 2))
-    assert summary(record, "in-process", None)["outcome"] == "undecided"
-    assert all("still moves" in (final_report.blocking_reason or "") for final_report in record.final_reports.values())
+    recording = play(scenario_of(SIGMA, SHORT, max_ticks=ticks + 2))
+    assert summary(recording, "in-process", None)["outcome"] == "undecided"
+    assert all(
+        "still moves" in (final_report.blocking_reason or "")
+        for final_report in recording.final_reports.values()
+    )

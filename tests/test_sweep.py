@@ -49,7 +49,7 @@ seed = 5
 field = "robot.b.anchor[0]"
 values = [10.0, 8]
 [[axis]]
-field = "planner.variant"
+field = "planner.name"
 values = ["paper", "assured"]
 paired = true
 """
@@ -124,9 +124,9 @@ def played(
 ) -> execution.Results:
     """The campaign, as the command plays it, but for figures and what is said."""
     silent = execution.Progress(say=print, begin=lambda *_: None, done=done)
-    campaign = spec.load(str(folder / source), trials=trials)
+    sweep = spec.load(str(folder / source), trials=trials)
     return execution.sweep(
-        campaign,
+        sweep,
         folder / out,
         execution.ExecutionOptions(workers=workers, play=play, audit=audit),
         Inbox("test"),
@@ -153,7 +153,7 @@ def test_rows_are_the_same_on_one_worker_and_on_two(folder: Path) -> None:
     found = rows(folder / "one")
     assert [(row["cell"], row["trial"]) for row in found] == [(i, k) for i in range(4) for k in range(12)]
     assert found == rows(folder / "two")
-    for file in ("summary.csv", "campaign.json", "cells/003.toml"):
+    for file in ("summary.csv", "sweep.json", "cells/003.toml"):
         assert (folder / "one" / file).read_bytes() == (folder / "two" / file).read_bytes()
     assert len({row["seed"] for row in found}) == 24
     assert [row["seed"] for row in found[:12]] == [row["seed"] for row in found[12:24]], "paired"
@@ -229,8 +229,8 @@ def test_a_scheduler_that_accepts_and_says_nothing_is_waited_for_with_a_bound(fo
 def test_a_seed_follows_from_the_campaign_the_cell_and_the_trial(folder: Path) -> None:
     def seeds(text: str) -> dict[tuple[str, ...], int]:
         (folder / "x.toml").write_text(text)
-        campaign = spec.load(str(folder / "x.toml"))
-        return {tuple(map(str, cell.fields.values())): trial_seed(5, cell.key, 0) for cell in cells(campaign)}
+        sweep = spec.load(str(folder / "x.toml"))
+        return {tuple(map(str, cell.fields.values())): trial_seed(5, cell.key, 0) for cell in cells(sweep)}
 
     before = seeds(BOTH)
     assert trial_seed(5, '{"robot.b.anchor[0]":10}', 0) == before["10.0", "paper"] == 2706173664366694412
@@ -365,7 +365,7 @@ def test_a_folder_may_be_called_anything_and_a_label_stands_as_it_is_written(fol
     name = "two words: 12:30"
     (folder / "both.toml").write_text(
         'name = "both"\nscenario = "base.toml"\ntrials = 1\n[[axis]]\nname = "way"\n'
-        'field = "planner.variant"\nvalues = ["paper", "assured"]\nlabels = ["$\\\\nosuch{$ a", "b_c$"]\n'
+        'field = "planner.name"\nvalues = ["paper", "assured"]\nlabels = ["$\\\\nosuch{$ a", "b_c$"]\n'
     )
     ended = sweep(folder, "both.toml", name, "-q")
     assert ended.status in (0, 1), ended.err
@@ -423,18 +423,18 @@ def test_results_are_left_in_a_folder_named_for_the_campaign(folder: Path) -> No
         f"{name}.{kind}"
         for kind in ("svg", "pdf", "png")
         for name in (
-            *("success-robot-b-anchor-0", "success-planner-variant", "meeting"),
-            *("ticks-robot-b-anchor-0", "ticks-planner-variant"),
+            *("success-robot-b-anchor-0", "success-planner-name", "meeting"),
+            *("ticks-robot-b-anchor-0", "ticks-planner-name"),
         )
     }
     assert min(drawn.values()) > 5_000
     assert {path.name for path in out.iterdir()} == {
-        *("campaign.json", "cells", "figures", "summary.csv", "trials.parquet")
+        *("sweep.json", "cells", "figures", "summary.csv", "trials.parquet")
     }
     summary = summary_rows(out)
     assert [row["trials"] for row in summary] == ["2"] * 4
     assert list(summary[0])[:9] == [
-        *("cell", "robot.b.anchor[0]", "planner.variant"),
+        *("cell", "robot.b.anchor[0]", "planner.name"),
         *("trials", "localised", "undecided", "inconsistent", "wrong", "failed"),
     ]
     assert ended.out.splitlines()[-1] == "results: sweep-both"
@@ -462,9 +462,9 @@ def test_the_command_that_the_table_prints_plays_the_trial_again(folder: Path) -
 def test_of_more_cells_than_fit_a_screen_those_in_which_all_is_well_are_counted(folder: Path) -> None:
     starts = ", ".join([f"[{0.3 + 0.01 * i:.2f}, 0.1, 1.0]" for i in range(101)])
     axis = f'[[axis]]\nfield = "robot.a.start"\nvalues = [{starts}]\n'
-    variant = '[[axis]]\nfield = "planner.variant"\nvalues = ["assured", "paper"]\n'
+    planner_name = '[[axis]]\nfield = "planner.name"\nvalues = ["assured", "paper"]\n'
     (folder / "many.toml").write_text(
-        f'name = "many"\nscenario = "random"\ntrials = 1\nseed = 1\n{axis}{variant}'
+        f'name = "many"\nscenario = "random"\ntrials = 1\nseed = 1\n{axis}{planner_name}'
     )
     ended = sweep(folder, "many.toml", "out")
     total = {row["cell"]: row["localised"] for row in summary_rows(folder / "out")}
@@ -563,7 +563,7 @@ def test_an_axis_reaches_into_tables_that_the_base_scenario_leaves_out(folder: P
     assert "noise" not in RANDOM
     results = played(folder, "nested.toml", "out")
     for cell, (v, sigma, accuracy) in zip(results.cells, [(0.0, 0.0, 0.1), (0.01, 0.02, 0.3)], strict=True):
-        setting = setting_of(results.campaign, cell)
+        setting = setting_of(results.sweep, cell)
         assert not isinstance(setting, RefusedCell)
         assert load(str(folder / "out" / "cells" / cell.file_name)) == setting.scenario
         mission = setting.scenario.mission
@@ -598,9 +598,9 @@ def test_a_figure_tells_every_choice_of_the_other_axes_apart_while_they_are_few(
     def told_apart(name: str) -> list[str]:
         return [text.get_text() for text in drawn[name].legends[0].get_texts()]
 
-    both = [f"{variant}, anchor[0] = {d}" for variant in ("paper", "assured") for d in (10, 8)]
+    both = [f"{planner_name}, anchor[0] = {d}" for planner_name in ("paper", "assured") for d in (10, 8)]
     assert told_apart("success-mission-noise-outliers") == told_apart("success-max_ticks") == both
-    assert told_apart("success-planner-variant") == [
+    assert told_apart("success-planner-name") == [
         f"anchor[0] = {d}, outliers = {share}" for d in (10, 8) for share in (0, 0.05)
     ]
     assert told_apart("meeting") == both
@@ -608,18 +608,18 @@ def test_a_figure_tells_every_choice_of_the_other_axes_apart_while_they_are_few(
 
 @pytest.mark.parametrize("name", sorted(spec.shipped()))
 def test_a_campaign_that_ships_can_be_played(name: str) -> None:
-    campaign = spec.load(name)
-    execution.check_columns(campaign, schema_of(campaign, list(cells(campaign))))
-    for cell in cells(campaign):
-        setting = setting_of(campaign, cell)
-        assert isinstance(setting, RefusedCell) or setting.scenario.name == campaign.base["name"]
+    sweep = spec.load(name)
+    execution.check_columns(sweep, schema_of(sweep, list(cells(sweep))))
+    for cell in cells(sweep):
+        setting = setting_of(sweep, cell)
+        assert isinstance(setting, RefusedCell) or setting.scenario.name == sweep.base["name"]
     assert f"{name:10} " in tandem("scenarios").out
 
 
 def test_the_campaign_of_noise_plays_the_same_starts_in_every_cell() -> None:
-    campaign = spec.load("noise")
-    settings = [setting_of(campaign, cell) for cell in cells(campaign)]
-    assert {cell.key for cell in cells(campaign)} == {"{}"}
+    sweep = spec.load("noise")
+    settings = [setting_of(sweep, cell) for cell in cells(sweep)]
+    assert {cell.key for cell in cells(sweep)} == {"{}"}
     assert len(settings) == 15 * 2 * 2
     missions = set()
     starts = set()
@@ -633,7 +633,7 @@ def test_the_campaign_of_noise_plays_the_same_starts_in_every_cell() -> None:
         assert noise.anchor_sigma == noise.mutual_sigma
         fine = 0.03 if noise.anchor_sigma <= 0.01 else 0.1
         assert mission.accuracy == (0.3 if fraction == 0.01 else fine)
-        missions.add((noise.anchor_sigma, fraction, noise.outliers, scenario.variant))
+        missions.add((noise.anchor_sigma, fraction, noise.outliers, scenario.planner_name))
     assert len(starts) == 1
     assert missions == set(
         product((0, 0.001, 0.01, 0.05, 0.1), (0, 0.001, 0.01), (0, 0.05), ("paper", "assured"))
@@ -693,8 +693,8 @@ JOINT = 'name = "both"\nfields = ["mission.period", "mission.max_speed"]\nvalues
             "axis[0].field: 'mission.period.x': mission.period is a single",
         ),
         ("robot.b.anchor[0]", "seed", "axis[0].field: 'seed': every trial has a seed of its own"),
-        ("robot.b.anchor[0]", "planner", "axis[1]: 'planner.variant' is set by axis[0] ('planner') already"),
-        ("robot.b.anchor[0]", "planner.variant", "axis[1]: another axis is called 'planner.variant'"),
+        ("robot.b.anchor[0]", "planner", "axis[1]: 'planner.name' is set by axis[0] ('planner') already"),
+        ("robot.b.anchor[0]", "planner.name", "axis[1]: another axis is called 'planner.name'"),
         ("[10.0, 8]", "[]", "axis[0].values: "),
         ("[10.0, 8]", "[8, 8.0]", "axis[0].values[1]: the same as values[0]"),
         ("[10.0, 8]", "[8, 1979-05-27]", "axis[0].values[1]: not a number"),
@@ -702,9 +702,9 @@ JOINT = 'name = "both"\nfields = ["mission.period", "mission.max_speed"]\nvalues
         (
             "[10.0, 8]",
             '[8, "x"]',
-            "cell 2 (robot.b.anchor[0] = x; planner.variant = paper): robot[1].anchor[0]: ",
+            "cell 2 (robot.b.anchor[0] = x; planner.name = paper): robot[1].anchor[0]: ",
         ),
-        ("[10.0, 8]", "[8, 0]", "cell 2 (robot.b.anchor[0] = 0; planner.variant = paper): robot[1].anchor: "),
+        ("[10.0, 8]", "[8, 0]", "cell 2 (robot.b.anchor[0] = 0; planner.name = paper): robot[1].anchor: "),
         ('field = "robot.b.anchor[0]"', "", "axis[0]: names one 'field', or a 'name'"),
         (AXIS, AXIS + '\nlabels = ["x", "y"]', "axis[0].name: missing"),
         (AXIS, AXIS + '\nname = "D"\nlabels = ["x", "x"]', "axis[0].labels: not 2 different ones"),

@@ -168,9 +168,9 @@ def test_a_world_whose_reason_is_too_long_leaves_a_journal_that_is_read_and_take
     with Journal(path) as journal:
         end = Course(scenario, journal).end(Judgement("failed", "no answer from " + "robot, " * 200))
     assert history(read(path), path).end == end
-    record = Retrace(path)
-    assert again(scenario, record).over == end
-    record.close()
+    recording = Retrace(path)
+    assert again(scenario, recording).over == end
+    recording.close()
 
 
 def test_an_agent_that_gives_up_at_length_leaves_a_journal_that_is_read(tmp_path: Path) -> None:

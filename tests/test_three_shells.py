@@ -123,7 +123,7 @@ def waiting(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """The endpoint of a world, run "mine", that has a and waits for b."""
     out = tmp_path_factory.mktemp("waiting") / "out"
     with (
-        world("paper-1", "--run", "mine", "--patience", "100") as (_, endpoint),
+        world("paper-1", "--run", "mine", "--timeout", "100") as (_, endpoint),
         TandemProcess("agent", "a", "--connect", endpoint, "--out", out) as agent,
     ):
         agent.until_answered("a", out)

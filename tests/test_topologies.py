@@ -195,7 +195,7 @@ def test_an_agent_that_is_a_router_says_where_it_cannot_listen() -> None:
 
 def test_a_world_whose_router_is_not_there_says_what_to_check_and_gives_up(tmp_path: Path) -> None:
     x = free_endpoint()
-    ended = tandem("world", "paper-1", "--connect", x, "--patience", "1", "--out", tmp_path / "out")
+    ended = tandem("world", "paper-1", "--connect", x, "--timeout", "1", "--out", tmp_path / "out")
     what = "nobody listens there; check the address, and that the router runs"
     assert ended == (3, "", f"tandem world: no router at {x}; gave up after 1 s: {what}\n")
     assert not (tmp_path / "out").exists()

@@ -61,12 +61,12 @@ def test_the_letter_gives_up_where_the_third_mutual_range_settles_nothing(
 ) -> None:
     """b drove its last manoeuvre; a, which the paper has stand, stands. No placement is known well here."""
     monkeypatch.setattr(precision, "pinned_down", lambda *_: False)
-    text = f'{shipped()["random"].read_text()}\n[planner]\nvariant = "paper"\n'
-    record = play(parse(text, "random", seed=441))
-    assert record.end is not None
-    assert record.end.outcome == "undecided"
-    assert record.end.reason == "b: the third mutual range does not settle where they are"
-    states = [(moment.commands["a"].state, moment.commands["b"].state) for moment in record.moments]
+    text = f'{shipped()["random"].read_text()}\n[planner]\nname = "paper"\n'
+    recording = play(parse(text, "random", seed=441))
+    assert recording.end is not None
+    assert recording.end.outcome == "undecided"
+    assert recording.end.reason == "b: the third mutual range does not settle where they are"
+    states = [(moment.commands["a"].state, moment.commands["b"].state) for moment in recording.moments]
     assert states[-3:] == [("straight", "standing"), ("waiting", "last-manoeuvre"), ("waiting", "undecided")]
 
 
@@ -133,34 +133,36 @@ def test_without_a_world_a_claim_less_accurate_than_was_asked_does_not_end_local
         assert ends[-1].outcome == outcome
 
 
-def honest_claims(variant: str, sigmas: Sequence[float], seeds: Sequence[int], outliers: float = 0.0) -> int:
+def honest_claims(
+    planner_name: str, sigmas: Sequence[float], seeds: Sequence[int], outliers: float = 0.0
+) -> int:
     """How many claims honest robots make under such noise, each as accurate as was asked for."""
     claims = 0
     for sigma in sigmas:
         for seed in seeds:
             noise = f"anchor_sigma = {sigma}\nmutual_sigma = {sigma}\noutliers = {outliers}"
-            record = play(scenario_of(noise, seed, variant=variant))
-            assert record.end is not None
-            for moment in record.moments:
+            recording = play(scenario_of(noise, seed, planner_name=planner_name))
+            assert recording.end is not None
+            for moment in recording.moments:
                 for command in moment.commands.values():
                     if isinstance(command.verdict, Localised):
                         claims += 1
-                        assert inaccuracy(command.verdict, record.scenario.mission) is None, (sigma, seed)
-            assert "claims a" not in (record.end.reason or ""), (sigma, seed, record.end)
+                        assert inaccuracy(command.verdict, recording.scenario.mission) is None, (sigma, seed)
+            assert "claims a" not in (recording.end.reason or ""), (sigma, seed, recording.end)
     return claims
 
 
-@pytest.mark.parametrize("variant", ["paper", "assured"])
-def test_every_claim_of_an_honest_robot_is_as_accurate_as_was_asked(variant: str) -> None:
-    assert honest_claims(variant, [0.001, 0.05], range(3)) > 0
+@pytest.mark.parametrize("planner_name", ["paper", "assured"])
+def test_every_claim_of_an_honest_robot_is_as_accurate_as_was_asked(planner_name: str) -> None:
+    assert honest_claims(planner_name, [0.001, 0.05], range(3)) > 0
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("sigma", [0.001, 0.01, 0.05, 0.1])
 @pytest.mark.parametrize("outliers", [0.0, 0.05])
-@pytest.mark.parametrize("variant", ["paper", "assured"])
+@pytest.mark.parametrize("planner_name", ["paper", "assured"])
 def test_every_claim_of_many_noisy_missions_is_as_accurate_as_was_asked(
-    variant: str, outliers: float, sigma: float
+    planner_name: str, outliers: float, sigma: float
 ) -> None:
-    found = honest_claims(variant, [sigma], range(25), outliers)
-    assert found > 0 or variant == "paper"
+    found = honest_claims(planner_name, [sigma], range(25), outliers)
+    assert found > 0 or planner_name == "paper"

@@ -44,7 +44,7 @@ from tests.commands import (
 
 FAST_TICKS = 1000
 """about a second of a mission that nobody slows"""
-PATIENT = ("--patience", "600")
+WITH_TIMEOUT = ("--timeout", "600")
 """a mission that waits while browsers start"""
 
 
@@ -103,10 +103,10 @@ def test_the_plane_is_drawn_in_the_colours_of_what_happens(opened: Open, address
 def test_what_becomes_of_reports_is_drawn_on_their_way(opened: Open, tmp_path: Path) -> None:
     seen = {}
     for fault in ("loss=0", "loss=1", "corrupt=1"):
-        record = tmp_path / fault
-        record.mkdir()
-        in_process.play(load("paper-1", faults=[f"{fault}, contact_ticks=0..1"]), record)
-        with watching(record) as (_, where):
+        recording = tmp_path / fault
+        recording.mkdir()
+        in_process.play(load("paper-1", faults=[f"{fault}, contact_ticks=0..1"]), recording)
+        with watching(recording) as (_, where):
             page = opened(f"{where}#tick=46")
             until_shown(page, 46)
             seen[fault] = inks(page)["fault"]
@@ -242,10 +242,10 @@ def test_fifty_robots_are_shown(opened: Open, tmp_path: Path) -> None:
         for role, peer, offset in (("a", "b", 0.0), ("b", "a", 10.0))
     ]
     scenario.write_text(f'name = "fifty"\nseed = 5\n{SECTION_IV}' + "".join(robots))
-    record = tmp_path / "record"
-    record.mkdir()
-    in_process.play(load(str(scenario)), record)
-    with watching(record) as (_, where):
+    recording = tmp_path / "record"
+    recording.mkdir()
+    in_process.play(load(str(scenario)), recording)
+    with watching(recording) as (_, where):
         page = opened(f"{where}#tick=20")
         until_shown(page, 20)
         expect(page.locator(".entry")).to_have_count(50)
@@ -259,10 +259,10 @@ def test_fifty_robots_are_shown(opened: Open, tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_lost_late_and_damaged_reports_are_told(opened: Open, tmp_path: Path) -> None:
-    record = tmp_path / "record"
-    record.mkdir()
-    in_process.play(load("noisy", faults=["loss=0.3, delay=0..3, corrupt=0.1, duplicate=0.2"]), record)
-    with watching(record) as (_, where):
+    recording = tmp_path / "record"
+    recording.mkdir()
+    in_process.play(load("noisy", faults=["loss=0.3, delay=0..3, corrupt=0.1, duplicate=0.2"]), recording)
+    with watching(recording) as (_, where):
         page = opened(f"{where}#tick=26")
         until_shown(page, 26)
         expect(page.locator("#log")).to_contain_text("is lost")
@@ -318,17 +318,17 @@ def test_a_campaign_shows_its_cells_and_its_figures(opened: Open, tmp_path: Path
 def test_a_mission_is_followed_to_its_end_from_its_journals_and_from_the_network(
     opened: Open, tmp_path: Path
 ) -> None:
-    scenario, record = tmp_path / "paper-1.toml", tmp_path / "record"
+    scenario, recording = tmp_path / "paper-1.toml", tmp_path / "record"
     scenario.write_text(PAPER_1)
     with (
-        world(scenario, "--out", record, *PATIENT) as (_, endpoint),
-        world("paper-2", *PATIENT) as (_, other),
-        TandemProcess("agent", "a", "--connect", endpoint, "--out", record, *PATIENT) as a,
+        world(scenario, "--out", recording, *WITH_TIMEOUT) as (_, endpoint),
+        world("paper-2", *WITH_TIMEOUT) as (_, other),
+        TandemProcess("agent", "a", "--connect", endpoint, "--out", recording, *WITH_TIMEOUT) as a,
         TandemProcess("agent", "b", "--connect", other),
-        watching(record) as (_, of_journals),
+        watching(recording) as (_, of_journals),
         watching("--connect", endpoint, "--connect", other) as (_, of_network),
     ):
-        a.until_answered("a", record)
+        a.until_answered("a", recording)
         files, heard = opened(of_journals), opened(of_network)
         expect(heard.locator("#list a")).to_have_count(2)
         heard.locator("#list a", has_text="paper-1").click()
@@ -336,7 +336,7 @@ def test_a_mission_is_followed_to_its_end_from_its_journals_and_from_the_network
             until_shown(page, 0)
             expect(page.locator("#status")).to_have_text("● runs, tick 0")
             expect(page.locator("#follow")).to_be_visible()
-        with TandemProcess("agent", "b", "--connect", endpoint, "--out", record) as b:
+        with TandemProcess("agent", "b", "--connect", endpoint, "--out", recording) as b:
             for page in (files, heard):
                 expect(page.locator("#status")).to_have_text("localised after 48 ticks")
                 until_shown(page, 48)

@@ -54,12 +54,12 @@ class WorldProcess:
         inbox: Inbox,
         *,
         rate: float | None = None,
-        patience: float = 30.0,
+        timeout: float = 30.0,
         on_kill_point: Callable[[str, int], None] | None = None,
     ) -> None:
         """`course` may have come some way. `rate` is real time's speed, lockstep without.
 
-        `patience` (s) bounds every wait for an answer; `on_kill_point` is told how far each tick has come.
+        `timeout` (s) bounds every wait for an answer; `on_kill_point` is told how far each tick has come.
         """
         self._run = run
         scenario = course.world.scenario
@@ -68,7 +68,7 @@ class WorldProcess:
         self._on_kill_point = on_kill_point
         self._period = scenario.mission.period / rate if rate is not None else None
         self._tick_s = self._period or 0.0
-        self._patience = patience
+        self._timeout = timeout
         self._inbox = inbox
         self._robots = [robot.id for robot in scenario.robots]
         self._peers = {robot.id: robot.peer for robot in scenario.robots}
@@ -98,7 +98,9 @@ class WorldProcess:
         run, inbox = self._run, self._inbox
         self._silence = SILENCE_S + self._tick_s if replaceable else math.inf
         self._mute = time.monotonic() + self._silence
-        self._observation = {robot: session.publisher(link, keys.observation(run, robot)) for robot in self._robots}
+        self._observation = {
+            robot: session.publisher(link, keys.observation(run, robot)) for robot in self._robots
+        }
         self._truth = session.publisher(link, keys.truth(run))
         session.on_matching(self._truth, self._want_truth)
         session.subscribe(link, keys.command(run, "*"), inbox, "command")
@@ -122,7 +124,7 @@ class WorldProcess:
                 commands = self._answers(course.observations(), due)
                 if self._on_kill_point is not None:
                     self._on_kill_point("command", course.tick)
-                course.record(commands)
+                course.recording(commands)
                 if self._on_kill_point is not None:
                     self._on_kill_point("journal", course.tick)
                 end = course.advance(commands)
@@ -169,7 +171,7 @@ class WorldProcess:
                 self._put_again(frames, [arrival.source.robot])
             if due is None and now >= self._repeat:
                 self._put_all_again(frames, frames.keys() - commands.keys(), now)
-            if len(commands) < len(self._robots) and now - self._answered > self._patience + self._tick_s:
+            if len(commands) < len(self._robots) and now - self._answered > self._timeout + self._tick_s:
                 raise NoAnswer(self._who_is_missing(commands))
             if due is not None and now >= due and (arrival is NOTHING or now >= due + self._tick_s):
                 break
@@ -249,7 +251,7 @@ class WorldProcess:
     def _who_is_missing(self, commands: Mapping[str, Command]) -> str:
         missing = [robot for robot in self._robots if robot not in commands]
         names = ", ".join(robot if robot in self._alive else f"{robot} (not there)" for robot in missing)
-        return f"no answer from {names} at tick {self._course.tick} for {self._patience:g} s"
+        return f"no answer from {names} at tick {self._course.tick} for {self._timeout:g} s"
 
     def _say_who_gave_none(self) -> None:
         """Tell of which robots there is no FinalReport, and why."""
@@ -303,13 +305,13 @@ class WorldProcess:
         while True:
             last_words = set(self._course.witnesses) - said.keys()
             others = self._alive.union(expected) - said.keys()
-            give_up = began + (self._patience if last_words else FAREWELL_S)
+            give_up = began + (self._timeout if last_words else FAREWELL_S)
             if now >= give_up or not (last_words or others):
                 return list(said.values())
             if last_words and now >= began + FAREWELL_S and not told:
                 told = True
                 names = ", ".join(sorted(last_words))
-                self._inbox.say(f"waiting {self._patience:g} s for the last word of {names}")
+                self._inbox.say(f"waiting {self._timeout:g} s for the last word of {names}")
             if now >= self._repeat:
                 self._put_all_again(frames, last_words | others, now)
             arrival = self._next(min(self._repeat, give_up) - now)

@@ -6,7 +6,7 @@ import msgspec
 
 from protocol.attack import Attack
 from protocol.messages import RobotConfig
-from protocol.mission import Anchor, Mission, Role, Variant
+from protocol.mission import Anchor, Mission, PlannerName, Role
 from protocol.motion import Pose
 from protocol.orbits import Rendezvous
 from protocol.units import RobotId, Tick
@@ -32,7 +32,7 @@ class Scenario(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fiel
     seed: int
     max_ticks: Tick
     mission: Mission
-    variant: Variant
+    planner_name: PlannerName
     robots: tuple[RobotSpec, ...]
     faults: tuple[Fault, ...] = ()
     """of the radio"""
@@ -64,7 +64,7 @@ class Scenario(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fiel
             anchor=own.anchor,
             peer_anchor=self.robot(own.peer).anchor,
             mission=self.mission,
-            variant=self.variant,
+            planner_name=self.planner_name,
             rendezvous=own.rendezvous,
             attack=own.attack,
             tick_s=tick_s,

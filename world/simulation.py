@@ -11,7 +11,7 @@ from protocol.messages import Command, DeadlineMissed, Environment, FinalReport,
 from protocol.wire import encode
 from world.referee import Judgement
 from world.scenario import Scenario
-from world.tick import advance, release, observations
+from world.tick import advance, observations, release
 from world.world_journal import history
 
 
@@ -50,15 +50,17 @@ class Course:
 
     def command(self, commands: Mapping[str, Command]) -> MissionEnd | None:
         """One tick on; or the end. A robot that is not in `commands` stands still."""
-        self.record(commands)
+        self.recording(commands)
         return self.advance(commands)
 
-    def record(self, commands: Mapping[str, Command]) -> None:
+    def recording(self, commands: Mapping[str, Command]) -> None:
         """First half of `command`: the tick is on record."""
         if self._journal is not None:
             self._journal.write(
                 *[
-                    encode(commands[robot.id] if robot.id in commands else DeadlineMissed(self.tick, robot.id))
+                    encode(
+                        commands[robot.id] if robot.id in commands else DeadlineMissed(self.tick, robot.id)
+                    )
                     for robot in self.world.scenario.robots
                 ]
             )
@@ -99,29 +101,29 @@ class Course:
             self._journal.write(*[encode(final_report) for final_report in new])
 
 
-def again(scenario: Scenario, record: Retrace) -> Course:
-    """The course of the run that `record` tells, as far as it has come; of none, if there is nothing in it.
+def again(scenario: Scenario, recording: Retrace) -> Course:
+    """The course of the run that `recording` tells, as far as it has come; of none, if there is nothing in it.
 
     Raises CorruptJournal, also if it is that of another scenario, or if the world once went on otherwise.
     """
     course = Course(scenario)
-    course.keep(record)
-    named = environment.named_in(record.frames)
-    if environment.is_blank(record.frames):
-        record.write(encode(named or environment.of_world()), encode(scenario))
+    course.keep(recording)
+    named = environment.named_in(recording.frames)
+    if environment.is_blank(recording.frames):
+        recording.write(encode(named or environment.of_world()), encode(scenario))
     else:
-        _retrace(course, record, named)
+        _retrace(course, recording, named)
     return course
 
 
-def _retrace(course: Course, record: Retrace, named: Environment | None) -> None:
-    lived = history(record.frames, record.path)
+def _retrace(course: Course, recording: Retrace, named: Environment | None) -> None:
+    lived = history(recording.frames, recording.path)
     if lived.disorder is not None:
-        raise CorruptJournal(f"{record.path}: {lived.disorder.what}")
+        raise CorruptJournal(f"{recording.path}: {lived.disorder.what}")
     if lived.scenario != course.world.scenario:
-        raise CorruptJournal(f"{record.path}: the record of another scenario, {lived.scenario.name}")
+        raise CorruptJournal(f"{recording.path}: the record of another scenario, {lived.scenario.name}")
     try:
-        record.write(*[encode(one) for one in (named, lived.scenario) if one is not None])
+        recording.write(*[encode(one) for one in (named, lived.scenario) if one is not None])
         for tick in lived.ticks:
             course.command(tick.commands)
         if lived.end is not None and course.over is None:
@@ -129,6 +131,6 @@ def _retrace(course: Course, record: Retrace, named: Environment | None) -> None
         course.final_reports(lived.final_reports.values())
     except ReplayMismatch:
         raise CorruptJournal(
-            f"{record.path}: on record the world went on otherwise at tick {course.tick}: "
+            f"{recording.path}: on record the world went on otherwise at tick {course.tick}: "
             + (environment.otherwise(named, environment.of_world()) or "the journal is another version's")
         ) from None

@@ -161,7 +161,10 @@ RangedPair = tuple[Pose, Pose, float]
 
 
 def weigh_placements(
-    candidates: Iterable[Placement], pair_observations: Sequence[PairObservation], sensing_range: float, floor: float
+    candidates: Iterable[Placement],
+    pair_observations: Sequence[PairObservation],
+    sensing_range: float,
+    floor: float,
 ) -> tuple[Placement, ...]:
     """Return those of `candidates` that explain every sighting, be it a range or silence.
 
@@ -227,7 +230,9 @@ def turn_error(
     return max(turned_a, turned_b) / determinant
 
 
-def information(placement: Placement, pair_observations: Sequence[PairObservation]) -> tuple[float, float, float]:
+def information(
+    placement: Placement, pair_observations: Sequence[PairObservation]
+) -> tuple[float, float, float]:
     """What the ranges in `pair_observations` tell of phi and of psi, the bearing of M1 in <b(M2)>.
 
     The Fisher information for ranges of 1 m standard deviation, in 1 / rad^2: of phi, mixed, of psi.

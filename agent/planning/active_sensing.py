@@ -292,7 +292,9 @@ def _confusion(
     first = np.minimum(distances[0], RIM * reach)
     for one, distance in zip(held[1:], distances[1:], strict=True):
         gap = np.square((np.minimum(distance, RIM * reach) - first) / (COARSE * sigma))
-        left += math.sqrt(held[0].probability * one.probability) * np.exp(-np.minimum(np.sum(gap, 1), SURE) / 8.0)
+        left += math.sqrt(held[0].probability * one.probability) * np.exp(
+            -np.minimum(np.sum(gap, 1), SURE) / 8.0
+        )
     return CONFUSION * left
 
 

@@ -53,9 +53,9 @@ def sensed(state: RobotState, anchor_range: float | None) -> RobotState:
     """`state` in the state that its own senses lead to."""
     match state.mode:
         case Straight("anchor") | Backing("anchor") | Turning("anchor") | Circling("anchor"):
-            mission, variant = state.config.mission, state.config.variant
+            mission, planner_name = state.config.mission, state.config.planner_name
             onward = range_seeking.onward(
-                state.mode, state.odometry, anchor_range is not None, mission, variant
+                state.mode, state.odometry, anchor_range is not None, mission, planner_name
             )
             return _surveyed(state) if onward is None else replace(state, mode=onward)
         case Surveying("anchor"):
@@ -140,13 +140,13 @@ def _under_way(state: RobotState, ranged: bool) -> RobotState:
             return _parted(state)
     assert isinstance(state.mode, Aligning | Radial | Tangent | Orbiting)
     mode = phase2_orbit.onward(state.mode, state.odometry, state.start, state.orbit, mission)
-    patience: float = LOST * active_sensing.stride(mission)
-    if state.orbit.v == 0.0 and isinstance(mode, Radial | Orbiting) and _silent(state) >= patience:
+    timeout: float = LOST * active_sensing.stride(mission)
+    if state.orbit.v == 0.0 and isinstance(mode, Radial | Orbiting) and _silent(state) >= timeout:
         return _homeward(state)
     if isinstance(mode, Orbiting):
         since = mode.since or state.tick
-        patience += state.config.rendezvous.bound / mission.period
-        if state.orbit.v != 0.0 and state.tick - since > patience and not state.in_contact:
+        timeout += state.config.rendezvous.bound / mission.period
+        if state.orbit.v != 0.0 and state.tick - since > timeout and not state.in_contact:
             return _homeward(state)
         if state.orbit.v != 0.0:
             command = phase2_orbit.pursuit(state.local_pose, state.orbit, mission)

@@ -21,8 +21,10 @@ PEER_RESTS = (MODE_NAMES[Standing], MODE_NAMES[Waiting])
 
 def meets(state: RobotState) -> bool:
     """Whether phase 3 begins, once in contact: by the letter when both orbit, else as soon as it can."""
-    if state.config.variant == "paper":
-        return isinstance(state.mode, Orbiting) and (state.peer_state.phase == 3 or state.peer_state.state == state.mode_name)
+    if state.config.planner_name == "paper":
+        return isinstance(state.mode, Orbiting) and (
+            state.peer_state.phase == 3 or state.peer_state.state == state.mode_name
+        )
     return state.peer_state.phase == 3 or (state.peer_state.start is not None and state.off_anchor)
 
 
@@ -32,7 +34,7 @@ def lingers(state: RobotState) -> bool:
     The peer is in phase 1, or has not been heard; or it is b, and too near its anchor.
     """
     return (
-        state.config.variant == "assured"
+        state.config.planner_name == "assured"
         and state.in_contact
         and (state.peer_state.start is None or state.config.role == "a")
     )
@@ -75,15 +77,19 @@ def _settled(state: RobotState) -> RobotState:
 
     The letter looks at the encounter alone; `assured` also at what was ranged, and what was silent, before.
     """
-    mission, variant, began = state.config.mission, state.config.variant, state.belief.encounter_tick
+    mission, planner_name, began = (
+        state.config.mission,
+        state.config.planner_name,
+        state.belief.encounter_tick,
+    )
     assert began is not None
-    pair_observations = state.pair_observations(began if variant == "paper" else 0)
+    pair_observations = state.pair_observations(began if planner_name == "paper" else 0)
     ranged = [at for at in pair_observations if at.range is not None]
     away = [at for at in ranged if off_anchor(at.b, state.config.rendezvous.b)]
     base = phase3_last_manoeuvre.base(away, precision.drift(state))
     if base is None:  # yet; or, where a report was missed, b was still driving as a went straight
         again = isinstance(state.mode, Waiting) and state.peer_state.state == MODE_NAMES[Standing]
-        return met(state) if again and variant == "assured" else state
+        return met(state) if again and planner_name == "assured" else state
     if state.belief.peer_anchor is None:
         state = replace(state, belief=replace(state.belief, peer_anchor=precision.peer_anchor(state)))
     off = precision.apart(state)
@@ -95,23 +101,27 @@ def _settled(state: RobotState) -> RobotState:
     if checked and len(left) == 1 and precision.pinned_down(state, left[0], ranged, off):
         return replace(state, mode=Done(3, Localised(state.world_pose(left[0]))))
     mover = state.config.role
-    alone = variant == "assured" and isinstance(state.peer_state.verdict, Localised)  # the peer stands for good
+    alone = planner_name == "assured" and isinstance(
+        state.peer_state.verdict, Localised
+    )  # the peer stands for good
     if not alone and mover != (
-        phase3_last_manoeuvre.turn(pair_observations) if checked and variant == "assured" else "b"
+        phase3_last_manoeuvre.turn(pair_observations) if checked and planner_name == "assured" else "b"
     ):
         return state
-    if variant == "assured" and not alone and state.peer_state.state not in PEER_RESTS:
+    if planner_name == "assured" and not alone and state.peer_state.state not in PEER_RESTS:
         return state
-    if variant == "paper" and state.belief.plan is not None:
+    if planner_name == "paper" and state.belief.plan is not None:
         failure = "does not settle where they are" if checked else "could not be taken: b left a's range"
         return state.undecided(f"the third mutual range {failure}")
     a, b = pair_observations[-1].a, pair_observations[-1].b
     if checked and len(left) == 1:
         plan = phase3_last_manoeuvre.survey(mover, a, b, left[0], pair_observations, mission)
     else:
-        plan = phase3_last_manoeuvre.last_manoeuvre(mover, a, b, left, mission, variant)
+        plan = phase3_last_manoeuvre.last_manoeuvre(mover, a, b, left, mission, planner_name)
     if plan is None:
-        return state if variant == "assured" else state.undecided("no manoeuvre keeps the safety distance")
+        return (
+            state if planner_name == "assured" else state.undecided("no manoeuvre keeps the safety distance")
+        )
     return replace(
         state,
         state=LastManoeuvre(plan.command, state.odometry),
@@ -129,7 +139,9 @@ def _weighed(
     reach, findings = state.config.mission.sensing_range, state.belief
     if findings.candidates is None:
         solutions = phase3_last_manoeuvre.solve(state.config.anchor_distance, base)
-        silence = [pair_observation for pair_observation in pair_observations if pair_observation.range is None]
+        silence = [
+            pair_observation for pair_observation in pair_observations if pair_observation.range is None
+        ]
         unheard = weigh_placements(solutions, silence, reach, floor)
         findings = replace(findings, placements=tuple(solutions), candidates=(len(solutions), len(unheard)))
     left = weigh_placements(findings.placements, pair_observations, reach, floor)

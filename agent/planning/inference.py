@@ -145,9 +145,7 @@ def missing_for(
         return "no hypothesis explains the ranges"
     probability = scored[0].hypothesis.probability
     if probability < mission.confidence:
-        return (
-            f"the likeliest of {len(scored)} hypotheses has the probability {probability:.6f}, of {mission.confidence:g}"
-        )
+        return f"the likeliest of {len(scored)} hypotheses has the probability {probability:.6f}, of {mission.confidence:g}"
     if not against.p_value >= DOUBTFUL:
         return f"the likeliest hypothesis is in doubt: {against.what}"
     _, covariance = bent(held[0], pair.apart)

@@ -69,7 +69,9 @@ def considered(state: RobotState) -> RobotState:
 def waits(state: RobotState) -> bool:
     """Whether b has yet to hear that a has its second range."""
     return (
-        isinstance(state.mode, Standing) and state.belief.plan is None and state.peer_state.state != MODE_NAMES[Waiting]
+        isinstance(state.mode, Standing)
+        and state.belief.plan is None
+        and state.peer_state.state != MODE_NAMES[Waiting]
     )
 
 

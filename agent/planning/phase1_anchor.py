@@ -10,7 +10,7 @@ import msgspec
 
 from agent.estimation.exact import Branch
 from agent.planning.range_seeking import ARRIVED
-from protocol.mission import RANGE_MARGIN, Mission, Variant, third_point_turn_rate
+from protocol.mission import RANGE_MARGIN, Mission, PlannerName, third_point_turn_rate
 from protocol.motion import Controls, Pose, chord, compose
 
 PREFERENCE = 1e-9
@@ -32,7 +32,7 @@ class ThirdPoint(msgspec.Struct, frozen=True):
 def third_point(
     places: Sequence[Pose],
     mission: Mission,
-    variant: Variant,
+    planner_name: PlannerName,
     *,
     margin: float = RANGE_MARGIN,
     pinning: bool = False,
@@ -51,14 +51,14 @@ def third_point(
     shortest = ARRIVED * mission.first_straight
     rim = mission.sensing_range - max(margin, SIGMAS * mission.noise.anchor_sigma)
     turn_rate = third_point_turn_rate(mission)
-    turn_rates = [turn_rate] if variant == "paper" else [turn_rate, -turn_rate]
+    turn_rates = [turn_rate] if planner_name == "paper" else [turn_rate, -turn_rate]
     if len(places) > 1 or pinning:  # one branch was found on a radius: there, straight ahead checks nothing
         turn_rates.append(0.0)
     for omega in turn_rates:
         unit = chord(1.0, omega, mission.period)
         longest = mission.max_speed * unit
         half = 0.5 * mission.period * omega
-        for forward in (1.0,) if variant == "paper" else (1.0, -1.0):
+        for forward in (1.0,) if planner_name == "paper" else (1.0, -1.0):
             outward = [_outward(place, half, forward) for place in places]
             reach = max(_reach(along, across, rim) for along, across in outward)
             length = min(longest, reach)

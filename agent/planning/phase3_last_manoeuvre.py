@@ -15,7 +15,7 @@ from agent.estimation.closed_forms import Placement, placements
 from agent.estimation.exact import PairObservation, information
 from agent.planning.range_seeking import travelled
 from agent.planning.separation import nearest
-from protocol.mission import RANGE_MARGIN, Mission, Role, Variant
+from protocol.mission import RANGE_MARGIN, Mission, PlannerName, Role
 from protocol.motion import Controls, Pose
 
 Array = NDArray[np.float64]
@@ -124,7 +124,9 @@ def base(
     ranged: list[PairObservation] = []
     for pair_observation in pair_observations:
         if pair_observation.range is not None and not (
-            ranged and (ranged[-1].a, ranged[-1].b) == (pair_observation.a, pair_observation.b)  # both have stood since
+            ranged
+            and (ranged[-1].a, ranged[-1].b)
+            == (pair_observation.a, pair_observation.b)  # both have stood since
         ):
             ranged.append(pair_observation)
     for first in ranged:
@@ -151,12 +153,15 @@ def solve(distance: float, base: tuple[PairObservation, PairObservation]) -> lis
     return placements(distance, first.b, first.a, second.a, first.range, second.range)
 
 
-def redundant(pair_observations: Sequence[PairObservation], base: tuple[PairObservation, PairObservation]) -> bool:
+def redundant(
+    pair_observations: Sequence[PairObservation], base: tuple[PairObservation, PairObservation]
+) -> bool:
     """Whether there is a range more, from elsewhere, than the two that the placements were made from."""
     return any(
         pair_observation.range is not None
         and all(
-            travelled(pair_observation.a, used.a) > ELSEWHERE or travelled(pair_observation.b, used.b) > ELSEWHERE
+            travelled(pair_observation.a, used.a) > ELSEWHERE
+            or travelled(pair_observation.b, used.b) > ELSEWHERE
             for used in base
         )
         for pair_observation in pair_observations
@@ -186,7 +191,12 @@ def advanced(state: LastManoeuvre | Returning, pose: Pose, in_contact: bool, res
 
 
 def last_manoeuvre(
-    mover: Role, a: Pose, b: Pose, candidates: Sequence[Placement], mission: Mission, variant: Variant
+    mover: Role,
+    a: Pose,
+    b: Pose,
+    candidates: Sequence[Placement],
+    mission: Mission,
+    planner_name: PlannerName,
 ) -> Plan | None:
     """The manoeuvre after which the ranges that `candidates` predict differ most (eq. (8), on squares).
 
@@ -196,7 +206,7 @@ def last_manoeuvre(
     silence would check nothing. None where every manoeuvre comes nearer than the safety distance.
     """
     question = Question(mover, a, b, tuple(candidates))
-    reach, gap, value = compared(question, mission, variant)
+    reach, gap, value = compared(question, mission, planner_name)
     row, column = _best(value)
     if value[row, column] == -np.inf:
         return None
@@ -204,10 +214,10 @@ def last_manoeuvre(
     return Plan(command, float(gap[row, column]) if len(candidates) > 1 else None, question)
 
 
-def compared(question: Question, mission: Mission, variant: Variant) -> Compared:
+def compared(question: Question, mission: Mission, planner_name: PlannerName) -> Compared:
     """What `last_manoeuvre` chooses from: the largest value."""
     mover, a, b, candidates = question
-    reach = reachable(a if mover == "a" else b, mission, variant)
+    reach = reachable(a if mover == "a" else b, mission, planner_name)
     squared: list[Array] = []
     for candidate in candidates:
         (ax, ay), (bx, by) = _placed(mover, a, b, candidate, reach.x, reach.y)
@@ -218,7 +228,7 @@ def compared(question: Question, mission: Mission, variant: Variant) -> Compared
         gap = np.min([abs(one - other) for i, one in enumerate(squared) for other in squared[:i]], axis=0)
     apart = _keeps_apart(question, reach, mission)
     value = np.where(apart, gap, -np.inf)
-    if variant == "assured":
+    if planner_name == "assured":
         rim = (mission.sensing_range - RANGE_MARGIN) ** 2
         outside = np.sum([distance > rim for distance in squared], axis=0)
         fewest = np.min(outside, where=apart, initial=len(squared))
@@ -288,12 +298,12 @@ def _best(value: Array) -> tuple[int, int]:
     return int(row), int(column)
 
 
-def reachable(pose: Pose, mission: Mission, variant: Variant) -> Reach:
+def reachable(pose: Pose, mission: Mission, planner_name: PlannerName) -> Reach:
     """The manoeuvres that are compared, from `pose`."""
     omega = np.linspace(-mission.max_turn_rate, mission.max_turn_rate, TURN_RATES)
     half = 0.5 * mission.period * omega
     unit = mission.period * np.sinc(half / math.pi)
-    if variant == "paper":
+    if planner_name == "paper":
         speed = np.array([[mission.max_speed]])
     else:
         speed = mission.first_straight / mission.period * np.array(SPEEDS)[:, None]

@@ -72,7 +72,16 @@ def observe(state: RobotState, observation: Observation) -> RobotState:
             if contact.range is not None:
                 mutual = (*mutual, Ranged(observation.tick, contact.range))
     sensed = RobotState(
-        state.config, state.mode, observation.tick, odometry, log, mutual, state.belief, state.peer_state, near, leg
+        state.config,
+        state.mode,
+        observation.tick,
+        odometry,
+        log,
+        mutual,
+        state.belief,
+        state.peer_state,
+        near,
+        leg,
     )
     return _advanced(sensed, observation.anchor_range)
 
@@ -83,7 +92,9 @@ def report(state: RobotState) -> Report:
     log, start = state.log, state.belief.branch.start if state.belief.branch and state.phase > 1 else None
     if (attack := state.config.attack) is not None:
         findings = state.belief
-        log = false_reports.told(log, attack, findings.phase1_done_tick, findings.encounter_tick, state.config.mission.period)
+        log = false_reports.told(
+            log, attack, findings.phase1_done_tick, findings.encounter_tick, state.config.mission.period
+        )
         start = false_reports.start(start, attack) if start is not None else None
     news = log.after(since, ranges_since)
     return Report(
@@ -165,7 +176,9 @@ def _heard(state: RobotState, reports: Sequence[Report]) -> RobotState:
     for told in reports:
         heard = peer_state.hear(state.peer_state, told)
         doubt = (
-            plausibility.objection(state.peer_state, heard, told, state.config) if state.verdict is None else None
+            plausibility.objection(state.peer_state, heard, told, state.config)
+            if state.verdict is None
+            else None
         )
         state = replace(state, peer_state=heard)
         if doubt is not None:
@@ -193,8 +206,8 @@ def _advanced(state: RobotState, anchor_range: float | None) -> RobotState:
             return _on_to_orbit(state, state.mode)
         case Straight(beacon) | Backing(beacon) | Turning(beacon) | Circling(beacon):
             measured = state.in_contact if beacon == "peer" else anchor_range is not None
-            mission, variant = state.config.mission, state.config.variant
-            onward = range_seeking.onward(state.mode, state.odometry, measured, mission, variant)
+            mission, planner_name = state.config.mission, state.config.planner_name
+            onward = range_seeking.onward(state.mode, state.odometry, measured, mission, planner_name)
             if onward is not None:
                 return state if onward is state.mode else replace(state, mode=onward)
             return replace(state, mode=Waiting()) if beacon == "peer" else _second_range(state)
@@ -203,7 +216,8 @@ def _advanced(state: RobotState, anchor_range: float | None) -> RobotState:
         case LastManoeuvre(_, origin) | Returning(_, origin) if range_seeking.moved(origin, state.odometry):
             rest = Standing() if state.config.role == "b" else Waiting()
             return replace(
-                state, state=phase3_last_manoeuvre.advanced(state.mode, state.odometry, state.in_contact, rest)
+                state,
+                state=phase3_last_manoeuvre.advanced(state.mode, state.odometry, state.in_contact, rest),
             )
         case Asleep():
             return _released(state, anchor_range)
@@ -213,7 +227,7 @@ def _advanced(state: RobotState, anchor_range: float | None) -> RobotState:
 
 def _surveys(state: RobotState) -> bool:
     """Whether sensors are noisy, and more than one look at them may be taken."""
-    return state.config.variant == "assured" and not state.config.mission.noise.exact
+    return state.config.planner_name == "assured" and not state.config.mission.noise.exact
 
 
 def _again(state: RobotState, observation: Observation) -> bool:
@@ -270,7 +284,7 @@ def _weighed(
     That takes ranges that fix the anchor as exactly as the claim needs; the letter takes no more of them.
     `kind` is how it ends; None where it goes on for another range in any case.
     """
-    mission, as_published = state.config.mission, state.config.variant == "paper"
+    mission, as_published = state.config.mission, state.config.planner_name == "paper"
     floor = precision.drifted(state, state.log, state.tick)
     margin = precision.margin(mission, floor)
     left = weigh_branches(candidates, state.seen(), mission.sensing_range, floor, margin)
@@ -287,10 +301,10 @@ def _weighed(
 def _to_third_point(state: RobotState, left: tuple[Branch, ...], margin: float) -> RobotState:
     if not left:
         return state.undecided("no pose explains the anchor ranges")
-    mission, variant = state.config.mission, state.config.variant
-    pinning = variant == "assured" and len(left) == 1 and mission.noise.exact
+    mission, planner_name = state.config.mission, state.config.planner_name
+    pinning = planner_name == "assured" and len(left) == 1 and mission.noise.exact
     places = phase1_anchor.local(left, state.odometry)
-    controls = phase1_anchor.third_point(places, mission, variant, margin=margin, pinning=pinning)
+    controls = phase1_anchor.third_point(places, mission, planner_name, margin=margin, pinning=pinning)
     if controls is None:
         return state.undecided("eq. (5) leaves no way to a third range")
     return replace(state, mode=ThirdPoint(left, state.odometry, controls))
@@ -298,7 +312,9 @@ def _to_third_point(state: RobotState, left: tuple[Branch, ...], margin: float) 
 
 def _located(state: RobotState, branch: Branch, kind: messages.BranchKind, off: float = 0.0) -> RobotState:
     """Phase 1 is done: its pose relative to the anchor is known, and that it may be `off` m elsewhere."""
-    findings = replace(state.belief, branch=branch, branch_kind=kind, phase1_done_tick=state.tick, own_anchor=off)
+    findings = replace(
+        state.belief, branch=branch, branch_kind=kind, phase1_done_tick=state.tick, own_anchor=off
+    )
     state = replace(state, belief=findings)
     mu = phase2_orbit.orientation(state.local_pose)
     return _on_to_orbit(state, Aligning(state.odometry.heading - mu))

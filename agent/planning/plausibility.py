@@ -25,7 +25,9 @@ EXACT = 1e-6
 """m and rad: where sensors are exact, what is told of one tick agrees so far"""
 
 
-def objection(before: PeerState, after: PeerState, report: Report, config: RobotConfig) -> Inconsistent | None:
+def objection(
+    before: PeerState, after: PeerState, report: Report, config: RobotConfig
+) -> Inconsistent | None:
     """What in `report` cannot be so, which led from `before` to `after`; None if all of it may be."""
     return (
         _second_story(before, report, config.mission)
@@ -54,7 +56,9 @@ def _impossible_drive(report: Report, mission: Mission) -> Inconsistent | None:
     """Nobody drives faster than v_max, or turns faster than omega_max."""
     noise = mission.noise
     speed = _most(mission.max_speed, noise.actuation.v, noise.odometry.v, noise.standstill_bound[0])
-    rate = _most(mission.max_turn_rate, noise.actuation.omega, noise.odometry.omega, noise.standstill_bound[1])
+    rate = _most(
+        mission.max_turn_rate, noise.actuation.omega, noise.odometry.omega, noise.standstill_bound[1]
+    )
     for run in report.runs:
         for what, value, most in (("v", abs(run.v), speed), ("omega", abs(run.omega), rate)):
             if value > most:

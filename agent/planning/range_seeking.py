@@ -13,7 +13,7 @@ from typing import Literal
 import msgspec
 
 from agent.planning.separation import leeway
-from protocol.mission import Mission, Variant
+from protocol.mission import Mission, PlannerName
 from protocol.motion import REST, TAU, Controls, Pose, wrap
 
 ARRIVED = 1e-9
@@ -95,7 +95,9 @@ def ahead(origin: Pose, pose: Pose) -> float:
     return (pose.x - origin.x) * math.cos(origin.heading) + (pose.y - origin.y) * math.sin(origin.heading)
 
 
-def onward(state: Seeking, pose: Pose, measured: bool, mission: Mission, variant: Variant) -> Seeking | None:
+def onward(
+    state: Seeking, pose: Pose, measured: bool, mission: Mission, planner_name: PlannerName
+) -> Seeking | None:
     """The state after a tick that led to `pose`; None once there is a second range."""
     there, facing = arrived(mission)
     step = stretch(state.beacon, state.rho0, mission)
@@ -105,7 +107,7 @@ def onward(state: Seeking, pose: Pose, measured: bool, mission: Mission, variant
                 return state
             if measured:
                 return None
-            if variant == "assured":
+            if planner_name == "assured":
                 return Backing(beacon, origin, rho0)
             return Turning(beacon, origin, rho0, pose.heading + math.pi / 2)
         case Backing(beacon, origin, rho0):

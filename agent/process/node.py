@@ -45,16 +45,16 @@ class AgentProcess:
         run: str,
         inbox: Inbox,
         *,
-        patience: float = 30.0,
+        timeout: float = 30.0,
         on_kill_point: Callable[[str, int], None] | None = None,
     ) -> None:
-        """`patience` (s) bounds the wait for the world; `on_kill_point` is told how far each tick has come."""
+        """`timeout` (s) bounds the wait for the world; `on_kill_point` is told how far each tick has come."""
         config = memory.config
         self._id = config.robot
         self._inbox = inbox
-        self._patience = patience
+        self._timeout = timeout
         self._tick_s = config.tick_s
-        self._silence = patience + (self._tick_s or 0.0)
+        self._silence = timeout + (self._tick_s or 0.0)
         """how long to wait for something new from the world"""
         self._give_up = time.monotonic() + self._silence
         self._on_kill_point = on_kill_point
@@ -253,7 +253,7 @@ class AgentProcess:
             frames_refused=self._inbox.refused.total(),
         )
         self.end = end
-        self._give_up = time.monotonic() + self._patience
+        self._give_up = time.monotonic() + self._timeout
 
     def _part(self, end: MissionEnd) -> MissionEnd:
         """Answer the MissionEnd, as often as it is said, until the world says that it has the answer on record."""
@@ -280,7 +280,7 @@ class AgentProcess:
                 gone = True  # what it said before may be on its way
             elif gone and arrival.topic == "nothing":
                 self._inbox.say(
-                    f"the world has gone after its MissionEnd; waiting {self._patience:g} s for it"
+                    f"the world has gone after its MissionEnd; waiting {self._timeout:g} s for it"
                 )
                 gone = False
         return end

@@ -39,18 +39,18 @@ class Memory(msgspec.Struct, frozen=True):
     """what it has answered to the MissionEnd"""
 
 
-def remember(record: Retrace) -> Memory | None:
-    """What `record` tells; None if there is nothing in it.
+def remember(recording: Retrace) -> Memory | None:
+    """What `recording` tells; None if there is nothing in it.
 
     Raises CorruptJournal if it tells no mission, or one in which other decisions were taken.
     """
-    if environment.is_blank(record.frames):
+    if environment.is_blank(recording.frames):
         return None
-    named = environment.named_in(record.frames)
-    lived = past(record.frames, record.path)
+    named = environment.named_in(recording.frames)
+    lived = past(recording.frames, recording.path)
     robot = Robot(lived.config)
-    robot.keep(record)
-    record.write(*[encode(one) for one in (named, lived.config) if one is not None])
+    robot.keep(recording)
+    recording.write(*[encode(one) for one in (named, lived.config) if one is not None])
     told: deque[FramedReport] = deque(maxlen=REPORTS_TOLD)
     for step in lived.steps:
         try:
@@ -62,11 +62,11 @@ def remember(record: Retrace) -> Memory | None:
                 robot.estimate()
         except ReplayMismatch:
             raise CorruptJournal(
-                f"{record.path}: on record it decided otherwise at tick {step.observation.tick}: "
+                f"{recording.path}: on record it decided otherwise at tick {step.observation.tick}: "
                 + (environment.otherwise(named, environment.of_robot()) or "the journal is another version's")
             ) from None
     if lived.final_report is not None:  # counts what the wire brought, too, which no fold can
-        record.write(*record.frames[-2:])
+        recording.write(*recording.frames[-2:])
     observation = lived.steps[-1].observation if lived.steps else None
     now = observation.tick if observation is not None else 0
     latest = lived.steps[-REPORTS_KEPT:]

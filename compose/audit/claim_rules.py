@@ -59,7 +59,7 @@ def _redundant(case: Evidence, placed: RobotSpec, past: Past, tick: int) -> Viol
     if noise.exact:
         places = _places(case, placed, mutual)
         return _too_few(tick, placed, "relative placements with a mutual range", places, PLACES)
-    least = CHECKED if scenario.variant == "assured" else CHECKED_BY_LETTER
+    least = CHECKED if scenario.planner_name == "assured" else CHECKED_BY_LETTER
     if noise.outliers:
         least = CHECKED_WITH_OUTLIERS
     return _too_few(tick, placed, "mutual ranges", len(mutual), least)

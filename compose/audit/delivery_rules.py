@@ -21,7 +21,9 @@ def observation(case: Evidence) -> Checks:
                 yield None
             else:
                 what = difference(step.observation, expected)
-                yield Violation("observation", step.observation.tick, robot, what, between(step.observation, expected))
+                yield Violation(
+                    "observation", step.observation.tick, robot, what, between(step.observation, expected)
+                )
 
 
 def contact(case: Evidence) -> Checks:
@@ -39,7 +41,9 @@ def contact(case: Evidence) -> Checks:
 def _sent(case: Evidence, robot: str, step: Step) -> Violation | None:
     if case.contact(robot, step.observation.tick) is not None:
         return None
-    return Violation("contact", step.observation.tick, robot, "it sent a report, expected none: out of contact")
+    return Violation(
+        "contact", step.observation.tick, robot, "it sent a report, expected none: out of contact"
+    )
 
 
 def _listed(robot: str, step: Step) -> Violation | None:

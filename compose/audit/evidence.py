@@ -81,7 +81,9 @@ def case_of(journals: Mapping[str, Iterable[bytes]], folder: object) -> Evidence
         if testimony.past is not None and testimony.past.config.robot != robot.id:
             raise CorruptJournal(f"{folder}/{name} is the journal of {testimony.past.config.robot}")
         testimonies[robot.id] = testimony
-    sensed = tuple([{observation.robot: observation for observation in observations(world)} for world in told.worlds])
+    sensed = tuple(
+        [{observation.robot: observation for observation in observations(world)} for world in told.worlds]
+    )
     return Evidence(told, sensed, testimonies)
 
 

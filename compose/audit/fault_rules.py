@@ -34,7 +34,9 @@ def befallen(case: Evidence) -> tuple[LinkStatistics, ...]:
 
 def _befallen(past: Past) -> LinkStatistics:
     """Of the link to this robot."""
-    contacts = [(step.observation.tick, contact) for step in past.steps for contact in step.observation.contacts]
+    contacts = [
+        (step.observation.tick, contact) for step in past.steps for contact in step.observation.contacts
+    ]
     heard = [(now, tick) for now, contact in contacts for tick in contact.heard or ()]
     damaged = [tick for _, contact in contacts for tick in contact.damaged]
     ticks = [tick for _, tick in heard]

@@ -14,7 +14,7 @@ import msgspec
 
 from compose.audit.agent_rules import decision
 from compose.audit.claim_rules import outcome
-from compose.audit.delivery_rules import contact, report, observation
+from compose.audit.delivery_rules import contact, observation, report
 from compose.audit.evidence import Evidence
 from compose.audit.findings import Checks, Violation
 from compose.audit.hardware_rules import Alone
@@ -23,7 +23,15 @@ from compose.audit.journal_rules import config, order
 from compose.audit.rules import judged
 from compose.recording.run import books
 
-RULES: tuple[Callable[[Evidence], Checks], ...] = (config, observation, contact, report, decision, order, outcome)
+RULES: tuple[Callable[[Evidence], Checks], ...] = (
+    config,
+    observation,
+    contact,
+    report,
+    decision,
+    order,
+    outcome,
+)
 """in the order of a tick: what differs first has caused what differs later"""
 ALONE: tuple[Callable[[Alone], Checks], ...] = (report, decision, order_alone)
 """the same without a world"""

@@ -8,7 +8,7 @@ from pathlib import Path
 from compose.audit import hardware_rules
 from compose.audit.agent_rules import decision, limits, log
 from compose.audit.claim_rules import claim
-from compose.audit.delivery_rules import contact, report, observation
+from compose.audit.delivery_rules import contact, observation, report
 from compose.audit.evidence import Evidence, case_of, other_versions
 from compose.audit.fault_rules import befallen, faults
 from compose.audit.findings import Checks, Findings, findings_of

@@ -8,7 +8,14 @@ from compose.audit.evidence import Evidence, Testified
 from compose.audit.findings import Checks, Violation, difference
 from compose.scenario.scenario_file import NEAREST_ANCHORS
 from protocol.attack import OF_THE_START
-from protocol.mission import Anchor, Mission, Variant, noise_infeasibility, infeasibility, safety_infeasibility
+from protocol.mission import (
+    Anchor,
+    Mission,
+    PlannerName,
+    infeasibility,
+    noise_infeasibility,
+    safety_infeasibility,
+)
 from protocol.orbits import Rendezvous, rendezvous
 from world.scenario import RobotSpec
 
@@ -25,7 +32,7 @@ def scenario(case: Evidence) -> Checks:
             _off_role(robot, first=place[robot.id] < place[robot.peer]),
             _off_range(robot, told.mission),
             _off_lie(robot),
-            _off_plan(robot.rendezvous, told.mission, told.variant, robot.anchor, peer.anchor),
+            _off_plan(robot.rendezvous, told.mission, told.planner_name, robot.anchor, peer.anchor),
         ):
             yield _violation(robot.id, why)
 
@@ -37,7 +44,7 @@ def config(case: Testified) -> Checks:
     """
     for robot, past in case.pasts.items():
         told = past.config
-        why = _off_plan(told.rendezvous, told.mission, told.variant, told.anchor, told.peer_anchor)
+        why = _off_plan(told.rendezvous, told.mission, told.planner_name, told.anchor, told.peer_anchor)
         yield Violation("config", None, robot, why) if why is not None else None
 
 
@@ -57,7 +64,7 @@ def _off_lie(robot: RobotSpec) -> str | None:
 
 
 def _off_plan(
-    found: Rendezvous, mission: Mission, variant: Variant, anchor: Anchor, peer: Anchor
+    found: Rendezvous, mission: Mission, planner_name: PlannerName, anchor: Anchor, peer: Anchor
 ) -> str | None:
     """Return why `found` is not the plan for these anchors; None if it is."""
     distance = math.dist((anchor.x, anchor.y), (peer.x, peer.y))
@@ -65,7 +72,7 @@ def _off_plan(
         return f"its anchor is {distance:.3g} m from its peer's, expected {NEAREST_ANCHORS:g} m at the least"
     if (why := infeasibility(mission, distance)) is not None:
         return f"mission: {why}"
-    expected = rendezvous(mission, distance, variant)
+    expected = rendezvous(mission, distance, planner_name)
     return None if found == expected else f"rendezvous.{difference(found, expected)}"
 
 

@@ -65,8 +65,8 @@ def _play(options: argparse.Namespace, inbox: Inbox) -> MissionEnd:
     memory = remember(old) if old is not None else None
     end = memory.end if memory is not None else None
     which = f"world of run '{options.run}'" if options.run else "world"
-    wait = options.wait if end is None else min(options.wait, STILL_THERE_S)
-    patience = options.patience if end is None else min(options.patience, LAST_WORD_S)
+    wait = options.connect_timeout if end is None else min(options.connect_timeout, STILL_THERE_S)
+    timeout = options.timeout if end is None else min(options.timeout, LAST_WORD_S)
     search = Search(which, endpoints, wait, inbox)
     warning = beyond(endpoints)
     process: AgentProcess | None = None
@@ -87,7 +87,7 @@ def _play(options: argparse.Namespace, inbox: Inbox) -> MissionEnd:
                         raise CorruptJournal(f"{old.path}: another run's: its briefing is not this world's")
                     memory = _ready(options, config, old, memory, inbox)
                     process = AgentProcess(
-                        memory, run, inbox, patience=patience, on_kill_point=kills.taker(options.kill)
+                        memory, run, inbox, timeout=timeout, on_kill_point=kills.taker(options.kill)
                     )
                     process.attach(link)
                     if not (options.quiet or options.launched):

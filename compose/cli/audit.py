@@ -19,8 +19,8 @@ SHOWN = 20
 
 def main(options: argparse.Namespace) -> int:
     """Judge the record, and say what there is to find."""
-    with legible(options.record):
-        findings = audit(options.record)
+    with legible(options.recording):
+        findings = audit(options.recording)
     _show(findings)
     return VIOLATED if findings.violations else CLEAN
 

@@ -225,7 +225,7 @@ def _missions(rounds: int, done: Callable[[], None]) -> Table:
     return table
 
 
-def _world_alone(played: run.Record) -> float:
+def _world_alone(played: run.Recording) -> float:
     """Seconds that the same run takes with the robots' answers given."""
     began = time.perf_counter()
     course = Course(played.scenario)
@@ -259,7 +259,7 @@ def _noisy(rounds: int, done: Callable[[], None]) -> Table:
 def _with_noise(exact: Scenario, noise: Noise) -> Scenario:
     mission = replace(exact.mission, noise=noise)
     first, second = (robot.anchor for robot in exact.robots)
-    plan = rendezvous(mission, math.dist((first.x, first.y), (second.x, second.y)), exact.variant)
+    plan = rendezvous(mission, math.dist((first.x, first.y), (second.x, second.y)), exact.planner_name)
     robots = tuple([replace(robot, rendezvous=plan) for robot in exact.robots])
     return replace(exact, mission=mission, robots=robots, max_ticks=tick_budget(mission, plan))
 
@@ -275,12 +275,19 @@ def _parts(scenarios: Sequence[Scenario]) -> tuple[float, float, float]:
             began = time.perf_counter()
             observations = course.observations()
             sensed = time.perf_counter()
-            told = {observation.robot: robots[observation.robot].observation(observation) for observation in observations}
+            told = {
+                observation.robot: robots[observation.robot].observation(observation)
+                for observation in observations
+            }
             heard = time.perf_counter()
             commands = {}
             for observation in observations:
-                reports = [told[contact.peer] for contact in observation.contacts for _ in contact.heard or ()]
-                commands[observation.robot] = robots[observation.robot].decide([one for one in reports if one is not None])
+                reports = [
+                    told[contact.peer] for contact in observation.contacts for _ in contact.heard or ()
+                ]
+                commands[observation.robot] = robots[observation.robot].decide(
+                    [one for one in reports if one is not None]
+                )
             decided = time.perf_counter()
             end = course.command(commands)
             world += sensed - began + time.perf_counter() - decided

@@ -16,11 +16,11 @@ from protocol.output import say
 def main(options: argparse.Namespace) -> int:
     """Write the files; FAILED if a robot's journal is missing: of that one there is only what others tell."""
     need(*MODULES)
-    out: Path = options.out or options.record
+    out: Path = options.out or options.recording
     inbox = Inbox("tandem export")
     stop_by_signal(inbox)
     try:
-        done = exported(options.record, out, inbox)
+        done = exported(options.recording, out, inbox)
     except Interrupted as signal_name:
         inbox.say(f"stopped by {signal_name}")
         return STOPPED

@@ -11,7 +11,7 @@ from compose.errors import ENDED, FAILED, UserError
 from compose.extras import need
 from compose.figures import FORMATS, PICTURES
 from compose.recording.robots import alone, casts
-from compose.recording.run import Record, agent_journal, legible, read
+from compose.recording.run import Recording, agent_journal, legible, read
 from compose.terminal.outcome import counting
 from protocol.journal.journal_file import CorruptJournal
 from protocol.output import say
@@ -24,27 +24,27 @@ if TYPE_CHECKING:
 def main(options: argparse.Namespace) -> int:
     """Draw each pair of the record; FAILED if a robot has left no journal that can be followed to its end."""
     need("matplotlib")
-    with legible(options.record):
-        record = None if alone(options.record) else read(options.record)
-        pairs = _casts(options.record, record)
-    folder, status = options.record / "figures", ENDED
+    with legible(options.recording):
+        recording = None if alone(options.recording) else read(options.recording)
+        pairs = _casts(options.recording, recording)
+    folder, status = options.recording / "figures", ENDED
     kinds = [kind for kind in PICTURES if kind in (options.only or PICTURES)]
     formats = [one for one in FORMATS if one in (options.format or FORMATS)]
     with counting("tandem figures", sum([len(robots) + len(kinds) for robots in pairs])) as done:
         for robots in pairs:
             accounts = {}
             for robot in robots:
-                account = _account(options.record, robot)
+                account = _account(options.recording, robot)
                 if account is not None:
                     accounts[robot] = account
                 if account is None or account.broken is not None:
                     status = FAILED
                 done()
             torn = [name for name, one in accounts.items() if one.past is not None and one.past.end is None]
-            torn += ["the world"] if record is not None and record.end is None else []
+            torn += ["the world"] if recording is not None and recording.end is None else []
             if torn:
                 _say(f"the record of {' and '.join(torn)} breaks off before the mission's end")
-            pair = _pair(record, robots, accounts)
+            pair = _pair(recording, robots, accounts)
             if pair is None:
                 _say(f"no picture of {' and '.join(robots)}: nothing is on record")
                 status = FAILED
@@ -58,21 +58,23 @@ def main(options: argparse.Namespace) -> int:
     return status
 
 
-def _casts(folder: Path, record: Record | None) -> list[tuple[str, ...]]:
+def _casts(folder: Path, recording: Recording | None) -> list[tuple[str, ...]]:
     """The robots of each pair, a first; of one that has left a journal, where there was no world."""
-    if record is None:
+    if recording is None:
         return casts(folder)
-    robots = record.scenario.robots
-    return [(robots[a].id, robots[b].id) for a, b in record.scenario.pairs()]
+    robots = recording.scenario.robots
+    return [(robots[a].id, robots[b].id) for a, b in recording.scenario.pairs()]
 
 
-def _pair(record: Record | None, robots: Sequence[str], accounts: Mapping[str, Account]) -> PairRecord | None:
+def _pair(
+    recording: Recording | None, robots: Sequence[str], accounts: Mapping[str, Account]
+) -> PairRecord | None:
     """None of those of whom nothing is known."""
     from compose.figures.pair import of_record, of_robots  # noqa: PLC0415
 
-    if record is not None:
-        places = {robot.id: place for place, robot in enumerate(record.scenario.robots)}
-        return of_record(record, (places[robots[0]], places[robots[1]]), accounts)
+    if recording is not None:
+        places = {robot.id: place for place, robot in enumerate(recording.scenario.robots)}
+        return of_record(recording, (places[robots[0]], places[robots[1]]), accounts)
     told = {robot: account for robot, account in accounts.items() if account.past is not None}
     return of_robots(told) if told else None
 

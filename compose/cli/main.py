@@ -224,7 +224,7 @@ def _add_scenario(parser: argparse.ArgumentParser) -> None:
 
 def _add_playing(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=folder, metavar="DIR", help="where the record goes")
-    parser.add_argument("--patience", type=positive, default=30.0, metavar="S", help="longest silence (30)")
+    parser.add_argument("--timeout", type=positive, default=30.0, metavar="S", help="longest silence (30)")
     parser.add_argument("-q", "--quiet", action="store_true", help="print only the outcome")
 
 

@@ -13,8 +13,8 @@ from protocol.output import say
 
 def main(options: argparse.Namespace) -> int:
     """Play it again, and show the first difference."""
-    with legible(options.record):
-        played, torn = replay(options.record)
+    with legible(options.recording):
+        played, torn = replay(options.recording)
     if played.differences:
         first, *more = played.differences
         say(f"{played.scenario}: not as recorded")

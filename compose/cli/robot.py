@@ -82,7 +82,7 @@ def main(options: argparse.Namespace) -> int:
     try:
         with (
             folder_for(options.out) as folder,
-            recorded(folder, config, inbox, fsync=options.fsync) as record,
+            recorded(folder, config, inbox, fsync=options.fsync) as recording,
             closing(made(maker, options.driver, config, manoeuvre_s, given)) as driver,
         ):
             field = Field(
@@ -92,10 +92,10 @@ def main(options: argparse.Namespace) -> int:
                 inbox,
                 max_ticks=scenario.max_ticks,
                 manoeuvre_s=manoeuvre_s,
-                patience=options.patience,
-                journal=record.journal,
+                timeout=options.timeout,
+                journal=recording.journal,
             )
-            record.take_up(driver, options.driver, field)
+            recording.take_up(driver, options.driver, field)
             end = _play(options, field, reached, folder, inbox)
     except session.CannotListen as error:
         raise UserError(f"--listen: {error}") from None
@@ -135,7 +135,7 @@ def _play(
         agent = Agent(
             [
                 *("agent", options.id, "--connect", own, "--launched", "--run", field.run, *keys),
-                *("--out", str(folder.resolve()), "--patience", str(options.patience)),
+                *("--out", str(folder.resolve()), "--timeout", str(options.timeout)),
                 *(["--fsync"] if options.fsync else []),
             ],
             inbox,
@@ -145,7 +145,7 @@ def _play(
             if not options.quiet:
                 where = f", again, from tick {field.tick} on" if field.tick >= 0 else ", waiting for its peer"
                 say(f"{options.id}: in run {field.run}{where}")
-            end = field.play(options.wait, agent.again)
+            end = field.play(options.connect_timeout, agent.again)
             agent.end(STOP_S)
         finally:
             agent.end()

@@ -114,7 +114,7 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[
                     inbox,
                     run=run_name(scenario),
                     rate=options.rate,
-                    patience=options.patience,
+                    timeout=options.timeout,
                     kills=kills,
                     keys=keys,
                     agents_journal=bool(options.out is not None or kills or shows),

@@ -12,7 +12,7 @@ from compose.extras import need
 from compose.launch.signals import stop_by_signal
 from compose.sweep import spec
 from compose.sweep.cells import cells, trial_table
-from compose.sweep.spec import Campaign
+from compose.sweep.spec import Sweep
 from protocol.network.inbox import Inbox
 from protocol.output import say
 
@@ -22,15 +22,15 @@ if TYPE_CHECKING:
 
 def main(options: argparse.Namespace) -> int:
     """Play the campaign, or what is left of it."""
-    campaign = spec.load(options.spec, trials=options.trials, seed=options.seed)
+    sweep = spec.load(options.spec, trials=options.trials, seed=options.seed)
     need("distributed", "matplotlib", "pyarrow", "tomli_w")
     if options.print_trial is not None:
-        return print_trial(campaign, *options.print_trial)
+        return print_trial(sweep, *options.print_trial)
     inbox = Inbox("tandem sweep")
     stop_by_signal(inbox)
     from compose.sweep import axis_figures, execution, report  # noqa: PLC0415  # slow, and there may be no extra
 
-    out = options.out if options.out is not None else Path(f"sweep-{campaign.name}")
+    out = options.out if options.out is not None else Path(f"sweep-{sweep.name}")
     chosen = {"workers": options.workers} if options.workers is not None else {}
     means = execution.ExecutionOptions(
         scheduler=options.scheduler,
@@ -40,8 +40,8 @@ def main(options: argparse.Namespace) -> int:
         **chosen,
     )
     visible = sys.stdout.isatty() and not options.quiet
-    with report.progress(campaign.name, inbox.say, visible) as progress:
-        results = execution.sweep(campaign, out, means, inbox, progress)
+    with report.progress(sweep.name, inbox.say, visible) as progress:
+        results = execution.sweep(sweep, out, means, inbox, progress)
     if results.stopped is not None:
         inbox.say(
             f"{results.stopped}: {len(results.table)} of {results.trials} trials are done; "
@@ -56,14 +56,14 @@ def main(options: argparse.Namespace) -> int:
     return status_of(results)
 
 
-def print_trial(campaign: Campaign, cell: int, trial: int) -> int:
+def print_trial(sweep: Sweep, cell: int, trial: int) -> int:
     """Print the scenario file of a trial."""
     import tomli_w  # noqa: PLC0415  # there may be no extra
 
-    found = next((one for one in cells(campaign) if one.index == cell), None)
+    found = next((one for one in cells(sweep) if one.index == cell), None)
     if found is None:
-        raise UserError(f"--print-trial: {campaign.source} has no cell {cell}")
-    say(*tomli_w.dumps(trial_table(campaign, found, trial)).splitlines())
+        raise UserError(f"--print-trial: {sweep.source} has no cell {cell}")
+    say(*tomli_w.dumps(trial_table(sweep, found, trial)).splitlines())
     return LOCALISED
 
 

@@ -27,7 +27,7 @@ def main(options: argparse.Namespace) -> int:
     need("starlette", "uvicorn")
     from compose.view.web import server, site  # noqa: PLC0415  # there may be no extra
 
-    if options.record is None:
+    if options.recording is None:
         from compose.network import places  # noqa: PLC0415  # a record needs no network
 
         shown = site.of_network(places(options))
@@ -35,7 +35,7 @@ def main(options: argparse.Namespace) -> int:
         flag = "--connect" if options.connect else "--config" if options.config else "--keys"
         raise UserError(f"{flag}: a record needs no network; leave out one of the two")
     else:
-        shown = site.of_record(options.record) if options.launched else site.of_folder(options.record)
+        shown = site.of_record(options.recording) if options.launched else site.of_folder(options.recording)
     for note in shown.notes:
         say(f"tandem watch: {note}", error=True)
     try:

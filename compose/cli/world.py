@@ -45,19 +45,19 @@ def main(options: argparse.Namespace) -> int:
     stop_by_signal(inbox)
     try:
         endpoints = _endpoints(options)
-        record = _record(options)
-        course = again(scenario, record) if record is not None else None
+        recording = _record(options)
+        course = again(scenario, recording) if recording is not None else None
         limits.need_files(limits.SESSION_FILES + len(scenario.robots), "a world with a link to each robot")
         with ExitStack() as stack:
-            wait = RELISTEN_S if record is not None else 0.0
-            way = stack.enter_context(_Way(endpoints, options.patience, inbox, wait))
+            wait = RELISTEN_S if recording is not None else 0.0
+            way = stack.enter_context(_Way(endpoints, options.timeout, inbox, wait))
             if (warning := beyond(endpoints)) is not None:
                 inbox.say(warning)
             folder = stack.enter_context(folder_for(options.out))
-            if course is None or record is None:
+            if course is None or recording is None:
                 journal = stack.enter_context(Journal(folder / WORLD_JOURNAL, fsync=options.fsync))
                 return _play(options, Course(scenario, journal), way, folder, inbox)
-            course.keep(stack.enter_context(going_on(record, inbox)))
+            course.keep(stack.enter_context(going_on(recording, inbox)))
             return _play(options, course, way, folder, inbox)
     except session.CannotListen as error:
         raise UserError(f"--listen: {error}") from None
@@ -96,10 +96,10 @@ class NoRouter(TimeoutError):
 class _Way:
     """One session of the world's after the other."""
 
-    def __init__(self, endpoints: Endpoints, patience: float, inbox: Inbox, wait: float) -> None:
-        """`wait` (s) bounds how long to wait for where it listens to be free, `patience` for a router."""
+    def __init__(self, endpoints: Endpoints, timeout: float, inbox: Inbox, wait: float) -> None:
+        """`wait` (s) bounds how long to wait for where it listens to be free, `timeout` for a router."""
         self.endpoints = endpoints
-        self._patience = patience
+        self._timeout = timeout
         self._inbox = inbox
         self._wait = wait
         self._open = ExitStack()
@@ -107,13 +107,13 @@ class _Way:
     def open(self) -> None:
         """Close the session there is, and open another. Raises CannotListen, NoRouter or Interrupted."""
         self._open.close()
-        give_up = time.monotonic() + self._patience
+        give_up = time.monotonic() + self._timeout
         self.session: zenoh.Session | None = None
 
         def unanswered() -> None:
             if time.monotonic() >= give_up:
                 why = diagnosis.why(self.endpoints)
-                raise NoRouter(f"no router at {self.endpoints}; gave up after {self._patience:g} s: {why}")
+                raise NoRouter(f"no router at {self.endpoints}; gave up after {self._timeout:g} s: {why}")
             self._inbox.next(LOOK_AGAIN_S)
 
         if self.endpoints.connect:
@@ -164,7 +164,7 @@ def _play(options: argparse.Namespace, course: Course, way: _Way, folder: Path, 
         run,
         inbox,
         rate=options.rate,
-        patience=options.patience,
+        timeout=options.timeout,
         on_kill_point=kills.taker(options.kill),
     )
     if not (options.quiet or options.launched):

@@ -127,7 +127,9 @@ def _overheard(pair: SessionPair, run: str, me: str, wait: float) -> Iterator[Fi
             f"rules: reading the truth of {run}: {me} has no part in it; try by a robot's keys that has"
         )
         return
-    forbidden = {_short(key): key for key in (keys.truth(run), keys.command(run, peer), keys.observation(run, peer))}
+    forbidden = {
+        _short(key): key for key in (keys.truth(run), keys.command(run, peer), keys.observation(run, peer))
+    }
     latest: Any = zenoh.handlers.RingChannel(RING)
     ears: dict[str, Any] = {
         name: pair.hearer.declare_subscriber(key, latest) for name, key in forbidden.items()

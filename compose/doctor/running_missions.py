@@ -124,7 +124,9 @@ class _Ear:
         robots = self._there[run] - {""}
         if "" not in self._there[run]:
             return True
-        again = any(self._count[Key(keys.observation, run, one)] > 1 for one in self.named(run, keys.observation))
+        again = any(
+            self._count[Key(keys.observation, run, one)] > 1 for one in self.named(run, keys.observation)
+        )
         return again and robots <= self.named(run, keys.command)
 
     def named(self, run: str, kind: Any) -> set[str]:
@@ -148,7 +150,9 @@ def _mission(link: zenoh.Session, ear: _Ear, run: str, there: frozenset[str]) ->
     briefed = [one for frame in answers.values() if (one := _said(frame, RobotConfig)) is not None]
     named = there - {""} | ear.named(run, keys.observation) | ear.named(run, keys.command)
     named |= {one.peer for one in briefed}
-    said = [ear.said(Key(keys.observation, run, robot), Observation | MissionEnd | FinalReport) for robot in named]
+    said = [
+        ear.said(Key(keys.observation, run, robot), Observation | MissionEnd | FinalReport) for robot in named
+    ]
     ends = [one for one in said if isinstance(one, MissionEnd)]
     tick = max((one.tick for one in said if isinstance(one, Observation | MissionEnd)), default=None)
     return RunningMission(

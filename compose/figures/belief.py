@@ -52,7 +52,7 @@ def draw_error(axes: Axes, story: Story) -> None:
     if story.exact:
         limit, gid, name = TOLERANCE, "tolerance", "wrong, if more: 1e-6 m"
     else:
-        limit = story.record.scenario.mission.accuracy
+        limit = story.recording.scenario.mission.accuracy
         gid, name = "accuracy", f"sigma asked for: {limit:g} m"
     if not distances and not story.placed:  # there is nothing to fit but the limit
         axes.set_ylim(limit / 10.0, limit * 10.0)
@@ -125,7 +125,7 @@ def draw_probability(axes: Axes, story: Story) -> None:
 
 def _draw_probability(axes: Axes, story: Story) -> None:
     """On a scale on which 99.99 % is as far from 99 % as that from evens."""
-    confidence = story.record.scenario.mission.confidence
+    confidence = story.recording.scenario.mission.confidence
     edge = max(SUREST, BEYOND * (1.0 - confidence))
     axes.set_yscale("logit")
     for rank in reversed(range(RANKS)):
@@ -148,7 +148,12 @@ def _draw_probability(axes: Axes, story: Story) -> None:
 def _odds_of(axes: Axes, story: Story, rank: int, placed: bool, edge: float) -> None:
     """Those of the hypothesis that is so likely, before or after they are about the plane."""
     points = [
-        (one.tick, min(max(one.probabilities[rank], edge), 1.0 - edge) if rank < len(one.probabilities) else math.nan)
+        (
+            one.tick,
+            min(max(one.probabilities[rank], edge), 1.0 - edge)
+            if rank < len(one.probabilities)
+            else math.nan,
+        )
         for one, _ in story.estimates
         if bool(one.world) == placed
     ]

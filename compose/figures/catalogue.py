@@ -37,7 +37,7 @@ def _phase_one(pair: PairRecord) -> Iterator[Picture]:
 
 def _plan(pair: PairRecord) -> Iterator[Picture]:
     """What there is of them under noise is hypotheses, of `assured`."""
-    if pair.told and pair.variant == "assured" and not pair.exact:
+    if pair.told and pair.planner_name == "assured" and not pair.exact:
         yield f"plan-{pair.name}", decisions.draw(pair)
     elif pair.told:
         for name, figure in manoeuvre.draw(pair).items():
@@ -61,11 +61,11 @@ def _robot(pair: PairRecord) -> Iterator[Picture]:
     for role in pair.told:
         name, account = pair.robot(role).id, pair.robot(role).account
         assert account is not None
-        if pair.record is None:
+        if pair.recording is None:
             yield f"robot-{name}", Absent(NO_TRUTH)
             continue
-        ids = [one.id for one in pair.record.scenario.robots]
-        yield f"robot-{name}", one_robot.figure_of(Story(pair.record, ids.index(name), account.held))
+        ids = [one.id for one in pair.recording.scenario.robots]
+        yield f"robot-{name}", one_robot.figure_of(Story(pair.recording, ids.index(name), account.held))
 
 
 _DRAWN: dict[str, Callable[[PairRecord], Iterator[Picture]]] = {

@@ -98,7 +98,7 @@ def _inverse(placement: Placement) -> Pose:
 
 def _figure(pair: PairRecord, one: Planned) -> Figure:
     seen, plan, mission = scene(one.plan), one.plan, pair.mission
-    ways = compared(plan.question, mission, pair.variant)
+    ways = compared(plan.question, mission, pair.planner_name)
     below = 0.5 + ROW * math.ceil((SIGNS + len(seen.others)) / COLUMNS) + 0.05
     sheet = Sheet(0.6 + PLANE + 0.75 + COST + 0.2, below + PLANE + 0.08, [pair.title, _title(pair, one)])
     axes = sheet.panel(0.6, below, PLANE, PLANE)

@@ -79,13 +79,13 @@ def key_of(beside: Axes, panel: Axes, corner: Corner, columns: int = 1, title: s
 
 def _title(story: Story) -> str:
     """Who it is, how the mission ended, and what the robot says at its end."""
-    record, claim = story.record, story.claim
+    recording, claim = story.recording, story.claim
     end = (
         "the record breaks off"
-        if record.end is None
-        else ended(record.end.outcome, story.last, record.end.reason)
+        if recording.end is None
+        else ended(recording.end.outcome, story.last, recording.end.reason)
     )
-    lines = [f"Robot {story.own.id} of {record.scenario.name}, seed {record.scenario.seed}: {end}"]
+    lines = [f"Robot {story.own.id} of {recording.scenario.name}, seed {recording.scenario.seed}: {end}"]
     if claim is None:
         lines.append("It never claimed to know where it is.")
     else:

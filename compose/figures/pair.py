@@ -13,10 +13,10 @@ from agent.planning.state import RobotState
 from compose.figures.account import Account
 from compose.recording.claim import Claim
 from compose.recording.robots import outcome
-from compose.recording.run import Record
+from compose.recording.run import Recording
 from compose.recording.summary_json import broken_off, ended, first_claim
 from protocol.messages import Command
-from protocol.mission import Anchor, Mission, Role, Variant
+from protocol.mission import Anchor, Mission, PlannerName, Role
 from protocol.motion import Pose
 from protocol.orbits import Orbit
 from world.sensors import anchor_ranges, mutual_ranges
@@ -49,13 +49,13 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
     """which run it is of, and how that ended"""
     mission: Mission
     """what is known of the mission by all"""
-    variant: Variant
+    planner_name: PlannerName
     a: Side
     b: Side
     mutual: tuple[tuple[bool, float | None], ...]
     """whether the two were in contact, and the range that was measured, tick by tick; where the two measured
     it each for itself, a's, or where a has none, b's"""
-    record: Record | None
+    recording: Recording | None
     """of the truth; none without a world"""
 
     @property
@@ -76,7 +76,7 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
     @property
     def true(self) -> bool:
         """Whether paths are true, and not what the robots claim."""
-        return self.record is not None
+        return self.recording is not None
 
     @property
     def placed(self) -> int:
@@ -140,11 +140,15 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
         return None
 
 
-def of_record(record: Record, places: tuple[int, int], accounts: Mapping[str, Account]) -> PairRecord:
+def of_record(recording: Recording, places: tuple[int, int], accounts: Mapping[str, Account]) -> PairRecord:
     """The robots at those places of the scenario, a first; `accounts` are those that can be read."""
-    scenario, moments = record.scenario, record.moments
+    scenario, moments = recording.scenario, recording.moments
     last = len(moments) - 1
-    how = ended(record.end.outcome, last, record.end.reason) if record.end is not None else broken_off(last)
+    how = (
+        ended(recording.end.outcome, last, recording.end.reason)
+        if recording.end is not None
+        else broken_off(last)
+    )
     ranges = [anchor_ranges(one.truth, scenario) for one in moments]
     mutual = [mutual_ranges(one.truth, scenario, [places])[0] for one in moments]
 
@@ -158,17 +162,17 @@ def of_record(record: Record, places: tuple[int, int], accounts: Mapping[str, Ac
             commands=tuple([one.commands.get(robot.id) for one in moments]),
             anchor_ranges=tuple([each[place] for each in ranges]),
             account=accounts.get(robot.id),
-            claim=first_claim(record, place),
+            claim=first_claim(recording, place),
         )
 
     return PairRecord(
-        title=f"{scenario.name}, seed {scenario.seed}, {scenario.variant}: {how}",
+        title=f"{scenario.name}, seed {scenario.seed}, {scenario.planner_name}: {how}",
         mission=scenario.mission,
-        variant=scenario.variant,
+        planner_name=scenario.planner_name,
         a=side("a", places[0]),
         b=side("b", places[1]),
         mutual=tuple([(one is not None, one.range if one is not None else None) for one in mutual]),
-        record=record,
+        recording=recording,
     )
 
 
@@ -198,12 +202,12 @@ def of_robots(accounts: Mapping[str, Account]) -> PairRecord:
         )
 
     pair = PairRecord(
-        title=f"{' and '.join(told)} without a world, {config.variant}: {outcome(told)}",
+        title=f"{' and '.join(told)} without a world, {config.planner_name}: {outcome(told)}",
         mission=config.mission,
-        variant=config.variant,
+        planner_name=config.planner_name,
         a=side("a"),
         b=side("b"),
         mutual=tuple(mutual),
-        record=None,
+        recording=None,
     )
     return replace(pair, title=f"{pair.title}; places by their claims") if pair.placed else pair

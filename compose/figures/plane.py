@@ -41,7 +41,7 @@ MANY = 400
 
 def window(story: Story) -> Window:
     """What of the plane is to be seen: both paths, and both anchors' ranges."""
-    reach = story.record.scenario.mission.sensing_range
+    reach = story.recording.scenario.mission.sensing_range
     points = [(pose.x, pose.y) for one in (story.own, story.peer) for pose in story.truth(one.id)]
     for one in (story.own, story.peer):
         points += [(one.anchor.x + dx, one.anchor.y + dy) for dx in (-reach, reach) for dy in (-reach, reach)]
@@ -74,7 +74,7 @@ def draw(axes: Axes, story: Story) -> None:
 
 def _anchor(axes: Axes, one: RobotSpec, story: Story) -> None:
     """Its place, and how far it is heard."""
-    place, reach = (one.anchor.x, one.anchor.y), story.record.scenario.mission.sensing_range
+    place, reach = (one.anchor.x, one.anchor.y), story.recording.scenario.mission.sensing_range
     own = one is story.own
     axes.plot(*place, "+", color="k", ms=9, mew=1.3, gid=f"anchor-{one.id}")
     circle = Circle(place, reach, fill=False, ls="--", lw=0.8, color="0.4", gid=f"range-{one.id}")
@@ -152,7 +152,7 @@ def legible(story: Story) -> list[tuple[Estimate, Pose]]:
     Not one larger than R: that says that nothing is known.
     """
     chosen: list[tuple[Estimate, Pose]] = []
-    largest = story.record.scenario.mission.sensing_range
+    largest = story.recording.scenario.mission.sensing_range
     for estimate, truth in reversed(story.likeliest):
         if estimate.covariance is None or len(chosen) == ELLIPSES:
             continue
@@ -239,7 +239,7 @@ def _half(story: Story) -> float:
 
     last = size(*story.likeliest[-1])
     most = max([size(*one) for one in legible(story)], default=last)
-    least = EXACTLY * story.record.scenario.mission.sensing_range if story.exact else TOLERANCE
+    least = EXACTLY * story.recording.scenario.mission.sensing_range if story.exact else TOLERANCE
     return max(min(1.1 * most, AROUND * last), least)
 
 

@@ -9,7 +9,7 @@ from itertools import groupby
 import msgspec
 
 from compose.recording.claim import Claim
-from compose.recording.run import Record
+from compose.recording.run import Recording
 from compose.recording.summary_json import first_claim
 from protocol.messages import Estimate
 from protocol.motion import Pose
@@ -27,7 +27,7 @@ class Span(msgspec.Struct, frozen=True):
 class Story(msgspec.Struct, frozen=True, dict=True):
     """One robot's mission, and what it thought of it."""
 
-    record: Record
+    recording: Recording
     place: int
     """in the scenario"""
     held: tuple[Estimate, ...]
@@ -36,29 +36,29 @@ class Story(msgspec.Struct, frozen=True, dict=True):
     @property
     def own(self) -> RobotSpec:
         """Who it is."""
-        return self.record.scenario.robots[self.place]
+        return self.recording.scenario.robots[self.place]
 
     @property
     def peer(self) -> RobotSpec:
         """Whom it is to find."""
-        return self.record.scenario.robot(self.own.peer)
+        return self.recording.scenario.robot(self.own.peer)
 
     @property
     def exact(self) -> bool:
         """Whether its sensors are: then nothing is likelier than anything else that is possible."""
-        return self.record.scenario.mission.noise.exact
+        return self.recording.scenario.mission.noise.exact
 
     @property
     def last(self) -> int:
         """The last tick on record."""
-        return max(0, len(self.record.moments) - 1)
+        return max(0, len(self.recording.moments) - 1)
 
     def truth(self, robot: str | None = None) -> list[Pose]:
         """Where it was, or `robot`, in every tick; at least where it was released."""
-        places = {one.id: i for i, one in enumerate(self.record.scenario.robots)}
+        places = {one.id: i for i, one in enumerate(self.recording.scenario.robots)}
         place = self.place if robot is None else places[robot]
-        poses = [moment.truth.poses[place] for moment in self.record.moments]
-        return poses or [self.record.scenario.robots[place].start]
+        poses = [moment.truth.poses[place] for moment in self.recording.moments]
+        return poses or [self.recording.scenario.robots[place].start]
 
     @cached_property
     def estimates(self) -> list[tuple[Estimate, Pose]]:
@@ -88,13 +88,13 @@ class Story(msgspec.Struct, frozen=True, dict=True):
     @cached_property
     def claim(self) -> Claim | None:
         """The first, if it ever claimed."""
-        return first_claim(self.record, self.place)
+        return first_claim(self.recording, self.place)
 
     @cached_property
     def phases(self) -> tuple[Span, ...]:
         """In order, over all ticks on record; one in which no Command came goes with those before."""
         told, phase = [], 1
-        for moment in self.record.moments:
+        for moment in self.recording.moments:
             command = moment.commands.get(self.own.id)
             phase = command.phase if command is not None else phase
             told.append((phase, moment.truth.tick))

@@ -37,7 +37,7 @@ def over_time(axes: Axes, story: Story) -> None:
     marked = _marks(story.phases, ticks, shares)
     axes.xaxis.set_major_locator(FixedLocator(marked))
     axes.xaxis.set_minor_locator(NullLocator())
-    period = story.record.scenario.mission.period
+    period = story.recording.scenario.mission.period
     if period == 1.0:
         axes.xaxis.set_major_formatter("{x:g}")
         what = "tick, one a second"

@@ -118,9 +118,7 @@ class ExerciseRun:
                 Observation,
             )
             if reading.mutual_range is not None:
-                decode(
-                    encode(Observation(tick, self.config.robot, None, reading.mutual_range)), Observation
-                )
+                decode(encode(Observation(tick, self.config.robot, None, reading.mutual_range)), Observation)
         except (MalformedFrame, TypeError) as error:
             raise Broken(f"sense({tick}): {error}") from None
         share_s = self._manoeuvre_s

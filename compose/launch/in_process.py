@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from agent.process.robot import FramedReport, Robot
-from compose.recording.run import WORLD_JOURNAL, Record, TickRecord, agent_journal
+from compose.recording.run import WORLD_JOURNAL, Recording, TickRecord, agent_journal
 from protocol.journal.journal_file import Journal, Sink
 from protocol.messages import Command, FinalReport, MissionEnd
 from world.faults import LATEST
@@ -15,7 +15,7 @@ from world.scenario import Scenario
 from world.simulation import Course
 
 
-def play(scenario: Scenario, out: Path | None = None) -> Record:
+def play(scenario: Scenario, out: Path | None = None) -> Recording:
     """The run of `scenario`. Journals go to `out`, byte for byte those of the run as processes.
 
     Raises journal.CannotRecord if `out` holds a record, or cannot be written.
@@ -33,7 +33,7 @@ def journals(scenario: Scenario) -> list[str]:
     return [*[agent_journal(robot.id) for robot in scenario.robots], WORLD_JOURNAL]
 
 
-def played(scenario: Scenario, sinks: Mapping[str, Sink]) -> Record:
+def played(scenario: Scenario, sinks: Mapping[str, Sink]) -> Recording:
     """The run of `scenario`, whose journals go to `sinks`, by name: all of them, or none."""
     ids = [robot.id for robot in scenario.robots]
     course = Course(scenario, sinks.get(WORLD_JOURNAL))
@@ -49,7 +49,9 @@ def played(scenario: Scenario, sinks: Mapping[str, Sink]) -> Record:
                 told[observation.robot, observation.tick] = report
         commands: dict[str, Command] = {}
         for observation in observations:
-            heard = [told[contact.peer, tick] for contact in observation.contacts for tick in contact.heard or ()]
+            heard = [
+                told[contact.peer, tick] for contact in observation.contacts for tick in contact.heard or ()
+            ]
             commands[observation.robot] = robots[observation.robot].decide(heard)
             if robots[observation.robot].journaled:
                 robots[observation.robot].estimate()
@@ -60,4 +62,4 @@ def played(scenario: Scenario, sinks: Mapping[str, Sink]) -> Record:
         end = course.command(commands)
     final_reports: dict[str, FinalReport] = {robot: robots[robot].final_report(end) for robot in ids}
     course.final_reports(final_reports.values())
-    return Record(scenario, tuple(moments), end, final_reports)
+    return Recording(scenario, tuple(moments), end, final_reports)

@@ -130,14 +130,14 @@ def play(
     *,
     run: str,
     rate: float | None,
-    patience: float,
+    timeout: float,
     kills: Sequence[Kill] = (),
     keys: Path | None = None,
     agents_journal: bool = True,
 ) -> list[Kill]:
     """Run `scenario`, write its journals to `out`, and return the kills that did not happen.
 
-    `rate` is the speed relative to real time, None for lockstep; `patience` is a timeout in s. A process is
+    `rate` is the speed relative to real time, None for lockstep; `timeout` is a timeout in s. A process is
     killed at its points in `kills`, and started again.
 
     Without `agents_journal`, only the world writes a journal. The outcome follows from that one alone, and
@@ -148,7 +148,7 @@ def play(
     Raises ChildFailed, or Interrupted if `inbox` receives a signal. No process is left running in any case.
     """
     limits.need_files(CHILD_FILES * (1 + len(scenario.robots)) + SPARE_FILES, "a run as processes")
-    arguments = _arguments(scenario, out, run, rate, patience, keys, agents_journal=agents_journal)
+    arguments = _arguments(scenario, out, run, rate, timeout, keys, agents_journal=agents_journal)
     launched = _Run(scenario, inbox, arguments)
     try:
         for name in launched.names:
@@ -164,14 +164,14 @@ def _arguments(
     out: Path,
     run: str,
     rate: float | None,
-    patience: float,
+    timeout: float,
     keys: Path | None,
     *,
     agents_journal: bool,
 ) -> dict[str, list[str]]:
     """Return the command lines of the world and the agents, by process name."""
     endpoint = free_endpoint("tcp" if keys is None else "tls")
-    shared = ["--launched", "--run", run, "--patience", str(patience)]
+    shared = ["--launched", "--run", run, "--timeout", str(timeout)]
     journal = ["--out", str(out)]
     real_time = ["--rate", str(rate)] if rate is not None else []
 
@@ -217,7 +217,7 @@ class _Run:
         """Wait until all have ended, the agents at most FOLLOW_S after the world. Raises ChildFailed."""
         running = set(self.names)
         while running:
-            arrival = self._inbox.next(self._patience(WORLD in running))
+            arrival = self._inbox.next(self._timeout(WORLD in running))
             if arrival.topic == "nothing" and not self._due:
                 return
             if arrival.topic == "ended":
@@ -232,7 +232,7 @@ class _Run:
                 del self._due[name]
                 self.start(name, self.children[name].kills)
 
-    def _patience(self, world_runs: bool) -> float | None:
+    def _timeout(self, world_runs: bool) -> float | None:
         """Return the timeout in s for the next message of the inbox; None is no timeout."""
         if self._due:
             return min(self._due.values()) - time.monotonic()

@@ -14,22 +14,22 @@ import numpy as np
 from agent.estimation.gaussian.least_squares import deviation, fit, poses
 from agent.estimation.gaussian.odometry_noise import Track, track
 from agent.estimation.gaussian.range_model import Ranges
-from compose.recording.run import Record
+from compose.recording.run import Recording
 from protocol.motion import Controls, Pose
 from world.sensors import anchor_ranges, executed, mutual_ranges
 from world.truth import asked
 
 
-def position_bounds(record: Record, pair: tuple[int, int], tick: int) -> tuple[float, float] | None:
+def position_bounds(recording: Recording, pair: tuple[int, int], tick: int) -> tuple[float, float] | None:
     """m: the root of the trace of the bound on each one's position at `tick`.
 
     None where sensors are exact, or ranges may be outliers: there the bound is not that of a Gaussian.
     """
-    scenario = record.scenario
+    scenario = recording.scenario
     noise = scenario.mission.noise
     if noise.exact or noise.outliers or noise.anchor_sigma == noise.mutual_sigma == 0.0:
         return None
-    moments = record.moments[: tick + 1]
+    moments = recording.moments[: tick + 1]
     anchors = [scenario.robots[place].anchor for place in pair]
     own: list[list[tuple[int, float]]] = [[], []]
     mutual: list[tuple[int, float]] = []
@@ -44,7 +44,7 @@ def position_bounds(record: Record, pair: tuple[int, int], tick: int) -> tuple[f
             mutual.append((truth.tick, _apart(truth.poses[pair[0]], truth.poses[pair[1]])))
     tracks, guess = [], []
     for place, anchor in zip(pair, anchors, strict=True):
-        tracks.append(_driven(record, place, tick))
+        tracks.append(_driven(recording, place, tick))
         start = moments[0].truth.poses[place]
         c, s = math.cos(start.heading), math.sin(start.heading)
         dx, dy = anchor.x - start.x, anchor.y - start.y
@@ -60,13 +60,13 @@ def _apart(one: Pose, other: Pose) -> float:
     return math.hypot(one.x - other.x, one.y - other.y)
 
 
-def _driven(record: Record, place: int, tick: int) -> Track:
+def _driven(recording: Recording, place: int, tick: int) -> Track:
     """What a robot executed until `tick`."""
-    scenario = record.scenario
+    scenario = recording.scenario
     robot = scenario.robots[place].id
     done: Sequence[Controls] = [
         executed(asked(moment.commands.get(robot), scenario.mission), scenario, robot, moment.truth.tick)
-        for moment in record.moments[:tick]
+        for moment in recording.moments[:tick]
     ]
     v, omega = np.array([one.v for one in done]), np.array([one.omega for one in done])
     return track(v, omega, scenario.mission.period)

@@ -75,7 +75,7 @@ def _shared(config: RobotConfig, robot: str) -> tuple[object, ...]:
         config.anchor if own else config.peer_anchor,
         config.peer_anchor if own else config.anchor,
         config.mission,
-        config.variant,
+        config.planner_name,
         config.rendezvous,
         config.tick_s,
     )

@@ -74,7 +74,7 @@ class TickRecord(msgspec.Struct, frozen=True):
     commands: dict[str, Command]
 
 
-class Record(msgspec.Struct, frozen=True):
+class Recording(msgspec.Struct, frozen=True):
     """A run, whole."""
 
     scenario: Scenario
@@ -104,7 +104,7 @@ def books(folder: Path) -> dict[str, JournalFile]:
     return {name: JournalFile(*journal_file.torn(folder / name)) for name in names}
 
 
-def read(folder: Path) -> Record:
+def read(folder: Path) -> Recording:
     """The record of the run in `folder`: its world's journal, folded.
 
     Raises OSError if there is none, journal.CorruptJournal if it is damaged before its end.
@@ -114,7 +114,7 @@ def read(folder: Path) -> Record:
     if told.disorder is not None:
         raise journal_file.CorruptJournal(f"{path}: {told.disorder.what}")
     moments = tuple([TickRecord(tick.world.truth, tick.commands) for tick in told.ticks])
-    return Record(told.scenario, moments, told.end, told.final_reports)
+    return Recording(told.scenario, moments, told.end, told.final_reports)
 
 
 def estimates(folder: Path, robot: str) -> tuple[Estimate, ...]:

@@ -14,7 +14,7 @@ import msgspec
 
 from compose.extras import version
 from compose.recording.claim import Claim, claim, matrix
-from compose.recording.run import Record
+from compose.recording.run import Recording
 from compose.recording.ticks_csv import ticks_csv
 from protocol import files
 from protocol.messages import FinalReport, Localised, Outcome
@@ -26,18 +26,18 @@ Mode = Literal["processes", "in-process"]
 SUMMARY = "summary.json"
 
 
-def summary(record: Record, mode: Mode, wall_s: float | None) -> dict[str, Any]:
+def summary(recording: Recording, mode: Mode, wall_s: float | None) -> dict[str, Any]:
     """What `summary.json` says; what does not apply is None."""
-    scenario, moments = record.scenario, record.moments
+    scenario, moments = recording.scenario, recording.moments
     return {
         "scenario": scenario.name,
         "seed": scenario.seed,
         "mode": mode,
-        "outcome": record.end.outcome if record.end is not None else "failed",
-        "reason": record.end.reason if record.end is not None else "the record breaks off",
+        "outcome": recording.end.outcome if recording.end is not None else "failed",
+        "reason": recording.end.reason if recording.end is not None else "the record breaks off",
         "ticks": moments[-1].truth.tick if moments else 0,
         "wall_s": wall_s,
-        "first_contact_tick": first_contact(record),
+        "first_contact_tick": first_contact(recording),
         "t_max_s": max(robot.rendezvous.bound for robot in scenario.robots),
         "min_separation_m": min(
             (
@@ -49,64 +49,66 @@ def summary(record: Record, mode: Mode, wall_s: float | None) -> dict[str, Any]:
         ),
         "parameters": {
             **msgspec.to_builtins(scenario.mission),
-            "variant": scenario.variant,
+            "planner": scenario.planner_name,
             "max_ticks": scenario.max_ticks,
         },
         "versions": versions(),
-        "robots": {robot.id: _robot_summary(record, i) for i, robot in enumerate(scenario.robots)},
+        "robots": {robot.id: _robot_summary(recording, i) for i, robot in enumerate(scenario.robots)},
     }
 
 
-def first_contact(record: Record) -> int | None:
+def first_contact(recording: Recording) -> int | None:
     """The first tick at which two peers were in range of each other."""
-    pairs = record.scenario.pairs()
-    for moment in record.moments:
-        if any(mutual is not None for mutual in mutual_ranges(moment.truth, record.scenario, pairs)):
+    pairs = recording.scenario.pairs()
+    for moment in recording.moments:
+        if any(mutual is not None for mutual in mutual_ranges(moment.truth, recording.scenario, pairs)):
             return moment.truth.tick
     return None
 
 
-def first_claim(record: Record, place: int) -> Claim | None:
+def first_claim(recording: Recording, place: int) -> Claim | None:
     """The first claim to know its pose of the robot at that place in the scenario."""
-    robot = record.scenario.robots[place].id
-    for moment in record.moments:
+    robot = recording.scenario.robots[place].id
+    for moment in recording.moments:
         command = moment.commands.get(robot)
         if command is not None and isinstance(command.verdict, Localised):
             return claim(moment.truth.tick, command.verdict, moment.truth.poses[place])
     return None
 
 
-def _robot_summary(record: Record, place: int) -> dict[str, Any]:
-    robot = record.scenario.robots[place].id
-    final_report = record.final_reports.get(robot)
-    claimed = first_claim(record, place)
+def _robot_summary(recording: Recording, place: int) -> dict[str, Any]:
+    robot = recording.scenario.robots[place].id
+    final_report = recording.final_reports.get(robot)
+    claimed = first_claim(recording, place)
     covariance = claimed.covariance if claimed is not None else None
     return {
         "localised": claimed is not None,
         "localised_tick": claimed.tick if claimed is not None else None,
         "estimate": _listed(claimed.pose) if claimed is not None else None,
         "covariance": matrix(covariance) if covariance is not None else None,
-        "truth": _listed(record.moments[-1].truth.poses[place]) if record.moments else None,
+        "truth": _listed(recording.moments[-1].truth.poses[place]) if recording.moments else None,
         "position_error_m": claimed.position_error if claimed is not None else None,
         "heading_error_rad": claimed.heading_error if claimed is not None else None,
         "position_sigma_m": covariance.position_sigma if covariance is not None else None,
         "heading_sigma_rad": covariance.heading_sigma if covariance is not None else None,
         "nees": claimed.nees if claimed is not None else None,
         **{field: getattr(final_report, field, None) for field in _SAID},
-        "no_farewell": None if final_report is not None else _why_none(record, robot),
-        "deadlines_missed": sum([robot not in moment.commands for moment in record.moments[:-1]]),
+        "no_farewell": None if final_report is not None else _why_none(recording, robot),
+        "deadlines_missed": sum([robot not in moment.commands for moment in recording.moments[:-1]]),
     }
 
 
-def _why_none(record: Record, robot: str) -> str:
+def _why_none(recording: Recording, robot: str) -> str:
     """Why there is no FinalReport of `robot`, as far as the world's journal tells."""
-    if record.end is None:
+    if recording.end is None:
         return "the record breaks off"
-    latest = max([moment.truth.tick for moment in record.moments if robot in moment.commands], default=None)
+    latest = max(
+        [moment.truth.tick for moment in recording.moments if robot in moment.commands], default=None
+    )
     if latest is None:
         return "no Command of it came in time"
-    if latest < record.end.tick:
-        return f"its last Command in time was of tick {latest} of {record.end.tick}"
+    if latest < recording.end.tick:
+        return f"its last Command in time was of tick {latest} of {recording.end.tick}"
     return "it did not answer the MissionEnd"
 
 
@@ -126,9 +128,9 @@ def versions() -> dict[str, str | None]:
     return found
 
 
-def leave(record: Record, summary: Mapping[str, Any], folder: Path) -> None:
+def leave(recording: Recording, summary: Mapping[str, Any], folder: Path) -> None:
     """Write `ticks.csv` and `summary.json` into `folder`."""
-    files.write(folder / "ticks.csv", ticks_csv(record))
+    files.write(folder / "ticks.csv", ticks_csv(recording))
     files.write(folder / SUMMARY, msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n")
 
 

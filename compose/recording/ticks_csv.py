@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import msgspec
 from msgspec.structs import astuple
 
-from compose.recording.run import Record
+from compose.recording.run import Recording
 from protocol.motion import Pose, wrap
 from world.scenario import Scenario
 from world.sensors import anchor_ranges, executed, mutual_ranges
@@ -46,11 +46,11 @@ class TickRow(msgspec.Struct, frozen=True):
         return Pose(self.x, self.y, self.heading)
 
 
-def rows(record: Record) -> Iterator[TickRow]:
+def rows(recording: Recording) -> Iterator[TickRow]:
     """One per tick and robot, tick 0 included."""
-    scenario = record.scenario
-    last = record.moments[-1].truth.tick if record.moments else 0
-    for moment in record.moments:
+    scenario = recording.scenario
+    last = recording.moments[-1].truth.tick if recording.moments else 0
+    for moment in recording.moments:
         tick = moment.truth.tick
         anchor = anchor_ranges(moment.truth, scenario)
         mutual = _mutual(scenario, moment.truth)
@@ -91,9 +91,9 @@ def rows_of(told: Mapping[str, Past]) -> Iterator[TickRow]:
             )
 
 
-def ticks_csv(record: Record) -> str:
+def ticks_csv(recording: Recording) -> str:
     """One row per tick and robot."""
-    return table(rows(record))
+    return table(rows(recording))
 
 
 def table(rows: Iterable[TickRow]) -> str:

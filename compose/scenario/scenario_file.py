@@ -22,7 +22,15 @@ from compose.scenario.kills import DRAWN, POINTS, BadKill, Kill, KillTable, draw
 from compose.scenario.toml_file import field_first, read_text, table_in
 from protocol.attack import OF_THE_START, Attack, Kind, Part
 from protocol.messages import RobotConfig
-from protocol.mission import Anchor, Mission, Role, Variant, noise_infeasibility, infeasibility, safety_infeasibility
+from protocol.mission import (
+    Anchor,
+    Mission,
+    PlannerName,
+    Role,
+    infeasibility,
+    noise_infeasibility,
+    safety_infeasibility,
+)
 from protocol.motion import TAU, Pose, wrap
 from protocol.orbits import Rendezvous, rendezvous, tick_budget
 from protocol.rounding import TOLERANCE
@@ -48,7 +56,7 @@ WITHIN = 1.0 - 1e-9
 
 
 CHOICES: dict[str, tuple[str, ...]] = {
-    "variant": get_args(Variant),
+    "name": get_args(PlannerName),
     "kind": get_args(Kind),
     "part": get_args(Part),
     "point": (*POINTS, DRAWN),
@@ -71,7 +79,7 @@ class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class PlannerTable(_Table, frozen=True):
     """[planner]"""
 
-    variant: Variant = "assured"
+    name: PlannerName = "assured"
 
 
 class RobotTable(_Table, frozen=True):
@@ -255,7 +263,7 @@ def _validated(file: ScenarioFile, source: str, told: Sequence[str]) -> Scenario
         seed=file.seed,
         max_ticks=file.max_ticks if file.max_ticks is not None else budget + held_up,
         mission=file.mission,
-        variant=file.planner.variant,
+        planner_name=file.planner.name,
         robots=tuple(placed),
         faults=faults,
     )
@@ -309,7 +317,7 @@ def _plan(file: ScenarioFile, first: int, second: int, source: str) -> Rendezvou
     why = infeasibility(file.mission, distance)
     if why is not None:
         raise Unworkable(f"{source}: mission: {why}")
-    return rendezvous(file.mission, distance, file.planner.variant)
+    return rendezvous(file.mission, distance, file.planner.name)
 
 
 def _peers(robots: list[RobotTable], source: str) -> dict[str, str]:

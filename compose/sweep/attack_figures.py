@@ -26,7 +26,7 @@ WRONG = "#d9541e"
 
 def axis_of_lies(results: Results) -> int | None:
     """Which axis is of lies, with the truth among its values; none if there is none."""
-    for place, axis in enumerate(results.campaign.axes):
+    for place, axis in enumerate(results.sweep.axes):
         if axis.fields[0].endswith(FIELD) and axis.labels is not None and HONEST in axis.labels:
             return place
     return None
@@ -34,7 +34,7 @@ def axis_of_lies(results: Results) -> int | None:
 
 def outcomes(results: Results, place: int) -> Figure:
     """What became of the missions under each lie: found out, believed without harm, or believed and wrong."""
-    axis = results.campaign.axes[place]
+    axis = results.sweep.axes[place]
     groups = _settings(results, place)
     labels = [axis.label(i) for i in range(len(axis.values))]
     figure = Figure(figsize=(3.2 + 2.6 * len(groups), 1.2 + 0.2 * len(labels)), layout="constrained")
@@ -61,7 +61,7 @@ def roc(results: Results, place: int) -> Figure | None:
     A line for each kind and part of a lie, all its sizes pooled. No picture where sensors are exact: there a
     p-value is 0 or 1.
     """
-    axis = results.campaign.axes[place]
+    axis = results.sweep.axes[place]
     truth = _honest(axis)
     noisy = [
         (name, cells)
@@ -124,7 +124,10 @@ def _least(table: pa.Table) -> NDArray[np.float64]:
     rows = zip(table["outcome"].to_pylist(), *columns, strict=True)
     return np.array(
         [
-            min([value for value in values if value is not None], default=0.0 if outcome == "inconsistent" else 1.0)
+            min(
+                [value for value in values if value is not None],
+                default=0.0 if outcome == "inconsistent" else 1.0,
+            )
             for outcome, *values in rows
         ]
     )

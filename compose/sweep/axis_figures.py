@@ -45,7 +45,7 @@ def draw(results: Results, folder: Path) -> None:
     """Draw them anew, each as SVG, PDF and PNG, into `folder`."""
     folder.mkdir(exist_ok=True)
     with look():
-        for place, axis in enumerate(results.campaign.axes):
+        for place, axis in enumerate(results.sweep.axes):
             if len(axis.values) > 1:
                 name = re.sub(r"[^A-Za-z0-9_-]+", "-", axis.name).strip("-")
                 save(_success(results, place), folder / f"success-{name}")
@@ -61,21 +61,21 @@ def draw(results: Results, folder: Path) -> None:
 
 def _success(results: Results, place: int) -> Figure:
     """The rate of localised trials, with Wilson's interval."""
-    figure, axes, at = _against(results.campaign.axes[place])
+    figure, axes, at = _against(results.sweep.axes[place])
     lines = list(_lines(results, place))
     for i, (label, tables) in enumerate(lines):
         colour, style, marker = STYLES[i]
         points = [
             (x, figures) for x, table in zip(at, tables, strict=True) if (figures := counted(table)).trials
         ]
-        where = np.array([x for x, _ in points]) + _aside(results.campaign.axes[place], i, len(lines))
+        where = np.array([x for x, _ in points]) + _aside(results.sweep.axes[place], i, len(lines))
         rates, low, high = _rates([figures for _, figures in points])
         axes.errorbar(
             where,
             rates,
             yerr=[rates - low, high - rates],
             color=colour,
-            ls=_joined(results.campaign.axes[place], style),
+            ls=_joined(results.sweep.axes[place], style),
             marker=marker,
             ms=4,
             lw=1.2,
@@ -99,7 +99,7 @@ def ticks_against(results: Results, place: int) -> Figure:
 
     Between numbers that is a band, above names a line.
     """
-    axis = results.campaign.axes[place]
+    axis = results.sweep.axes[place]
     joined = _numbers(axis) is not None
     figure, axes, at = _against(axis)
     lines = list(_lines(results, place))
@@ -172,7 +172,7 @@ def _meeting(results: Results) -> Figure:
 
 def _groups(results: Results) -> list[tuple[str, pa.Table]]:
     """Each cell on its own while there are few; else those told apart."""
-    axes = results.campaign.axes
+    axes = results.sweep.axes
     played = [cell for cell in results.cells if results.figures[cell.index].trials]
     if len(played) <= len(STYLES):
         return [
@@ -193,14 +193,14 @@ def _lines(results: Results, place: int) -> Iterator[tuple[str, list[pa.Table]]]
             label,
             [
                 results.of(*[i for i in chosen if results.cells[i].place[place] == x])
-                for x in range(len(results.campaign.axes[place].values))
+                for x in range(len(results.sweep.axes[place].values))
             ],
         )
 
 
 def _apart(results: Results, place: int | None) -> Iterator[tuple[str, set[int]]]:
     """The cells of each choice of values of the axes told apart, and what to call it; the others pooled."""
-    axes, apart = results.campaign.axes, _told_apart(results, place)
+    axes, apart = results.sweep.axes, _told_apart(results, place)
     for choice in product(*[range(len(axes[i].values)) for i in apart]):
         label = ", ".join([_named(axes[i], value) for i, value in zip(apart, choice, strict=True)])
         yield (
@@ -211,7 +211,7 @@ def _apart(results: Results, place: int | None) -> Iterator[tuple[str, set[int]]
 
 def _told_apart(results: Results, place: int | None) -> tuple[int, ...]:
     """The other axes with few values, paired ones first, while there is a style for each choice of them."""
-    axes = results.campaign.axes
+    axes = results.sweep.axes
     others = [i for i, axis in enumerate(axes) if i != place and len(axis.values) > 1]
     apart: list[int] = []
     for i in sorted(others, key=lambda i: (not axes[i].paired, i)):

@@ -11,7 +11,7 @@ import msgspec
 
 from compose.scenario.scenario_file import ScenarioTemplate, Unworkable, validate
 from compose.sweep.field_paths import canonical, with_value
-from compose.sweep.spec import Campaign
+from compose.sweep.spec import Sweep
 
 
 class Cell(msgspec.Struct, frozen=True):
@@ -39,13 +39,13 @@ class RefusedCell(msgspec.Struct, frozen=True):
     reason: str
 
 
-def cells(campaign: Campaign) -> Iterator[Cell]:
+def cells(sweep: Sweep) -> Iterator[Cell]:
     """All of them, in order: the last axis varies fastest."""
-    for index, place in enumerate(product(*[range(len(axis.values)) for axis in campaign.axes])):
-        table = campaign.base
+    for index, place in enumerate(product(*[range(len(axis.values)) for axis in sweep.axes])):
+        table = sweep.base
         fields: dict[str, Any] = {}
         unpaired: dict[str, Any] = {}
-        for axis, i in zip(campaign.axes, place, strict=True):
+        for axis, i in zip(sweep.axes, place, strict=True):
             for field, way, value in zip(axis.fields, axis.ways, axis.values[i], strict=True):
                 table = with_value(table, way, value)
                 fields[field] = value
@@ -54,25 +54,25 @@ def cells(campaign: Campaign) -> Iterator[Cell]:
         yield Cell(index, place, fields, canonical(unpaired), table)
 
 
-def label(campaign: Campaign, cell: Cell) -> str:
+def label(sweep: Sweep, cell: Cell) -> str:
     """The cell's values, in words."""
-    said = [f"{axis.name} = {axis.label(i)}" for axis, i in zip(campaign.axes, cell.place, strict=True)]
+    said = [f"{axis.name} = {axis.label(i)}" for axis, i in zip(sweep.axes, cell.place, strict=True)]
     return "; ".join(said) or "the only one"
 
 
-def setting_of(campaign: Campaign, cell: Cell) -> ScenarioTemplate | RefusedCell:
+def setting_of(sweep: Sweep, cell: Cell) -> ScenarioTemplate | RefusedCell:
     """The cell's scenario, validated. Raises BadScenario where the user is mistaken in one of its fields."""
-    source = f"{campaign.source}: cell {cell.index} ({label(campaign, cell)})"
+    source = f"{sweep.source}: cell {cell.index} ({label(sweep, cell)})"
     try:
         return validate(cell.table, source)
     except Unworkable as error:
         return RefusedCell(str(error).removeprefix(f"{source}: "))
 
 
-def trial_table(campaign: Campaign, cell: Cell, trial: int) -> dict[str, Any]:
+def trial_table(sweep: Sweep, cell: Cell, trial: int) -> dict[str, Any]:
     """Return the table of a trial's scenario file, complete but for starts that follow from its seed."""
-    seed = trial_seed(campaign.seed, cell.key, trial)
-    return {**campaign.draws.table(cell.table, seed), "seed": seed}
+    seed = trial_seed(sweep.seed, cell.key, trial)
+    return {**sweep.draws.table(cell.table, seed), "seed": seed}
 
 
 def trial_seed(campaign_seed: int, key: str, trial: int) -> int:

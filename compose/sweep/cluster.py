@@ -123,7 +123,7 @@ def play(
     Raises Interrupted if `inbox` receives a signal, and EngineFailed if the connection to the scheduler is
     lost. In any case, all chunks are cancelled and their processes ended.
     """
-    campaign = secrets.token_hex(8)
+    sweep = secrets.token_hex(8)
     flying: dict[str, tuple[Future[Any], Chunk, Work]] = {}
     try:
         threads, looked = _threads(client), time.monotonic()
@@ -134,7 +134,7 @@ def play(
             while len(flying) < AHEAD * max(threads, 1) and (following := next(chunks, None)) is not None:
                 chunk, source = following
                 future = client.submit(
-                    worker_pool.run, campaign, msgspec.msgpack.encode(chunk), pure=False, retries=RETRIES
+                    worker_pool.run, sweep, msgspec.msgpack.encode(chunk), pure=False, retries=RETRIES
                 )
                 flying[str(future.key)] = future, chunk, source
                 future.add_done_callback(lambda ended: inbox.put("ended", str(ended.key)))
@@ -152,7 +152,7 @@ def play(
                     raise EngineFailed("the scheduler is lost")
                 threads, looked = _threads(client), time.monotonic()
     finally:
-        _leave(client, campaign, [future for future, _, _ in flying.values()])
+        _leave(client, sweep, [future for future, _, _ in flying.values()])
 
 
 def _rows(future: Future[Any], chunk: Chunk) -> list[TrialRow]:
@@ -201,12 +201,12 @@ def _within(seconds: float, ask: Callable[[], T]) -> T | None:
     return None
 
 
-def _leave(client: Client, campaign: str, flying: Sequence[Future[Any]]) -> None:
+def _leave(client: Client, sweep: str, flying: Sequence[Future[Any]]) -> None:
     """Cancel the futures `flying`, and end all processes of the sweep."""
 
     def dismiss() -> None:
         client.cancel(flying, force=True)
-        client.run(worker_pool.dismiss, campaign)
+        client.run(worker_pool.dismiss, sweep)
 
     _within(CONNECT_S, dismiss)  # if the scheduler is lost, its workers' processes end by themselves
-    worker_pool.dismiss(campaign)
+    worker_pool.dismiss(sweep)

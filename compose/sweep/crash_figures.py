@@ -26,7 +26,7 @@ MOST_LABELS = 14
 
 def axis_of_ticks(results: Results) -> int | None:
     """Which axis is of the tick of a kill, the first of its fields; none if there is none."""
-    for place, axis in enumerate(results.campaign.axes):
+    for place, axis in enumerate(results.sweep.axes):
         whole = all(isinstance(values[0], int) for values in axis.values)
         if len(axis.values) > 1 and whole and TICK(axis.fields[0]):
             return place
@@ -38,7 +38,7 @@ def costs(results: Results, place: int) -> Figure:
 
     That is what it took longer than nobody's in the median, or all of it where there is nobody's.
     """
-    ticks = [values[0] for values in results.campaign.axes[place].values]
+    ticks = [values[0] for values in results.sweep.axes[place].values]
     tables = {
         ", ".join([label for _, label in named]): [results.of(cell) for cell in cells]
         for named, cells in results.settings(place)

@@ -14,7 +14,7 @@ import pyarrow as pa
 from compose.sweep.cells import Cell, RefusedCell, setting_of
 from compose.sweep.remaining_work import EngineFailed, TrialOptions, Work
 from compose.sweep.results_folder import Folder, opened
-from compose.sweep.spec import BadSpec, Campaign
+from compose.sweep.spec import BadSpec, Sweep
 from compose.sweep.statistics import CellSummary, counted, header, summary_csv
 from compose.sweep.trial import TrialRow
 from compose.sweep.worker import PLAY
@@ -53,7 +53,7 @@ class Progress(msgspec.Struct, frozen=True):
 class Results(msgspec.Struct, frozen=True):
     """What there is of a campaign."""
 
-    campaign: Campaign
+    sweep: Sweep
     cells: tuple[Cell, ...]
     table: pa.Table
     figures: dict[int, CellSummary]
@@ -71,7 +71,7 @@ class Results(msgspec.Struct, frozen=True):
 
     def settings(self, place: int) -> list[tuple[list[tuple[str, str]], list[int]]]:
         """Each choice of values of all axes but that at `place`: names and labels; its cells, along that."""
-        others = [(i, axis) for i, axis in enumerate(self.campaign.axes) if i != place]
+        others = [(i, axis) for i, axis in enumerate(self.sweep.axes) if i != place]
         found: dict[tuple[int, ...], list[int]] = {}
         for cell in self.cells:
             found.setdefault(tuple([cell.place[i] for i, _ in others]), []).append(cell.index)
@@ -81,15 +81,13 @@ class Results(msgspec.Struct, frozen=True):
         ]
 
 
-def sweep(
-    campaign: Campaign, out: Path, means: ExecutionOptions, inbox: Inbox, progress: Progress
-) -> Results:
+def sweep(sweep: Sweep, out: Path, means: ExecutionOptions, inbox: Inbox, progress: Progress) -> Results:
     """Play what has no row in `out` yet, and gather what there is then, however it ended.
 
     Raises UserError: of the spec, a cell that is not a scenario, `out` or the scheduler.
     """
-    with opened(out, campaign) as folder:
-        check_columns(campaign, folder.schema)
+    with opened(out, sweep) as folder:
+        check_columns(sweep, folder.schema)
         if means.retry:
             folder.forget_lost()
         work = _left(folder, progress)
@@ -108,39 +106,39 @@ def sweep(
         return _gathered(folder, stopped, interrupted)
 
 
-def check_columns(campaign: Campaign, schema: pa.Schema) -> None:
+def check_columns(sweep: Sweep, schema: pa.Schema) -> None:
     """Raises BadSpec where two columns of a table would be called the same."""
-    for names in (schema.names, header(campaign)):
+    for names in (schema.names, header(sweep)):
         for name, count in Counter(names).items():
             if count > 1:
-                raise BadSpec(f"{campaign.source}: axis: {count} columns would be called '{name}'")
+                raise BadSpec(f"{sweep.source}: axis: {count} columns would be called '{name}'")
 
 
 def _left(folder: Folder, progress: Progress) -> list[Work]:
     """What has to be played; only the settings of those cells are worked out."""
-    campaign, refused = folder.campaign, dict(folder.refused)
+    sweep, refused = folder.sweep, dict(folder.refused)
     done = folder.done()
-    beyond = sum([trial >= campaign.trials for trials in done.values() for trial in trials])
+    beyond = sum([trial >= sweep.trials for trials in done.values() for trial in trials])
     if beyond:
-        progress.say(f"{folder.path} holds {beyond} trials beyond {campaign.trials} a cell; they are kept")
+        progress.say(f"{folder.path} holds {beyond} trials beyond {sweep.trials} a cell; they are kept")
     work = []
     count = 0
     for cell in folder.cells.values():
         if cell.index in refused:
             continue
-        count += campaign.trials
-        left = [trial for trial in range(campaign.trials) if trial not in done[cell.index]]
+        count += sweep.trials
+        left = [trial for trial in range(sweep.trials) if trial not in done[cell.index]]
         if not left:
             continue
-        setting = setting_of(campaign, cell)
+        setting = setting_of(sweep, cell)
         if isinstance(setting, RefusedCell):
             refused[cell.index] = setting.reason
-            count -= campaign.trials
+            count -= sweep.trials
         else:
             work.append(Work(cell.index, cell.key, setting, left, cell.table))
     if len(refused) == len(folder.cells):
         first, reason = next(iter(refused.items()))
-        raise BadSpec(f"{campaign.source}: no cell can be played; cell {first}: {reason}")
+        raise BadSpec(f"{sweep.source}: no cell can be played; cell {first}: {reason}")
     folder.ask(refused)
     for part in folder.ignored:
         progress.say(f"{part} cannot be read: its trials are played again")
@@ -151,9 +149,9 @@ def _left(folder: Folder, progress: Progress) -> list[Work]:
 def _play(
     folder: Folder, work: list[Work], means: ExecutionOptions, inbox: Inbox, progress: Progress
 ) -> None:
-    campaign = folder.campaign
+    sweep = folder.sweep
     orders = TrialOptions(
-        campaign.seed, means.processes, campaign.trial_timeout, means.play, means.audit, campaign.draws
+        sweep.seed, means.processes, sweep.trial_timeout, means.play, means.audit, sweep.draws
     )
 
     def keep(rows: list[TrialRow]) -> None:
@@ -172,11 +170,11 @@ def _gathered(folder: Folder, stopped: str | None, interrupted: bool) -> Results
     figures = _figures(table, cells, folder.refused)
     try:
         folder.gather(table)
-        files.write(folder.path / SUMMARY, summary_csv(folder.campaign, cells, figures))
+        files.write(folder.path / SUMMARY, summary_csv(folder.sweep, cells, figures))
     except OSError as error:
         stopped = stopped or f"cannot be written: {files.said(error)}"
-    trials = folder.campaign.trials * (len(cells) - len(folder.refused))
-    return Results(folder.campaign, cells, table, figures, stopped, interrupted, trials)
+    trials = folder.sweep.trials * (len(cells) - len(folder.refused))
+    return Results(folder.sweep, cells, table, figures, stopped, interrupted, trials)
 
 
 def _figures(table: pa.Table, cells: tuple[Cell, ...], refused: Mapping[int, str]) -> dict[int, CellSummary]:

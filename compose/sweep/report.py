@@ -79,7 +79,7 @@ def show(results: Results, out: Path, *, quiet: bool) -> None:
     total = {name: sum([getattr(one, name) for one in results.figures.values()]) for name in OUTCOMES}
     total["refused"] = sum([one.refused_trials for one in results.figures.values()])
     counts = ", ".join([f"{count} {name}" for name, count in total.items() if count])
-    say(f"{results.campaign.name}: {counts} of {len(results.table)} trials in {_cells(len(results.cells))}")
+    say(f"{results.sweep.name}: {counts} of {len(results.table)} trials in {_cells(len(results.cells))}")
     if any(one.audited for one in results.figures.values()):
         say(_audited(results))
     if quiet:
@@ -101,8 +101,8 @@ def show(results: Results, out: Path, *, quiet: bool) -> None:
         how = f"{note.outcome} after {note.ticks} ticks" if note.ticks is not None else note.outcome
         file = shlex.quote(str(out / CELLS / f"{note.cell:03d}.toml"))
         say(f"to look at first: trial {note.trial} of cell {note.cell}, {how}{why}; any trial again:")
-        if results.campaign.draws:
-            source = shlex.quote(results.campaign.source)
+        if results.sweep.draws:
+            source = shlex.quote(results.sweep.source)
             say(f"  tandem sweep {source} --print-trial {note.cell}:{note.trial} > trial.toml")
             file = "trial.toml"
         say(f"  tandem run {file} --seed {note.seed} --out record")
@@ -155,7 +155,7 @@ def _choices(results: Results) -> tuple[tuple[str, ...], ...]:
 
 
 def _table(results: Results, columns: Sequence[str]) -> Table:
-    axes = [axis.name.rpartition(".")[2] for axis in results.campaign.axes]
+    axes = [axis.name.rpartition(".")[2] for axis in results.sweep.axes]
     rows = []
     for cell in _shown(results):
         said = _figures(results.figures[cell.index])
@@ -164,7 +164,7 @@ def _table(results: Results, columns: Sequence[str]) -> Table:
 
 
 def _axes(results: Results, cell: Cell) -> list[str]:
-    places = zip(results.campaign.axes, cell.place, strict=True)
+    places = zip(results.sweep.axes, cell.place, strict=True)
     return [str(cell.index), *[axis.label(place) for axis, place in places]]
 
 

@@ -21,13 +21,13 @@ from compose.errors import UserError
 from compose.recording.run import make
 from compose.sweep.cells import Cell, cells, label
 from compose.sweep.field_paths import canonical
-from compose.sweep.spec import Campaign
+from compose.sweep.spec import Sweep
 from compose.sweep.table import encoded, gathered, of_rows, read, schema_of
 from compose.sweep.trial import TrialRow
 from protocol import files
 
 TRIALS = "trials.parquet"
-CAMPAIGN = "campaign.json"
+CAMPAIGN = "sweep.json"
 PARTS = "parts"
 CELLS = "cells"
 MAX_DIFFERENCE = 60
@@ -35,9 +35,9 @@ MAX_DIFFERENCE = 60
 
 
 class Manifest(msgspec.Struct, frozen=True):
-    """`campaign.json`: what a folder's rows are of."""
+    """`sweep.json`: what a folder's rows are of."""
 
-    campaign: Campaign
+    sweep: Sweep
     refused: dict[int, str]
     """cells in whose setting no mission can be played, and why"""
 
@@ -45,11 +45,11 @@ class Manifest(msgspec.Struct, frozen=True):
 class Folder:
     """A campaign's folder, which no other run writes meanwhile."""
 
-    def __init__(self, path: Path, campaign: Campaign) -> None:
+    def __init__(self, path: Path, sweep: Sweep) -> None:
         self.path = path
-        self.campaign = campaign
-        self.cells: dict[int, Cell] = {cell.index: cell for cell in cells(campaign)}
-        self.schema = schema_of(campaign, list(self.cells.values()))
+        self.sweep = sweep
+        self.cells: dict[int, Cell] = {cell.index: cell for cell in cells(sweep)}
+        self.schema = schema_of(sweep, list(self.cells.values()))
         self.ignored: list[Path] = []
         """parts that cannot be read"""
         self.refused: dict[int, str] = {}
@@ -71,12 +71,12 @@ class Folder:
     def ask(self, refused: Mapping[int, str]) -> None:
         """Put down what is about to be played, and each cell's scenario."""
         self.refused = dict(refused)
-        asked = msgspec.json.encode(Manifest(self.campaign, self.refused))
+        asked = msgspec.json.encode(Manifest(self.sweep, self.refused))
         files.write(self.path / CAMPAIGN, msgspec.json.format(asked, indent=2) + b"\n")
         (self.path / CELLS).mkdir(exist_ok=True)
         self._parts.mkdir(exist_ok=True)
         for cell in self.cells.values():
-            comment = f"# Cell {cell.index} of {self.campaign.name}: {label(self.campaign, cell)}."
+            comment = f"# Cell {cell.index} of {self.sweep.name}: {label(self.sweep, cell)}."
             text = f"{comment}\n{tomli_w.dumps(cell.table)}"
             files.write(self.path / CELLS / cell.file_name, text.encode())
 
@@ -84,7 +84,7 @@ class Folder:
         """Keep the rows of a chunk."""
         if rows:
             name = f"{rows[0].cell:05d}-{rows[0].trial:08d}.parquet"
-            files.write(self._parts / name, encoded(of_rows(rows, self.campaign, self.cells, self.schema)))
+            files.write(self._parts / name, encoded(of_rows(rows, self.sweep, self.cells, self.schema)))
 
     def table(self) -> pa.Table:
         """All rows, in order."""
@@ -115,7 +115,7 @@ class Folder:
 
 
 @contextmanager
-def opened(path: Path, campaign: Campaign) -> Iterator[Folder]:
+def opened(path: Path, sweep: Sweep) -> Iterator[Folder]:
     """The folder at `path`, new or with what has been played of the same campaign.
 
     Raises UserError where it cannot be written, is in use, or is of another campaign.
@@ -128,8 +128,8 @@ def opened(path: Path, campaign: Campaign) -> Iterator[Folder]:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             raise UserError(f"--out: {path} is in use by another sweep") from None
-        folder = Folder(path, campaign)
-        folder.refused = _refused_before(path, campaign)
+        folder = Folder(path, sweep)
+        folder.refused = _refused_before(path, sweep)
         yield folder
     finally:
         os.close(lock)
@@ -138,7 +138,7 @@ def opened(path: Path, campaign: Campaign) -> Iterator[Folder]:
                 path.rmdir()
 
 
-def _refused_before(path: Path, campaign: Campaign) -> dict[int, str]:
+def _refused_before(path: Path, sweep: Sweep) -> dict[int, str]:
     """The cells that an earlier run found unworkable. Raises UserError if it was of another campaign."""
     try:
         asked = msgspec.json.decode(files.read_bytes(path / CAMPAIGN), type=Manifest)
@@ -148,20 +148,20 @@ def _refused_before(path: Path, campaign: Campaign) -> dict[int, str]:
         return {}
     except ValueError as error:
         raise UserError(f"--out: {path / CAMPAIGN} cannot be read: {error}") from None
-    difference = _difference(_identity(asked.campaign), _identity(campaign))
+    difference = _difference(_identity(asked.sweep), _identity(sweep))
     if difference is not None:
         raise UserError(f"--out: {path} holds another campaign: {difference}; choose another folder")
     return asked.refused
 
 
-def _identity(campaign: Campaign) -> dict[str, Any]:
+def _identity(sweep: Sweep) -> dict[str, Any]:
     """What two campaigns must share to share a folder. Trials can be added, and time-outs changed."""
     return {
-        "name": campaign.name,
-        "seed": campaign.seed,
-        "scenario": campaign.base,
-        "axis": [msgspec.to_builtins(axis) for axis in campaign.axes],
-        "draws": msgspec.to_builtins(campaign.draws),
+        "name": sweep.name,
+        "seed": sweep.seed,
+        "scenario": sweep.base,
+        "axis": [msgspec.to_builtins(axis) for axis in sweep.axes],
+        "draws": msgspec.to_builtins(sweep.draws),
     }
 
 

@@ -83,7 +83,7 @@ class Axis(msgspec.Struct, frozen=True):
         return ", ".join(f"{field}={value}" for field, value in zip(self.fields, said, strict=True))
 
 
-class Campaign(msgspec.Struct, frozen=True):
+class Sweep(msgspec.Struct, frozen=True):
     """A campaign, complete: what each trial is follows from it."""
 
     source: str
@@ -106,7 +106,7 @@ def shipped() -> dict[str, Path]:
     return scenario_file.shipped("sweep")
 
 
-def load(source: str, *, trials: int | None = None, seed: int | None = None) -> Campaign:
+def load(source: str, *, trials: int | None = None, seed: int | None = None) -> Sweep:
     """The campaign of that name, or in the file at that path; `trials` and `seed` override its own.
 
     Raises BadSpec, and NotToml where it is not TOML.
@@ -125,7 +125,7 @@ def load(source: str, *, trials: int | None = None, seed: int | None = None) -> 
     axes = tuple(_axis(axis, f"{source}: axis[{i}]", base) for i, axis in enumerate(spec.axis))
     draws = Draws(_draws(spec, axes, base, source), spec.starts)
     _check_together(axes, draws, source)
-    return Campaign(
+    return Sweep(
         source=source,
         name=spec.name,
         base=base,

@@ -20,7 +20,7 @@ from scipy.special import gammainccinv, gammaincinv  # type: ignore[import-untyp
 from compose.recording.claim import DEGREES_OF_FREEDOM
 from compose.sweep.cells import Cell
 from compose.sweep.field_paths import canonical
-from compose.sweep.spec import Campaign
+from compose.sweep.spec import Sweep
 from compose.sweep.trial import TrialOutcome
 from protocol.messages import Outcome
 
@@ -205,25 +205,25 @@ def orbited_over_t_max(table: pa.Table) -> Floats:
     return np.divide(orbited * column(table, "period_s"), t_max, out=at_once, where=t_max > 0.0)
 
 
-def summary_csv(campaign: Campaign, cells: Sequence[Cell], figures: Mapping[int, CellSummary]) -> str:
+def summary_csv(sweep: Sweep, cells: Sequence[Cell], figures: Mapping[int, CellSummary]) -> str:
     """A row a cell."""
     out = io.StringIO()
     rows = csv.writer(out, lineterminator="\n")
-    rows.writerow(header(campaign))
+    rows.writerow(header(sweep))
     for cell in cells:
         axes: list[Any] = []
-        for axis, place in zip(campaign.axes, cell.place, strict=True):
+        for axis, place in zip(sweep.axes, cell.place, strict=True):
             axes += [axis.label(place)] if axis.labels is not None else []
             axes += [value if isinstance(value, str) else canonical(value) for value in axis.values[place]]
         rows.writerow([cell.index, *axes, *msgspec.structs.astuple(figures[cell.index])])
     return out.getvalue()
 
 
-def header(campaign: Campaign) -> list[str]:
+def header(sweep: Sweep) -> list[str]:
     """Of `summary.csv`."""
     axes = [
         name
-        for axis in campaign.axes
+        for axis in sweep.axes
         for name in ([axis.name] if axis.labels is not None else []) + list(axis.fields)
     ]
     return ["cell", *axes, *CellSummary.__struct_fields__]

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 
 from compose.sweep.cells import Cell
 from compose.sweep.field_paths import canonical
-from compose.sweep.spec import Campaign
+from compose.sweep.spec import Sweep
 from compose.sweep.trial import RobotRow, TrialRow
 from protocol.files import open_file
 from protocol.motion import Covariance
@@ -30,22 +30,23 @@ _KINDS: dict[str, pa.DataType] = {
     "same_record": pa.bool_(),
     **dict.fromkeys(("period_s", "t_max_s", "wall_s", "position_error_m", "nearest_m"), pa.float64()),
     **dict.fromkeys(
-        ("heading_error_rad", "alpha", "probability", "p_value", "position_sigma_m", "nees", "bound_m"), pa.float64()
+        ("heading_error_rad", "alpha", "probability", "p_value", "position_sigma_m", "nees", "bound_m"),
+        pa.float64(),
     ),
     **dict.fromkeys([f"cov_{name}" for name in Covariance.__struct_fields__], pa.float64()),
 }
 _OF_ALL = [field for field in TrialRow.__struct_fields__ if field not in ("cell", "trial", "robots", "drawn")]
 
 
-def schema_of(campaign: Campaign, cells: Sequence[Cell]) -> pa.Schema:
+def schema_of(sweep: Sweep, cells: Sequence[Cell]) -> pa.Schema:
     """Its columns; they follow from the campaign."""
     fields = [pa.field("cell", _KINDS["cell"])]
-    for axis in campaign.axes:
+    for axis in sweep.axes:
         if axis.labels is not None:
             fields.append(pa.field(axis.name, pa.string()))
         for i, field in enumerate(axis.fields):
             fields.append(pa.field(field, _kind([values[i] for values in axis.values])))
-    fields += [pa.field(draw.field, pa.float64()) for draw in campaign.draws.fields]
+    fields += [pa.field(draw.field, pa.float64()) for draw in sweep.draws.fields]
     fields.append(pa.field("trial", _KINDS["trial"]))
     fields += [pa.field(name, _KINDS[name]) for name in _OF_ALL]
     for robot in _robots(cells):
@@ -83,18 +84,16 @@ def _held(value: Any, kind: pa.DataType) -> Any:
     return float(value) if kind == pa.float64() else value
 
 
-def of_rows(
-    rows: Sequence[TrialRow], campaign: Campaign, cells: Mapping[int, Cell], schema: pa.Schema
-) -> pa.Table:
+def of_rows(rows: Sequence[TrialRow], sweep: Sweep, cells: Mapping[int, Cell], schema: pa.Schema) -> pa.Table:
     """The table of `rows`; what the axes say belongs to the cell."""
     columns: dict[str, list[Any]] = {"cell": [row.cell for row in rows]}
-    for where, axis in enumerate(campaign.axes):
+    for where, axis in enumerate(sweep.axes):
         if axis.labels is not None:
             columns[axis.name] = [axis.labels[cells[row.cell].place[where]] for row in rows]
         for field in axis.fields:
             kind = schema.field(field).type
             columns[field] = [_held(cells[row.cell].fields[field], kind) for row in rows]
-    for draw in campaign.draws.fields:
+    for draw in sweep.draws.fields:
         columns[draw.field] = [row.drawn.get(draw.field) for row in rows]
     columns["trial"] = [row.trial for row in rows]
     for name in _OF_ALL:

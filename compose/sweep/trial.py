@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from compose.audit.findings import Findings
 from compose.recording.claim import Claim
 from compose.recording.closest_approach import nearest
-from compose.recording.run import Record
+from compose.recording.run import Recording
 from compose.recording.summary_json import first_claim, first_contact
 from compose.scenario.kills import Kill
 from compose.sweep.trial_mission import as_processes, run_in_process
@@ -153,7 +153,7 @@ def play(trial: Trial) -> TrialRow:
         played = as_processes(trial.scenario, audit=trial.audit, kills=trial.kills)
     else:
         played = run_in_process(trial.scenario, audit=trial.audit)
-    found = row(trial, played.record, played.wall_s, played.belief)
+    found = row(trial, played.recording, played.wall_s, played.belief)
     if played.kills is None:
         return found
     found = replace(found, kills=played.kills, same_record=not played.otherwise)
@@ -163,17 +163,17 @@ def play(trial: Trial) -> TrialRow:
     return replace(found, outcome="failed", reason=why)
 
 
-def row(trial: Trial, record: Record, wall_s: float, findings: Findings | None = None) -> TrialRow:
+def row(trial: Trial, recording: Recording, wall_s: float, findings: Findings | None = None) -> TrialRow:
     """What is kept of a record, and of what its audit found."""
-    scenario, end = record.scenario, record.end
+    scenario, end = recording.scenario, recording.end
     if end is None:
         return lost(trial.cell, trial.number, scenario.seed, "the record breaks off", wall_s)
-    robots = {robot.id: _robot_row(record, i) for i, robot in enumerate(scenario.robots)}
+    robots = {robot.id: _robot_row(recording, i) for i, robot in enumerate(scenario.robots)}
     for pair in scenario.pairs():
-        robots |= _bounded(robots, record, pair)
+        robots |= _bounded(robots, recording, pair)
     t_max_s = max(robot.rendezvous.bound for robot in scenario.robots)
-    met = [_meeting(record, scenario.robots[a].id, scenario.robots[b].id) for a, b in scenario.pairs()]
-    said = record.final_reports.values()
+    met = [_meeting(recording, scenario.robots[a].id, scenario.robots[b].id) for a, b in scenario.pairs()]
+    said = recording.final_reports.values()
     errors = [robot.position_error_m for robot in robots.values() if robot.position_error_m is not None]
     nees = [robot.nees for robot in robots.values() if robot.nees is not None]
     return TrialRow(
@@ -183,7 +183,7 @@ def row(trial: Trial, record: Record, wall_s: float, findings: Findings | None =
         outcome=end.outcome,
         reason=end.reason,
         ticks=end.tick,
-        first_contact_tick=first_contact(record),
+        first_contact_tick=first_contact(recording),
         orbiting_tick=_last([orbiting for orbiting, _ in met]),
         meeting_tick=_last([meeting for _, meeting in met]),
         period_s=scenario.mission.period,
@@ -194,7 +194,7 @@ def row(trial: Trial, record: Record, wall_s: float, findings: Findings | None =
         position_error_m=_most([robot.position_error_m for robot in robots.values()]),
         heading_error_rad=_most([robot.heading_error_rad for robot in robots.values()]),
         hypotheses=_most([robot.hypotheses for robot in robots.values()]),
-        nearest_m=nearest(record) if scenario.mission.safety_distance else None,
+        nearest_m=nearest(recording) if scenario.mission.safety_distance else None,
         claims=len(errors),
         claims_within=sum([error <= WITHIN * scenario.mission.accuracy for error in errors]),
         nees=sum(nees) / len(nees) if nees else None,
@@ -210,9 +210,9 @@ def row(trial: Trial, record: Record, wall_s: float, findings: Findings | None =
     )
 
 
-def _robot_row(record: Record, place: int) -> RobotRow:
-    robot = record.scenario.robots[place].id
-    return _claimed(_said(record.final_reports.get(robot)), first_claim(record, place))
+def _robot_row(recording: Recording, place: int) -> RobotRow:
+    robot = recording.scenario.robots[place].id
+    return _claimed(_said(recording.final_reports.get(robot)), first_claim(recording, place))
 
 
 def _said(final_report: FinalReport | None) -> RobotRow:
@@ -247,28 +247,34 @@ def _claimed(row: RobotRow, claim: Claim | None) -> RobotRow:
     )
 
 
-def _bounded(robots: dict[str, RobotRow], record: Record, pair: tuple[int, int]) -> dict[str, RobotRow]:
+def _bounded(robots: dict[str, RobotRow], recording: Recording, pair: tuple[int, int]) -> dict[str, RobotRow]:
     """The rows of a pair that has claimed covariances, with the bounds on them."""
-    names = [record.scenario.robots[place].id for place in pair]
-    claims = [first_claim(record, place) for place in pair]
+    names = [recording.scenario.robots[place].id for place in pair]
+    claims = [first_claim(recording, place) for place in pair]
     if any(robots[name].position_sigma_m is None for name in names):
         return {}
     from compose.recording.cramer_rao import position_bounds  # noqa: PLC0415  # where sensors are exact, it takes no numpy
 
-    bounds = position_bounds(record, pair, max([one.tick for one in claims if one is not None]))
+    bounds = position_bounds(recording, pair, max([one.tick for one in claims if one is not None]))
     if bounds is None:
         return {}
     return {name: replace(robots[name], bound_m=bound) for name, bound in zip(names, bounds, strict=True)}
 
 
-def _meeting(record: Record, a: str, b: str) -> tuple[int | None, int | None]:
+def _meeting(recording: Recording, a: str, b: str) -> tuple[int | None, int | None]:
     """The tick from which both of a pair orbit, and that at which their phase 3 begins."""
     orbiting = None
-    for moment in record.moments:
-        commands = [command for command in (moment.commands.get(a), moment.commands.get(b)) if command is not None]
+    for moment in recording.moments:
+        commands = [
+            command for command in (moment.commands.get(a), moment.commands.get(b)) if command is not None
+        ]
         if any(command.phase == 3 for command in commands):
             return orbiting, moment.truth.tick
-        if orbiting is None and len(commands) == 2 and all(command.state == "orbiting" for command in commands):
+        if (
+            orbiting is None
+            and len(commands) == 2
+            and all(command.state == "orbiting" for command in commands)
+        ):
             orbiting = moment.truth.tick
     return orbiting, None
 

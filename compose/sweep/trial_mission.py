@@ -12,7 +12,7 @@ import msgspec
 from compose.audit import rules
 from compose.audit.findings import Findings
 from compose.launch import in_process
-from compose.recording.run import Record, read
+from compose.recording.run import Recording, read
 from compose.recording.ticks_csv import ticks_csv
 from compose.scenario.kills import Kill
 from compose.scenario.scenario_file import run_name
@@ -27,7 +27,7 @@ PATIENCE_S = 30.0
 class Played(msgspec.Struct, frozen=True):
     """A mission to its end."""
 
-    record: Record
+    recording: Recording
     belief: Findings | None
     """of its audit, if there was one"""
     wall_s: float
@@ -44,9 +44,9 @@ def run_in_process(scenario: Scenario, *, audit: bool) -> Played:
     if not audit:
         return Played(in_process.play(scenario), None, time.perf_counter() - began)
     kept = {name: MemoryJournal() for name in in_process.journals(scenario)}
-    record = in_process.played(scenario, kept)
+    recording = in_process.played(scenario, kept)
     findings = rules.judge({name: journal.frames for name, journal in kept.items()})
-    return Played(record, findings, time.perf_counter() - began)
+    return Played(recording, findings, time.perf_counter() - began)
 
 
 def as_processes(scenario: Scenario, *, audit: bool, kills: Sequence[Kill] | None = None) -> Played:
@@ -62,20 +62,20 @@ def as_processes(scenario: Scenario, *, audit: bool, kills: Sequence[Kill] | Non
             Inbox("tandem sweep"),
             run=run_name(scenario),
             rate=None,
-            patience=PATIENCE_S,
+            timeout=PATIENCE_S,
             kills=kills or (),
             agents_journal=audit or kills is not None,
         )
-        record = read(out)
+        recording = read(out)
         findings = rules.audit(out) if audit else None
         wall_s = time.perf_counter() - began
         if kills is None:
-            return Played(record, findings, wall_s)
-        return Played(record, findings, wall_s, len(kills) - len(spared), _otherwise(record, out))
+            return Played(recording, findings, wall_s)
+        return Played(recording, findings, wall_s, len(kills) - len(spared), _otherwise(recording, out))
 
 
-def _otherwise(record: Record, out: Path) -> tuple[str, ...]:
-    undisturbed = {name: MemoryJournal() for name in in_process.journals(record.scenario)}
-    ticks = ticks_csv(in_process.played(record.scenario, undisturbed))
+def _otherwise(recording: Recording, out: Path) -> tuple[str, ...]:
+    undisturbed = {name: MemoryJournal() for name in in_process.journals(recording.scenario)}
+    ticks = ticks_csv(in_process.played(recording.scenario, undisturbed))
     files = [name for name, kept in undisturbed.items() if (out / name).read_bytes() != packed(kept.frames)]
-    return (*files, "ticks.csv") if ticks_csv(record) != ticks else tuple(files)
+    return (*files, "ticks.csv") if ticks_csv(recording) != ticks else tuple(files)

@@ -107,14 +107,14 @@ class _Children:
         self._resting: dict[tuple[str, int], WorkerProcess] = {}
         self._over: set[str] = set()
 
-    def take(self, campaign: str) -> tuple[WorkerProcess, bool] | None:
+    def take(self, sweep: str) -> tuple[WorkerProcess, bool] | None:
         """Return this thread's process and whether it is reused; None if the sweep is over.
 
         Raises Died or Hung if a new process does not become ready.
         """
-        key = campaign, threading.get_ident()
+        key = sweep, threading.get_ident()
         with self._lock:
-            if campaign in self._over:
+            if sweep in self._over:
                 return None
             kept = self._resting.pop(key, None)
             child = self._working[key] = kept or WorkerProcess()
@@ -123,36 +123,36 @@ class _Children:
                 ready = child.answer(START_S)
                 assert ready == READY
             except (Died, Hung):
-                self.drop(campaign)
+                self.drop(sweep)
                 raise
         return child, kept is not None
 
-    def keep(self, campaign: str) -> None:
+    def keep(self, sweep: str) -> None:
         """Store this thread's process for its next chunk; close it if the sweep is over."""
-        key = campaign, threading.get_ident()
+        key = sweep, threading.get_ident()
         with self._lock:
             child = self._working.pop(key)
-            if campaign not in self._over:
+            if sweep not in self._over:
                 self._resting[key] = child
                 return
         child.close()
 
-    def drop(self, campaign: str) -> bool:
+    def drop(self, sweep: str) -> bool:
         """Close this thread's process, and return whether the sweep is still running."""
         with self._lock:
-            child = self._working.pop((campaign, threading.get_ident()))
-            goes_on = campaign not in self._over
+            child = self._working.pop((sweep, threading.get_ident()))
+            goes_on = sweep not in self._over
         child.close()
         return goes_on
 
-    def dismiss(self, campaign: str) -> None:
+    def dismiss(self, sweep: str) -> None:
         """End all processes of the sweep, and start no more of them."""
         with self._lock:
-            self._over.add(campaign)
+            self._over.add(sweep)
             for key, child in self._working.items():
-                if key[0] == campaign:
+                if key[0] == sweep:
                     child.kill()  # its thread sees that it has ended, and closes it
-            idle = [self._resting.pop(key) for key in list(self._resting) if key[0] == campaign]
+            idle = [self._resting.pop(key) for key in list(self._resting) if key[0] == sweep]
         for child in idle:
             child.close()
 
@@ -160,19 +160,19 @@ class _Children:
 _children = _Children()
 
 
-def dismiss(campaign: str) -> None:
+def dismiss(sweep: str) -> None:
     """End all processes of the sweep in this pool, and start no more of them."""
-    _children.dismiss(campaign)
+    _children.dismiss(sweep)
 
 
-def run(campaign: str, encoded: bytes) -> list[bytes]:
+def run(sweep: str, encoded: bytes) -> list[bytes]:
     """Run an encoded chunk of the sweep, and return its encoded rows; fewer if the sweep is over.
 
     Raises Died or Hung if no new process for trials becomes ready.
     """
     chunk = msgspec.msgpack.decode(encoded, type=Chunk)
     rows: list[bytes] = []
-    while len(rows) < len(chunk.trials) and (taken := _children.take(campaign)) is not None:
+    while len(rows) < len(chunk.trials) and (taken := _children.take(sweep)) is not None:
         child, kept = taken
         asked = len(rows)
         began = time.perf_counter()
@@ -185,13 +185,13 @@ def run(campaign: str, encoded: bytes) -> list[bytes]:
             error = f"hung: no answer within {chunk.timeout:g} s"
         except Died as death:
             if kept and len(rows) == asked:  # a reused process may have ended earlier: try a new one
-                _children.drop(campaign)
+                _children.drop(sweep)
                 continue
             error = f"died: {death}"
         else:
-            _children.keep(campaign)
+            _children.keep(sweep)
             break
-        if not _children.drop(campaign):
+        if not _children.drop(sweep):
             break
         i = len(rows)
         took_s = time.perf_counter() - began

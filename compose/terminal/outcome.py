@@ -50,7 +50,7 @@ def counting(what: str, steps: int) -> Iterator[Callable[[], None]]:
 
 def conclude(
     options: argparse.Namespace,
-    played: run.Record,
+    played: run.Recording,
     folder: Path | None,
     mode: Mode,
     began: float,

@@ -70,7 +70,11 @@ def live(scenario: Scenario, folder: Path) -> Iterator[None]:
                 rows.add_row(robot, "", "awaited", "", "")
             else:
                 rows.add_row(
-                    robot, str(command.phase), one_line(command.state), f"{command.v:.3f}", f"{command.omega:.3f}"
+                    robot,
+                    str(command.phase),
+                    one_line(command.state),
+                    f"{command.v:.3f}",
+                    f"{command.omega:.3f}",
                 )
         return rows
 

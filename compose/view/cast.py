@@ -9,7 +9,7 @@ import msgspec
 
 from protocol.attack import Attack
 from protocol.messages import RobotConfig
-from protocol.mission import Anchor, Mission, Role, Variant
+from protocol.mission import Anchor, Mission, PlannerName, Role
 from protocol.motion import Pose
 from protocol.orbits import Orbit
 from protocol.units import RobotId, Tick
@@ -40,7 +40,7 @@ class Stage(msgspec.Struct, frozen=True):
     """of the scenario; where only robots tell of it, of the run"""
     robots: tuple[Seat, ...]
     mission: Mission
-    variant: Variant
+    planner_name: PlannerName
     t_max_s: float
     """T_max, the longest of all pairs"""
     max_ticks: Tick | None = None
@@ -89,7 +89,7 @@ def of_scenario(scenario: Scenario, mode: str | None = None, tick_s: float | Non
             ]
         ),
         mission=scenario.mission,
-        variant=scenario.variant,
+        planner_name=scenario.planner_name,
         t_max_s=max(robot.rendezvous.bound for robot in scenario.robots),
         max_ticks=scenario.max_ticks,
         seed=scenario.seed,
@@ -111,7 +111,7 @@ def of_briefings(name: str, briefings: Mapping[str, RobotConfig]) -> Stage:
             ]
         ),
         mission=told[0].mission,
-        variant=told[0].variant,
+        planner_name=told[0].planner_name,
         t_max_s=max(one.rendezvous.bound for one in told),
         tick_s=told[0].tick_s,
     )

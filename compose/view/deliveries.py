@@ -46,4 +46,8 @@ def passages(stage: Stage, before: Facts | None, now: Facts) -> Iterator[Passage
 def contact_of(now: Facts, robot: str, peer: str) -> Contact | None:
     """With `peer`, of `robot`, if they are in range and that is known."""
     observation = now.observations.get(robot)
-    return next((one for one in observation.contacts if one.peer == peer), None) if observation is not None else None
+    return (
+        next((one for one in observation.contacts if one.peer == peer), None)
+        if observation is not None
+        else None
+    )

@@ -125,7 +125,13 @@ def _player(seat: Seat, now: Facts) -> Player:
             else None
         ),
         held=(
-            HeldPoses(estimate.local, estimate.world, estimate.probabilities, estimate.covariance, estimate.localised)
+            HeldPoses(
+                estimate.local,
+                estimate.world,
+                estimate.probabilities,
+                estimate.covariance,
+                estimate.localised,
+            )
             if estimate is not None
             else None
         ),

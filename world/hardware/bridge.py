@@ -74,10 +74,10 @@ class Field:
         *,
         max_ticks: int,
         manoeuvre_s: float,
-        patience: float = 30.0,
+        timeout: float = 30.0,
         journal: Sink | None = None,
     ) -> None:
-        """`manoeuvre_s` (s) is T_s by the clock; `patience` (s) bounds every wait for an answer.
+        """`manoeuvre_s` (s) is T_s by the clock; `timeout` (s) bounds every wait for an answer.
 
         What is measured and driven goes to `journal`, which begins with the briefing.
         """
@@ -88,11 +88,11 @@ class Field:
         self._inbox = inbox
         self._manoeuvre_s = manoeuvre_s
         self._tick_s = (1.0 + THINKING) * manoeuvre_s
-        self._patience = patience + self._tick_s
+        self._timeout = timeout + self._tick_s
         self._ended: Callable[[], None] = lambda: None
         self._journal = journal
         self._max_ticks = max_ticks
-        self._ending = Ending(config, max_ticks, self._patience)
+        self._ending = Ending(config, max_ticks, self._timeout)
         self._end: MissionEnd | None = None
         """once it is on record"""
         self._again = False
@@ -225,8 +225,8 @@ class Field:
         while (now := time.monotonic()) < max(until, self._next):
             self._take(self._inbox.next(max(until, self._next) - now))
         self._take_waiting()
-        if self._unanswered and now - self._answered > self._patience:
-            return MissionEnd(tick, "failed", f"no answer from {self._id}'s agent for {self._patience:g} s")
+        if self._unanswered and now - self._answered > self._timeout:
+            return MissionEnd(tick, "failed", f"no answer from {self._id}'s agent for {self._timeout:g} s")
         return self._ending.after(tick, command, peer_there=self._peer in self._alive)
 
     def _reading(self, tick: int) -> Reading:

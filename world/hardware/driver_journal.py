@@ -113,7 +113,9 @@ def driver_past(frames: Sequence[bytes], config: RobotConfig, path: Path) -> Dri
             case Observation(tick) if tick == len(ticks) and place > 0:
                 ticks.append(DrivenTick(message, frame))
                 mark = marked.mark if marked is not None and marked.tick == tick else ()
-            case Command() if ticks and message.tick == ticks[-1].observation.tick and ticks[-1].command is None:
+            case Command() if (
+                ticks and message.tick == ticks[-1].observation.tick and ticks[-1].command is None
+            ):
                 ticks[-1] = msgspec.structs.replace(ticks[-1], command=message)
             case Report() if ticks:
                 ticks[-1] = msgspec.structs.replace(ticks[-1], reports=(*ticks[-1].reports, message))

@@ -27,12 +27,12 @@ LAST_WORDS = 4
 class Ending:
     """What is known of both verdicts."""
 
-    def __init__(self, config: RobotConfig, max_ticks: int, patience: float) -> None:
+    def __init__(self, config: RobotConfig, max_ticks: int, timeout: float) -> None:
         self._peer = config.peer
         self._me = config.robot
         self._mission = config.mission
         self._max_ticks = max_ticks
-        self._patience = patience
+        self._timeout = timeout
         self.verdict: Verdict | None = None
         """the robot's own"""
         self._at = 0
@@ -70,7 +70,7 @@ class Ending:
             self._known = tick
         if self._known is not None and tick >= self._known + LAST_WORDS:
             return self._end(tick)
-        if tick >= self._max_ticks or time.monotonic() - self._since > self._patience:
+        if tick >= self._max_ticks or time.monotonic() - self._since > self._timeout:
             return self._end(tick)
         return None
 

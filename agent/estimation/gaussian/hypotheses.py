@@ -128,7 +128,9 @@ def of_anchor(
         starts = [np.array([*point, 0.0]) for point in anchors(path, ranges, sensing_range, noise, places)]
         steps = STEPS
     fits = [fit(guess, [path], ranges, noise, steps=steps) for guess in starts]
-    return with_probability([(one, _within(one, 0, silent, ranges.tick, sensing_range, noise)) for one in fits])
+    return with_probability(
+        [(one, _within(one, 0, silent, ranges.tick, sensing_range, noise)) for one in fits]
+    )
 
 
 def _within(

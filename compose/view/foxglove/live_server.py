@@ -182,5 +182,5 @@ def _serve(live: Live, server: WebSocketServer, inbox: Inbox) -> None:
 
 
 if __name__ == "__main__":
-    _, where, pages, record, *ids = sys.argv
-    sys.exit(main(int(where), [one for one in pages.split(",") if one], Path(record), ids))
+    _, where, pages, recording, *ids = sys.argv
+    sys.exit(main(int(where), [one for one in pages.split(",") if one], Path(recording), ids))

@@ -68,7 +68,7 @@ class _Answers:
     async def index(self, _request: Request) -> Response:
         return FileResponse(PAGE / "index.html")
 
-    async def campaign(self, _request: Request) -> Response:
+    async def sweep(self, _request: Request) -> Response:
         if self._site.folder is None:
             return _json({"error": "no campaign is shown"}, 404)
         try:
@@ -109,7 +109,7 @@ def application(site: Site) -> Starlette:
     return Starlette(
         routes=[
             Route("/", answers.index),
-            Route("/api/campaign", answers.campaign),
+            Route("/api/sweep", answers.sweep),
             Route("/api/figures/{name}", answers.figure),
             Route("/api/shows/{name}", answers.show),
             Route("/api/shows/{name}/scenes", answers.scenes),

@@ -12,7 +12,7 @@ import msgspec
 from compose.errors import UserError
 from protocol import files
 
-CAMPAIGN = "campaign.json"
+CAMPAIGN = "sweep.json"
 SUMMARY = "summary.csv"
 PARTS = "parts"
 FIGURES = "figures"
@@ -27,7 +27,7 @@ def told(folder: Path) -> dict[str, Any]:
     """What there is to see, now: a sweep that is under way has no summary yet. Raises UserError."""
     try:
         asked = msgspec.json.decode(files.read_bytes(folder / CAMPAIGN))
-        campaign = asked["campaign"]
+        sweep = asked["campaign"]
         axes = [
             {
                 "name": axis["name"],
@@ -35,16 +35,16 @@ def told(folder: Path) -> dict[str, Any]:
                 "labels": axis.get("labels"),
                 "values": axis["values"],
             }
-            for axis in campaign["axes"]
+            for axis in sweep["axes"]
         ]
         rows: list[dict[str, str]] = []
         if (folder / SUMMARY).is_file():
             rows = list(csv.DictReader(StringIO(files.read_text(folder / SUMMARY), newline="")))
         return {
             "folder": str(folder),
-            "name": campaign["name"],
-            "trials": campaign["trials"],
-            "seed": campaign["seed"],
+            "name": sweep["name"],
+            "trials": sweep["trials"],
+            "seed": sweep["seed"],
             "axes": axes,
             "refused": asked["refused"],
             "rows": rows,

@@ -3,7 +3,7 @@
 import { make } from "./cards.js";
 
 export async function campaign(root) {
-  const answer = await fetch("/api/campaign"), told = await answer.json();
+  const answer = await fetch("/api/sweep"), told = await answer.json();
   root.hidden = false;
   if (!answer.ok) {
     root.replaceChildren(make("p", { textContent: told.error }));
