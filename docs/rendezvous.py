@@ -33,7 +33,7 @@ SETTINGS = [
         for omega in (0.2, math.pi)
     ),
 ]
-"""D in m, and R, T_s, v_max, omega_max: those of the campaign `settings`"""
+"""D in m, and R, T_s, v_max, omega_max: those of the sweep `settings`"""
 
 COARSE = 40
 """starting angles, of a plan that is only drawn"""

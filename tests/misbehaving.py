@@ -1,4 +1,4 @@
-"""Trials that go wrong, and a campaign of them: `python -m tests.misbehaving FUNCTION SPEC OUT`."""
+"""Trials that go wrong, and a sweep of them: `python -m tests.misbehaving FUNCTION SPEC OUT`."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def endless(one: trial.Trial) -> trial.TrialRow:
 
 
 def main(function: str, source: str, out: str) -> None:
-    """Play the campaign so on two workers, as `tandem sweep` does."""
+    """Play the sweep so on two workers, as `tandem sweep` does."""
     inbox = Inbox("misbehaving")
     stop_by_signal(inbox)
     means = execution.ExecutionOptions(workers=2, play=f"tests.misbehaving:{function}")

@@ -162,8 +162,8 @@ def test_wildcards_odd_keys_and_deletions_end_no_process_and_change_nothing(tmp_
         for process in (clock, *agents.values()):
             process.until_says("not a key of one mission and robot")
             process.until_says("a deletion" if process is not agents["c"] else "not a key")
-        listed = tandem("ps", "--connect", endpoint, "--json", "--wait", "1")
-        doctor = tandem("doctor", "--connect", endpoint, "--wait", "1")
+        listed = tandem("ps", "--connect", endpoint, "--json", "--timeout", "1")
+        doctor = tandem("doctor", "--connect", endpoint, "--timeout", "1")
         assert (listed.status, doctor.status) == (0, 0), listed.err + doctor.out
         [mission] = json.loads(listed.out)["missions"]
         assert [robot["robot"] for robot in mission["robots"]] == ["a", "b", "c", "d"]

@@ -369,7 +369,10 @@ def test_an_unknown_scenario_is_refused(
         *((["run", "paper-1", "--rate", v], "--rate: ") for v in ("0", "-1", "nan", "inf", "fast", "1e400")),
         *((["run", "paper-1", "--timeout", v], "--timeout: ") for v in ("0", "-1", "nan", "inf", "x")),
         *((["run", "paper-1", "--seed", v], "--seed: ") for v in ("-1", "1.5", "x", "nan", "²", str(2**63))),
-        *((["agent", "a", *CONNECT, "--wait", v], "--wait: ") for v in ("0", "-1", "nan", "inf", "soon")),
+        *(
+            (["agent", "a", *CONNECT, "--connect-timeout", v], "--connect-timeout: ")
+            for v in ("0", "-1", "nan", "inf", "soon")
+        ),
         *((["agent", v, *CONNECT], "ID: ") for v in ("", "a/b", "*", "a\n", "x" * 65)),
         *((["agent", "a", *CONNECT, "--run", v], "--run: ") for v in ("", "a/b", "**", "a b")),
         *((["world", "paper-1", *LISTEN, "--run", v], "--run: ") for v in ("", "a/b", "@x", "x" * 65)),
@@ -465,8 +468,8 @@ def test_an_agents_record_is_never_overwritten(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("run noise", "noise is a campaign: `tandem sweep noise` plays it"),
-        ("world noise --listen tcp/127.0.0.1:7447", "noise is a campaign: `tandem sweep noise` plays it"),
+        ("run noise", "noise is a sweep: `tandem sweep noise` plays it"),
+        ("world noise --listen tcp/127.0.0.1:7447", "noise is a sweep: `tandem sweep noise` plays it"),
         ("sweep noisy", "noisy is a scenario: `tandem run noisy` plays it"),
         ("run papr-1", "; did you mean 'paper-1'?"),
         ("run niose", "; did you mean 'noise'?"),

@@ -170,7 +170,7 @@ def test_the_papers_missions_leave_one_hypothesis_and_no_probability(tmp_path: P
         assert (told[robot]["hypotheses"], told[robot]["probability"]) == (1, None)
 
 
-# --- a campaign's rows and figures ---------------------------------------------------------------------
+# --- a sweep's rows and figures ---------------------------------------------------------------------
 
 HONEST = ["cov_xx", "cov_xy", "cov_xh", "cov_yy", "cov_yh", "cov_hh"]
 SWEEP = 'name = "noisy"\nscenario = "noisy.toml"\ntrials = 3\n'
@@ -212,7 +212,7 @@ def test_a_row_counts_the_claims_within_three_times_the_accuracy() -> None:
 
 
 def results_of(rows: list[trial.TrialRow], folder: Path) -> execution.Results:
-    """Of a campaign of one cell."""
+    """Of a sweep of one cell."""
     (folder / "noisy.toml").write_text(NOISY)
     (folder / "sweep.toml").write_text(SWEEP)
     sweep = spec.load(str(folder / "sweep.toml"))
@@ -264,7 +264,7 @@ def test_a_trial_with_two_claims_counts_once_in_the_mean_nees() -> None:
     assert row.nees == pytest.approx(sum(each) / 2)
 
 
-def test_the_table_of_a_campaign_gives_the_nees_where_covariances_are_claimed(
+def test_the_table_of_a_sweep_gives_the_nees_where_covariances_are_claimed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     report.show(results_of([row_of(claimed(NOISY, SURE))], tmp_path), tmp_path, quiet=False)

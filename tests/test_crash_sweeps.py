@@ -1,4 +1,4 @@
-"""Campaigns over kills: each trial is held against the mission without kills, and leaves nobody behind."""
+"""Sweeps over kills: each trial is held against the mission without kills, and leaves nobody behind."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def test_a_process_that_is_never_started_again_ends_its_trial() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("how", ["killed, then hung", "campaign stopped", "campaign killed"])
+@pytest.mark.parametrize("how", ["killed, then hung", "sweep stopped", "sweep killed"])
 def test_however_a_trial_ends_its_processes_end_with_it(how: str, tmp_path: Path) -> None:
     (tmp_path / "endless.toml").write_text(ENDLESS + '[[kill]]\nwho = "a"\ntick = 1\n')
     (tmp_path / "hung.toml").write_text(HUNG + ("10.0" if "hung" in how else "600.0"))
@@ -119,7 +119,7 @@ def test_however_a_trial_ends_its_processes_end_with_it(how: str, tmp_path: Path
             os.kill(min(left(tmp_path)), SIGKILL)
         else:
             command.tell(SIGINT if "stopped" in how else SIGKILL)
-        assert command.ended().status == {"campaign stopped": 130, "campaign killed": -SIGKILL}.get(how, 3)
+        assert command.ended().status == {"sweep stopped": 130, "sweep killed": -SIGKILL}.get(how, 3)
     until(lambda: not left(tmp_path), "no process is left")
     if "hung" in how:
         rows = pq.read_table(tmp_path / "out" / "trials.parquet").to_pylist()
@@ -189,11 +189,11 @@ def test_who_starts_nobody_again_refuses_a_scenario_with_kills(tmp_path: Path) -
     refused(world, "mine.toml: kill: a world starts nobody again; `tandem run` does")
 
 
-# --- the campaigns that ship --------------------------------------------------------------------------
+# --- the sweeps that ship --------------------------------------------------------------------------
 
 
 def killed(name: str, seed: int) -> list[tuple[Any, ...]]:
-    """What each cell of the campaign comes to: who, when and where."""
+    """What each cell of the sweep comes to: who, when and where."""
     tables = [msgspec.convert(cell.table["kill"], list[KillTable]) for cell in cells(spec.load(name))]
     return [
         tuple((kill.who, kill.tick, kill.point) for kill in drawn(table, seed, ("a", "b")))
@@ -201,7 +201,7 @@ def killed(name: str, seed: int) -> list[tuple[Any, ...]]:
     ]
 
 
-def test_the_campaign_of_crashes_kills_everyone_in_every_tick_at_every_point() -> None:
+def test_the_sweep_of_crashes_kills_everyone_in_every_tick_at_every_point() -> None:
     end = in_process.play(load("paper-1")).end
     assert end is not None
     ticks = range(end.tick + 1)
@@ -209,7 +209,7 @@ def test_the_campaign_of_crashes_kills_everyone_in_every_tick_at_every_point() -
     assert Counter(killed("crash", 1)) == Counter(everything) + Counter({(): len(ticks)})
 
 
-def test_the_campaign_of_two_kills_kills_any_two_or_both_robots_in_one_tick() -> None:
+def test_the_sweep_of_two_kills_kills_any_two_or_both_robots_in_one_tick() -> None:
     end = in_process.play(load("paper-2")).end
     assert end is not None
     for seed in range(50):

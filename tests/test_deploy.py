@@ -200,7 +200,7 @@ def test_the_units_command_plays_a_robot_with_its_keys(tmp_path: Path) -> None:
         for robot in ("a", "b"):
             line = start.replace("%i", robot).replace("%d", str(keys / f"agent-{robot}"))
             line = line.replace("%S", str(tmp_path / "state"))
-            line = line.replace("$TANDEM_OPTIONS", f"--connect {endpoint} --wait 60")
+            line = line.replace("$TANDEM_OPTIONS", f"--connect {endpoint} --connect-timeout 60")
             program, *arguments = shlex.split(line)
             assert program == "/opt/tandem/bin/tandem"
             playing.append(stack.enter_context(TandemProcess(*arguments)))

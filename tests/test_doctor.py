@@ -283,7 +283,7 @@ def of_another_version(keys: Path) -> Iterator[str]:
 @pytest.mark.parametrize("who", ["agent-a", "viewer"])
 def test_a_world_of_another_protocol_version_is_told(who: str, keys: Path) -> None:
     with of_another_version(keys) as endpoint:
-        flags = ("--connect", endpoint, "--keys", keys / who, "--wait", "0.2")
+        flags = ("--connect", endpoint, "--keys", keys / who, "--timeout", "0.2")
         only_fix(
             tandem("doctor", *flags),
             f"versions: r speaks protocol version {VERSION + 1}, and this machine {VERSION}; install",
@@ -391,7 +391,7 @@ def test_rules_are_tried_while_a_mission_runs(
         part("world", "world", tmp_path / "endless.toml", "--run", "mine")
         for robot in [part(f"agent-{robot}", "agent", robot) for robot in "ab"]:
             robot.until((tmp_path / "out" / "agent-b.journal").exists, "b plays")
-        ended = tandem("doctor", "--connect", endpoint, "--keys", keys / "agent-a", "--wait", "20")
+        ended = tandem("doctor", "--connect", endpoint, "--keys", keys / "agent-a", "--timeout", "20")
     assert findings(ended, "--") == []
     found = findings(ended, "fix")
     assert len(found) == len(fixes)
@@ -431,7 +431,7 @@ def test_what_cannot_be_tried_without_a_mission_that_moves_is_not_said_to_be_wel
     keys: Path, tmp_path: Path
 ) -> None:
     with router_by(keys, enforce, tmp_path) as endpoint, ExitStack() as stack:
-        flags = ("--connect", endpoint, "--keys", keys / "agent-a", "--wait", "0.2")
+        flags = ("--connect", endpoint, "--keys", keys / "agent-a", "--timeout", "0.2")
         assert not any(
             "read" in line for line in tandem("doctor", *flags).out.splitlines() if "rules:" in line
         )
@@ -462,7 +462,7 @@ def test_a_mission_beside_which_all_is_tried_leaves_the_record_of_one_alone(
         started["a"].until_answered("a", out)
         doctors = [
             stack.enter_context(
-                TandemProcess("doctor", "--connect", endpoint, "--keys", keys / who, "--wait", "20")
+                TandemProcess("doctor", "--connect", endpoint, "--keys", keys / who, "--timeout", "20")
             )
             for who in ("agent-a", "agent-b", "viewer")
         ]

@@ -251,7 +251,7 @@ def test_a_world_whose_port_another_world_has_is_one_clear_line() -> None:
 def test_an_agent_at_a_port_that_does_not_speak_zenoh_gives_up() -> None:
     with socket.create_server(("127.0.0.1", 0)) as mute:
         endpoint = f"tcp/127.0.0.1:{mute.getsockname()[1]}"
-        ended = tandem("agent", "a", "--connect", endpoint, "--wait", "2")
+        ended = tandem("agent", "a", "--connect", endpoint, "--connect-timeout", "2")
     assert ended == (3, "", f"tandem agent a: no world at {endpoint}; gave up after 2 s: {MUTE}\n")
 
 

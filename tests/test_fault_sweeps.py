@@ -1,4 +1,4 @@
-"""Campaigns over faults: those that ship say what their labels say, and rows count what was lost."""
+"""Sweeps over faults: those that ship say what their labels say, and rows count what was lost."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ WINDOWS = (0, 1, 5, 10, 20, 50)
 
 
 def scenarios(name: str) -> list[Scenario]:
-    """One for each cell of the campaign `name`, with the same seed; all of them face the same starts."""
+    """One for each cell of the sweep `name`, with the same seed; all of them face the same starts."""
     sweep = spec.load(name)
     found = []
     for cell in cells(sweep):
@@ -44,7 +44,7 @@ def there(scenario: Scenario) -> Fault:
     return fault
 
 
-def test_the_campaign_of_loss_loses_what_it_says() -> None:
+def test_the_sweep_of_loss_loses_what_it_says() -> None:
     for (share, bursts), scenario in zip(product(LOSSES, (False, True)), scenarios("loss"), strict=True):
         fault = there(scenario)
         assert fault.let_through == pytest.approx(1.0 - share)
@@ -52,7 +52,7 @@ def test_the_campaign_of_loss_loses_what_it_says() -> None:
             assert (fault.loss, 1.0 / fault.burst_end) == (0.0, 20.0)
 
 
-def test_the_campaign_of_delay_delays_by_what_it_says() -> None:
+def test_the_sweep_of_delay_delays_by_what_it_says() -> None:
     for (ticks, how), scenario in zip(product(TICKS, range(3)), scenarios("delay"), strict=True):
         fault = there(scenario)
         assert fault.delay == (ticks if how == 0 else 0, ticks)
@@ -61,7 +61,7 @@ def test_the_campaign_of_delay_delays_by_what_it_says() -> None:
         assert fault.bursty == pytest.approx(0.9 if how == 2 else 0.0)
 
 
-def test_the_campaign_of_partitions_cuts_when_and_which_way_it_says() -> None:
+def test_the_sweep_of_partitions_cuts_when_and_which_way_it_says() -> None:
     ways = ("a->b", "b->a", "a<->b")
     for (ticks, begin, way), scenario in zip(
         product(WINDOWS, (0, 2), ways), scenarios("partition"), strict=True

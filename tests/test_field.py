@@ -217,7 +217,7 @@ def test_a_robot_without_a_beacon_waits_for_it_idle_and_gives_up() -> None:
 def test_a_robot_whose_peer_does_not_come_has_not_moved(tmp_path: Path) -> None:
     ended = tandem(
         *("robot", "a", "--mission", "paper-1", "--driver", "docs.rover:Rover", "--rate", "10"),
-        *("--wait", "2", "--out", tmp_path / "out"),
+        *("--connect-timeout", "2", "--out", tmp_path / "out"),
     )
     assert ended.status == 3
     assert ended.err.endswith("b: not there; nobody has moved\n")

@@ -174,7 +174,7 @@ def test_with_one_robots_certificate_nobody_forges_end_truth_ticks_or_another_ro
                 watch.until_says(f"refused a frame on {key}: {why}")
         found = shown(address)
         assert (found["last"], found["end"], found["live"]) == (0, None, True)
-        listed = tandem("ps", "--connect", endpoint, *keyed("viewer"), "--json", "--wait", "2")
+        listed = tandem("ps", "--connect", endpoint, *keyed("viewer"), "--json", "--timeout", "2")
         [mission] = json.loads(listed.out)["missions"]
         assert (mission["tick"], mission["outcome"]) == (0, None)
         assert all(robot["tick"] in (0, None) for robot in mission["robots"])

@@ -198,7 +198,7 @@ def test_the_more_robots_a_run_starts_the_longer_each_looks_for_its_world(
     with TandemProcess("run", endless, "--out", out, "-q") as run:
         run.until_written(out / "agent-c.journal", 1)
         words = processes_of(out)[process_of(out, "agent", "c")]
-    assert words[words.index("--wait") + 1] == "62.0"
+    assert words[words.index("--connect-timeout") + 1] == "62.0"
 
 
 @pytest.mark.parametrize("server_too", [False, pytest.param(True, marks=ON_LINUX)])

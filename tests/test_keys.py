@@ -254,7 +254,7 @@ def test_who_has_no_good_certificate_is_not_let_in_and_told_why(
 ) -> None:
     spoil(mine, keys)
     with world_of(keys) as endpoint:
-        ended = tandem("agent", "a", "--connect", endpoint, "--keys", mine, "--wait", "2")
+        ended = tandem("agent", "a", "--connect", endpoint, "--keys", mine, "--connect-timeout", "2")
     assert ended == (3, "", f"tandem agent a: no world at {endpoint}; gave up after 2 s: {words}\n")
 
 
@@ -262,7 +262,7 @@ def test_a_world_of_another_authority_is_not_believed(mine: Path, tmp_path: Path
     other = tmp_path / "others"
     assert tandem("keys", other, "--robots", "a,b").status == 0
     with world_of(other) as endpoint:
-        ended = tandem("agent", "a", "--connect", endpoint, "--keys", mine, "--wait", "2")
+        ended = tandem("agent", "a", "--connect", endpoint, "--keys", mine, "--connect-timeout", "2")
     assert ended.status == 3
     assert "its certificate is refused here: unable to get local issuer certificate" in ended.err
 
@@ -273,7 +273,7 @@ def test_a_world_whose_certificate_has_expired_is_not_believed(
     shutil.copytree(keys / "world", tmp_path / "old" / "world")
     expire(tmp_path / "old" / "world", keys)
     with world_of(tmp_path / "old") as endpoint:
-        ended = tandem("agent", "a", "--connect", endpoint, "--keys", mine, "--wait", "2")
+        ended = tandem("agent", "a", "--connect", endpoint, "--keys", mine, "--connect-timeout", "2")
     assert ended.status == 3
     assert "its certificate is refused here: certificate has expired" in ended.err
 
@@ -282,7 +282,7 @@ def test_a_world_by_another_name_than_its_certificates_is_not_believed(keys: Pat
     with world_of(keys) as endpoint:
         elsewhere = endpoint.replace("127.0.0.1", "127.0.0.2")
         with session.open_router(configured(keys / "world" / KEYED, listen=[elsewhere])):
-            ended = tandem("agent", "a", "--connect", elsewhere, "--keys", mine, "--wait", "2")
+            ended = tandem("agent", "a", "--connect", elsewhere, "--keys", mine, "--connect-timeout", "2")
     assert ended.status == 3
     assert "its certificate is refused here: IP address mismatch" in ended.err
 
@@ -292,7 +292,7 @@ def test_a_robot_that_the_rules_do_not_name_is_told_to_check_them(keys: Path, tm
     assert tandem("keys", tmp_path / "keys", "--robots", "c").status == 0
     with world_of(keys) as endpoint:
         own = tmp_path / "keys" / "agent-c"
-        ended = tandem("agent", "c", "--connect", endpoint, "--keys", own, "--wait", "2")
+        ended = tandem("agent", "c", "--connect", endpoint, "--keys", own, "--connect-timeout", "2")
     assert ended.status == 3
     assert (
         "a router answers; check that the world runs, and that its access rules name this robot" in ended.err
@@ -302,7 +302,7 @@ def test_a_robot_that_the_rules_do_not_name_is_told_to_check_them(keys: Path, tm
 def test_who_speaks_without_tls_is_told_to(keys: Path) -> None:
     with world_of(keys) as endpoint:
         plain = endpoint.replace("tls/", "tcp/")
-        ended = tandem("agent", "a", "--connect", plain, "--wait", "2")
+        ended = tandem("agent", "a", "--connect", plain, "--connect-timeout", "2")
     assert ended.status == 3
     assert "check that it is a Zenoh router, user and password, and tls/" in ended.err
 
@@ -312,7 +312,7 @@ def test_who_speaks_tls_where_nobody_does_is_told_so(mine: Path) -> None:
     endpoint = free_endpoint()
     with session.open_router(listening(endpoint)):
         secured = endpoint.replace("tcp/", "tls/")
-        ended = tandem("agent", "a", "--connect", secured, "--keys", mine, "--wait", "2")
+        ended = tandem("agent", "a", "--connect", secured, "--keys", mine, "--connect-timeout", "2")
     assert ended.status == 3
     assert "check that it listens at tls/" in ended.err
 
@@ -327,7 +327,7 @@ def test_a_wrong_password_is_told_to_be_checked(tmp_path: Path) -> None:
         (tmp_path / name).write_text(json.dumps({"transport": account}))
     endpoint = free_endpoint()
     with session.open_router(configured(tmp_path / "router.json5", listen=[endpoint])):
-        part = ("agent", "a", "--connect", endpoint, "--wait", "2", "--config")
+        part = ("agent", "a", "--connect", endpoint, "--connect-timeout", "2", "--config")
         right, wrong = (tandem(*part, tmp_path / name) for name in ("right", "wrong"))
     assert (right.status, wrong.status) == (3, 3)
     assert "a router answers; check that the world runs" in right.err

@@ -1,4 +1,4 @@
-"""The campaign over lies: its labels say what is told, and its pictures what became of it."""
+"""The sweep over lies: its labels say what is told, and its pictures what became of it."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> execution.Results:
     )
 
 
-def test_the_campaign_that_ships_tells_the_lies_of_its_labels() -> None:
+def test_the_sweep_that_ships_tells_the_lies_of_its_labels() -> None:
     sweep = spec.load("attacks")
     seen: dict[str, Attack | None] = {}
     for cell in cells(sweep):
@@ -95,7 +95,7 @@ def test_the_pictures_show_what_became_of_each_lie(results: execution.Results, t
     assert all(np.all(line.get_ydata() == 1.0) for line in panel.lines), "every lie before any honest one"
 
 
-def test_a_campaign_without_lies_has_no_such_pictures(tmp_path: Path) -> None:
+def test_a_sweep_without_lies_has_no_such_pictures(tmp_path: Path) -> None:
     (tmp_path / "few.toml").write_text('name = "few"\nscenario = "random"\ntrials = 2\nseed = 1\n')
     progress = execution.Progress(say=lambda _: None, begin=lambda *_: None, done=lambda _: None)
     sweep = spec.load(str(tmp_path / "few.toml"))

@@ -225,7 +225,10 @@ def test_what_is_said_is_told_and_what_is_not_is_said_so(
     start: Callable[[Played], None], lines: list[str]
 ) -> None:
     with played(start) as (_, endpoint):
-        assert listed(endpoint, "--wait", "0.5") == [f"r at {endpoint}, {lines[0]}", f"  a  {lines[1]}"]
+        assert listed(endpoint, "--connect-timeout", "0.5") == [
+            f"r at {endpoint}, {lines[0]}",
+            f"  a  {lines[1]}",
+        ]
 
 
 def test_a_peer_of_whom_nothing_is_heard_is_missing() -> None:

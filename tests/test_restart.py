@@ -348,7 +348,7 @@ def test_who_has_ended_says_so_again(undisturbed: Path, tmp_path: Path) -> None:
     for name, data in journals(undisturbed).items():
         (out / name).write_bytes(data)
     endpoint = free_endpoint()
-    agent = tandem("agent", "a", "--connect", endpoint, "--out", out, "--wait", "0.2")
+    agent = tandem("agent", "a", "--connect", endpoint, "--out", out, "--connect-timeout", "0.2")
     assert agent == (0, "a: localised after 48 ticks\n", "")
     clock = tandem("world", "paper-1", "--listen", endpoint, "--out", out, "-q")
     assert clock == (0, LOCALISED, "")

@@ -137,7 +137,7 @@ def test_a_base_behind_a_bridge_keeps_the_contract(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     with ros_base.base(endpoint, (1.0, 0.5), 3.0) as base:
         ended = tandem(
-            *("conform", "world.hardware.ros2:Ros2", "--mission", tmp_path / "ros.toml", "--rate", "2"),
+            *("check-driver", "world.hardware.ros2:Ros2", "--mission", tmp_path / "ros.toml", "--rate", "2"),
             *(
                 "--option",
                 f"connect={endpoint}",
@@ -157,7 +157,7 @@ def test_a_base_behind_a_bridge_keeps_the_contract(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_a_bridge_that_is_not_there_is_one_line() -> None:
     endpoint = free_endpoint()
-    ended = tandem("conform", "world.hardware.ros2:Ros2", "--option", f"connect={endpoint}")
+    ended = tandem("check-driver", "world.hardware.ros2:Ros2", "--option", f"connect={endpoint}")
     assert ended.status == 2
     why = f"cannot be made: TimeoutError: no bridge at {endpoint}"
-    assert ended.err == f"tandem conform: world.hardware.ros2:Ros2: {why}\n"
+    assert ended.err == f"tandem check-driver: world.hardware.ros2:Ros2: {why}\n"

@@ -329,7 +329,7 @@ def test_scenarios_lists_what_ships() -> None:
 
 def test_whatever_is_listed_is_a_whole_sentence_and_stands_in_one_column() -> None:
     listed = tandem("scenarios").out.splitlines()
-    scenarios = listed[: listed.index("campaigns, for `tandem sweep`:")]
+    scenarios = listed[: listed.index("sweeps, for `tandem sweep`:")]
     for lines in (scenarios, listed[len(scenarios) + 1 :]):
         width = max(len(line.split()[0]) for line in lines)
         assert all(line[width] == " " != line[width + 1] and line.endswith(".") for line in lines), lines

@@ -1,4 +1,4 @@
-"""A campaign's rows depend on what was asked, and not on who plays them or what goes wrong meanwhile."""
+"""A sweep's rows depend on what was asked, and not on who plays them or what goes wrong meanwhile."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def played(
     audit: bool = True,
     done: Callable[[int], None] = lambda _: None,
 ) -> execution.Results:
-    """The campaign, as the command plays it, but for figures and what is said."""
+    """The sweep, as the command plays it, but for figures and what is said."""
     silent = execution.Progress(say=print, begin=lambda *_: None, done=done)
     sweep = spec.load(str(folder / source), trials=trials)
     return execution.sweep(
@@ -202,7 +202,7 @@ def test_rows_are_the_same_by_a_scheduler_and_workers_started_by_hand_even_if_on
             command.until(lambda: parts(folder / "there") >= 2, "two chunks are done")
             workers[0].kill()
             assert command.ended().status == 1
-        until(lambda: not trial_processes(folder), "the workers keep no process of a campaign that is over")
+        until(lambda: not trial_processes(folder), "the workers keep no process of a sweep that is over")
         for worker in workers[1:]:
             worker.terminate()
             worker.wait(20.0)
@@ -226,7 +226,7 @@ def test_a_scheduler_that_accepts_and_says_nothing_is_waited_for_with_a_bound(fo
     assert ended.err == f"tandem sweep: --scheduler: {address} cannot be reached: no answer within 5 s\n"
 
 
-def test_a_seed_follows_from_the_campaign_the_cell_and_the_trial(folder: Path) -> None:
+def test_a_seed_follows_from_the_sweep_the_cell_and_the_trial(folder: Path) -> None:
     def seeds(text: str) -> dict[tuple[str, ...], int]:
         (folder / "x.toml").write_text(text)
         sweep = spec.load(str(folder / "x.toml"))
@@ -285,7 +285,7 @@ def test_trials_that_raise_die_or_hang_are_rows_and_the_others_go_on(folder: Pat
 
 
 @pytest.mark.long
-def test_a_campaign_that_is_killed_twice_goes_on_where_it_was(folder: Path) -> None:
+def test_a_sweep_that_is_killed_twice_goes_on_where_it_was(folder: Path) -> None:
     out = folder / "killed"
     for already in (0, 1):
         with TandemProcess("sweep", "lengthy.toml", "--out", "killed", cwd=folder) as command:
@@ -309,7 +309,7 @@ def test_a_campaign_that_is_killed_twice_goes_on_where_it_was(folder: Path) -> N
 
 
 @pytest.mark.long
-def test_a_campaign_whose_trials_hang_can_be_stopped(folder: Path) -> None:
+def test_a_sweep_whose_trials_hang_can_be_stopped(folder: Path) -> None:
     with misbehaving("endless", "both.toml", folder) as process:
         until(lambda: len(list(folder.glob("tmp/*/playing"))) == 2, "trials are played")
         os.killpg(process.pid, SIGTERM)
@@ -318,7 +318,7 @@ def test_a_campaign_whose_trials_hang_can_be_stopped(folder: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_stopped_campaign_says_so_in_one_line_and_goes_on(folder: Path) -> None:
+def test_a_stopped_sweep_says_so_in_one_line_and_goes_on(folder: Path) -> None:
     with TandemProcess("sweep", "lengthy.toml", "--out", "out", "--workers", "1", cwd=folder) as command:
         command.until(lambda: parts(folder / "out"), "a chunk is done")
         command.tell(SIGINT)
@@ -337,9 +337,7 @@ def test_a_stopped_campaign_says_so_in_one_line_and_goes_on(folder: Path) -> Non
 
 
 @pytest.mark.long
-def test_a_campaign_goes_on_after_its_machine_has_slept(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_sweep_goes_on_after_its_machine_has_slept(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL", "1s")
     with TandemProcess("sweep", "lengthy.toml", "--out", "out", "--workers", "1", cwd=folder) as command:
         command.until(lambda: parts(folder / "out"), "a chunk is done")
@@ -374,11 +372,11 @@ def test_a_folder_may_be_called_anything_and_a_label_stands_as_it_is_written(fol
     assert (folder / name / "figures" / "success-way.png").exists()
 
 
-# --- a campaign's folder ------------------------------------------------------------------------------
+# --- a sweep's folder ------------------------------------------------------------------------------
 
 
 @pytest.mark.long
-def test_more_trials_extend_a_campaign_and_fewer_leave_it(folder: Path) -> None:
+def test_more_trials_extend_a_sweep_and_fewer_leave_it(folder: Path) -> None:
     played(folder, "both.toml", "grown", trials=3)
     more: list[int] = []
     played(folder, "both.toml", "grown", done=more.append)
@@ -388,7 +386,7 @@ def test_more_trials_extend_a_campaign_and_fewer_leave_it(folder: Path) -> None:
     assert rows(folder / "grown") == rows(folder / "whole")
 
 
-def test_a_folder_of_another_campaign_is_refused(folder: Path) -> None:
+def test_a_folder_of_another_sweep_is_refused(folder: Path) -> None:
     played(folder, "both.toml", "out", trials=1)
     before = rows(folder / "out")
     (folder / "other.toml").write_text(RANDOM.replace("period = 1.0", "period = 0.5"))
@@ -400,7 +398,7 @@ def test_a_folder_of_another_campaign_is_refused(folder: Path) -> None:
         (folder / "both.toml").write_text(BOTH.replace(was, new))
         with pytest.raises(UserError) as refused:
             played(folder, "both.toml", "out")
-        assert str(refused.value).endswith(f"out holds another campaign: {says}; choose another folder")
+        assert str(refused.value).endswith(f"out holds another sweep: {says}; choose another folder")
     assert rows(folder / "out") == before
 
 
@@ -415,7 +413,7 @@ def test_a_folder_in_use_is_refused(folder: Path) -> None:
 
 
 @pytest.mark.long
-def test_results_are_left_in_a_folder_named_for_the_campaign(folder: Path) -> None:
+def test_results_are_left_in_a_folder_named_for_the_sweep(folder: Path) -> None:
     ended = tandem("sweep", "both.toml", "--trials", "2", cwd=folder)
     out = folder / "sweep-both"
     drawn = {path.name: path.stat().st_size for path in (out / "figures").iterdir()}
@@ -480,7 +478,7 @@ def test_of_more_cells_than_fit_a_screen_those_in_which_all_is_well_are_counted(
 # --- every trial is judged ------------------------------------------------------------------------------
 
 
-def test_a_trial_that_breaks_a_rule_fails_the_campaign_and_is_named(
+def test_a_trial_that_breaks_a_rule_fails_the_sweep_and_is_named(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     results = played(folder, "both.toml", "out", trials=4, play="tests.misbehaving:boastful")
@@ -506,7 +504,7 @@ def test_a_trial_that_breaks_a_rule_fails_the_campaign_and_is_named(
 
 
 @pytest.mark.long
-def test_a_campaign_without_audit_says_nothing_of_it(folder: Path) -> None:
+def test_a_sweep_without_audit_says_nothing_of_it(folder: Path) -> None:
     ended = sweep(folder, "both.toml", "out", "--trials", "1", "--no-audit")
     assert "audited" not in ended.out
     assert {(row["violations"], row["first_violation"]) for row in rows(folder / "out")} == {(None, None)}
@@ -532,7 +530,7 @@ def test_a_setting_in_which_nobody_can_meet_is_a_refused_cell(folder: Path) -> N
     assert not (folder / "none").exists()
 
 
-def test_a_campaign_in_which_none_localises_has_its_figures(folder: Path) -> None:
+def test_a_sweep_in_which_none_localises_has_its_figures(folder: Path) -> None:
     (folder / "short.toml").write_text(
         'name = "short"\nscenario = "base.toml"\ntrials = 1\n[[axis]]\nfield = "max_ticks"\nvalues = [1, 2]\n'
     )
@@ -607,7 +605,7 @@ def test_a_figure_tells_every_choice_of_the_other_axes_apart_while_they_are_few(
 
 
 @pytest.mark.parametrize("name", sorted(spec.shipped()))
-def test_a_campaign_that_ships_can_be_played(name: str) -> None:
+def test_a_sweep_that_ships_can_be_played(name: str) -> None:
     sweep = spec.load(name)
     execution.check_columns(sweep, schema_of(sweep, list(cells(sweep))))
     for cell in cells(sweep):
@@ -616,7 +614,7 @@ def test_a_campaign_that_ships_can_be_played(name: str) -> None:
     assert f"{name:10} " in tandem("scenarios").out
 
 
-def test_the_campaign_of_noise_plays_the_same_starts_in_every_cell() -> None:
+def test_the_sweep_of_noise_plays_the_same_starts_in_every_cell() -> None:
     sweep = spec.load("noise")
     settings = [setting_of(sweep, cell) for cell in cells(sweep)]
     assert {cell.key for cell in cells(sweep)} == {"{}"}
@@ -741,9 +739,7 @@ def test_a_mistake_in_a_spec_is_one_line_and_status_2(folder: Path) -> None:
 def test_a_spec_that_is_not_there_is_named() -> None:
     ended = tandem("sweep", "nowhere")
     assert ended.status == 2
-    assert ended.err.startswith(
-        "tandem sweep: nowhere: neither a file nor a campaign that ships (any-start, "
-    )
+    assert ended.err.startswith("tandem sweep: nowhere: neither a file nor a sweep that ships (any-start, ")
 
 
 @pytest.mark.long

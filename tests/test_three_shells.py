@@ -99,7 +99,7 @@ def test_several_pairs_localise_side_by_side_in_one_world(pairs: int, tmp_path: 
 
 def test_an_agent_without_a_world_says_so_and_gives_up(tmp_path: Path) -> None:
     endpoint = free_endpoint()
-    ended = tandem("agent", "a", "--connect", endpoint, "--wait", "6", "--out", tmp_path / "out")
+    ended = tandem("agent", "a", "--connect", endpoint, "--connect-timeout", "6", "--out", tmp_path / "out")
     assert ended.status == 3
     assert ended.err.splitlines() == [
         f"tandem agent a: no world at {endpoint} yet; looking for one for 6 s: {NOBODY}",
@@ -110,7 +110,7 @@ def test_an_agent_without_a_world_says_so_and_gives_up(tmp_path: Path) -> None:
 
 def test_an_agent_finds_no_world_where_its_run_is_not_alive() -> None:
     with world("paper-1", "--run", "mine") as (_, endpoint):
-        ended = tandem("agent", "a", "--connect", endpoint, "--run", "yours", "--wait", "1")
+        ended = tandem("agent", "a", "--connect", endpoint, "--run", "yours", "--connect-timeout", "1")
     assert ended.status == 3
     assert "gave up after 1 s" in ended.err
 
@@ -179,7 +179,7 @@ def test_an_agent_that_is_answered_nonsense_alone_looks_on_and_says_why() -> Non
     with session.open_router(listening(endpoint := free_endpoint())) as link:
         _token = session.show_alive(link, keys.world_alive("mine"))
         link.declare_queryable(keys.config("mine", "*"), lambda query: query.reply(query.key_expr, b"junk"))
-        ended = tandem("agent", "a", "--connect", endpoint, "--wait", "1")
+        ended = tandem("agent", "a", "--connect", endpoint, "--connect-timeout", "1")
     assert ended.status == 3
     assert "gave up after 1 s: the world's briefing is not understood: 4 bytes" in ended.err
 

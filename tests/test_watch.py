@@ -293,13 +293,13 @@ def test_the_records_in_a_folder_are_listed(opened: Open, paper_1: Path, tmp_pat
 
 
 @pytest.mark.long
-def test_a_campaign_shows_its_cells_and_its_figures(opened: Open, tmp_path: Path) -> None:
+def test_a_sweep_shows_its_cells_and_its_figures(opened: Open, tmp_path: Path) -> None:
     spec = tmp_path / "speeds.toml"
     spec.write_text(
         'name = "speeds"\nscenario = "random"\ntrials = 2\nseed = 1\n'
         '[[axis]]\nfield = "mission.max_speed"\nvalues = [0.5, 1.0]\n'
     )
-    folder = tmp_path / "campaign"
+    folder = tmp_path / "sweep"
     with TandemProcess("sweep", spec, "--out", folder, "--workers", "1", "-q", "--no-audit") as sweep:
         assert sweep.ended(4 * BOUND_S).status == 0
     with watching(folder) as (_, where):
@@ -307,9 +307,9 @@ def test_a_campaign_shows_its_cells_and_its_figures(opened: Open, tmp_path: Path
         expect(page.locator("#title")).to_have_text("speeds")
         expect(page.locator("tbody tr")).to_have_count(2)
         expect(page.locator("tbody tr").first).to_contain_text("100.0 %")
-        expect(page.locator("#campaign")).to_contain_text("Trials are not recorded one by one")
-        expect(page.locator("#campaign img").first).to_have_js_property("complete", value=True)
-        shot(page, "campaign")
+        expect(page.locator("#sweep")).to_contain_text("Trials are not recorded one by one")
+        expect(page.locator("#sweep img").first).to_have_js_property("complete", value=True)
+        shot(page, "sweep")
 
 
 # --- live -------------------------------------------------------------------------------------------
@@ -465,7 +465,7 @@ def test_ctrl_c_ends_the_page_with_somebody_watching(paper_1: Path) -> None:
     ("arguments", "complaint"),
     [
         (["nowhere"], "nowhere is no folder"),
-        (["."], ". holds neither a record, nor a campaign, nor folders with records"),
+        (["."], ". holds neither a record, nor a sweep, nor folders with records"),
         (
             [".", "--connect", "tcp/127.0.0.1:7447"],
             "--connect: a record needs no network; leave out one of the two",

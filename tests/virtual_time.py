@@ -1,6 +1,6 @@
 """A clock that only sleeping moves, for an exercise and the drivers that it is tried on.
 
-`tandem conform tests.virtual_time:Rover` is an exercise in it: what it finds does not depend on the machine.
+`tandem check-driver tests.virtual_time:Rover` is an exercise in it: what it finds does not depend on the machine.
 """
 
 from __future__ import annotations

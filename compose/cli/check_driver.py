@@ -1,4 +1,4 @@
-"""`tandem conform`: a driver, tried against the contract; the robot moves."""
+"""`tandem check-driver`: a driver, tried against the contract; the robot moves."""
 
 from __future__ import annotations
 

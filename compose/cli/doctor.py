@@ -19,7 +19,7 @@ def main(options: argparse.Namespace) -> int:
     """Check everything, whatever of it fails."""
     endpoints = reach(options, None)
     status = CLEAN
-    checks = (versions(), ports(endpoints), papers(endpoints), network(endpoints, options.connect_timeout))
+    checks = (versions(), ports(endpoints), papers(endpoints), network(endpoints, options.timeout))
     for finding in chain.from_iterable(checks):
         say(*text_width.wrapped(one_line(str(finding)), len(finding.mark) + 2))
         status = AMISS if finding.mark == FIX else status

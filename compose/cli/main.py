@@ -71,7 +71,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         options.parser.refuse(unknown)
     try:
         limits.need_memory(limits.START_BYTES, "Tandem")
-        status = import_module(f"compose.cli.{options.command}").main(options)
+        status = import_module(f"compose.cli.{options.command.replace('-', '_')}").main(options)
         sys.stdout.flush()
     except UserError as error:
         say(f"tandem {options.command}: {error}", error=True)
@@ -158,7 +158,11 @@ def parser() -> argparse.ArgumentParser:
     _add_playing(agent)
     agent.add_argument("--run", type=name, metavar="NAME", help="which run, if several are alive")
     agent.add_argument(
-        "--wait", type=positive, default=60.0, metavar="S", help="how long to look for a world (60)"
+        "--connect-timeout",
+        type=positive,
+        default=60.0,
+        metavar="S",
+        help="how long to look for a world (60)",
     )
     for sub in (world, agent):
         _add_reaching(sub)
@@ -170,9 +174,9 @@ def parser() -> argparse.ArgumentParser:
         sub.add_argument("--fsync", action="store_true", help="the journal survives a power cut")
 
     _add_robot(command("robot", "Play one robot's part without a world: its own driver, and its agent."))
-    _add_conform(command("conform", "Try a driver against the contract of docs/driver.md."))
+    _add_conform(command("check-driver", "Try a driver against the contract of docs/driver.md."))
 
-    _add_sweep(command("sweep", "Play a campaign: many trials of a scenario, over axes of its fields."))
+    _add_sweep(command("sweep", "Play a sweep: many trials of a scenario, over axes of its fields."))
 
     _add_figures(
         command("figures", "Draw a record, into DIR/figures: the paper's figures, and each robot's mission.")
@@ -200,7 +204,7 @@ def parser() -> argparse.ArgumentParser:
         command("ps", "List the missions on a network, and who takes part in them."),
     )
 
-    command("scenarios", "List the scenarios and the campaigns that ship.")
+    command("scenarios", "List the scenarios and the sweeps that ship.")
 
     bench = command("bench", "Measure speed, against the bare thing in the same run.")
     bench.add_argument("--rounds", type=count, default=5, metavar="N", help="repetitions (5)")
@@ -249,7 +253,7 @@ def _add_watch(parser: argparse.ArgumentParser) -> None:
         type=folder,
         nargs="?",
         metavar="DIR",
-        help="a record, a campaign, or a folder of records",
+        help="a record, a sweep, or a folder of records",
     )
     _add_reaching(parser)
     parser.add_argument(
@@ -263,7 +267,7 @@ def _add_looking(doctor: argparse.ArgumentParser, ps: argparse.ArgumentParser) -
     for sub in (doctor, ps):
         _add_reaching(sub)
         sub.add_argument(
-            "--wait", type=positive, default=2.0, metavar="S", help="how long to listen to missions (2)"
+            "--timeout", type=positive, default=2.0, metavar="S", help="how long to listen to missions (2)"
         )
     _add_listening(doctor, "where a world, an agent or a router is to listen; as often as you like")
     ps.add_argument("--json", action="store_true", help="as JSON")
@@ -305,7 +309,11 @@ def _add_robot(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--run", type=name, metavar="NAME", help="what the mission is called (its name)")
     parser.add_argument("--fsync", action="store_true", help="the journals survive a power cut")
     parser.add_argument(
-        "--wait", type=positive, default=60.0, metavar="S", help="how long to look for the peer (60)"
+        "--connect-timeout",
+        type=positive,
+        default=60.0,
+        metavar="S",
+        help="how long to look for the peer (60)",
     )
 
 

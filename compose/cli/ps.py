@@ -28,7 +28,7 @@ def main(options: argparse.Namespace) -> int:
     for place in places(options):
         try:
             with linked(place) as link:
-                seen = running_missions.look(link, options.connect_timeout)
+                seen = running_missions.look(link, options.timeout)
         except Unreached as error:
             say(f"tandem ps: {error}", error=True)
             status = FAILED
@@ -41,7 +41,7 @@ def main(options: argparse.Namespace) -> int:
         say(*json.dumps({"missions": told}, indent=2).replace("\x7f", "\\u007f").splitlines())
     else:
         for at, mission in found:
-            for line in _lines(at, mission, options.connect_timeout):
+            for line in _lines(at, mission, options.timeout):
                 say(*text_width.wrapped(one_line(line), INDENT))
     return status
 

@@ -15,9 +15,9 @@ from protocol.output import say
 
 
 def main(_options: argparse.Namespace) -> int:
-    """List the scenarios and the campaigns that ship, with the first sentence of each."""
+    """List the scenarios and the sweeps that ship, with the first sentence of each."""
     _list(shipped())
-    say("campaigns, for `tandem sweep`:")
+    say("sweeps, for `tandem sweep`:")
     _list(shipped("sweep"))
     return ENDED
 

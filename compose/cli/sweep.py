@@ -1,4 +1,4 @@
-"""`tandem sweep`: a campaign, on this machine or wherever a Dask scheduler has workers."""
+"""`tandem sweep`: a sweep, on this machine or wherever a Dask scheduler has workers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def main(options: argparse.Namespace) -> int:
-    """Play the campaign, or what is left of it."""
+    """Play the sweep, or what is left of it."""
     sweep = spec.load(options.spec, trials=options.trials, seed=options.seed)
     need("distributed", "matplotlib", "pyarrow", "tomli_w")
     if options.print_trial is not None:

@@ -154,7 +154,7 @@ def _overheard(pair: SessionPair, run: str, me: str, wait: float) -> Iterator[Fi
         yield ok(f"rules: {access_control.agent(me)} hears nothing of {what} in {run}")
     else:
         yield untried(
-            f"rules: reading {what}: {run} did not move within {wait:g} s; try while it does (--wait)"
+            f"rules: reading {what}: {run} did not move within {wait:g} s; try while it does (--connect-timeout)"
         )
 
 

@@ -178,7 +178,7 @@ def _arguments(
     def keyed(who: str) -> list[str]:
         return ["--keys", str(keys / who)] if keys is not None else []
 
-    wait = ["--wait", str(JOIN_S + JOIN_EACH_S * len(scenario.robots))]
+    wait = ["--connect-timeout", str(JOIN_S + JOIN_EACH_S * len(scenario.robots))]
     world = ["world", scenario.name, "--listen", endpoint, *keyed("world"), *shared, *journal, *real_time]
     return {WORLD: world} | {
         f"agent {robot.id}": [

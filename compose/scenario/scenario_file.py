@@ -144,7 +144,7 @@ def shipped(package: str = "scenario") -> dict[str, Path]:
     return {file.stem: file for file in sorted(path.glob("*.toml"))}
 
 
-SHIPPED = {"scenario": ("scenario", "run"), "sweep": ("campaign", "sweep")}
+SHIPPED = {"scenario": ("scenario", "run"), "sweep": ("sweep", "sweep")}
 """of each folder: what a file in it is, and the command that plays it"""
 
 

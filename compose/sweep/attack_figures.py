@@ -1,4 +1,4 @@
-"""Pictures of a campaign over lies: which are found out, and at what price in false alarms."""
+"""Pictures of a sweep over lies: which are found out, and at what price in false alarms."""
 
 from __future__ import annotations
 

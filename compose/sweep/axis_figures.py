@@ -1,4 +1,4 @@
-"""Pictures of a campaign: success and ticks against each axis, and when robots met, against T_max."""
+"""Pictures of a sweep: success and ticks against each axis, and when robots met, against T_max."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The cells of a campaign, and the seed of every trial in them."""
+"""The cells of a sweep, and the seed of every trial in them."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def trial_table(sweep: Sweep, cell: Cell, trial: int) -> dict[str, Any]:
     return {**sweep.draws.table(cell.table, seed), "seed": seed}
 
 
-def trial_seed(campaign_seed: int, key: str, trial: int) -> int:
+def trial_seed(sweep_seed: int, key: str, trial: int) -> int:
     """The seed of a trial's scenario: of 63 bits, whoever plays it and whatever else is played."""
-    digest = hashlib.sha256(f"{campaign_seed}/{key}/{trial}".encode()).digest()
+    digest = hashlib.sha256(f"{sweep_seed}/{key}/{trial}".encode()).digest()
     return int.from_bytes(digest[:8], "big") >> 1

@@ -1,4 +1,4 @@
-"""Pictures of a campaign over kills: whose death in which tick left another record, and what it cost."""
+"""Pictures of a sweep over kills: whose death in which tick left another record, and what it cost."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A campaign, from its spec to its results: what is left of it is played, and what there is gathered."""
+"""A sweep, from its spec to its results: what is left of it is played, and what there is gathered."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class ExecutionOptions(msgspec.Struct, frozen=True):
 
 
 class Progress(msgspec.Struct, frozen=True):
-    """Who is told how the campaign goes on."""
+    """Who is told how the sweep goes on."""
 
     say: Callable[[str], None]
     begin: Callable[[int, int], None]
@@ -51,7 +51,7 @@ class Progress(msgspec.Struct, frozen=True):
 
 
 class Results(msgspec.Struct, frozen=True):
-    """What there is of a campaign."""
+    """What there is of a sweep."""
 
     sweep: Sweep
     cells: tuple[Cell, ...]

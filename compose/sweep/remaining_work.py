@@ -1,4 +1,4 @@
-"""What is left to do in a campaign, and how it is cut into chunks.
+"""What is left to do in a sweep, and how it is cut into chunks.
 
 What a chunk holds, and who plays which, follows from how long trials take; what a trial is does not.
 """
@@ -29,7 +29,7 @@ FADES = 0.8
 
 
 class EngineFailed(Exception):
-    """The campaign cannot go on; the text says why."""
+    """The sweep cannot go on; the text says why."""
 
 
 class Work(msgspec.Struct):
@@ -64,7 +64,7 @@ class Work(msgspec.Struct):
 
 
 class TrialOptions(msgspec.Struct, frozen=True):
-    """What holds for every trial of a campaign."""
+    """What holds for every trial of a sweep."""
 
     seed: int
     processes: bool

@@ -1,4 +1,4 @@
-"""What a campaign shows on a terminal: how far it is, and in the end a table with a row a cell."""
+"""What a sweep shows on a terminal: how far it is, and in the end a table with a row a cell."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The folder of a campaign: what was asked, the rows of what has been played, and what follows from them.
+"""The folder of a sweep: what was asked, the rows of what has been played, and what follows from them.
 
 A row is on disk from the moment its chunk is done: in a part of its own until the parts are gathered into
 `trials.parquet`. Both change by renaming, so whenever it ends, what is there is whole.
@@ -27,7 +27,7 @@ from compose.sweep.trial import TrialRow
 from protocol import files
 
 TRIALS = "trials.parquet"
-CAMPAIGN = "sweep.json"
+SWEEP = "sweep.json"
 PARTS = "parts"
 CELLS = "cells"
 MAX_DIFFERENCE = 60
@@ -43,7 +43,7 @@ class Manifest(msgspec.Struct, frozen=True):
 
 
 class Folder:
-    """A campaign's folder, which no other run writes meanwhile."""
+    """A sweep's folder, which no other run writes meanwhile."""
 
     def __init__(self, path: Path, sweep: Sweep) -> None:
         self.path = path
@@ -72,7 +72,7 @@ class Folder:
         """Put down what is about to be played, and each cell's scenario."""
         self.refused = dict(refused)
         asked = msgspec.json.encode(Manifest(self.sweep, self.refused))
-        files.write(self.path / CAMPAIGN, msgspec.json.format(asked, indent=2) + b"\n")
+        files.write(self.path / SWEEP, msgspec.json.format(asked, indent=2) + b"\n")
         (self.path / CELLS).mkdir(exist_ok=True)
         self._parts.mkdir(exist_ok=True)
         for cell in self.cells.values():
@@ -116,9 +116,9 @@ class Folder:
 
 @contextmanager
 def opened(path: Path, sweep: Sweep) -> Iterator[Folder]:
-    """The folder at `path`, new or with what has been played of the same campaign.
+    """The folder at `path`, new or with what has been played of the same sweep.
 
-    Raises UserError where it cannot be written, is in use, or is of another campaign.
+    Raises UserError where it cannot be written, is in use, or is of another sweep.
     """
     new = not path.exists()
     make(path)
@@ -139,23 +139,23 @@ def opened(path: Path, sweep: Sweep) -> Iterator[Folder]:
 
 
 def _refused_before(path: Path, sweep: Sweep) -> dict[int, str]:
-    """The cells that an earlier run found unworkable. Raises UserError if it was of another campaign."""
+    """The cells that an earlier run found unworkable. Raises UserError if it was of another sweep."""
     try:
-        asked = msgspec.json.decode(files.read_bytes(path / CAMPAIGN), type=Manifest)
+        asked = msgspec.json.decode(files.read_bytes(path / SWEEP), type=Manifest)
     except FileNotFoundError:
         if (path / TRIALS).exists() or (path / PARTS).exists():
-            raise UserError(f"--out: {path} holds the rows of an unknown campaign") from None
+            raise UserError(f"--out: {path} holds the rows of an unknown sweep") from None
         return {}
     except ValueError as error:
-        raise UserError(f"--out: {path / CAMPAIGN} cannot be read: {error}") from None
+        raise UserError(f"--out: {path / SWEEP} cannot be read: {error}") from None
     difference = _difference(_identity(asked.sweep), _identity(sweep))
     if difference is not None:
-        raise UserError(f"--out: {path} holds another campaign: {difference}; choose another folder")
+        raise UserError(f"--out: {path} holds another sweep: {difference}; choose another folder")
     return asked.refused
 
 
 def _identity(sweep: Sweep) -> dict[str, Any]:
-    """What two campaigns must share to share a folder. Trials can be added, and time-outs changed."""
+    """What two sweeps must share to share a folder. Trials can be added, and time-outs changed."""
     return {
         "name": sweep.name,
         "seed": sweep.seed,

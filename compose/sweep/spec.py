@@ -1,4 +1,4 @@
-"""A campaign's TOML file -> a validated campaign, or one line that names the file and the field."""
+"""A sweep's TOML file -> a validated sweep, or one line that names the file and the field."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Label = Annotated[str, Meta(min_length=1, max_length=60)]
 
 
 class BadSpec(UserError):
-    """The user's campaign cannot be run; the text names the file, the field and what is wrong."""
+    """The user's sweep cannot be run; the text names the file, the field and what is wrong."""
 
 
 class AxisTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -43,7 +43,7 @@ class AxisTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SpecFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a campaign's file may say."""
+    """What a sweep's file may say."""
 
     name: Annotated[str, Meta(pattern=NAME, max_length=48)]
     scenario: str
@@ -84,7 +84,7 @@ class Axis(msgspec.Struct, frozen=True):
 
 
 class Sweep(msgspec.Struct, frozen=True):
-    """A campaign, complete: what each trial is follows from it."""
+    """A sweep, complete: what each trial is follows from it."""
 
     source: str
     """the spec, as the user calls it"""
@@ -102,12 +102,12 @@ class Sweep(msgspec.Struct, frozen=True):
 
 
 def shipped() -> dict[str, Path]:
-    """The campaigns that come with Tandem, by name."""
+    """The sweeps that come with Tandem, by name."""
     return scenario_file.shipped("sweep")
 
 
 def load(source: str, *, trials: int | None = None, seed: int | None = None) -> Sweep:
-    """The campaign of that name, or in the file at that path; `trials` and `seed` override its own.
+    """The sweep of that name, or in the file at that path; `trials` and `seed` override its own.
 
     Raises BadSpec, and NotToml where it is not TOML.
     """

@@ -73,7 +73,7 @@ class CellSummary(msgspec.Struct, frozen=True):
     """over trials that were not wrong, each with the mean of its robots' claims: 3 is expected where
     covariances are true"""
     nees_low: float | None
-    """between which bounds that lies in 99 % of campaigns then"""
+    """between which bounds that lies in 99 % of sweeps then"""
     nees_high: float | None
     rmse_over_bound: float | None
     """root mean square of the position errors of all robots, over that of their Cramér-Rao bounds"""

@@ -39,7 +39,7 @@ _OF_ALL = [field for field in TrialRow.__struct_fields__ if field not in ("cell"
 
 
 def schema_of(sweep: Sweep, cells: Sequence[Cell]) -> pa.Schema:
-    """Its columns; they follow from the campaign."""
+    """Its columns; they follow from the sweep."""
     fields = [pa.field("cell", _KINDS["cell"])]
     for axis in sweep.axes:
         if axis.labels is not None:

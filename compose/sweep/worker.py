@@ -34,7 +34,7 @@ LENGTH_BYTES = 4
 MAX_ERROR = 300
 """characters"""
 IDLE_S = 300.0
-"""how long to wait for work: whoever ran the campaign may have been killed, and the owner live on"""
+"""how long to wait for work: whoever ran the sweep may have been killed, and the owner live on"""
 
 
 class Chunk(msgspec.Struct, frozen=True):

@@ -2,7 +2,7 @@
 
 What the world is to a robot, its hardware is without one: from both come Observations, to both go Commands, and an
 agent cannot tell which it has. So the contract stands in this room, and `world/hardware/bridge.py` plays by
-it. docs/driver.md tells a driver's author the same at length, and `tandem conform` tries a driver.
+it. docs/driver.md tells a driver's author the same at length, and `tandem check-driver` tries a driver.
 """
 
 from __future__ import annotations

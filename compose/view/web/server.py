@@ -70,7 +70,7 @@ class _Answers:
 
     async def sweep(self, _request: Request) -> Response:
         if self._site.folder is None:
-            return _json({"error": "no campaign is shown"}, 404)
+            return _json({"error": "no sweep is shown"}, 404)
         try:
             return _json(sweep_page.told(self._site.folder))
         except UserError as error:

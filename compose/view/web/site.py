@@ -1,4 +1,4 @@
-"""What one server shows: records, a campaign, or missions on a network."""
+"""What one server shows: records, a sweep, or missions on a network."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Site:
         listeners: list[Listener] | None = None,
         folder: Path | None = None,
     ) -> None:
-        """`folder` is that of a campaign, if it is one that is shown."""
+        """`folder` is that of a sweep, if it is one that is shown."""
         self.folder = folder
         self.recorded = shows or []
         self.listeners = listeners or []
@@ -76,7 +76,7 @@ class Site:
     def listed(self) -> dict[str, Any]:
         """What the page lists."""
         return {
-            "campaign": self.folder is not None,
+            "sweep": self.folder is not None,
             "network": [{"endpoint": one.endpoint, "reached": one.reached} for one in self.listeners],
             "waiting": self.waiting,
             "shows": [
@@ -104,11 +104,11 @@ def of_network(places: Sequence[Endpoints]) -> Site:
 
 
 def of_folder(folder: Path) -> Site:
-    """Of a record, of a campaign, or of the records in the folders in `folder`. Raises UserError."""
+    """Of a record, of a sweep, or of the records in the folders in `folder`. Raises UserError."""
     try:
         if not folder.is_dir():
             raise UserError(f"{folder} is no folder")
-        if sweep_page.is_campaign(folder):
+        if sweep_page.is_sweep(folder):
             sweep_page.told(folder)
             return Site(folder=folder)
         folders = [folder]
@@ -120,7 +120,7 @@ def of_folder(folder: Path) -> Site:
     except OSError as error:
         raise UserError(f"{folder} cannot be read: {error.strerror or error}") from None
     if not shows:
-        raise UserError(f"{folder} holds neither a record, nor a campaign, nor folders with records")
+        raise UserError(f"{folder} holds neither a record, nor a sweep, nor folders with records")
     if not any(show.live or show.stage is not None for show in shows):
         why = "; ".join(note for show in shows for note in show.notes) or "its journals are empty"
         raise UserError(f"there is nothing to see in {folder}: {why}")

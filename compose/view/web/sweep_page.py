@@ -1,4 +1,4 @@
-"""The folder of a campaign, as the page shows it: what was asked, a row a cell, and the figures."""
+"""The folder of a sweep, as the page shows it: what was asked, a row a cell, and the figures."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ import msgspec
 from compose.errors import UserError
 from protocol import files
 
-CAMPAIGN = "sweep.json"
+SWEEP = "sweep.json"
 SUMMARY = "summary.csv"
 PARTS = "parts"
 FIGURES = "figures"
 
 
-def is_campaign(folder: Path) -> bool:
+def is_sweep(folder: Path) -> bool:
     """Whether a sweep has left it."""
-    return (folder / CAMPAIGN).is_file()
+    return (folder / SWEEP).is_file()
 
 
 def told(folder: Path) -> dict[str, Any]:
     """What there is to see, now: a sweep that is under way has no summary yet. Raises UserError."""
     try:
-        asked = msgspec.json.decode(files.read_bytes(folder / CAMPAIGN))
-        sweep = asked["campaign"]
+        asked = msgspec.json.decode(files.read_bytes(folder / SWEEP))
+        sweep = asked["sweep"]
         axes = [
             {
                 "name": axis["name"],
@@ -54,7 +54,7 @@ def told(folder: Path) -> dict[str, Any]:
     except OSError as error:
         raise UserError(f"{folder} cannot be read: {error.strerror or error}") from None
     except (msgspec.MsgspecError, KeyError, TypeError, UnicodeDecodeError, csv.Error) as error:
-        raise UserError(f"{folder / CAMPAIGN} is no campaign's: {error!r}") from None
+        raise UserError(f"{folder / SWEEP} is no sweep's: {error!r}") from None
 
 
 def figures(folder: Path) -> list[str]:

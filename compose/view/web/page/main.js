@@ -1,6 +1,6 @@
 // What is shown, and how one moves through it. The address says the same: #show=…&tick=46&robot=a&truth=0
 
-import { campaign } from "./campaign.js";
+import { sweep } from "./sweep.js";
 import { Cards, make } from "./cards.js";
 import { leads } from "./held.js";
 import { Log } from "./log.js";
@@ -83,11 +83,11 @@ function listen() {
 
 async function on_list(list) {
   listed = list;
-  if (list.campaign) {
-    if ($("campaign").hidden) {
-      text($("title"), await campaign($("campaign")));
+  if (list.sweep) {
+    if ($("sweep").hidden) {
+      text($("title"), await sweep($("sweep")));
       document.title = `${$("title").textContent} · Tandem`;
-      text($("status"), "campaign");
+      text($("status"), "sweep");
     }
     return;
   }
@@ -124,7 +124,7 @@ async function open(name) {
 function staged() {
   $("home").hidden = !listed || listed.shows.length < 2;
   for (const id of ["mission", "time", "view"]) $(id).hidden = false;
-  for (const id of ["list", "campaign"]) $(id).hidden = true;
+  for (const id of ["list", "sweep"]) $(id).hidden = true;
   $("title").textContent = store.stage.name;
   document.title = `${store.stage.name} · Tandem`;
   const all = make("option", { value: "", textContent: "all" });

@@ -1,13 +1,13 @@
-// A campaign: what was asked, a row a cell, the figures. Its trials are not on record, each can be played again.
+// A sweep: what was asked, a row a cell, the figures. Its trials are not on record, each can be played again.
 
 import { make } from "./cards.js";
 
-export async function campaign(root) {
+export async function sweep(root) {
   const answer = await fetch("/api/sweep"), told = await answer.json();
   root.hidden = false;
   if (!answer.ok) {
     root.replaceChildren(make("p", { textContent: told.error }));
-    return "Campaign";
+    return "Sweep";
   }
   const { name, rows, axes, trials, seed, refused, under_way, folder, figures } = told;
   const played = rows.reduce((sum, row) => sum + Number(row.trials), 0);

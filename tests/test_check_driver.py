@@ -1,4 +1,4 @@
-"""`tandem conform`: the example keeps the contract, and each broken driver is told what it breaks."""
+"""`tandem check-driver`: the example keeps the contract, and each broken driver is told what it breaks."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ BRIEFING = briefed(load("paper-1"), "a", MANOEUVRE_S)
 
 
 def test_the_example_keeps_the_contract() -> None:
-    ended = tandem("conform", "tests.virtual_time:Rover", "--rate", "8")
+    ended = tandem("check-driver", "tests.virtual_time:Rover", "--rate", "8")
     assert ended.status == 0, ended.out
     lines = [line for line in ended.out.splitlines() if "truly at" not in line]
     assert len(lines) == 8
@@ -65,7 +65,7 @@ def test_a_broken_driver_is_told_what_it_breaks(
     ],
 )
 def test_what_is_wrong_is_a_line_and_a_status(broken: str, said: str) -> None:
-    ended = tandem("conform", f"tests.broken_drivers:{broken}", "--rate", "10")
+    ended = tandem("check-driver", f"tests.broken_drivers:{broken}", "--rate", "10")
     assert ended.status == 1
     assert said in ended.out
     assert ended.err == ""
@@ -81,15 +81,15 @@ def test_what_is_wrong_is_a_line_and_a_status(broken: str, said: str) -> None:
     ],
 )
 def test_what_is_no_driver_is_one_line(name: str, said: str) -> None:
-    ended = tandem("conform", name)
+    ended = tandem("check-driver", name)
     assert ended.status == 2
-    assert ended.err.startswith("tandem conform: ")
+    assert ended.err.startswith("tandem check-driver: ")
     assert said in ended.err
     assert ended.err.count("\n") == 1
 
 
 def test_an_option_that_a_driver_does_not_know_is_one_line() -> None:
-    ended = tandem("conform", "docs.rover:Rover", "--option", "colour=red")
+    ended = tandem("check-driver", "docs.rover:Rover", "--option", "colour=red")
     assert ended.status == 2
     assert "docs.rover:Rover: cannot be made: TypeError: " in ended.err
     assert "colour" in ended.err
