@@ -296,7 +296,7 @@ class FinalReport(Message, frozen=True):
     """of reports"""
 
     def __post_init__(self) -> None:
-        _cut(self, "missing")
+        _cut(self, "blocking_reason")
 
 
 OfRobot = (

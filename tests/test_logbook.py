@@ -197,7 +197,7 @@ def test_the_longest_report_that_there_is_fits_its_frame(begin: int, verdict: st
     state = replace(
         MIND,
         config=replace(MIND.config, robot="r" * 32),
-        state=Done(3, said) if said is not None else MIND.mode,
+        mode=Done(3, said) if said is not None else MIND.mode,
         log=book,
         tick=book.through,
         peer_state=PeerState(acknowledged=begin),

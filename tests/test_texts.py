@@ -101,7 +101,7 @@ def test_the_text_fields_are_these() -> None:
         (Undecided, "reason"),
         (Inconsistent, "claim"),
         (MissionEnd, "reason"),
-        (FinalReport, "missing"),
+        (FinalReport, "blocking_reason"),
     }
 
 

@@ -230,7 +230,7 @@ def _considered(state: RobotState) -> RobotState:
     a, b = active_sensing.together(
         inference.held_together(scored, pair), pair.apart, state.mutual[-1].range, mission
     )
-    return replace(judged, state=Surveying("peer", a if role == "a" else b))
+    return replace(judged, mode=Surveying("peer", a if role == "a" else b))
 
 
 def _against(state: RobotState, bound: float) -> bool:

@@ -124,7 +124,7 @@ def _settled(state: RobotState) -> RobotState:
         )
     return replace(
         state,
-        state=LastManoeuvre(plan.command, state.odometry),
+        mode=LastManoeuvre(plan.command, state.odometry),
         belief=replace(state.belief, plan=plan),
     )
 

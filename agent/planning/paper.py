@@ -61,7 +61,7 @@ def considered(state: RobotState) -> RobotState:
         return state.undecided("no manoeuvre keeps the safety distance")
     return replace(
         state,
-        state=LastManoeuvre(plan.command, state.odometry),
+        mode=LastManoeuvre(plan.command, state.odometry),
         belief=replace(state.belief, plan=plan),
     )
 

@@ -217,7 +217,7 @@ def _advanced(state: RobotState, anchor_range: float | None) -> RobotState:
             rest = Standing() if state.config.role == "b" else Waiting()
             return replace(
                 state,
-                state=phase3_last_manoeuvre.advanced(state.mode, state.odometry, state.in_contact, rest),
+                mode=phase3_last_manoeuvre.advanced(state.mode, state.odometry, state.in_contact, rest),
             )
         case Asleep():
             return _released(state, anchor_range)
