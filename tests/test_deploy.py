@@ -22,7 +22,7 @@ from protocol.journal import journal_file
 from tests.commands import TandemProcess, tandem
 
 HOUSE = Path(__file__).parents[1]
-DEPLOY = HOUSE / "compose" / "deploy"
+DEPLOY = HOUSE / "compose" / "hardware" / "deploy"
 COMPOSE = DEPLOY / "compose.yaml"
 CONTAINER = DEPLOY / "Containerfile"
 UNIT = DEPLOY / "tandem-agent@.service"

@@ -49,7 +49,7 @@ class Pair:
                 *("--rate", "4", "--listen" if name == "a" else "--connect", self._endpoint),
                 *("--out", self._out / name, "--option", f"state={self._out / f'body-{name}'}"),
                 *("--option", f"start={STARTS[name]}", "--option", f"beacon={self._air}"),
-                *("--option", "patience=60"),
+                *("--option", "timeout=60"),
             )
         )
 

@@ -38,24 +38,11 @@ SHELL = {
 """the rooms' windows: files, networks, clocks"""
 
 PURE = {
-    "agent.planning.planner",
-    "agent.planning.separation",
-    "agent.planning.state",
-    "agent.planning.encounter",
-    "agent.planning.precision",
-    "agent.estimation.exact",
-    "agent.estimation.closed_forms",
-    "agent.planning.inference",
-    "agent.planning.paper",
-    "agent.peer.motion_log",
-    "agent.peer.false_reports",
-    "agent.planning.assured",
-    "agent.planning.plausibility",
-    "agent.peer.peer_state",
     *(
         ".".join(path.relative_to(HOUSE).with_suffix("").parts)
-        for floor in ("phases", "estimation")
-        for path in sorted((HOUSE / "agent" / floor).glob("*.py"))
+        for room in ("planning", "estimation", "peer")
+        for path in sorted((HOUSE / "agent" / room).rglob("*.py"))
+        if path.name != "__init__.py"
     ),
     "world.tick",
     "world.truth",
@@ -163,7 +150,7 @@ if TYPE_CHECKING:
 def f():
     class C:
         def g(self):
-            from agent import geometry
+            from agent.estimation import closed_forms
             import compose.cli.main, math
 """
     assert sorted(imports(ast.parse(source))) == [

@@ -188,13 +188,13 @@ def parser() -> argparse.ArgumentParser:
         sub.add_argument("--port", type=port, metavar="N", help="of the page (one that is free)")
 
     audit = command("audit", "Judge a record: what its journals say, held against the world and the planner.")
-    audit.add_argument("record", type=folder, metavar="DIR", help="where `tandem run --out DIR` left it")
+    audit.add_argument("recording", type=folder, metavar="DIR", help="where `tandem run --out DIR` left it")
 
     replay = command("replay", "Play a record once more, and hold every decision against it, to the bit.")
-    replay.add_argument("record", type=folder, metavar="DIR", help="where `tandem run --out DIR` left it")
+    replay.add_argument("recording", type=folder, metavar="DIR", help="where `tandem run --out DIR` left it")
 
     export = command("export", "Leave a record in other formats: run.mcap, frames.csv, ticks.parquet.")
-    export.add_argument("record", type=folder, metavar="DIR", help="where `tandem run --out DIR` left it")
+    export.add_argument("recording", type=folder, metavar="DIR", help="where `tandem run --out DIR` left it")
     export.add_argument("--out", type=folder, metavar="DIR", help="where the files go (where the record is)")
 
     _add_keys(command("keys", "Make certificates and access rules, for networks that are not trusted."))
@@ -249,7 +249,7 @@ def _add_reaching(parser: argparse.ArgumentParser) -> None:
 
 def _add_watch(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "record",
+        "recording",
         type=folder,
         nargs="?",
         metavar="DIR",
@@ -278,7 +278,7 @@ def _add_listening(parser: argparse.ArgumentParser, what: str) -> None:
 
 
 def _add_figures(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("record", type=folder, metavar="DIR", help="where `tandem run --out DIR` left it")
+    parser.add_argument("recording", type=folder, metavar="DIR", help="where `tandem run --out DIR` left it")
     parser.add_argument(
         "--only", action="append", choices=PICTURES, metavar="NAME",
         help=f"draw only these; again for more: {', '.join(PICTURES)}",

@@ -40,7 +40,7 @@ class CellSummary(msgspec.Struct, frozen=True):
     trials: int
     localised: int
     undecided: int
-    alarm: int
+    inconsistent: int
     wrong: int
     failed: int
     """lost to an error, or to a process that was"""
