@@ -389,7 +389,7 @@ def test_a_briefing_that_is_not_the_scenarios_is_found(folder: Path) -> None:
     )
     findings = audit(folder)
     assert found(findings) == [(None, "b", "config")]
-    assert findings.violations[0].line.startswith("no tick, b, briefing: mission is ")
+    assert findings.violations[0].line.startswith("no tick, b, config: mission is ")
 
 
 def test_how_long_a_tick_lasts_is_not_the_scenarios_to_say(folder: Path) -> None:
@@ -848,6 +848,6 @@ def test_what_befell_the_reports_is_listed_and_another_plan_is_found(tmp_path: P
 
 
 def test_a_liar_that_tells_what_it_was_told_to_tell_breaks_no_rule(tmp_path: Path) -> None:
-    text = shipped()["random"].read_text().replace('id = "b"', 'id = "b"\nlie = {kind = "scale", size = 0.5}')
+    text = shipped()["random"].read_text().replace('id = "b"', 'id = "b"\nattack = {kind = "scale", size = 0.5}')
     in_process.play(parse(text, "random"), tmp_path)
     assert found(audit(tmp_path)) == []

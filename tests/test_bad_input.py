@@ -79,23 +79,23 @@ def test_an_unknown_field_is_named(was: str, typo: str, field: str, tmp_path: Pa
         ('"paper"', '"papers"', "planner.name: there is no 'papers'; there are assured, paper"),
         (
             'id = "a"',
-            'id = "a"\nlie = {kind = "scal", size = 2}',
+            'id = "a"\nattack = {kind = "scal", size = 2}',
             "robot[0].attack.kind: there is no 'scal'; ",
         ),
         (
             'id = "a"',
-            'id = "a"\nlie = {kind = "radius", size = 0.1, part = "orbit"}',
+            'id = "a"\nattack = {kind = "radius", size = 0.1, part = "orbit"}',
             "robot[0].attack.part: a lie of the radius is of the beginning, and so of all",
         ),
         (
             'id = "a"',
-            'id = "a"\nlie = {kind = "scale", size = 2, part = "orbits"}',
+            'id = "a"\nattack = {kind = "scale", size = 2, part = "orbits"}',
             "robot[0].attack.part: there is no 'orbits'; there are phase-1, orbit, encounter, all",
         ),
         (
             "[planner]",
             '[[kill]]\npoint = "sens"\n[planner]',
-            "kill[0].point: there is no 'sens'; there are sense, report, journal, drive, ?",
+            "kill[0].point: there is no 'sens'; there are observation, report, journal, command, ?",
         ),
     ],
 )

@@ -82,7 +82,7 @@ def test_a_journals_first_frame_names_versions_and_instruction_set(recording: Pa
 def test_a_robot_names_the_instructions_that_numpy_and_linear_algebra_really_use() -> None:
     told = [
         subprocess.run(
-            [sys.executable, "-c", "from protocol import environment; print(environment.of_robot())"],
+            [sys.executable, "-c", "from protocol.journal import environment; print(environment.of_robot())"],
             env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), **more},
             capture_output=True,
             text=True,

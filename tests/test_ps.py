@@ -225,7 +225,7 @@ def test_what_is_said_is_told_and_what_is_not_is_said_so(
     start: Callable[[Played], None], lines: list[str]
 ) -> None:
     with played(start) as (_, endpoint):
-        assert listed(endpoint, "--connect-timeout", "0.5") == [
+        assert listed(endpoint, "--timeout", "0.5") == [
             f"r at {endpoint}, {lines[0]}",
             f"  a  {lines[1]}",
         ]

@@ -86,7 +86,7 @@ def test_any_msgpack_library_reads_what_we_send(message: Message) -> None:
     assert frame[0] == VERSION
     assert frame[1:HEAD] == zlib.crc32(frame[HEAD:]).to_bytes(4, "big")
     assert plain(message) == msgspec.json.decode(msgspec.json.encode(message))
-    assert plain(message)[0] == type(message).__name__.lower()
+    assert plain(message)[0] == type(message).__struct_config__.tag
     assert decode(framed(packed(plain(message))), ANY) == message
 
 
@@ -269,7 +269,7 @@ msgpack_values = st.recursive(
     | st.floats()
     | st.text(max_size=8)
     | st.binary(max_size=8)
-    | st.sampled_from([kind.__name__.lower() for kind in Message.__subclasses__()]),
+    | st.sampled_from([str(kind.__struct_config__.tag) for kind in Message.__subclasses__()]),
     lambda inner: (
         st.lists(inner, max_size=12)
         | st.dictionaries(st.text(max_size=8) | st.integers(0, 9), inner, max_size=4)
