@@ -81,7 +81,7 @@ def main(function: str, source: str, out: str) -> None:
     stop_by_signal(inbox)
     means = execution.ExecutionOptions(workers=2, play=f"tests.misbehaving:{function}")
     silent = execution.Progress(say=print, begin=lambda *_: None, done=lambda _: None)
-    with patch.object(worker_pool, "Child", Owned):
+    with patch.object(worker_pool, "WorkerProcess", Owned):
         results = execution.sweep(spec.load(source), Path(out), means, inbox, silent)
     print(f"{len(results.table)} rows, {results.stopped}")
 

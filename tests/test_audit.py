@@ -848,6 +848,8 @@ def test_what_befell_the_reports_is_listed_and_another_plan_is_found(tmp_path: P
 
 
 def test_a_liar_that_tells_what_it_was_told_to_tell_breaks_no_rule(tmp_path: Path) -> None:
-    text = shipped()["random"].read_text().replace('id = "b"', 'id = "b"\nattack = {kind = "scale", size = 0.5}')
+    text = (
+        shipped()["random"].read_text().replace('id = "b"', 'id = "b"\nattack = {kind = "scale", size = 0.5}')
+    )
     in_process.play(parse(text, "random"), tmp_path)
     assert found(audit(tmp_path)) == []

@@ -366,10 +366,10 @@ def start(
 
 
 FORGED = (
-    "robot/a/tick-start, robot/a/observation, robot/b/command, robot/b/estimate, robot/b/to/a, world/truth"
+    "robot/a/observation, robot/a/tick-start, robot/b/command, robot/b/estimate, robot/b/to/a, world/truth"
 )
 FORGED_BY_VIEWER = (
-    "robot/a/tick-start, robot/a/command, robot/a/estimate, robot/a/observation, robot/a/to/a, world/truth"
+    "robot/a/command, robot/a/estimate, robot/a/observation, robot/a/tick-start, robot/a/to/a, world/truth"
 )
 READ = "robot/b/command, robot/b/observation, world/truth"
 

@@ -175,7 +175,7 @@ def test_every_frame_is_as_its_channels_schema_says(faulty: Path) -> None:
             assert form["minItems"] <= len(said) <= form["maxItems"]
             assert said[0] in form["prefixItems"][0]["enum"]
     observation = next(one for one, _, _ in told(faulty / "run.mcap") if one.name == "tandem.Observation")
-    titles = [item["title"] for item in json.loads(observation.data)["$defs"]["Sense"]["prefixItems"]]
+    titles = [item["title"] for item in json.loads(observation.data)["$defs"]["Observation"]["prefixItems"]]
     assert titles == ["kind", *Observation.__struct_fields__]
 
 

@@ -258,7 +258,9 @@ def test_a_false_radius_goes_with_false_ranges_and_moves_the_start_only() -> Non
 
 def test_a_scenario_says_who_lies_and_how() -> None:
     text = (
-        shipped()["paper-1"].read_text().replace('id = "b"', 'id = "b"\nattack = {kind = "scale", size = 0.5}')
+        shipped()["paper-1"]
+        .read_text()
+        .replace('id = "b"', 'id = "b"\nattack = {kind = "scale", size = 0.5}')
     )
     scenario = parse(text, "paper-1")
     assert [robot.attack for robot in scenario.robots] == [None, Attack("scale", 0.5, "all")]

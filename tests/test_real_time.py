@@ -133,7 +133,7 @@ def test_a_world_says_why_there_is_no_farewell_of_a_robot(tmp_path: Path) -> Non
         leaves.close()
         ended = clock.ended()
     assert ended.status == 1
-    behind, gone = [line for line in ended.err.splitlines() if "no Farewell" in line]
+    behind, gone = [line for line in ended.err.splitlines() if "no FinalReport" in line]
     assert behind.startswith(
         "tandem world: no FinalReport of a: behind, at tick 0 of 9; a lower --rate leaves"
     )

@@ -542,7 +542,7 @@ def test_an_agents_record_in_which_it_sensed_otherwise_is_no_use(recording: Path
 def test_a_record_on_which_it_decided_otherwise_is_refused(recording: Path) -> None:
     path = recording / "agent-a.journal"
     frames = list(journal_file.read(path))
-    place = next(i for i, frame in enumerate(frames) if frame[5:].find(b"drive\x0c") > 0)
+    place = next(i for i, frame in enumerate(frames) if frame[5:].find(b"command\x0c") > 0)
     command = decode(frames[place], Command)
     assert command.tick == 12
     frames[place] = encode(replace(command, v=command.v / 2.0))
