@@ -23,8 +23,11 @@ from protocol.network.endpoints import listening
 Covariance: Any = array[float64, 36]  # type: ignore[misc]
 PERIOD_S = 0.01
 """of odometry and ranges"""
-WATCHDOG_S = 0.05
-"""without a Twist for so long, the base stands"""
+WATCHDOG_S = 0.5
+"""The time in s after the last Twist at which the base stops: the default of ros2_control's diff drive.
+
+A driver on a busy machine may be late by tens of milliseconds, which must not stop the base.
+"""
 
 
 @dataclass
