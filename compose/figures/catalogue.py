@@ -1,4 +1,4 @@
-"""All pictures of a pair, by their names."""
+"""The catalogue of the figures of a pair, by kind."""
 
 from __future__ import annotations
 
@@ -17,12 +17,15 @@ Picture = tuple[str, Figure | Absent]
 
 
 def settings(kind: str) -> AbstractContextManager[None]:
-    """Within which pictures of one kind (see `PICTURES`) are drawn and saved."""
+    """Return the matplotlib settings for drawing and saving figures of one kind (see `PICTURES`)."""
     return look(symbols=kind != "robot")
 
 
 def pictures(pair: PairRecord, kind: str) -> Iterator[Picture]:
-    """Those of one kind, in its `settings`; none where the journals that they need are missing."""
+    """Yield the figures of one kind with their names; none if the journals they need are missing.
+
+    Must be called within the `settings` of that kind.
+    """
     return _DRAWN[kind](pair)
 
 
@@ -36,7 +39,7 @@ def _phase_one(pair: PairRecord) -> Iterator[Picture]:
 
 
 def _plan(pair: PairRecord) -> Iterator[Picture]:
-    """What there is of them under noise is hypotheses, of `assured`."""
+    """Yield the planned manoeuvres; with noisy sensors and `assured`, the hypotheses at its decisions."""
     if pair.told and pair.planner_name == "assured" and not pair.exact:
         yield f"plan-{pair.name}", decisions.draw(pair)
     elif pair.told:
