@@ -416,7 +416,7 @@ def test_a_journal_of_another_version_is_followed_to_where_it_decides_otherwise(
     assert ended.err == (
         "tandem figures: of b only up to where its journal can be followed: on record it decided otherwise "
         "at tick 20: the journal is another version's\n"
-        "tandem figures: no plan-a-b: the journal of b is missing, or cannot be followed to its end\n"
+        "tandem figures: no plan-a-b: the journal of b is missing or cannot be replayed to its end\n"
     )
 
 
@@ -432,7 +432,7 @@ def test_no_plan_is_said_to_be_none_where_only_a_journal_is_missing(recordings: 
         cut(folder / "agent-a.journal", 4)
         ended = tandem("figures", folder, "--only", "plan", "--format", "svg")
         assert (ended.status, whole in ended.err) == (3, False)
-        assert "no plan-a-b: the journal of b is missing, or cannot be followed to its end" in ended.err
+        assert "no plan-a-b: the journal of b is missing or cannot be replayed to its end" in ended.err
 
 
 def _turned(frame: bytes, tick: int) -> bytes:

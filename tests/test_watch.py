@@ -466,8 +466,8 @@ def test_ctrl_c_ends_the_page_with_somebody_watching(paper_1: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["nowhere"], "nowhere is no folder"),
-        (["."], ". holds neither a record, nor a sweep, nor folders with records"),
+        (["nowhere"], "nowhere is not a folder"),
+        (["."], ". contains no recording, no sweep, and no folders with recordings"),
         (
             [".", "--connect", "tcp/127.0.0.1:7447"],
             "--connect: a record needs no network; leave out one of the two",

@@ -169,7 +169,7 @@ def test_a_robot_that_was_never_briefed_is_passed_over(folders: tuple[Path, Path
     assert ended.err.splitlines() == nothing
     ended = tandem("export", tmp_path)
     assert (ended.status, ended.out) == (2, "")
-    assert ended.err.endswith("there is no world.journal, and no robot in it was briefed\n")
+    assert ended.err.endswith("there is no world.journal, and no robot's journal has a configuration\n")
 
 
 def test_whose_journal_is_shorter_takes_nothing_from_its_peer(

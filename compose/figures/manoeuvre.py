@@ -266,7 +266,7 @@ def draw_cost(axes: Axes, plan: Plan, ways: Compared, mission: Mission) -> None:
         )
     axes.set_xlabel(r"$\omega_2$ [rad/s]")
     axes.set_ylabel(
-        "$J$ of eq. (8), on squares [m$^2$]"
+        "$J$ of eq. (8), squared ranges [m$^2$]"
         if plan.separation_m2 is not None
         else "decrease of squared range [m$^2$]"
     )

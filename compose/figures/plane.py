@@ -28,7 +28,7 @@ SIGMAS = 3.0
 ELLIPSES = 5
 """The maximum number of error ellipses."""
 SMALLER = 0.75
-"""The largest ratio of the sizes of two overlapping ellipses, later over earlier, at which both are legible."""
+"""The largest size ratio, later over earlier, at which two overlapping ellipses are both legible."""
 AROUND = 2.2
 """The maximum half-width of the enlarged panel, as a multiple of the last ellipse's size."""
 EXACTLY = 0.02

@@ -45,7 +45,7 @@ class Facts(msgspec.Struct, frozen=True):
     without: set[str] = msgspec.field(default_factory=set)
     """Robots that decided without their peer's report because it missed the deadline."""
     under_way: dict[Link, tuple[int, ...]] = msgspec.field(default_factory=dict)
-    """The ticks of the reports in flight on each link after this tick, known only from the world's journal."""
+    """The ticks of the reports in flight on each link after this tick; only the world's journal has them."""
     down: set[str | None] = msgspec.field(default_factory=set)
     """Robots whose process ended in this tick; None is the world. Observed by viewers, never journaled."""
     back: set[str | None] = msgspec.field(default_factory=set)

@@ -61,7 +61,7 @@ class Gate:
     async def _admit(self, reader: StreamReader, writer: StreamWriter) -> None:
         with closing(writer), suppress(OSError, EOFError, LimitOverrunError):
             if self._guests >= GUESTS:
-                await _refuse(writer, "503 Service Unavailable", "too many look already")
+                await _refuse(writer, "503 Service Unavailable", "too many connections")
                 return
             self._guests += 1
             try:
@@ -84,7 +84,7 @@ class Gate:
             return [value.strip() for name, _, value in lines if name.strip().lower() == wanted]
 
         if [value.lower() for value in values("upgrade")] != ["websocket"]:
-            return "only viewers are served here, over WebSocket"  # so a connection has one head
+            return "only WebSocket connections are accepted"  # so that a connection has one head
         return refusal(values("host"), values("origin"), self._origins)
 
     async def _hand_on(self, head: bytes, reader: StreamReader, writer: StreamWriter) -> None:
@@ -100,9 +100,9 @@ class Gate:
 
 
 async def _refuse(writer: StreamWriter, status: str, why: str) -> None:
-    said = f"{why}\n".encode()
+    body = f"{why}\n".encode()
     writer.write(f"HTTP/1.1 {status}\r\nConnection: close\r\nContent-Type: text/plain\r\n".encode())
-    writer.write(b"Content-Length: %d\r\n\r\n%s" % (len(said), said))
+    writer.write(b"Content-Length: %d\r\n\r\n%s" % (len(body), body))
     await writer.drain()
 
 
