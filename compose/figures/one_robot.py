@@ -48,9 +48,9 @@ def figure_of(story: Story) -> Figure:
     belief.draw_error(panels["error"], story)
     belief.draw_probability(panels["probability"], story)
     columns = 1 if layout is RIGHT else 3
-    key = key_of(panels["key"], panels["plane"], "upper left", columns)
+    legend = key_of(panels["key"], panels["plane"], "upper left", columns)
     if story.likeliest:
-        panels["key"].add_artist(key)
+        panels["key"].add_artist(legend)
         corner: Corner = "lower left" if layout is RIGHT else "upper right"
         key_of(panels["key"], panels["near"], corner, 3, title="estimates, by tick")
     key_of(panels["error key"], panels["error"], "upper left")
