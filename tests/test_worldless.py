@@ -142,7 +142,7 @@ def test_of_one_robot_there_is_what_it_alone_knows(folders: tuple[Path, Path], t
     told = alone_of(tmp_path, "b")
     assert trajectory.draw(told) == Absent(NO_PLACES)
     assert told.a.id == "a"
-    assert told.told == ["b"]
+    assert told.readable == ["b"]
     ended = tandem("figures", tmp_path, "--only", "ranges", "--only", "trajectory", "--format", "png")
     assert ended.status == 3
     assert ended.err.splitlines() == [

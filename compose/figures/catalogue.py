@@ -34,15 +34,15 @@ def _trajectory(pair: PairRecord) -> Iterator[Picture]:
 
 
 def _phase_one(pair: PairRecord) -> Iterator[Picture]:
-    for role in pair.told:
+    for role in pair.readable:
         yield f"phase-1-{pair.robot(role).id}", phase_one.draw(pair, role)
 
 
 def _plan(pair: PairRecord) -> Iterator[Picture]:
     """Yield the planned manoeuvres; with noisy sensors and `assured`, the hypotheses at its decisions."""
-    if pair.told and pair.planner_name == "assured" and not pair.exact:
+    if pair.readable and pair.planner_name == "assured" and not pair.exact:
         yield f"plan-{pair.name}", decisions.draw(pair)
-    elif pair.told:
+    elif pair.readable:
         for name, figure in manoeuvre.draw(pair).items():
             yield f"plan-{name}", figure
 
@@ -56,12 +56,12 @@ def _ranges(pair: PairRecord) -> Iterator[Picture]:
 
 
 def _errors(pair: PairRecord) -> Iterator[Picture]:
-    if pair.told:
+    if pair.readable:
         yield f"errors-{pair.name}", over_time.errors(pair)
 
 
 def _robot(pair: PairRecord) -> Iterator[Picture]:
-    for role in pair.told:
+    for role in pair.readable:
         name, account = pair.robot(role).id, pair.robot(role).account
         assert account is not None
         if pair.recording is None:

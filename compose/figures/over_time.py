@@ -132,7 +132,7 @@ def _measured(
 
 
 def errors(pair: PairRecord) -> Figure | Absent:
-    """How far off each robot's pose was: its position, and its heading."""
+    """Return the figure of the position and heading errors of both robots."""
     if not pair.true:
         return Absent(NO_TRUTH)
     if not any(_held(pair, role) for role in ROLES):
@@ -196,10 +196,10 @@ def _errors(axes: Axes, pair: PairRecord, role: Role, name: str, off: Callable[[
     ]
     _line(axes, others, ls="", marker="x" if role == "a" else "+", ms=5, mew=0.9, color=colour, alpha=0.75,
           gid=f"{name}-others-{role}", label=f"{robot.id}, other possible poses")  # fmt: skip
-    likeliest = [(one.tick, off(one.world[0], truth)) for one, truth in single]
-    _line(axes, likeliest, lw=1.3, ls=LINES[role], ms=4.5, color=colour, gid=f"{name}-{role}",
+    most_probable = [(one.tick, off(one.world[0], truth)) for one, truth in single]
+    _line(axes, most_probable, lw=1.3, ls=LINES[role], ms=4.5, color=colour, gid=f"{name}-{role}",
           label=f"{robot.id}, {'pose' if pair.exact else 'most probable pose'}",
-          markevery=max(1, math.ceil(len(likeliest) / MARKED)), **MARKS[role])  # fmt: skip
+          markevery=max(1, math.ceil(len(most_probable) / MARKED)), **MARKS[role])  # fmt: skip
     sigmas = [
         (one.tick, SIGMAS * (c.position_sigma if name == "position" else c.heading_sigma))
         for one, _ in single

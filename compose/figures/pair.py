@@ -107,7 +107,7 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
         return f"the journal of {' and '.join(robots)} is missing or cannot be replayed to its end"
 
     @property
-    def told(self) -> list[Role]:
+    def readable(self) -> list[Role]:
         """The roles of the robots whose journals can be read."""
         return [role for role in ROLES if self.robot(role).account is not None]
 

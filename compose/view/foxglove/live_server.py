@@ -54,7 +54,7 @@ class Live:
     """A growing recording, published on channels."""
 
     def __init__(self, folder: Path, channels: Channels) -> None:
-        self.asked = False
+        self.subscribed = False
         """True if a viewer has subscribed since `look` last published the static content."""
         self._folder = folder
         self._channels = channels
@@ -90,9 +90,9 @@ class Live:
         if ready:
             self._next = ready[-1].tick + 1
         due = self._once_more is not None and now >= self._once_more
-        if self.asked or due:
-            self._once_more = now + SETTLED_S if self.asked else None
-            self.asked = False
+        if self.subscribed or due:
+            self._once_more = now + SETTLED_S if self.subscribed else None
+            self.subscribed = False
             self._channels.again()
             for view in (self._views.standing(), *self._views.again()):
                 self._channels.view(*view, nanoseconds(stage, max(0, self._next - 1)))
@@ -133,7 +133,7 @@ class _Listener(ServerListener):
         self._live = live
 
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:  # noqa: ARG002
-        self._live.asked = True
+        self._live.subscribed = True
 
 
 def main(port: int, origins: Sequence[str], folder: Path, robots: Sequence[str]) -> int:

@@ -63,7 +63,7 @@ LOOK_AGAIN_S = 0.25
 """The interval in s between checks for the stop request, and between attempts to connect."""
 QUERY_S = 2.0
 """The timeout of a query in s."""
-SILENCE_S = 10.0
+STALE_SESSION_S = 10.0
 """The time in s without any received frame after which the session is replaced."""
 TICKS_KEPT = 100_000
 """The maximum number of ticks times robots stored per mission. The oldest ticks are dropped."""
@@ -232,14 +232,14 @@ class Listener:
         session.watch_liveliness(link, keys.robot_alive("*", "*"), self._inbox)
         liveliness: Any = link.liveliness()
         liveliness.declare_subscriber(keys.robot_alive("*", "*"), appears, history=True)
-        silent = 0.0
+        idle_s = 0.0
         while not self._stop.is_set():
             try:
                 robot = appeared.get(timeout=LOOK_AGAIN_S)
             except Empty:
-                silent = 0.0 if received.is_set() else silent + LOOK_AGAIN_S
+                idle_s = 0.0 if received.is_set() else idle_s + LOOK_AGAIN_S
                 received.clear()
-                if silent >= SILENCE_S:
+                if idle_s >= STALE_SESSION_S:
                     return
                 continue
             self._ask(link, robot.run, robot.robot)

@@ -72,7 +72,7 @@ class _Answers:
         if self._site.folder is None:
             return _json({"error": "this server shows no sweep"}, 404)
         try:
-            return _json(sweep_page.told(self._site.folder))
+            return _json(sweep_page.contents(self._site.folder))
         except UserError as error:
             return _json({"error": str(error)}, 500)
 

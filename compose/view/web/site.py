@@ -112,7 +112,7 @@ def of_folder(folder: Path) -> Site:
         if not folder.is_dir():
             raise UserError(f"{folder} is not a folder")
         if sweep_page.is_sweep(folder):
-            sweep_page.told(folder)
+            sweep_page.contents(folder)
             return Site(folder=folder)
         folders = [folder]
         if not any(journals_in(folder)):

@@ -23,7 +23,7 @@ def is_sweep(folder: Path) -> bool:
     return (folder / SWEEP).is_file()
 
 
-def told(folder: Path) -> dict[str, Any]:
+def contents(folder: Path) -> dict[str, Any]:
     """Return the data for the page. A running sweep has no rows yet.
 
     Raises UserError if the folder cannot be read.

@@ -35,7 +35,7 @@ log.onchange = () => draw();
 
 // --- the address ---
 
-function asked() {
+function address_state() {
   const fields = new URLSearchParams(location.hash.slice(1));
   const tick = fields.get("tick");
   return {
@@ -91,7 +91,7 @@ async function on_list(list) {
     }
     return;
   }
-  const { show } = asked();
+  const { show } = address_state();
   const chosen = list.shows.find((one) => one.name === show) ?? (list.shows.length === 1 ? list.shows[0] : null);
   if (chosen && chosen.name !== store?.name) await open(chosen.name);
   else if (!chosen && !(store && list.shows.some((one) => one.name === store.name) && show)) show_list();
@@ -108,7 +108,7 @@ async function open(name) {
     store = new Store(name, await answer.json(), draw);
     store.onstage = staged;
     store.onforget = (tick) => { timeline.forget(tick); log.forget(tick); };
-    const { tick, robot, truth } = asked();
+    const { tick, robot, truth } = address_state();
     view.follow = tick === null;
     view.tick = tick ?? (store.live ? Math.max(store.last, 0) : store.first);
     view.wanted = truth;
@@ -398,7 +398,7 @@ for (const phase of [1, 2, 3]) {
 }
 
 window.addEventListener("hashchange", () => {
-  const { show, tick, robot, truth } = asked();
+  const { show, tick, robot, truth } = address_state();
   if (!store || (show || store.name) !== store.name || (!show && listed?.shows.length > 1)) return void (listed && on_list(listed));
   view.focus = store.places.has(robot) ? robot : null;
   view.wanted = truth;
