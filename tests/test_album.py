@@ -414,8 +414,8 @@ def test_a_journal_of_another_version_is_followed_to_where_it_decides_otherwise(
     ended = tandem("figures", folder, "--only", "plan", "--format", "svg")
     assert ended.status == 3
     assert ended.err == (
-        "tandem figures: of b only up to where its journal can be followed: on record it decided otherwise "
-        "at tick 20: the journal is another version's\n"
+        "tandem figures: of b only up to where its journal can be followed: the recorded decision "
+        "at tick 20 differs: another version wrote the journal\n"
         "tandem figures: no plan-a-b: the journal of b is missing or cannot be replayed to its end\n"
     )
 

@@ -141,7 +141,7 @@ def test_a_picture_says_what_the_robot_claimed_and_how_far_off_it_was(
 
 def test_a_picture_names_its_axes_with_units_and_what_was_asked_for(drawn: Path) -> None:
     words = texts(drawn / "robot-a.svg")
-    assert {"x [m]", "y [m]", "error of position [m]", "probability of a hypothesis"} <= words
+    assert {"x [m]", "y [m]", "position error [m]", "probability of a hypothesis"} <= words
     assert {"required sigma: 0.1 m", "required: 99.99 %", "sensing range, 3 m"} <= words
     assert {"1: own anchor", "2: search for the peer", "3: encounter"} <= words
     assert {"anchor of a", "anchor of b", "true path of a", "true path of b"} <= words
@@ -232,7 +232,7 @@ def test_seconds_stand_below_the_ticks_where_a_tick_is_no_second(tmp_path: Path)
     text = PAPER_1.replace("period = 1.0", "period = 0.5").replace("max_speed = 1.0", "max_speed = 2.0")
     words = texts(picture(recorded(parse(text, "half"), tmp_path), "a"))
     assert {"10", "5 s"} <= words
-    assert any(line.startswith("tick, and time since release") for line in words)
+    assert any(line.startswith("tick and time since the start") for line in words)
 
 
 @pytest.mark.parametrize(
@@ -378,7 +378,7 @@ def test_a_journal_of_another_run_is_no_record_of_this_one(noisy: Path, tmp_path
     with pytest.raises(CorruptJournal, match=r"agent-a\.journal: another run's: its briefing"):
         estimates(folder, "a")
     assert [note.split("/")[-1] for note in performed(folder).notes] == [
-        "agent-a.journal: another run's: its briefing is not this world's"
+        "agent-a.journal: belongs to another run: its configuration does not match world.journal"
     ]
     ended = tandem("export", folder)
     assert ended.status == 2
