@@ -35,7 +35,7 @@ export function ellipse([xx, xy, , yy], sigmas) {
   return { major: root(mean + spread), minor: root(mean - spread), turn: Math.atan2(2 * xy, xx - yy) / 2 };
 }
 
-/** Returns the pose at the fraction `share` of a tick, driven from `from` and corrected towards `to` if it is known. */
+/** Returns the pose at the fraction `share` of a tick, driven from `from` and corrected towards `to` if known. */
 export function between(from, to, driven, share, period) {
   if (share <= 0) return from;
   if (!driven) return share < 1 || !to ? from : to;

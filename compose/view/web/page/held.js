@@ -2,13 +2,13 @@
 
 import { between, compose, distance, frame_of, wrap } from "./geometry.js";
 
-/** The largest distance, as a fraction of the sensing range, and angle in rad between a driven pose and its successor. */
+/** The largest distance (a fraction of the sensing range) and angle (rad) of a driven pose to its successor. */
 const NEAR = 0.05, TURNED = 0.5;
 
 /** True if the first pose is the only one, or more probable than all others together. */
 export const leads = ({ world, local, probability }) => (world.length || local.length) === 1 || probability[0] > 0.5;
 
-/** Returns the robot's possible poses on the plane and the covariance of the first; null without an estimate. */
+/** Returns the robot's possible poses on the plane and the first one's covariance; null without an estimate. */
 export function held_now({ store, scene, truth, tick, share, moving }, robot) {
   const held = scene.players[store.places.get(robot.id)]?.held;
   if (!held) return null;

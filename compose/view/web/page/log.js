@@ -1,4 +1,4 @@
-// The event log, one line per event; selecting an event goes to its tick. Only events near the tick are in the DOM.
+// The event log, one line per event; selecting one goes to its tick. Only events near the tick are in the DOM.
 
 import { make } from "./cards.js";
 import { KIND_NAMES, SIGNS, without_error } from "./words.js";

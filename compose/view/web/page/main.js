@@ -1,4 +1,4 @@
-// The entry point of the page: view state, playback, keys, and the address, e.g. #show=…&tick=46&robot=a&truth=0.
+// The entry point of the page: view state, playback, keys, and the address (#show=…&tick=46&robot=a&truth=0).
 
 import { sweep } from "./sweep.js";
 import { Cards, make } from "./cards.js";
@@ -292,7 +292,7 @@ function text(element, content) {
   if (element.textContent !== content) element.textContent = content;
 }
 
-/** Writes the tick's events to the live region for screen readers, at most once per ANNOUNCE_MS while playing. */
+/** Writes the tick's events for screen readers, at most once per ANNOUNCE_MS while playing. */
 let announced = null;
 let announced_at = 0;
 function announce(now) {
@@ -343,7 +343,7 @@ function needed({ target, key }) {
   return [" ", "Enter"].includes(key) && (["BUTTON", "A"].includes(tagName) || (tagName === "INPUT" && type === "checkbox"));
 }
 
-/** Removes the focus from a control after a click, so that the space key starts playback instead of the control. */
+/** Removes the focus from a control after a click, so that the space key starts playback. */
 let pointing = false;
 for (const [name, on] of [["pointerdown", true], ["keydown", false]]) document.addEventListener(name, () => { pointing = on; }, true);
 for (const name of ["click", "change"]) {

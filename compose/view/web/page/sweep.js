@@ -1,4 +1,4 @@
-// The page of a sweep: its parameters, one row per cell, and its figures. Trials are not recorded; each can be re-run.
+// The page of a sweep: its parameters, one row per cell, and its figures. Trials are not recorded.
 
 import { make } from "./cards.js";
 
