@@ -174,8 +174,8 @@ def test_every_frame_is_as_its_channels_schema_says(faulty: Path) -> None:
             said = msgpack.unpackb(message.data)
             assert form["minItems"] <= len(said) <= form["maxItems"]
             assert said[0] in form["prefixItems"][0]["enum"]
-    observation = next(one for one, _, _ in told(faulty / "run.mcap") if one.name == "tandem.Sense")
-    titles = [item["title"] for item in json.loads(observation.data)["$defs"]["Sense"]["prefixItems"]]
+    observation = next(one for one, _, _ in told(faulty / "run.mcap") if one.name == "tandem.Observation")
+    titles = [item["title"] for item in json.loads(observation.data)["$defs"]["Observation"]["prefixItems"]]
     assert titles == ["kind", *Observation.__struct_fields__]
 
 
@@ -513,7 +513,7 @@ def test_a_viewer_sees_a_run_while_it_is_played_and_to_its_end(tmp_path: Path) -
     assert ended.status in OVER
     assert re.search(r"\n(localised|undecided) after ", ended.out)
     assert topics["/tf"] == "foxglove.FrameTransforms"
-    assert topics["/journal/agent-a/observation"] == "tandem.Sense"
+    assert topics["/journal/agent-a/observation"] == "tandem.Observation"
     again, _ = replay(out)
     assert again.differences == ()
 
