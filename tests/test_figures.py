@@ -222,7 +222,7 @@ def test_where_panels_stand_does_not_depend_on_the_last_bits_of_their_layout(
 def test_an_exact_record_has_counts_for_odds_and_no_ellipse(tmp_path: Path) -> None:
     svg = picture(recorded(load("paper-1"), tmp_path), "a")
     words, found = texts(svg), ids(svg)
-    assert {"possible poses", "one pose", "limit for wrong: 1e-6 m"} <= words
+    assert {"possible poses", "one pose", "tolerance: 1e-6 m"} <= words
     assert {"count", "tolerance", "error", "ghosts", "near-truth"} <= found
     assert not {"envelope", "sigma", "confidence", "accuracy"} & found
     assert not [name for name in found if name.startswith(("ellipse-", "probability-"))]

@@ -50,7 +50,7 @@ def draw_error(axes: Axes, story: Story) -> None:
     name = "error, most probable pose" if story.weighed else "error"
     _plot(axes, errors, "-D", ms=3, markevery=marked, color=AGES(1.0), gid="error", label=name)
     if story.exact:
-        limit, gid, name = TOLERANCE, "tolerance", "limit for wrong: 1e-6 m"
+        limit, gid, name = TOLERANCE, "tolerance", "tolerance: 1e-6 m"
     else:
         limit = story.recording.scenario.mission.accuracy
         gid, name = "accuracy", f"required sigma: {limit:g} m"

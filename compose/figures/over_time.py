@@ -247,7 +247,7 @@ def _scale(panels: Sequence[Axes], pair: PairRecord, name: str) -> None:
         axes.set_yscale("log")
         if pair.exact:
             axes.axhline(TOLERANCE, ls="-.", lw=0.9, color=PALE, gid=f"{name}-tolerance", zorder=1,
-                         label="limit for wrong: $10^{-6}$")  # fmt: skip
+                         label="tolerance: $10^{-6}$")  # fmt: skip
         elif name == "position":
             required = pair.mission.accuracy
             axes.axhline(required, ls="--", lw=0.9, color=PALE, gid="accuracy", zorder=1,
