@@ -152,7 +152,7 @@ def test_a_plan_shows_each_candidate_and_the_axis_of_each_two_and_the_choice(
     away = [math.dist(end, place) for place in places]
     assert sorted(away) == pytest.approx(sorted(computed.d_i), abs=1e-6)
     labels = [one.get_label() for i in range(count) for one in found(figure, f"candidate-{i + 1}")]
-    assert labels == [f"{i}: would be {far:.4f} m away" for i, far in enumerate(away, start=1)]
+    assert labels == [f"{i}: predicted range {far:.4f} m" for i, far in enumerate(away, start=1)]
     for i, j in combinations(range(count), 2):
         for point in line(figure, f"bisector-{i + 1}-{j + 1}"):
             assert math.dist(point, places[i]) == pytest.approx(math.dist(point, places[j]))
@@ -217,7 +217,7 @@ def test_phase_1_shows_both_branches_the_rings_and_what_rules_one_out(
     kept = line(figure, "kept")
     assert [math.hypot(x, y) for x, y in kept] == pytest.approx(true[: len(kept)])
     words = [one.get_label() for one in found(figure, "contradicted")]
-    assert words == [f"what rules it out: $k$ = {against}"]
+    assert words == [f"ruled out by $k$ = {against}"]
     assert len(line(figure, "ranged-kept")) == len(ranges)
     if (name, role) == ("paper-2", "a"):
         assert radii(figure, "rho-virtual") == pytest.approx([true[2]])
@@ -414,14 +414,17 @@ def test_a_journal_of_another_version_is_followed_to_where_it_decides_otherwise(
     ended = tandem("figures", folder, "--only", "plan", "--format", "svg")
     assert ended.status == 3
     assert ended.err == (
-        "tandem figures: of b only up to where its journal can be followed: on record it decided otherwise "
-        "at tick 20: the journal is another version's\n"
-        "tandem figures: no plan-a-b: the journal of b is missing, or cannot be followed to its end\n"
+        "tandem figures: of b only up to where its journal can be followed: the recorded decision "
+        "at tick 20 differs: another version wrote the journal\n"
+        "tandem figures: no plan-a-b: the journal of b is missing or cannot be replayed to its end\n"
     )
 
 
 def test_no_plan_is_said_to_be_none_where_only_a_journal_is_missing(recordings: Path, tmp_path: Path) -> None:
-    for name, whole in (("paper-1", "no last manoeuvre was planned"), ("noisy", "they never weighed")):
+    for name, whole in (
+        ("paper-1", "no last manoeuvre was planned"),
+        ("noisy", "no robot scored hypotheses"),
+    ):
         folder = tmp_path / name
         folder.mkdir()
         copied(recorded(name, recordings), folder)
@@ -429,7 +432,7 @@ def test_no_plan_is_said_to_be_none_where_only_a_journal_is_missing(recordings: 
         cut(folder / "agent-a.journal", 4)
         ended = tandem("figures", folder, "--only", "plan", "--format", "svg")
         assert (ended.status, whole in ended.err) == (3, False)
-        assert "no plan-a-b: the journal of b is missing, or cannot be followed to its end" in ended.err
+        assert "no plan-a-b: the journal of b is missing or cannot be replayed to its end" in ended.err
 
 
 def _turned(frame: bytes, tick: int) -> bytes:

@@ -130,10 +130,10 @@ def test_a_picture_says_what_the_robot_claimed_and_how_far_off_it_was(
     assert claim.covariance is not None
     robot = recording.scenario.robots[place].id
     words = texts(drawn / f"robot-{robot}.svg")
-    (said,) = [line for line in words if line.startswith("It claims")]
-    assert f"in tick {claim.tick}: off by {claim.position_error:.2g} m" in said
+    (said,) = [line for line in words if line.startswith("The robot claims its pose")]
+    assert f"in tick {claim.tick}: errors {claim.position_error:.2g} m" in said
     assert f"(sigmas {claim.covariance.position_sigma:.2g} m" in said
-    assert f"it claims, tick {claim.tick}" in words
+    assert f"claim, tick {claim.tick}" in words
     assert (
         f"Robot {robot} of noisy, seed {recording.scenario.seed}: localised after {claim.tick} ticks" in words
     )
@@ -141,9 +141,9 @@ def test_a_picture_says_what_the_robot_claimed_and_how_far_off_it_was(
 
 def test_a_picture_names_its_axes_with_units_and_what_was_asked_for(drawn: Path) -> None:
     words = texts(drawn / "robot-a.svg")
-    assert {"x [m]", "y [m]", "error of position [m]", "probability of a hypothesis"} <= words
-    assert {"sigma asked for: 0.1 m", "asked for: 99.99 %", "its sensing range, 3 m"} <= words
-    assert {"1: alone with its anchor", "2: looking for its peer", "3: together"} <= words
+    assert {"x [m]", "y [m]", "position error [m]", "probability of a hypothesis"} <= words
+    assert {"required sigma: 0.1 m", "required: 99.99 %", "sensing range, 3 m"} <= words
+    assert {"1: own anchor", "2: search for the peer", "3: encounter"} <= words
     assert {"anchor of a", "anchor of b", "true path of a", "true path of b"} <= words
 
 
@@ -222,7 +222,7 @@ def test_where_panels_stand_does_not_depend_on_the_last_bits_of_their_layout(
 def test_an_exact_record_has_counts_for_odds_and_no_ellipse(tmp_path: Path) -> None:
     svg = picture(recorded(load("paper-1"), tmp_path), "a")
     words, found = texts(svg), ids(svg)
-    assert {"poses held possible", "one is left", "wrong, if more: 1e-6 m"} <= words
+    assert {"possible poses", "one pose", "tolerance: 1e-6 m"} <= words
     assert {"count", "tolerance", "error", "ghosts", "near-truth"} <= found
     assert not {"envelope", "sigma", "confidence", "accuracy"} & found
     assert not [name for name in found if name.startswith(("ellipse-", "probability-"))]
@@ -232,7 +232,7 @@ def test_seconds_stand_below_the_ticks_where_a_tick_is_no_second(tmp_path: Path)
     text = PAPER_1.replace("period = 1.0", "period = 0.5").replace("max_speed = 1.0", "max_speed = 2.0")
     words = texts(picture(recorded(parse(text, "half"), tmp_path), "a"))
     assert {"10", "5 s"} <= words
-    assert any(line.startswith("tick, and time since release") for line in words)
+    assert any(line.startswith("tick and time since the start") for line in words)
 
 
 @pytest.mark.parametrize(
@@ -254,7 +254,7 @@ def test_a_mission_that_ends_undecided_is_drawn(noise: str, planner_name: str, t
     assert recording.end.outcome == "undecided"
     svg = picture(tmp_path, "b")
     words = texts(svg)
-    assert "It never claimed to know where it is." in words
+    assert "The robot claims no pose." in words
     assert any("undecided after" in line for line in words)
     assert not {"met", "claim"} & ids(svg)
 
@@ -268,8 +268,8 @@ def test_a_record_that_breaks_off_is_drawn_as_far_as_it_goes(ticks: int, noisy: 
     assert len(read(folder).moments) == ticks
     for robot in "ab":
         words = texts(picture(folder, robot))
-        assert f"Robot {robot} of noisy, seed 5: the record breaks off" in words
-        assert {"anchor of a", "anchor of b", "released"} <= words
+        assert f"Robot {robot} of noisy, seed 5: the recording breaks off" in words
+        assert {"anchor of a", "anchor of b", "start"} <= words
 
 
 def test_an_agent_killed_before_its_briefing_has_a_picture_without_estimates(
@@ -378,7 +378,7 @@ def test_a_journal_of_another_run_is_no_record_of_this_one(noisy: Path, tmp_path
     with pytest.raises(CorruptJournal, match=r"agent-a\.journal: another run's: its briefing"):
         estimates(folder, "a")
     assert [note.split("/")[-1] for note in performed(folder).notes] == [
-        "agent-a.journal: another run's: its briefing is not this world's"
+        "agent-a.journal: belongs to another run: its configuration does not match world.journal"
     ]
     ended = tandem("export", folder)
     assert ended.status == 2

@@ -170,7 +170,7 @@ def test_with_one_robots_certificate_nobody_forges_end_truth_ticks_or_another_ro
         for source in OF_A:
             assert source.kind is not None
             key = source.kind(*[name for name in source[1:] if name])
-            for why in ("it says it is from 'b'", "it is of a tick to come"):
+            for why in ("it names robot 'b' as its sender", "its tick is in the future"):
                 watch.until_says(f"refused a frame on {key}: {why}")
         found = shown(address)
         assert (found["last"], found["end"], found["live"]) == (0, None, True)

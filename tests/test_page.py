@@ -55,7 +55,7 @@ def test_what_becomes_known_of_a_tick_later_is_on_the_time_line_and_in_the_log(
         grow(46, 47)
         _, where = stack.enter_context(watching(tmp_path))
         page = opened(where)
-        expect(page.locator("#status")).to_have_text("● runs, tick 46")
+        expect(page.locator("#status")).to_have_text("● running, tick 46")
         until_shown(page, 46)  # where the two are and what they do, and nothing of what they sense
         expect(page.locator("#log")).not_to_contain_text("in range of each other")
         page.keyboard.press("Home")
@@ -65,7 +65,7 @@ def test_what_becomes_known_of_a_tick_later_is_on_the_time_line_and_in_the_log(
         expect(page.locator("#log")).to_contain_text("a and b are in range of each other: 2.95 m")
         assert marks(page) > 20  # of the contact
         grow(48, 48)
-        expect(page.locator("#log")).to_contain_text("for b, 4 placements of the two are possible")
+        expect(page.locator("#log")).to_contain_text("b has 4 possible placements of the pair")
         expect(page.locator("#log")).to_contain_text("a and b are in range of each other: 2.95 m")
 
 
@@ -108,7 +108,7 @@ def test_a_killed_robot_keeps_its_phase_and_is_shown_as_down_until_it_is_back(
         for i, page in enumerate(pages):
             card = page.locator(".card[data-robot=a]")
             expect(card.locator(".doing")).to_have_text("a is down: its process is gone")
-            expect(card.locator(".phase")).to_have_text("phase 2: the search; down")
+            expect(card.locator(".phase")).to_have_text("phase 2: search; down")
             expect(card).to_have_attribute("data-phase", "2")
             expect(page.locator("#log .now").last).to_contain_text("a is down: its process is gone")
             assert inks(page)["fault"] > 0  # crossed out
@@ -201,7 +201,7 @@ def test_without_the_truth_the_page_opens_with_what_the_robots_believe(
         until_shown(page, 48)
         expect(page.locator("#truth")).not_to_be_checked()
         expect(page.locator("#truth")).to_be_disabled()
-        expect(page.locator("#seen")).to_have_text("the truth is not on record: only what each robot knows")
+        expect(page.locator("#seen")).to_have_text("no ground truth: only the belief of each robot")
         expect(page.locator("#canvas")).to_have_attribute(
             "aria-label", re.compile(r"The plane at tick 48: a at .*; b at ")
         )
@@ -224,15 +224,15 @@ def test_an_error_is_told_of_a_pose_that_leads_and_else_as_a_range(
     assert len(off) == 4
     assert off[3] > 1.0
     error = page.locator(".card[data-robot=b] .error")
-    expect(error).to_have_text(f"up to {off[3]:.2f} m off")
+    expect(error).to_have_text(f"error up to {off[3]:.2f} m")
     expect(error).to_have_attribute("title", re.compile(rf"^\S+ m to {off[3]:.2f} m: 4 poses are possible"))
     shot(page, "equally-likely")
     page.locator("#truth").uncheck()
-    expect(page.locator("#canvas")).to_have_attribute("aria-label", re.compile("b at one of 4 places"))
+    expect(page.locator("#canvas")).to_have_attribute("aria-label", re.compile("b at one of 4 poses"))
     shot(page, "equally-likely-believed")
     page.locator("#truth").check()
     page.keyboard.press("End")
-    expect(error).to_have_text(re.compile(r"^\S+ \S*m off$"))
+    expect(error).to_have_text(re.compile(r"^error \S+ \S*m$"))
 
 
 # --- keys -------------------------------------------------------------------------------------------

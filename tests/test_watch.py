@@ -64,7 +64,7 @@ def test_a_record_scrubbed_to_tick_46_shows_the_first_contact(opened: Open, addr
     until_shown(page, 46)
     expect(page.locator(".card[data-robot=a] dd").first).to_contain_text("b 2.95 m")
     expect(page.locator(".card[data-robot=b] .doing")).to_have_text(
-        "b stands still; waits for a's second range"
+        "b stands still and waits for a's second range"
     )
     expect(page.locator("#log .now").first).to_contain_text("a and b are in range of each other: 2.95 m")
     expect(page.locator("#live")).to_contain_text("Tick 46. a and b are in range of each other: 2.95 m")
@@ -121,8 +121,8 @@ def test_with_the_truth_hidden_only_what_a_robot_knows_is_there(opened: Open, ad
     expect(plane).to_have_attribute("aria-label", re.compile(r"a at 2\.66, 5\.93 m"))
     page.locator("#truth").uncheck()
     page.locator("#robot").select_option("b")
-    expect(page.locator("#seen")).to_contain_text("only what b knows")
-    expect(plane).to_have_attribute("aria-label", "The plane at tick 20: b nowhere known")
+    expect(page.locator("#seen")).to_contain_text("only the belief of b")
+    expect(plane).to_have_attribute("aria-label", "The plane at tick 20: b at an unknown pose")
     expect(page.locator(".card")).to_have_count(1)
     expect(page.locator(".card dl")).not_to_contain_text("9.31")
     assert picture(page) != truth
@@ -158,7 +158,7 @@ def test_all_of_it_goes_by_keyboard_alone(opened: Open, address: str) -> None:
     expect(page.locator("#truth")).not_to_be_checked()
     press("r")
     expect(page.locator("#robot")).to_have_value("a")
-    expect(page.locator("#seen")).to_contain_text("only what a knows")
+    expect(page.locator("#seen")).to_contain_text("only the belief of a")
     press("a")
     press("t")
     expect(page.locator("#robot")).to_have_value("")
@@ -194,9 +194,11 @@ def test_robots_without_a_world_are_shown_by_what_they_know(
     with watching(tmp_path) as (_, where):
         page = opened(f"{where}#tick=46")
         until_shown(page, 46)
-        expect(page.locator(".card[data-robot=a] dl")).to_contain_text("what b tells within the tick")
+        expect(page.locator(".card[data-robot=a] dl")).to_contain_text(
+            "reports of b that arrive within the tick"
+        )
         expect(page.locator(".card[data-robot=b] .doing")).to_contain_text("b stands still")
-        expect(page.locator("#seen")).to_contain_text("the truth is not on record")
+        expect(page.locator("#seen")).to_contain_text("no ground truth")
         expect(page.locator("#log")).to_contain_text("b claims to be at")
         assert inks(page)["ghost"] > 100
 
@@ -284,7 +286,7 @@ def test_the_records_in_a_folder_are_listed(opened: Open, paper_1: Path, tmp_pat
         page = opened(where)
         links = page.locator("#list a")
         expect(links).to_have_count(2)
-        expect(links.first).to_contain_text("breaks off at tick")
+        expect(links.first).to_contain_text("incomplete, ends at tick")
         shot(page, "list")
         links.last.click()
         expect(page.locator("#status")).to_have_text("localised after 48 ticks")
@@ -307,7 +309,7 @@ def test_a_sweep_shows_its_cells_and_its_figures(opened: Open, tmp_path: Path) -
         expect(page.locator("#title")).to_have_text("speeds")
         expect(page.locator("tbody tr")).to_have_count(2)
         expect(page.locator("tbody tr").first).to_contain_text("100.0 %")
-        expect(page.locator("#sweep")).to_contain_text("Trials are not recorded one by one")
+        expect(page.locator("#sweep")).to_contain_text("Individual trials are not recorded")
         expect(page.locator("#sweep img").first).to_have_js_property("complete", value=True)
         shot(page, "sweep")
 
@@ -334,7 +336,7 @@ def test_a_mission_is_followed_to_its_end_from_its_journals_and_from_the_network
         heard.locator("#list a", has_text="paper-1").click()
         for page in (files, heard):
             until_shown(page, 0)
-            expect(page.locator("#status")).to_have_text("● runs, tick 0")
+            expect(page.locator("#status")).to_have_text("● running, tick 0")
             expect(page.locator("#follow")).to_be_visible()
         with TandemProcess("agent", "b", "--connect", endpoint, "--out", recording) as b:
             for page in (files, heard):
@@ -384,7 +386,7 @@ def test_run_watch_stays_until_ctrl_c_and_leaves_the_record_that_it_would_have_l
         run.tell(SIGINT)
         assert run.ended().status == 0
         assert "localised after 48 ticks" in run.out
-        expect(page.locator("#status")).to_have_text("the server has gone")
+        expect(page.locator("#status")).to_have_text("connection to the server lost")
     assert journals(tmp_path / "record") == journals(paper_1)
 
 
@@ -464,8 +466,8 @@ def test_ctrl_c_ends_the_page_with_somebody_watching(paper_1: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["nowhere"], "nowhere is no folder"),
-        (["."], ". holds neither a record, nor a sweep, nor folders with records"),
+        (["nowhere"], "nowhere is not a folder"),
+        (["."], ". contains no recording, no sweep, and no folders with recordings"),
         (
             [".", "--connect", "tcp/127.0.0.1:7447"],
             "--connect: a record needs no network; leave out one of the two",

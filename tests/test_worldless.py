@@ -118,7 +118,7 @@ def test_what_needs_no_truth_is_drawn_as_with_a_world(folders: tuple[Path, Path]
     figure = drawn(over_time.ranges(told))
     assert line(figure, "mutual-range") == line(drawn(over_time.ranges(known)), "mutual-range")
     labels = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
-    assert "separation, as claimed" in labels
+    assert "separation, from claims" in labels
     assert "true separation" not in labels
 
 
@@ -130,8 +130,10 @@ def test_the_command_draws_what_can_be_known_and_says_what_cannot(folders: tuple
     assert {"trajectory-a-b", "encounter-a-b", "ranges-a-b"} <= there
     assert not {name for name in there if name.startswith(("errors", "robot"))}
     lines = ended.err.splitlines()
-    assert [text for text in lines if "no errors-a-b: without a world nobody knows" in text]
-    assert [text for text in lines if "no robot-b: without a world nobody knows" in text]
+    assert [
+        text for text in lines if "no errors-a-b: a recording in hardware mode has no ground truth" in text
+    ]
+    assert [text for text in lines if "no robot-b: a recording in hardware mode has no ground truth" in text]
 
 
 def test_of_one_robot_there_is_what_it_alone_knows(folders: tuple[Path, Path], tmp_path: Path) -> None:
@@ -140,7 +142,7 @@ def test_of_one_robot_there_is_what_it_alone_knows(folders: tuple[Path, Path], t
     told = alone_of(tmp_path, "b")
     assert trajectory.draw(told) == Absent(NO_PLACES)
     assert told.a.id == "a"
-    assert told.told == ["b"]
+    assert told.readable == ["b"]
     ended = tandem("figures", tmp_path, "--only", "ranges", "--only", "trajectory", "--format", "png")
     assert ended.status == 3
     assert ended.err.splitlines() == [
@@ -167,7 +169,7 @@ def test_a_robot_that_was_never_briefed_is_passed_over(folders: tuple[Path, Path
     assert ended.err.splitlines() == nothing
     ended = tandem("export", tmp_path)
     assert (ended.status, ended.out) == (2, "")
-    assert ended.err.endswith("there is no world.journal, and no robot in it was briefed\n")
+    assert ended.err.endswith("there is no world.journal, and no robot's journal has a configuration\n")
 
 
 def test_whose_journal_is_shorter_takes_nothing_from_its_peer(

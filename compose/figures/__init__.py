@@ -1,8 +1,9 @@
-"""Pictures of a record: `pair` and `story` are what there is to tell, `style` and `sheet` what all share.
+"""Figures of a recording.
 
-`album` has them all, by the names below.
+`pair` and `story` prepare the data, `style` and `sheet` define the common layout, and `catalogue` lists all
+figures by kind.
 """
 
 PICTURES = ("trajectory", "phase-1", "plan", "encounter", "ranges", "errors", "robot")
-"""in the order of the paper's Figs. 3 and 4, then over time"""
+"""The kinds of figures, in the order of Figs. 3 and 4 of the paper, then those over time."""
 FORMATS = ("svg", "pdf", "png")

@@ -1,4 +1,4 @@
-"""What a robot's own journal tells of its mind: its planner, run again on what came in."""
+"""The planner states of a robot, recomputed from the inputs in its journal."""
 
 from __future__ import annotations
 
@@ -15,46 +15,47 @@ from protocol.wire import encode
 
 
 class Account(msgspec.Struct, frozen=True):
-    """One robot's own record."""
+    """The journal of one robot, with the recomputed planner states."""
 
     past: Past | None
-    """none if it was killed before it was briefed"""
+    """The journal's content; None if the robot was killed before it received its configuration."""
     states: tuple[RobotState, ...] = ()
-    """after each tick, from 0 on, as far as it decided in it"""
+    """The state after each tick in which the robot decided, starting at tick 0."""
     broken: str | None = None
-    """why minds end before the record does, if they do"""
+    """The reason why `states` ends before the recording does; None if it does not."""
 
     @property
     def held(self) -> tuple[Estimate, ...]:
-        """What it held possible, as it journaled."""
+        """The journaled estimates."""
         return self.past.estimates if self.past is not None else ()
 
 
 def account(folder: Path, robot: str) -> Account:
-    """What `robot` journaled, and its planner run again on it.
+    """Read the journal of `robot` in `folder`, and run its planner again on the journaled inputs.
 
-    Raises OSError if there is no journal, CorruptJournal if it is damaged before its end, or another's.
+    Raises OSError if there is no journal, CorruptJournal if it is damaged before its end or belongs to
+    another robot or run.
     """
-    told = past_of(folder, robot)
-    return _again(told) if told is not None else Account(None)
+    past = past_of(folder, robot)
+    return _recomputed(past) if past is not None else Account(None)
 
 
-def _again(told: Past) -> Account:
-    """Every decision once more, which must be the one on record."""
-    robot = Robot(told.config)
+def _recomputed(past: Past) -> Account:
+    """Repeat every decision. Stops at the first that differs from the recording."""
+    robot = Robot(past.config)
     states: list[RobotState] = []
-    for step in told.steps:
+    for step in past.steps:
         tick = step.observation.tick
         try:
             robot.observation(step.observation, step.frame)
             if step.command is None:
                 break
             robot.decide(step.heard, step.missed)
-        except Exception as error:  # noqa: BLE001  # whatever the inputs on record do to it
-            why = f"the planner cannot go on from its inputs of tick {tick}: {type(error).__name__}: {error}"
-            return Account(told, tuple(states), why)
+        except Exception as error:  # noqa: BLE001  # recorded inputs may raise any error in the planner
+            why = f"the planner fails on its inputs of tick {tick}: {type(error).__name__}: {error}"
+            return Account(past, tuple(states), why)
         if robot.drive_frame != encode(step.command):
-            why = f"on record it decided otherwise at tick {tick}: the journal is another version's"
-            return Account(told, tuple(states), why)
+            why = f"the recorded decision at tick {tick} differs: another version wrote the journal"
+            return Account(past, tuple(states), why)
         states.append(robot.mind)
-    return Account(told, tuple(states))
+    return Account(past, tuple(states))

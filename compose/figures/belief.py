@@ -1,4 +1,4 @@
-"""What a robot held for true, over time: how far off its likeliest pose was, and how likely it was."""
+"""A robot's belief over time: the error and the probability of its most probable pose."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from compose.figures.timeline import name_phases, over_time
 from protocol.rounding import TOLERANCE
 
 LEAST = 1e-16
-"""m: what an error is drawn as that is less"""
+"""The smallest error drawn, in m. Smaller errors are drawn at this value."""
 RANKS = 6
-"""hypotheses of which each has a line"""
+"""The number of hypotheses drawn as lines."""
 BEYOND = 0.05
-"""of the doubt that is allowed: how far the scale of probability goes"""
+"""The end of the probability scale, as a fraction of 1 - confidence."""
 SUREST = 1e-12
-"""the least doubt on that scale"""
+"""The smallest distance of the probability scale's ends from 0 and 1."""
 SHORT = 20.0
-"""the largest value on a scale over its smallest, where powers of ten are too few to name"""
+"""The ratio of a logarithmic scale's ends below which powers of ten give too few tick labels."""
 DENSE = 30
-"""ticks of a phase, too many to mark each"""
+"""The number of ticks in a phase from which on single ticks get no marker."""
 
 
 def draw_error(axes: Axes, story: Story) -> None:
-    """The likeliest pose's error, and what is claimed of it."""
+    """Draw the position error of the most probable pose, with its claimed sigma."""
     over_time(axes, story)
     name_phases(axes, story)
     axes.set_yscale("log")
-    name = "at first: of its distance\nto its anchor"
+    name = "error of the anchor distance,\nbefore the encounter"
     distances = _distance_errors(story)
     marked = _marked(story, [tick for tick, _ in distances])
     _plot(axes, distances, "-o", ms=1.5, markevery=marked, color="0.45", gid="error-of-distance", label=name)
@@ -44,17 +44,17 @@ def draw_error(axes: Axes, story: Story) -> None:
     sigmas = [
         (one.tick, one.covariance.position_sigma) for one, _ in story.likeliest if one.covariance is not None
     ]
-    _plot(axes, sigmas, "--", color=AGES(0.6), gid="sigma", label="sigma, as claimed")
+    _plot(axes, sigmas, "--", color=AGES(0.6), gid="sigma", label="claimed sigma")
     errors = [(one.tick, error(one.world[0], truth)) for one, truth in story.likeliest]
     marked = _marked(story, [tick for tick, _ in errors])
-    name = "of its likeliest pose" if story.weighed else "of its pose"
+    name = "error, most probable pose" if story.weighed else "error"
     _plot(axes, errors, "-D", ms=3, markevery=marked, color=AGES(1.0), gid="error", label=name)
     if story.exact:
-        limit, gid, name = TOLERANCE, "tolerance", "wrong, if more: 1e-6 m"
+        limit, gid, name = TOLERANCE, "tolerance", "tolerance: 1e-6 m"
     else:
         limit = story.recording.scenario.mission.accuracy
-        gid, name = "accuracy", f"sigma asked for: {limit:g} m"
-    if not distances and not story.placed:  # there is nothing to fit but the limit
+        gid, name = "accuracy", f"required sigma: {limit:g} m"
+    if not distances and not story.placed:  # the axis can only be scaled to the limit
         axes.set_ylim(limit / 10.0, limit * 10.0)
     axes.axhline(limit, color="k", lw=0.9, ls="-.", gid=gid, label=name)
     _envelope(axes, sigmas)
@@ -68,18 +68,21 @@ def _in_metres(axes: Axes) -> None:
     axes.yaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}".replace("e-0", "e-")))
     axes.yaxis.set_minor_locator(NullLocator())
     axes.set_xlabel("")
-    axes.set_ylabel("error of position [m]")
+    axes.set_ylabel("position error [m]")
 
 
 def _plot(axes: Axes, points: Sequence[tuple[int, float]], style: str, **look: Any) -> None:
-    """Nothing, where there are none."""
+    """Plot `points`, (tick, value) pairs, if there are any."""
     if points:
         ticks, values = zip(*points, strict=True)
         axes.plot(ticks, np.maximum(values, LEAST), style, **{"lw": 1.2, **look})
 
 
 def _distance_errors(story: Story) -> list[tuple[int, float]]:
-    """All that can be off before the two have met: until then any rotation about the anchor is possible."""
+    """Return the errors of the distance to the anchor, in m, as (tick, error) pairs before the encounter.
+
+    Until the encounter any rotation about the anchor is possible, so no other position error is defined.
+    """
     anchor = story.own.anchor
     return [
         (
@@ -95,7 +98,7 @@ def _distance_errors(story: Story) -> list[tuple[int, float]]:
 
 
 def _envelope(axes: Axes, sigmas: Sequence[tuple[int, float]]) -> None:
-    """What should hold the error, if sigma is true; down to the end of the scale, on which there is no 0."""
+    """Shade the errors within the claimed 3 sigma, down to the end of the logarithmic scale."""
     if not sigmas:
         return
     ticks, values = np.array(sigmas).T
@@ -103,13 +106,13 @@ def _envelope(axes: Axes, sigmas: Sequence[tuple[int, float]]) -> None:
     low, high = axes.get_ylim()
     axes.fill_between(
         ticks, low, np.maximum(SIGMAS * values, low), color=AGES(0.25), alpha=0.35, lw=0, zorder=0,
-        gid="envelope", label="within 3 sigma, as claimed",
+        gid="envelope", label="claimed 3 sigma",
     )  # fmt: skip
     axes.set_ylim(low, high)
 
 
 def draw_probability(axes: Axes, story: Story) -> None:
-    """How likely each hypothesis was; or how many poses were possible, where none is likelier."""
+    """Draw the probability of each hypothesis, or, with exact sensors, the number of possible poses."""
     over_time(axes, story)
     if story.weighed:
         _draw_probability(axes, story)
@@ -117,36 +120,36 @@ def draw_probability(axes: Axes, story: Story) -> None:
         _draw_count(axes, story)
     placed = next((one.tick for one, _ in story.placed), None)
     words: dict[str, Any] = {"transform": axes.transAxes, "fontsize": 8, "color": "0.3"}
-    axes.text(0.0, 1.05, "of where its anchor is", **words)
+    axes.text(0.0, 1.05, "branches in the anchor's frame", **words)
     if placed is not None:
         axes.axvline(placed, color="0.3", lw=0.8, ls=":", gid="placed")
-        axes.text(1.0, 1.05, f"from tick {placed}: of how both lie in the plane", ha="right", **words)
+        axes.text(1.0, 1.05, f"from tick {placed}: placements of the pair", ha="right", **words)
 
 
 def _draw_probability(axes: Axes, story: Story) -> None:
-    """On a scale on which 99.99 % is as far from 99 % as that from evens."""
+    """Draw the probabilities on a logit scale, on which 99 % and 99.99 % are easy to distinguish."""
     confidence = story.recording.scenario.mission.confidence
     edge = max(SUREST, BEYOND * (1.0 - confidence))
     axes.set_yscale("logit")
     for rank in reversed(range(RANKS)):
         for placed in (False, True):
-            _odds_of(axes, story, rank, placed, edge)
-    axes.plot([], [], "-D", ms=3, lw=1.4, color=AGES(1.0), label="the likeliest hypothesis")
+            _draw_rank(axes, story, rank, placed, edge)
+    axes.plot([], [], "-D", ms=3, lw=1.4, color=AGES(1.0), label="most probable hypothesis")
     if any(len(one.probabilities) > 1 for one, _ in story.estimates):
         axes.plot([], [], "-x", ms=3, lw=0.8, color=GHOST, label=name_of_others(story))
     axes.axhline(
-        confidence, color="k", lw=0.9, ls="-.", gid="confidence", label=f"asked for: {percent(confidence)}"
+        confidence, color="k", lw=0.9, ls="-.", gid="confidence", label=f"required: {percent(confidence)}"
     )
-    doubts = [10.0**-k for k in range(2, 13, 2) if 10.0**-k > edge]
-    ticks = [*doubts[::-1], 0.5, *[1.0 - doubt for doubt in doubts]]
+    tails = [10.0**-k for k in range(2, 13, 2) if 10.0**-k > edge]
+    ticks = [*tails[::-1], 0.5, *[1.0 - tail for tail in tails]]
     axes.set_yticks([edge, *ticks, 1.0 - edge], ["less", *map(percent, ticks), "more"])
     axes.yaxis.set_minor_locator(NullLocator())
     axes.set_ylim(edge, 1.0 - edge)
     axes.set_ylabel("probability of a hypothesis")
 
 
-def _odds_of(axes: Axes, story: Story, rank: int, placed: bool, edge: float) -> None:
-    """Those of the hypothesis that is so likely, before or after they are about the plane."""
+def _draw_rank(axes: Axes, story: Story, rank: int, placed: bool, edge: float) -> None:
+    """Draw the probability of the hypothesis at `rank`: of placements if `placed`, else of branches."""
     points = [
         (
             one.tick,
@@ -180,7 +183,7 @@ def _odds_of(axes: Axes, story: Story, rank: int, placed: bool, edge: float) -> 
 
 
 def _marked(story: Story, ticks: Sequence[int]) -> list[int]:
-    """The places of those that have room to be marked each."""
+    """Return the indices of the ticks whose phase is short enough for a marker at each tick."""
     sparse: set[int] = set()
     for span in story.phases:
         if span.last - span.first < DENSE:
@@ -189,20 +192,20 @@ def _marked(story: Story, ticks: Sequence[int]) -> list[int]:
 
 
 def percent(probability: float) -> str:
-    """In as many digits as tell it from certainty."""
+    """Return a probability as a percentage with all its significant digits."""
     return f"{round(100.0 * probability, 10):.12g} %"
 
 
 def _draw_count(axes: Axes, story: Story) -> None:
-    """Before there are some to be counted, it may be anywhere on a circle."""
+    """Draw the number of possible poses. It is undefined while the robot may be anywhere on a circle."""
     counts = [(one.tick, len(one.world or one.local) or math.nan) for one, _ in story.estimates]
     if counts:
         ticks, held = zip(*counts, strict=True)
         axes.plot(
             ticks, held, "-D", ms=3, lw=1.2, drawstyle="steps-post", color=AGES(1.0), gid="count",
-            markevery=_marked(story, ticks), label="poses held possible",
+            markevery=_marked(story, ticks), label="possible poses",
         )  # fmt: skip
-    axes.axhline(1.0, color="k", lw=0.9, ls="-.", label="one is left")
+    axes.axhline(1.0, color="k", lw=0.9, ls="-.", label="one pose")
     axes.set_ylim(0.0, 1.0 + max([len(one.world or one.local) for one, _ in story.estimates], default=1))
     axes.yaxis.set_major_locator(MaxNLocator(nbins=5, integer=True))
-    axes.set_ylabel("poses held possible")
+    axes.set_ylabel("possible poses")

@@ -1,4 +1,4 @@
-"""All pictures of a pair, by their names."""
+"""The catalogue of the figures of a pair, by kind."""
 
 from __future__ import annotations
 
@@ -17,12 +17,15 @@ Picture = tuple[str, Figure | Absent]
 
 
 def settings(kind: str) -> AbstractContextManager[None]:
-    """Within which pictures of one kind (see `PICTURES`) are drawn and saved."""
+    """Return the matplotlib settings for drawing and saving figures of one kind (see `PICTURES`)."""
     return look(symbols=kind != "robot")
 
 
 def pictures(pair: PairRecord, kind: str) -> Iterator[Picture]:
-    """Those of one kind, in its `settings`; none where the journals that they need are missing."""
+    """Yield the figures of one kind with their names; none if the journals they need are missing.
+
+    Must be called within the `settings` of that kind.
+    """
     return _DRAWN[kind](pair)
 
 
@@ -31,15 +34,15 @@ def _trajectory(pair: PairRecord) -> Iterator[Picture]:
 
 
 def _phase_one(pair: PairRecord) -> Iterator[Picture]:
-    for role in pair.told:
+    for role in pair.readable:
         yield f"phase-1-{pair.robot(role).id}", phase_one.draw(pair, role)
 
 
 def _plan(pair: PairRecord) -> Iterator[Picture]:
-    """What there is of them under noise is hypotheses, of `assured`."""
-    if pair.told and pair.planner_name == "assured" and not pair.exact:
+    """Yield the planned manoeuvres; with noisy sensors and `assured`, the hypotheses at its decisions."""
+    if pair.readable and pair.planner_name == "assured" and not pair.exact:
         yield f"plan-{pair.name}", decisions.draw(pair)
-    elif pair.told:
+    elif pair.readable:
         for name, figure in manoeuvre.draw(pair).items():
             yield f"plan-{name}", figure
 
@@ -53,12 +56,12 @@ def _ranges(pair: PairRecord) -> Iterator[Picture]:
 
 
 def _errors(pair: PairRecord) -> Iterator[Picture]:
-    if pair.told:
+    if pair.readable:
         yield f"errors-{pair.name}", over_time.errors(pair)
 
 
 def _robot(pair: PairRecord) -> Iterator[Picture]:
-    for role in pair.told:
+    for role in pair.readable:
         name, account = pair.robot(role).id, pair.robot(role).account
         assert account is not None
         if pair.recording is None:

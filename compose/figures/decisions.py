@@ -1,4 +1,4 @@
-"""Under noise, in place of Fig. 3(c): what was held possible at each decision, and what both then did."""
+"""The hypotheses and the chosen manoeuvre at each decision of phase 3, under noise; in place of Fig. 3(c)."""
 
 from __future__ import annotations
 
@@ -18,50 +18,53 @@ from protocol.mission import Role
 from protocol.motion import Pose, step
 
 WIDTH, NARROWEST = 2.3, 5.6
-"""inches: of a panel at the most, and of the whole at the least"""
+"""The maximum width of a panel and the minimum width of the figure, in inches."""
 FINE = 12
-"""pieces that a manoeuvre is drawn in, a tick"""
+"""The number of line segments per tick of a drawn manoeuvre."""
 LIKELY = 1e-3
-"""probability from which on a hypothesis is within what is seen"""
+"""The minimum probability of a hypothesis that the panels' window must contain."""
 
 
 class PairDecision(NamedTuple):
-    """A tick in which a robot weighed what it holds possible of both, and chose a manoeuvre."""
+    """A tick in which at least one robot scored hypotheses of both poses and chose a manoeuvre."""
 
     tick: int
     states: dict[Role, RobotState]
-    """of those robots that decided in it"""
+    """The states of the robots that decided in this tick."""
 
 
 def decisions(pair: PairRecord) -> list[PairDecision]:
-    """Of phase 3, in order."""
+    """Return the decisions of phase 3, in order."""
     found: dict[int, dict[Role, RobotState]] = {}
     for role in ROLES:
         before: object = ()
         for state in pair.states(role):
-            held, surveys = state.belief.pair, isinstance(state.mode, Surveying) and state.phase == 3
-            if held and held is not before and (surveys or state.verdict is not None):
+            hypotheses = state.belief.pair
+            surveys = isinstance(state.mode, Surveying) and state.phase == 3
+            if hypotheses and hypotheses is not before and (surveys or state.verdict is not None):
                 found.setdefault(state.tick, {})[role] = state
-            before = held
+            before = hypotheses
     return [PairDecision(tick, found[tick]) for tick in sorted(found)]
 
 
 def draw(pair: PairRecord) -> Figure | Absent:
-    """A panel a decision; as many as have room."""
-    told = decisions(pair)
-    if not told:
-        why = pair.unknown or "they never weighed how both lie in the plane"
+    """Return the figure, with one panel per decision for up to `series.PANELS` decisions."""
+    found = decisions(pair)
+    if not found:
+        why = pair.unknown or "no robot scored hypotheses of the pair"
         return Absent(NO_ENCOUNTER if pair.encounter_tick is None else why)
-    shown = some(told)
+    shown = some(found)
     many = (
-        f"{len(shown)} of {len(told)} decisions" if len(shown) < len(told) else f"all {len(told)} decisions"
+        f"{len(shown)} of {len(found)} decisions"
+        if len(shown) < len(found)
+        else f"all {len(found)} decisions"
     )
-    title = f"Hypotheses of how both lie in the plane, and the manoeuvres chosen: {many}"
+    title = f"Hypotheses of the pair and chosen manoeuvres: {many}"
     series = Series(len(shown), _window(pair, shown), WIDTH, NARROWEST, [pair.title, title])
     for i, one in enumerate(shown):
-        axes = series.panel(i, _said(one, i + 1))
+        axes = series.panel(i, _panel_title(one, i + 1))
         _panel(axes, pair, one)
-    _signs(axes, pair)
+    _key(axes, pair)
     series.key(axes)
     return series.figure
 
@@ -81,13 +84,14 @@ def _window(pair: PairRecord, shown: list[PairDecision]) -> Window:
     return square(points, 0.16, 0.5 * pair.mission.sensing_range)
 
 
-def _said(one: PairDecision, number: int) -> str:
+def _panel_title(one: PairDecision, number: int) -> str:
     state = next(iter(one.states.values()))
     count, probability = len(state.belief.pair), state.belief.pair[0].probability
-    held = f"{count} hypotheses" if count > 1 else "one hypothesis"
-    surest = f"{math.floor(1e4 * probability) / 100:g} %"
-    end = "; claims" if any(state.verdict is not None for state in one.states.values()) else ""
-    return f"({number}) $k$ = {one.tick}, {len(state.mutual)} mutual ranges\n{held}, first {surest}{end}"
+    hypotheses = f"{count} hypotheses" if count > 1 else "1 hypothesis"
+    first = f"{math.floor(1e4 * probability) / 100:g} %"
+    end = "; claim" if any(state.verdict is not None for state in one.states.values()) else ""
+    ranges = f"{len(state.mutual)} mutual ranges"
+    return f"({number}) $k$ = {one.tick}, {ranges}\n{hypotheses}, first {first}{end}"
 
 
 def _panel(axes: Axes, pair: PairRecord, one: PairDecision) -> None:
@@ -117,13 +121,13 @@ def _panel(axes: Axes, pair: PairRecord, one: PairDecision) -> None:
 
 
 def _places(pair: PairRecord, tick: int) -> dict[Role, Pose]:
-    """Where each was; without a world, of those that have claimed to know."""
+    """Return the true pose of each robot; in hardware mode, the pose implied by its claim, if it has one."""
     paths = {role: pair.robot(role).path for role in ROLES}
     return {role: path[tick] for role, path in paths.items() if tick < len(path)}
 
 
 def _ties(axes: Axes, one: PairDecision) -> None:
-    """Between places of a and b that belong to one hypothesis, where both hold the same."""
+    """Join the poses of a and b that belong to one hypothesis, if both robots have the same hypotheses."""
     if len(one.states) < 2 or one.states["a"].belief.pair != one.states["b"].belief.pair:
         return
     for p, q in zip(one.states["a"].belief.poses, one.states["b"].belief.poses, strict=True):
@@ -131,7 +135,7 @@ def _ties(axes: Axes, one: PairDecision) -> None:
 
 
 def _drive(axes: Axes, pair: PairRecord, role: Role, state: RobotState) -> None:
-    """Where the manoeuvre leads from the likeliest pose."""
+    """Draw the chosen manoeuvre from the most probable pose."""
     ends = _ends(state, pair)
     if not ends:
         return
@@ -149,7 +153,7 @@ def _drive(axes: Axes, pair: PairRecord, role: Role, state: RobotState) -> None:
 
 
 def _ends(state: RobotState, pair: PairRecord) -> list[Pose]:
-    """Along the manoeuvre that was chosen, from the likeliest pose; none, where none was."""
+    """Return poses along the chosen manoeuvre from the most probable pose; empty if none was chosen."""
     if not isinstance(state.mode, Surveying) or not state.belief.poses:
         return []
     command, ticks = state.mode.command, stride(pair.mission)
@@ -160,14 +164,14 @@ def _ends(state: RobotState, pair: PairRecord) -> list[Pose]:
     ]
 
 
-def _signs(axes: Axes, pair: PairRecord) -> None:
+def _key(axes: Axes, pair: PairRecord) -> None:
     for role in ROLES:
         axes.plot(
             [], [], MARKS[role]["marker"], ls="", ms=7, color=COLOURS[role],
-            label=f"{pair.robot(role).id}, likeliest",
+            label=f"{pair.robot(role).id}, most probable",
         )  # fmt: skip
-    axes.plot([], [], "o", ls="", ms=4, mfc="white", mec=PALE, label="less likely")
-    axes.plot([], [], "x-", ms=6, mew=1.5, lw=1.6, color=PALE, label="manoeuvre chosen")
-    known = "true" if pair.true else "by the claim"
+    axes.plot([], [], "o", ls="", ms=4, mfc="white", mec=PALE, label="less probable")
+    axes.plot([], [], "x-", ms=6, mew=1.5, lw=1.6, color=PALE, label="chosen manoeuvre")
+    known = "true" if pair.true else "from the claim"
     axes.plot([], [], "+", ls="", ms=9, mew=1.2, color=INK, label=known)
     axes.plot([], [], "x", ls="", ms=6, mew=1.4, color="k", label="anchor")

@@ -1,4 +1,4 @@
-"""A last manoeuvre as it was planned, in the frame of who makes it: Figs. 3(c) and 4(b), and eq. (8)."""
+"""A planned last manoeuvre in the frame of the robot that makes it: Figs. 3(c) and 4(b), with eq. (8)."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ from protocol.mission import Mission, Role
 from protocol.motion import ORIGIN, Pose, compose, step
 
 PLANE, COST = 3.7, 2.4
-"""inches: of the plane, and of eq. (8)'s value beside it"""
+"""The widths of the plane's panel and of the panel with the value of eq. (8), in inches."""
 COLUMNS = 3
 SIGNS = 6
-"""in the key, beside one for each candidate"""
+"""The number of entries in the key, without the candidates."""
 AROUND = 1.14
-"""of what is to be seen about where it stands"""
+"""The half-width of the window, as a multiple of the largest distance from the robot that must be visible."""
 FINE = 24
-"""pieces that the arc of the manoeuvre is drawn in"""
+"""The number of line segments of the drawn arc of the manoeuvre."""
 OTHER: dict[Role, Role] = {"a": "b", "b": "a"}
 
 
 class Planned(NamedTuple):
-    """A last manoeuvre, and when it was planned."""
+    """A last manoeuvre and the tick in which it was planned."""
 
     tick: int
     plan: Plan
 
 
 def planned(pair: PairRecord, role: Role) -> Iterator[Planned]:
-    """Every last manoeuvre of one robot, in order."""
+    """Yield every last manoeuvre of one robot, in order."""
     before = None
     for state in pair.states(role):
         if state.belief.plan is not before and isinstance(state.mode, LastManoeuvre):
@@ -50,7 +50,7 @@ def planned(pair: PairRecord, role: Role) -> Iterator[Planned]:
 
 
 def draw(pair: PairRecord) -> dict[str, Figure | Absent]:
-    """A picture of each plan, by what tells it from others: who made it, and when."""
+    """Return a figure of each plan, by the name "ROBOT-TICK"."""
     found: dict[str, Figure | Absent] = {}
     for role in ROLES:
         for one in planned(pair, role):
@@ -62,22 +62,22 @@ def draw(pair: PairRecord) -> dict[str, Figure | Absent]:
 
 
 class ManoeuvreView(NamedTuple):
-    """What was compared, seen from the mover: its frame turned such that it stands on the x-axis."""
+    """The compared candidates in the moving robot's anchor frame, rotated to put the robot on the x-axis."""
 
     mover: Pose
     others: tuple[Pose, ...]
-    """where the other robot may be, by each candidate"""
+    """The pose of the other robot for each candidate."""
     spin: float
-    """rad, by which the frame of its anchor is turned"""
+    """The rotation of the anchor frame, in rad."""
 
     def turned(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Points of the frame of its anchor, likewise."""
+        """Rotate points of the anchor frame, in m, into this view."""
         c, s = math.cos(self.spin), math.sin(self.spin)
         return c * x - s * y, s * x + c * y
 
 
 def scene(plan: Plan) -> ManoeuvreView:
-    """Of `plan`."""
+    """Return the view of `plan`."""
     mover, a, b, candidates = plan.question
     own, other = (a, b) if mover == "a" else (b, a)
     spin = -math.atan2(own.y, own.x)
@@ -89,7 +89,7 @@ def scene(plan: Plan) -> ManoeuvreView:
 
 
 def _inverse(placement: Placement) -> Pose:
-    """<b(M2)> in <a(M1)>."""
+    """Return the inverse of a placement as the pose of frame <b(M2)> in frame <a(M1)>."""
     c, s = math.cos(placement.phi), math.sin(placement.phi)
     return Pose(
         -c * placement.x - s * placement.y, s * placement.x - c * placement.y, -placement.phi
@@ -129,25 +129,25 @@ def _title(pair: PairRecord, one: Planned) -> str:
     v, omega = one.plan.command.v, one.plan.command.omega
     chosen = rf"$v_2$ = {v:g} m/s, $\omega_2$ = {omega:+.4f} rad/s"
     count = len(one.plan.question.candidates)
-    told = f"{count} candidates" if count > 1 else "one candidate, to be checked"
+    candidates = f"{count} candidates" if count > 1 else "1 candidate, to be checked"
     value = f", $J$ = {one.plan.separation_m2:.5g} m$^2$" if one.plan.separation_m2 is not None else ""
-    return f"Plan of {robot} at $k$ = {one.tick}, in {frame}: {told}; {chosen}{value}"
+    return f"Plan of {robot} at $k$ = {one.tick}, in {frame}: {candidates}; {chosen}{value}"
 
 
 def _framed_by_itself(plan: Plan) -> bool:
-    """Whether candidates are placed in the frame of the mover's own pose, as the letter does under noise."""
+    """Return whether candidates are given in the mover's own frame, as by the `paper` planner under noise."""
     return plan.question.a == ORIGIN == plan.question.b
 
 
 def _candidates(axes: Axes, pair: PairRecord, one: Planned, seen: ManoeuvreView, half: float) -> None:
-    """Where the other may be, at the range last measured, and the axes of each two of these places."""
+    """Draw the candidate positions of the other robot, the last range, and the bisectors of all pairs."""
     mover: Role = one.plan.question.mover
     other = OTHER[mover]
     x, y = seen.mover.x, seen.mover.y
     for i, j in combinations(range(len(seen.others)), 2):
         _bisector(axes, seen.others[i], seen.others[j], 3.0 * half, f"bisector-{i + 1}-{j + 1}")
     if len(seen.others) > 1:
-        axes.plot([], [], "-", color=PALE, lw=0.7, label="axes of two candidates")
+        axes.plot([], [], "-", color=PALE, lw=0.7, label="bisectors of two candidates")
     rho = pair.mutual[one.tick][1]
     if rho is not None:
         circle(
@@ -160,7 +160,7 @@ def _candidates(axes: Axes, pair: PairRecord, one: Planned, seen: ManoeuvreView,
         axes.plot(
             place.x, place.y, MARKS[other]["marker"], ms=7, mfc=COLOURS[other], mec="white", mew=0.6, ls="",
             gid=f"candidate-{i}", zorder=5,
-            label=f"{i}: would be {math.hypot(place.x - end.x, place.y - end.y):.4f} m away",
+            label=f"{i}: predicted range {math.hypot(place.x - end.x, place.y - end.y):.4f} m",
         )  # fmt: skip
         axes.annotate(
             str(i), (place.x, place.y), xytext=(-13 * (place.x - x) / away, -13 * (place.y - y) / away),
@@ -171,16 +171,16 @@ def _candidates(axes: Axes, pair: PairRecord, one: Planned, seen: ManoeuvreView,
 
 
 def _after(pair: PairRecord, one: Planned) -> str:
-    """What the manoeuvre led to."""
+    """Return the range measured after the manoeuvre, as text."""
     if one.tick + 1 >= len(pair.mutual):
-        return "the record ends before the next range"
+        return "the recording ends before the next range"
     near, rho = pair.mutual[one.tick + 1]
-    said = f"{rho:.4f} m" if rho is not None else "a drop-out" if near else "none: out of range"
-    return f"measured at $k$ = {one.tick + 1}: {said}"
+    measured = f"{rho:.4f} m" if rho is not None else "drop-out" if near else "none, out of range"
+    return f"measured at $k$ = {one.tick + 1}: {measured}"
 
 
 def _bisector(axes: Axes, one: Pose, other: Pose, length: float, gid: str) -> None:
-    """The axis of the segment between the two."""
+    """Draw the perpendicular bisector of the segment between two positions."""
     dx, dy = other.x - one.x, other.y - one.y
     apart = math.hypot(dx, dy)
     if apart == 0.0:
@@ -197,7 +197,7 @@ def _end(seen: ManoeuvreView, plan: Plan, mission: Mission) -> Pose:
 
 
 def _reach(axes: Axes, pair: PairRecord, plan: Plan, seen: ManoeuvreView, ways: Compared) -> None:
-    """The ends of all manoeuvres that were compared, and the one that was chosen."""
+    """Draw the end positions of all compared manoeuvres, and the chosen manoeuvre."""
     mover = plan.question.mover
     colour = COLOURS[mover]
     chosen = chosen_row(plan, ways)
@@ -207,13 +207,13 @@ def _reach(axes: Axes, pair: PairRecord, plan: Plan, seen: ManoeuvreView, ways: 
             continue
         axes.plot(
             *seen.turned(ways.reach.x[row], ways.reach.y[row]), "-", lw=0.7, color=PALER, zorder=1.5,
-            gid=f"reach-{row}", label="with another $v_2$" if first else None,
+            gid=f"reach-{row}", label="reachable with another $v_2$" if first else None,
         )  # fmt: skip
         first = False
     v = float(ways.reach.v[chosen, 0])
     axes.plot(
         *seen.turned(ways.reach.x[chosen], ways.reach.y[chosen]), "-", lw=2.0, color="k", zorder=2,
-        gid="reach", label=f"within reach with $v_2$ = {v:g} m/s",
+        gid="reach", label=f"reachable with $v_2$ = {v:g} m/s",
     )  # fmt: skip
     ends = [
         step(seen.mover, plan.command.v, plan.command.omega, pair.mission.period * i / FINE)
@@ -222,18 +222,18 @@ def _reach(axes: Axes, pair: PairRecord, plan: Plan, seen: ManoeuvreView, ways: 
     axes.plot([p.x for p in ends], [p.y for p in ends], "-", lw=2.0, color=colour, zorder=4, gid="chosen")
     axes.plot(
         [ends[0].x, ends[-1].x], [ends[0].y, ends[-1].y], "x", ms=9, mew=2.0, color=colour, zorder=5, ls="",
-        gid="chosen-ends", label=f"the choice: {pair.robot(mover).id} drives here",
+        gid="chosen-ends", label=f"chosen manoeuvre of {pair.robot(mover).id}",
     )  # fmt: skip
     heading(axes, ends[0], 0.42 * max(abs(v) * pair.mission.period, 1e-9), INK)
 
 
 def chosen_row(plan: Plan, ways: Compared) -> int:
-    """Which of the speeds was chosen."""
+    """Return the row of `ways` with the chosen speed."""
     return int(np.argmin(abs(ways.reach.v[:, 0] - plan.command.v)))
 
 
 def draw_cost(axes: Axes, plan: Plan, ways: Compared, mission: Mission) -> None:
-    """What each turn rate is worth, eq. (8)."""
+    """Draw the value of eq. (8) over the turn rate."""
     chosen = chosen_row(plan, ways)
     omega = ways.reach.omega
     allowed = np.isfinite(ways.value)
@@ -244,7 +244,7 @@ def draw_cost(axes: Axes, plan: Plan, ways: Compared, mission: Mission) -> None:
                 gid=f"cost-{row}",
             )  # fmt: skip
     if not allowed[chosen].all():
-        axes.plot(omega, ways.gap[chosen], ":", lw=1.2, color=PALE, label="more candidates out of range")
+        axes.plot(omega, ways.gap[chosen], ":", lw=1.2, color=PALE, label="excluded: range or separation")
     axes.plot(
         omega,
         np.where(allowed[chosen], ways.gap[chosen], np.nan),
@@ -266,7 +266,9 @@ def draw_cost(axes: Axes, plan: Plan, ways: Compared, mission: Mission) -> None:
         )
     axes.set_xlabel(r"$\omega_2$ [rad/s]")
     axes.set_ylabel(
-        "$J$ of eq. (8), on squares [m$^2$]" if plan.separation_m2 is not None else "nearer by [m$^2$]"
+        "$J$ of eq. (8), squared ranges [m$^2$]"
+        if plan.separation_m2 is not None
+        else "decrease of squared range [m$^2$]"
     )
     axes.tick_params(labelsize=SMALL)
     if axes.get_legend_handles_labels()[0]:

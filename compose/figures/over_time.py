@@ -1,4 +1,4 @@
-"""Ranges and separation, and errors, over time: all of the mission, and the encounter again beside it."""
+"""Ranges, separation and errors over time, for the whole mission and enlarged for the encounter."""
 
 from __future__ import annotations
 
@@ -21,31 +21,33 @@ from protocol.motion import Pose, wrap
 from protocol.rounding import TOLERANCE
 
 WHOLE, NEAR = 4.4, 2.2
-"""inches: of all the mission, and of its encounter"""
+"""The widths of the panels of the mission and of the encounter, in inches."""
 APART = 0.5
 TALL, BETWEEN, LEFT = 2.2, 0.2, 0.75
 BEFORE = 3
-"""ticks before the encounter"""
+"""The number of ticks shown before the encounter."""
 MARKED = 90
-"""points, of which each has room for its mark"""
+"""The maximum number of markers on a line."""
 LEAST = 1e-16
-"""what an error is drawn as that is less"""
+"""The smallest error drawn, in m or rad. Smaller errors are drawn at this value."""
 LINES: dict[Role, Any] = {"a": "-", "b": (0, (4, 1.5))}
 ALONE: dict[Role, Any] = {"a": "-.", "b": (0, (1, 1))}
 CLAIMED: dict[Role, Any] = {"a": (0, (6, 1.5, 1, 1.5, 1, 1.5)), "b": (0, (1, 3))}
-"""lines of the likeliest pose, before the encounter, and of sigmas: a's are solid or dashed and dotted, b's
-dashed or dotted, and no two are the same"""
+"""Line styles by role: LINES of the most probable pose, ALONE before the encounter, CLAIMED of sigmas.
+
+No two are the same, so the lines differ without colour.
+"""
 SIGMAS = 3.0
 ROOM = 4.0
-"""how many times more, and less, than what is drawn the scale of errors goes"""
+"""The factor by which the error scale extends beyond the drawn values."""
 KEY_ROWS = 4
-"""of errors, at the most"""
+"""The maximum number of rows in the key of the errors."""
 
 Points = list[tuple[int, float]]
 
 
 def ranges(pair: PairRecord) -> Figure:
-    """What each sensor measured, and how far apart the two were."""
+    """Return the figure of the measured ranges and of the robots' separation."""
     tall, key = TALL + 0.4, 2 * ROW + 0.05
     sheet = Sheet(_width(), 0.53 + tall + key, [pair.title])
     panels = _panels(sheet, pair, key + 0.45, tall)
@@ -65,7 +67,7 @@ def _width() -> float:
 
 
 def _panels(sheet: Sheet, pair: PairRecord, bottom: float, tall: float, *, named: bool = True) -> list[Axes]:
-    """Of all ticks; and of those of the encounter, if there was one."""
+    """Return the panel of all ticks, and the panel of the encounter if there was one."""
     width = WHOLE if pair.encounter_tick is not None else WHOLE + APART + NEAR
     panels = [sheet.panel(LEFT, bottom, width, tall)]
     panels[0].set_xlim(-0.5, pair.last + 0.5)
@@ -79,15 +81,14 @@ def _panels(sheet: Sheet, pair: PairRecord, bottom: float, tall: float, *, named
         axes.xaxis.set_minor_locator(NullLocator())
         if named:
             period = pair.mission.period
-            unit = "one a second" if period == 1.0 else f"{period:g} s each"
-            axes.set_xlabel(f"tick $k$, {unit}" if i == 0 else "the encounter again")
+            axes.set_xlabel(f"tick $k$ ({period:g} s)" if i == 0 else "encounter")
         else:
             axes.tick_params(labelbottom=False)
     return panels
 
 
 def _shade(axes: Axes, pair: PairRecord) -> None:
-    """The ticks in contact."""
+    """Shade the ticks in contact."""
     for i, (first, last) in enumerate(pair.contacts):
         axes.axvspan(
             first - 0.5, last + 0.5, color=SHADE, lw=0, zorder=-2, gid=f"contact-{first}-{last}",
@@ -100,7 +101,7 @@ def _ranges(axes: Axes, pair: PairRecord) -> None:
     if apart:
         axes.plot(
             range(len(apart)), apart, "-", lw=1.2, color=INK, zorder=2, gid="separation",
-            label="true separation" if pair.true else "separation, as claimed",
+            label="true separation" if pair.true else "separation, from claims",
         )  # fmt: skip
     for role in ROLES:
         _measured(
@@ -118,12 +119,12 @@ def _ranges(axes: Axes, pair: PairRecord) -> None:
 def _measured(
     axes: Axes, values: Sequence[float | None], gid: str, colour: str, mark: dict[str, Any], label: str
 ) -> None:
-    told = [(tick, rho) for tick, rho in enumerate(values) if rho is not None]
-    if not told:
+    points = [(tick, rho) for tick, rho in enumerate(values) if rho is not None]
+    if not points:
         return
     axes.plot(
-        [tick for tick, _ in told], [rho for _, rho in told], ls="", ms=4, mew=1.0, color=colour, gid=gid,
-        markevery=max(1, math.ceil(len(told) / (2 * MARKED))), label=label, zorder=3, **mark,
+        [tick for tick, _ in points], [rho for _, rho in points], ls="", ms=4, mew=1.0, color=colour, gid=gid,
+        markevery=max(1, math.ceil(len(points) / (2 * MARKED))), label=label, zorder=3, **mark,
     )  # fmt: skip
 
 
@@ -131,16 +132,16 @@ def _measured(
 
 
 def errors(pair: PairRecord) -> Figure | Absent:
-    """How far off each robot's pose was: its position, and its heading."""
+    """Return the figure of the position and heading errors of both robots."""
     if not pair.true:
         return Absent(NO_TRUTH)
     if not any(_held(pair, role) for role in ROLES):
-        return Absent("neither robot held anything possible of where it is")
+        return Absent("neither robot has an estimate of its pose")
     key = KEY_ROWS * ROW + 0.05
     sheet = Sheet(_width(), 0.53 + 2 * TALL + BETWEEN + key, [pair.title])
     rows: list[tuple[str, str, Callable[[Pose, Pose], float], Callable[[Claim], float]]] = [
-        ("position", "error of position [m]", _off, lambda claim: claim.position_error),
-        ("heading", "error of heading [rad]", _askew, lambda claim: claim.heading_error),
+        ("position", "position error [m]", _position_error, lambda claim: claim.position_error),
+        ("heading", "heading error [rad]", _heading_error, lambda claim: claim.heading_error),
     ]
     for i, (name, label, off, of_claim) in enumerate(rows):
         bottom = key + 0.45 + (1 - i) * (TALL + BETWEEN)
@@ -157,23 +158,26 @@ def errors(pair: PairRecord) -> Figure | Absent:
     return sheet.figure
 
 
-def _off(pose: Pose, truth: Pose) -> float:
+def _position_error(pose: Pose, truth: Pose) -> float:
     return math.hypot(pose.x - truth.x, pose.y - truth.y)
 
 
-def _askew(pose: Pose, truth: Pose) -> float:
+def _heading_error(pose: Pose, truth: Pose) -> float:
     return abs(wrap(pose.heading - truth.heading))
 
 
 def _held(pair: PairRecord, role: Role) -> list[tuple[Estimate, Pose]]:
-    """Each estimate, and where the robot was then."""
+    """Return each estimate with the true pose in the same tick."""
     account, truth = pair.robot(role).account, pair.robot(role).path
     held = account.held if account is not None else ()
     return [(one, truth[one.tick]) for one in held if one.tick < len(truth)]
 
 
 def _errors(axes: Axes, pair: PairRecord, role: Role, name: str, off: Callable[[Pose, Pose], float]) -> None:
-    """Of its likeliest pose, of others that it holds possible; before it has any, of its distance."""
+    """Draw the errors of the most probable pose and of the other possible poses.
+
+    Before the encounter, draw those of the pose relative to the anchor.
+    """
     held, robot, colour = _held(pair, role), pair.robot(role), COLOURS[role]
     anchor = robot.anchor
     alone = [
@@ -183,7 +187,7 @@ def _errors(axes: Axes, pair: PairRecord, role: Role, name: str, off: Callable[[
         if one.local and not one.world
     ]  # fmt: skip
     _line(axes, alone, ls=ALONE[role], lw=1.1, color=colour, gid=f"{name}-alone-{role}",
-          label=f"{robot.id}, seen from its anchor")  # fmt: skip
+          label=f"{robot.id}, relative to its anchor")  # fmt: skip
     single = [one for one in held if one[0].world and (one[0].probabilities or len(one[0].world) == 1)]
     others = [
         (one.tick, off(pose, truth))
@@ -191,23 +195,26 @@ def _errors(axes: Axes, pair: PairRecord, role: Role, name: str, off: Callable[[
         for pose in (one.world[1:] if one.probabilities or len(one.world) == 1 else one.world)
     ]
     _line(axes, others, ls="", marker="x" if role == "a" else "+", ms=5, mew=0.9, color=colour, alpha=0.75,
-          gid=f"{name}-others-{role}", label=f"{robot.id}, others held possible")  # fmt: skip
-    likeliest = [(one.tick, off(one.world[0], truth)) for one, truth in single]
-    _line(axes, likeliest, lw=1.3, ls=LINES[role], ms=4.5, color=colour, gid=f"{name}-{role}",
-          label=f"{robot.id}, of its {'pose' if pair.exact else 'likeliest pose'}",
-          markevery=max(1, math.ceil(len(likeliest) / MARKED)), **MARKS[role])  # fmt: skip
+          gid=f"{name}-others-{role}", label=f"{robot.id}, other possible poses")  # fmt: skip
+    most_probable = [(one.tick, off(one.world[0], truth)) for one, truth in single]
+    _line(axes, most_probable, lw=1.3, ls=LINES[role], ms=4.5, color=colour, gid=f"{name}-{role}",
+          label=f"{robot.id}, {'pose' if pair.exact else 'most probable pose'}",
+          markevery=max(1, math.ceil(len(most_probable) / MARKED)), **MARKS[role])  # fmt: skip
     sigmas = [
         (one.tick, SIGMAS * (c.position_sigma if name == "position" else c.heading_sigma))
         for one, _ in single
         if (c := one.covariance) is not None
     ]
     _line(axes, sigmas, lw=0.9, ls=CLAIMED[role], color=colour, gid=f"{name}-sigma-{role}",
-          label=rf"{robot.id}, 3 $\sigma$ as claimed")  # fmt: skip
+          label=rf"{robot.id}, claimed 3 $\sigma$")  # fmt: skip
 
 
 def _alone(pose: Pose, truth: Pose) -> dict[str, float]:
-    """All that can be off before the two have met, both in the frame of the anchor: the distance to it, and
-    mu, the heading relative to the line from it."""
+    """Return the errors that are defined before the encounter, for two poses in the anchor's frame.
+
+    These are the error of the distance to the anchor, in m, and that of mu, the heading relative to the line
+    from the anchor, in rad.
+    """
     mu, true = (one.heading - math.atan2(one.y, one.x) for one in (pose, truth))
     return {
         "position": abs(math.hypot(pose.x, pose.y) - math.hypot(truth.x, truth.y)),
@@ -216,7 +223,7 @@ def _alone(pose: Pose, truth: Pose) -> dict[str, float]:
 
 
 def _line(axes: Axes, points: Points, **looks: Any) -> None:
-    """Nothing, where there are none."""
+    """Plot `points`, if there are any; a single point gets a marker."""
     if len(points) == 1:
         looks = {"marker": ".", **looks}
     if points:
@@ -230,21 +237,21 @@ def _claimed(axes: Axes, pair: PairRecord, role: Role, of_claim: Callable[[Claim
             claim.tick, max(of_claim(claim), LEAST), MARKS[role]["marker"], ms=11, mfc="none", mec=INK,
             mew=1.2,
             ls="", clip_on=False, gid=f"claim-{role}",
-            label=f"{pair.robot(role).id} claims, $k$ = {claim.tick}",
+            label=f"claim of {pair.robot(role).id}, $k$ = {claim.tick}",
         )  # fmt: skip
 
 
 def _scale(panels: Sequence[Axes], pair: PairRecord, name: str) -> None:
-    """One scale for both; with a line at what would be wrong, where sensors are exact."""
+    """Set one scale for both panels, and draw the limit: the tolerance, or with noise the required sigma."""
     for axes in panels:
         axes.set_yscale("log")
         if pair.exact:
             axes.axhline(TOLERANCE, ls="-.", lw=0.9, color=PALE, gid=f"{name}-tolerance", zorder=1,
-                         label="wrong, if more: $10^{-6}$")  # fmt: skip
+                         label="tolerance: $10^{-6}$")  # fmt: skip
         elif name == "position":
-            asked = pair.mission.accuracy
-            axes.axhline(asked, ls="--", lw=0.9, color=PALE, gid="accuracy", zorder=1,
-                         label=rf"$\sigma$ asked for: {asked:g} m")  # fmt: skip
+            required = pair.mission.accuracy
+            axes.axhline(required, ls="--", lw=0.9, color=PALE, gid="accuracy", zorder=1,
+                         label=rf"required $\sigma$: {required:g} m")  # fmt: skip
     values = [float(y) for axes in panels for one in axes.lines for y in np.ravel(one.get_ydata()) if y > 0.0]
     for axes in panels:
         if values:

@@ -1,4 +1,4 @@
-"""What there is to tell of a pair: where both were, what each measured, and each robot's own account."""
+"""The data of a pair for figures: true paths, measurements, and the planner states of both robots."""
 
 from __future__ import annotations
 
@@ -25,76 +25,78 @@ ROLES: tuple[Role, Role] = ("a", "b")
 
 
 class Side(msgspec.Struct, frozen=True):
-    """One of the two, tick by tick."""
+    """One robot of a pair, with one entry per tick in each sequence."""
 
     id: str
     anchor: Anchor
     orbit: Orbit
     path: tuple[Pose, ...]
-    """where it was; without a world, as it claims, and empty if it never did"""
+    """The true poses; in hardware mode, those implied by the robot's claim, and empty if it made none."""
     commands: tuple[Command | None, ...]
-    """what it set out to do; none, where that did not come"""
+    """The commands; None in ticks whose Command missed the deadline."""
     anchor_ranges: tuple[float | None, ...]
-    """m, as measured"""
+    """The measured ranges to the robot's anchor, in m; None out of range."""
     account: Account | None
-    """none where its journal cannot be read"""
+    """The recomputed planner states; None if the robot's journal cannot be read."""
     claim: Claim | None = None
-    """the first that it made, held against the truth; none without a world"""
+    """The robot's first claim, compared with the ground truth; None in hardware mode."""
 
 
 class PairRecord(msgspec.Struct, frozen=True, dict=True):
     """Two robots that are each other's peers."""
 
     title: str
-    """which run it is of, and how that ended"""
+    """The name of the run and its outcome."""
     mission: Mission
-    """what is known of the mission by all"""
+    """The mission parameters, common to all robots."""
     planner_name: PlannerName
     a: Side
     b: Side
     mutual: tuple[tuple[bool, float | None], ...]
-    """whether the two were in contact, and the range that was measured, tick by tick; where the two measured
-    it each for itself, a's, or where a has none, b's"""
+    """One entry per tick: whether the robots were in contact, and the measured range in m.
+
+    In hardware mode, in which both robots measure, it is the range of a, or that of b if a has none.
+    """
     recording: Recording | None
-    """of the truth; none without a world"""
+    """The recording with the ground truth; None in hardware mode."""
 
     @property
     def name(self) -> str:
-        """Of the pair, in names of files."""
+        """The name of the pair in file names."""
         return f"{self.a.id}-{self.b.id}"
 
     @property
     def exact(self) -> bool:
-        """Whether its sensors are."""
+        """True if the sensors are exact."""
         return self.mission.noise.exact
 
     @property
     def last(self) -> int:
-        """The last tick on record."""
+        """The last recorded tick."""
         return max(0, len(self.mutual) - 1)
 
     @property
     def true(self) -> bool:
-        """Whether paths are true, and not what the robots claim."""
+        """True if the paths are the ground truth, and not implied by claims."""
         return self.recording is not None
 
     @property
     def placed(self) -> int:
-        """Ticks, from 0 on, in which it is known, or claimed, where both were."""
+        """The number of ticks, from 0 on, in which the poses of both robots are known or claimed."""
         return min(len(self.a.path), len(self.b.path))
 
     def robot(self, role: Role) -> Side:
-        """Who plays it."""
+        """Return the robot with `role`."""
         return self.a if role == "a" else self.b
 
     def command(self, role: Role, tick: int) -> Command | None:
-        """What it set out to do then; none, if that did not come."""
+        """Return the command of the robot with `role` at `tick`; None if there is none."""
         commands = self.robot(role).commands
         return commands[tick] if tick < len(commands) else None
 
     @property
     def unknown(self) -> str | None:
-        """The reason why what the two planned is not known to the end; none if it is."""
+        """The reason why the planner states are incomplete; None if they are complete."""
         robots = [
             side.id
             for side in (self.a, self.b)
@@ -102,21 +104,21 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
         ]  # fmt: skip
         if not robots:
             return None
-        return f"the journal of {' and '.join(robots)} is missing, or cannot be followed to its end"
+        return f"the journal of {' and '.join(robots)} is missing or cannot be replayed to its end"
 
     @property
-    def told(self) -> list[Role]:
-        """Those whose journal can be read."""
+    def readable(self) -> list[Role]:
+        """The roles of the robots whose journals can be read."""
         return [role for role in ROLES if self.robot(role).account is not None]
 
     def states(self, role: Role) -> tuple[RobotState, ...]:
-        """After each tick, as far as the rest of the record goes."""
+        """Return the planner state after each tick, up to the last tick of the recording."""
         account = self.robot(role).account
         return account.states[: max(1, len(self.mutual))] if account is not None else ()
 
     @cached_property
     def separations(self) -> list[float]:
-        """m: how far apart the two were, tick by tick, as far as it is known."""
+        """The distance between the robots in m, one entry per tick in which both poses are known."""
         return [math.hypot(p.x - q.x, p.y - q.y) for p, q in zip(self.a.path, self.b.path, strict=False)]
 
     @cached_property
@@ -132,7 +134,7 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
 
     @cached_property
     def encounter_tick(self) -> int | None:
-        """The first tick in which one of them is in phase 3."""
+        """The first tick in which one of the robots is in phase 3; None if there is none."""
         for tick in range(len(self.mutual)):
             commands = [self.command(role, tick) for role in ROLES]
             if any(command is not None and command.phase == 3 for command in commands):
@@ -141,7 +143,10 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
 
 
 def of_record(recording: Recording, places: tuple[int, int], accounts: Mapping[str, Account]) -> PairRecord:
-    """The robots at those places of the scenario, a first; `accounts` are those that can be read."""
+    """Return the pair at the indices `places` of the scenario's robots, role a first.
+
+    `accounts` holds the readable journals by robot id.
+    """
     scenario, moments = recording.scenario, recording.moments
     last = len(moments) - 1
     how = (
@@ -177,19 +182,22 @@ def of_record(recording: Recording, places: tuple[int, int], accounts: Mapping[s
 
 
 def of_robots(accounts: Mapping[str, Account]) -> PairRecord:
-    """Without a world: of one or both of a pair, each of whom was briefed."""
-    told = {robot: one.past for robot, one in accounts.items() if one.past is not None}
-    config = next(iter(told.values())).config
-    in_order = sorted(told.values(), key=lambda past: past.config.role)
+    """Return a pair in hardware mode, from the journals of one or both of its robots.
+
+    At least one journal must hold a configuration.
+    """
+    pasts = {robot: one.past for robot, one in accounts.items() if one.past is not None}
+    config = next(iter(pasts.values())).config
+    in_order = sorted(pasts.values(), key=lambda past: past.config.role)
     mutual: list[tuple[bool, float | None]] = []
-    for tick in range(max([len(past.steps) for past in told.values()])):
-        met = [one for past in in_order if (one := past.contact(tick)) is not None]
-        mutual.append((bool(met), next((one.range for one in met if one.range is not None), None)))
+    for tick in range(max([len(past.steps) for past in pasts.values()])):
+        contacts = [one for past in in_order if (one := past.contact(tick)) is not None]
+        mutual.append((bool(contacts), next((one.range for one in contacts if one.range is not None), None)))
 
     def side(role: Role) -> Side:
         own = config.role == role
         robot = config.robot if own else config.peer
-        past = told.get(robot)
+        past = pasts.get(robot)
         steps = past.steps if past is not None else ()
         return Side(
             id=robot,
@@ -202,7 +210,7 @@ def of_robots(accounts: Mapping[str, Account]) -> PairRecord:
         )
 
     pair = PairRecord(
-        title=f"{' and '.join(told)} without a world, {config.planner_name}: {outcome(told)}",
+        title=f"{' and '.join(pasts)} in hardware mode, {config.planner_name}: {outcome(pasts)}",
         mission=config.mission,
         planner_name=config.planner_name,
         a=side("a"),
@@ -210,4 +218,4 @@ def of_robots(accounts: Mapping[str, Account]) -> PairRecord:
         mutual=tuple(mutual),
         recording=None,
     )
-    return replace(pair, title=f"{pair.title}; places by their claims") if pair.placed else pair
+    return replace(pair, title=f"{pair.title}; positions from claims") if pair.placed else pair

@@ -1,4 +1,4 @@
-"""Phase 1 of a robot in the frame of its anchor, as Fig. 3(b) shows it, with both branches."""
+"""Phase 1 of a robot in its anchor's frame with both branches, like Fig. 3(b)."""
 
 from __future__ import annotations
 
@@ -21,46 +21,45 @@ from protocol.motion import Pose, compose
 
 WIDTH, BESIDE, TALLEST = 4.3, 2.5, 4.6
 FEW = 4
-"""ranges of which each ring is named"""
+"""The maximum number of ranges for which each circle has an entry in the key."""
 SAME = 0.03
-"""of the longest range: places nearer than this share a name"""
+"""The distance below which two positions share a label, as a fraction of the longest range."""
 EXPLAINED = 1e-9
-"""of R: ranges and silence that differ by less are drawn as explained"""
-Seen = list[tuple[Pose, float | None]]
+"""The largest residual of a consistent range or missing detection, as a fraction of R."""
+Track = list[tuple[Pose, float | None]]
+"""The odometry pose and the anchor range in m, or None out of range, at each tick."""
 
 
-Fate = Literal["kept", "rejected", "possible"]
-"""what phase 1 made of a branch; possible, where it is not over"""
-WORDS: dict[Fate, str] = {"kept": "kept", "rejected": "ruled out", "possible": "possible"}
-LINES: dict[Fate, str] = {"kept": "-", "rejected": ":", "possible": "--"}
+Status = Literal["kept", "rejected", "possible"]
+"""The status of a branch at the end of phase 1; "possible" if phase 1 has not ended."""
+WORDS: dict[Status, str] = {"kept": "selected", "rejected": "ruled out", "possible": "possible"}
+LINES: dict[Status, str] = {"kept": "-", "rejected": ":", "possible": "--"}
 
 
 class DrawnBranch(NamedTuple):
-    """A branch, as it is drawn."""
+    """A branch with its status and its name in the key."""
 
     branch: Branch
-    fate: Fate
+    status: Status
     name: str
 
 
 def draw(pair: PairRecord, role: Role) -> Figure | Absent:
-    """The branches, the rings of the ranges, and the sensing range."""
+    """Return the figure of the branches, with circles of the measured ranges and of the sensing range."""
     state = _at_its_end(pair.states(role))
     if state is None:
-        return Absent("there is no tick of it on record")
-    told = _told(pair.states(role), state)
-    if not told:
-        why = (
-            "it began on its anchor" if state.belief.branch_kind == "on-anchor" else "it has no second range"
-        )
-        return Absent(why)
-    seen = state.seen()
+        return Absent("the recording has no tick of the robot")
+    branches = _branches(pair.states(role), state)
+    if not branches:
+        on_anchor = state.belief.branch_kind == "on-anchor"
+        return Absent("the robot starts on its anchor" if on_anchor else "the robot has no second range")
+    track = state.seen()
     reach = pair.mission.sensing_range
     points = [(x, y) for x in (-reach, reach) for y in (-reach, reach)]
-    for one in told:
-        points += [(place.x, place.y) for place in _places(one.branch, seen)]
+    for one in branches:
+        points += [(place.x, place.y) for place in _places(one.branch, track)]
     if state.belief.branch_kind == "three-ranges-virtual":
-        virtual = told[0].branch.distance(state.odometry)
+        virtual = branches[0].branch.distance(state.odometry)
         points += [(x, y) for x in (-virtual, virtual) for y in (-virtual, virtual)]
     window = around(points, 0.05)
     width, height = fitted(window, WIDTH, TALLEST)
@@ -68,12 +67,12 @@ def draw(pair: PairRecord, role: Role) -> Figure | Absent:
     axes = sheet.panel(0.55, 0.42, width, height)
     circle(axes, (0, 0), reach, lw=1.2, ls="-", color="k", gid="range", label=f"$R$ = {reach:g} m")
     axes.plot(0, 0, "x", color="k", ms=7, mew=1.6, ls="", gid="anchor", label=f"anchor ${ANCHORS[role]}$")
-    _rings(axes, seen, told[0].branch, state.belief.branch_kind)
-    for i, one in enumerate(told):
-        _draw(axes, role, one, seen, pair.exact, named=i < 2 or pair.exact)
-        if one.fate == "rejected" and pair.exact:
-            _contradictions(axes, one.branch, seen, reach)
-    _name_points(axes, seen, told[0].branch)
+    _circles(axes, track, branches[0].branch, state.belief.branch_kind)
+    for i, one in enumerate(branches):
+        _draw(axes, role, one, track, pair.exact, named=i < 2 or pair.exact)
+        if one.status == "rejected" and pair.exact:
+            _contradictions(axes, one.branch, track, reach)
+    _name_points(axes, track, branches[0].branch)
     equal(axes, window)
     axes.set_xlabel("$x$ [m]")
     axes.set_ylabel("$y$ [m]")
@@ -82,73 +81,74 @@ def draw(pair: PairRecord, role: Role) -> Figure | Absent:
 
 
 def _at_its_end(states: Sequence[RobotState]) -> RobotState | None:
-    """The mind in the tick in which phase 1 is over; or the last there is of it."""
+    """Return the state in the tick in which phase 1 ends, or the last state in phase 1."""
     for state in states:
         if state.belief.phase1_done_tick is not None:
             return state
-    alone = [state for state in states if state.phase == 1]
-    return alone[-1] if alone else None
+    in_phase = [state for state in states if state.phase == 1]
+    return in_phase[-1] if in_phase else None
 
 
-def _told(states: Sequence[RobotState], end: RobotState) -> list[DrawnBranch]:
-    """The branches that were held, the one that was kept first."""
+def _branches(states: Sequence[RobotState], end: RobotState) -> list[DrawnBranch]:
+    """Return the branches considered in phase 1, the selected one first."""
     if end.config.mission.noise.exact:
-        held = list(end.belief.possible)
-        kept = end.belief.branch
+        branches = list(end.belief.possible)
+        selected = end.belief.branch
     else:
         most = max([len(state.belief.branches) for state in states if state.tick <= end.tick], default=0)
         first = next((m for m in states if len(m.belief.branches) == most and m.tick <= end.tick), end)
-        held = list(first.belief.branches)
-        kept = end.belief.branches[0] if end.belief.phase1_done_tick is not None else None
-    if not held:
+        branches = list(first.belief.branches)
+        selected = end.belief.branches[0] if end.belief.phase1_done_tick is not None else None
+    if not branches:
         return []
-    if kept is not None:
-        held.sort(key=lambda one: math.dist(one.anchor, kept.anchor))
-        held[0] = kept  # polished by what came since
-    fates: list[Fate] = ["possible" if kept is None else "rejected" for _ in held]
-    if kept is not None:
-        fates[0] = "kept"
+    if selected is not None:
+        branches.sort(key=lambda one: math.dist(one.anchor, selected.anchor))
+        branches[0] = selected  # its estimate uses all measurements up to the end of phase 1
+    statuses: list[Status] = ["possible" if selected is None else "rejected" for _ in branches]
+    if selected is not None:
+        statuses[0] = "kept"
     return [
-        DrawnBranch(branch, fate, _name(branch, held, end)) for branch, fate in zip(held, fates, strict=True)
-    ]  # fmt: skip
+        DrawnBranch(branch, status, _name(branch, branches, end))
+        for branch, status in zip(branches, statuses, strict=True)
+    ]
 
 
-def _name(branch: Branch, held: Sequence[Branch], end: RobotState) -> str:
+def _name(branch: Branch, branches: Sequence[Branch], end: RobotState) -> str:
     sign = "+" if branch.alpha >= 0.0 else "-"
     if end.config.mission.noise.exact:
         return rf"${sign}\alpha$, $\alpha = {abs(branch.alpha):.4f}$ rad"
-    others = "another" if len(held) == 2 else f"{len(held) - 1} others"
-    return "the likeliest" if branch is held[0] else others
+    others = "other branch" if len(branches) == 2 else f"{len(branches) - 1} other branches"
+    return "most probable branch" if branch is branches[0] else others
 
 
 def _title(pair: PairRecord, role: Role, state: RobotState) -> str:
     robot = pair.robot(role).id
     frame = rf"$\langle {role}({ANCHORS[role]})\rangle$"
     if state.belief.phase1_done_tick is None:
-        how = f"not over at $k$ = {state.tick}"
+        result = f"not finished at $k$ = {state.tick}"
     else:
-        how = f"{_how(state)}, over at $k$ = {state.belief.phase1_done_tick}"
-    return f"Phase 1 of {robot} in {frame}: {how}"
+        result = f"{_measurements(state)}, finished at $k$ = {state.belief.phase1_done_tick}"
+    return f"Phase 1 of {robot} in {frame}: {result}"
 
 
-def _how(state: RobotState) -> str:
+def _measurements(state: RobotState) -> str:
     ranges = f"{len(state.log.ranges)} ranges"
     match state.belief.branch_kind:
         case "three-ranges-virtual":
             return f"{ranges} and a virtual one"
         case "circle":
-            return f"{ranges}, and silence on the circle"
+            return f"{ranges} and no detection on the circle"
         case _:
             return ranges
 
 
-def _places(branch: Branch, seen: Seen) -> list[Pose]:
-    return [compose(branch.start, pose) for pose, _ in seen]
+def _places(branch: Branch, track: Track) -> list[Pose]:
+    return [compose(branch.start, pose) for pose, _ in track]
 
 
-def _rings(axes: Axes, seen: Seen, branch: Branch, kind: BranchKind | None) -> None:
-    """The ranges, as circles about the anchor; the virtual one too."""
-    ranged = [(tick, rho) for tick, (_, rho) in enumerate(seen) if rho is not None]
+def _circles(axes: Axes, track: Track, branch: Branch, kind: BranchKind | None) -> None:
+    """Draw the ranges, including a virtual one, as circles about the anchor."""
+    ranged = [(tick, rho) for tick, (_, rho) in enumerate(track) if rho is not None]
     styles = [(0, (6, 2)), (0, (3, 2)), (0, (1, 1.5)), (0, (6, 2, 1, 2))]
     for i, (tick, rho) in enumerate(ranged):
         named = i < FEW if len(ranged) <= FEW else i < 2
@@ -158,50 +158,52 @@ def _rings(axes: Axes, seen: Seen, branch: Branch, kind: BranchKind | None) -> N
             label=rf"$\rho_{i}$ = {rho:.4f} m, $k$ = {tick}" if named else None,
         )  # fmt: skip
     if len(ranged) > FEW:
-        axes.plot([], [], "-", lw=0.4, color=PALER, label=f"{len(ranged) - 2} ranges more")
+        axes.plot([], [], "-", lw=0.4, color=PALER, label=f"{len(ranged) - 2} more ranges")
     if kind == "three-ranges-virtual":
-        rho = branch.distance(seen[-1][0])
+        rho = branch.distance(track[-1][0])
         circle(
             axes, (0, 0), rho, lw=0.9, ls=styles[3], color=PALE, gid="rho-virtual", zorder=1,
-            label=rf"$\rho_{len(ranged)}$ = {rho:.4f} m, virtual, $k$ = {len(seen) - 1}",
+            label=rf"$\rho_{len(ranged)}$ = {rho:.4f} m, virtual, $k$ = {len(track) - 1}",
         )  # fmt: skip
 
 
-def _draw(axes: Axes, role: Role, one: DrawnBranch, seen: Seen, exact: bool, named: bool) -> None:
-    """The path that it says was driven."""
-    places, kept = _places(one.branch, seen), one.fate == "kept"
-    colour = COLOURS[role] if kept else INK
-    fate = "given up" if one.fate == "rejected" and not exact else WORDS[one.fate]
+def _draw(axes: Axes, role: Role, one: DrawnBranch, track: Track, exact: bool, named: bool) -> None:
+    """Draw the path implied by a branch."""
+    places, selected = _places(one.branch, track), one.status == "kept"
+    colour = COLOURS[role] if selected else INK
+    status = "discarded" if one.status == "rejected" and not exact else WORDS[one.status]
     axes.plot(
-        [p.x for p in places], [p.y for p in places], LINES[one.fate], lw=1.5 if kept else 1.3, color=colour,
-        zorder=3 if kept else 2, gid=one.fate, label=f"{one.name}, {fate}" if named else None,
+        [p.x for p in places], [p.y for p in places], LINES[one.status], lw=1.5 if selected else 1.3,
+        color=colour, zorder=3 if selected else 2, gid=one.status,
+        label=f"{one.name}, {status}" if named else None,
     )  # fmt: skip
-    ranged = [p for p, (_, rho) in zip(places, seen, strict=True) if rho is not None]
-    silent = [p for p, (_, rho) in zip(places, seen, strict=True) if rho is None]
-    for points, face, gid in ((ranged, colour, "ranged"), (silent, "white", "silent")):
+    ranged = [p for p, (_, rho) in zip(places, track, strict=True) if rho is not None]
+    undetected = [p for p, (_, rho) in zip(places, track, strict=True) if rho is None]
+    for points, face, gid in ((ranged, colour, "ranged"), (undetected, "white", "silent")):
         if points:
             axes.plot(
                 [p.x for p in points], [p.y for p in points], MARKS[role]["marker"], ms=5, mfc=face,
-                mec=colour, mew=1.0, ls="", zorder=4 if kept else 2.5, gid=f"{gid}-{one.fate}",
-                label=("ranged" if gid == "ranged" else "silent: out of range") if kept else None,
+                mec=colour, mew=1.0, ls="", zorder=4 if selected else 2.5, gid=f"{gid}-{one.status}",
+                label=("range measured" if gid == "ranged" else "no detection") if selected else None,
             )  # fmt: skip
 
 
-def _contradictions(axes: Axes, branch: Branch, seen: Seen, reach: float) -> None:
-    against, places = contradicted(branch, seen, reach), _places(branch, seen)
+def _contradictions(axes: Axes, branch: Branch, track: Track, reach: float) -> None:
+    """Mark the measurements that rule out `branch`."""
+    against, places = contradicted(branch, track, reach), _places(branch, track)
     if against:
         ticks = ", ".join(map(str, against))
         axes.plot(
             [places[k].x for k in against], [places[k].y for k in against], "x", ms=9, mew=1.3, color=INK,
-            ls="", zorder=5, gid="contradicted", label=f"what rules it out: $k$ = {ticks}",
+            ls="", zorder=5, gid="contradicted", label=f"ruled out by $k$ = {ticks}",
         )  # fmt: skip
 
 
-def contradicted(branch: Branch, seen: Seen, reach: float) -> list[int]:
-    """The ticks whose range, or silence, `branch` does not explain."""
+def contradicted(branch: Branch, track: Track, reach: float) -> list[int]:
+    """Return the ticks whose range, or missing detection within `reach` m, is inconsistent with `branch`."""
     return [
         tick
-        for tick, (pose, rho) in enumerate(seen)
+        for tick, (pose, rho) in enumerate(track)
         if (
             branch.distance(pose) <= reach * (1.0 - EXPLAINED)
             if rho is None
@@ -210,15 +212,15 @@ def contradicted(branch: Branch, seen: Seen, reach: float) -> list[int]:
     ]
 
 
-def _name_points(axes: Axes, seen: Seen, branch: Branch) -> None:
-    """p_0 and the places of the next ranges."""
-    places = _places(branch, seen)
-    rim = max(rho for _, rho in seen if rho is not None)
-    named = [tick for tick, (_, rho) in enumerate(seen) if rho is not None][:3]
+def _name_points(axes: Axes, track: Track, branch: Branch) -> None:
+    """Label p_0, p_1 and p_2, the positions of the first three ranges."""
+    places = _places(branch, track)
+    rim = max(rho for _, rho in track if rho is not None)
+    named = [tick for tick, (_, rho) in enumerate(track) if rho is not None][:3]
     for i, tick in enumerate(named):
         place = places[tick]
         if any(travelled(place, places[other]) < SAME * rim for other in named[:i]):
-            continue  # back where it was
+            continue  # the robot has returned to a labelled position
         away = math.hypot(place.x, place.y) or 1.0
         axes.annotate(
             f"$p_{i}$", (place.x, place.y), xytext=(11 * place.x / away, 11 * place.y / away),

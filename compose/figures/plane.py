@@ -1,4 +1,4 @@
-"""The plane: where both robots were, and where one of them thought it was."""
+"""The plane: the true paths of both robots, and the estimates of one of them."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ from protocol.rounding import TOLERANCE
 from world.scenario import RobotSpec
 
 Window = tuple[float, float, float, float]
-"""left, right, low, high"""
+"""Left, right, low and high, in m."""
 
 AGES = LinearSegmentedColormap.from_list("ages", ["#e0a8d8", "#a8459c", "#4a0d52"])
-"""of an estimate: the first, to the last"""
+"""The colours of estimates over time, from the first to the last."""
 GHOST = "0.55"
 SIGMAS = 3.0
 ELLIPSES = 5
-"""at the most"""
+"""The maximum number of error ellipses."""
 SMALLER = 0.75
-"""of the next ellipse in time, where neither stands outside the other: then both are legible"""
+"""The largest size ratio, later over earlier, at which two overlapping ellipses are both legible."""
 AROUND = 2.2
-"""sizes of the last ellipse, to be seen around the truth"""
+"""The maximum half-width of the enlarged panel, as a multiple of the last ellipse's size."""
 EXACTLY = 0.02
-"""of the sensing range, to be seen around the truth where there is no ellipse"""
+"""The minimum half-width of the enlarged panel with exact sensors, as a fraction of the sensing range."""
 ARROW = 0.55
-"""of that: how long a heading is drawn"""
+"""The length of a heading arrow, as a fraction of that half-width."""
 MANY = 400
-"""ticks of a path, too many to mark each"""
+"""The number of ticks above which a path has no markers."""
 
 
 def window(story: Story) -> Window:
-    """What of the plane is to be seen: both paths, and both anchors' ranges."""
+    """Return the window that contains both paths and both anchors' sensing ranges."""
     reach = story.recording.scenario.mission.sensing_range
     points = [(pose.x, pose.y) for one in (story.own, story.peer) for pose in story.truth(one.id)]
     for one in (story.own, story.peer):
@@ -51,8 +51,8 @@ def window(story: Story) -> Window:
 
 
 def draw(axes: Axes, story: Story) -> None:
-    """The mission, from above."""
-    seen = window(story)
+    """Draw the mission from above."""
+    visible = window(story)
     for one in (story.own, story.peer):
         _anchor(axes, one, story)
     _path(axes, story, story.own)
@@ -61,19 +61,19 @@ def draw(axes: Axes, story: Story) -> None:
         ends = [story.truth(one.id)[story.encounter_tick] for one in (story.own, story.peer)]
         axes.plot(
             [p.x for p in ends], [p.y for p in ends], ":", color="0.1", lw=1.3, gid="met",
-            label=f"where they met, tick {story.encounter_tick}",
+            label=f"encounter, tick {story.encounter_tick}",
         )  # fmt: skip
-    _ghosts(axes, story, seen)
+    _ghosts(axes, story, visible)
     _estimates(axes, story)
     axes.set_aspect("equal", anchor="N")
-    axes.set_xlim(*seen[:2])
-    axes.set_ylim(*seen[2:])
+    axes.set_xlim(*visible[:2])
+    axes.set_ylim(*visible[2:])
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
 
 
 def _anchor(axes: Axes, one: RobotSpec, story: Story) -> None:
-    """Its place, and how far it is heard."""
+    """Draw a robot's anchor and its sensing range."""
     place, reach = (one.anchor.x, one.anchor.y), story.recording.scenario.mission.sensing_range
     own = one is story.own
     axes.plot(*place, "+", color="k", ms=9, mew=1.3, gid=f"anchor-{one.id}")
@@ -85,12 +85,12 @@ def _anchor(axes: Axes, one: RobotSpec, story: Story) -> None:
         bbox={"facecolor": "white", "alpha": 0.7, "pad": 0.5, "lw": 0},
     )  # fmt: skip
     if own:
-        axes.plot([], [], "+", color="k", ms=9, mew=1.3, label="an anchor")
-        axes.plot([], [], "--", color="0.4", lw=0.8, label=f"its sensing range, {reach:g} m")
+        axes.plot([], [], "+", color="k", ms=9, mew=1.3, label="anchor")
+        axes.plot([], [], "--", color="0.4", lw=0.8, label=f"sensing range, {reach:g} m")
 
 
 def _path(axes: Axes, story: Story, one: RobotSpec) -> None:
-    """Where it truly drove; the peer's faintly."""
+    """Draw the true path of a robot; that of the peer is pale."""
     truth, own = story.truth(one.id), one is story.own
     colour, alpha = COLOURS[one.role], 1.0 if own else 0.4
     marker = "." if own and len(truth) <= MANY else ""
@@ -100,12 +100,12 @@ def _path(axes: Axes, story: Story, one: RobotSpec) -> None:
     )  # fmt: skip
     axes.plot(truth[0].x, truth[0].y, "s", ms=6, mfc="white", mec=colour, mew=1.3, alpha=alpha)
     if own:
-        axes.plot([], [], "s", ms=6, mfc="white", mec=colour, mew=1.3, label="released")
+        axes.plot([], [], "s", ms=6, mfc="white", mec=colour, mew=1.3, label="start")
 
 
-def _ghosts(axes: Axes, story: Story, seen: Window) -> None:
-    """Poses held possible that are not the likeliest."""
-    left, right, low, high = seen
+def _ghosts(axes: Axes, story: Story, visible: Window) -> None:
+    """Draw the possible poses that are not the most probable."""
+    left, right, low, high = visible
     ghosts = [pose for estimate, _ in story.placed for pose in story.others(estimate)]
     within = [pose for pose in ghosts if left <= pose.x <= right and low <= pose.y <= high]
     if within:
@@ -116,12 +116,12 @@ def _ghosts(axes: Axes, story: Story, seen: Window) -> None:
 
 
 def name_of_others(story: Story) -> str:
-    """What to call them."""
-    return "other hypotheses" if story.weighed else "held possible"
+    """Return the label of the poses in `story.others`."""
+    return "other hypotheses" if story.weighed else "possible poses"
 
 
 def _estimates(axes: Axes, story: Story) -> None:
-    """The likeliest pose over time, the older the paler, with ellipses where they are legible."""
+    """Draw the most probable pose over time, paler with age, with the legible error ellipses."""
     if not story.likeliest:
         return
     colours, label = ages(story), "estimate, 3 sigma" if legible(story) else "estimate"
@@ -138,7 +138,7 @@ def _estimates(axes: Axes, story: Story) -> None:
 
 
 def ages(story: Story) -> dict[int, str]:
-    """The colour of each likeliest estimate, by its tick."""
+    """Return the colours of the estimates in `story.likeliest`, by tick."""
     ticks = [estimate.tick for estimate, _ in story.likeliest]
     return {
         tick: to_hex(AGES(i / max(1, len(ticks) - 1) if len(ticks) > 1 else 1.0))
@@ -147,9 +147,10 @@ def ages(story: Story) -> dict[int, str]:
 
 
 def legible(story: Story) -> list[tuple[Estimate, Pose]]:
-    """The estimates whose ellipse is drawn, in time: the last, and before it those that it does not hide.
+    """Return the estimates whose ellipses are drawn, with the true poses, in order of time.
 
-    Not one larger than R: that says that nothing is known.
+    These are the last one and earlier ones that later ellipses do not hide, ELLIPSES at most. Ellipses
+    larger than the sensing range R are omitted, because they carry no information.
     """
     chosen: list[tuple[Estimate, Pose]] = []
     largest = story.recording.scenario.mission.sensing_range
@@ -170,7 +171,7 @@ def legible(story: Story) -> list[tuple[Estimate, Pose]]:
 
 
 def _ellipse(axes: Axes, estimate: Estimate, origin: Pose, story: Story, gid: str) -> None:
-    """Where the likeliest pose is claimed to lie, about an `origin` of its own; the last one filled."""
+    """Draw the error ellipse of the most probable position relative to `origin`; the last one is filled."""
     pose, covariance, last = estimate.world[0], estimate.covariance, estimate is story.likeliest[-1][0]
     if covariance is None:
         return
@@ -193,26 +194,26 @@ def _ellipse(axes: Axes, estimate: Estimate, origin: Pose, story: Story, gid: st
 
 
 def draw_near(axes: Axes, story: Story) -> None:
-    """How the estimates lie about the truth, up close: each relative to where the robot was then."""
+    """Draw the estimates relative to the true pose in the same tick, enlarged."""
     axes.set_aspect("equal", adjustable="box", anchor="N")
     if not story.likeliest:
         axes.set_axis_off()
         axes.text(
-            0.5, 0.5, "That a pose in the plane was\nthe likeliest is not on record.",
+            0.5, 0.5, "The recording has no\nmost probable pose.",
             transform=axes.transAxes, ha="center", va="center", color="0.3", gid="nothing-near",
         )  # fmt: skip
         return
-    axes.set_title("closer: estimates about the truth", fontsize=8, color="0.3")
-    axes.set_xlabel("x of estimate - true x [m]")
-    axes.set_ylabel("y of estimate - true y [m]")
+    axes.set_title("estimates relative to the true pose", fontsize=8, color="0.3")
+    axes.set_xlabel("x error [m]")
+    axes.set_ylabel("y error [m]")
     colours, (last, truth), half = ages(story), story.likeliest[-1], _half(story)
     _heading(axes, (0.0, 0.0), truth.heading, half, COLOURS[story.own.role])
     axes.plot(0.0, 0.0, "o", ms=6, color=COLOURS[story.own.role], gid="near-truth", label="true")
     for estimate, then in legible(story) or [(last, truth)]:
-        pose, sign = estimate.world[0], "*" if estimate is last else "D"
+        pose, marker = estimate.world[0], "*" if estimate is last else "D"
         _ellipse(axes, estimate, then, story, f"near-{estimate.tick}")
         axes.plot(
-            pose.x - then.x, pose.y - then.y, sign, ms=10 if estimate is last else 3.5,
+            pose.x - then.x, pose.y - then.y, marker, ms=10 if estimate is last else 3.5,
             color=colours[estimate.tick], mec="white", mew=0.5, zorder=6, label=str(estimate.tick),
         )  # fmt: skip
     off = last.world[0].x - truth.x, last.world[0].y - truth.y
@@ -231,7 +232,7 @@ def draw_near(axes: Axes, story: Story) -> None:
 
 
 def _half(story: Story) -> float:
-    """Half the width of what is to be seen about the truth, in m."""
+    """Return the half-width of the enlarged panel, in m."""
 
     def size(estimate: Estimate, truth: Pose) -> float:
         sigma = estimate.covariance.position_sigma if estimate.covariance is not None else 0.0

@@ -1,4 +1,4 @@
-"""A few moments of a mission, a panel each, in rows; below them a key."""
+"""A series of panels in rows, one per moment of a mission, with a key below them."""
 
 from __future__ import annotations
 
@@ -12,25 +12,28 @@ from matplotlib.figure import Figure
 from compose.figures.sheet import ROW, SMALL, Sheet, Window, around, equal, fitted
 
 LEFT, GAP, KEY = 0.68, 0.42, 0.28
-"""inches: left of panels, between panels, and of the key below them on one line"""
+"""The left margin, the gap between panels, and the height of a key with one row, in inches."""
 HEAD, FOOT, ROOM = 0.36, 0.42, 0.03
-"""inches: above a panel, for what is said of it; below it, for its axis; and between rows"""
+"""The space above a panel for its title, below it for its axis, and between rows, in inches."""
 COLUMNS, PANELS = 3, 6
-"""panels in a row, and in all at the most"""
+"""The maximum number of panels in a row and in total."""
 SIGNS = 6
-"""in the key: side by side below a whole row of panels, else on two lines"""
+"""The number of entries in the key, in one row below a full row of panels and in two rows otherwise."""
 Moment = TypeVar("Moment")
 
 
 def some(moments: list[Moment]) -> list[Moment]:
-    """As many as have room: the first and the last, and others as evenly as can be."""
+    """Return at most PANELS moments: the first, the last, and evenly spaced others."""
     if len(moments) <= PANELS:
         return moments
     return [moments[round(i * (len(moments) - 1) / (PANELS - 1))] for i in range(PANELS)]
 
 
 def square(points: Sequence[tuple[float, float]], margin: float, least: float) -> Window:
-    """The square window that holds `points`, `least` m wide; `margin` is a part of their larger side."""
+    """Return the square window that contains `points` and is at least `least` m wide.
+
+    `margin` is a fraction of the larger side of the points' bounding box.
+    """
     left, right, low, high = around(points, margin)
     half = 0.5 * max(right - left, high - low, least)
     x, y = (left + right) / 2, (low + high) / 2
@@ -38,10 +41,14 @@ def square(points: Sequence[tuple[float, float]], margin: float, least: float) -
 
 
 class Series:
-    """Room for `count` panels that show `window` to one scale, `width` inches wide at the most."""
+    """A figure with `count` panels that show `window` to one scale."""
 
     def __init__(self, count: int, window: Window, width: float, narrowest: float, lines: Sequence[str]):
-        """`narrowest` is the least width of the whole, in inches; `lines` are its title (see `Sheet`)."""
+        """Create the figure.
+
+        `width` is the maximum width of a panel and `narrowest` the minimum width of the figure, in inches;
+        `lines` are its title (see `Sheet`).
+        """
         self._window = window
         self._width, self._height = fitted(window, width, math.inf)
         self._columns, self._rows = min(COLUMNS, count), math.ceil(count / COLUMNS)
@@ -53,11 +60,11 @@ class Series:
 
     @property
     def figure(self) -> Figure:
-        """All of it."""
+        """The whole figure."""
         return self._sheet.figure
 
     def panel(self, place: int, title: str) -> Axes:
-        """The panel at `place`, from 0 on."""
+        """Add and return the panel at index `place`, row by row, starting at 0."""
         row, column = divmod(place, self._columns)
         left = LEFT + column * (self._width + GAP)
         bottom = self._key + FOOT + (self._rows - 1 - row) * self._row
@@ -70,5 +77,5 @@ class Series:
         return axes
 
     def key(self, panel: Axes) -> None:
-        """What the signs in `panel` mean."""
+        """Draw the legend of `panel` below all panels."""
         self._sheet.key(panel, LEFT, self._key - 0.05, columns=self._signs)

@@ -1,6 +1,6 @@
-"""A picture's paper: panels placed in inches, a title, keys beside the panels.
+"""The layout of a figure: panels placed in inches, a title, and keys beside the panels.
 
-Nothing is fitted to the size of a text, so the same picture is the same bytes.
+The layout never depends on measured text sizes, so that equal figures are equal byte for byte.
 """
 
 from __future__ import annotations
@@ -17,23 +17,24 @@ from compose.figures.style import INK
 from protocol.mission import Role
 
 LINE, ROW = 0.17, 0.175
-"""inches: of a line of the title, and of a row of a key"""
+"""The heights of a title line and of a row of a key, in inches."""
 CHARACTERS = 14.8
-"""of the title, to an inch"""
+"""The number of title characters per inch."""
 SMALL = 8
-NO_ENCOUNTER = "the two did not meet in phase 3"
-NO_TRUTH = "without a world nobody knows where the two truly were"
-NO_PLACES = "without a world there are only claims of where the two were, and not both claims are on record"
+"""The small font size, in points."""
+NO_ENCOUNTER = "the robots had no encounter (phase 3)"
+NO_TRUTH = "a recording in hardware mode has no ground truth"
+NO_PLACES = "in hardware mode, positions follow from claims, and not both robots made one"
 
 
 ANCHORS: dict[Role, str] = {"a": "M_1", "b": "M_2"}
-"""the paper's names, to stand between two `$`"""
+"""The anchors' names in the paper, for use between two `$`."""
 Window = tuple[float, float, float, float]
-"""of the plane, in m: left, right, low, high"""
+"""A window of the plane: left, right, low and high, in m."""
 
 
 class Absent(NamedTuple):
-    """A picture that does not apply."""
+    """The reason why a figure cannot be drawn."""
 
     why: str
 
@@ -41,7 +42,7 @@ class Absent(NamedTuple):
 class Sheet:
     """A figure of `width` by `height` inches below its title.
 
-    The first line of that is as long as it likes, and stands as it is written; in others `$` enclose symbols.
+    The first line of the title is wrapped and printed literally; in the others `$` encloses symbols.
     """
 
     def __init__(self, width: float, height: float, lines: Sequence[str]) -> None:
@@ -56,13 +57,13 @@ class Sheet:
             )  # fmt: skip
 
     def panel(self, left: float, bottom: float, width: float, height: float) -> Axes:
-        """In inches from the lower left corner."""
+        """Add and return axes; all arguments are in inches, from the lower left corner."""
         return self.figure.add_axes(
             (left / self.width, bottom / self.tall, width / self.width, height / self.tall)
         )
 
     def key(self, panel: Axes, left: float, top: float, columns: int = 1) -> None:
-        """What the signs in `panel` mean; `left` and `top` in inches from the lower left corner."""
+        """Draw the legend of `panel`; `left` and `top` are in inches from the lower left corner."""
         handles, _ = panel.get_legend_handles_labels()
         self.figure.legend(
             handles=handles,
@@ -79,7 +80,7 @@ class Sheet:
 
 
 def circle(axes: Axes, place: tuple[float, float], radius: float, **look: Any) -> None:
-    """Of `radius` about `place`; in a key it is a line."""
+    """Draw a circle of `radius` m about `place`; its entry in the key is a line."""
     label, gid = look.pop("label", None), look.pop("gid", None)
     axes.add_patch(Circle(place, radius, fill=False, gid=gid, **look))
     if label is not None:
@@ -87,12 +88,12 @@ def circle(axes: Axes, place: tuple[float, float], radius: float, **look: Any) -
 
 
 def plain(text: str) -> str:
-    """`text` as it stands, where what is between two `$` would be set as symbols."""
+    """Return `text` with each `$` escaped, for literal printing."""
     return text.replace("$", r"\$")
 
 
 def equal(axes: Axes, window: Window) -> None:
-    """To one scale."""
+    """Set the window of `axes`, with one scale for x and y."""
     left, right, low, high = window
     axes.set_xlim(left, right)
     axes.set_ylim(low, high)
@@ -101,14 +102,14 @@ def equal(axes: Axes, window: Window) -> None:
 
 
 def fitted(window: Window, width: float, tallest: float) -> tuple[float, float]:
-    """Width and height in inches of a panel that shows `window` to one scale."""
+    """Return the width and height of a panel for `window`, within `width` by `tallest` inches."""
     left, right, low, high = window
     scale = min(width / (right - left), tallest / (high - low))
     return scale * (right - left), scale * (high - low)
 
 
 def around(points: Sequence[tuple[float, float]], margin: float) -> Window:
-    """The window that holds `points`; `margin` is a part of its larger side."""
+    """Return the window that contains `points`; `margin` is a fraction of its larger side."""
     xs, ys = zip(*points, strict=True)
     more = margin * max(max(xs) - min(xs), max(ys) - min(ys))
     return min(xs) - more, max(xs) + more, min(ys) - more, max(ys) + more

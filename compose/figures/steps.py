@@ -1,4 +1,4 @@
-"""The encounter step by step, as Figs. 3(d) and 4(c) show it: a panel for each mutual range."""
+"""The encounter step by step, like Figs. 3(d) and 4(c), with one panel per mutual range."""
 
 from __future__ import annotations
 
@@ -17,43 +17,43 @@ from protocol.mission import Role
 from protocol.motion import Pose
 
 WIDTH, NARROWEST = 2.35, 5.4
-"""inches: of a panel at the most, and of the whole at the least"""
+"""The maximum width of a panel and the minimum width of the figure, in inches."""
 BEFORE = 2
-"""ticks before the encounter that are seen"""
+"""The number of ticks shown before the encounter."""
 ARROW = 0.12
-"""of the window: how long a heading is drawn"""
+"""The length of a heading arrow, as a fraction of the window's width."""
 
 
 def draw(pair: PairRecord) -> Figure | Absent:
-    """The ticks in which the two were ranged from new places."""
+    """Return the figure of the mutual ranges measured from new positions."""
     if not pair.placed:
         return Absent(NO_PLACES)
     ticks = steps(pair)
     if not ticks:
-        return Absent(NO_ENCOUNTER if pair.encounter_tick is None else "no mutual range was measured in it")
+        return Absent(NO_ENCOUNTER if pair.encounter_tick is None else "the encounter has no mutual range")
     shown = some(ticks)
     window = _window(pair, ticks[0], shown[-1])
     series = Series(len(shown), window, WIDTH, NARROWEST, [pair.title, _title(ticks, shown)])
     for i, tick in enumerate(shown):
-        axes = series.panel(i, _said(pair, tick, i + 1))
+        axes = series.panel(i, _panel_title(pair, tick, i + 1))
         _panel(axes, pair, ticks[0], shown[i - 1] if i else tick, tick)
-    _signs(axes, pair)
+    _key(axes, pair)
     series.key(axes)
     return series.figure
 
 
 def steps(pair: PairRecord) -> list[int]:
-    """The ticks of phase 3 with a mutual range that is taken from elsewhere than the one before."""
+    """Return the ticks of phase 3 with a mutual range whose positions differ from the previous one's."""
     if pair.encounter_tick is None:
         return []
-    told: list[int] = []
+    ticks: list[int] = []
     for tick in range(pair.encounter_tick, min(pair.last + 1, pair.placed)):
         if pair.mutual[tick][1] is None:
             continue
-        if told and all(pair.robot(role).path[told[-1]] == pair.robot(role).path[tick] for role in ROLES):
+        if ticks and all(pair.robot(role).path[ticks[-1]] == pair.robot(role).path[tick] for role in ROLES):
             continue
-        told.append(tick)
-    return told
+        ticks.append(tick)
+    return ticks
 
 
 def _window(pair: PairRecord, first: int, last: int) -> Window:
@@ -63,24 +63,22 @@ def _window(pair: PairRecord, first: int, last: int) -> Window:
 
 def _title(ticks: list[int], shown: list[int]) -> str:
     if len(ticks) == 1:
-        return f"The encounter: its mutual range, $k$ = {ticks[0]}"
-    many = (
-        f"{len(shown)} of its {len(ticks)} mutual ranges" if len(shown) < len(ticks) else "its mutual ranges"
-    )
-    return f"The encounter: {many}, $k$ = {ticks[0]} to {ticks[-1]}"
+        return f"Encounter: mutual range at $k$ = {ticks[0]}"
+    many = f"{len(shown)} of {len(ticks)} mutual ranges" if len(shown) < len(ticks) else "mutual ranges"
+    return f"Encounter: {many}, $k$ = {ticks[0]} to {ticks[-1]}"
 
 
-def _said(pair: PairRecord, tick: int, number: int) -> str:
-    """The range, and what each robot then sets out to do."""
+def _panel_title(pair: PairRecord, tick: int, number: int) -> str:
+    """Return the title of a panel: the range, and the state of each robot's command."""
     rho = pair.mutual[tick][1]
-    doing = []
+    states = []
     for role in ROLES:
         command = pair.command(role, tick)
-        doing.append(f"{pair.robot(role).id}: {command.state if command is not None else 'no answer'}")
-    return f"({number}) $k$ = {tick}, " + rf"$\rho$ = {rho:.4f} m" + "\n" + ", ".join(doing)
+        states.append(f"{pair.robot(role).id}: {command.state if command is not None else 'no command'}")
+    return f"({number}) $k$ = {tick}, " + rf"$\rho$ = {rho:.4f} m" + "\n" + ", ".join(states)
 
 
-def _panel(axes: Axes, pair: PairRecord, met: int, before: int, tick: int) -> None:
+def _panel(axes: Axes, pair: PairRecord, first: int, before: int, tick: int) -> None:
     for role in ROLES:
         one = pair.robot(role)
         place = (one.anchor.x, one.anchor.y)
@@ -94,13 +92,13 @@ def _panel(axes: Axes, pair: PairRecord, met: int, before: int, tick: int) -> No
             zorder=1,
         )
         poses = pair.robot(role).path
-        _trail(axes, poses[max(0, met - BEFORE) : before + 1], 1.0, PALE)
+        _trail(axes, poses[max(0, first - BEFORE) : before + 1], 1.0, PALE)
         _trail(axes, poses[before : tick + 1], 2.0, COLOURS[role])
-        for k in range(max(0, met - BEFORE), tick + 1):
+        for k in range(max(0, first - BEFORE), tick + 1):
             _place(axes, role, poses[k], ranged=pair.mutual[k][1] is not None, now=k == tick)
     ends = [pair.robot(role).path[tick] for role in ROLES]
     axes.plot([p.x for p in ends], [p.y for p in ends], ":", color=INK, lw=1.4, zorder=3, gid=f"rho-{tick}")
-    left, right, _, _ = _window(pair, met, tick)
+    left, right, _, _ = _window(pair, first, tick)
     for role, pose in zip(ROLES, ends, strict=True):
         heading(axes, pose, ARROW * (right - left), COLOURS[role], zorder=6)
 
@@ -113,7 +111,7 @@ def _trail(axes: Axes, poses: Sequence[Pose], width: float, colour: str) -> None
 
 
 def _place(axes: Axes, role: Role, pose: Pose, ranged: bool, now: bool) -> None:
-    """Filled, where the two are ranged; the present one large."""
+    """Mark a position: filled if a mutual range was measured there, large if it is the current one."""
     colour = COLOURS[role]
     axes.plot(
         pose.x, pose.y, MARKS[role]["marker"], ms=7.5 if now else 4, mfc=colour if ranged else "white",
@@ -121,7 +119,7 @@ def _place(axes: Axes, role: Role, pose: Pose, ranged: bool, now: bool) -> None:
     )  # fmt: skip
 
 
-def _signs(axes: Axes, pair: PairRecord) -> None:
+def _key(axes: Axes, pair: PairRecord) -> None:
     for role in ROLES:
         axes.plot(
             [],
@@ -133,7 +131,7 @@ def _signs(axes: Axes, pair: PairRecord) -> None:
             color=COLOURS[role],
             label=pair.robot(role).id,
         )
-    axes.plot([], [], "o", ls="", ms=4, mfc="white", mec=INK, label="not ranged")
+    axes.plot([], [], "o", ls="", ms=4, mfc="white", mec=INK, label="no range")
     axes.plot([], [], ":", color=INK, lw=1.4, label="mutual range")
     axes.plot([], [], ls="", marker=r"$\rightarrow$", ms=12, color=PALE, label="heading")
     axes.plot([], [], ls=DASHES["a"], color=PALE, lw=0.9, label="orbits")

@@ -1,4 +1,4 @@
-"""What there is to tell of one robot of a record."""
+"""The data of one robot of a recording for figures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from world.scenario import RobotSpec
 
 
 class Span(msgspec.Struct, frozen=True):
-    """Ticks in a row in which the robot is in one of the paper's phases."""
+    """The consecutive ticks `first` to `last` in which the robot is in one of the paper's phases."""
 
     phase: int
     first: int
@@ -25,36 +25,36 @@ class Span(msgspec.Struct, frozen=True):
 
 
 class Story(msgspec.Struct, frozen=True, dict=True):
-    """One robot's mission, and what it thought of it."""
+    """One robot's mission: its true path and its estimates."""
 
     recording: Recording
     place: int
-    """in the scenario"""
+    """The index of the robot in the scenario."""
     held: tuple[Estimate, ...]
-    """what it held possible, as it journaled"""
+    """The robot's journaled estimates."""
 
     @property
     def own(self) -> RobotSpec:
-        """Who it is."""
+        """The robot."""
         return self.recording.scenario.robots[self.place]
 
     @property
     def peer(self) -> RobotSpec:
-        """Whom it is to find."""
+        """The robot's peer."""
         return self.recording.scenario.robot(self.own.peer)
 
     @property
     def exact(self) -> bool:
-        """Whether its sensors are: then nothing is likelier than anything else that is possible."""
+        """True if the sensors are exact. Then all possible poses are equally probable."""
         return self.recording.scenario.mission.noise.exact
 
     @property
     def last(self) -> int:
-        """The last tick on record."""
+        """The last recorded tick."""
         return max(0, len(self.recording.moments) - 1)
 
     def truth(self, robot: str | None = None) -> list[Pose]:
-        """Where it was, or `robot`, in every tick; at least where it was released."""
+        """Return the true pose of `robot`, by default this robot, in every tick; at least its start."""
         places = {one.id: i for i, one in enumerate(self.recording.scenario.robots)}
         place = self.place if robot is None else places[robot]
         poses = [moment.truth.poses[place] for moment in self.recording.moments]
@@ -62,54 +62,54 @@ class Story(msgspec.Struct, frozen=True, dict=True):
 
     @cached_property
     def estimates(self) -> list[tuple[Estimate, Pose]]:
-        """Each with where the robot was then, as far as both are on record."""
+        """The estimates, each with the true pose in the same tick, for ticks in which both are recorded."""
         truth = self.truth()
         return [(one, truth[one.tick]) for one in self.held if one.tick < len(truth)]
 
     @cached_property
     def placed(self) -> list[tuple[Estimate, Pose]]:
-        """Those that say where in the plane it is, which nothing tells before the two have met."""
+        """The estimates with poses in the world frame, which exist only from the encounter on."""
         return [(one, truth) for one, truth in self.estimates if one.world]
 
     @cached_property
     def weighed(self) -> bool:
-        """Whether it held one pose for likelier than another, as it does where sensors are not exact."""
+        """True if the estimates have probabilities, which they have only with noisy sensors."""
         return any(one.probabilities for one in self.held)
 
     @cached_property
     def likeliest(self) -> list[tuple[Estimate, Pose]]:
-        """Those of `placed` whose first pose is likelier than others, or the only one."""
+        """The estimates in `placed` whose first pose is the most probable or the only one."""
         return [(one, truth) for one, truth in self.placed if one.probabilities or len(one.world) == 1]
 
     def others(self, estimate: Estimate) -> tuple[Pose, ...]:
-        """Where else in the plane it may be than at the likeliest pose; all of them, where none is that."""
+        """Return the possible world poses but the most probable; all of them if none is more probable."""
         return estimate.world[1:] if estimate.probabilities or len(estimate.world) == 1 else estimate.world
 
     @cached_property
     def claim(self) -> Claim | None:
-        """The first, if it ever claimed."""
+        """The robot's first claim; None if it made none."""
         return first_claim(self.recording, self.place)
 
     @cached_property
     def phases(self) -> tuple[Span, ...]:
-        """In order, over all ticks on record; one in which no Command came goes with those before."""
-        told, phase = [], 1
+        """The phases in order, over all recorded ticks. A tick without a Command has the phase before it."""
+        by_tick, phase = [], 1
         for moment in self.recording.moments:
             command = moment.commands.get(self.own.id)
             phase = command.phase if command is not None else phase
-            told.append((phase, moment.truth.tick))
+            by_tick.append((phase, moment.truth.tick))
         spans = []
-        for phase, ticks in groupby(told, key=lambda one: one[0]):
-            run = [tick for _, tick in ticks]
-            spans.append(Span(phase, run[0], run[-1]))
+        for phase, group in groupby(by_tick, key=lambda one: one[0]):
+            ticks = [tick for _, tick in group]
+            spans.append(Span(phase, ticks[0], ticks[-1]))
         return tuple(spans) or (Span(1, 0, 0),)
 
     @property
     def encounter_tick(self) -> int | None:
-        """The tick in which phase 3 began."""
+        """The tick in which phase 3 began; None if it did not."""
         return next((span.first for span in self.phases if span.phase == 3), None)
 
 
 def error(pose: Pose, truth: Pose) -> float:
-    """m"""
+    """Return the distance between the positions of two poses, in m."""
     return math.hypot(pose.x - truth.x, pose.y - truth.y)

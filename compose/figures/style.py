@@ -1,4 +1,4 @@
-"""What all pictures share: fonts, colours, lines and markers, and how they are saved."""
+"""The common style of all figures: fonts, colours, lines and markers, and saving."""
 
 from __future__ import annotations
 
@@ -16,31 +16,32 @@ from protocol import files
 from protocol.mission import Role
 
 COLOURS: dict[Role, str] = {"a": "#0b62a4", "b": "#c4451c"}
-"""of a pair's robots, as in the paper: blue and red; in grey their markers tell them apart"""
+"""The colours of a pair's robots by role, blue and red as in the paper. MARKS distinguish them in grey."""
 MARKS: dict[Role, dict[str, Any]] = {
     "a": {"marker": "o", "markerfacecolor": COLOURS["a"], "markeredgecolor": COLOURS["a"]},
     "b": {"marker": "^", "markerfacecolor": "white", "markeredgecolor": COLOURS["b"]},
 }
-"""filled circles, and open triangles"""
+"""The markers of a pair's robots by role: filled circles and open triangles."""
 DASHES: dict[Role, Any] = {"a": (0, (6, 2)), "b": (0, (2, 1.4))}
-"""of what belongs to a robot and is no path"""
+"""The line styles by role of a robot's lines other than paths."""
 INK, PALE, PALER = "#1a1a1a", "0.45", "0.75"
-"""what belongs to neither robot, by how much it matters"""
+"""The colours of lines that belong to neither robot, in decreasing importance."""
 SHADE = "#f3e6bd"
-"""of time in contact"""
+"""The background colour of ticks in contact."""
 DPI = 160
+"""The resolution of PNG files, in dots per inch."""
 PLACES = 6
-"""digits of a place on the paper, as a share of its width or height"""
+"""The number of decimal places of panel positions, which are fractions of the figure's size."""
 
 _DATES: dict[str, dict[str, None]] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {}}
 
 
 def look(symbols: bool = False) -> AbstractContextManager[None]:
-    """Matplotlib's settings, within which pictures are drawn and saved.
+    """Return the matplotlib settings for drawing and saving figures.
 
-    With that salt the same picture is the same bytes. Fonts are embedded as TrueType (42): publishers refuse
-    Type 3, matplotlib's default. Text is as it stands, `$` and `_` included; or, with `symbols`, what is
-    between two `$` is set as the paper sets it.
+    The fixed hash salt makes equal figures equal byte for byte. Fonts are embedded as TrueType (42), because
+    publishers reject Type 3, matplotlib's default. Text is printed literally, or, with `symbols`, text
+    between two `$` is set as mathematics.
     """
     return mpl.rc_context(
         {"svg.hashsalt": "tandem", "pdf.fonttype": 42, "font.size": 9, "text.parse_math": symbols}
@@ -48,7 +49,10 @@ def look(symbols: bool = False) -> AbstractContextManager[None]:
 
 
 def save(figure: Figure, path: Path, formats: Sequence[str] = FORMATS) -> tuple[Path, ...]:
-    """In each of `formats`, `path` with that ending; none carries a date. Raises OSError."""
+    """Save `figure` as `path` with each of `formats` as its extension, without dates; return the paths.
+
+    Raises OSError.
+    """
     _settle(figure)
     written = [path.with_name(f"{path.name}.{ending}") for ending in formats]
     for ending, place in zip(formats, written, strict=True):
@@ -58,7 +62,10 @@ def save(figure: Figure, path: Path, formats: Sequence[str] = FORMATS) -> tuple[
 
 
 def _settle(figure: Figure) -> None:
-    """Panels stay where a constrained layout has them, to PLACES: the last bits depend on where in memory."""
+    """Fix the panels' positions from a constrained layout, rounded to PLACES.
+
+    The last bits of a constrained layout vary between processes, so unrounded files would differ.
+    """
     if figure.get_layout_engine() is None:
         return
     figure.draw_without_rendering()

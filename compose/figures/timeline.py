@@ -1,4 +1,4 @@
-"""An axis of time: ticks, the paper's phases, and the claim."""
+"""A time axis with ticks, the paper's phases, and the claim."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLoca
 
 from compose.figures.story import Span, Story
 
-PHASES = {1: "alone with its anchor", 2: "looking for its peer", 3: "together"}
+PHASES = {1: "own anchor", 2: "search for the peer", 3: "encounter"}
 SHADES = {1: "0.93", 2: "1.0", 3: "#fbf3dc"}
 NARROW = 0.18
-"""of the width: where a phase would have less, each is drawn to a scale of its own"""
+"""The fraction of the width below which a phase is too narrow, so that each phase gets its own scale."""
 SHARES = (0.3, 0.45)
-"""of the width, the least and the most that a phase has then, before they are made to fill it"""
+"""The bounds of a phase's fraction of the width in that case, before normalisation."""
 DIGIT = 0.015
-"""of the width, that a digit takes there"""
+"""The fraction of the width that a digit of a tick label takes."""
 MARKS = 13
-"""ticks named along the axis"""
+"""The approximate number of tick labels on the axis."""
 
 
 def over_time(axes: Axes, story: Story) -> None:
-    """Ticks along `axes`, the phases shaded, and the claim."""
+    """Set up the time axis of `axes`: tick labels, shaded phases, and a line at the claim."""
     ticks, shares = _edges(story)
     even = np.allclose(np.diff(ticks) / (ticks[-1] - ticks[0]), np.diff(shares))
     if not even:
@@ -40,11 +40,11 @@ def over_time(axes: Axes, story: Story) -> None:
     period = story.recording.scenario.mission.period
     if period == 1.0:
         axes.xaxis.set_major_formatter("{x:g}")
-        what = "tick, one a second"
+        label = "tick (1 s)"
     else:
         axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}\n{x * period:g} s"))
-        what = "tick, and time since release"
-    axes.set_xlabel(what if even else f"{what}; each phase to a scale of its own")
+        label = "tick and time since the start"
+    axes.set_xlabel(label if even else f"{label}; one scale per phase")
     if story.claim is not None:
         axes.axvline(
             story.claim.tick,
@@ -52,12 +52,12 @@ def over_time(axes: Axes, story: Story) -> None:
             lw=1.2,
             ls="--",
             gid="claim",
-            label=f"it claims, tick {story.claim.tick}",
+            label=f"claim, tick {story.claim.tick}",
         )
 
 
 def name_phases(axes: Axes, story: Story) -> None:
-    """Above each, what it is; its number, where there is no room for more."""
+    """Write the name of each phase above it, or only its number if the phase is too narrow."""
     shares = _edges(story)[1]
     for span, left, right in zip(story.phases, shares, shares[1:], strict=False):
         words = f"{span.phase}: {PHASES[span.phase]}" if right - left >= NARROW else str(span.phase)
@@ -67,7 +67,7 @@ def name_phases(axes: Axes, story: Story) -> None:
 
 
 def _edges(story: Story) -> tuple[list[float], list[float]]:
-    """Where phases begin and end: in ticks, and as shares of the width."""
+    """Return the boundaries of the phases, in ticks and as fractions of the width."""
     spans = story.phases
     ticks = [spans[0].first - 0.5, *[span.last + 0.5 for span in spans]]
     shares = np.diff(ticks) / (ticks[-1] - ticks[0])
@@ -78,7 +78,7 @@ def _edges(story: Story) -> tuple[list[float], list[float]]:
 
 
 def _along(values: Any, here: list[float], there: list[float]) -> Any:
-    """Piecewise linear from `here` to `there`; beyond the ends, straight on."""
+    """Map `values` by the piecewise linear function from the knots `here` to `there`, with extrapolation."""
     x, begins, goals = np.asarray(values, float), np.asarray(here), np.asarray(there)
     piece = np.clip(np.searchsorted(begins, x) - 1, 0, len(begins) - 2)
     slopes = np.diff(goals) / np.diff(begins)
@@ -86,7 +86,7 @@ def _along(values: Any, here: list[float], there: list[float]) -> Any:
 
 
 def _marks(spans: tuple[Span, ...], ticks: list[float], shares: list[float]) -> list[float]:
-    """The ticks that are named: round ones of each phase, as many as have room."""
+    """Return the ticks with labels: round numbers in each phase that do not overlap."""
     marked: list[float] = []
     end = -1.0
     for span, share in zip(spans, np.diff(shares), strict=True):

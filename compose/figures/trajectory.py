@@ -1,4 +1,4 @@
-"""The whole mission from above, as Figs. 3(a) and 4(a) show it: paths, anchors, sensing ranges, orbits."""
+"""The whole mission from above, like Figs. 3(a) and 4(a): paths, anchors, sensing ranges and orbits."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from protocol.mission import Role
 from protocol.motion import Pose
 
 WIDTH, BESIDE, TALLEST = 4.9, 1.95, 6.0
-"""inches: of the plane, of the key, of the plane at the most"""
+"""The maximum width of the plane, the width of the key, and the maximum height of the plane, in inches."""
 MANY = 160
-"""ticks of a path, too many to mark each"""
+"""The maximum number of markers on a path."""
 LABEL = {"facecolor": "white", "alpha": 0.75, "pad": 0.6, "lw": 0}
 
 
 def draw(pair: PairRecord) -> Figure | Absent:
-    """The plane, and what the signs in it mean beside it."""
+    """Return the figure: the plane with the key beside it."""
     if not pair.placed:
         return Absent(NO_PLACES)
     window = around(_extent(pair), 0.03)
@@ -57,12 +57,12 @@ def _extent(pair: PairRecord) -> list[tuple[float, float]]:
 
 
 def _arrow(pair: PairRecord) -> float:
-    """m: how long a heading is drawn."""
+    """Return the length of a heading arrow, in m."""
     return 0.35 * pair.mission.sensing_range
 
 
 def draw_anchor(axes: Axes, pair: PairRecord, role: Role) -> None:
-    """Its place, and how far it is heard."""
+    """Draw the anchor of the robot with `role`, and its sensing range."""
     one, reach = pair.robot(role), pair.mission.sensing_range
     place, first = (one.anchor.x, one.anchor.y), role == "a"
     axes.plot(
@@ -94,7 +94,7 @@ def _orbit(axes: Axes, pair: PairRecord, role: Role) -> None:
 
 
 def draw_path(axes: Axes, role: Role, poses: Sequence[Pose], gid: str, label: str | None) -> None:
-    """Successive positions, joined by lines as in the paper."""
+    """Draw successive positions, joined by lines as in the paper."""
     axes.plot(
         [p.x for p in poses], [p.y for p in poses], "-", lw=1.3, ms=3.6, mew=0.8, color=COLOURS[role],
         markevery=max(1, math.ceil(len(poses) / MANY)), gid=gid, label=label, zorder=3, **MARKS[role],
@@ -102,7 +102,7 @@ def draw_path(axes: Axes, role: Role, poses: Sequence[Pose], gid: str, label: st
 
 
 def released(axes: Axes, role: Role, start: Pose, length: float) -> None:
-    """Where it was released, and which way it faced."""
+    """Draw the start pose of a robot, with a heading arrow of `length` m."""
     axes.plot(
         start.x, start.y, "s", ms=7, mfc="white", mec=COLOURS[role], mew=1.5, zorder=4,
         gid=f"released-{role}",
@@ -111,7 +111,7 @@ def released(axes: Axes, role: Role, start: Pose, length: float) -> None:
 
 
 def heading(axes: Axes, pose: Pose, length: float, colour: str, zorder: float = 4.5) -> None:
-    """An arrow of `length` m."""
+    """Draw an arrow of `length` m along the heading of `pose`."""
     axes.annotate(
         "",
         (pose.x + length * math.cos(pose.heading), pose.y + length * math.sin(pose.heading)),
@@ -124,14 +124,14 @@ def heading(axes: Axes, pose: Pose, length: float, colour: str, zorder: float = 
 
 
 def _marks(axes: Axes, pair: PairRecord) -> None:
-    """Where the two met, and where they were last."""
-    axes.plot([], [], "s", ms=7, mfc="white", mec=INK, mew=1.5, label="released, heading")
+    """Draw the first contact and the last positions."""
+    axes.plot([], [], "s", ms=7, mfc="white", mec=INK, mew=1.5, label="start pose")
     tick = next((first for first, _ in pair.contacts if first < pair.placed), None)
     if tick is not None:
         ends = [pair.robot(role).path[tick] for role in ROLES]
         axes.plot(
             [p.x for p in ends], [p.y for p in ends], ":", color=INK, lw=1.6, zorder=5, gid="contact",
-            label=f"first in range of each\nother, $k$ = {tick}",
+            label=f"first contact, $k$ = {tick}",
         )  # fmt: skip
     for role in ROLES:
         end = pair.robot(role).path[-1]
@@ -139,5 +139,5 @@ def _marks(axes: Axes, pair: PairRecord) -> None:
             end.x, end.y, "*", ms=11, mfc=COLOURS[role], mec="white", mew=0.7, zorder=6, gid=f"last-{role}"
         )
     last = sorted({len(pair.robot(role).path) - 1 for role in ROLES})
-    told = f"last position, $k$ = {' and '.join(map(str, last))}"
-    axes.plot([], [], "*", ms=10, mfc=PALE, mec="white", ls="", label=told)
+    label = f"last position, $k$ = {' and '.join(map(str, last))}"
+    axes.plot([], [], "*", ms=10, mfc=PALE, mec="white", ls="", label=label)

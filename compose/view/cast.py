@@ -1,4 +1,4 @@
-"""The static part of what there is to see: who plays, where the anchors stand, what can be sensed."""
+"""The static data of a run: its robots, their anchors and orbits, and the mission parameters."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from world.scenario import Scenario
 
 
 class Seat(msgspec.Struct, frozen=True):
-    """One robot: its part, and its places."""
+    """One robot: its role, peer, anchor and orbit."""
 
     id: RobotId
     peer: RobotId
@@ -26,52 +26,57 @@ class Seat(msgspec.Struct, frozen=True):
     anchor: Anchor
     orbit: Orbit
     attack: Attack | None = None
-    """what it is told to tell its peer instead of the truth"""
+    """The false data injection that the scenario configures for this robot."""
     frame: Pose | None = None
-    """that of its own anchor, in the world's: the x-axis leads from the anchor to where the robot was
-    released. None where that is not known. Its heading is nothing that the robot knows before it is
-    localised, so a picture of what the robot knows may turn the frame about the anchor as it likes"""
+    """The pose of the robot's anchor frame in the world frame, in m and rad.
+
+    The x-axis points from the anchor to the robot's start. None if the start is not known. A robot does
+    not know this heading before it is localised, so a picture of its belief may use any heading.
+    """
 
 
 class Stage(msgspec.Struct, frozen=True):
-    """A run, before it begins."""
+    """The static data of a run, known before its first tick."""
 
     name: str
-    """of the scenario; where only robots tell of it, of the run"""
+    """The name of the scenario, or, in hardware mode, of the run."""
     robots: tuple[Seat, ...]
     mission: Mission
     planner_name: PlannerName
     t_max_s: float
-    """T_max, the longest of all pairs"""
+    """The time bound T_max in s, the largest of all pairs."""
     max_ticks: Tick | None = None
-    """like what follows, only where the world's journal is there"""
+    """The tick limit of the mission. None, like all fields below, without the world's journal."""
     seed: int | None = None
     mode: str | None = None
-    """how it was played: "processes", "in-process"; none where that is not known"""
+    """The launch mode, "processes" or "in-process"; None if unknown."""
     tick_s: float | None = None
-    """s of wall time that a tick lasts; none in lockstep"""
+    """The wall-clock duration of a tick in s; None in lockstep."""
     faults: tuple[Fault, ...] = ()
 
     @property
     def ids(self) -> tuple[str, ...]:
-        """Of the robots, in their order."""
+        """The ids of the robots, in scenario order."""
         return tuple([seat.id for seat in self.robots])
 
     def seat(self, robot: str) -> Seat:
-        """Raises KeyError if nobody is called that."""
+        """Return the seat of `robot`. Raises KeyError if there is no such robot."""
         for seat in self.robots:
             if seat.id == robot:
                 return seat
         raise KeyError(robot)
 
     def pairs(self) -> tuple[tuple[Seat, Seat], ...]:
-        """Those of which both are known; a first."""
+        """Return the pairs whose robots are both known, as (robot of role a, robot of role b)."""
         known = {seat.id: seat for seat in self.robots}
         return tuple([(one, known[one.peer]) for one in self.robots if one.role == "a" and one.peer in known])
 
 
 def of_scenario(scenario: Scenario, mode: str | None = None, tick_s: float | None = None) -> Stage:
-    """As the world's journal tells it."""
+    """Return the static data that the world's journal holds.
+
+    `mode` and `tick_s` are not part of the scenario; see the fields of Stage.
+    """
     return Stage(
         name=scenario.name,
         robots=tuple(
@@ -100,23 +105,26 @@ def of_scenario(scenario: Scenario, mode: str | None = None, tick_s: float | Non
 
 
 def of_briefings(name: str, briefings: Mapping[str, RobotConfig]) -> Stage:
-    """As the robots were told it; there must be one at least."""
-    told = list(briefings.values())
+    """Return the static data that the robots' configurations hold.
+
+    `briefings` maps robot ids to configurations and must not be empty.
+    """
+    configs = list(briefings.values())
     return Stage(
         name=name,
         robots=tuple(
             [
                 Seat(one.robot, one.peer, one.role, one.anchor, one.rendezvous.of(one.role), one.attack)
-                for one in told
+                for one in configs
             ]
         ),
-        mission=told[0].mission,
-        planner_name=told[0].planner_name,
-        t_max_s=max(one.rendezvous.bound for one in told),
-        tick_s=told[0].tick_s,
+        mission=configs[0].mission,
+        planner_name=configs[0].planner_name,
+        t_max_s=max(one.rendezvous.bound for one in configs),
+        tick_s=configs[0].tick_s,
     )
 
 
 def frame(anchor: Anchor, start: Pose) -> Pose:
-    """The frame of `anchor` for a robot that is released at `start`, in the world's."""
+    """Return the anchor frame, as a pose in the world frame, of a robot that starts at `start`."""
     return Pose(anchor.x, anchor.y, math.atan2(start.y - anchor.y, start.x - anchor.x))

@@ -1,4 +1,4 @@
-"""What happens in one tick, in sentences."""
+"""Events of one tick, described in sentences."""
 
 from __future__ import annotations
 
@@ -24,21 +24,25 @@ Kind = Literal[
 
 
 class Event(msgspec.Struct, frozen=True):
-    """Something that happens in a tick, in a sentence."""
+    """One event of a tick."""
 
     tick: int
     kind: Kind
     robot: str | None
-    """whom it concerns, first; none is the world, or all"""
+    """The robot concerned; None for the world or for all robots."""
     text: str
+    """The event as a sentence."""
 
 
 def events(
     stage: Stage, before: Facts | None, now: Facts, passages: Sequence[Passage], end: MissionEnd | None
 ) -> Iterator[Event]:
-    """Robot by robot, then on the radio; `before` is the tick before, if it is known."""
-    for who in (None, *stage.ids):
-        yield from _presence(who, before, now)
+    """Yield the events of the tick of `now`: process events, then those of each robot, then of the radio.
+
+    `before` is the previous tick, if it is known.
+    """
+    for robot in (None, *stage.ids):
+        yield from _presence(robot, before, now)
     for seat in stage.robots:
         yield from _sensing(seat, before, now)
         yield from _deciding(seat, before, now)
@@ -49,29 +53,30 @@ def events(
         yield Event(now.tick, "end", None, f"The mission ends: {end.outcome}{why}")
 
 
-def _presence(who: str | None, before: Facts | None, now: Facts) -> Iterator[Event]:
-    name = who or "The world"
-    if who in now.down and (before is None or who not in before.down - before.back):
-        yield Event(now.tick, "down", who, f"{name} is down: its process is gone")
-    if who in now.back:
-        yield Event(now.tick, "back", who, f"{name} is back: its process runs again")
+def _presence(robot: str | None, before: Facts | None, now: Facts) -> Iterator[Event]:
+    name = robot or "The world"
+    if robot in now.down and (before is None or robot not in before.down - before.back):
+        yield Event(now.tick, "down", robot, f"{name} is down: its process is gone")
+    if robot in now.back:
+        yield Event(now.tick, "back", robot, f"{name} is back: its process runs again")
 
 
 def _radio(tick: int, passages: Sequence[Passage]) -> Iterator[Event]:
-    came = Counter((one.receiver, one.tick) for one in passages if one.what == "heard")
+    received = Counter((one.receiver, one.tick) for one in passages if one.what == "heard")
     for one in passages:
-        whose = f"{one.sender}'s report of tick {one.tick}"
+        report = f"{one.sender}'s report of tick {one.tick}"
         match one.what:
             case "lost":
-                yield Event(tick, "report-lost", one.sender, f"{whose} to {one.receiver} is lost")
+                yield Event(tick, "report-lost", one.sender, f"{report} to {one.receiver} is lost")
             case "damaged":
-                yield Event(tick, "report-damaged", one.receiver, f"{one.receiver} refuses {whose}: damaged")
+                text = f"{one.receiver} rejects {report}: damaged"
+                yield Event(tick, "report-damaged", one.receiver, text)
             case "heard" if one.tick < tick:
                 late = f"{tick - one.tick} tick{'s' if tick - one.tick > 1 else ''} late"
-                yield Event(tick, "report-late", one.receiver, f"{one.receiver} hears {whose}, {late}")
-    for (receiver, sent), times in came.items():
+                yield Event(tick, "report-late", one.receiver, f"{one.receiver} receives {report}, {late}")
+    for (receiver, sent), times in received.items():
         if times > 1:
-            text = f"{receiver} hears the report of tick {sent} {times} times"
+            text = f"{receiver} receives the report of tick {sent} {times} times"
             yield Event(tick, "report-doubled", receiver, text)
 
 
@@ -86,8 +91,8 @@ def _sensing(seat: Seat, before: Facts | None, now: Facts) -> Iterator[Event]:
         text = f"{robot} is in its anchor's range: {metres(observation.anchor_range)}"
         yield Event(tick, "anchor", robot, text)
     if was is not None and observation.anchor_range is None:
-        yield Event(tick, "anchor-lost", robot, f"{robot} has no range to its anchor any more")
-    if seat.role == "b" and peer in now.observations:  # of a pair, a tells it
+        yield Event(tick, "anchor-lost", robot, f"{robot} is out of its anchor's range")
+    if seat.role == "b" and peer in now.observations:  # the events of a pair are yielded once, for role a
         return
     contact = contact_of(now, robot, peer)
     near = before is not None and contact_of(before, robot, peer) is not None
@@ -101,11 +106,10 @@ def _sensing(seat: Seat, before: Facts | None, now: Facts) -> Iterator[Event]:
 def _deciding(seat: Seat, before: Facts | None, now: Facts) -> Iterator[Event]:
     robot, tick = seat.id, now.tick
     if robot in now.late:
-        yield Event(tick, "late", robot, f"{robot}'s answer did not come in time; it stands still")
+        yield Event(tick, "late", robot, f"{robot} misses the deadline and stops for this tick")
     if robot in now.without:
-        yield Event(
-            tick, "late", robot, f"{robot} goes without {seat.peer}'s report, which did not come in time"
-        )
+        text = f"{robot} decides without {seat.peer}'s report, which missed the deadline"
+        yield Event(tick, "late", robot, text)
     command = now.commands.get(robot)
     earlier = before.commands.get(robot) if before is not None else None
     if command is None or (before is not None and earlier is None):
@@ -126,14 +130,15 @@ def _verdict(seat: Seat, command: Command, now: Facts) -> Event:
             text = f"{robot} claims to be at ({x:.2f}, {y:.2f}) m, heading {heading:+.2f} rad"
             truth = now.truth.get(robot)
             if truth is not None:
-                text += f"; it is {metres(math.hypot(x - truth.x, y - truth.y))} off"
+                text += f"; the error is {metres(math.hypot(x - truth.x, y - truth.y))}"
             return Event(now.tick, "claim", robot, text)
         case verdict:
             kind: Kind = "inconsistent" if isinstance(verdict, Inconsistent) else "undecided"
             return Event(now.tick, kind, robot, doing(seat, command.phase, command.state, verdict))
 
 
-PHASES = {1: "its own anchor", 2: "the search for its peer", 3: "the encounter"}
+PHASES = {1: "localisation relative to its anchor", 2: "search for its peer", 3: "encounter"}
+"""The names of the paper's phases, by number."""
 
 
 def _believing(seat: Seat, before: Facts | None, now: Facts) -> Iterator[Event]:
@@ -143,16 +148,18 @@ def _believing(seat: Seat, before: Facts | None, now: Facts) -> Iterator[Event]:
     if held is None or earlier is None:
         return
     if len(held.local) == 1 != len(earlier.local) and not held.world:
-        yield Event(tick, "branch", robot, f"{robot} has chosen its branch: it knows where its anchor is")
-    many, few = len(earlier.world), len(held.world)
-    if many == 0 < few:
-        ways = "one placement of the two is" if few == 1 else f"{few} placements of the two are"
-        yield Event(tick, "candidates", robot, f"for {robot}, {ways} possible")
-    elif many != few > 0:
-        change = "fall" if few < many else "rise"
-        yield Event(tick, "candidates", robot, f"{robot}'s candidates {change} from {many} to {few}")
+        text = f"{robot} has chosen its branch: its pose in its anchor's frame is unique"
+        yield Event(tick, "branch", robot, text)
+    previous, current = len(earlier.world), len(held.world)
+    if previous == 0 < current:
+        text = f"{robot} has {current} possible placement{'s' if current > 1 else ''} of the pair"
+        yield Event(tick, "candidates", robot, text)
+    elif previous != current > 0:
+        change = "fall" if current < previous else "rise"
+        text = f"{robot}'s possible placements {change} from {previous} to {current}"
+        yield Event(tick, "candidates", robot, text)
 
 
 def metres(length: float) -> str:
-    """A length as one reads it."""
+    """Return `length`, in m, as text with its unit."""
     return f"{length:.2f} m" if 0.095 <= length < 1e5 else f"{length:.2g} m"

@@ -1,4 +1,4 @@
-"""What is known of a run, tick by tick, however and in whatever order it comes to be known."""
+"""The messages of a run, gathered by tick from journals or the network, in any order."""
 
 from __future__ import annotations
 
@@ -19,40 +19,41 @@ from protocol.messages import (
 from protocol.motion import Pose
 
 Link = tuple[str, str]
-"""from a robot to its peer"""
+"""A directed link: sender and receiver."""
 
 
 class Said(msgspec.Struct, frozen=True):
-    """A report, and how long its frame was."""
+    """A report and the size of its frame."""
 
     report: Report
     bytes: int
+    """The size of the frame in bytes."""
 
 
 class Facts(msgspec.Struct, frozen=True):
-    """One tick, as far as it is known; whatever is missing may come later."""
+    """The known data of one tick. Missing data may be added later."""
 
     tick: int
     truth: dict[str, Pose] = msgspec.field(default_factory=dict)
     observations: dict[str, Observation] = msgspec.field(default_factory=dict)
     reports: dict[str, Said] = msgspec.field(default_factory=dict)
-    """by who says them"""
+    """Reports by sender."""
     commands: dict[str, Command] = msgspec.field(default_factory=dict)
     estimates: dict[str, Estimate] = msgspec.field(default_factory=dict)
     late: set[str] = msgspec.field(default_factory=set)
-    """robots whose Command did not come in time"""
+    """Robots whose Command missed the deadline."""
     without: set[str] = msgspec.field(default_factory=set)
-    """robots that went without their peer's report, which did not come in time"""
+    """Robots that decided without their peer's report because it missed the deadline."""
     under_way: dict[Link, tuple[int, ...]] = msgspec.field(default_factory=dict)
-    """the ticks of the reports that are on that link after this tick; known only to the world"""
+    """The ticks of the reports in flight on each link after this tick; only the world's journal has them."""
     down: set[str | None] = msgspec.field(default_factory=set)
-    """robots whose process was seen to be gone in this tick; none is the world's. No journal tells of it"""
+    """Robots whose process ended in this tick; None is the world. Observed by viewers, never journaled."""
     back: set[str | None] = msgspec.field(default_factory=set)
-    """of these, those whose process was then seen again"""
+    """Robots in `down` whose process was seen again in the same tick."""
 
 
 class Gathering:
-    """Facts, as they come in."""
+    """The facts of a run, collected while messages arrive."""
 
     def __init__(self) -> None:
         self.ticks: dict[int, Facts] = {}
@@ -60,17 +61,17 @@ class Gathering:
         self.final_reports: dict[str, FinalReport] = {}
         self.end: MissionEnd | None = None
         self.last = -1
-        """the latest tick of which anything is known"""
+        """The latest tick with any data; -1 if there is none."""
         self.has_truth = False
-        """whether the truth of any tick is known"""
+        """True once the ground truth of any tick is known."""
         self._seen: set[str | None] = set()
         self.gone: set[str | None] = set()
-        """those whose process was seen, and is not there any more; none is the world's"""
+        """Robots whose process was seen and has ended; None is the world."""
         self.touched: int | None = None
-        """the earliest tick of which something has become known since somebody last set this to none"""
+        """The earliest tick that has changed since the user of this object last set this to None."""
 
     def at(self, tick: int) -> Facts:
-        """What is known of `tick`, to be added to."""
+        """Return the facts of `tick` for modification, created if needed; marks the tick as changed."""
         down = self.gone if tick > self.last else ()
         self.last = max(self.last, tick)
         if self.touched is None or tick < self.touched:
@@ -80,28 +81,30 @@ class Gathering:
             known = self.ticks[tick] = Facts(tick, down=set(down))
         return known
 
-    def present(self, who: str | None, there: bool) -> None:
-        """Fold in whether the process of a robot, or none for the world's, is there now.
+    def present(self, robot: str | None, there: bool) -> None:
+        """Record that the process of `robot`, or of the world if None, is present or absent now.
 
-        One that has not been seen yet is not missed, nor one that has done its part.
+        A process counts as gone only if it was seen before, the mission has not ended, and the robot has
+        sent no FinalReport. Calls before the first tick have no effect.
         """
         if self.last < 0:
             return
         if there:
-            self._seen.add(who)
-            if who in self.gone:
-                self.gone.remove(who)
-                self.at(self.last).back.add(who)
-        elif who in self._seen - self.gone and self.end is None and who not in self.final_reports:
-            self.gone.add(who)
+            self._seen.add(robot)
+            if robot in self.gone:
+                self.gone.remove(robot)
+                self.at(self.last).back.add(robot)
+        elif robot in self._seen - self.gone and self.end is None and robot not in self.final_reports:
+            self.gone.add(robot)
             now = self.at(self.last)
-            now.down.add(who)
-            now.back.discard(who)
+            now.down.add(robot)
+            now.back.discard(robot)
 
-    def take(self, message: Message, size: int, teller: str | None = None) -> None:
-        """Fold in `message`, of a frame of `size` bytes; what is known already stays.
+    def take(self, message: Message, size: int, journal_owner: str | None = None) -> None:
+        """Add `message`, from a frame of `size` bytes. Data that is already known is not replaced.
 
-        `teller` is the robot in whose journal it stands; none of the world's, or on the network.
+        `journal_owner` is the robot whose journal holds the message; None for the world's journal and for
+        the network.
         """
         match message:
             case Observation(tick, robot):
@@ -117,7 +120,7 @@ class Gathering:
                 self.has_truth = True
             case DeadlineMissed(tick, robot):
                 facts = self.at(tick)
-                (facts.late if teller is None else facts.without).add(teller or robot)
+                (facts.late if journal_owner is None else facts.without).add(journal_owner or robot)
             case _:
                 self._take_once(message)
 

@@ -1,4 +1,4 @@
-"""A run as its journals tell it: whole, torn, or growing."""
+"""Scenes of a run read from its journals, which may be complete, torn or still growing."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from world.world_journal import JournalReading, opened
 
 
 class Performance(msgspec.Struct, frozen=True):
-    """A whole run, to be looked at."""
+    """A recorded run with all its scenes."""
 
     stage: Stage
     scenes: tuple[Scene, ...]
-    """one a tick, from the first that is known on"""
+    """One scene per tick, beginning with the first known tick."""
     end: MissionEnd | None
-    """none where the record breaks off"""
+    """The end of the mission; None if the recording breaks off."""
     final_reports: dict[str, FinalReport]
     notes: tuple[str, ...]
-    """what could not be read, a line each"""
+    """One line for each part of the recording that cannot be read."""
 
 
 def read(folder: Path) -> Performance:
-    """The run whose record is in `folder`, as far as it goes.
+    """Return the run recorded in `folder`, up to the end of its journals.
 
-    Raises FileNotFoundError if there is no journal that tells of a run, OSError if one cannot be read.
+    Raises FileNotFoundError if no journal holds a configuration, OSError if one cannot be read.
     """
     journals = Journals(folder)
     journals.read()
@@ -48,7 +48,7 @@ def read(folder: Path) -> Performance:
 
 
 def scenes(stage: Stage, known: Gathering, first: int = 0, last: int | None = None) -> tuple[Scene, ...]:
-    """Of the ticks from `first` through `last` of which anything is known."""
+    """Return the scenes of the known ticks from `first` to `last`, inclusive."""
     last = known.last if last is None else min(last, known.last)
     before = known.ticks.get(first - 1)
     shown = []
@@ -61,22 +61,22 @@ def scenes(stage: Stage, known: Gathering, first: int = 0, last: int | None = No
 
 
 class Journals:
-    """The journals in a folder, read as they grow."""
+    """The journals in a folder, read incrementally while they grow."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.known = Gathering()
         self.stage: Stage | None = None
-        """none until somebody has told"""
+        """The static data of the run; None until a scenario or a configuration has been read."""
         self.notes: list[str] = []
-        """journals that are damaged; what stands in one from there on is left out"""
+        """One line per damaged journal. Its frames after the damage are ignored."""
         self._tails: dict[str, Tail] = {}
         self._world: JournalReading | None = None
         self._head: list[bytes] = []
-        """of the world's journal, while its scenario has not come"""
+        """The frames of the world's journal that precede its scenario."""
 
     def read(self) -> None:
-        """Fold in what has come since the last time. Raises OSError."""
+        """Read the frames appended since the last call. Raises OSError."""
         for path in journals_in(self.folder):
             tail = self._tails.setdefault(path.name, Tail(path))
             try:
@@ -88,16 +88,17 @@ class Journals:
             except (CorruptJournal, MalformedFrame) as error:
                 text = str(error)
                 self._note(text if text.startswith(str(path)) else f"{path}: {text}")
-        told = self.known.configs
+        configs = self.known.configs
         if self._world is not None:
-            for robot in [robot for robot, one in told.items() if not self._world.world.scenario.is_of(one)]:
+            scenario = self._world.world.scenario
+            for robot in [robot for robot, one in configs.items() if not scenario.is_of(one)]:
                 path = self.folder / agent_journal(robot)
-                self._note(f"{path}: another run's: its briefing is not this world's")
-        if self._world is None and len(told) > (len(self.stage.robots) if self.stage is not None else 0):
-            self.stage = of_briefings(self.folder.name, told)
+                self._note(f"{path}: belongs to another run: its configuration does not match world.journal")
+        if self._world is None and len(configs) > (len(self.stage.robots) if self.stage is not None else 0):
+            self.stage = of_briefings(self.folder.name, configs)
 
     def fill(self) -> None:
-        """Nothing more will come: what is missing of what robots sensed follows from the world's journal."""
+        """Compute missing observations from the world's journal. Call once the journals are complete."""
         if self._world is None:
             return
         for world in self._world.told().worlds:
@@ -127,14 +128,14 @@ class Journals:
             self._show(self._world.world)
             frames = list(rest)
         reading = self._world
-        told = len(reading.ticks)
+        first_new = len(reading.ticks)
         for frame in frames:
             if reading.disorder is not None:
                 break
             if not reading.take(frame):
                 assert reading.disorder is not None
-                self._note(f"{path}: {reading.disorder.what}; what comes after it is left out")
-        for tick in reading.ticks[told:]:
+                self._note(f"{path}: {reading.disorder.what}; all later frames are ignored")
+        for tick in reading.ticks[first_new:]:
             self._show(tick.world)
             facts = self.known.at(tick.world.truth.tick)
             for command in tick.commands.values():
@@ -146,7 +147,7 @@ class Journals:
         self.known.final_reports.update(reading.final_reports)
 
     def _show(self, world: World) -> None:
-        """The truth at a tick, and the air."""
+        """Add the ground truth and the reports in flight of the world's current tick."""
         ids = [robot.id for robot in world.scenario.robots]
         facts = self.known.at(world.truth.tick)
         facts.truth.update(zip(ids, world.truth.poses, strict=True))
@@ -158,7 +159,7 @@ class Journals:
 
     def _mode(self) -> str | None:
         try:
-            told = msgspec.json.decode(files.read_bytes(self.folder / SUMMARY))
-            return str(told["mode"])
+            summary = msgspec.json.decode(files.read_bytes(self.folder / SUMMARY))
+            return str(summary["mode"])
         except (OSError, msgspec.MsgspecError, TypeError, KeyError):
             return None

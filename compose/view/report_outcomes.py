@@ -1,4 +1,4 @@
-"""What became of each report that was sent."""
+"""The delivery outcome of each report that was sent."""
 
 from __future__ import annotations
 
@@ -11,41 +11,49 @@ from compose.view.scene import Scene
 from world.faults import LATEST
 
 Fate = Literal["heard", "late", "damaged", "lost", "under way"]
-"""`late` is heard in a later tick than it was sent in; `lost` never came, `under way` may come yet"""
+"""The outcome of a report.
+
+"heard" means received in the tick in which it was sent, "late" received in a later tick, "lost" never
+received, and "under way" not received yet.
+"""
 
 
 class Flight(msgspec.Struct, frozen=True):
-    """One report, from the tick in which it was sent on."""
+    """One report and its deliveries."""
 
     sender: str
     receiver: str
     tick: int
+    """The tick in which the report was sent."""
     fate: Fate
-    """that of its first copy that was heard; if none was, of the first that came"""
+    """The outcome of its first copy received intact, or, if there is none, of its first copy."""
     heard: tuple[int, ...]
-    """the ticks in which it was; two where it came twice"""
+    """The ticks in which a copy was received intact."""
     damaged: tuple[int, ...]
-    """the ticks in which it came damaged"""
+    """The ticks in which a damaged copy was received."""
 
 
 def fates(scenes: Iterable[Scene], over: bool) -> tuple[Flight, ...]:
-    """Of all reports that were sent in `scenes`, in their order; `over` is whether nothing more will come."""
+    """Return the outcomes of all reports in `scenes`, in the order in which they were sent.
+
+    `over` is true if the run is complete, so that no report is under way.
+    """
     sent: dict[tuple[str, str, int], tuple[list[int], list[int]]] = {}
     last = 0
     for one in scenes:
         last = one.tick
         for passage in one.passages:
-            heard, damaged = sent.setdefault((passage.sender, passage.receiver, passage.tick), ([], []))
+            received, damaged = sent.setdefault((passage.sender, passage.receiver, passage.tick), ([], []))
             if passage.what == "heard":
-                heard.append(one.tick)
+                received.append(one.tick)
             elif passage.what == "damaged":
                 damaged.append(one.tick)
     flights = []
-    for (sender, receiver, tick), (heard, damaged) in sent.items():
+    for (sender, receiver, tick), (received, damaged) in sent.items():
         fate: Fate = "lost" if over or last - tick >= LATEST else "under way"
-        if heard:
-            fate = "heard" if heard[0] == tick else "late"
+        if received:
+            fate = "heard" if received[0] == tick else "late"
         elif damaged:
             fate = "damaged"
-        flights.append(Flight(sender, receiver, tick, fate, tuple(heard), tuple(damaged)))
+        flights.append(Flight(sender, receiver, tick, fate, tuple(received), tuple(damaged)))
     return tuple(flights)

@@ -1,4 +1,4 @@
-"""What there is to see of one tick. A scene follows from what is known of the tick and of the one before."""
+"""A scene: the visible data of one tick, derived from the facts of that tick and of the previous one."""
 
 from __future__ import annotations
 
@@ -14,19 +14,20 @@ from protocol.motion import Controls, Covariance, Pose, wrap
 
 
 class Sent(msgspec.Struct, frozen=True):
-    """A report that a robot says to its peer."""
+    """A report that a robot sends to its peer."""
 
     bytes: int
+    """The size of the frame in bytes."""
     phase: Phase
     state: Word
     through: int
-    """its log covers the manoeuvres through this tick"""
+    """The last tick of the manoeuvres in the report's log."""
     heard: int
-    """it knows the peer's through this one"""
+    """The last tick of the peer's manoeuvres that the report acknowledges."""
 
 
 class Decision(msgspec.Struct, frozen=True):
-    """What a robot does until the next tick."""
+    """A robot's command until the next tick: v in m/s and omega in rad/s, with phase, state and verdict."""
 
     v: float
     omega: float
@@ -36,32 +37,36 @@ class Decision(msgspec.Struct, frozen=True):
 
 
 class HeldPoses(msgspec.Struct, frozen=True):
-    """What a robot holds possible."""
+    """The poses that a robot considers possible."""
 
     local: tuple[Pose, ...]
-    """in the frame of its own anchor; `Seat.frame` says where that lies"""
+    """The poses in the frame of the robot's anchor; see `Seat.frame`."""
     world: tuple[Pose, ...]
+    """The poses in the world frame; empty before the robot has placed its anchor frame in it."""
     probability: tuple[Probability, ...]
-    """of each of `world`, or, while there is none, of `local`; none where each is equally possible"""
+    """The probability of each pose in `world`, or in `local` if `world` is empty.
+
+    Empty if all poses are equally possible.
+    """
     covariance: Covariance | None
-    """of the first of `world`"""
+    """The covariance of the first pose in `world`."""
     localised: bool
 
 
 class Player(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One robot in one tick; none is what did not happen, or is not known."""
+    """One robot in one tick. A field is None if it did not occur or is unknown."""
 
     robot: str
     mode_name: str
-    """in a sentence"""
+    """The robot's activity, as a sentence."""
     pose: Pose | None = None
-    """the true one; its heading is wrapped"""
+    """The true pose; its heading is wrapped."""
     sensed: bool = False
-    """whether its Observation is known; if not, no range tells nothing"""
+    """True if the robot's Observation is known. If false, a missing range has no meaning."""
     down: bool = False
-    """whether its process was seen to be gone, and has not been seen again"""
+    """True while the robot's process is gone."""
     executed: Controls | None = None
-    """until this tick, as its odometry measured it"""
+    """The controls over the previous tick, as measured by odometry."""
     anchor_range: float | None = None
     contacts: tuple[Contact, ...] = ()
     sent: Sent | None = None
@@ -70,16 +75,16 @@ class Player(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class Scene(msgspec.Struct, frozen=True):
-    """One tick."""
+    """The visible data of one tick."""
 
     tick: int
     players: tuple[Player, ...]
-    """in the order of the stage"""
+    """One entry per robot, in the order of `Stage.robots`."""
     passages: tuple[Passage, ...]
     events: tuple[Event, ...]
 
     def player(self, robot: str) -> Player:
-        """Raises KeyError if nobody is called that."""
+        """Return the entry of `robot`. Raises KeyError if there is no such robot."""
         for player in self.players:
             if player.robot == robot:
                 return player
@@ -87,15 +92,15 @@ class Scene(msgspec.Struct, frozen=True):
 
 
 def scene(stage: Stage, before: Facts | None, now: Facts, end: MissionEnd | None = None) -> Scene:
-    """What there is to see in the tick of `now`; `before` is the tick before, if it is known."""
+    """Return the scene of the tick of `now`; `before` is the previous tick, if it is known."""
     players = tuple([_player(seat, now) for seat in stage.robots])
-    flying = tuple(passages(stage, before, now))
-    return Scene(now.tick, players, flying, tuple(events(stage, before, now, flying, end)))
+    deliveries = tuple(passages(stage, before, now))
+    return Scene(now.tick, players, deliveries, tuple(events(stage, before, now, deliveries, end)))
 
 
 def _player(seat: Seat, now: Facts) -> Player:
     robot = seat.id
-    pose, observation, said = now.truth.get(robot), now.observations.get(robot), now.reports.get(robot)
+    pose, observation, sent = now.truth.get(robot), now.observations.get(robot), now.reports.get(robot)
     command, estimate = now.commands.get(robot), now.estimates.get(robot)
     sentence = f"{robot} has not answered"
     down = robot in now.down - now.back
@@ -104,7 +109,7 @@ def _player(seat: Seat, now: Facts) -> Player:
     elif command is not None:
         sentence = doing(seat, command.phase, command.state, command.verdict)
     elif robot in now.late:
-        sentence = f"{robot} has not answered in time, and stands still"
+        sentence = f"{robot} has missed the deadline and stands still"
     return Player(
         robot=robot,
         mode_name=sentence,
@@ -115,8 +120,8 @@ def _player(seat: Seat, now: Facts) -> Player:
         anchor_range=observation.anchor_range if observation is not None else None,
         contacts=observation.contacts if observation is not None else (),
         sent=(
-            Sent(said.bytes, said.report.phase, said.report.state, said.report.through, said.report.heard)
-            if said is not None
+            Sent(sent.bytes, sent.report.phase, sent.report.state, sent.report.through, sent.report.heard)
+            if sent is not None
             else None
         ),
         command=(

@@ -1,4 +1,4 @@
-"""What a robot is doing, in a sentence."""
+"""Sentences that describe the activity of a robot."""
 
 from __future__ import annotations
 
@@ -6,42 +6,46 @@ from compose.view.cast import Seat
 from protocol.messages import Inconsistent, Undecided, Verdict
 
 SEEKING = {
-    "straight": "{robot} drives straight ahead, for a second range to {beacon}",
-    "backing": "{robot} has left the range of {beacon} ahead, and drives back past where it turned to it",
-    "turning": "{robot} has left the range of {beacon}, and turns by a quarter on the spot",
-    "circling": "{robot} circles until {beacon} ranges it",
-    "surveying": "{robot} drives where the next ranges to {beacon} tell most",
+    "straight": "{robot} drives straight ahead to get a second range to {beacon}",
+    "backing": "{robot} has left the range of {beacon} and drives back past its first range position",
+    "turning": "{robot} has left the range of {beacon} and makes a quarter turn on the spot",
+    "circling": "{robot} drives in a circle until it gets a second range to {beacon}",
+    "surveying": "{robot} drives to where the next ranges to {beacon} are most informative",
 }
-"""in phase 1 the beacon is the robot's anchor, in phase 3 the peer"""
+"""Sentences by state name, of states in which a robot drives to get ranges.
+
+The beacon is the robot's own anchor in phase 1 and the peer in phase 3.
+"""
 
 DOING = {
-    "asleep": "{robot} has not sensed anything yet",
-    "third-point": "{robot} drives to where a third range tells its two branches apart",
-    "homing": "{robot} has lost its anchor, and drives back to where that was ranged last",
-    "aligning": "{robot} turns to head straight away from its anchor",
+    "asleep": "{robot} has not received an observation yet",
+    "third-point": "{robot} drives to where a third range distinguishes its two branches",
+    "homing": "{robot} has left its anchor's range and drives back to where it was last in range",
+    "aligning": "{robot} turns until it points straight away from its anchor",
     "radial": "{robot} drives along the radius to its orbit",
     "tangent": "{robot} turns from the radius onto its orbit",
-    "orbiting": "{robot} goes round its anchor, and looks for {peer}",
-    "standing": "{robot} stands still; waits for {peer}'s second range",
-    "waiting": "{robot} stands still; waits for {peer}'s last manoeuvre",
-    "last-manoeuvre": "{robot} drives to where the placements that are left predict different ranges",
-    "returning": "{robot} has left {peer}'s range, and drives the same arc back to tell it",
-    "retreating": "{robot} has left {peer}'s range, and drives back as it came, and as far again",
-    "listening": "{robot} stands in {peer}'s range; waits for what it has not been told yet",
-    "localised": "{robot} knows where it is, and stands",
+    "orbiting": "{robot} drives on its orbit until {peer} is in range",
+    "standing": "{robot} stands still and waits for {peer}'s second range",
+    "waiting": "{robot} stands still and waits for {peer}'s last manoeuvre",
+    "last-manoeuvre": "{robot} drives to where the remaining placements predict different ranges",
+    "returning": "{robot} has left {peer}'s range and drives the same arc back to report to it",
+    "retreating": "{robot} has left {peer}'s range and drives back along its path, and as far again",
+    "listening": "{robot} stands still within {peer}'s range and waits for missing reports",
+    "localised": "{robot} is localised and stands still",
 }
-WAITING = "{robot} waits beside its anchor until {peer} comes by"
-"""orbiting, where the plan gives it no speed"""
+"""Sentences by state name, of all other states."""
+WAITING = "{robot} waits beside its anchor until {peer} comes into range"
+"""The sentence of the state "orbiting" of a robot whose plan has no speed."""
 
 
 def doing(seat: Seat, phase: int, state: str, verdict: Verdict | None) -> str:
-    """What a robot is doing whose Command says so."""
+    """Return a sentence for the phase, state and verdict of a robot's Command."""
     beacon = seat.peer if phase == 3 else "its anchor"
     match verdict:
         case Undecided(reason):
-            return f"{seat.id} cannot go on: {reason}"
+            return f"{seat.id} is undecided: {reason}"
         case Inconsistent(claim):
-            return f"{seat.id} does not believe {seat.peer}, which tells {claim}"
+            return f"{seat.id} found an inconsistency in the reports of {seat.peer}: {claim}"
     sentence = SEEKING.get(state) or DOING.get(state) or "{robot}: " + state
     if state == "orbiting" and seat.orbit.v == 0.0:
         sentence = WAITING

@@ -1,1 +1,1 @@
-"""Recordings exported to CSV and Parquet tables."""
+"""Exports of recordings: MCAP, CSV and Parquet files."""

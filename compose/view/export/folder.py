@@ -1,4 +1,4 @@
-"""The files that an export leaves: `run.mcap`, `frames.csv`, `ticks.csv` and `ticks.parquet`."""
+"""The files of an export: `run.mcap`, `frames.csv`, `ticks.csv` and `ticks.parquet`."""
 
 from __future__ import annotations
 
@@ -22,17 +22,18 @@ from protocol.messages import Command, Estimate
 
 
 class Exported(msgspec.Struct, frozen=True):
-    """What has been written, and of what."""
+    """The result of an export."""
 
     files: tuple[Path, ...]
+    """The written files."""
     torn: dict[str, int]
-    """bytes of a torn write at the end of a journal, by its name; of those that have any"""
+    """The size in bytes of an incomplete last frame, by the journal's name; only journals that have one."""
     missing: tuple[str, ...]
-    """journals of robots that are not there"""
+    """The names of missing robot journals."""
 
 
 class _Ticks(NamedTuple):
-    """What goes into the tables of ticks."""
+    """The data for the tables of ticks. `period` is T_s in s."""
 
     rows: list[TickRow]
     commands: dict[At, Command]
@@ -50,15 +51,15 @@ def export(
     done: Callable[[], object] = lambda: None,
     check: Callable[[], object] = lambda: None,
 ) -> Exported:
-    """Write those of the record in `folder` into `out`.
+    """Write the files for the recording in `folder` to `out`.
 
-    Calls `done` after each file, and `check` now and then, which may raise.
-    Raises OSError if there is no record, journal.CorruptJournal if it is damaged before its end,
-    UserError if it is too long for a format, or `out` cannot be written.
+    Calls `done` after each file, and `check` between steps, which may raise.
+    Raises OSError if there is no recording, journal_file.CorruptJournal if it is damaged before its end,
+    UserError if it is too long for a format or `out` cannot be written.
     """
     books = run.books(folder)
     check()
-    robots, told = _of_world(folder, books) if WORLD_JOURNAL in books else _of_robots(folder)
+    robots, tables = _of_world(folder, books) if WORLD_JOURNAL in books else _of_robots(folder)
     check()
     shown = recorded.read(folder)
     run.make(out)
@@ -66,8 +67,8 @@ def export(
     writers: dict[Path, Callable[[Path], object]] = {
         mcap: lambda path: write_mcap(books, shown, path, check),
         frames: lambda path: path.write_text(frames_csv(in_time(books), check), encoding="utf-8"),
-        ticks: lambda path: path.write_text(table(told.rows), encoding="utf-8"),
-        parquet: lambda path: write_ticks(told.rows, told.commands, told.held, told.period, path),
+        ticks: lambda path: path.write_text(table(tables.rows), encoding="utf-8"),
+        parquet: lambda path: write_ticks(tables.rows, tables.commands, tables.held, tables.period, path),
     }
     try:
         for path, write in writers.items():
@@ -88,32 +89,36 @@ def export(
 
 
 def _of_world(folder: Path, books: Collection[str]) -> tuple[list[str], _Ticks]:
-    """Of whom journals there should be, and what the tables say."""
-    told = run.read(folder)
-    ids = [robot.id for robot in told.scenario.robots]
+    """Return the ids of all robots and the tables' data, from a recording with the world's journal."""
+    recording = run.read(folder)
+    ids = [robot.id for robot in recording.scenario.robots]
     there = [robot for robot in ids if run.agent_journal(robot) in books]
     return ids, _Ticks(
-        list(rows(told)),
-        {(robot, at.truth.tick): command for at in told.moments for robot, command in at.commands.items()},
+        list(rows(recording)),
+        {
+            (robot, at.truth.tick): command
+            for at in recording.moments
+            for robot, command in at.commands.items()
+        },
         {(robot, one.tick): one for robot in there for one in run.estimates(folder, robot)},
-        told.scenario.mission.period,
+        recording.scenario.mission.period,
     )
 
 
 def _of_robots(folder: Path) -> tuple[list[str], _Ticks]:
-    """The same without a world."""
-    told = pasts(folder)
-    if not told:
-        raise UserError(f"{folder}: there is no {WORLD_JOURNAL}, and no robot in it was briefed")
-    briefings = [past.config for past in told.values()]
-    return sorted({*told, *[one.peer for one in briefings]}), _Ticks(
-        list(rows_of(told)),
+    """Return the same data from a recording in hardware mode. Raises UserError if it has no configuration."""
+    robots = pasts(folder)
+    if not robots:
+        raise UserError(f"{folder}: there is no {WORLD_JOURNAL}, and no robot's journal has a configuration")
+    configs = [past.config for past in robots.values()]
+    return sorted({*robots, *[one.peer for one in configs]}), _Ticks(
+        list(rows_of(robots)),
         {
             (robot, step.observation.tick): step.command
-            for robot, past in told.items()
+            for robot, past in robots.items()
             for step in past.steps
             if step.command is not None
         },
-        {(robot, one.tick): one for robot, past in told.items() for one in past.estimates},
-        briefings[0].mission.period,
+        {(robot, one.tick): one for robot, past in robots.items() for one in past.estimates},
+        configs[0].mission.period,
     )

@@ -1,4 +1,4 @@
-"""A record as tables: a row per tick and robot, with what it held possible; and a row per journaled frame."""
+"""Tables of a recording: one row per tick and robot with its estimate, and one row per journaled frame."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _KINDS: dict[str, pa.DataType] = {
     **dict.fromkeys(("local", "world"), pa.list_(_POSE)),
     "probability": pa.list_(pa.float64()),
 }
-"""the rest are floats"""
+"""The types of columns. All others are float64."""
 _MEASURES = ["position_error_m", "heading_error_rad", "position_sigma_m", "heading_sigma_rad", "nees"]
 _COVARIANCE = [f"cov_{name}" for name in Covariance.__struct_fields__]
 COLUMNS = [
@@ -40,9 +40,9 @@ COLUMNS = [
     *_COVARIANCE,
     *_MEASURES,
 ]
-"""of `ticks.parquet`"""
+"""The columns of `ticks.parquet`."""
 At = tuple[str, int]
-"""a robot, and a tick"""
+"""A robot's id and a tick."""
 
 
 def write_ticks(
@@ -52,16 +52,16 @@ def write_ticks(
     period: float,
     path: Path,
 ) -> None:
-    """`ticks.parquet`: `rows`, and what each robot held possible, against the truth where there is one.
+    """Write `ticks.parquet` to `path`: `rows` with estimates, and their errors if there is a ground truth.
 
-    `period` is T_s.
+    `period` is T_s in s.
     """
     lines = []
     for row in rows:
         at = row.robot, row.tick
         verdict = commands[at].verdict if at in commands else None
-        said = {"time_s": row.tick * period, "verdict": _tag(verdict)}
-        lines.append(asdict(row) | said | _estimate(held.get(at), row.pose))
+        extra = {"time_s": row.tick * period, "verdict": _tag(verdict)}
+        lines.append(asdict(row) | extra | _estimate(held.get(at), row.pose))
     schema = pa.schema([pa.field(name, _KINDS.get(name, pa.float64())) for name in COLUMNS])
     pq.write_table(pa.Table.from_pylist(lines, schema=schema), path)
 
@@ -71,41 +71,41 @@ def _tag(verdict: msgspec.Struct | None) -> str | None:
 
 
 def _estimate(held: Estimate | None, truth: Pose | None) -> dict[str, Any]:
-    """All of it, and of the first in the world how far off it is, where that is known."""
+    """Return the columns of an estimate, with the errors of its first world pose if the truth is known."""
     if held is None:
         return {}
-    told: dict[str, Any] = {
+    columns: dict[str, Any] = {
         "local": [asdict(pose) for pose in held.local],
         "world": [asdict(pose) for pose in held.world],
         "probability": list(held.probabilities),
     }
     if not held.world:
-        return told
+        return columns
     first = held.world[0]
-    told |= {f"estimate_{name}": value for name, value in asdict(first).items()}
+    columns |= {f"estimate_{name}": value for name, value in asdict(first).items()}
     if truth is not None:
-        told["position_error_m"], told["heading_error_rad"] = errors(first, truth)
+        columns["position_error_m"], columns["heading_error_rad"] = errors(first, truth)
     if held.covariance is not None:
-        told |= {f"cov_{name}": value for name, value in asdict(held.covariance).items()}
-        told["position_sigma_m"] = held.covariance.position_sigma
-        told["heading_sigma_rad"] = held.covariance.heading_sigma
+        columns |= {f"cov_{name}": value for name, value in asdict(held.covariance).items()}
+        columns["position_sigma_m"] = held.covariance.position_sigma
+        columns["heading_sigma_rad"] = held.covariance.heading_sigma
         if truth is not None:
-            told["nees"] = nees(first, truth, held.covariance)
-    return told
+            columns["nees"] = nees(first, truth, held.covariance)
+    return columns
 
 
 def frames_csv(frames: Iterable[Journaled], check: Callable[[], object] = lambda: None) -> str:
-    """One row per frame: where it stands, when it was journaled, and what it says, as JSON.
+    """Return the CSV table with one row per frame: its position, tick, kind, size, and message as JSON.
 
-    Calls `check` before each, which may raise.
+    Calls `check` before each frame, which may raise.
     """
     out = io.StringIO()
-    written = csv.writer(out, lineterminator="\n")
-    written.writerow(["journal", "place", "tick", "kind", "bytes", "message"])
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(["journal", "place", "tick", "kind", "bytes", "message"])
     for one in frames:
         check()
         text = msgspec.json.encode(_named(one.message)).decode()
-        written.writerow([one.journal, one.place, one.tick, one.kind, len(one.frame), text])
+        writer.writerow([one.journal, one.place, one.tick, one.kind, len(one.frame), text])
     return out.getvalue()
 
 

@@ -20,19 +20,21 @@ from compose.view.web.origin import refusal
 FOXGLOVE = ("https://app.foxglove.dev", "file://")
 """The origins of Foxglove's app, in a browser and installed; not `null`, which any page can have."""
 HEAD_BYTES = 1 << 14
-"""the maximum size in bytes of the head of a request"""
+"""The maximum size of a request's head in bytes."""
 HEAD_S = 10.0
-"""s that the head of a request may take to arrive"""
+"""The maximum time in s for a request's head to arrive."""
 PIECE_BYTES = 1 << 16
+"""The maximum size in bytes of a forwarded piece."""
 GUESTS = 64
 """The maximum number of connections; more are refused.
 
 Without a limit, the SDK's server would run out of descriptors, and accept no more.
 """
 GUESTS_FILES = 3 * GUESTS + 120
-"""descriptors for GUESTS: two in the gate and one in the SDK for each, and some for refused connections"""
+"""The file descriptors for GUESTS: three for each, and some for refused connections."""
 
 Place = tuple[str, int]
+"""A host and a port."""
 
 
 def private_host() -> str:
@@ -44,7 +46,10 @@ class Gate:
     """A listening port whose thread forwards the allowed connections to the SDK's server."""
 
     def __init__(self, taken: socket.socket, behind: Place, origins: Sequence[str]) -> None:
-        """`taken` is the listening socket, `behind` the SDK's server; `origins` are allowed like FOXGLOVE."""
+        """Create a gate on the listening socket `taken`, in front of the SDK's server at `behind`.
+
+        Web pages of `origins` are allowed in addition to FOXGLOVE.
+        """
         self._taken = taken
         self._behind = behind
         self._origins = (*FOXGLOVE, *origins)
@@ -61,7 +66,7 @@ class Gate:
     async def _admit(self, reader: StreamReader, writer: StreamWriter) -> None:
         with closing(writer), suppress(OSError, EOFError, LimitOverrunError):
             if self._guests >= GUESTS:
-                await _refuse(writer, "503 Service Unavailable", "too many look already")
+                await _refuse(writer, "503 Service Unavailable", "too many connections")
                 return
             self._guests += 1
             try:
@@ -84,7 +89,7 @@ class Gate:
             return [value.strip() for name, _, value in lines if name.strip().lower() == wanted]
 
         if [value.lower() for value in values("upgrade")] != ["websocket"]:
-            return "only viewers are served here, over WebSocket"  # so a connection has one head
+            return "only WebSocket connections are accepted"  # so that a connection has one head
         return refusal(values("host"), values("origin"), self._origins)
 
     async def _hand_on(self, head: bytes, reader: StreamReader, writer: StreamWriter) -> None:
@@ -100,9 +105,9 @@ class Gate:
 
 
 async def _refuse(writer: StreamWriter, status: str, why: str) -> None:
-    said = f"{why}\n".encode()
+    body = f"{why}\n".encode()
     writer.write(f"HTTP/1.1 {status}\r\nConnection: close\r\nContent-Type: text/plain\r\n".encode())
-    writer.write(b"Content-Length: %d\r\n\r\n%s" % (len(said), said))
+    writer.write(b"Content-Length: %d\r\n\r\n%s" % (len(body), body))
     await writer.drain()
 
 

@@ -1,9 +1,9 @@
-"""A run served to Foxglove's viewers while it is played, by a process of its own that reads its journals.
+"""A process that serves a live run to Foxglove's viewers, from the journals of the run.
 
     python -m compose.view.foxglove.live_server PORT ORIGIN,... FOLDER ROBOT ...
 
-The mission knows nothing of it. What cannot be shown as fast as it happens is left out: the frames of every
-tick are told, but of a backlog only the latest tick is seen. It ends when its standard input does.
+The mission does not depend on this process. It publishes every journaled frame, but skips scenes if it falls
+behind: of a backlog it shows the latest tick. It ends when its standard input is closed.
 """
 
 from __future__ import annotations
@@ -37,65 +37,68 @@ from protocol.output import say
 
 HOST = "127.0.0.1"
 LOOK_S = 0.05
-"""how often the journals are looked at"""
+"""The interval in s at which the journals are read."""
 WAIT_S = 0.5
-"""for what is missing of a tick, once the next is there"""
+"""The time in s to wait for the rest of an incomplete tick once the next tick has begun."""
 SETTLED_S = 1.0
-"""after which who has asked for a channel surely listens"""
+"""The time in s after which a new subscriber certainly receives messages."""
 BACKLOG = 8
-"""ticks that are shown one by one; of more, the latest"""
+"""The maximum number of new ticks that are shown one by one. Of more, only the latest is shown."""
 MESSAGES = 1 << 14
-"""that a slow viewer may be behind, before it misses the oldest"""
+"""The number of messages buffered for a slow viewer before the oldest are dropped."""
 NICE = 10
-"""how much the mission goes first"""
+"""The niceness of the process, which gives priority to the mission."""
 
 
 class Live:
-    """A run whose record grows in a folder, on channels."""
+    """A growing recording, published on channels."""
 
     def __init__(self, folder: Path, channels: Channels) -> None:
-        self.asked = False
-        """whether somebody has come who has not seen what stands"""
+        self.subscribed = False
+        """True if a viewer has subscribed since `look` last published the static content."""
         self._folder = folder
         self._channels = channels
         self._journals = Journals(folder)
         self._tails: dict[str, tuple[Tail, Telling]] = {}
         self._views: Views | None = None
         self._next = 0
-        """the tick that is to be shown next"""
+        """The next tick to show."""
         self._once_more: float | None = None
-        """when what stands is to be told again: whoever has just asked may not have listened yet"""
+        """The time at which to publish the static content once more, for viewers that missed it; or None."""
         self._since: dict[int, float] = {}
-        """when those from there on were first there to be shown"""
+        """The time at which each tick that is not yet shown was first seen."""
 
     def look(self, now: float) -> int | None:
-        """Tell what has come since the last time; what time it is in the run, in ns, once it has begun."""
+        """Publish everything new in the journals.
+
+        `now` is the monotonic clock in s. Return the simulated time in ns; None before the run has begun.
+        """
         with suppress(OSError):
             self._journals.read()
         stage = self._journals.stage
-        if stage is None or stage.seed is None:  # the world has not told yet
+        if stage is None or stage.seed is None:  # the world's journal has no scenario yet
             return None
         if self._views is None:
             self._views = Views(stage)
-        self._tell_frames(stage)
+        self._publish_frames(stage)
         ready = self._ready(stage, now)
-        seen = ready[0 if len(ready) <= BACKLOG else -1].tick if ready else 0
+        first_shown = ready[0 if len(ready) <= BACKLOG else -1].tick if ready else 0
         for scene in ready:
-            visible = scene.tick >= seen and self._channels.watched
+            visible = scene.tick >= first_shown and self._channels.watched
             for view in self._views.of(scene) if visible else self._views.passing(scene):
                 self._channels.view(*view, nanoseconds(stage, scene.tick))
         if ready:
             self._next = ready[-1].tick + 1
         due = self._once_more is not None and now >= self._once_more
-        if self.asked or due:
-            self._once_more = now + SETTLED_S if self.asked else None
-            self.asked = False
+        if self.subscribed or due:
+            self._once_more = now + SETTLED_S if self.subscribed else None
+            self.subscribed = False
             self._channels.again()
             for view in (self._views.standing(), *self._views.again()):
                 self._channels.view(*view, nanoseconds(stage, max(0, self._next - 1)))
         return nanoseconds(stage, self._next)
 
-    def _tell_frames(self, stage: Stage) -> None:
+    def _publish_frames(self, stage: Stage) -> None:
         for name in (WORLD_JOURNAL, *map(agent_journal, stage.ids)):
             tail, telling = self._tails.setdefault(name, (Tail(self._folder / name), Telling(name)))
             with suppress(OSError, CorruptJournal):
@@ -103,7 +106,10 @@ class Live:
                     self._channels.frame(one, nanoseconds(stage, one.tick))
 
     def _ready(self, stage: Stage, now: float) -> list[Scene]:
-        """Scenes of which all is known, or as much as will be: not before the world has gone on."""
+        """Return the next scenes that are complete, or incomplete for longer than WAIT_S.
+
+        The last tick is ready only after the mission's end, because its data may still be arriving.
+        """
         known = self._journals.known
         last = known.last if known.end is not None else known.last - 1
         there = scenes(stage, known, self._next, last)
@@ -120,24 +126,24 @@ class Live:
         return found
 
 
-class _Door(ServerListener):
-    """Notes who comes."""
+class _Listener(ServerListener):
+    """A listener that notes new subscriptions."""
 
     def __init__(self, live: Live) -> None:
         self._live = live
 
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:  # noqa: ARG002
-        self._live.asked = True
+        self._live.subscribed = True
 
 
 def main(port: int, origins: Sequence[str], folder: Path, robots: Sequence[str]) -> int:
-    """Serve until standard input ends. 1 if the port cannot be had.
+    """Serve until standard input ends. Return the exit status, which is 1 if the port is not available.
 
-    Channels are there before anyone can come: under load the SDK refuses who asks for one that is new.
-    Web pages of `origins` may look, too.
+    Web pages of `origins` are allowed to connect, in addition to Foxglove's app. All channels are created
+    before a viewer can connect, because under load the SDK rejects subscriptions to new channels.
     """
     os.nice(NICE)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the launcher's to handle
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the launcher handles it
     inbox = Inbox("tandem run --foxglove")
     stop_with_launcher(inbox)
     context = Context()
@@ -154,10 +160,10 @@ def main(port: int, origins: Sequence[str], folder: Path, robots: Sequence[str])
             port=0,
             context=context,
             capabilities=[Capability.Time],
-            server_listener=_Door(live),
+            server_listener=_Listener(live),
             message_backlog_size=MESSAGES,
         )
-    except Exception as error:  # noqa: BLE001  # the SDK's own, of no type of its own
+    except Exception as error:  # noqa: BLE001  # the SDK raises untyped errors
         say(f"--foxglove: port {port} cannot be served: {error}", error=True)
         return 1
     Gate(taken, (behind, server.port), origins).open()
@@ -170,17 +176,17 @@ def main(port: int, origins: Sequence[str], folder: Path, robots: Sequence[str])
 
 
 def _serve(live: Live, server: WebSocketServer, inbox: Inbox) -> None:
-    going_on = True
-    while going_on:
+    running = True
+    while running:
         try:
             inbox.next(LOOK_S)
         except Interrupted:
-            going_on = False
+            running = False
         at = live.look(time.monotonic())
         if at is not None:
             server.broadcast_time(at)
 
 
 if __name__ == "__main__":
-    _, where, pages, recording, *ids = sys.argv
-    sys.exit(main(int(where), [one for one in pages.split(",") if one], Path(recording), ids))
+    _, port, pages, recording, *ids = sys.argv
+    sys.exit(main(int(port), [one for one in pages.split(",") if one], Path(recording), ids))

@@ -1,6 +1,6 @@
-"""`run.mcap`: every journaled frame of a record, and what there is to see of it.
+"""`run.mcap`: every journaled frame of a recording, and its scenes.
 
-Times are of the simulation, from 0 on. The same record gives the same bytes.
+Times are simulated times, beginning at 0. Equal recordings give equal bytes.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from protocol.messages import OfRobot
 from protocol.wire import VERSION
 
 CHUNK_BYTES = 1 << 18
-"""trails of ticks in a row are much alike: a chunk of many is a tenth of many chunks"""
+"""The size of a chunk. Trails of consecutive ticks are similar, so large chunks compress ten times better."""
 LONGEST_S = 2**32
-"""what Foxglove's timestamps can tell"""
+"""The largest time in s that Foxglove's timestamps can represent."""
 
 
 class TooLong(ValueError):
-    """A run of more time than the format can tell."""
+    """A run that is too long for the format's timestamps."""
 
 
 class Channels:
-    """Those of a run in a context, made as something is to be told on them."""
+    """The channels of a run in a Foxglove context, created on first use."""
 
     def __init__(self, context: Context) -> None:
         self._context = context
@@ -47,7 +47,7 @@ class Channels:
         self._views: dict[str, Channel] = {}
 
     def open(self, robots: Sequence[str]) -> None:
-        """All that there can be in a run of these, so that none is added once somebody looks."""
+        """Create all channels that a run of `robots` can have, so that none is added while viewers watch."""
         for name, kinds in {
             WORLD_JOURNAL: OfWorld,
             **{agent_journal(one): OfRobot for one in robots},
@@ -57,18 +57,21 @@ class Channels:
         self.open_views(robots)
 
     def frame(self, one: Journaled, at: int) -> None:
-        """A journaled frame: its body, msgpack, on a channel of its journal and kind."""
+        """Publish the msgpack body of a journaled frame on the channel of its journal and message type.
+
+        `at` is the simulated time in ns.
+        """
         channel = self._of_frames(one.journal, type(one.message))
         channel.log(one.body, log_time=at)
         self._latest[channel] = (one.body, at)
 
     def again(self) -> None:
-        """The latest journaled frame on each channel, for who has come since."""
+        """Publish the latest journaled frame of each channel again, for new viewers."""
         for channel, (body, at) in self._latest.items():
             channel.log(body, log_time=at)
 
     def _of_frames(self, journal: str, kind: type[msgspec.Struct]) -> Channel:
-        """That one, made if there is none yet."""
+        """Return the channel of a journal and a message type, created if needed."""
         channel = self._frames.get((journal, kind))
         if channel is None:
             described = Schema(name=f"tandem.{kind.__name__}", encoding="jsonschema", data=schema(kind))
@@ -82,7 +85,7 @@ class Channels:
         return channel
 
     def open_views(self, robots: Iterable[str]) -> None:
-        """All that there will be to see, whether or not anything is told of it."""
+        """Create all channels for scenes, including those that stay empty."""
         for topic, kind in topics(robots).items():
             if topic not in self._views:
                 self._views[topic] = Channel(
@@ -90,16 +93,16 @@ class Channels:
                 )
 
     def view(self, topic: str, message: Any, at: int) -> None:
-        """Something to be seen."""
+        """Publish a message of a scene on `topic`; `at` is the simulated time in ns."""
         self._views[topic].log(message.encode(), log_time=at)
 
     @property
     def watched(self) -> bool:
-        """Whether there is anyone to see anything."""
+        """True if any scene channel has a subscriber."""
         return any(channel.has_sinks() for channel in self._views.values())
 
     def close(self) -> None:
-        """Nothing more is told on them."""
+        """Close all channels."""
         for channel in (*self._frames.values(), *self._views.values()):
             channel.close()
 
@@ -107,34 +110,37 @@ class Channels:
 def write_mcap(
     books: Mapping[str, JournalFile], run: Performance, path: Path, check: Callable[[], object] = lambda: None
 ) -> int:
-    """Write `path` anew; how many frames are in it. Calls `check` in each tick, which may raise.
+    """Write `path`, and return the number of journaled frames in it.
 
-    Raises OSError if it cannot be written, TooLong, CorruptJournal.
+    Calls `check` in each tick, which may raise. Raises OSError if the file cannot be written, TooLong if the
+    run is too long, CorruptJournal if a journal is damaged.
     """
     last = max([scene.tick for scene in run.scenes], default=0)
     if nanoseconds(run.stage, last) >= LONGEST_S * 1_000_000_000:
-        raise TooLong(f"the run lasts {last * run.stage.mission.period:g} s; MCAP can tell {LONGEST_S} s")
+        raise TooLong(
+            f"the run lasts {last * run.stage.mission.period:g} s; MCAP can represent {LONGEST_S} s"
+        )
     context = Context()
     channels = Channels(context)
     try:
         with path.open("wb", buffering=0) as file:
-            kept = _Kept(file)
+            output = _Output(file)
             options = MCAPWriteOptions(chunk_size=CHUNK_BYTES, compression_threads=0)
-            with foxglove.open_mcap(kept, context=context, writer_options=options):
-                count = _tell(books, run, channels, [kept.check, check])
-            kept.check()
+            with foxglove.open_mcap(output, context=context, writer_options=options):
+                count = _publish(books, run, channels, [output.check, check])
+            output.check()
     finally:
         channels.close()
     return count
 
 
-def _tell(
+def _publish(
     books: Mapping[str, JournalFile],
     run: Performance,
     channels: Channels,
     checks: Sequence[Callable[[], object]],
 ) -> int:
-    """Everything, tick by tick: first the frames, then what there is to see."""
+    """Publish everything, tick by tick: the journaled frames, then the scene. Return the number of frames."""
     views = Views(run.stage)
     channels.open_views(run.stage.ids)
     count = 0
@@ -160,10 +166,10 @@ def _by_tick(books: Mapping[str, JournalFile], run: Performance) -> Iterator[tup
         yield tick, one
 
 
-class _Kept:
-    """A file whose first error is kept. From then on it seems to take what it is given, as if it had room.
+class _Output:
+    """A file that stores its first write error and then pretends that all writes succeed.
 
-    The writer would say every time that it cannot, and does not survive that places are not as it left them.
+    MCAP's writer reports an error at every write, and fails if the file position is not where it left it.
     """
 
     def __init__(self, file: RawIOBase) -> None:
@@ -172,7 +178,7 @@ class _Kept:
         self._at = self._end = 0
 
     def check(self) -> None:
-        """Raises OSError if something could not be written."""
+        """Raise the stored OSError, if a write has failed."""
         if self._error is not None:
             raise self._error
 
@@ -194,4 +200,4 @@ class _Kept:
         return self._at
 
     def flush(self) -> None:
-        """Nothing waits."""
+        """Do nothing: writes are unbuffered."""

@@ -1,4 +1,4 @@
-"""What messages look like on the wire, as JSON Schema: arrays of their name and their fields."""
+"""The wire format of messages as JSON Schema: arrays of the message's name and its fields."""
 
 from __future__ import annotations
 
@@ -11,10 +11,13 @@ from msgspec import inspect
 
 @cache
 def schema(kind: type[msgspec.Struct]) -> bytes:
-    """Of the messages of that kind. msgspec knows neither field's names in arrays nor ECMA's expressions."""
-    told = msgspec.json.schema(kind)
+    """Return the JSON Schema of messages of type `kind`.
+
+    It extends msgspec's schema, which has no field names in arrays and regular expressions in Python syntax.
+    """
+    described = msgspec.json.schema(kind)
     structs = {one.__name__: one for one in _structs(inspect.type_info(kind))}
-    for name, part in told["$defs"].items():
+    for name, part in described["$defs"].items():
         struct = structs.get(name)
         if struct is not None and "prefixItems" in part:
             tagged = len(part["prefixItems"]) - len(struct.__struct_fields__)
@@ -22,11 +25,11 @@ def schema(kind: type[msgspec.Struct]) -> bytes:
             part["prefixItems"] = [
                 {"title": title, **item} for title, item in zip(titles, part["prefixItems"], strict=True)
             ]
-    return msgspec.json.encode(_in_ecma(told), order="sorted")
+    return msgspec.json.encode(_in_ecma(described), order="sorted")
 
 
 def _structs(info: Any) -> set[type[msgspec.Struct]]:
-    """All that occur in a type, however deep."""
+    """Return all struct types that occur in a type, at any depth."""
     found: set[type[msgspec.Struct]] = set()
     match info:
         case inspect.Metadata(type=inner) | inspect.VarTupleType(item_type=inner):
@@ -41,7 +44,7 @@ def _structs(info: Any) -> set[type[msgspec.Struct]]:
 
 
 def _in_ecma(part: Any) -> Any:
-    """The same, its regular expressions with the anchors that JSON Schema has."""
+    """Return a copy of a schema with the anchors of its regular expressions in ECMA syntax."""
     match part:
         case dict():
             return {

@@ -1,4 +1,4 @@
-"""What is drawn for viewers, in Foxglove's schemas: lines, arrows, words."""
+"""Drawing primitives in Foxglove's schemas: lines, arrows and texts."""
 
 from __future__ import annotations
 
@@ -10,43 +10,43 @@ from foxglove import messages as fox
 from protocol.motion import Covariance, Pose, compose
 
 CORNERS = 72
-"""of what is drawn for a circle"""
+"""The number of corners of a polygon drawn for a circle."""
 SIGMAS = 3.0
-"""of an ellipse"""
+"""The size of an error ellipse, in standard deviations."""
 
 
 def timestamp(ns: int) -> fox.Timestamp:
-    """Of simulated time."""
+    """Return the timestamp of a simulated time in ns."""
     return fox.Timestamp(*divmod(ns, 1_000_000_000))
 
 
 def turned(heading: float) -> fox.Quaternion:
-    """About the vertical, by rad."""
+    """Return the rotation about the vertical axis by `heading` rad."""
     return fox.Quaternion(x=0.0, y=0.0, z=math.sin(heading / 2.0), w=math.cos(heading / 2.0))
 
 
 def pose(at: Pose) -> fox.Pose:
-    """On the ground."""
+    """Return a pose on the ground plane."""
     return fox.Pose(position=fox.Vector3(x=at.x, y=at.y, z=0.0), orientation=turned(at.heading))
 
 
 def colour(rgb: tuple[float, float, float], alpha: float = 1.0) -> fox.Color:
-    """Red, green and blue from 0 to 1."""
+    """Return a colour from red, green, blue and alpha, each from 0 to 1."""
     return fox.Color(r=rgb[0], g=rgb[1], b=rgb[2], a=alpha)
 
 
 def point(x: float, y: float) -> fox.Point3:
-    """On the ground."""
+    """Return a point on the ground plane."""
     return fox.Point3(x=x, y=y, z=0.0)
 
 
 def strip(points: Sequence[tuple[float, float]], tint: fox.Color, width: float) -> fox.LinePrimitive:
-    """A line through `points`, `width` pixels wide."""
+    """Return a line through `points`, `width` pixels wide."""
     return line([point(x, y) for x, y in points], tint, width)
 
 
 def line(points: Sequence[fox.Point3], tint: fox.Color, width: float) -> fox.LinePrimitive:
-    """As `strip`, through points that are made already."""
+    """Return a line through Foxglove points, `width` pixels wide."""
     return fox.LinePrimitive(
         type=fox.LinePrimitiveLineType.LineStrip,
         pose=fox.Pose(position=fox.Vector3(), orientation=fox.Quaternion(w=1.0)),
@@ -58,13 +58,16 @@ def line(points: Sequence[fox.Point3], tint: fox.Color, width: float) -> fox.Lin
 
 
 def circle(centre: tuple[float, float], radius: float) -> list[tuple[float, float]]:
-    """A closed line of CORNERS corners, in m."""
+    """Return the points of a closed polygon with CORNERS corners, in m."""
     turns = [2.0 * math.pi * i / CORNERS for i in range(CORNERS + 1)]
     return [(centre[0] + radius * math.cos(turn), centre[1] + radius * math.sin(turn)) for turn in turns]
 
 
 def ellipse(centre: Pose, covariance: Covariance) -> list[tuple[float, float]]:
-    """Of SIGMAS of the position, by the eigenvalues of its part of the covariance."""
+    """Return the points of the error ellipse of a position, SIGMAS standard deviations large.
+
+    Its axes follow from the eigenvalues of the position block of the covariance.
+    """
     mean = (covariance.xx + covariance.yy) / 2.0
     spread = math.hypot((covariance.xx - covariance.yy) / 2.0, covariance.xy)
     axis = Pose(centre.x, centre.y, math.atan2(2.0 * covariance.xy, covariance.xx - covariance.yy) / 2.0)
@@ -74,7 +77,7 @@ def ellipse(centre: Pose, covariance: Covariance) -> list[tuple[float, float]]:
 
 
 def arrow(at: Pose, size: float, tint: fox.Color) -> fox.ArrowPrimitive:
-    """A heading, `size` m long."""
+    """Return an arrow of `size` m along the heading of a pose."""
     return fox.ArrowPrimitive(
         pose=pose(at),
         shaft_length=0.6 * size,
@@ -86,7 +89,7 @@ def arrow(at: Pose, size: float, tint: fox.Color) -> fox.ArrowPrimitive:
 
 
 def words(text: str, at: Pose, above: float, tint: fox.Color) -> fox.TextPrimitive:
-    """A text `above` m above a place, that faces whoever looks."""
+    """Return a text `above` m above a position, always facing the viewer."""
     place = fox.Pose(position=fox.Vector3(x=at.x, y=at.y + above, z=above), orientation=turned(0.0))
     return fox.TextPrimitive(
         pose=place, billboard=True, font_size=14.0, scale_invariant=True, color=tint, text=text

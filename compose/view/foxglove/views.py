@@ -1,7 +1,7 @@
-"""What there is to see of a run, in Foxglove's schemas: any viewer that knows these shows it as it is.
+"""Scenes of a run in Foxglove's schemas, which any compatible viewer displays without configuration.
 
-Frames of reference: `world`; `ID`, where robot ID truly is; `ID/anchor`, that of its own anchor. Whatever
-stays on a topic is whole in its latest message, so one may look at any time of a record, or come late.
+The reference frames are `world`, the true pose `ID` of robot ID, and its anchor's frame `ID/anchor`. Each
+message is complete in itself, so a viewer can seek in a recording or connect late.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from protocol.motion import Pose
 
 WORLD = "world"
 TRAIL = 200
-"""poses, the latest, that a trail shows"""
+"""The number of latest poses in a trail."""
 BODY = 0.12
-"""of R: how long a robot is drawn"""
+"""The drawn length of a robot, as a fraction of the sensing range R."""
 LEAST = 0.06
-"""of its full colour: a hypothesis that is all but ruled out"""
+"""The minimum opacity of a hypothesis."""
 COLOURS: dict[Role, tuple[float, float, float]] = {"a": (0.04, 0.38, 0.64), "b": (0.77, 0.27, 0.11)}
 GREY = (0.5, 0.5, 0.5)
 GREEN = (0.0, 0.5, 0.35)
@@ -33,19 +33,21 @@ LEVELS = {
     **dict.fromkeys(("report-lost", "report-damaged", "late", "undecided"), fox.LogLevel.Warning),
     "inconsistent": fox.LogLevel.Error,
 }
-"""of an event's kind; of all others Info"""
+"""The log level of an event by its kind; Info for all others."""
+DELIVERED = {"heard": "received", "damaged": "damaged", "lost": "lost"}
+"""The words for the deliveries of reports, by `Passage.what`."""
 
 
 class Shown(NamedTuple):
-    """A message for viewers."""
+    """A message for viewers and its topic."""
 
     topic: str
     message: Any
-    """of Foxglove's"""
+    """A message of Foxglove's schemas."""
 
 
 def topics(robots: Iterable[str]) -> dict[str, Any]:
-    """The kind of message on each."""
+    """Return the message type of each topic, in a run of `robots`."""
     found = {
         "/tf": fox.FrameTransforms,
         "/stage": fox.SceneUpdate,
@@ -62,25 +64,25 @@ def topics(robots: Iterable[str]) -> dict[str, Any]:
 
 
 def nanoseconds(stage: Stage, tick: int) -> int:
-    """When that tick is, of simulated time."""
+    """Return the simulated time of `tick` in ns."""
     return round(tick * stage.mission.period * 1e9)
 
 
 class Trail:
-    """Where a robot was, the latest TRAIL poses; each is made once for all the messages that it is in."""
+    """The latest TRAIL true poses of a robot. Each is converted once for all messages that contain it."""
 
     def __init__(self) -> None:
         self.poses: deque[fox.Pose] = deque(maxlen=TRAIL)
         self.points: deque[fox.Point3] = deque(maxlen=TRAIL)
 
     def add(self, pose: Pose) -> None:
-        """The next."""
+        """Append a pose."""
         self.poses.append(shapes.pose(pose))
         self.points.append(shapes.point(pose.x, pose.y))
 
 
 class Views:
-    """A run, to be shown tick by tick, in the order of the ticks."""
+    """The messages of a run. Scenes must be passed in the order of their ticks."""
 
     def __init__(self, stage: Stage) -> None:
         self.stage = stage
@@ -89,23 +91,23 @@ class Views:
         self._latest: Scene | None = None
 
     def standing(self) -> Shown:
-        """What is there before anything happens: anchors, their ranges, and the orbits."""
+        """Return the static content: anchors, sensing ranges and orbits."""
         entities = [self._anchor(seat) for seat in self.stage.robots]
         return Shown("/stage", fox.SceneUpdate(entities=entities))
 
     def of(self, scene: Scene) -> Iterator[Shown]:
-        """One tick."""
+        """Yield the messages of one tick."""
         yield from self.passing(scene)
         yield from self._whole(scene)
 
     def again(self) -> Iterator[Shown]:
-        """The latest tick, for who has come since."""
+        """Yield the messages of the latest tick again, for new viewers."""
         if self._latest is not None:
             yield from self._lines(self._latest)
             yield from self._whole(self._latest)
 
     def passing(self, scene: Scene) -> Iterator[Shown]:
-        """One tick, of which nobody is to see more than what happens in it."""
+        """Yield only the log of a tick that is not shown; its poses are added to the trails."""
         self._latest = scene
         for player in scene.players:
             if player.pose is not None:
@@ -124,7 +126,7 @@ class Views:
             yield from self._robot(player, at)
         yield Shown("/contact", fox.SceneUpdate(entities=list(self._contacts(scene, at))))
 
-    # --- where everyone is ---
+    # --- robots ---
 
     def _transforms(self, scene: Scene, at: fox.Timestamp) -> Iterator[fox.FrameTransform]:
         for player in scene.players:
@@ -149,14 +151,14 @@ class Views:
             yield Shown(f"/{robot}/trail", fox.PosesInFrame(timestamp=at, frame_id=WORLD, poses=poses))
             yield Shown(f"/{robot}/body", fox.SceneUpdate(entities=[self._body(seat, player, at)]))
         if player.held is not None:
-            frame, held = _placed(robot, player.held)
-            poses = [shapes.pose(one) for one in held]
+            frame, hypotheses = _hypotheses(robot, player.held)
+            poses = [shapes.pose(one) for one in hypotheses]
             yield Shown(f"/{robot}/hypotheses", fox.PosesInFrame(timestamp=at, frame_id=frame, poses=poses))
-            belief = self._belief(seat, frame, held, player.held, at)
+            belief = self._belief(seat, frame, hypotheses, player.held, at)
             yield Shown(f"/{robot}/belief", fox.SceneUpdate(entities=[belief]))
 
     def _body(self, seat: Seat, player: Player, at: fox.Timestamp) -> fox.SceneEntity:
-        """The robot, what it does in words, and its anchor's range while it has one."""
+        """Return the drawing of a robot with its activity, its trail, and its anchor range if it has one."""
         assert player.pose is not None
         colour = shapes.colour(COLOURS[seat.role])
         lines, texts = [], [shapes.words(f"{seat.id}: {player.mode_name}", player.pose, self._unit, colour)]
@@ -177,7 +179,7 @@ class Views:
             texts=texts,
         )
 
-    # --- what stands ---
+    # --- anchors and contacts ---
 
     def _anchor(self, seat: Seat) -> fox.SceneEntity:
         colour = COLOURS[seat.role]
@@ -199,7 +201,7 @@ class Views:
         )
 
     def _contacts(self, scene: Scene, at: fox.Timestamp) -> Iterator[fox.SceneEntity]:
-        """Of each pair, while both are in range of each other: the link, the range, and the reports on it."""
+        """Yield one entity per pair. In contact it shows the link, the range and deliveries of reports."""
         for one, other in self.stage.pairs():
             a, b = scene.player(one.id), scene.player(other.id)
             contact = next((contact for contact in a.contacts if contact.peer == other.id), None)
@@ -209,7 +211,7 @@ class Views:
                 lines = [shapes.strip(ends, shapes.colour(GREEN), 3.0)]
                 words = [f"{contact.range:.3f} m"] if contact.range is not None else ["no range"]
                 words += [
-                    f"{passage.sender}'s report of tick {passage.tick}: {passage.what}"
+                    f"{passage.sender}'s report of tick {passage.tick}: {DELIVERED[passage.what]}"
                     for passage in scene.passages
                     if passage.sender in (one.id, other.id) and passage.what != "sent"
                 ]
@@ -219,12 +221,12 @@ class Views:
                 timestamp=at, frame_id=WORLD, id=f"{one.id}-{other.id}", lines=lines, texts=texts
             )
 
-    # --- what a robot holds possible ---
+    # --- hypotheses ---
 
     def _belief(
         self, seat: Seat, frame: str, poses: Sequence[Pose], held: HeldPoses, at: fox.Timestamp
     ) -> fox.SceneEntity:
-        """An arrow for each hypothesis, the paler the less probable, and the ellipse of the first."""
+        """Return an arrow for each hypothesis, paler if less probable, and the error ellipse of the first."""
         colour = COLOURS[seat.role]
         probability = held.probability or (1.0 / max(1, len(poses)),) * len(poses)
         lines = []
@@ -250,13 +252,13 @@ class Views:
         )
 
 
-def _placed(robot: str, held: HeldPoses) -> tuple[str, tuple[Pose, ...]]:
-    """The frame that its hypotheses are given in, and these."""
+def _hypotheses(robot: str, held: HeldPoses) -> tuple[str, tuple[Pose, ...]]:
+    """Return the frame of a robot's hypotheses, and their poses in it."""
     return (WORLD, held.world) if held.world else (f"{robot}/anchor", held.local)
 
 
 def _frame(seat: Seat) -> Pose:
-    """That of its anchor; one that nobody knows how it is turned is not."""
+    """Return the robot's anchor frame in the world frame, unrotated if its heading is unknown."""
     return seat.frame or Pose(seat.anchor.x, seat.anchor.y, 0.0)
 
 

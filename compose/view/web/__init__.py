@@ -1,1 +1,1 @@
-"""The page on which runs are watched, and its server."""
+"""The web page for watching runs, and its server."""

@@ -1,4 +1,4 @@
-"""Missions that run on a network, as whoever listens there hears them."""
+"""Missions observed on a network, for viewers."""
 
 from __future__ import annotations
 
@@ -45,86 +45,92 @@ CARRIED: Mapping[Callable[..., str] | None, Any] = {
     keys.report: Report,
     keys.estimate: Estimate,
 }
-"""the messages that each kind of key carries"""
+"""The message types that each kind of key carries."""
 OF_WORLD = (keys.truth, keys.observation)
-"""keys under which the world speaks"""
+"""The kinds of keys under which the world publishes."""
 AHEAD = UNANSWERED - 1
-"""ticks by which a robot's frame may be ahead of the world's latest, which may come by another way"""
+"""The number of ticks by which a robot's frame may precede the world's, which may take another route."""
 LEAP = 100_000
-"""ticks by which the world may be ahead of what was last heard of it; it plays fewer while a link is down"""
+"""The number of ticks by which the world may advance between two received frames.
+
+It is more than a world can run while a link is down.
+"""
 MOST_RUNS = 1000
-"""missions that are listed at the most"""
+"""The maximum number of listed missions."""
 MOST_APPEARING = 10_000
-"""robots at the most that wait to be asked for"""
+"""The maximum number of robots that wait for the query of their configuration."""
 LOOK_AGAIN_S = 0.25
-"""how often to look whether to end, and for a world that was not there"""
+"""The interval in s between checks for the stop request, and between attempts to connect."""
 QUERY_S = 2.0
-"""how long to wait for one answer"""
-SILENCE_S = 10.0
-"""a session over which nothing has come for so long, though a world was there, is replaced"""
+"""The timeout of a query in s."""
+STALE_SESSION_S = 10.0
+"""The time in s without any received frame after which the session is replaced."""
 TICKS_KEPT = 100_000
-"""robots times ticks, of one mission; beyond, the oldest are forgotten"""
+"""The maximum number of ticks times robots stored per mission. The oldest ticks are dropped."""
 
 
 class RefusedFrame(ValueError):
-    """A frame that the key it came under does not carry; its text says why."""
+    """A frame that does not belong under its key; the text says why."""
 
 
 class Heard(Show):
-    """A mission, as far as it has been heard."""
+    """A mission, built from the frames received from the network."""
 
     def __init__(self, run: str) -> None:
         super().__init__(run, Gathering())
         self.stage = None
         self.live = True
         self._tick: int | None = None
-        """the latest of which the world has spoken"""
+        """The latest tick in a frame of the world; None before the first."""
         self._robots: dict[str, bool] = {}
-        """those whose tokens have appeared or gone since the last poll: whether they are there"""
+        """Robots whose liveliness tokens changed since the last poll: True if the token is present."""
 
     def take(self, source: Key, frame: bytes) -> None:
-        """Fold in what came under `source`.
+        """Add a frame received under the key `source`.
 
-        A robot can put frames under its own keys only, and so it speaks for nobody else: raises Refused
-        unless kind, robot and tick are such as the key carries. Raises MalformedFrame.
+        Access control lets a robot publish only under its own keys, so the key identifies the sender. Raises
+        RefusedFrame unless kind, robot and tick match the key, and MalformedFrame if the frame is invalid.
         """
         message: Message = decode(frame, CARRIED[source.kind])
         robot = getattr(message, "robot", source.robot)
         if robot != source.robot:
-            raise RefusedFrame(f"it says it is from '{robot}'")
+            raise RefusedFrame(f"it names robot '{robot}' as its sender")
         tick: int | None = getattr(message, "tick", None)
         if tick is not None and not self._timely(tick, by_world=source.kind in OF_WORLD):
             return
-        briefed = len(self.known.configs)
+        configured = len(self.known.configs)
         self.known.take(message, len(frame))
-        if len(self.known.configs) > briefed:
+        if len(self.known.configs) > configured:
             order = sorted(self.known.configs)
             self.stage = of_briefings(self.name, {robot: self.known.configs[robot] for robot in order})
         if self.known.end is not None:
             self.live = False
 
     def _timely(self, tick: int, *, by_world: bool) -> bool:
-        """Whether `tick` has begun: the world says so, and before it has, nobody is heard. Raises Refused."""
+        """Return whether the world has begun any tick. Frames before that are ignored.
+
+        Raises RefusedFrame if `tick` is too far in the future.
+        """
         latest = self._tick
         if latest is not None and tick > latest + (LEAP if by_world else AHEAD):
-            raise RefusedFrame("it is of a tick to come")
+            raise RefusedFrame("its tick is in the future")
         if by_world:
             self._tick = max(tick, latest or 0)
         return self._tick is not None
 
     def poll(self) -> None:
-        """Forget what is too long ago."""
+        """Drop the oldest ticks beyond TICKS_KEPT, and apply changes of liveliness tokens."""
         robots = len(self.stage.robots) if self.stage is not None else 1
         while len(self.known.ticks) * robots > TICKS_KEPT:
             del self.known.ticks[next(iter(self.known.ticks))]
-        if not self.live:  # without its world, which may be the router, nobody is heard of
+        if not self.live:  # the world may be the router: without it, robots' tokens disappear as well
             self._robots.clear()
         for robot in self._robots.keys() & self.known.configs.keys():
             self.known.present(robot, self._robots.pop(robot))
         self.revised()
 
     def there(self, source: Key, alive: bool) -> None:
-        """Fold in whether its world, or a robot, shows itself by the token at `source`."""
+        """Record that the liveliness token at `source`, of the world or a robot, appeared or disappeared."""
         if source.kind is not keys.world_alive:
             if len(self._robots) < MOST_APPEARING:
                 self._robots[source.robot] = alive
@@ -134,33 +140,33 @@ class Heard(Show):
 
 
 class Listener:
-    """Somebody who listens at an endpoint, in a thread of its own; says nothing but questions."""
+    """A viewer's connection to a router, in a thread of its own. It only subscribes and queries."""
 
     def __init__(self, endpoints: Endpoints) -> None:
         self.endpoint = str(endpoints)
         self._endpoints = endpoints
         self.shows: dict[str, Heard] = {}
-        """by run, in the order in which they were found"""
+        """The missions by run name, in the order in which they were found."""
         self.reached = False
-        """whether there is a router at the endpoint"""
+        """True while connected to a router."""
         self._inbox = Inbox("tandem watch")
         self._answers: SimpleQueue[Arrival] = SimpleQueue()
         self._stop = threading.Event()
         self._looking_since: float | None = None
-        self._told = False
+        self._reported = False
         self._thread = threading.Thread(target=self._listen, daemon=True)
 
     def start(self) -> None:
-        """Begin."""
+        """Start the thread."""
         self._thread.start()
 
     def stop(self) -> None:
-        """End; waits a moment for the session to close."""
+        """Stop the thread, and wait until the session is closed or the time for that is over."""
         self._stop.set()
         self._thread.join(session.CLOSE_TIMEOUT_S + 1.0)
 
     def poll(self) -> None:
-        """Fold in what has come."""
+        """Process the received frames and answers."""
         while (arrival := self._inbox.next(0.0)).topic != "nothing":
             self._take(arrival)
         while True:
@@ -173,7 +179,7 @@ class Listener:
             show.poll()
 
     def _take(self, arrival: Arrival) -> None:
-        """Fold it in. A mission is one whose world has shown itself."""
+        """Process one arrival. A mission is listed once its world's liveliness token has appeared."""
         run = arrival.source.run
         appears = arrival.topic == "alive" and arrival.source.kind is keys.world_alive
         if appears and run not in self.shows and len(self.shows) < MOST_RUNS:
@@ -204,14 +210,14 @@ class Listener:
     def _unanswered(self) -> None:
         if self._looking_since is None:
             self._looking_since = time.monotonic()
-        elif not self._told and time.monotonic() >= self._looking_since + diagnosis.FIRST_WORD_S:
-            self._told = True
+        elif not self._reported and time.monotonic() >= self._looking_since + diagnosis.FIRST_WORD_S:
+            self._reported = True
             self._inbox.say(f"no router at {self.endpoint} yet: {diagnosis.why(self._endpoints)}")
         if self._stop.wait(LOOK_AGAIN_S):
             raise Interrupted("stop")
 
     def _attend(self, link: zenoh.Session) -> None:
-        """Listen, and ask for the briefing of every robot that appears, until the session is mute."""
+        """Subscribe, and query the configuration of each robot that appears, until no frames arrive."""
         appeared: SimpleQueue[Key] = SimpleQueue()
 
         def appears(sample: zenoh.Sample) -> None:
@@ -219,28 +225,28 @@ class Listener:
             if robot is not None and appeared.qsize() < MOST_APPEARING:
                 appeared.put(robot)
 
-        heard = threading.Event()
+        received = threading.Event()
         session.watch_liveliness(link, keys.world_alive("*"), self._inbox)
         for key in LISTENED:
-            link.declare_subscriber(key, self._hand_over(heard))
+            link.declare_subscriber(key, self._hand_over(received))
         session.watch_liveliness(link, keys.robot_alive("*", "*"), self._inbox)
-        told: Any = link.liveliness()
-        told.declare_subscriber(keys.robot_alive("*", "*"), appears, history=True)
-        silent = 0.0
+        liveliness: Any = link.liveliness()
+        liveliness.declare_subscriber(keys.robot_alive("*", "*"), appears, history=True)
+        idle_s = 0.0
         while not self._stop.is_set():
             try:
                 robot = appeared.get(timeout=LOOK_AGAIN_S)
             except Empty:
-                silent = 0.0 if heard.is_set() else silent + LOOK_AGAIN_S
-                heard.clear()
-                if silent >= SILENCE_S:
+                idle_s = 0.0 if received.is_set() else idle_s + LOOK_AGAIN_S
+                received.clear()
+                if idle_s >= STALE_SESSION_S:
                     return
                 continue
             self._ask(link, robot.run, robot.robot)
 
-    def _hand_over(self, heard: threading.Event) -> Callable[[zenoh.Sample], None]:
+    def _hand_over(self, received: threading.Event) -> Callable[[zenoh.Sample], None]:
         def hand_over(sample: zenoh.Sample) -> None:
-            heard.set()
+            received.set()
             session.deliver(sample, self._inbox, "command")
 
         return hand_over
@@ -249,7 +255,7 @@ class Listener:
         known = self.shows.get(run)
         if known is not None and robot in known.known.configs:
             return
-        asked = keys.config(run, robot)
-        answer = session.ask(link, asked, QUERY_S)
+        key = keys.config(run, robot)
+        answer = session.ask(link, key, QUERY_S)
         if isinstance(answer, bytes):
-            self._answers.put(Arrival("command", asked, answer, Key(keys.config, run, robot)))
+            self._answers.put(Arrival("command", key, answer, Key(keys.config, run, robot)))

@@ -1,7 +1,8 @@
-"""Requests that a foreign web page makes through the user's browser, recognised by their Host and Origin.
+"""Protection against requests that foreign web pages make through the user's browser.
 
-A browser says in Origin which page asks, and no page can change that. A page whose own name is made to lead
-here (DNS rebinding) says that name in Host. A program that is no browser sends no Origin.
+A browser sends the origin of the requesting page in the Origin header, which pages cannot change. A page
+whose own host name resolves to this server (DNS rebinding) has that name in the Host header. Programs other
+than browsers send no Origin.
 """
 
 from __future__ import annotations
@@ -12,21 +13,21 @@ from collections.abc import Collection, Sequence
 
 
 def refusal(hosts: Sequence[str], origins: Sequence[str], allowed: Collection[str] = ()) -> str | None:
-    """Return why a request is refused, in a line; none if it is not.
+    """Return the reason for which a request is refused, in one line; None if it is allowed.
 
-    `hosts` and `origins` are the values of these headers in the request; `allowed` are the origins of other
-    pages that may ask.
+    `hosts` and `origins` are the values of these headers in the request; `allowed` are the origins of
+    foreign pages that are allowed.
     """
     if len(hosts) != 1 or not _is_here(hosts[0]):
-        return "this server is asked for by its address, or as localhost (Host)"
+        return "the Host header must be an IP address or localhost"
     own = (f"http://{hosts[0]}", f"https://{hosts[0]}")
     if len(origins) > 1 or any(origin not in (*own, *allowed) for origin in origins):
-        return "pages of this origin may not ask (Origin)"
+        return "requests from pages of this origin are not allowed (Origin header)"
     return None
 
 
 def _is_here(host: str) -> bool:
-    """Whether `host` is localhost or an address, to which no foreign name can lead."""
+    """Return whether `host` is localhost or an IP address, which no foreign host name can imitate."""
     name = re.sub(r":[0-9]*$", "", host).lower()
     if name == "localhost":
         return True

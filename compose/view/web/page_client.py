@@ -1,4 +1,4 @@
-"""Somebody who looks at a page without a browser, and takes what one would. `tandem bench` sends one."""
+"""A client that makes the requests of an open page without a browser, as a load for `tandem bench`."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from urllib.parse import quote, urlsplit
 
 TIMEOUT_S = 30.0
 BETWEEN_S = 0.05
-"""how long a page waits between two answers while the mission runs (`page/store.js`)"""
+"""The time in s that a page waits between two requests while the mission runs (see `page/store.js`)."""
 
 
 def visit(address: str) -> None:
-    """Take the news and all the scenes of the first mission listed, until the server ends."""
+    """Request the updates and all scenes of the first listed mission until the server ends."""
     place = urlsplit(address).netloc
     news = http.client.HTTPConnection(place, timeout=TIMEOUT_S)
     scenes = http.client.HTTPConnection(place, timeout=TIMEOUT_S)

@@ -1,6 +1,6 @@
-"""Who serves the page: on loopback if not told otherwise, to programs and to its own page.
+"""The page's web server. It listens on the loopback interface by default.
 
-It reads, and writes nothing.
+It only reads data, and it refuses requests of foreign web pages.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from compose.view.web.sources import Show
 LOOPBACK = "127.0.0.1"
 PAGE = Path(__file__).parent / "page"
 POLL_S = 0.05
-"""how often to look for what is new while a mission runs, and how often a page hears of it"""
+"""The interval in s at which runs are polled and updates are sent to pages while a mission is live."""
 IDLE_S = 0.5
-"""the same, while none does"""
+"""The same interval while no mission is live."""
 PLAYERS_AT_ONCE = 4000
-"""robots times ticks in one answer: some megabytes, and some hundredths of a second of work"""
+"""The maximum number of robots times ticks in one answer: some megabytes and some 10 ms of work."""
 HEADERS = {
     b"content-security-policy": b"default-src 'self'; style-src 'self' 'unsafe-inline'; "
     b"img-src 'self' data:; frame-ancestors 'none'",
@@ -49,18 +49,18 @@ HEADERS = {
     b"referrer-policy": b"no-referrer",
     b"cache-control": b"no-store",
 }
-"""the page may ask nobody else for anything, and no other page may show it, or a part of it"""
+"""The headers of every answer. The page loads nothing from elsewhere, and no other page may embed it."""
 
 
 class CannotServe(OSError):
-    """The port cannot be had; the text says why."""
+    """The port is not available; the text says why."""
 
 
-# --- what is asked for ------------------------------------------------------------------------------
+# --- requests ---------------------------------------------------------------------------------------
 
 
 class _Answers:
-    """What is answered, of `site`."""
+    """The request handlers for `site`."""
 
     def __init__(self, site: Site) -> None:
         self._site = site
@@ -70,9 +70,9 @@ class _Answers:
 
     async def sweep(self, _request: Request) -> Response:
         if self._site.folder is None:
-            return _json({"error": "no sweep is shown"}, 404)
+            return _json({"error": "this server shows no sweep"}, 404)
         try:
-            return _json(sweep_page.told(self._site.folder))
+            return _json(sweep_page.contents(self._site.folder))
         except UserError as error:
             return _json({"error": str(error)}, 500)
 
@@ -99,12 +99,12 @@ class _Answers:
         return _json({"from": first, "to": last, "version": show.version, "scenes": shown})
 
     async def news(self, request: Request) -> Response:
-        told = _news(self._site, request.query_params.get("show"), _number(request, "since", 0))
-        return StreamingResponse(told, media_type="text/event-stream")
+        stream = _news(self._site, request.query_params.get("show"), _number(request, "since", 0))
+        return StreamingResponse(stream, media_type="text/event-stream")
 
 
 def application(site: Site) -> Starlette:
-    """The pages of `site`, for whoever asks for them by an address, and is no page of another."""
+    """Return the web application of `site`, which refuses requests of foreign web pages."""
     answers = _Answers(site)
     return Starlette(
         routes=[
@@ -124,7 +124,7 @@ def application(site: Site) -> Starlette:
 
 
 class _Own:
-    """Refuses what pages of others ask."""
+    """Middleware that refuses requests of foreign web pages (see `origin`)."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -139,7 +139,7 @@ class _Own:
 
 
 class _Sealed:
-    """Every answer with HEADERS."""
+    """Middleware that adds HEADERS to every answer."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -153,9 +153,9 @@ class _Sealed:
         await self._app(scope, receive, sealed)
 
 
-def _number(request: Request, name: str, otherwise: int) -> int:
+def _number(request: Request, name: str, default: int) -> int:
     text = request.query_params.get(name, "")
-    return int(text) if text.isascii() and text.isdigit() and len(text) < 16 else otherwise
+    return int(text) if text.isascii() and text.isdigit() and len(text) < 16 else default
 
 
 def _json(value: object, status: int = 200) -> Response:
@@ -175,14 +175,17 @@ def _state(show: Show) -> dict[str, Any]:
 
 
 async def _news(site: Site, name: str | None, version: int) -> AsyncIterator[bytes]:
-    """What changes, as it does: the list, and of the show of that name from which tick on more is known."""
+    """Yield server-sent events: the list of runs when it changes, and updates of the show called `name`.
+
+    An update has the state of the run and the first tick that changed since `version`.
+    """
     listed: dict[str, Any] | None = None
     state: dict[str, Any] | None = None
     while not site.over:
-        told: dict[str, Any] = {}
+        event: dict[str, Any] = {}
         now = site.listed()
         if now != listed:
-            told["list"] = listed = now
+            event["list"] = listed = now
         show = site.shows.get(name or "")
         if show is not None and show.stage is not None:
             since = show.since(version)
@@ -191,14 +194,14 @@ async def _news(site: Site, name: str | None, version: int) -> AsyncIterator[byt
             if since is not None or now != state:
                 state = now
                 head = show.head
-                told["show"] = {
+                event["show"] = {
                     **now,
                     "from": since,
                     "robots": len(show.stage.robots),
                     "scenes": scenes(show.stage, show.known, head, head) if show.live else (),
                 }
-        if told:
-            yield b"data: " + msgspec.json.encode(told) + b"\n\n"
+        if event:
+            yield b"data: " + msgspec.json.encode(event) + b"\n\n"
         await asyncio.sleep(POLL_S if site.waiting else IDLE_S)
 
 
@@ -206,7 +209,10 @@ async def _news(site: Site, name: str | None, version: int) -> AsyncIterator[byt
 
 
 def bound(port: int, address: str = LOOPBACK) -> socket.socket:
-    """A socket on `address` at `port`, or, if that is 0, at one that is free. Raises CannotServe."""
+    """Return a listening socket on `address` at `port`, or at a free port if it is 0.
+
+    Raises CannotServe if the port is not available.
+    """
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
     taken = socket.socket(family, socket.SOCK_STREAM)
     taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -220,28 +226,28 @@ def bound(port: int, address: str = LOOPBACK) -> socket.socket:
 
 
 def host(address: str) -> str:
-    """What a browser on this machine calls a server on `address`."""
+    """Return the host part of the URL of a server on `address`, for a browser on this machine."""
     if ipaddress.ip_address(address).is_unspecified:
         return LOOPBACK
     return f"[{address}]" if ":" in address else address
 
 
 def address(taken: socket.socket) -> str:
-    """What to open in a browser."""
-    where, port, *_ = taken.getsockname()
-    return f"http://{host(where)}:{port}/"
+    """Return the URL of the server that listens on the socket `taken`."""
+    bound_to, port, *_ = taken.getsockname()
+    return f"http://{host(bound_to)}:{port}/"
 
 
 Ready = Callable[[Callable[[], None]], None]
-"""what is called once pages are answered, with what ends it all"""
+"""A callback for when the server answers requests. Its argument is a function that stops the server."""
 
 
 def serve(site: Site, taken: socket.socket, ready: Ready) -> None:
-    """Serve `site` until SIGINT, SIGTERM or SIGHUP, or until what `ready` is given is called."""
+    """Serve `site` until SIGINT, SIGTERM or SIGHUP, or until the function passed to `ready` is called."""
     asyncio.run(_serve(site, taken, ready))
 
 
-logging.getLogger("uvicorn").addHandler(logging.NullHandler())  # what is to be said, we say
+logging.getLogger("uvicorn").addHandler(logging.NullHandler())  # Tandem reports errors itself
 
 
 async def _serve(site: Site, taken: socket.socket, ready: Ready) -> None:
@@ -264,27 +270,27 @@ async def _serve(site: Site, taken: socket.socket, ready: Ready) -> None:
         loop.add_signal_handler(number, stop)
     site.poll()
     serving = asyncio.create_task(server.serve(sockets=[taken]))
-    told = False
+    announced = False
     while not serving.done():
-        if server.started and not told:
-            told = True
+        if server.started and not announced:
+            announced = True
             ready(lambda: _soon(loop, stop))
-        await asyncio.wait([serving], timeout=POLL_S if site.waiting or not told else IDLE_S)
+        await asyncio.wait([serving], timeout=POLL_S if site.waiting or not announced else IDLE_S)
         site.poll()
     await serving
 
 
 def _soon(loop: asyncio.AbstractEventLoop, stop: Callable[[], None]) -> None:
-    with suppress(RuntimeError):  # it has ended
+    with suppress(RuntimeError):  # the loop is closed
         loop.call_soon_threadsafe(stop)
 
 
 class _Server(uvicorn.Server):
-    """Signals are ours."""
+    """A uvicorn server that leaves signals to `_serve`."""
 
     def install_signal_handlers(self) -> None:
-        """Nothing."""
+        """Do nothing."""
 
     def capture_signals(self) -> Any:
-        """Nothing."""
+        """Return a context that does nothing."""
         return nullcontext()

@@ -1,4 +1,4 @@
-"""What one server shows: records, a sweep, or missions on a network."""
+"""The content of one server: recordings, a sweep, or missions on a network."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from protocol.network.endpoints import Endpoints
 
 
 class Site:
-    """All that one server shows."""
+    """The runs, or the sweep, that one server shows."""
 
     def __init__(
         self,
@@ -24,16 +24,16 @@ class Site:
         listeners: list[Listener] | None = None,
         folder: Path | None = None,
     ) -> None:
-        """`folder` is that of a sweep, if it is one that is shown."""
+        """Create the content of a server. `folder` is the folder of a sweep; None if there is none."""
         self.folder = folder
         self.recorded = shows or []
         self.listeners = listeners or []
         self.over = False
-        """whether the server is about to end"""
+        """True once the server is stopping."""
 
     @property
     def shows(self) -> dict[str, Show]:
-        """Every run of which enough is known to show it, by name."""
+        """The runs whose static data is known, by name."""
         found: dict[str, Show] = {show.name: show for show in self.recorded}
         for i, listener in enumerate(self.listeners):
             for run, show in listener.shows.items():
@@ -42,26 +42,26 @@ class Site:
 
     @property
     def waiting(self) -> bool:
-        """Whether something may come."""
+        """True if new data may arrive."""
         return bool(self.listeners) or any(show.live for show in self.recorded)
 
     @property
     def notes(self) -> list[str]:
-        """What could not be read, a line each."""
+        """One line for each part of a recording that cannot be read."""
         return [note for show in self.recorded for note in show.notes]
 
     def start(self) -> None:
-        """Begin to listen."""
+        """Start listening on the network."""
         for listener in self.listeners:
             listener.start()
 
     def stop(self) -> None:
-        """Listen no more."""
+        """Stop listening on the network."""
         for listener in self.listeners:
             listener.stop()
 
     def poll(self) -> None:
-        """Fold in what has come."""
+        """Read new data."""
         for show in self.recorded:
             with suppress(OSError):
                 show.poll()
@@ -69,12 +69,12 @@ class Site:
             listener.poll()
 
     def concluded(self) -> None:
-        """Whoever wrote has ended."""
+        """Mark the recordings as complete, because their writers have ended."""
         for show in self.recorded:
             show.concluded()
 
     def listed(self) -> dict[str, Any]:
-        """What the page lists."""
+        """Return the list of runs for the page."""
         return {
             "sweep": self.folder is not None,
             "network": [{"endpoint": one.endpoint, "reached": one.reached} for one in self.listeners],
@@ -94,22 +94,25 @@ class Site:
 
 
 def of_record(folder: Path) -> Site:
-    """Of a record that is about to be written."""
+    """Return the content for one recording, which need not exist yet."""
     return Site([Recorded(folder.name, folder, expected=True)])
 
 
 def of_network(places: Sequence[Endpoints]) -> Site:
-    """Of the missions that are heard there."""
+    """Return the content for the missions found at the given endpoints."""
     return Site(listeners=[Listener(endpoints) for endpoints in places])
 
 
 def of_folder(folder: Path) -> Site:
-    """Of a record, of a sweep, or of the records in the folders in `folder`. Raises UserError."""
+    """Return the content for a recording, a sweep, or the recordings in the subfolders of `folder`.
+
+    Raises UserError if there is none of these.
+    """
     try:
         if not folder.is_dir():
-            raise UserError(f"{folder} is no folder")
+            raise UserError(f"{folder} is not a folder")
         if sweep_page.is_sweep(folder):
-            sweep_page.told(folder)
+            sweep_page.contents(folder)
             return Site(folder=folder)
         folders = [folder]
         if not any(journals_in(folder)):
@@ -120,8 +123,8 @@ def of_folder(folder: Path) -> Site:
     except OSError as error:
         raise UserError(f"{folder} cannot be read: {error.strerror or error}") from None
     if not shows:
-        raise UserError(f"{folder} holds neither a record, nor a sweep, nor folders with records")
+        raise UserError(f"{folder} contains no recording, no sweep, and no folders with recordings")
     if not any(show.live or show.stage is not None for show in shows):
         why = "; ".join(note for show in shows for note in show.notes) or "its journals are empty"
-        raise UserError(f"there is nothing to see in {folder}: {why}")
+        raise UserError(f"the recordings in {folder} cannot be shown: {why}")
     return Site(shows)

@@ -1,4 +1,4 @@
-"""Runs that can be watched: records, whether they grow yet or not, and what is said on a network."""
+"""Sources of runs for the page: recordings, complete or growing, and missions on a network."""
 
 from __future__ import annotations
 
@@ -14,41 +14,41 @@ from compose.view.facts import Gathering
 from compose.view.recorded import Journals
 
 REVISIONS_KEPT = 1000
-"""polls that changed something; who has not looked for longer begins anew"""
+"""The number of stored revisions. A page that has missed more reloads all scenes."""
 UNANSWERED = 5
-"""ticks at the most that the head looks back for one that everyone has answered"""
+"""The maximum number of ticks by which the head goes back to a tick with all commands."""
 
 
 class Show(ABC):
-    """A run to be watched."""
+    """A run that pages can watch."""
 
     live: bool
-    """whether more may come"""
+    """True if new data may arrive."""
     stage: Stage | None
-    """none until somebody has told"""
+    """The static data of the run; None until it is known."""
 
     def __init__(self, name: str, known: Gathering) -> None:
         self.name = name
-        """within one server; part of an address"""
+        """The name of the run, unique within one server and part of URLs."""
         self.known = known
         self.notes: list[str] = []
         self.version = 0
-        """how often something has become known"""
+        """The number of polls that changed the run."""
         self._revisions: deque[tuple[int, int]] = deque(maxlen=REVISIONS_KEPT)
 
     @abstractmethod
     def poll(self) -> None:
-        """Fold in what has come."""
+        """Read new data."""
 
     def revised(self) -> None:
-        """To be called where something may have come: whoever watches is told from which tick on."""
+        """Record a revision if the facts have changed. Subclasses call this at the end of `poll`."""
         if self.known.touched is not None:
             self.version += 1
             self._revisions.append((self.version, self.known.touched))
             self.known.touched = None
 
     def since(self, version: int) -> int | None:
-        """The first tick of which more is known than at `version`; none if there is no such tick."""
+        """Return the first tick that changed after `version`; None if none did."""
         if version >= self.version:
             return None
         if not self._revisions or self._revisions[0][0] > version + 1:
@@ -57,9 +57,10 @@ class Show(ABC):
 
     @property
     def head(self) -> int:
-        """The latest tick to show: while more may come, one in which every robot has answered.
+        """The latest tick to show.
 
-        While a process is gone, nothing more comes, but that it is.
+        It is the last tick, or, in a live run, the latest of the last UNANSWERED ticks in which every robot
+        has answered. While a process is gone it is the last tick as well, because no answer is expected.
         """
         last = self.known.last
         if not self.live or self.stage is None or self.known.gone:
@@ -73,10 +74,10 @@ class Show(ABC):
 
 
 class Recorded(Show):
-    """The record in a folder."""
+    """The recording in a folder."""
 
     def __init__(self, name: str, folder: Path, *, expected: bool = False) -> None:
-        """`expected` is whether it will be written, though there may be nothing yet."""
+        """Open the recording in `folder`. `expected` is true if its journals may not exist yet."""
         self._journals = Journals(folder)
         super().__init__(name, self._journals.known)
         self.notes = self._journals.notes
@@ -86,11 +87,12 @@ class Recorded(Show):
         self._expected = expected
         self._over = False
         self._writers: dict[str, int] = {}
-        """the process that was seen last to have a journal locked, by the journal's name"""
+        """The id of the process that last held the lock of each journal, by the journal's name."""
 
     def poll(self) -> None:
-        """Fold in what has come. Raises OSError."""
-        writers = writers_of(journals_in(self.folder))  # first: all that a process wrote that is gone is read
+        """Read new frames of the journals. Raises OSError."""
+        # Locks before journals: then all frames of a process that has ended are read.
+        writers = writers_of(journals_in(self.folder))
         written = self._expected or bool(writers)
         if self._over and not written:
             return
@@ -99,35 +101,35 @@ class Recorded(Show):
         if written:
             self._attend(writers)
         self.live = written and self.known.end is None
-        self._over = not written  # until whoever went on with it writes again
+        self._over = not written  # until a resumed mission writes again
         if self._over:
             self._journals.fill()
         self.revised()
 
     def _attend(self, writers: dict[str, int]) -> None:
-        """Fold in whose process has ended, and whose is another since."""
+        """Record which processes have ended or have been replaced."""
         robots = self.stage.ids if self.stage is not None else ()
-        for who, name in ((None, WORLD_JOURNAL), *((robot, agent_journal(robot)) for robot in robots)):
+        for robot, name in ((None, WORLD_JOURNAL), *((one, agent_journal(one)) for one in robots)):
             process = writers.get(name)
             if process != self._writers.get(name):
-                self.known.present(who, False)
+                self.known.present(robot, False)
             if process is not None:
-                self.known.present(who, True)
+                self.known.present(robot, True)
                 self._writers[name] = process
 
     def concluded(self) -> None:
-        """Nobody writes it any more."""
+        """Mark the recording as complete, because its writers have ended."""
         self._expected = False
 
 
 def writers_of(journals: Iterable[Path]) -> dict[str, int]:
-    """Return the processes that have `journals` locked, by the journal's name.
+    """Return the ids of the processes that have locked `journals`, by the journal's name.
 
-    To try to lock one could keep its writer from it.
+    The locks are read from /proc/locks, because an attempt to lock a journal could block its writer.
     """
     try:
         locks = [line.split() for line in LOCKS.read_text(encoding="ascii").splitlines()]
-    except OSError:  # a system that does not tell
+    except OSError:  # the system has no /proc/locks
         return {}
     by_inode = {lock[5].rpartition(":")[2]: int(lock[4]) for lock in locks if lock[1] == "FLOCK"}
     found = {}

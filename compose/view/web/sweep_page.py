@@ -1,4 +1,4 @@
-"""The folder of a sweep, as the page shows it: what was asked, a row a cell, and the figures."""
+"""The data of a sweep's folder for the page: parameters, one row per cell, and figures."""
 
 from __future__ import annotations
 
@@ -19,15 +19,18 @@ FIGURES = "figures"
 
 
 def is_sweep(folder: Path) -> bool:
-    """Whether a sweep has left it."""
+    """Return whether `folder` contains the results of a sweep."""
     return (folder / SWEEP).is_file()
 
 
-def told(folder: Path) -> dict[str, Any]:
-    """What there is to see, now: a sweep that is under way has no summary yet. Raises UserError."""
+def contents(folder: Path) -> dict[str, Any]:
+    """Return the data for the page. A running sweep has no rows yet.
+
+    Raises UserError if the folder cannot be read.
+    """
     try:
-        asked = msgspec.json.decode(files.read_bytes(folder / SWEEP))
-        sweep = asked["sweep"]
+        manifest = msgspec.json.decode(files.read_bytes(folder / SWEEP))
+        sweep = manifest["sweep"]
         axes = [
             {
                 "name": axis["name"],
@@ -46,7 +49,7 @@ def told(folder: Path) -> dict[str, Any]:
             "trials": sweep["trials"],
             "seed": sweep["seed"],
             "axes": axes,
-            "refused": asked["refused"],
+            "refused": manifest["refused"],
             "rows": rows,
             "under_way": (folder / PARTS).is_dir(),
             "figures": figures(folder),
@@ -54,9 +57,9 @@ def told(folder: Path) -> dict[str, Any]:
     except OSError as error:
         raise UserError(f"{folder} cannot be read: {error.strerror or error}") from None
     except (msgspec.MsgspecError, KeyError, TypeError, UnicodeDecodeError, csv.Error) as error:
-        raise UserError(f"{folder / SWEEP} is no sweep's: {error!r}") from None
+        raise UserError(f"{folder / SWEEP} is not a valid sweep manifest: {error!r}") from None
 
 
 def figures(folder: Path) -> list[str]:
-    """Their names."""
+    """Return the file names of the sweep's figures."""
     return sorted(path.name for path in (folder / FIGURES).glob("*.svg"))

@@ -1,4 +1,4 @@
-// What robots hold possible, and what they have just ruled out.
+// The poses that robots consider possible, and those that they have just ruled out.
 
 import { between, compose, distance, ellipse, frame_of, step, TAU } from "./geometry.js";
 import { held_now } from "./held.js";
@@ -46,7 +46,7 @@ export class Beliefs {
     return undefined;
   }
 
-  /** Before anything is known but a range, or nothing: somewhere in the anchor's range. */
+  /** Draws the circle on which the robot is, or its anchor's sensing range, before it has a pose. */
   #somewhere({ look, truth, store }, robot, player) {
     if (truth || !player) return;
     const pen = this.plane.context, [x, y] = this.plane.at(robot.anchor);
@@ -58,10 +58,10 @@ export class Beliefs {
     pen.setLineDash([2, 6]);
     pen.stroke();
     pen.setLineDash([]);
-    label(pen, `${robot.id} is somewhere here`, x, y - range * this.plane.scale - 6, look.ghost, "center", look);
+    label(pen, `${robot.id}: position unknown`, x, y - range * this.plane.scale - 6, look.ghost, "center", look);
   }
 
-  /** Its place relative to its anchor is known, the bearing is not: the frame is turned at will. */
+  /** Draws the circle of possible positions of a robot whose bearing from its anchor is unknown. */
   #any_bearing({ look }, robot, pose) {
     const pen = this.plane.context, [x, y] = this.plane.at(robot.anchor);
     const radius = distance(pose, robot.anchor) * this.plane.scale;
@@ -74,10 +74,10 @@ export class Beliefs {
     pen.stroke();
     pen.setLineDash([]);
     pen.globalAlpha = 1;
-    label(pen, `${robot.id}: here, at any bearing`, x, y - radius - 6, look.ghost, "center", look);
+    label(pen, `${robot.id}: bearing unknown`, x, y - radius - 6, look.ghost, "center", look);
   }
 
-  /** What was held possible up to FADING ticks ago, moved on, and is not any more. */
+  /** Draws the poses ruled out in the last FADING ticks, propagated by odometry to the current tick. */
   #ruled_out(view, robot) {
     const { store, truth, look, size, tick, share, moving } = view;
     const pen = this.plane.context, period = store.stage.mission.period;

@@ -1,4 +1,4 @@
-// Beside the plane: what each robot does, in words; what came in, what it decides, what it believes and has counted.
+// The cards beside the plane: each robot's activity, measurements, reports, command, belief and totals.
 
 import { distance, wrap } from "./geometry.js";
 import { leads } from "./held.js";
@@ -48,11 +48,11 @@ export class Cards {
     }
     for (const [id, entry] of this.entries ?? []) {
       const player = store.player(tick, id), phase = player ? store.phase(tick, id) : 0;
-      const text = `${id} ${player?.down ? "is down" : player?.drive?.state ?? "–"}`;
+      const text = `${id} ${player?.down ? "is down" : player?.command?.state ?? "–"}`;
       if (entry.textContent !== text) entry.textContent = text;
       entry.dataset.phase = phase;
       entry.setAttribute("aria-pressed", String(id === focus));
-      entry.setAttribute("aria-label", player?.doing ?? id);
+      entry.setAttribute("aria-label", player?.mode_name ?? id);
     }
   }
 }
@@ -88,26 +88,26 @@ class Card {
     const player = store.player(tick, this.robot.id);
     this.root.classList.toggle("chosen", chosen);
     this.name.setAttribute("aria-pressed", String(chosen));
-    this.name.title = chosen ? "Show all robots (A)" : `Show what ${this.robot.id} knows`;
+    this.name.title = chosen ? "Show all robots (A)" : `Show the belief of ${this.robot.id}`;
     if (!player) return void (this.doing.textContent = "…");
-    const { drive, held } = player;
+    const { command, held } = player;
     const phase = store.phase(tick, this.robot.id);
     this.root.dataset.phase = phase;
     this.root.classList.toggle("down", Boolean(player.down));
     this.phase.textContent = `phase ${phase}: ${PHASES[phase]}${player.down ? "; down" : ""}`;
-    if (this.doing.textContent !== player.doing) this.doing.textContent = player.doing;
+    if (this.doing.textContent !== player.mode_name) this.doing.textContent = player.mode_name;
     const [off, range] = truth && player.pose && held?.world.length ? error(held, player.pose) : ["", ""];
     this.error.textContent = off;
     this.error.title = range;
-    this.#row("observations", inputs(player, this.robot));
-    this.#row("hears", hears(player, this.robot));
-    this.#row("decides", drive ? decides(drive) : "–");
-    this.#row("says", player.sent ? `a report of ${player.sent.bytes} bytes, its log through tick ${player.sent.through}` : "nothing");
-    this.#row("holds", held ? holds(held) : "–");
-    if (truth) this.#row("is at", player.pose ? `${place(player.pose)}, ${rad(player.pose[2])}` : "not known here");
-    else if (this.fields.has("is at")) this.#row("is at", "hidden");
+    this.#row("measured", measured(player, this.robot));
+    this.#row("received", received(player, this.robot));
+    this.#row("command", command ? commanded(command) : "–");
+    this.#row("sent", player.sent ? `report of ${player.sent.bytes} bytes, log through tick ${player.sent.through}` : "nothing");
+    this.#row("belief", held ? believed(held) : "–");
+    if (truth) this.#row("true pose", player.pose ? `${place(player.pose)}, ${rad(player.pose[2])}` : "unknown");
+    else if (this.fields.has("true pose")) this.#row("true pose", "hidden");
     const counted = store.counted(this.robot.id, tick);
-    this.#row("so far", counted ? counts(counted) : "…");
+    this.#row("totals", counted ? totals(counted) : "…");
     this.#probability(held);
   }
 
@@ -123,50 +123,54 @@ class Card {
   }
 }
 
-/** How far it is from where it takes itself to be; of several poses none of which leads, from the farthest. */
+/**
+ * Returns the position error as text, and its explanation.
+ *
+ * The error is that of the leading pose, or, if no pose leads, the largest of all possible poses.
+ */
 function error(held, pose) {
   const off = held.world.map((one) => distance(one, pose)), least = metres(Math.min(...off)), most = metres(Math.max(...off));
-  if (leads(held)) return [`${metres(off[0])} off`, ""];
-  return [`up to ${most} off`, `${least} to ${most}: ${off.length} poses are possible, and none is likelier than the others together`];
+  if (leads(held)) return [`error ${metres(off[0])}`, ""];
+  return [`error up to ${most}`, `${least} to ${most}: ${off.length} poses are possible, and none has a probability above 50 %`];
 }
 
-function inputs(player, robot) {
-  if (!player.sensed) return "not known";
-  const drove = player.executed ? `drove ${speed(player.executed[0])}, ${turning(player.executed[1])}; ` : "";
+function measured(player, robot) {
+  if (!player.sensed) return "unknown";
+  const odometry = player.executed ? `odometry ${speed(player.executed[0])}, ${turning(player.executed[1])}; ` : "";
   const anchor = player.anchor_range === undefined ? "no range to its anchor" : `anchor ${metres(player.anchor_range)}`;
   const contact = player.contacts?.[0];
-  if (!contact) return `${drove}${anchor}; ${robot.peer} is not in range`;
-  return `${drove}${anchor}; ${contact[0]} ${contact[1] === null ? "in range, not measured" : metres(contact[1])}`;
+  if (!contact) return `${odometry}${anchor}; ${robot.peer} is not in range`;
+  return `${odometry}${anchor}; ${contact[0]} ${contact[1] === null ? "in range, not measured" : metres(contact[1])}`;
 }
 
-function hears(player, robot) {
+function received(player, robot) {
   const contact = player.contacts?.[0];
   if (!contact) return "nothing";
-  if (contact[2] === null) return `what ${robot.peer} tells within the tick`;  // without a world nobody lists it
+  if (contact[2] === null) return `reports of ${robot.peer} that arrive within the tick`;  // hardware mode
   const ticks = (list) => `${list.length > 1 ? "ticks" : "tick"} ${list.join(", ")}`;
-  const heard = contact[2].length ? `${robot.peer}'s report of ${ticks(contact[2])}` : `nothing of ${robot.peer}`;
-  return contact[3].length ? `${heard}; refuses that of ${ticks(contact[3])}: damaged` : heard;
+  const intact = contact[2].length ? `${robot.peer}'s report of ${ticks(contact[2])}` : `nothing from ${robot.peer}`;
+  return contact[3].length ? `${intact}; damaged: report of ${ticks(contact[3])}` : intact;
 }
 
-const decides = ({ v, omega, state }) => `${state}: ${v === 0 && omega === 0 ? "stands" : `${speed(v)}, ${turning(omega)}`}`;
+const commanded = ({ v, omega, state }) => `${state}: ${v === 0 && omega === 0 ? "stop" : `${speed(v)}, ${turning(omega)}`}`;
 
-function holds({ local, world, probability: chances, covariance, localised }) {
+function believed({ local, world, probability: chances, covariance, localised }) {
   const sigma = covariance && world.length ? `, sigma ${metres(Math.sqrt(Math.max(0, covariance[0] + covariance[3])))}` : "";
   if (world.length === 1) {
     const at = `${place(world[0])}, ${rad(wrap(world[0][2]))}${sigma}`;
-    return localised ? `it is at ${at}` : `one placement: ${at}`;
+    return localised ? `localised at ${at}` : `1 possible placement: ${at}`;
   }
-  if (world.length) return `${world.length} placements of the two possible${chances.length ? "" : ", equally"}${sigma}`;
-  if (local.length > 1) return `${local.length} branches possible about its anchor`;
-  if (local.length) return `${metres(Math.hypot(local[0][0], local[0][1]))} from its anchor, at no known bearing`;
-  return "nothing but its ranges";
+  if (world.length) return `${world.length} possible placements${chances.length ? "" : ", equally probable"}${sigma}`;
+  if (local.length > 1) return `${local.length} possible branches in the anchor's frame`;
+  if (local.length) return `${metres(Math.hypot(local[0][0], local[0][1]))} from its anchor, bearing unknown`;
+  return "pose unknown";
 }
 
-function counts({ anchor, mutual, sent, heard, refused, lost, bytes }) {
-  const fates = [`${plural(sent, "report")} sent`, `${heard} heard`];
-  if (refused) fates.push(`${refused} refused`);
-  if (lost) fates.push(`${lost} of its own lost`);
-  return `${anchor} + ${mutual} ranges; ${fates.join(", ")}; ${bytes} bytes`;
+function totals({ anchor, mutual, sent, heard, refused, lost, bytes }) {
+  const reports = [`${plural(sent, "report")} sent`, `${heard} received`];
+  if (refused) reports.push(`${refused} received damaged`);
+  if (lost) reports.push(`${lost} sent but lost`);
+  return `${anchor} anchor ranges, ${mutual} mutual ranges; ${reports.join(", ")}; ${bytes} bytes sent`;
 }
 
 export function make(tag, properties, ...children) {

@@ -1,21 +1,21 @@
-// Poses are [x, y, heading]: m and rad, headings counter-clockwise. As in protocol/motion.py.
+// Geometry of poses [x, y, heading] in m and rad, headings counter-clockwise, as in protocol/motion.py.
 
 export const TAU = 2 * Math.PI;
 
-/** The pose after driving (v, omega) for `s` seconds. */
+/** Returns the pose after driving with (v, omega) for `s` seconds. */
 export function step([x, y, heading], v, omega, s) {
   const half = (omega * s) / 2;
   const length = half === 0 ? v * s : (v * s * Math.sin(half)) / half;
   return [x + length * Math.cos(heading + half), y + length * Math.sin(heading + half), heading + omega * s];
 }
 
-/** `local`, given in `frame`, in the coordinates in which `frame` itself is given. */
+/** Returns the pose `local`, given in `frame`, in the parent frame of `frame`. */
 export function compose(frame, local) {
   const c = Math.cos(frame[2]), s = Math.sin(frame[2]);
   return [frame[0] + c * local[0] - s * local[1], frame[1] + s * local[0] + c * local[1], frame[2] + local[2]];
 }
 
-/** The frame in which `pose` is the origin's. */
+/** Returns the inverse of a pose: compose(pose, inverse(pose)) is the origin. */
 export function inverse([x, y, heading]) {
   const c = Math.cos(heading), s = Math.sin(heading);
   return [-x * c - y * s, x * s - y * c, -heading];
@@ -28,14 +28,14 @@ export function wrap(angle) {
   return turned <= -Math.PI ? Math.PI : turned;
 }
 
-/** Half axes and direction of the ellipse of `sigmas` standard deviations, of [xx, xy, xh, yy, yh, hh]. */
+/** Returns the semi-axes and the direction of the error ellipse of a covariance [xx, xy, xh, yy, yh, hh]. */
 export function ellipse([xx, xy, , yy], sigmas) {
   const mean = (xx + yy) / 2, spread = Math.hypot((xx - yy) / 2, xy);
   const root = (value) => sigmas * Math.sqrt(Math.max(0, value));
   return { major: root(mean + spread), minor: root(mean - spread), turn: Math.atan2(2 * xy, xx - yy) / 2 };
 }
 
-/** The pose between two ticks, a share of the way along what was driven; as driven, if none is known in the next. */
+/** Returns the pose at the fraction `share` of a tick, driven from `from` and corrected towards `to` if known. */
 export function between(from, to, driven, share, period) {
   if (share <= 0) return from;
   if (!driven) return share < 1 || !to ? from : to;
@@ -49,7 +49,7 @@ export function between(from, to, driven, share, period) {
   ];
 }
 
-/** The frame of its anchor; its bearing is the truth's, or, where only the robot is asked, anything. */
+/** Returns the robot's anchor frame. Its heading is the true one, or 0 if the ground truth is hidden. */
 export function frame_of(robot, truth) {
   return truth && robot.frame ? robot.frame : [robot.anchor[0], robot.anchor[1], 0];
 }

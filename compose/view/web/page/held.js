@@ -1,14 +1,14 @@
-// What a robot holds possible, where it is then: between two ticks each pose moves to what it is in the next.
+// The poses that a robot considers possible, interpolated between two ticks.
 
 import { between, compose, distance, frame_of, wrap } from "./geometry.js";
 
-/** A pose goes on in the next tick if it is so near to where it was driven to, of the sensing range and in rad. */
+/** The largest distance (a fraction of the sensing range) and angle (rad) of a driven pose to its successor. */
 const NEAR = 0.05, TURNED = 0.5;
 
-/** Whether the first pose is the only one, or likelier than all others together. */
+/** True if the first pose is the only one, or more probable than all others together. */
 export const leads = ({ world, local, probability }) => (world.length || local.length) === 1 || probability[0] > 0.5;
 
-/** The poses that a robot holds possible, on the plane, and the covariance of the first; none if it holds none. */
+/** Returns the robot's possible poses on the plane and the first one's covariance; null without an estimate. */
 export function held_now({ store, scene, truth, tick, share, moving }, robot) {
   const held = scene.players[store.places.get(robot.id)]?.held;
   if (!held) return null;
@@ -32,7 +32,7 @@ const placed = (held, frame) => (held.world.length ? held.world : held.local.map
 
 const mixed = (one, other, share) => (one && other ? one.map((value, i) => value + share * (other[i] - value)) : one);
 
-/** Which of `goals` each of `poses` goes on as; none for one that does not. */
+/** Returns for each of `poses` the index of its successor in `goals`, or null if it has none. */
 function matched(poses, goals, driven, period, near) {
   const free = new Set(goals.keys());
   return poses.map((pose) => {

@@ -1,7 +1,7 @@
-// What happened, a line an event; choosing one goes there. Only what is near the tick is in the page.
+// The event log, one line per event; selecting one goes to its tick. Only events near the tick are in the DOM.
 
 import { make } from "./cards.js";
-import { KIND_NAMES, SIGNS } from "./words.js";
+import { KIND_NAMES, SIGNS, without_error } from "./words.js";
 
 const NEAR = 120;
 
@@ -29,7 +29,7 @@ export class Log {
     }
   }
 
-  /** What has been read of `tick` and later is not so any more. */
+  /** Discards the events of `tick` and later, because they have changed. */
   forget(tick) {
     if (tick >= this.read) return;
     this.read = tick;
@@ -44,7 +44,7 @@ export class Log {
     return event.kind.startsWith("contact") && this.store.stage.robots.some((r) => r.id === focus && r.peer === event.robot);
   }
 
-  /** The nearest wanted event's tick before (-1) or after (+1) `tick`. */
+  /** Returns the tick of the nearest visible event before (-1) or after (+1) `tick`. */
   next(tick, direction, focus) {
     this.#read();
     const ticks = this.events.filter((event) => this.#wanted(event, focus)).map((event) => event.tick);
@@ -82,7 +82,7 @@ export class Log {
   }
 
   #item(event, truth) {
-    const text = truth ? event.text : event.text.replace(/; it is .* off$/, "");
+    const text = truth ? event.text : without_error(event.text);
     const sign = make("span", { className: "sign", textContent: SIGNS[event.kind], title: KIND_NAMES[event.kind] });
     sign.setAttribute("aria-hidden", "true");
     const go = make("button", { type: "button" }, make("b", { textContent: event.tick }), sign, make("span", { textContent: text }));

@@ -1,4 +1,4 @@
-// What is shown, and how one moves through it. The address says the same: #show=…&tick=46&robot=a&truth=0
+// The entry point of the page: view state, playback, keys, and the address (#show=…&tick=46&robot=a&truth=0).
 
 import { sweep } from "./sweep.js";
 import { Cards, make } from "./cards.js";
@@ -7,11 +7,11 @@ import { Log } from "./log.js";
 import { Plane } from "./plane.js";
 import { Store } from "./store.js";
 import { Timeline } from "./timeline.js";
-import { KEYS, MEANINGS, place, plural, rad } from "./words.js";
+import { KEYS, MEANINGS, place, plural, rad, without_error } from "./words.js";
 
 const SPEEDS = [0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000];
 const USUAL = 5;
-const TELL_MS = 900;
+const ANNOUNCE_MS = 900;
 
 const $ = (id) => document.getElementById(id);
 const still = matchMedia("(prefers-reduced-motion: reduce)");
@@ -19,7 +19,7 @@ let store = null;
 const view = {
   tick: 0, share: 0, playing: false, follow: true, focus: null, moving: false, speed: USUAL,
   wanted: true,
-  /** Whether the truth is shown: where it is not known, there is only what robots believe. */
+  /** True if the ground truth is shown; always false if the run has none. */
   get truth() { return this.wanted && (store?.has_truth ?? true); },
 };
 let listed = null;
@@ -35,41 +35,41 @@ log.onchange = () => draw();
 
 // --- the address ---
 
-function asked() {
-  const said = new URLSearchParams(location.hash.slice(1));
-  const tick = said.get("tick");
+function address_state() {
+  const fields = new URLSearchParams(location.hash.slice(1));
+  const tick = fields.get("tick");
   return {
-    show: said.get("show"),
+    show: fields.get("show"),
     tick: tick !== null && /^\d+$/.test(tick) ? Number(tick) : null,
-    robot: said.get("robot"),
-    truth: said.get("truth") !== "0",
+    robot: fields.get("robot"),
+    truth: fields.get("truth") !== "0",
   };
 }
 
-function tell_address() {
+function update_address() {
   if (!store) return;
-  const said = new URLSearchParams();
-  if (listed && listed.shows.length > 1) said.set("show", store.name);
-  if (!(view.follow && store.live)) said.set("tick", view.tick);
-  if (view.focus) said.set("robot", view.focus);
-  if (!view.wanted) said.set("truth", "0");
-  const hash = `#${said}`;
-  if (location.hash !== hash && (location.hash || String(said))) history.replaceState(null, "", hash);
+  const fields = new URLSearchParams();
+  if (listed && listed.shows.length > 1) fields.set("show", store.name);
+  if (!(view.follow && store.live)) fields.set("tick", view.tick);
+  if (view.focus) fields.set("robot", view.focus);
+  if (!view.wanted) fields.set("truth", "0");
+  const hash = `#${fields}`;
+  if (location.hash !== hash && (location.hash || String(fields))) history.replaceState(null, "", hash);
 }
 
-// --- which mission ---
+// --- the mission shown ---
 
 function listen() {
   source?.close();
   const query = store ? `?show=${encodeURIComponent(store.name)}&since=${store.version}` : "";
   source = new EventSource(`/api/news${query}`);
   source.onmessage = ({ data }) => {
-    const told = JSON.parse(data);
+    const news = JSON.parse(data);
     document.body.classList.remove("lost");
-    if (told.list) on_list(told.list);
-    if (told.show && store) {
+    if (news.list) on_list(news.list);
+    if (news.show && store) {
       const ahead = store.last;
-      store.told(told.show);
+      store.update(news.show);
       if (view.follow && store.live && store.last !== ahead) view.tick = Math.max(store.last, 0);
       else if (view.follow && !store.live && ahead !== store.last) view.tick = Math.max(store.last, 0);
     }
@@ -91,7 +91,7 @@ async function on_list(list) {
     }
     return;
   }
-  const { show } = asked();
+  const { show } = address_state();
   const chosen = list.shows.find((one) => one.name === show) ?? (list.shows.length === 1 ? list.shows[0] : null);
   if (chosen && chosen.name !== store?.name) await open(chosen.name);
   else if (!chosen && !(store && list.shows.some((one) => one.name === store.name) && show)) show_list();
@@ -108,7 +108,7 @@ async function open(name) {
     store = new Store(name, await answer.json(), draw);
     store.onstage = staged;
     store.onforget = (tick) => { timeline.forget(tick); log.forget(tick); };
-    const { tick, robot, truth } = asked();
+    const { tick, robot, truth } = address_state();
     view.follow = tick === null;
     view.tick = tick ?? (store.live ? Math.max(store.last, 0) : store.first);
     view.wanted = truth;
@@ -145,10 +145,10 @@ function show_list() {
   $("home").hidden = true;
   $("title").textContent = "Missions";
   document.title = "Missions · Tandem";
-  const where = listed.network.map(({ endpoint, reached }) => `${endpoint}${reached ? "" : " (nobody there yet)"}`);
-  $("status").textContent = listed.shows.length ? plural(listed.shows.length, "mission") : listed.waiting ? "waiting for a mission" : "nothing to see";
+  const where = listed.network.map(({ endpoint, reached }) => `${endpoint}${reached ? "" : " (no router yet)"}`);
+  $("status").textContent = listed.shows.length ? plural(listed.shows.length, "mission") : listed.waiting ? "waiting for a mission" : "no missions";
   root.replaceChildren(
-    ...(where.length ? [make("p", { className: "note", textContent: `Listening at ${where.join(", ")}.` })] : []),
+    ...(where.length ? [make("p", { className: "note", textContent: `Listening on ${where.join(", ")}.` })] : []),
     make("ul", {}, ...listed.shows.map((one) => {
       const link = make("a", { href: `#show=${encodeURIComponent(one.name)}` },
         make("b", { textContent: one.name }), " ",
@@ -162,11 +162,11 @@ function show_list() {
 
 function state_of(live, last, end) {
   if (end) return `${end.outcome} after ${end.tick} ticks`;
-  if (live) return `● runs, tick ${Math.max(last, 0)}`;
-  return `breaks off at tick ${last}`;
+  if (live) return `● running, tick ${Math.max(last, 0)}`;
+  return `incomplete, ends at tick ${last}`;
 }
 
-// --- moving ---
+// --- navigation ---
 
 function go(tick, { keep_playing = false } = {}) {
   if (!store) return;
@@ -232,23 +232,23 @@ function draw() {
     plane.draw(store, view);
     cards.draw(view);
     log.draw(view);
-    timeline.draw(view, doing());
+    timeline.draw(view, activities());
     controls();
-    speak(now);
+    announce(now);
     if (view.playing) draw();
-    else tell_address();
+    else update_address();
   });
 }
 
-function doing() {
+function activities() {
   const players = store.scene(view.tick)?.players ?? [];
   const chosen = view.focus ? players.filter((player) => player.robot === view.focus) : players.slice(0, 4);
-  return chosen.map((player) => player.doing).join(". ");
+  return chosen.map((player) => player.mode_name).join(". ");
 }
 
 function controls() {
   const lost = document.body.classList.contains("lost");
-  text($("status"), lost ? "the server has gone" : state_of(store.live, store.last, store.end));
+  text($("status"), lost ? "connection to the server lost" : state_of(store.live, store.last, store.end));
   $("status").dataset.outcome = lost ? "lost" : store.end?.outcome ?? (store.live ? "live" : "torn");
   $("status").title = store.end?.reason ?? "";
   text($("tick"), `tick ${view.tick} of ${Math.max(store.last, 0)}`);
@@ -263,11 +263,11 @@ function controls() {
   const notes = store.state.notes.join(" · ");
   text($("notes"), notes);
   $("notes").hidden = !notes;
-  const who = view.focus ?? "each robot";
-  const placed = knows_bearing() ? "" : "; before it is placed, its anchor's frame is turned at will";
-  const alone = `${store.has_truth ? "" : "the truth is not on record: "}only what ${who} knows${placed}`;
-  const untold = store.scene(view.tick)?.players.every((player) => !player.pose) ? "the truth of this tick is not known" : "";
-  text($("seen"), !view.truth ? alone : untold || (view.focus ? `the truth, and what ${who} believes` : ""));
+  const subject = view.focus ?? "each robot";
+  const bearing = knows_bearing() ? "" : "; the bearing from the anchor is arbitrary until the robot is placed in the world";
+  const only = store.has_truth ? `only the belief of ${subject}` : `no ground truth: only the belief of ${subject}`;
+  const unknown = store.scene(view.tick)?.players.every((player) => !player.pose) ? "the ground truth of this tick is unknown" : "";
+  text($("seen"), !view.truth ? `${only}${bearing}` : unknown || (view.focus ? `ground truth and the belief of ${subject}` : ""));
   $("canvas").setAttribute("aria-label", described());
 }
 
@@ -278,30 +278,31 @@ function knows_bearing() {
 
 function described() {
   const scene = store.scene(view.tick);
-  if (!scene) return `Tick ${view.tick}, not here yet`;
+  if (!scene) return `Tick ${view.tick}, not loaded yet`;
   const shown = scene.players.filter((player) => !view.focus || player.robot === view.focus).slice(0, 4);
   const at = shown.map((player) => {
     const { robot, held } = player, pose = view.truth ? player.pose : held && leads(held) ? held.world[0] : null;
     if (pose) return `${robot} at ${place(pose)}, heading ${rad(pose[2])}`;
-    return held?.world.length > 1 ? `${robot} at one of ${held.world.length} places` : `${robot} nowhere known`;
+    return held?.world.length > 1 ? `${robot} at one of ${held.world.length} poses` : `${robot} at an unknown pose`;
   });
   return `The plane at tick ${view.tick}: ${at.join("; ")}`;
 }
 
-function text(element, said) {
-  if (element.textContent !== said) element.textContent = said;
+function text(element, content) {
+  if (element.textContent !== content) element.textContent = content;
 }
 
-let spoken = null;
-let spoken_at = 0;
-function speak(now) {
+/** Writes the tick's events for screen readers, at most once per ANNOUNCE_MS while playing. */
+let announced = null;
+let announced_at = 0;
+function announce(now) {
   const scene = store.scene(view.tick);
-  if (!scene || spoken === view.tick || ((view.playing || view.follow) && now - spoken_at < TELL_MS)) return;
-  spoken = view.tick;
-  spoken_at = now;
+  if (!scene || announced === view.tick || ((view.playing || view.follow) && now - announced_at < ANNOUNCE_MS)) return;
+  announced = view.tick;
+  announced_at = now;
   const events = scene.events.filter((event) => !view.focus || !event.robot || event.robot === view.focus).slice(0, 6);
-  const said = events.map((event) => (view.truth ? event.text : event.text.replace(/; it is .* off$/, "")));
-  if (said.length || !(view.playing || view.follow)) text($("live"), `Tick ${view.tick}. ${said.join(". ") || doing()}`);
+  const texts = events.map((event) => (view.truth ? event.text : without_error(event.text)));
+  if (texts.length || !(view.playing || view.follow)) text($("live"), `Tick ${view.tick}. ${texts.join(". ") || activities()}`);
 }
 
 // --- keys and buttons ---
@@ -332,17 +333,17 @@ function fit() {
   draw();
 }
 
-/** Whether what has the keyboard needs that key for itself. */
+/** True if the focused element handles that key itself. */
 function needed({ target, key }) {
   const { tagName, type } = target;
-  if (target.closest("dialog")) return false; // closed a moment ago, and the browser has not moved the focus yet
+  if (target.closest("dialog")) return false; // the dialog has just closed and still has the focus
   if (tagName === "SELECT") {
     return ["ArrowUp", "ArrowDown", "Enter"].includes(key) || (target === $("robot") ? /^[\w-]$/ : /^\d$/).test(key);
   }
   return [" ", "Enter"].includes(key) && (["BUTTON", "A"].includes(tagName) || (tagName === "INPUT" && type === "checkbox"));
 }
 
-/** What was clicked or chosen with the pointer gives the keyboard back: space then plays, and does not repeat it. */
+/** Removes the focus from a control after a click, so that the space key starts playback. */
 let pointing = false;
 for (const [name, on] of [["pointerdown", true], ["keydown", false]]) document.addEventListener(name, () => { pointing = on; }, true);
 for (const name of ["click", "change"]) {
@@ -356,7 +357,7 @@ function pressed(event) {
   if (!store || event.ctrlKey || event.metaKey || event.altKey || $("keys").open) return;
   if (needed(event)) return;
   const far = event.shiftKey ? 10 : 1;
-  const deeds = {
+  const actions = {
     " ": () => play(), ArrowLeft: () => go(view.tick - far), ArrowRight: () => go(view.tick + far),
     PageDown: () => go(view.tick - 10), PageUp: () => go(view.tick + 10),
     Home: () => go(store.first), End: () => go(store.last), ",": () => to_event(-1), ".": () => to_event(1),
@@ -367,10 +368,10 @@ function pressed(event) {
     s: () => plane.shift(event.shiftKey ? -60 : 0, event.shiftKey ? 0 : -60),
     "?": () => $("keys").showModal(),
   };
-  const deed = deeds[event.key.length === 1 ? event.key.toLowerCase() : event.key];
-  if (!deed) return;
+  const action = actions[event.key.length === 1 ? event.key.toLowerCase() : event.key];
+  if (!action) return;
   event.preventDefault();
-  deed();
+  action();
 }
 
 document.addEventListener("keydown", pressed);
@@ -388,7 +389,7 @@ $("near").addEventListener("click", () => plane.near(store, view));
 $("help").addEventListener("click", () => $("keys").showModal());
 $("view").addEventListener("submit", (event) => event.preventDefault());
 $("speed").append(...SPEEDS.map((speed) => make("option", { value: speed, textContent: speed })));
-$("key-list").append(...KEYS.flatMap(([key, deed]) => [make("dt", {}, make("kbd", { textContent: key })), make("dd", { textContent: deed })]));
+$("key-list").append(...KEYS.flatMap(([key, action]) => [make("dt", {}, make("kbd", { textContent: key })), make("dd", { textContent: action })]));
 $("signs").append(...MEANINGS.map(([sign, meaning]) => make("li", {}, make("b", { textContent: sign }), `: ${meaning}`)));
 for (const phase of [1, 2, 3]) {
   const item = make("li", { textContent: `phase ${phase}` });
@@ -397,7 +398,7 @@ for (const phase of [1, 2, 3]) {
 }
 
 window.addEventListener("hashchange", () => {
-  const { show, tick, robot, truth } = asked();
+  const { show, tick, robot, truth } = address_state();
   if (!store || (show || store.name) !== store.name || (!show && listed?.shows.length > 1)) return void (listed && on_list(listed));
   view.focus = store.places.has(robot) ? robot : null;
   view.wanted = truth;

@@ -1,11 +1,11 @@
-// What is drawn with on a canvas: colours and fonts of the page, robots, and words.
+// Drawing primitives for a canvas: colours, fonts, robot shapes and labels.
 
 import { TAU } from "./geometry.js";
 
-/** CSS pixels that what is drawn takes for one: on a very large screen more. */
+/** The scale of drawings in CSS pixels per unit: 1, and more on very large screens. */
 export const unit = () => Math.max(1, window.innerWidth / 2200);
 
-/** a points, b is round with a nose: told apart without colour. */
+/** Traces a robot: pointed for role a, round with a nose for role b, so that they differ without colour. */
 export function shape(pen, role, x, y, heading, size) {
   const c = Math.cos(heading), s = -Math.sin(heading);
   const to = (ahead, left) => [x + size * (ahead * c + left * s), y + size * (ahead * s - left * c)];
@@ -20,7 +20,7 @@ export function shape(pen, role, x, y, heading, size) {
   pen.closePath();
 }
 
-/** Crossed out. */
+/** Draws a cross over a robot. */
 export function cross(pen, x, y, size, look) {
   const r = 0.7 * size;
   pen.strokeStyle = look.fault;

@@ -1,4 +1,4 @@
-// The plane: anchors, trails, robots, what they measure, say and believe, in one tick.
+// The plane in one tick: anchors, trails, robots, ranges, reports and beliefs.
 
 import { Beliefs } from "./beliefs.js";
 import { between, TAU } from "./geometry.js";
@@ -7,7 +7,7 @@ import { Signals } from "./signals.js";
 import { Trails } from "./trails.js";
 import { metres } from "./words.js";
 
-/** What is drawn where: world to canvas, and the pointer that shifts it. */
+/** The map from the world to the canvas, with pan and zoom, and the order in which things are drawn. */
 export class Plane {
   constructor(canvas, redraw) {
     this.canvas = canvas;
@@ -61,7 +61,7 @@ export class Plane {
     this.#redraw();
   }
 
-  /** Show all that there is; of a pair, if one is chosen among many. */
+  /** Zooms to the whole scenario, or to the pair of the selected robot if there are several pairs. */
   fit(store, focus, truth = true) {
     this.fitted = true;
     const { robots, mission } = store.stage, reach = mission.sensing_range;
@@ -73,7 +73,7 @@ export class Plane {
     return this.#frame(chosen.map((robot) => [robot.anchor, Math.max(reach, robot.orbit[0])]));
   }
 
-  /** Show the robots of now from near: of a pair, if one is chosen. */
+  /** Zooms to the current poses of the robots, or of the pair of the selected robot. */
   near(store, { tick, focus, truth }) {
     const reach = store.stage.mission.sensing_range, discs = [];
     for (const robot of store.stage.robots) {
@@ -143,7 +143,7 @@ export class Plane {
     if (truth) for (const robot of robots) this.#robot(view, robot, view.places.get(robot.id));
   }
 
-  // --- what stands still ---
+  // --- grid and anchors ---
 
   #grid({ look }) {
     const pen = this.context, raw = Math.min(80, this.width / 9) / this.scale, power = 10 ** Math.floor(Math.log10(raw));

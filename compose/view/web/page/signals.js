@@ -1,4 +1,4 @@
-// What robots measure, and what they say to each other.
+// Drawings of measured ranges, contacts and reports.
 
 import { distance, TAU } from "./geometry.js";
 import { held_now, leads } from "./held.js";
@@ -7,13 +7,13 @@ import { metres } from "./words.js";
 
 const MOST_ORIGINS = 6;
 
-/** What is measured in a tick fades until the next. */
+/** Returns the opacity of a range, which fades until the next tick. */
 const fading = (share, moving) => (moving ? Math.max(0, 1 - 1.6 * share) : 1);
 
 export class Signals {
   constructor(plane) { this.plane = plane; }
 
-  /** Where a robot may have been when it measured, the likeliest first: all of them, if none is that. */
+  /** Returns the possible poses at the measurement: the leading one, or up to MOST_ORIGINS if none leads. */
   #origins(view, robot) {
     const held = view.scene.players[view.store.places.get(robot.id)]?.held;
     if (!held) return [];
@@ -43,7 +43,7 @@ export class Signals {
     pen.globalAlpha = 1;
   }
 
-  /** Without the truth, a range to the peer is a ring. */
+  /** Draws a mutual range as a circle around the believed pose, for views that hide the ground truth. */
   mutual_ring(view, robot) {
     const { scene, store, look, share, moving } = view;
     const contact = scene.players[store.places.get(robot.id)]?.contacts?.[0];
@@ -94,7 +94,7 @@ export class Signals {
     pen.globalAlpha = 1;
   }
 
-  /** The reports on one lane: from `from` to `to`; those that wait on the way stand in its middle. */
+  /** Draws the reports on one lane, from `from` to `to`; reports in flight are in its middle. */
   #reports({ scene, share, moving, look, store, tick, size }, sender, receiver, from, to, across, side) {
     const passages = scene.passages.filter((one) => one.sender === sender && one.receiver === receiver);
     const here = new Map();

@@ -1,22 +1,22 @@
-// One mission, as far as it has been fetched: its stage, and its scenes by tick. The newest come by themselves,
-// what was skipped is fetched when there is time.
+// The client-side copy of one mission: its static data and its scenes by tick. The server pushes the newest
+// scenes; the store fetches all others in the background.
 
 const COUNTERS = ["anchor", "mutual", "sent", "heard", "refused", "lost", "bytes"];
 
 export class Store {
-  constructor(name, told, changed) {
+  constructor(name, mission, changed) {
     this.name = name;
-    this.stage = told.stage;
-    this.places = new Map(told.stage.robots.map((robot, place) => [robot.id, place]));
+    this.stage = mission.stage;
+    this.places = new Map(mission.stage.robots.map((robot, place) => [robot.id, place]));
     this.scenes = [];
-    this.state = told;
-    this.version = told.version;
+    this.state = mission;
+    this.version = mission.version;
     this.wanted = 0;
     this.closed = false;
     this.revision = 0;
     this.onforget = () => {};
     this.#changed = changed;
-    this.#counts = told.stage.robots.map(() => []);
+    this.#counts = mission.stage.robots.map(() => []);
     this.#fill();
   }
 
@@ -30,10 +30,10 @@ export class Store {
   get last() { return this.state.last; }
   get first() { return this.state.first; }
   get live() { return this.state.live; }
-  /** Whether the truth of any tick is known. */
+  /** True if the ground truth of any tick is known. */
   get has_truth() { return this.state.has_truth; }
   get end() { return this.state.end && { tick: this.state.end[1], outcome: this.state.end[2], reason: this.state.end[3] }; }
-  /** Every tick before this one is there. */
+  /** The first tick that is not loaded; all earlier ticks are. */
   get whole() { return this.#whole; }
 
   close() {
@@ -45,23 +45,23 @@ export class Store {
 
   player(tick, robot) { return this.scenes[tick]?.players[this.places.get(robot)]; }
 
-  /** The phase in which a robot is; in a tick in which it has decided nothing, that of before. */
+  /** Returns the phase of the robot's latest command up to `tick`; 1 if there is none. */
   phase(tick, robot) {
     for (let k = tick; k >= this.first; k--) {
-      const drive = this.player(k, robot)?.drive;
-      if (drive) return drive.phase;
+      const command = this.player(k, robot)?.command;
+      if (command) return command.phase;
     }
     return 1;
   }
 
-  /** The tick has something to show, or is being fetched. */
+  /** Gives `tick` priority in the background fetches. */
   want(tick) {
     this.wanted = tick;
     if (!this.scenes[tick]) this.#wake?.();
   }
 
-  /** What the server has told of it. */
-  told(news) {
+  /** Applies an update that the server has pushed. */
+  update(news) {
     const robots = this.stage.robots.length;
     this.state = news;
     if (news.from !== null && news.from !== undefined) this.#forget(news.from);
@@ -73,10 +73,10 @@ export class Store {
   }
 
   async #restage() {
-    const told = await (await fetch(`/api/shows/${encodeURIComponent(this.name)}`)).json();
-    this.stage = told.stage;
-    this.places = new Map(told.stage.robots.map((robot, place) => [robot.id, place]));
-    this.#counts = told.stage.robots.map(() => []);
+    const mission = await (await fetch(`/api/shows/${encodeURIComponent(this.name)}`)).json();
+    this.stage = mission.stage;
+    this.places = new Map(mission.stage.robots.map((robot, place) => [robot.id, place]));
+    this.#counts = mission.stage.robots.map(() => []);
     this.#forget(0);
     this.onstage?.();
   }
@@ -129,7 +129,7 @@ export class Store {
     }
   }
 
-  /** What `robot` has counted up to `tick`; none while not all before it is there. */
+  /** Returns the totals of `robot` up to `tick`; null until all earlier ticks are loaded. */
   counted(robot, tick) {
     if (tick >= this.#whole) return null;
     const place = this.places.get(robot), counts = this.#counts[place];
@@ -153,4 +153,4 @@ export class Store {
   }
 }
 
-const unknown = (robot) => ({ robot: robot.id, doing: `nothing is known of ${robot.id} in this tick` });
+const unknown = (robot) => ({ robot: robot.id, mode_name: `no data of ${robot.id} in this tick` });

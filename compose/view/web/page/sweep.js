@@ -1,32 +1,32 @@
-// A sweep: what was asked, a row a cell, the figures. Its trials are not on record, each can be played again.
+// The page of a sweep: its parameters, one row per cell, and its figures. Trials are not recorded.
 
 import { make } from "./cards.js";
 
 export async function sweep(root) {
-  const answer = await fetch("/api/sweep"), told = await answer.json();
+  const answer = await fetch("/api/sweep"), result = await answer.json();
   root.hidden = false;
   if (!answer.ok) {
-    root.replaceChildren(make("p", { textContent: told.error }));
+    root.replaceChildren(make("p", { textContent: result.error }));
     return "Sweep";
   }
-  const { name, rows, axes, trials, seed, refused, under_way, folder, figures } = told;
-  const played = rows.reduce((sum, row) => sum + Number(row.trials), 0);
+  const { name, rows, axes, trials, seed, refused, under_way, folder, figures } = result;
+  const run = rows.reduce((sum, row) => sum + Number(row.trials), 0);
   const localised = rows.reduce((sum, row) => sum + Number(row.localised), 0);
   const wrong = rows.reduce((sum, row) => sum + Number(row.wrong), 0);
   const broken = rows.reduce((sum, row) => sum + Number(row.violations || 0), 0);
   const facts = [
-    ["cells", rows.length || "not gathered yet"], ["trials asked for, in each", trials], ["trials played", played],
+    ["cells", rows.length || "none finished yet"], ["trials per cell", trials], ["trials run", run],
     ["localised", localised], ["wrong", wrong], ["violations found", broken], ["seed", seed],
   ];
   if (Object.keys(refused).length) facts.push(["cells refused", Object.keys(refused).length]);
   root.replaceChildren(
     make("dl", { className: "facts" }, ...facts.map(([what, value]) => make("div", {}, make("dt", { textContent: what }), make("dd", { textContent: value })))),
   );
-  if (under_way) root.append(make("p", { className: "note", textContent: "The sweep is under way, or was stopped: these are the rows that were gathered before." }));
+  if (under_way) root.append(make("p", { className: "note", textContent: "The sweep is running or was stopped. The table shows the cells finished so far." }));
   if (rows.length) root.append(table(rows, axes));
   const cell = String(rows[0]?.cell ?? 0).padStart(3, "0");
   root.append(
-    make("p", { className: "note" }, "Trials are not recorded one by one. Each plays again, to the bit, with the seed of its row in trials.parquet: ",
+    make("p", { className: "note" }, "Individual trials are not recorded. Re-run a trial, bit-identically, with the seed of its row in trials.parquet: ",
       make("code", { textContent: `tandem run ${folder}/cells/${cell}.toml --seed SEED --watch` })),
     make("div", { className: "figures" }, ...figures.map((figure) => make("figure", {},
       make("img", { src: `/api/figures/${encodeURIComponent(figure)}`, alt: figure.replace(".svg", "").replaceAll("-", " "), loading: "lazy" })))),
@@ -35,8 +35,8 @@ export async function sweep(root) {
 }
 
 const FIGURES = [
-  ["trials", "trials"], ["rate", "localised"], ["ticks_p50", "ticks, median"], ["ticks_p95", "95 %"], ["ticks_max", "most"],
-  ["undecided", "undecided"], ["inconsistent", "inconsistent"], ["wrong", "wrong"], ["failed", "failed"], ["error_max_m", "worst error, m"],
+  ["trials", "trials"], ["rate", "localised"], ["ticks_p50", "ticks, median"], ["ticks_p95", "ticks, 95 %"], ["ticks_max", "ticks, maximum"],
+  ["undecided", "undecided"], ["inconsistent", "inconsistent"], ["wrong", "wrong"], ["failed", "failed"], ["error_max_m", "largest error, m"],
   ["nees_mean", "NEES"], ["violations", "violations"], ["reports_lost", "reports lost"], ["refused", "refused"],
 ];
 
@@ -52,7 +52,7 @@ function table(rows, axes) {
   return make("div", { className: "wide", tabIndex: 0 }, make("table", {}, make("thead", {}, head), make("tbody", {}, ...body)));
 }
 
-/** The share that localised, and its interval. */
+/** Returns the cell of the localised fraction, with its 95 % confidence interval as the tooltip. */
 function rate(row) {
   const percent = (text) => `${(100 * Number(text)).toFixed(1)} %`;
   const bar = make("i", { className: "bar" });

@@ -1,4 +1,4 @@
-// The time line: a band a robot, its phases; contact shaded across; faults, claims and the end marked above.
+// The timeline: one band of phases per robot, contact shaded, and marks above for faults, claims and the end.
 
 import { unit } from "./pen.js";
 import { FAULTS, SIGNS } from "./words.js";
@@ -41,14 +41,14 @@ export class Timeline {
     this.marks = [];
   }
 
-  /** Fold in the scenes that have come. */
+  /** Adds the scenes that have been loaded since the last call. */
   #read() {
     const { store } = this;
     for (; this.read < store.whole; this.read++) {
       const scene = store.scene(this.read);
       if (!scene) continue;
       for (const player of scene.players) {
-        const spans = this.spans.get(player.robot), phase = player.drive?.phase ?? Math.abs(spans.at(-1)?.value ?? 1);
+        const spans = this.spans.get(player.robot), phase = player.command?.phase ?? Math.abs(spans.at(-1)?.value ?? 1);
         lengthen(spans, this.read, player.down ? -phase : phase);
         if (player.contacts?.length) lengthen(this.contacts.get(player.robot), this.read, 1);
       }
@@ -59,7 +59,7 @@ export class Timeline {
     }
   }
 
-  /** What has been read of `tick` and later is not so any more. */
+  /** Discards the data of `tick` and later, because it has changed. */
   forget(tick) {
     if (tick >= this.read) return;
     for (const spans of [...this.spans.values(), ...this.contacts.values()]) {
@@ -70,7 +70,7 @@ export class Timeline {
     this.read = tick;
   }
 
-  draw({ tick, share, focus, moving }, doing) {
+  draw({ tick, share, focus, moving }, activities) {
     const { store, canvas } = this;
     this.#read();
     this.last = Math.max(store.last, 0);
@@ -139,7 +139,7 @@ export class Timeline {
     pen.fill();
     if (this.scrub.max !== String(this.last)) this.scrub.max = String(this.last);
     if (this.scrub.value !== String(tick)) this.scrub.value = String(tick);
-    this.scrub.setAttribute("aria-valuetext", `tick ${tick} of ${this.last}. ${doing}`);
+    this.scrub.setAttribute("aria-valuetext", `tick ${tick} of ${this.last}. ${activities}`);
   }
 
   #ticks(pen, x, y, colour, wide) {

@@ -1,4 +1,4 @@
-// Where robots were: truly, or if what they now hold likeliest is true.
+// The trails of the robots: true, or as implied by their most probable current pose.
 
 import { between, compose, inverse } from "./geometry.js";
 import { held_now, leads } from "./held.js";
@@ -14,7 +14,7 @@ export class Trails {
 
   #chunks = new Map();
 
-  /** What was kept is not so any more. */
+  /** Discards the cached paths, because the scenes have changed. */
   forget() { this.#chunks.clear(); }
 
   trail({ store, tick, share, look, focus, moving }, robot) {
@@ -56,10 +56,10 @@ export class Trails {
     pen.setLineDash([]);
   }
 
-  /** The trail from tick `from` to `to`, a path a phase; kept once it is whole. */
+  /** Returns the trail from tick `from` to `to`, one path per phase; cached once it is complete. */
   #pieces(store, robot, from, to, whole) {
-    const key = `${robot.id}/${from}`, kept = this.#chunks.get(key);
-    if (kept && whole) return kept;
+    const key = `${robot.id}/${from}`, cached = this.#chunks.get(key);
+    if (cached && whole) return cached;
     const pieces = [], period = store.stage.mission.period;
     let path = null, phase = null, complete = true;
     for (let k = from; k < to; k++) {
@@ -69,7 +69,7 @@ export class Trails {
         complete = complete && Boolean(here && next);
         continue;
       }
-      const now = here.drive?.phase ?? phase ?? store.phase(k, robot.id);
+      const now = here.command?.phase ?? phase ?? store.phase(k, robot.id);
       if (now !== phase || !path) {
         path = new Path2D();
         path.moveTo(here.pose[0], here.pose[1]);
@@ -87,7 +87,7 @@ export class Trails {
     return pieces;
   }
 
-  /** Where the robot was, if what it now holds likeliest is true; or each pose that is equally likely. */
+  /** Draws the trail implied by the most probable current pose, or one per pose if none leads. */
   believed_trail(view, robot) {
     const { store, tick, share, moving } = view, now = store.player(tick, robot.id)?.held;
     if (!now?.local.length) return;
@@ -99,7 +99,7 @@ export class Trails {
     }
   }
 
-  /** One of them: `turn` leads from the anchor's frame to the plane; it ends at `there`, now. */
+  /** Draws one implied trail. `turn` maps the anchor's frame to the plane; the trail ends at `there`. */
   #believed({ store, tick, share, look }, robot, turn, there, driven, faint) {
     const pen = this.plane.context, { period } = store.stage.mission;
     let phase = null, last = null;
@@ -114,7 +114,7 @@ export class Trails {
     for (let k = Math.max(store.first, tick - 4000); k <= tick; k++) {
       const player = store.player(k, robot.id);
       if (!player?.held?.local.length || (player.held.local.length > 1 && k < tick)) continue;
-      const pose = compose(turn, player.held.local[0]), next = player.drive?.phase ?? phase ?? store.phase(k, robot.id);
+      const pose = compose(turn, player.held.local[0]), next = player.command?.phase ?? phase ?? store.phase(k, robot.id);
       if (phase !== null && last) go(pose, player.executed, 1);
       last = pose;
       if (next !== phase) {

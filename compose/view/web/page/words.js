@@ -1,6 +1,6 @@
-// How figures are written, what the phases and the signs are called.
+// Formats of numbers, and the names of phases, events and keys.
 
-export const PHASES = { 1: "its anchor", 2: "the search", 3: "the encounter" };
+export const PHASES = { 1: "own anchor", 2: "search", 3: "encounter" };
 
 const number = (value, digits) => value.toFixed(digits).replace("-", "−");
 
@@ -24,48 +24,52 @@ export function probability(value) {
   return `${(100 * value).toFixed(value < 0.1 ? 1 : 0)} %`;
 }
 
+/** Removes the position error from an event's text, for views that hide the ground truth. */
+export const without_error = (text) => text.replace(/; the error is .*$/, "");
+
 export const plural = (count, one) => `${count} ${one}${count === 1 ? "" : "s"}`;
 
-/** Kinds of events: a sign of its own for each, since colour says too little. */
+/** One symbol for each kind of event, so that kinds can be distinguished without colour. */
 export const SIGNS = {
   anchor: "◎", "anchor-lost": "○", contact: "⇄", "contact-lost": "⇎", phase: "§", state: "·",
-  branch: "∠", candidates: "∴", claim: "★", undecided: "…", alarm: "!", late: "◔", end: "■", down: "⊘", back: "↻",
+  branch: "∠", candidates: "∴", claim: "★", undecided: "…", inconsistent: "!", late: "◔", end: "■", down: "⊘", back: "↻",
   "report-lost": "✕", "report-damaged": "⊗", "report-late": "◷", "report-doubled": "‖",
 };
 
 export const KIND_NAMES = {
   anchor: "anchor in range", "anchor-lost": "anchor out of range", contact: "contact", "contact-lost": "contact lost",
-  phase: "phase", state: "state", branch: "branch chosen", candidates: "candidates", claim: "claim",
-  undecided: "undecided", alarm: "inconsistent", late: "late", end: "end", down: "process gone", back: "process runs again", "report-lost": "report lost",
-  "report-damaged": "report damaged", "report-late": "report late", "report-doubled": "report doubled",
+  phase: "phase", state: "state", branch: "branch chosen", candidates: "possible placements", claim: "claim",
+  undecided: "undecided", inconsistent: "inconsistent", late: "deadline missed", end: "end", down: "process gone",
+  back: "process back", "report-lost": "report lost", "report-damaged": "report damaged",
+  "report-late": "report late", "report-doubled": "report duplicated",
 };
 
 export const FAULTS = new Set(["report-lost", "report-damaged", "report-late", "report-doubled", "late"]);
 
 export const KEYS = [
-  ["space", "play, pause"],
-  ["← →", "a tick back, on; with shift ten"],
-  [", .", "to the event before, after"],
-  ["Home End", "to the beginning, to the end"],
-  ["[ ]", "slower, faster"],
-  ["L", "follow a mission that runs"],
-  ["T", "truth, or only what robots know"],
-  ["R", "the next robot; with shift the one before"],
+  ["space", "play or pause"],
+  ["← →", "previous or next tick; with Shift, 10 ticks"],
+  [", .", "previous or next event"],
+  ["Home End", "first or last tick"],
+  ["[ ]", "slower or faster"],
+  ["L", "follow a running mission"],
+  ["T", "show or hide the ground truth"],
+  ["R", "next robot; with Shift, previous robot"],
   ["A", "all robots"],
-  ["+ −", "nearer, farther; also the wheel"],
-  ["W S", "shift the plane up, down; with shift left, right; also by dragging"],
-  ["N", "the robots from near"],
-  ["F", "fit everything in"],
-  ["?", "these keys"],
+  ["+ −", "zoom in or out; also the mouse wheel"],
+  ["W S", "pan up or down; with Shift, left or right; also by dragging"],
+  ["N", "zoom to the robots"],
+  ["F", "zoom to the whole scenario"],
+  ["?", "this help"],
 ];
 
 export const MEANINGS = [
-  ["a filled robot", "where it truly is; a pointed one plays a, a round one b"],
-  ["an outlined robot", "where it may be, for all it knows; the paler, the less likely; crossed out: ruled out just now"],
-  ["an ellipse", "three sigma of the likeliest"],
-  ["a hollow robot, crossed out", "its process is gone"],
-  ["a line to an anchor", "a range, in the tick in which it is measured"],
-  ["a double line", "contact; the dots on it are reports: filled heard, with a tail late, hollow lost, crossed damaged"],
-  ["a dotted trail", "phase 1; a thin one phase 2, a thick one phase 3"],
-  ["a ring round an anchor", "its range; broken: the orbit"],
+  ["filled robot", "true pose; pointed for role a, round for role b"],
+  ["outlined robot", "pose that the robot considers possible; paler means less probable; crossed out: just ruled out"],
+  ["ellipse", "3 sigma of the most probable position"],
+  ["hollow robot, crossed out", "its process is gone"],
+  ["line to an anchor", "range measured in this tick"],
+  ["double line", "contact; dots are reports: filled received, with a tail late, hollow lost, crossed out damaged"],
+  ["trail", "dotted in phase 1, thin in phase 2, thick in phase 3"],
+  ["circle around an anchor", "solid: its sensing range; dashed: the orbit"],
 ];
