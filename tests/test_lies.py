@@ -150,9 +150,9 @@ def objection(step: Step, *reports: Report) -> Inconsistent | None:
     """Of a, to the last of `reports`, after it has heard the others."""
     state = step.observed["a"]
     for report in reports[:-1]:
-        state = replace(state, peer_state=peer_state.hear(state.peer_state, report))
+        state = replace(state, peer_state=peer_state.with_report(state.peer_state, report))
     return plausibility.objection(
-        state.peer_state, peer_state.hear(state.peer_state, reports[-1]), reports[-1], state.config
+        state.peer_state, peer_state.with_report(state.peer_state, reports[-1]), reports[-1], state.config
     )
 
 
@@ -226,11 +226,11 @@ def test_a_liar_tells_the_same_story_as_it_grows(
     seen = min(seen, log.through)
     young = MotionLog(seen, log.between(0, seen))
     known = [tick if tick is not None and tick <= seen else None for tick in (parted, met)]
-    whole = false_reports.told(log, attack, parted, met, 1.0)
+    whole = false_reports.falsified_log(log, attack, parted, met, 1.0)
     assert whole.through == log.through
-    assert false_reports.told(young, attack, known[0], known[1], 1.0).between(0, seen) == whole.between(
+    assert false_reports.falsified_log(young, attack, known[0], known[1], 1.0).between(
         0, seen
-    )
+    ) == whole.between(0, seen)
 
 
 @settings(max_examples=50)
@@ -238,7 +238,7 @@ def test_a_liar_tells_the_same_story_as_it_grows(
 def test_a_rotation_turns_what_was_driven_in_its_part_and_nothing_after(
     log: MotionLog, parted: int, orbit: int, angle: float
 ) -> None:
-    told = false_reports.told(log, Attack("rotate", angle, "orbit"), parted, parted + orbit, 1.0)
+    told = false_reports.falsified_log(log, Attack("rotate", angle, "orbit"), parted, parted + orbit, 1.0)
     true_end = follow(ORIGIN, log.between(0, log.through), 1.0)
     told_end = follow(ORIGIN, told.between(0, log.through), 1.0)
     over = orbit > 0 and parted + orbit < log.through
@@ -249,7 +249,10 @@ def test_a_rotation_turns_what_was_driven_in_its_part_and_nothing_after(
 def test_a_false_radius_goes_with_false_ranges_and_moves_the_start_only() -> None:
     log = MotionLog(3, (Segment(3, 1.0, 0.0),), (Ranged(0, 1.0), Ranged(1, 0.2)))
     attack = Attack("radius", -0.5)
-    assert false_reports.told(log, attack, None, None, 1.0).ranges == (Ranged(0, 0.5), Ranged(1, 0.0))
+    assert false_reports.falsified_log(log, attack, None, None, 1.0).ranges == (
+        Ranged(0, 0.5),
+        Ranged(1, 0.0),
+    )
     assert false_reports.start(Pose(1.0, 0.0, 2.0), attack) == Pose(0.5, 0.0, 2.0)
 
 

@@ -68,7 +68,7 @@ def after_observation(state: RobotState, anchor_range: float | None) -> RobotSta
         case Homing():
             if anchor_range is not None:
                 return _continue_phase1(state)
-            arrived = range_seeking.homeward(state.mode, state.odometry, state.config.mission) is None
+            arrived = range_seeking.homing_controls(state.mode, state.odometry, state.config.mission) is None
             return replace(state, mode=Straight("anchor", state.odometry, 0.0)) if arrived else state
         case Aligning() | Radial() | Tangent() | Orbiting():
             return _continue_phase2(state, anchor_range is not None)
@@ -102,10 +102,14 @@ def _continue_phase1(state: RobotState) -> RobotState:
     mission = state.config.mission
     if inference.is_anchor_known(scored, mission):
         kind: BranchKind = "circle" if len(state.log.ranges) == 2 else "three-ranges"
-        phase1_done_tick = state.tick if state.belief.phase1_done_tick is None else state.belief.phase1_done_tick
-        state = replace(state, belief=replace(state.belief, branch_kind=kind, phase1_done_tick=phase1_done_tick))
+        phase1_done_tick = (
+            state.tick if state.belief.phase1_done_tick is None else state.belief.phase1_done_tick
+        )
+        state = replace(
+            state, belief=replace(state.belief, branch_kind=kind, phase1_done_tick=phase1_done_tick)
+        )
         return _start_phase2(state)
-    command = active_sensing.alone(inference.anchor_planning_hypotheses(scored), mission)
+    command = active_sensing.plan_alone(inference.anchor_planning_hypotheses(scored), mission)
     return replace(state, mode=Surveying("anchor", command))
 
 
@@ -146,7 +150,11 @@ def _continue_phase2(state: RobotState, ranged: bool) -> RobotState:
     assert isinstance(state.mode, Aligning | Radial | Tangent | Orbiting)
     mode = phase2_orbit.onward(state.mode, state.odometry, state.start, state.orbit, mission)
     timeout: float = LOST_AFTER * active_sensing.stride(mission)
-    if state.orbit.v == 0.0 and isinstance(mode, Radial | Orbiting) and _ticks_without_range(state) >= timeout:
+    if (
+        state.orbit.v == 0.0
+        and isinstance(mode, Radial | Orbiting)
+        and _ticks_without_range(state) >= timeout
+    ):
         return _return_to_anchor(state)
     if isinstance(mode, Orbiting):
         since = mode.since or state.tick
@@ -156,7 +164,9 @@ def _continue_phase2(state: RobotState, ranged: bool) -> RobotState:
         if state.orbit.v != 0.0:
             command = phase2_orbit.pursuit(state.local_pose, state.orbit, mission)
         elif scored:
-            command = active_sensing.alone(inference.anchor_planning_hypotheses(scored), mission, state.orbit.radius)
+            command = active_sensing.plan_alone(
+                inference.anchor_planning_hypotheses(scored), mission, state.orbit.radius
+            )
         else:
             command = REST if is_planning_tick(state) else mode.command or REST
         mode = Orbiting(command, since)
@@ -236,7 +246,7 @@ def _decide_phase3(state: RobotState) -> RobotState:
         return _return_to_anchor(tested)
     if not scored:
         return _drive_without_hypotheses(tested)
-    a, b = active_sensing.together(
+    a, b = active_sensing.plan_together(
         inference.pair_planning_hypotheses(scored, pair), pair.apart, state.mutual[-1].range, mission
     )
     return replace(tested, mode=Surveying("peer", a if role == "a" else b))
@@ -269,7 +279,7 @@ def _drive_without_hypotheses(state: RobotState) -> RobotState:
     mission = state.config.mission
     if state.config.role == "b" or not state.mutual:
         return replace(state, mode=Surveying("peer"))
-    step = range_seeking.stretch("peer", state.mutual[-1].range, mission)
+    step = range_seeking.step_length("peer", state.mutual[-1].range, mission)
     return replace(state, mode=Surveying("peer", Controls(step / mission.period, 0.0)))
 
 

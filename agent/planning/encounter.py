@@ -14,7 +14,7 @@ from agent.estimation.exact import PairObservation, weigh_placements
 from agent.planning import paper, phase3_last_manoeuvre, precision
 from agent.planning.phase2_orbit import Orbiting, off_anchor
 from agent.planning.phase3_last_manoeuvre import LastManoeuvre, Standing, Waiting
-from agent.planning.range_seeking import Straight, stretch
+from agent.planning.range_seeking import Straight, step_length
 from agent.planning.state import MODE_NAMES, Done, RobotState
 from protocol.messages import Inconsistent, Localised
 from protocol.mission import SHORTEST_STEP
@@ -70,7 +70,7 @@ def begin_phase3(state: RobotState) -> RobotState:
 def _may_drive_straight(state: RobotState) -> bool:
     """Return whether a knows that b stands, and is far enough from b to drive straight on."""
     now = bool(state.mutual) and state.mutual[-1].tick == state.tick == state.peer_state.peer.through
-    return now and stretch("peer", state.mutual[-1].range, state.config.mission) >= SHORTEST_STEP
+    return now and step_length("peer", state.mutual[-1].range, state.config.mission) >= SHORTEST_STEP
 
 
 def decide_phase3(state: RobotState) -> RobotState:
@@ -114,8 +114,14 @@ def _decide_exact(state: RobotState) -> RobotState:
     remaining = state.belief.placements
     checked = phase3_last_manoeuvre.redundant(observations_in_range, base)
     if not remaining:
-        return state.inconsistent(Inconsistent("a path that contradicts the mutual ranges under every placement"))
-    if checked and len(remaining) == 1 and precision.pinned_down(state, remaining[0], observations_in_range, error_bound):
+        return state.inconsistent(
+            Inconsistent("a path that contradicts the mutual ranges under every placement")
+        )
+    if (
+        checked
+        and len(remaining) == 1
+        and precision.pinned_down(state, remaining[0], observations_in_range, error_bound)
+    ):
         return replace(state, mode=Done(3, Localised(state.world_pose(remaining[0]))))
     mover = state.config.role
     peer_has_ended = planner_name == "assured" and isinstance(

@@ -75,8 +75,7 @@ def branch_of(state: RobotState, scored: ScoredHypothesis) -> Branch:
 
 
 def anchor_planning_hypotheses(scored: Sequence[ScoredHypothesis]) -> list[PlanningHypothesis]:
-    """Return the hypotheses about the robot's pose relative to its anchor, in the form that planning needs.
-    """
+    """Return the hypotheses about the robot's pose relative to its anchor, in the form that planning needs."""
     hypotheses = []
     for one in scored:
         mx, my = one.hypothesis.guess[:2]
@@ -146,7 +145,9 @@ def pair_of(state: RobotState) -> PairRanges:
     )
 
 
-def pair_planning_hypotheses(scored: Sequence[ScoredHypothesis], pair: PairRanges) -> list[PlanningHypothesis]:
+def pair_planning_hypotheses(
+    scored: Sequence[ScoredHypothesis], pair: PairRanges
+) -> list[PlanningHypothesis]:
     """Return the hypotheses about both poses relative to M1, with covariances, in the form that planning
     needs.
     """
@@ -217,7 +218,9 @@ def with_pair(
         covariance=claims[0][1] if claims else None,
         candidates=(first, len(scored)),
         inconsistency=inconsistency,
-        blocking_reason=blocking_reason if enough else f"{len(pair.places)} of {mutual} required mutual ranges",
+        blocking_reason=blocking_reason
+        if enough
+        else f"{len(pair.places)} of {mutual} required mutual ranges",
     )
     return replace(state, belief=belief)
 

@@ -56,7 +56,9 @@ def decide_phase3(state: RobotState) -> RobotState:
         return state
     scored = search(pair)
     required_ranges = CHECKED_WITH_OUTLIERS if state.config.mission.noise.outliers else CHECKED
-    state = inference.with_convergence_check(inference.with_pair(state, scored, pair, required_ranges), scored)
+    state = inference.with_convergence_check(
+        inference.with_pair(state, scored, pair, required_ranges), scored
+    )
     blocking_reason = state.belief.blocking_reason
     if blocking_reason is None:
         return claim_pose(state)
@@ -64,7 +66,10 @@ def decide_phase3(state: RobotState) -> RobotState:
         return state.undecided(f"the paper's manoeuvres give no further ranges: {blocking_reason}")
     if state.config.role == "a":
         return state
-    placements = [_pose_in_b_frame(planning_hypothesis) for planning_hypothesis in inference.pair_planning_hypotheses(scored, pair)]
+    placements = [
+        _pose_in_b_frame(planning_hypothesis)
+        for planning_hypothesis in inference.pair_planning_hypotheses(scored, pair)
+    ]
     plan = phase3_last_manoeuvre.last_manoeuvre(
         "b", ORIGIN, ORIGIN, placements, state.config.mission, "paper"
     )

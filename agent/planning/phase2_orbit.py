@@ -6,7 +6,7 @@ import math
 
 import msgspec
 
-from agent.planning.range_seeking import arrived, straight, turn
+from agent.planning.range_seeking import arrival_tolerances, straight, turn
 from protocol.mission import Mission
 from protocol.motion import Controls, Pose, compose, wrap
 from protocol.orbits import Orbit
@@ -55,7 +55,7 @@ def onward(state: Meeting, odometry: Pose, start: Pose, orbit: Orbit, mission: M
 
     `start` is the pose of tick 0 in the anchor's frame.
     """
-    distance_tolerance, angle_tolerance = arrived(mission)
+    distance_tolerance, angle_tolerance = arrival_tolerances(mission)
     while True:
         match state:
             case Aligning(heading) if abs(heading - odometry.heading) <= angle_tolerance:

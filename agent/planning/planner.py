@@ -184,7 +184,7 @@ def _with_reports(state: RobotState, reports: Sequence[Report]) -> RobotState:
     The verdict is Inconsistent if a report is implausible, and Undecided if the peer has given up.
     """
     for received in reports:
-        updated = peer_state.hear(state.peer_state, received)
+        updated = peer_state.with_report(state.peer_state, received)
         objection = (
             plausibility.objection(state.peer_state, updated, received, state.config)
             if state.verdict is None
@@ -374,7 +374,7 @@ def _safe_controls(state: RobotState) -> Controls:
     if not state.mutual or state.mutual[-1].tick != state.tick:  # the range was not measured
         return REST
     return separation.slowed(
-        controls, separation.BOTH * separation.leeway(state.mutual[-1].range, mission), mission
+        controls, separation.SHARE_OF_EACH * separation.leeway(state.mutual[-1].range, mission), mission
     )
 
 
@@ -396,6 +396,6 @@ def _mode_controls(state: RobotState) -> Controls:
         case Surveying(command=controls) | Retreating(controls):
             return controls
         case Homing():
-            return range_seeking.homeward(state.mode, state.odometry, state.config.mission) or REST
+            return range_seeking.homing_controls(state.mode, state.odometry, state.config.mission) or REST
         case _:
             return REST

@@ -58,7 +58,9 @@ def _changed_report(before: PeerState, report: Report, mission: Mission) -> Inco
 def _exceeded_limit(report: Report, mission: Mission) -> Inconsistent | None:
     """Return a contradiction if a speed exceeds v_max or a turn rate exceeds omega_max."""
     noise = mission.noise
-    speed = _largest_measurement(mission.max_speed, noise.actuation.v, noise.odometry.v, noise.standstill_bound[0])
+    speed = _largest_measurement(
+        mission.max_speed, noise.actuation.v, noise.odometry.v, noise.standstill_bound[0]
+    )
     rate = _largest_measurement(
         mission.max_turn_rate, noise.actuation.omega, noise.odometry.omega, noise.standstill_bound[1]
     )
@@ -70,8 +72,7 @@ def _exceeded_limit(report: Report, mission: Mission) -> Inconsistent | None:
 
 
 def _largest_measurement(limit: float, actuation: float, odometry: float, floor: float) -> float:
-    """Return the largest plausible measurement of a speed that is at most `limit`, with noise of both kinds.
-    """
+    """Return the largest plausible measurement of a speed that is at most `limit`, with noise of both kinds."""
     return limit * (1.0 + SLACK + NOISY * math.hypot(actuation, odometry)) + floor
 
 

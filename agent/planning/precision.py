@@ -140,8 +140,7 @@ def _odometry_rounding_until(state: RobotState, tick: int) -> float:
 
 
 def combined_error(state: RobotState) -> float:
-    """Return the bound in m on the sum of both anchor errors and both odometries' rounding errors until now.
-    """
+    """Return the bound in m on the sum of both anchor errors and both odometries' rounding errors until now."""
     return _combined_error_until(state, min(state.tick, state.peer_state.peer.through))
 
 
