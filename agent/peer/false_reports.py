@@ -45,8 +45,9 @@ def falsified_log(
 def _attacked_span(
     attack: Attack, through: int, phase1_done_tick: int | None, encounter_tick: int | None
 ) -> tuple[int, int]:
-    """Return the first tick of the attacked part, and the one after its last; an empty span if it has not
-    begun.
+    """Return the first tick of the attacked part, and the one after its last.
+
+    The span is empty if the part has not begun.
     """
     end = through + 1
     phase1_done_tick = phase1_done_tick if phase1_done_tick is not None else end

@@ -35,9 +35,7 @@ class MotionLog(msgspec.Struct, frozen=True):
         return self.runs if tick >= self.through else _between(self.runs, 0, tick)
 
     def drove(self, v: float, omega: float, ticks: int = 1) -> MotionLog:
-        """Return the log with `ticks` more ticks of one manoeuvre. Equal manoeuvres are joined to one
-        segment.
-        """
+        """Return the log with `ticks` more ticks of one manoeuvre. Equal manoeuvres are joined."""
         runs = self.runs
         if runs:
             last = runs[-1]

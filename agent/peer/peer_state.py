@@ -14,9 +14,7 @@ class PeerState(msgspec.Struct, frozen=True):
 
     peer: MotionLog = MotionLog()
     start: Pose | None = None
-    """The pose of tick 0 of the peer's odometry in the frame of the peer's anchor; None before the peer's
-    phase 2.
-    """
+    """The pose of the peer at tick 0 in the frame of the peer's anchor; None before the peer's phase 2."""
     phase: int = 1
     state: str = ""
     """The name of the peer's mode, like `phase` from the latest report."""
@@ -31,9 +29,7 @@ class PeerState(msgspec.Struct, frozen=True):
     heard: int = 0
     """The number of reports received, repeated ones included."""
     ranges_through: int = -1
-    """The tick through which the peer's anchor ranges are complete. In ticks without one, there was no
-    detection.
-    """
+    """The tick through which the peer's anchor ranges are complete: a tick without one had no detection."""
 
 
 def contradiction(report: Report) -> str | None:

@@ -65,8 +65,9 @@ class Listening(msgspec.Struct, frozen=True):
 
 
 class Retreating(msgspec.Struct, frozen=True):
-    """The robot has left the peer's range. It drives back the same way, and as far again, to avoid a
-    repetition.
+    """The robot has left the peer's range. It drives back the same way, and as far again.
+
+    The second half prevents that it takes the same decision, and leaves the range, once more.
     """
 
     command: Controls
@@ -130,9 +131,7 @@ class PlanningHypothesis(NamedTuple):
 
     probability: float
     poses: Array
-    """The poses (x and y in m, heading in rad): (3,) of one robot relative to its anchor, or (6,) of a and b
-    relative to M1.
-    """
+    """The poses in m and rad: (3,) of one robot relative to its anchor, or (6,) of a and b relative to M1."""
     covariance: Array
     """The covariance of the anchor's position, (2, 2), or of both poses, (6, 6)."""
 
@@ -289,9 +288,7 @@ def _keep_apart(
 
 
 STANDING_COST = 1e300
-"""The cost of standing still where every manoeuvre might violate the safety distance, standing still
-included.
-"""
+"""The cost of standing still where every manoeuvre, this one included, might violate the safety distance."""
 
 FARTHEST = 0.9
 """The largest planned distance between the robots, and from b to its anchor, as a fraction of R."""
@@ -341,9 +338,7 @@ SIGMA_FACTOR = 1.5
 """
 
 LARGEST_GAP = 400.0
-"""The squared difference of predictions, in sigmas squared, beyond which two hypotheses count as
-distinguished.
-"""
+"""The largest squared difference of predictions in sigmas^2. Larger ones do not distinguish better."""
 
 
 def _way(ways: Choice, pose: Array, some: Places) -> tuple[Array, Array]:

@@ -212,8 +212,7 @@ def after_reports(state: RobotState) -> RobotState:
 
 
 def _decide_phase3(state: RobotState) -> RobotState:
-    """Evaluate both logs in phase 3: update the hypotheses, then claim a pose or plan both robots'
-    manoeuvres.
+    """Evaluate both logs in phase 3: update the hypotheses, then claim a pose or plan the manoeuvres.
 
     Both robots compute the same pair of manoeuvres from the same logs, and each executes its own.
     """
@@ -259,8 +258,7 @@ def _p_value_below(state: RobotState, bound: float) -> bool:
 
 
 def _with_consistency_test(state: RobotState) -> RobotState:
-    """Return `state` after a search of the whole plane, with the verdict Inconsistent after LOOKS failed
-    tests.
+    """Return `state` with the consistency test of a search, and with its verdict after LOOKS failed tests.
 
     A test fails if its p-value is below UNBELIEVABLE. The failed tests must be consecutive.
     """

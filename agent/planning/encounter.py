@@ -138,7 +138,9 @@ def _decide_exact(state: RobotState) -> RobotState:
         return state.undecided(f"the third mutual range {failure}")
     a, b = pair_observations[-1].a, pair_observations[-1].b
     if checked and len(remaining) == 1:
-        plan = phase3_last_manoeuvre.survey(mover, a, b, remaining[0], pair_observations, mission)
+        plan = phase3_last_manoeuvre.most_informative_manoeuvre(
+            mover, a, b, remaining[0], pair_observations, mission
+        )
     else:
         plan = phase3_last_manoeuvre.last_manoeuvre(mover, a, b, remaining, mission, planner_name)
     if plan is None:

@@ -1,6 +1,4 @@
-"""The inference of one robot from both logs, with noisy sensors: its anchor's position, and both robots'
-poses.
-"""
+"""The inference of one robot with noisy sensors: its anchor's position, and both robots' poses."""
 
 from __future__ import annotations
 
@@ -33,9 +31,7 @@ def path_of(log: MotionLog, through: int, period: float) -> Track:
 
 
 def own_anchor(state: RobotState) -> tuple[ScoredHypothesis, ...]:
-    """Return the hypotheses about the anchor's position in the frame of the odometry, the most probable
-    first.
-    """
+    """Return the hypotheses about the anchor in the frame of the odometry, the most probable first."""
     mission = state.config.mission
     path = path_of(state.log, state.tick, mission.period)
     ranges = Ranges.of_lists(_ranges_until(state.log, state.tick), (), (), mission.noise)
@@ -52,18 +48,14 @@ def _ranges_until(log: MotionLog, through: int) -> list[tuple[int, float]]:
 
 
 def with_own(state: RobotState, scored: Sequence[ScoredHypothesis]) -> RobotState:
-    """Return `state` with the hypotheses `scored` about its anchor, and with the branch of the most probable
-    one.
-    """
+    """Return `state` with the hypotheses `scored` about its anchor, and with the most probable branch."""
     own = tuple([one.hypothesis for one in scored])
     branches = tuple([branch_of(state, one) for one in scored])
     return replace(state, belief=replace(state.belief, own=own, branches=branches, branch=branches[0]))
 
 
 def branch_of(state: RobotState, scored: ScoredHypothesis) -> Branch:
-    """Return the most probable trajectory as a branch. From its start, the odometry leads to the current
-    pose.
-    """
+    """Return the trajectory of `scored` as a branch, whose start and odometry lead to the present pose."""
     mx, my = scored.hypothesis.guess[:2]
     path = scored.fit.paths[0]
     frame = math.atan2(-my, -mx)
@@ -75,7 +67,7 @@ def branch_of(state: RobotState, scored: ScoredHypothesis) -> Branch:
 
 
 def anchor_planning_hypotheses(scored: Sequence[ScoredHypothesis]) -> list[PlanningHypothesis]:
-    """Return the hypotheses about the robot's pose relative to its anchor, in the form that planning needs."""
+    """Return the hypotheses about the pose relative to the anchor, in the form that planning needs."""
     hypotheses = []
     for one in scored:
         mx, my = one.hypothesis.guess[:2]
@@ -112,9 +104,7 @@ def known_through(state: RobotState) -> int:
 
 
 def peer_log_suffices(state: RobotState) -> bool:
-    """Return whether the peer's log reaches the tick in which this robot stopped, or the current one if it
-    drives.
-    """
+    """Return whether the peer's log reaches the tick of this robot's last motion."""
     return known_through(state) >= state.log.moved(state.config.mission.noise.standstill_bound)
 
 
@@ -148,9 +138,7 @@ def pair_of(state: RobotState) -> PairRanges:
 def pair_planning_hypotheses(
     scored: Sequence[ScoredHypothesis], pair: PairRanges
 ) -> list[PlanningHypothesis]:
-    """Return the hypotheses about both poses relative to M1, with covariances, in the form that planning
-    needs.
-    """
+    """Return the hypotheses about both poses relative to M1, in the form that planning needs."""
     return [PlanningHypothesis(one.hypothesis.probability, *poses(one.fit, pair.apart)) for one in scored]
 
 
@@ -161,9 +149,7 @@ def blocking_reason_for(
     pair: PairRanges,
     mission: Mission,
 ) -> str | None:
-    """Return the first condition for a claim that is not met, given enough mutual ranges; None if all are
-    met.
-    """
+    """Return the first condition for a claim that is not met, or None; there are enough mutual ranges."""
     if inconsistency is None:
         return "no hypothesis explains the ranges"
     probability = scored[0].hypothesis.probability
@@ -240,8 +226,9 @@ def claim(hypothesis: PlanningHypothesis, robot: int, pair: PairRanges) -> tuple
 
 
 def to_second_order(hypothesis: PlanningHypothesis, m2: tuple[float, float]) -> tuple[Array, Array]:
-    """Return the mean and the covariance of both poses, for Gaussian ranges and bearings: b's from M2, a's
-    from b.
+    """Return the mean and the covariance of both poses, if ranges and bearings are Gaussian.
+
+    These are the range and the bearing of b from M2, and those of a from b.
 
     Both are computed to second order. If ranges are much more accurate than bearings, the possible positions
     form an arc, which a first-order ellipse does not cover. `m2` is the position of M2 relative to M1.

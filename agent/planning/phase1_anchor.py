@@ -14,9 +14,7 @@ from protocol.mission import RANGE_MARGIN, Mission, PlannerName, third_point_tur
 from protocol.motion import Controls, Pose, chord, compose
 
 PREFERENCE = 1e-9
-"""The relative improvement that a later candidate needs to replace an earlier one. It exceeds rounding
-errors.
-"""
+"""The relative improvement, above rounding errors, that a later candidate needs to replace an earlier one."""
 
 
 SIGMAS = 3.0
@@ -98,8 +96,7 @@ def _reach(along: float, across: float, rim: float) -> float:
 
 
 def _separation(length: float, along: Sequence[float]) -> float:
-    """Return the smallest difference of the squared ranges that the branches predict, |d_+^2 - d_-^2|, in
-    m^2.
+    """Return the smallest difference |d_+^2 - d_-^2| in m^2 of the squared ranges that the branches predict.
 
     For a single branch the result is `length`: there is nothing to distinguish, and the longest chord gives
     the best check.

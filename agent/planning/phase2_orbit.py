@@ -34,8 +34,7 @@ class Orbiting(msgspec.Struct, frozen=True):
     """The robot drives on its orbit (eq. (6)), or waits at its place if its orbit has no speed."""
 
     command: Controls | None = None
-    """Noisy sensors: the controls of pure pursuit, or of active sensing while the robot waits. None: eq. (6).
-    """
+    """Noisy sensors: the controls of pure pursuit, or of active sensing while the robot waits."""
     since: int = 0
     """Noisy sensors: the tick in which the robot reached its orbit."""
 
@@ -71,9 +70,7 @@ def onward(state: Meeting, odometry: Pose, start: Pose, orbit: Orbit, mission: M
 
 
 def left_to_orbit(odometry: Pose, start: Pose, orbit: Orbit) -> float:
-    """Return the distance in m from the robot outward to its orbit; negative if the robot is outside the
-    orbit.
-    """
+    """Return the distance in m from the robot outward to its orbit; negative outside the orbit."""
     local = compose(start, odometry)
     return orbit.radius - math.hypot(local.x, local.y)
 

@@ -1,6 +1,4 @@
-"""Phase 3: the last manoeuvres, which select the true placement among the solutions of eq. (7) (Section
-III.C).
-"""
+"""Phase 3: the last manoeuvres, which select the true solution of eq. (7) (Section III.C)."""
 
 from __future__ import annotations
 
@@ -24,14 +22,13 @@ Array = NDArray[np.float64]
 Point = float | Array
 
 TURN_RATES = 721
-"""The number of values of omega_2 compared in eq. (8), from -omega_max to omega_max: one every half degree in
-Section IV.
+"""The number of values of omega_2 compared in eq. (8), from -omega_max to omega_max.
+
+With the parameters of Section IV, there is one every half degree.
 """
 
 SPEEDS = (1.0, -1.0, 0.75, -0.75, 0.5, -0.5, 0.25, -0.25, 0.1, -0.1)
-"""The values of v_2 compared, in units of A_0 / T_s. That unit is v_max, or less if one tick would come near
-R.
-"""
+"""The values of v_2 compared, in units of A_0 / T_s: v_max, or less if one tick would come near R."""
 
 ELSEWHERE = 1e-6
 """The distance in m within which two measurement points count as the same, so the second range adds nothing.
@@ -102,8 +99,7 @@ class Plan(NamedTuple):
 
     command: Controls
     separation_m2: float | None
-    """J of eq. (8) in m^2: the smallest difference of two predicted squared ranges; None for one candidate.
-    """
+    """J of eq. (8) in m^2: the smallest difference of predicted squared ranges; None for one candidate."""
     question: Question
 
 
@@ -196,9 +192,7 @@ def turn(pair_observations: Sequence[PairObservation]) -> Role:
 
 
 def advanced(state: LastManoeuvre | Returning, pose: Pose, in_contact: bool, rest: Resting) -> State:
-    """Return the mode after a tick that led to `pose`; `rest` once the manoeuvre has ended in range of the
-    peer.
-    """
+    """Return the mode after a tick that led to `pose`: `rest`, or back into the peer's range."""
     match state:
         case LastManoeuvre(command) if not in_contact:
             return Returning(Controls(-command.v, -command.omega), pose)
@@ -217,8 +211,9 @@ def last_manoeuvre(
     mission: Mission,
     planner_name: PlannerName,
 ) -> Plan | None:
-    """Return the manoeuvre that maximises the differences of the squared ranges that `candidates` predict
-    (eq. (8)).
+    """Return the manoeuvre that best distinguishes `candidates` by the range after it (eq. (8)).
+
+    It maximises the smallest difference of the predicted ranges, in squares.
 
     `mover` is the robot that moves, in the paper always b. `a` is given in <a(M1)> and `b` in <b(M2)>. The
     maximum is found by enumeration. `paper` drives at v_max. `assured` compares several speeds, and only
@@ -259,7 +254,7 @@ def compared(question: Question, mission: Mission, planner_name: PlannerName) ->
     return Compared(reach, gap, value)
 
 
-def survey(
+def most_informative_manoeuvre(
     mover: Role,
     a: Pose,
     b: Pose,
@@ -267,8 +262,7 @@ def survey(
     pair_observations: Sequence[PairObservation],
     mission: Mission,
 ) -> Plan | None:
-    """Return the manoeuvre of `mover` after which a range determines `placement` most accurately; None as
-    above.
+    """Return the manoeuvre after which a range determines `placement` best, or None (see `last_manoeuvre`).
 
     It applies to the only remaining placement if the ranges in `pair_observations` do not determine it,
     because both robots and their anchors lie on one line. The criterion is the determinant of the information

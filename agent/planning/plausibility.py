@@ -72,7 +72,7 @@ def _exceeded_limit(report: Report, mission: Mission) -> Inconsistent | None:
 
 
 def _largest_measurement(limit: float, actuation: float, odometry: float, floor: float) -> float:
-    """Return the largest plausible measurement of a speed that is at most `limit`, with noise of both kinds."""
+    """Return the largest plausible measurement of a speed of at most `limit`, with both kinds of noise."""
     return limit * (1.0 + SLACK + NOISY * math.hypot(actuation, odometry)) + floor
 
 

@@ -140,14 +140,12 @@ def _odometry_rounding_until(state: RobotState, tick: int) -> float:
 
 
 def combined_error(state: RobotState) -> float:
-    """Return the bound in m on the sum of both anchor errors and both odometries' rounding errors until now."""
+    """Return the bound in m on both anchor errors and both odometries' rounding errors until now."""
     return _combined_error_until(state, min(state.tick, state.peer_state.peer.through))
 
 
 def _combined_error_until(state: RobotState, tick: int) -> float:
-    """Return the bound in m on the sum of both anchor errors and both odometries' rounding errors until
-    `tick`.
-    """
+    """Return the bound in m on both anchor errors and both odometries' rounding errors until `tick`."""
     own, peers = state.belief.own_anchor, state.belief.peer_anchor
     assert peers is not None
     return own + peers + _odometry_rounding_until(state, tick)

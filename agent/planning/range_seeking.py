@@ -69,8 +69,9 @@ Seeking = Straight | Backing | Turning | Circling
 
 
 def step_length(beacon: Beacon, rho0: float, mission: Mission) -> float:
-    """Return the length in m of the straight from a point `rho0` m from `beacon`: A_0, or less to keep a
-    safety distance from the peer.
+    """Return the length in m of the straight from a point with range `rho0` in m to `beacon`.
+
+    The length is A_0, or less to keep a safety distance from the peer.
     """
     step = mission.first_straight
     return step if beacon == "anchor" else min(step, leeway(rho0, mission))
@@ -88,9 +89,7 @@ def travelled(origin: Pose, pose: Pose) -> float:
 
 
 def moved(origin: Pose, pose: Pose) -> bool:
-    """Return whether the manoeuvre that began at `origin` has been executed. In real time it may not have
-    been.
-    """
+    """Return whether the manoeuvre that began at `origin` was executed; in real time it may not be."""
     return pose != origin
 
 
@@ -173,13 +172,13 @@ def inside_arc(rho0: float, radius: float, reach: float) -> float:
 
 def turn(pose: Pose, heading: float, mission: Mission) -> Controls:
     """Return the controls of a turn on the spot towards `heading`, limited to one tick."""
-    left = (heading - pose.heading) / mission.period
-    if left == 0.0:
+    rate = (heading - pose.heading) / mission.period
+    if rate == 0.0:
         return REST
-    return Controls(0.0, math.copysign(min(abs(left), mission.max_turn_rate), left))
+    return Controls(0.0, math.copysign(min(abs(rate), mission.max_turn_rate), rate))
 
 
 def straight(distance: float, mission: Mission) -> Controls:
     """Return the controls of a straight by `distance` m (backward if negative), limited to one tick."""
-    left = distance / mission.period
-    return Controls(math.copysign(min(abs(left), mission.max_speed), left), 0.0)
+    speed = distance / mission.period
+    return Controls(math.copysign(min(abs(speed), mission.max_speed), speed), 0.0)

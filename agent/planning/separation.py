@@ -1,6 +1,4 @@
-"""The safety distance between two robots in range of each other, for all poses that each robot considers
-possible.
-"""
+"""The safety distance between two robots in range of each other, for all poses that may be true."""
 
 from __future__ import annotations
 
@@ -15,9 +13,7 @@ from protocol.motion import Controls, Pose
 Array = NDArray[np.float64]
 
 CHORDS = 16
-"""The number of chords that approximate an arc. Half a circle of 1 m radius is at most 1.5 mm from its
-chords.
-"""
+"""The number of chords per arc. Half a circle of 1 m arc length is at most 1.5 mm from its chords."""
 
 SIGMAS = 3.0
 """The assumed largest error of a noisy range, in standard deviations."""
@@ -42,8 +38,7 @@ def slowed(controls: Controls, metres: float, mission: Mission) -> Controls:
 
 
 def nearest(pose: Pose, v: Array, omega: Array, point: tuple[float, float], period: float) -> Array:
-    """Return the smallest distance in m between `point` and each arc from `pose`; of the shape of `v` and
-    `omega`.
+    """Return the smallest distance in m between `point` and each arc from `pose`; the shape is that of `v`.
 
     The result is a lower bound: the distance to the chords, minus the largest distance of an arc from its
     chord.

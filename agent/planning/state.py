@@ -1,6 +1,4 @@
-"""The complete state of one robot as one frozen value (`RobotState`), and its mode: the paper's phases as
-types.
-"""
+"""The complete state of one robot as one frozen value, and its mode: one type per state of the paper."""
 
 from __future__ import annotations
 
@@ -72,9 +70,7 @@ class Belief(msgspec.Struct, frozen=True):
     """
 
     possible: tuple[Branch, ...] = ()
-    """Exact sensors: the branches that the first two anchor ranges allow, before ticks without detection are
-    considered.
-    """
+    """Exact sensors: the branches that the first two anchor ranges allow."""
     branch: Branch | None = None
     """The branch selected at the end of phase 1. With noisy sensors, the most probable branch so far."""
     branch_kind: messages.BranchKind | None = None
@@ -85,8 +81,10 @@ class Belief(msgspec.Struct, frozen=True):
     placements: tuple[Placement, ...] = ()
     """The solutions of eq. (7) that no measurement has ruled out."""
     candidates: tuple[int, int] | None = None
-    """The number of candidates: exact sensors, the solutions of eq. (7), and those left by the ticks without
-    detection; noisy sensors, the hypotheses of the first search, and those left now.
+    """The number of candidates at the beginning, and after their evaluation.
+
+    Exact sensors: the solutions of eq. (7), and those that agree with the ticks without detection. Noisy
+    sensors: the hypotheses of the first search, and the present ones.
     """
     plan: Plan | None = None
     own_anchor: float = 0.0
@@ -112,9 +110,7 @@ class Belief(msgspec.Struct, frozen=True):
     p_value: float | None = None
     """Noisy sensors: the smallest p-value of all searches of the whole plane."""
     inconsistent_searches: int = 0
-    """Noisy sensors: the number of consecutive searches in which the mutual ranges contradicted the peer's
-    reports.
-    """
+    """Noisy sensors: the number of consecutive searches whose consistency test failed."""
     returns: int = 0
     """Noisy sensors: the number of times that the robot drove back to its anchor."""
 
@@ -194,9 +190,7 @@ class RobotState(msgspec.Struct, frozen=True):
         return replace(self, mode=Done(self.phase, Undecided(reason)))
 
     def inconsistent(self, contradiction: Inconsistent) -> RobotState:
-        """Return this state, ended with the verdict Inconsistent: the peer's reports contradict the
-        measurements.
-        """
+        """Return this state, ended with the verdict Inconsistent: the peer's reports are contradictory."""
         return replace(self, mode=Done(self.phase, contradiction))
 
     @property
@@ -220,8 +214,7 @@ class RobotState(msgspec.Struct, frozen=True):
         return compose(Pose(own.x, own.y, turn), self.local_pose)
 
     def seen(self) -> list[tuple[Pose, float | None]]:
-        """Return the odometry pose of each tick of phase 1, with the anchor range, or None without a
-        detection.
+        """Return the odometry pose of each tick of phase 1, and the anchor range or None.
 
         The result is not valid after phase 1: from phase 2 on, the log leaves out anchor ranges that repeat
         the last one.
@@ -231,9 +224,7 @@ class RobotState(msgspec.Struct, frozen=True):
         return [(pose, ranges.get(tick)) for tick, pose in enumerate(track)]
 
     def pair_observations(self, first: int) -> list[PairObservation]:
-        """Return both robots' poses and their mutual range for each tick from `first` on that both logs
-        cover.
-        """
+        """Return both poses and the mutual range of each tick from `first` on that both logs cover."""
         last = min(self.tick, self.peer_state.peer.through)
         if self.peer_state.start is None or last < first:
             return []
