@@ -334,8 +334,7 @@ FARTHEST_PREDICTION = 1.2
 """The largest predicted range that is distinguished from others, as a fraction of R. It is out of range."""
 
 SIGMA_FACTOR = 1.5
-"""The factor by which ranges count as noisier than they are, because the poses are not known exactly either.
-"""
+"""The factor by which ranges count as noisier than they are, because the poses are uncertain too."""
 
 LARGEST_GAP = 400.0
 """The largest squared difference of predictions in sigmas^2. Larger ones do not distinguish better."""

@@ -38,8 +38,7 @@ CHECKED, CHECKED_WITH_OUTLIERS = 8, 12
 """The minimum number of mutual ranges before a claim, without and with outliers."""
 
 FEWEST_MUTUAL_RANGES = 3
-"""The minimum number of mutual ranges for hypotheses. With fewer, there are too many hypotheses to be useful.
-"""
+"""The minimum number of mutual ranges for hypotheses. With fewer, there are too many hypotheses."""
 
 OFF_RADIUS = 0.5
 """The heading error in rad relative to the radius from which on the robot aligns again in phase 2."""

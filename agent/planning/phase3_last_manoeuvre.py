@@ -31,8 +31,7 @@ SPEEDS = (1.0, -1.0, 0.75, -0.75, 0.5, -0.5, 0.25, -0.25, 0.1, -0.1)
 """The values of v_2 compared, in units of A_0 / T_s: v_max, or less if one tick would come near R."""
 
 ELSEWHERE = 1e-6
-"""The distance in m within which two measurement points count as the same, so the second range adds nothing.
-"""
+"""The distance in m within which two measurement points count as one, so the second range adds nothing."""
 
 B_ON_M1 = 1e-6
 """The ratio of a distance to a's path between two ranges, below which b may be on M1.

@@ -56,7 +56,7 @@ class Known(msgspec.Struct, frozen=True):
     ranges: int
     """The number of ranges that give this error."""
     enough: bool = False
-    """Whether phase 1 may end."""
+    """True if phase 1 may end."""
 
 
 def anchor(state: RobotState, start: Pose, log: MotionLog) -> Known:

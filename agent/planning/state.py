@@ -128,7 +128,7 @@ class RobotState(msgspec.Struct, frozen=True):
     belief: Belief = Belief()
     peer_state: PeerState = PeerState()
     in_contact: bool = False
-    """Whether the peer is in range in this tick."""
+    """True if the peer is in range in this tick."""
     leg: Pose = ORIGIN
     """The odometry at the beginning of the last segment of the log."""
 
