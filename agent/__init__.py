@@ -1,5 +1,6 @@
-"""One robot's mind, and the process that it runs in."""
+"""One robot: its planner, its estimator, its view of the peer, and the process that runs them."""
 
 import os
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # numpy's sums are then the same on every machine
+# With one thread, the order of summation in numpy does not depend on the machine.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -19,7 +19,7 @@ from agent.estimation.closed_forms import Placement, same_placement
 from agent.estimation.exact import PairObservation, turn_error, weigh_placements
 from agent.planning import planner
 from agent.planning.phase3_last_manoeuvre import SPEEDS, TURN_RATES, LastManoeuvre, base, solve
-from agent.planning.precision import apart, drift
+from agent.planning.precision import combined_error, odometry_rounding
 from agent.planning.state import RobotState
 from compose.launch.in_process import play
 from compose.recording.run import Recording, TickRecord
@@ -282,9 +282,9 @@ def test_without_what_was_sensed_before_phase_3_more_placements_would_be_left(tm
         state = planner.decide(claim.observed["b"], claim.heard["b"])
         assert state.belief.encounter_tick is not None
         late = state.pair_observations(state.belief.encounter_tick)
-        pair = base(late, drift(state))
+        pair = base(late, odometry_rounding(state))
         assert pair is not None
-        left = weigh_placements(solve(CLOSE.distance, pair), late, CLOSE.reach, apart(state))
+        left = weigh_placements(solve(CLOSE.distance, pair), late, CLOSE.reach, combined_error(state))
         (known,) = state.belief.placements
         assert any(same_placement(known, one, 1e-6) for one in left), seed
         more += len(left) > 1

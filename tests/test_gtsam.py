@@ -332,7 +332,7 @@ def wrapped(change: Array) -> Array:
 
 
 def test_the_claim_came_of_this_fit(mission: Compared) -> None:
-    (held,) = inference.held_together([mission.ours], mission.pair)
+    (held,) = inference.pair_planning_hypotheses([mission.ours], mission.pair)
     pose, covariance = inference.claim(held, 0, mission.pair)
     anchor = mission.config.anchor
     assert mission.claimed == Localised(Pose(anchor.x + pose.x, anchor.y + pose.y, pose.heading), covariance)

@@ -35,7 +35,7 @@ def test_with_coarse_ranges_the_letter_is_undecided_and_says_what_is_missing() -
         said = summary(survey(SIGMA, seed, "paper"), "in-process", None)
         assert said["outcome"] == "undecided", seed
         reasons.append(said["reason"])
-    lacking = [reason for reason in reasons if "the letter takes no more ranges: " in reason]
+    lacking = [reason for reason in reasons if "the paper's manoeuvres give no further ranges: " in reason]
     assert len(lacking) > 3
     for reason in lacking:
         assert " of " in reason, "so much, of so much"
@@ -70,5 +70,5 @@ def test_where_there_are_outliers_the_letters_ranges_are_never_enough(sigma: flo
     recording = play(scenario_of(noise, seed, planner_name="paper", accuracy=0.03))
     said = summary(recording, "in-process", None)
     assert said["outcome"] == "undecided"
-    assert "the letter takes no more ranges: " in said["reason"]
-    assert "mutual ranges, of 12" in said["reason"]
+    assert "the paper's manoeuvres give no further ranges: " in said["reason"]
+    assert "of 12 required mutual ranges" in said["reason"]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from agent.peer.motion_log import MotionLog
-from agent.peer.peer_state import PeerState, contradiction, hear
+from agent.peer.peer_state import PeerState, contradiction, with_report
 from agent.planning import planner
 from agent.planning.state import Done, RobotState
 from compose.scenario.scenario_file import load
@@ -78,7 +78,7 @@ def test_reports_in_any_order_repeated_and_lost_give_back_the_log(
         report = told(books[tick], PeerState(acknowledged=since, ranges_acknowledged=known))
         assert contradiction(report) is None
         before = radio.peer
-        radio = hear(radio, report)
+        radio = with_report(radio, report)
         assert radio.peer.runs == books[radio.peer.through].runs
         assert radio.peer.ranges == books[-1].ranges[: len(radio.peer.ranges)]
         assert radio.peer.through >= before.through
@@ -91,7 +91,7 @@ def test_reports_in_any_order_repeated_and_lost_give_back_the_log(
     whole = books[-1]
     for _ in range(2 + whole.through // MAX_REPORT_RUNS + len(whole.ranges) // MAX_REPORT_RANGES):
         caught_up = PeerState(acknowledged=radio.peer.through, ranges_acknowledged=len(radio.peer.ranges))
-        radio = hear(radio, told(whole, caught_up))
+        radio = with_report(radio, told(whole, caught_up))
     assert radio.peer == whole
 
 
@@ -103,7 +103,7 @@ class Side:
         self.peer_state = PeerState()
         self.held: deque[Report] = deque()
 
-    def hear(self, report: Report, fate: str) -> None:
+    def with_report(self, report: Report, fate: str) -> None:
         match fate:
             case "lost":
                 return
@@ -111,10 +111,10 @@ class Side:
                 self.held.appendleft(report)
                 return
             case "twice":
-                self.peer_state = hear(self.peer_state, report)
-        self.peer_state = hear(self.peer_state, report)
+                self.peer_state = with_report(self.peer_state, report)
+        self.peer_state = with_report(self.peer_state, report)
         if self.held and fate == "late ones too":
-            self.peer_state = hear(self.peer_state, self.held.pop())
+            self.peer_state = with_report(self.peer_state, self.held.pop())
 
 
 @given(
@@ -128,15 +128,15 @@ def test_what_is_acknowledged_is_known_and_what_is_lost_is_told_again(
     fate = cycle(fates)
     for tick in range(length + 1):
         from_a, from_b = told(a.books[tick], a.peer_state), told(b.books[tick], b.peer_state)
-        a.hear(from_b, next(fate))
-        b.hear(from_a, next(fate))
+        a.with_report(from_b, next(fate))
+        b.with_report(from_a, next(fate))
         for one, other in ((a.peer_state, b.peer_state), (b.peer_state, a.peer_state)):
             assert one.acknowledged <= other.peer.through
             assert one.ranges_acknowledged <= len(other.peer.ranges)
     for _ in range(5 + 2 * length // min(MAX_REPORT_RUNS, MAX_REPORT_RANGES)):
         from_a, from_b = told(a.books[-1], a.peer_state), told(b.books[-1], b.peer_state)
-        a.hear(from_b, "heard")
-        b.hear(from_a, "heard")
+        a.with_report(from_b, "heard")
+        b.with_report(from_a, "heard")
     assert (a.peer_state.peer, b.peer_state.peer) == (b.books[-1], a.books[-1])
     last = told(a.books[-1], a.peer_state)
     assert (last.since, last.runs, last.ranges) == (length, (), ())
@@ -145,7 +145,7 @@ def test_what_is_acknowledged_is_known_and_what_is_lost_is_told_again(
 def test_an_overtaken_report_does_not_bring_back_an_old_state() -> None:
     old, new = (replace(told(MotionLog(), PeerState()), tick=tick) for tick in (3, 7))
     new = replace(new, state="standing", verdict=Undecided("lost"))
-    radio = hear(hear(PeerState(), new), old)
+    radio = with_report(with_report(PeerState(), new), old)
     assert (radio.state, radio.verdict, radio.latest, radio.heard) == ("standing", Undecided("lost"), 7, 2)
 
 
@@ -263,7 +263,7 @@ def test_a_sound_report_contradicts_nothing() -> None:
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        ({"tick": 7}, "log over [2, 8] told at tick 7"),
+        ({"tick": 7}, "log over [2, 8] reported at tick 7"),
         ({"since": 9, "runs": (), "ranges": ()}, "log over [9, 8]"),
         ({"runs": ()}, "do not fill [2, 8]"),
         ({"runs": (Segment(7, 1.0, 0.0),)}, "do not fill [2, 8]"),

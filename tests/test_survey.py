@@ -263,7 +263,7 @@ def test_a_robot_whose_peer_gives_up_under_noise_gives_up_too() -> None:
         (by_a, _) = observations(world)
         if by_a.contacts:
             told = replace(planner.report(observed["b"]), verdict=Undecided("no way"))
-            assert planner.decide(observed["a"], [told]).verdict == Undecided("b says: no way")
+            assert planner.decide(observed["a"], [told]).verdict == Undecided("b reports: no way")
             return
     pytest.fail("they never met")
 
@@ -329,6 +329,6 @@ def test_nothing_is_claimed_by_a_fit_that_still_moves(monkeypatch: pytest.Monkey
     recording = play(scenario_of(SIGMA, SHORT, max_ticks=ticks + 2))
     assert summary(recording, "in-process", None)["outcome"] == "undecided"
     assert all(
-        "still moves" in (final_report.blocking_reason or "")
+        "has not converged" in (final_report.blocking_reason or "")
         for final_report in recording.final_reports.values()
     )

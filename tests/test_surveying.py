@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from agent.estimation.gaussian.odometry_noise import Array
-from agent.planning.active_sensing import AHEAD, PlanningHypothesis, alone, choice, stride, together
+from agent.planning.active_sensing import AHEAD, PlanningHypothesis, choice, plan_alone, plan_together, stride
 from agent.planning.phase2_orbit import pursuit
-from agent.planning.range_seeking import Homing, arrived, homeward
+from agent.planning.range_seeking import Homing, arrival_tolerances, homing_controls
 from protocol.mission import Mission
 from protocol.motion import REST, Controls, Pose, step
 from protocol.noise import Noise, VelocityNoise
@@ -83,7 +83,7 @@ def test_alone_a_robot_stays_as_near_its_anchor_as_it_is_told(
 ) -> None:
     rho = part * within
     pose = Pose(rho * math.cos(bearing), rho * math.sin(bearing), heading)
-    there = after(pose, alone([held(pose)], MISSION, within))
+    there = after(pose, plan_alone([held(pose)], MISSION, within))
     assert math.hypot(there.x, there.y) <= within + 0.02
 
 
@@ -91,7 +91,7 @@ def test_alone_a_robot_stays_as_near_its_anchor_as_it_is_told(
 def test_alone_a_robot_stays_in_range_of_its_anchor(part: float, bearing: float, heading: float) -> None:
     rho = part * REACH
     pose = Pose(rho * math.cos(bearing), rho * math.sin(bearing), heading)
-    there = after(pose, alone([held(pose)], MISSION))
+    there = after(pose, plan_alone([held(pose)], MISSION))
     assert math.hypot(there.x, there.y) <= REACH
 
 
@@ -100,7 +100,7 @@ def test_of_mirror_images_a_robot_drives_where_their_ranges_differ(along: float,
     """Ahead and behind the two are alike, and standing tells nothing either."""
     one, other = Pose(along, aside, 0.0), Pose(along, -aside, 0.0)
     tight = np.eye(2) * 1e-6
-    command = alone([held(one, 0.5, tight), held(other, 0.5, tight)], MISSION)
+    command = plan_alone([held(one, 0.5, tight), held(other, 0.5, tight)], MISSION)
     gaps = []
     for _ in range(AHEAD):
         one, other = after(one, command), after(other, command)
@@ -120,7 +120,7 @@ def test_together_robots_keep_in_range_and_apart(
     b = Pose(M2[0] + off * REACH * math.cos(bearing), off * REACH * math.sin(bearing), b_heading)
     a = Pose(b.x + between * REACH * math.cos(towards), b.y + between * REACH * math.sin(towards), heading)
     poses = np.array([a.x, a.y, a.heading, b.x, b.y, b.heading])
-    by_a, by_b = together([PlanningHypothesis(1.0, poses, BOTH_SETTLED)], M2, between * REACH, MISSION)
+    by_a, by_b = plan_together([PlanningHypothesis(1.0, poses, BOTH_SETTLED)], M2, between * REACH, MISSION)
     there, peer = after(a, by_a), after(b, by_b)
     assert 0.15 * REACH < math.hypot(there.x - peer.x, there.y - peer.y) < 0.95 * REACH
     assert math.hypot(peer.x - M2[0], peer.y - M2[1]) < 0.95 * REACH
@@ -164,13 +164,13 @@ def test_from_anywhere_a_robot_finds_home(
     far = math.hypot(x - 1.0, y + 2.0)
     legs = far / (mission.max_speed * mission.period) + math.pi / (mission.max_turn_rate * mission.period)
     for _ in range(math.ceil(1.2 * legs) + 10):
-        command = homeward(home, pose, mission)
+        command = homing_controls(home, pose, mission)
         if command is None:
             break
         assert abs(command.v) <= mission.max_speed
         assert abs(command.omega) <= mission.max_turn_rate
         pose = step(pose, command.v, command.omega, mission.period)
-    assert math.hypot(pose.x - 1.0, pose.y + 2.0) <= arrived(mission)[0]
+    assert math.hypot(pose.x - 1.0, pose.y + 2.0) <= arrival_tolerances(mission)[0]
 
 
 # --- the way round ------------------------------------------------------------------------------------

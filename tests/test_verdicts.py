@@ -33,7 +33,7 @@ def test_a_robot_whose_peer_has_given_up_gives_up_too() -> None:
     met = next(step for step in steps("paper-1") if step.heard["a"])
     told = [replace(report, verdict=GAVE_UP) for report in met.heard["a"]]
     verdict = planner.decide(met.observed["a"], told).verdict
-    assert verdict == Undecided(f"b says: {GAVE_UP.reason}")
+    assert verdict == Undecided(f"b reports: {GAVE_UP.reason}")
 
 
 def test_a_reason_handed_on_stays_within_what_a_message_can_hold() -> None:
@@ -65,7 +65,7 @@ def test_the_letter_gives_up_where_the_third_mutual_range_settles_nothing(
     recording = play(parse(text, "random", seed=441))
     assert recording.end is not None
     assert recording.end.outcome == "undecided"
-    assert recording.end.reason == "b: the third mutual range does not settle where they are"
+    assert recording.end.reason == "b: the third mutual range does not select a placement"
     states = [(moment.commands["a"].state, moment.commands["b"].state) for moment in recording.moments]
     assert states[-3:] == [("straight", "standing"), ("waiting", "last-manoeuvre"), ("waiting", "undecided")]
 

@@ -1,4 +1,7 @@
-"""A log as a robot tells it that was told to lie (see `protocol.attack`); its own stays true."""
+"""False data injection: the log and the start pose that an attacker reports (see `protocol.attack`).
+
+The attacker's own log is not changed. It drives, measures and plans with the true data.
+"""
 
 from __future__ import annotations
 
@@ -15,48 +18,62 @@ from protocol.motion import Pose, Segment
 STARTS = ("radius", "heading", "reframe")
 
 
-def told(log: MotionLog, attack: Attack, parted: int | None, met: int | None, period: float) -> MotionLog:
-    """`log`, as `attack` has it; phase 1 was over at the tick `phase1_done_tick`, and phase 3 began at `encounter_tick`."""
+def falsified_log(
+    log: MotionLog, attack: Attack, phase1_done_tick: int | None, encounter_tick: int | None, period: float
+) -> MotionLog:
+    """Return `log` as falsified by `attack`.
+
+    The ticks tell in which part of the log each phase lies: phase 1 ended at `phase1_done_tick`, and phase 3
+    began at `encounter_tick`; None if that has not happened. `period` is T_s in s.
+    """
     if attack.kind == "radius":
         ranges = tuple([Ranged(one.tick, max(0.0, one.range + attack.size)) for one in log.ranges])
         return MotionLog(log.through, log.runs, ranges)
     if attack.kind in STARTS:
         return log
-    first, last = _span(attack, log.through, parted, met)
-    book = MotionLog(ranges=log.ranges)
+    first, last = _attacked_span(attack, log.through, phase1_done_tick, encounter_tick)
+    falsified = MotionLog(ranges=log.ranges)
     tick = 0
     for run in log.runs:
-        for begin, end in _cut(tick, tick + run.ticks, first, last):
-            part = _bent(Segment(end - begin, run.v, run.omega), begin, attack, first, last, period)
-            book = book.drove(part.v, part.omega, part.ticks)
+        for begin, end in _pieces(tick, tick + run.ticks, first, last):
+            piece = _falsified(Segment(end - begin, run.v, run.omega), begin, attack, first, last, period)
+            falsified = falsified.drove(piece.v, piece.omega, piece.ticks)
         tick += run.ticks
-    return book
+    return falsified
 
 
-def _span(attack: Attack, through: int, parted: int | None, met: int | None) -> tuple[int, int]:
-    """The ticks of the part: the first, and the one after the last; empty while it has not come."""
+def _attacked_span(
+    attack: Attack, through: int, phase1_done_tick: int | None, encounter_tick: int | None
+) -> tuple[int, int]:
+    """Return the first tick of the attacked part, and the one after its last.
+
+    The span is empty if the part has not begun.
+    """
     end = through + 1
-    parted = parted if parted is not None else end
-    met = met if met is not None else end
+    phase1_done_tick = phase1_done_tick if phase1_done_tick is not None else end
+    encounter_tick = encounter_tick if encounter_tick is not None else end
     match attack.part:
         case "phase-1":
-            return 0, parted
+            return 0, phase1_done_tick
         case "orbit":
-            return parted, max(parted, met)
+            return phase1_done_tick, max(phase1_done_tick, encounter_tick)
         case "encounter":
-            return met, end
+            return encounter_tick, end
         case _:
             return 0, end
 
 
-def _cut(begin: int, end: int, first: int, last: int) -> list[tuple[int, int]]:
-    """[begin, end), in pieces inside the part, or outside; its first tick, and the one after it, alone."""
+def _pieces(begin: int, end: int, first: int, last: int) -> list[tuple[int, int]]:
+    """Return [begin, end) in pieces that lie completely inside or outside the attacked part.
+
+    The first tick of the part, and the first one after it, are pieces of their own.
+    """
     marks = sorted({begin, end, *[mark for mark in (first, first + 1, last, last + 1) if begin < mark < end]})
     return list(pairwise(marks))
 
 
-def _bent(run: Segment, tick: int, attack: Attack, first: int, last: int, period: float) -> Segment:
-    """What is told of a run that begins at `tick`."""
+def _falsified(run: Segment, tick: int, attack: Attack, first: int, last: int, period: float) -> Segment:
+    """Return the reported segment instead of `run`, which begins at `tick`."""
     match attack.kind:
         case "scale" if first <= tick < last:
             return Segment(run.ticks, run.v * attack.size, run.omega)
@@ -71,7 +88,7 @@ def _bent(run: Segment, tick: int, attack: Attack, first: int, last: int, period
 
 
 def start(true: Pose, attack: Attack) -> Pose:
-    """Where tick 0 of its odometry lies in the frame of its anchor, as `attack` has it."""
+    """Return the reported pose of tick 0 in the frame of the anchor, instead of the true one."""
     match attack.kind:
         case "radius":
             return replace(true, x=true.x + attack.size)

@@ -1,4 +1,4 @@
-"""A robot's manoeuvres and anchor ranges, tick by tick: its own, or what it has been told of its peer's."""
+"""The motion log: the manoeuvres and anchor ranges of a robot, its own or as received from its peer."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from protocol.motion import Pose, Segment, arc, follow
 
 
 class MotionLog(msgspec.Struct, frozen=True):
-    """What was executed over [0, through], never what was asked, and the ranges taken on the way."""
+    """The manoeuvres executed over the ticks [0, through], as measured by odometry, and the anchor ranges."""
 
     through: int = 0
     runs: tuple[Segment, ...] = ()
     ranges: tuple[Ranged, ...] = ()
 
     def moved(self, standstill_bound: tuple[float, float] = (0.0, 0.0)) -> int:
-        """The tick by which the last manoeuvre that was no rest had ended.
+        """Return the tick at which the last motion ended.
 
-        A robot at rest may measure up to `standstill_bound`, in m/s and rad/s.
+        The odometry of a robot at rest may measure up to `standstill_bound`, in m/s and rad/s.
         """
         at_rest = 0
         for run in reversed(self.runs):
@@ -31,11 +31,11 @@ class MotionLog(msgspec.Struct, frozen=True):
         return self.through - at_rest
 
     def until(self, tick: int) -> tuple[Segment, ...]:
-        """Return what was driven over [0, tick]."""
+        """Return the segments over [0, tick]."""
         return self.runs if tick >= self.through else _between(self.runs, 0, tick)
 
     def drove(self, v: float, omega: float, ticks: int = 1) -> MotionLog:
-        """The log after `ticks` more of one manoeuvre."""
+        """Return the log with `ticks` more ticks of one manoeuvre. Equal manoeuvres are joined."""
         runs = self.runs
         if runs:
             last = runs[-1]
@@ -45,42 +45,43 @@ class MotionLog(msgspec.Struct, frozen=True):
         return MotionLog(self.through + ticks, (*runs, Segment(ticks, v, omega)), self.ranges)
 
     def ranged(self, distance: float) -> MotionLog:
-        """The log with an anchor range (m) at its last tick."""
+        """Return the log with an anchor range in m at its last tick."""
         return MotionLog(self.through, self.runs, (*self.ranges, Ranged(self.through, distance)))
 
     def after(self, since: int, ranges_since: int) -> MotionLog:
-        """What a peer lacks that knows the manoeuvres through `since`, and the first `ranges_since` ranges.
+        """Return the part of the log that a peer lacks which has acknowledged it up to `since`.
 
-        No more than one report can carry. Its runs begin at tick `since`.
+        The peer also has the first `ranges_since` ranges. The part is limited to what one report can carry,
+        and its segments begin at tick `since`.
         """
-        fresh = [begin for begin, run in _dated(self.runs) if begin + run.ticks > since]
-        through = fresh[MAX_REPORT_RUNS] if len(fresh) > MAX_REPORT_RUNS else self.through
+        unacknowledged = [begin for begin, run in _with_first_ticks(self.runs) if begin + run.ticks > since]
+        through = unacknowledged[MAX_REPORT_RUNS] if len(unacknowledged) > MAX_REPORT_RUNS else self.through
         ranges = self.ranges[ranges_since : ranges_since + MAX_REPORT_RANGES]
         return MotionLog(through, _between(self.runs, since, through), ranges)
 
-    def extended(self, since: int, ranges_since: int, told: MotionLog) -> MotionLog:
-        """The log with what `told` (see `after`) adds; of what would leave a gap, nothing."""
-        book = self
+    def extended(self, since: int, ranges_since: int, addition: MotionLog) -> MotionLog:
+        """Return the log extended by `addition` (see `after`). Data that would leave a gap are ignored."""
+        log = self
         if since <= self.through:
-            for run in _between(told.runs, self.through - since, told.through - since):
-                book = book.drove(run.v, run.omega, run.ticks)
+            for run in _between(addition.runs, self.through - since, addition.through - since):
+                log = log.drove(run.v, run.omega, run.ticks)
         known = len(self.ranges)
-        news = told.ranges[known - ranges_since :] if ranges_since <= known else ()
-        return MotionLog(book.through, book.runs, self.ranges + news)
+        new_ranges = addition.ranges[known - ranges_since :] if ranges_since <= known else ()
+        return MotionLog(log.through, log.runs, self.ranges + new_ranges)
 
     def between(self, first: int, last: int) -> tuple[Segment, ...]:
-        """What was driven over [first, last], as few runs."""
+        """Return the segments over [first, last], with equal manoeuvres joined."""
         runs = _between(self.runs, first, last)
         if all(one.v != other.v or one.omega != other.omega for one, other in pairwise(runs)):
             return runs
         return MotionLog().extended(0, 0, MotionLog(last - first, runs)).runs
 
     def pose(self, start: Pose, tick: int, period: float) -> Pose:
-        """Where the robot was at `tick`, if it was at `start` at tick 0."""
+        """Return the pose at `tick` for the pose `start` at tick 0."""
         return follow(start, self.until(tick), period)
 
     def track(self, start: Pose, first: int, last: int, period: float) -> list[Pose]:
-        """Where the robot was at each tick in [first, last], if it was at `start` at tick 0."""
+        """Return the poses at each tick in [first, last] for the pose `start` at tick 0."""
         pose = self.pose(start, first, period)
         track = [pose]
         for run in _between(self.runs, first, last):
@@ -88,8 +89,8 @@ class MotionLog(msgspec.Struct, frozen=True):
         return track
 
 
-def _dated(runs: Iterable[Segment]) -> Iterator[tuple[int, Segment]]:
-    """Each run with the tick it begins at, the first at 0."""
+def _with_first_ticks(runs: Iterable[Segment]) -> Iterator[tuple[int, Segment]]:
+    """Yield the first tick of each segment, and the segment."""
     begin = 0
     for run in runs:
         yield begin, run
@@ -97,7 +98,7 @@ def _dated(runs: Iterable[Segment]) -> Iterator[tuple[int, Segment]]:
 
 
 def _between(runs: tuple[Segment, ...], first: int, last: int) -> tuple[Segment, ...]:
-    """What was driven over [first, last]."""
+    """Return the segments over [first, last]; the outer ones are cut."""
     found: list[Segment] = []
     end = 0
     for run in runs:

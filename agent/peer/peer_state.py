@@ -1,4 +1,4 @@
-"""What a robot has told its peer, heard from it and acknowledged: pure bookkeeping."""
+"""The state of the exchange between two robots: received data and acknowledgements, as pure functions."""
 
 from __future__ import annotations
 
@@ -10,39 +10,42 @@ from protocol.motion import Pose
 
 
 class PeerState(msgspec.Struct, frozen=True):
-    """All that is known of the peer, and how much of its own log a robot need not repeat."""
+    """Everything received from the peer, and how much of the own log the peer has acknowledged."""
 
     peer: MotionLog = MotionLog()
     start: Pose | None = None
-    """where tick 0 of the peer's odometry lies in the frame of the peer's anchor"""
+    """The pose of the peer at tick 0 in the frame of the peer's anchor; None before the peer's phase 2."""
     phase: int = 1
     state: str = ""
-    """where in the mission the peer was when last heard, and what it did"""
+    """The name of the peer's mode, like `phase` from the latest report."""
     verdict: Verdict | None = None
-    """the peer's"""
+    """The verdict of the peer in the latest report."""
     latest: int = -1
-    """the tick of the newest report heard"""
+    """The tick of the latest report received; -1 if there is none."""
     acknowledged: int = 0
-    """the peer knows this robot's manoeuvres through this tick"""
+    """The last tick of this robot's manoeuvres that the peer has acknowledged."""
     ranges_acknowledged: int = 0
-    """and so many of its ranges"""
+    """The number of this robot's anchor ranges that the peer has acknowledged."""
     heard: int = 0
-    """reports, repeats included"""
+    """The number of reports received, repeated ones included."""
     ranges_through: int = -1
-    """the peer's ranges are known through this tick; what is not among them was silent"""
+    """The tick through which the peer's anchor ranges are complete: a tick without one had no detection."""
 
 
 def contradiction(report: Report) -> str | None:
-    """What in `report` no well-formed log could say, or None."""
+    """Return the reason why `report` is malformed, or None if it is well-formed.
+
+    The checks concern the report alone, and do not depend on earlier reports.
+    """
     if report.heard > report.tick:
         return f"tick {report.heard} acknowledged at tick {report.tick}"
     if report.ranges_heard > report.tick + 1:
-        return f"{report.ranges_heard} ranges acknowledged at tick {report.tick}, one a tick at the most"
+        return f"{report.ranges_heard} ranges acknowledged at tick {report.tick}, at most one per tick"
     if report.through > report.tick or report.since > report.through:
-        return f"a log over [{report.since}, {report.through}] told at tick {report.tick}"
+        return f"a log over [{report.since}, {report.through}] reported at tick {report.tick}"
     if sum(run.ticks for run in report.runs) != report.through - report.since:
         return f"manoeuvres that do not fill [{report.since}, {report.through}]"
-    earliest = report.ranges_since - 1  # one a tick at the most
+    earliest = report.ranges_since - 1  # at most one range per tick
     for ranged in report.ranges:
         if not earliest < ranged.tick <= report.tick:
             return f"a range of tick {ranged.tick} outside ({earliest}, {report.tick}]"
@@ -50,23 +53,26 @@ def contradiction(report: Report) -> str | None:
     return None
 
 
-def hear(radio: PeerState, report: Report) -> PeerState:
-    """Late, repeated and overtaken reports change nothing but the count."""
-    newer = report.tick > radio.latest
-    known = len(radio.peer.ranges) >= report.ranges_since
+def with_report(peer_state: PeerState, report: Report) -> PeerState:
+    """Return `peer_state` with the data of `report`.
+
+    Late, repeated and overtaken reports change only the number of reports received.
+    """
+    newer = report.tick > peer_state.latest
+    known = len(peer_state.peer.ranges) >= report.ranges_since
     whole = len(report.ranges) < MAX_REPORT_RANGES
-    told_through = report.tick if whole else report.ranges[-1].tick
+    ranges_through = report.tick if whole else report.ranges[-1].tick
     return PeerState(
-        peer=radio.peer.extended(
+        peer=peer_state.peer.extended(
             report.since, report.ranges_since, MotionLog(report.through, report.runs, report.ranges)
         ),
-        start=radio.start or report.start,
-        phase=report.phase if newer else radio.phase,
-        state=report.state if newer else radio.state,
-        verdict=report.verdict if newer else radio.verdict,
-        latest=max(report.tick, radio.latest),
-        acknowledged=max(report.heard, radio.acknowledged),
-        ranges_acknowledged=max(report.ranges_heard, radio.ranges_acknowledged),
-        heard=radio.heard + 1,
-        ranges_through=max(told_through, radio.ranges_through) if known else radio.ranges_through,
+        start=peer_state.start or report.start,
+        phase=report.phase if newer else peer_state.phase,
+        state=report.state if newer else peer_state.state,
+        verdict=report.verdict if newer else peer_state.verdict,
+        latest=max(report.tick, peer_state.latest),
+        acknowledged=max(report.heard, peer_state.acknowledged),
+        ranges_acknowledged=max(report.ranges_heard, peer_state.ranges_acknowledged),
+        heard=peer_state.heard + 1,
+        ranges_through=max(ranges_through, peer_state.ranges_through) if known else peer_state.ranges_through,
     )

@@ -1,7 +1,8 @@
-"""Under noise: where to drive so that the next ranges tell most, alone with the anchor or with the peer.
+"""Active sensing with noisy sensors: the manoeuvre whose next ranges are expected to be most informative.
 
-A manoeuvre is worth what it is expected to leave: the probability of taking the wrong hypothesis (Bhattacharyya's
-bound, by how many sigmas apart the ranges are that they predict), and the variance of the positions.
+The cost of a manoeuvre is the sum of two expectations after it: the probability of confusing the most
+probable hypothesis with another (Bhattacharyya bound, from the differences of the predicted ranges), and the
+variance of the positions.
 """
 
 from __future__ import annotations
@@ -22,77 +23,80 @@ from agent.planning.range_seeking import Beacon
 from protocol.mission import Mission
 from protocol.motion import REST, Controls
 
-STRIDE = 0.25
-"""of R: how far a manoeuvre leads at the least, in as many ticks as that takes"""
+STRIDE_LENGTH = 0.25
+"""The minimum length of a manoeuvre, as a fraction of R. A manoeuvre lasts as many ticks as that takes."""
 
 AHEAD = 3
-"""strides that a manoeuvre is looked at: so long would it go on"""
+"""The number of strides over which a manoeuvre is evaluated, as if it were continued."""
 
 TURNS = 17
-"""values of omega that are compared, from -omega_max to omega_max"""
+"""The number of values of omega that are compared, from -omega_max to omega_max."""
 
 SPEEDS = (1.0, -1.0, 0.5, -0.5)
-"""values of v, over A_0 / T_s"""
+"""The values of v that are compared, in units of A_0 / T_s."""
 
 SLOW = (0.1, -0.1)
-"""likewise, where there is a distance to keep and little room"""
+"""Additional values of v in the same units, for small gaps when there is a safety distance."""
 
-FINE = 0.03
-"""of the accuracy: what is known better than this need not be known better still"""
+NEGLIGIBLE = 0.03
+"""The standard deviation below which a further improvement has no value, as a fraction of the accuracy."""
 
-CONFUSION = 10.0
-"""what taking the wrong hypothesis costs, in variances as large as the accuracy asked for"""
+CONFUSION_COST = 10.0
+"""The cost of taking a wrong hypothesis, in variances as large as the required accuracy."""
 
-LOSS = 1e3
-"""per m: what it costs to be where no range is to be had or none tells, likewise"""
+OUTSIDE_COST = 1e3
+"""The cost per m in a place without informative ranges, in variances as large as the required accuracy."""
 
-ASTRAY = 10.0
-"""per m: the same, alone with the anchor, of which more is known each tick"""
+OUTSIDE_COST_ALONE = 10.0
+"""The same cost near the anchor alone, where the position estimate improves in each tick."""
 
 
 class Surveying(msgspec.Struct, frozen=True):
-    """Drives where the next ranges are expected to tell most."""
+    """The robot drives to where its next ranges are expected to be most informative."""
 
     beacon: Beacon
     command: Controls = REST
 
 
 class Listening(msgspec.Struct, frozen=True):
-    """Stands in the peer's range, and waits for what it has not been told of it yet."""
+    """The robot stands still in range of the peer, and waits for the missing part of the peer's log."""
 
     command: Controls = REST
 
 
 class Retreating(msgspec.Struct, frozen=True):
-    """Has left the peer's range: drives back as it came, and as far again, not to do the same once more."""
+    """The robot has left the peer's range. It drives back the same way, and as far again.
+
+    The second half prevents that it takes the same decision, and leaves the range, once more.
+    """
 
     command: Controls
     since: int
-    """the tick in which it found itself alone"""
+    """The tick in which the peer was out of range for the first time."""
 
 
 def stride(mission: Mission) -> int:
-    """Ticks that a manoeuvre lasts: from nearer by, a range tells little more."""
-    return max(1, round(STRIDE * mission.sensing_range / mission.first_straight))
+    """Return the number of ticks of a manoeuvre. Ranges from nearer points are hardly more informative."""
+    return max(1, round(STRIDE_LENGTH * mission.sensing_range / mission.first_straight))
 
 
 class Choice(NamedTuple):
-    """Manoeuvres to compare, C of them, and where each leads, relative to where it begins."""
+    """The C manoeuvres that are compared, with end points relative to the starting pose."""
 
     v: Array
     omega: Array
     along: Array
-    """m, in the direction of the heading; (C, AHEAD)"""
+    """The distance in m along the initial heading after each stride; (C, AHEAD)."""
     across: Array
-    """m, to the left of it"""
+    """The distance in m to the left of it; (C, AHEAD)."""
     way_along: Array
-    """the same at CHORDS times of the first stride; (C, CHORDS)"""
+    """The distance in m along the initial heading at CHORDS times during the first stride; (C, CHORDS)."""
     way_across: Array
 
 
 @cache
 def choice(mission: Mission) -> Choice:
-    """All of a robot's; the last is to stand."""
+    """Return all manoeuvres of a robot. The last one is to stand still."""
     period = stride(mission) * mission.period
     fastest = min(mission.max_turn_rate, math.pi / period)
     speeds = SPEEDS + SLOW if mission.safety_distance else SPEEDS
@@ -123,61 +127,65 @@ def choice(mission: Mission) -> Choice:
 
 
 class PlanningHypothesis(NamedTuple):
-    """A hypothesis, as far as planning needs it."""
+    """A hypothesis in the form that planning needs."""
 
     probability: float
     poses: Array
-    """x, y in m and heading: (3,) of one robot, relative to its anchor; or (6,) of a and b, relative to M1"""
+    """The poses in m and rad: (3,) of one robot relative to its anchor, or (6,) of a and b relative to M1."""
     covariance: Array
-    """of the anchor's place, (2, 2); or of both poses, (6, 6)"""
+    """The covariance of the anchor's position, (2, 2), or of both poses, (6, 6)."""
 
 
-def alone(held: Sequence[PlanningHypothesis], mission: Mission, within: float | None = None) -> Controls:
-    """The manoeuvre whose ranges to the anchor, at the origin, are expected to tell most.
+def plan_alone(
+    hypotheses: Sequence[PlanningHypothesis], mission: Mission, within: float | None = None
+) -> Controls:
+    """Return the manoeuvre whose ranges to the anchor are expected to be most informative.
 
-    The covariance is that of the anchor's place. `within` is how far (m) from it the robot may go.
+    The anchor is the origin, and the covariance of each hypothesis is that of the anchor's position. `within`
+    is the largest allowed distance from the anchor in m.
     """
     ways = choice(mission)
-    best = held[0]
+    best = hypotheses[0]
     reach = mission.sensing_range
     distances = []
-    for one in held:
+    for one in hypotheses:
         x, y = _ends(ways, one.poses)
         distances.append(np.maximum(np.hypot(x, y), SIGMA_FLOOR))
         if one is best:
             ux, uy = x / distances[0], y / distances[0]
-    sigma = max(mission.noise.anchor_sigma, FINE * mission.accuracy)
+    sigma = max(mission.noise.anchor_sigma, NEGLIGIBLE * mission.accuracy)
     weight = (distances[0] <= reach) / sigma**2
     information = _information(best.covariance, mission)
     xx = information[0, 0] + np.sum(weight * ux * ux, 1)
     xy = information[0, 1] + np.sum(weight * ux * uy, 1)
     yy = information[1, 1] + np.sum(weight * uy * uy, 1)
     cost = (xx + yy) / np.maximum(xx * yy - xy * xy, 1e-300) / mission.accuracy**2
-    cost += _confusion(held, distances, sigma, reach)
+    cost += _confusion(hypotheses, distances, sigma, reach)
     limit = within if within is not None else reach
-    for one, distance in zip(held, distances, strict=True):
-        cost += one.probability * LOSS * np.maximum(0.0, ASIDE * reach - distance[:, 0])
+    for one, distance in zip(hypotheses, distances, strict=True):
+        cost += one.probability * OUTSIDE_COST * np.maximum(0.0, NEAREST_TO_ANCHOR * reach - distance[:, 0])
         margin = math.sqrt(max(0.0, float(np.trace(one.covariance)))) if within is None else 0.0
-        loss = LOSS if within is not None else ASTRAY
+        loss = OUTSIDE_COST if within is not None else OUTSIDE_COST_ALONE
         cost += one.probability * loss * np.maximum(0.0, distance[:, 0] + min(margin, 0.1 * reach) - limit)
     i = int(np.argmin(cost))
     return Controls(float(ways.v[i]), float(ways.omega[i]))
 
 
-def together(
-    held: Sequence[PlanningHypothesis], m2: tuple[float, float], rho: float, mission: Mission
+def plan_together(
+    hypotheses: Sequence[PlanningHypothesis], m2: tuple[float, float], rho: float, mission: Mission
 ) -> tuple[Controls, Controls]:
-    """The manoeuvres of a and b after which both know best where they are.
+    """Return the manoeuvres of a and b after which both poses are expected to be known best.
 
-    The covariance is that of both poses, (6, 6), relative to M1; M2 is at `m2`. First b's is chosen, as if a
-    stood; then a's, as b will drive. Neither comes nearer to the other than the safety distance, whichever
-    hypothesis is true; `rho` is the latest range between them. If all would, they stand.
+    The covariance of each hypothesis is that of both poses, (6, 6), relative to M1. M2 is at `m2`. First, b's
+    manoeuvre is selected as if a stood still, then a's, given b's. Neither robot comes nearer to the other
+    than the safety distance under any hypothesis; `rho` is the latest range between them in m. If no
+    manoeuvre meets this condition, both stand still.
     """
     ways = choice(mission)
     stand = len(ways.v) - 1
     still = np.array([stand])
-    _, b = _best_of(ways, held, m2, rho, mission, still, np.arange(stand + 1))
-    a, _ = _best_of(ways, held, m2, rho, mission, np.arange(stand + 1), np.array([b]))
+    _, b = _best_of(ways, hypotheses, m2, rho, mission, still, np.arange(stand + 1))
+    a, _ = _best_of(ways, hypotheses, m2, rho, mission, np.arange(stand + 1), np.array([b]))
     return (
         Controls(float(ways.v[a]), float(ways.omega[a])),
         Controls(float(ways.v[b]), float(ways.omega[b])),
@@ -186,22 +194,22 @@ def together(
 
 def _best_of(
     ways: Choice,
-    held: Sequence[PlanningHypothesis],
+    hypotheses: Sequence[PlanningHypothesis],
     m2: tuple[float, float],
     latest: float,
     mission: Mission,
     of_a: Places,
     of_b: Places,
 ) -> tuple[int, int]:
-    """Of the ways `of_a` and `of_b`, one of which is a single one."""
+    """Return the best pair of manoeuvres from `of_a` and `of_b`, one of which contains a single manoeuvre."""
     reach = mission.sensing_range
-    own_sigma = max(mission.noise.anchor_sigma, FINE * mission.accuracy)
-    sigma = max(mission.noise.mutual_sigma, FINE * mission.accuracy)
+    own_sigma = max(mission.noise.anchor_sigma, NEGLIGIBLE * mission.accuracy)
+    sigma = max(mission.noise.mutual_sigma, NEGLIGIBLE * mission.accuracy)
     anchors = ((0.0, 0.0), m2)
     count = max(len(of_a), len(of_b))
     distances = []
     cost = np.zeros(count)
-    for one in held:
+    for one in hypotheses:
         ax, ay = _ends(ways, one.poses[:3], of_a)
         bx, by = _ends(ways, one.poses[3:], of_b)
         dx, dy = ax - bx, ay - by
@@ -209,13 +217,13 @@ def _best_of(
         distances.append(distance)
         off_anchor = np.hypot(bx[:, 0] - m2[0], by[:, 0] - m2[1])
         for beyond in (
-            distance[:, 0] - MARGIN * reach,
-            off_anchor - MARGIN * reach,
-            APART * reach - np.min(distance, 1),
-            ASIDE * reach - off_anchor,
+            distance[:, 0] - FARTHEST * reach,
+            off_anchor - FARTHEST * reach,
+            NEAREST * reach - np.min(distance, 1),
+            NEAREST_TO_ANCHOR * reach - off_anchor,
         ):
-            cost += one.probability * LOSS * np.maximum(0.0, beyond)
-        if one is not held[0]:
+            cost += one.probability * OUTSIDE_COST * np.maximum(0.0, beyond)
+        if one is not hypotheses[0]:
             continue
         rows = np.zeros((count, 3 * AHEAD, 6))
         nx, ny = dx / distance, dy / distance
@@ -233,90 +241,114 @@ def _best_of(
             rows[:, own_rows, i] = ox * own
             rows[:, own_rows, i + 1] = oy * own
             rows[:, own_rows, i + 2] = (oy * (x - px) - ox * (y - py)) * own
-        left = np.linalg.inv(_information(one.covariance, mission) + np.swapaxes(rows, 1, 2) @ rows)
+        covariance_after = np.linalg.inv(
+            _information(one.covariance, mission) + np.swapaxes(rows, 1, 2) @ rows
+        )
         for i, (x, y) in ((0, (ax, ay)), (3, (bx, by))):
             dx, dy = x[:, -1] - one.poses[i], y[:, -1] - one.poses[i + 1]
-            variance = left[:, i, i] + left[:, i + 1, i + 1] + (dx * dx + dy * dy) * left[:, i + 2, i + 2]
-            variance += 2.0 * (dx * left[:, i + 1, i + 2] - dy * left[:, i, i + 2])
+            variance = (
+                covariance_after[:, i, i]
+                + covariance_after[:, i + 1, i + 1]
+                + (dx * dx + dy * dy) * covariance_after[:, i + 2, i + 2]
+            )
+            variance += 2.0 * (dx * covariance_after[:, i + 1, i + 2] - dy * covariance_after[:, i, i + 2])
             cost += variance / mission.accuracy**2
-    cost += _confusion(held, distances, sigma, reach)
+    cost += _confusion(hypotheses, distances, sigma, reach)
     if mission.safety_distance:
-        cost[~_keep_apart(ways, held, latest, mission, of_a, of_b)] = np.inf
-        cost[-1] = min(cost[-1], STANDING)
+        cost[~_keep_apart(ways, hypotheses, latest, mission, of_a, of_b)] = np.inf
+        cost[-1] = min(cost[-1], STANDING_COST)
     i = int(np.argmin(cost))
     return int(of_a[i if len(of_a) > 1 else 0]), int(of_b[i if len(of_b) > 1 else 0])
 
 
 def _keep_apart(
-    ways: Choice, held: Sequence[PlanningHypothesis], rho: float, mission: Mission, of_a: Places, of_b: Places
+    ways: Choice,
+    hypotheses: Sequence[PlanningHypothesis],
+    rho: float,
+    mission: Mission,
+    of_a: Places,
+    of_b: Places,
 ) -> NDArray[np.bool]:
-    """Which of the ways keep the safety distance: by all of `held`, or too short for any to matter."""
+    """Return which pairs of manoeuvres keep the safety distance under all hypotheses.
+
+    A pair is also allowed if it is too short to violate the distance under any hypothesis.
+    """
     lengths = np.abs(ways.v) * stride(mission) * mission.period
-    together = lengths[of_a] + lengths[of_b]
-    kept = np.ones(len(together), dtype=np.bool)
-    for one in held:
+    lengths_of_both = lengths[of_a] + lengths[of_b]
+    allowed = np.ones(len(lengths_of_both), dtype=np.bool)
+    for one in hypotheses:
         (ax, ay), (bx, by) = _way(ways, one.poses[:3], of_a), _way(ways, one.poses[3:], of_b)
         relative = one.covariance[:2, :2] + one.covariance[3:5, 3:5] - 2.0 * one.covariance[:2, 3:5]
-        unsure = separation.SIGMAS * math.sqrt(max(0.0, float(np.trace(relative))))
-        least = np.min(np.hypot(ax - bx, ay - by), 1) - 0.5 * together / separation.CHORDS - unsure
-        kept &= least >= mission.safety_distance
-    return kept | (together <= separation.leeway(rho, mission))
+        uncertainty = separation.SIGMAS * math.sqrt(max(0.0, float(np.trace(relative))))
+        least = (
+            np.min(np.hypot(ax - bx, ay - by), 1) - 0.5 * lengths_of_both / separation.CHORDS - uncertainty
+        )
+        allowed &= least >= mission.safety_distance
+    return allowed | (lengths_of_both <= separation.leeway(rho, mission))
 
 
-STANDING = 1e300
-"""what it costs to stand where every way, that one too, might lead too near"""
+STANDING_COST = 1e300
+"""The cost of standing still where every manoeuvre, this one included, might violate the safety distance."""
 
-MARGIN = 0.9
-"""of R: how far apart two robots may plan to be, and b from its anchor"""
+FARTHEST = 0.9
+"""The largest planned distance between the robots, and from b to its anchor, as a fraction of R."""
 
-APART = 0.2
-"""of R: how near they may come; nearer, a range tells little of where, and they might touch"""
+NEAREST = 0.2
+"""The smallest planned distance between the robots, as a fraction of R.
 
-ASIDE = 0.06
-"""of R: how near a robot may come to its anchor; on which side of it, drift would then leave open"""
+From nearer points, a range contains little information about the direction, and the robots might collide.
+"""
+
+NEAREST_TO_ANCHOR = 0.06
+"""The smallest planned distance from the anchor, as a fraction of R.
+
+From nearer points, odometry noise would leave open on which side of the anchor the robot is.
+"""
 
 
 def _information(covariance: Array, mission: Mission) -> Array:
-    """Its inverse; what is hardly known counts as known to 2 R and half a turn."""
+    """Return the inverse of `covariance`, with variances limited to those of 2 R and half a turn."""
     variances, axes = np.linalg.eigh(covariance)
     most = max(4.0 * mission.sensing_range**2, math.pi**2)
-    information: Array = axes / (np.clip(variances, 0.0, most) + (FINE * mission.accuracy) ** 2) @ axes.T
+    information: Array = (
+        axes / (np.clip(variances, 0.0, most) + (NEGLIGIBLE * mission.accuracy) ** 2) @ axes.T
+    )
     return information
 
 
 def _confusion(
-    held: Sequence[PlanningHypothesis], distances: Sequence[Array], sigma: float, reach: float
+    hypotheses: Sequence[PlanningHypothesis], distances: Sequence[Array], sigma: float, reach: float
 ) -> Array:
-    """What is left of the probability of taking the first hypothesis for another."""
-    left = np.zeros(len(distances[0]))
-    first = np.minimum(distances[0], RIM * reach)
-    for one, distance in zip(held[1:], distances[1:], strict=True):
-        gap = np.square((np.minimum(distance, RIM * reach) - first) / (COARSE * sigma))
-        left += math.sqrt(held[0].probability * one.probability) * np.exp(
-            -np.minimum(np.sum(gap, 1), SURE) / 8.0
+    """Return the expected cost of confusing the first hypothesis with another."""
+    remaining = np.zeros(len(distances[0]))
+    first = np.minimum(distances[0], FARTHEST_PREDICTION * reach)
+    for one, distance in zip(hypotheses[1:], distances[1:], strict=True):
+        gap = np.square((np.minimum(distance, FARTHEST_PREDICTION * reach) - first) / (SIGMA_FACTOR * sigma))
+        remaining += math.sqrt(hypotheses[0].probability * one.probability) * np.exp(
+            -np.minimum(np.sum(gap, 1), LARGEST_GAP) / 8.0
         )
-    return CONFUSION * left
+    return CONFUSION_COST * remaining
 
 
-RIM = 1.2
-"""of R: so far off, a silence tells a prediction from one in range, and how far off it was does not matter"""
+FARTHEST_PREDICTION = 1.2
+"""The largest predicted range that is distinguished from others, as a fraction of R. It is out of range."""
 
-COARSE = 1.5
-"""by how much ranges are taken to be worse than they are, as the poses are not known either"""
+SIGMA_FACTOR = 1.5
+"""The factor by which ranges count as noisier than they are, because the poses are uncertain too."""
 
-SURE = 400.0
-"""sigmas, squared: hypotheses that differ by more are told apart; further apart is no better"""
+LARGEST_GAP = 400.0
+"""The largest squared difference of predictions in sigmas^2. Larger ones do not distinguish better."""
 
 
 def _way(ways: Choice, pose: Array, some: Places) -> tuple[Array, Array]:
-    """m: where the ways lead from `pose` on their first stride, (C, CHORDS)."""
+    """Return the positions in m along the first stride of the manoeuvres `some` from `pose`; (C, CHORDS)."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     along, across = ways.way_along[some], ways.way_across[some]
     return pose[0] + c * along - s * across, pose[1] + s * along + c * across
 
 
 def _ends(ways: Choice, pose: Array, some: Places | slice = slice(None)) -> tuple[Array, Array]:
-    """m: where the ways lead from `pose`, (C, AHEAD)."""
+    """Return the positions in m after each stride of the manoeuvres `some` from `pose`; (C, AHEAD)."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     along, across = ways.along[some], ways.across[some]
     return pose[0] + c * along - s * across, pose[1] + s * along + c * across

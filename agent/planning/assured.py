@@ -1,7 +1,8 @@
-"""The mission under noise, as `assured` goes through it: measure until poses are known as well as was asked.
+"""The `assured` planner with noisy sensors: measure until the poses are as accurate as the mission asks.
 
-The order is the paper's. In phase 1 a robot goes on inside its anchor's range until what it does not know
-yet is worth less than moving on; in phase 3 both move, each to where the next ranges should tell most.
+The phases are those of the paper. In phase 1, a robot collects ranges to its anchor until a better estimate
+is worth less than moving on. In phase 3, both robots move, each to where its next ranges are expected to tell
+most (see `active_sensing`).
 """
 
 from __future__ import annotations
@@ -21,164 +22,177 @@ from agent.planning.state import Asleep, Done, RobotState
 from protocol.messages import BranchKind, Localised
 from protocol.motion import ORIGIN, REST, Controls
 
-LOST = 3
-"""strides of silence where there should be a range, before the robot goes back"""
+LOST_AFTER = 3
+"""The number of strides without an expected anchor detection after which the robot returns to its anchor."""
 
-LOST_TOGETHER = 6
-"""likewise of b in phase 3, in which it may drive a little outside"""
+LOST_AFTER_IN_PHASE_3 = 6
+"""The same number for b in phase 3, in which b may drive slightly out of its anchor's range."""
 
-MISLED = -8.0
-"""in log-likelihood: less likely than this, it is not the sensors' chance that a hypothesis has against it"""
+MISLEADING = -8.0
+"""The smallest plausible log-likelihood of the ticks without detection.
+
+If it is smaller even for the most probable hypothesis, the ranges are misleading and not just unlucky.
+"""
 
 CHECKED, CHECKED_WITH_OUTLIERS = 8, 12
-"""mutual ranges at the least before a claim"""
+"""The minimum number of mutual ranges before a claim, without and with outliers."""
 
-FEW = 3
-"""mutual ranges; with fewer, hypotheses are too many to be of use"""
+FEWEST_MUTUAL_RANGES = 3
+"""The minimum number of mutual ranges for hypotheses. With fewer, there are too many hypotheses."""
 
 OFF_RADIUS = 0.5
-"""rad: a robot that turns out to head so far off the radius turns onto it again"""
+"""The heading error in rad relative to the radius from which on the robot aligns again in phase 2."""
 
-UNLUCKY = 3.0
-"""standard deviations, of the number of drop-outs"""
+DROP_OUT_SIGMAS = 3.0
+"""The margin for the number of drop-outs, in standard deviations."""
 
-SEARCHED = frozenset((FEW, *(CHECKED * 2**n for n in range(12))))
-"""with so many mutual ranges the whole plane is searched again"""
+SEARCH_AT = frozenset((FEWEST_MUTUAL_RANGES, *(CHECKED * 2**n for n in range(12))))
+"""The numbers of mutual ranges at which the whole plane is searched again for hypotheses."""
 
-ENOUGH = 60
-"""mutual ranges, after which it is ranges to the anchor that are lacking"""
+MANY_MUTUAL_RANGES = 60
+"""The number of mutual ranges after which a lack of accuracy is due to too few ranges to the anchor."""
 
 
-def sensed(state: RobotState, anchor_range: float | None) -> RobotState:
-    """`state` in the state that its own senses lead to."""
+def after_observation(state: RobotState, anchor_range: float | None) -> RobotState:
+    """Return `state` with the mode that follows from the robot's own sensors."""
     match state.mode:
         case Straight("anchor") | Backing("anchor") | Turning("anchor") | Circling("anchor"):
             mission, planner_name = state.config.mission, state.config.planner_name
-            onward = range_seeking.onward(
+            next_mode = range_seeking.onward(
                 state.mode, state.odometry, anchor_range is not None, mission, planner_name
             )
-            return _surveyed(state) if onward is None else replace(state, mode=onward)
+            return _continue_phase1(state) if next_mode is None else replace(state, mode=next_mode)
         case Surveying("anchor"):
-            return _surveyed(state) if decides(state) else state
+            return _continue_phase1(state) if is_planning_tick(state) else state
         case Homing():
             if anchor_range is not None:
-                return _surveyed(state)
-            there = range_seeking.homeward(state.mode, state.odometry, state.config.mission) is None
-            return replace(state, mode=Straight("anchor", state.odometry, 0.0)) if there else state
+                return _continue_phase1(state)
+            arrived = range_seeking.homing_controls(state.mode, state.odometry, state.config.mission) is None
+            return replace(state, mode=Straight("anchor", state.odometry, 0.0)) if arrived else state
         case Aligning() | Radial() | Tangent() | Orbiting():
-            return _under_way(state, anchor_range is not None)
+            return _continue_phase2(state, anchor_range is not None)
         case Surveying("peer") | Listening() | Retreating():
-            return _beside(state)
+            return _continue_phase3(state)
         case _:
             return state
 
 
-def decides(state: RobotState) -> bool:
-    """Whether this is a tick for a new manoeuvre; the same for both robots, so that they choose together."""
+def is_planning_tick(state: RobotState) -> bool:
+    """Return whether the robot plans a manoeuvre in this tick. Both robots plan in the same ticks."""
     return state.tick % active_sensing.stride(state.config.mission) == 0
 
 
-def _surveyed(state: RobotState) -> RobotState:
-    """Phase 1: what the ranges to the anchor leave possible, and whether that is enough.
+def _continue_phase1(state: RobotState) -> RobotState:
+    """Continue phase 1: update the hypotheses about the anchor, and end phase 1 if they are accurate enough.
 
-    Where no hypothesis explains in which places the anchor was silent, its ranges mislead: then more of them
-    are taken about the place of the last, as at first.
+    If no hypothesis explains the ticks without detection, the ranges are misleading. The robot then takes
+    further ranges around the place of the last one, as at the start.
     """
     ranged = state.log.ranges[-1].tick == state.tick
     scored = inference.own_anchor(state)
     if scored:
         state = inference.with_own(state, scored)
-    if _silent(state) >= LOST * active_sensing.stride(state.config.mission):
-        return _homeward(state)
-    if not scored or scored[0].silence < MISLED + _by_drop_outs(state):
+    if _ticks_without_range(state) >= LOST_AFTER * active_sensing.stride(state.config.mission):
+        return _return_to_anchor(state)
+    if not scored or scored[0].silence < MISLEADING + _drop_out_log_likelihood(state):
         if not ranged:
-            return _homeward(state)
+            return _return_to_anchor(state)
         return replace(state, mode=Straight("anchor", state.odometry, state.log.ranges[-1].range))
     mission = state.config.mission
-    if inference.settled(scored, mission):
+    if inference.is_anchor_known(scored, mission):
         kind: BranchKind = "circle" if len(state.log.ranges) == 2 else "three-ranges"
-        parted = state.tick if state.belief.phase1_done_tick is None else state.belief.phase1_done_tick
-        state = replace(state, belief=replace(state.belief, branch_kind=kind, phase1_done_tick=parted))
-        return _parted(state)
-    command = active_sensing.alone(inference.held_alone(scored), mission)
+        phase1_done_tick = (
+            state.tick if state.belief.phase1_done_tick is None else state.belief.phase1_done_tick
+        )
+        state = replace(
+            state, belief=replace(state.belief, branch_kind=kind, phase1_done_tick=phase1_done_tick)
+        )
+        return _start_phase2(state)
+    command = active_sensing.plan_alone(inference.anchor_planning_hypotheses(scored), mission)
     return replace(state, mode=Surveying("anchor", command))
 
 
-def _by_drop_outs(state: RobotState) -> float:
-    """In log-likelihood: what as many drop-outs cost as there may be by now."""
+def _drop_out_log_likelihood(state: RobotState) -> float:
+    """Return the log-likelihood of the largest number of drop-outs to be expected so far."""
     p = state.config.mission.noise.drop_outs
     expected = p * (state.tick + 1)
-    return (expected + UNLUCKY * math.sqrt(expected)) * math.log(p) if p else 0.0
+    return (expected + DROP_OUT_SIGMAS * math.sqrt(expected)) * math.log(p) if p else 0.0
 
 
-def _silent(state: RobotState) -> int:
-    """Ticks since the anchor was ranged."""
+def _ticks_without_range(state: RobotState) -> int:
+    """Return the number of ticks since the last anchor range."""
     return state.tick - state.log.ranges[-1].tick
 
 
-def _homeward(state: RobotState) -> RobotState:
-    """Back to where the anchor was ranged last; all that is held of where it is, is doubted."""
-    last = state.log.ranges[-1].tick
-    place = state.log.pose(ORIGIN, last, state.config.mission.period)
-    findings = replace(state.belief, own=(), encounter_tick=None, pair=(), returns=state.belief.returns + 1)
-    return replace(state, mode=Homing(place), belief=findings)
+def _return_to_anchor(state: RobotState) -> RobotState:
+    """Drive back to the place of the last anchor range, and discard all hypotheses."""
+    last_range_tick = state.log.ranges[-1].tick
+    place = state.log.pose(ORIGIN, last_range_tick, state.config.mission.period)
+    belief = replace(state.belief, own=(), encounter_tick=None, pair=(), returns=state.belief.returns + 1)
+    return replace(state, mode=Homing(place), belief=belief)
 
 
-def _parted(state: RobotState) -> RobotState:
-    """To the rendezvous, for the first time or again."""
+def _start_phase2(state: RobotState) -> RobotState:
+    """Start phase 2, for the first time or again."""
     mu = phase2_orbit.orientation(state.local_pose)
-    return _under_way(replace(state, mode=Aligning(state.odometry.heading - mu)), False)
+    return _continue_phase2(replace(state, mode=Aligning(state.odometry.heading - mu)), False)
 
 
-def _under_way(state: RobotState, ranged: bool) -> RobotState:
-    """Phase 2, with what another range to the anchor adds; b goes on to survey where it waits."""
+def _continue_phase2(state: RobotState, ranged: bool) -> RobotState:
+    """Continue phase 2 with the latest anchor range, if `ranged`. Robot b takes ranges while it waits."""
     mission = state.config.mission
     scored: Sequence[ScoredHypothesis] = ()
-    if ranged and decides(state) and (scored := inference.own_anchor(state)):
+    if ranged and is_planning_tick(state) and (scored := inference.own_anchor(state)):
         state = inference.with_own(state, scored)
         if isinstance(state.mode, Radial) and abs(phase2_orbit.orientation(state.local_pose)) > OFF_RADIUS:
-            return _parted(state)
+            return _start_phase2(state)
     assert isinstance(state.mode, Aligning | Radial | Tangent | Orbiting)
     mode = phase2_orbit.onward(state.mode, state.odometry, state.start, state.orbit, mission)
-    timeout: float = LOST * active_sensing.stride(mission)
-    if state.orbit.v == 0.0 and isinstance(mode, Radial | Orbiting) and _silent(state) >= timeout:
-        return _homeward(state)
+    timeout: float = LOST_AFTER * active_sensing.stride(mission)
+    if (
+        state.orbit.v == 0.0
+        and isinstance(mode, Radial | Orbiting)
+        and _ticks_without_range(state) >= timeout
+    ):
+        return _return_to_anchor(state)
     if isinstance(mode, Orbiting):
         since = mode.since or state.tick
         timeout += state.config.rendezvous.bound / mission.period
         if state.orbit.v != 0.0 and state.tick - since > timeout and not state.in_contact:
-            return _homeward(state)
+            return _return_to_anchor(state)
         if state.orbit.v != 0.0:
             command = phase2_orbit.pursuit(state.local_pose, state.orbit, mission)
         elif scored:
-            command = active_sensing.alone(inference.held_alone(scored), mission, state.orbit.radius)
+            command = active_sensing.plan_alone(
+                inference.anchor_planning_hypotheses(scored), mission, state.orbit.radius
+            )
         else:
-            command = REST if decides(state) else mode.command or REST
+            command = REST if is_planning_tick(state) else mode.command or REST
         mode = Orbiting(command, since)
     return replace(state, mode=mode)
 
 
-# --- with the peer ------------------------------------------------------------------------------------
+# --- in contact with the peer -------------------------------------------------------------------------
 
 
-def _beside(state: RobotState) -> RobotState:
-    """Phase 3, by whether the peer, and for b its anchor, are in range."""
+def _continue_phase3(state: RobotState) -> RobotState:
+    """Continue phase 3 depending on whether the peer, and for b also its anchor, are in range."""
     stride = active_sensing.stride(state.config.mission)
     match state.mode:
         case Retreating(_, since) if state.tick - since < 2 * stride:
             return state
         case Retreating():
-            return replace(state, mode=Surveying("peer")) if state.in_contact else _parted(state)
-        case _ if state.config.role == "b" and _silent(state) >= LOST_TOGETHER * stride:
-            return _homeward(state)
+            return replace(state, mode=Surveying("peer")) if state.in_contact else _start_phase2(state)
+        case _ if state.config.role == "b" and _ticks_without_range(state) >= LOST_AFTER_IN_PHASE_3 * stride:
+            return _return_to_anchor(state)
         case Surveying(_, command) | Listening(command) if not state.in_contact:
             return replace(state, mode=Retreating(Controls(0.0 - command.v, 0.0 - command.omega), state.tick))
         case _:
             return state
 
 
-def heard(state: RobotState) -> RobotState:
-    """What the robot is set to do once it has heard its peer, in range."""
+def after_reports(state: RobotState) -> RobotState:
+    """Return `state` with the mode that follows from the reports of a peer in range."""
     match state.mode:
         case Done() | Asleep():
             return state
@@ -188,78 +202,84 @@ def heard(state: RobotState) -> RobotState:
             return state
         case Retreating():
             return state
-        case Surveying("peer") | Listening() if not decides(state):
+        case Surveying("peer") | Listening() if not is_planning_tick(state):
             return state
-        case _ if not inference.answered(state):
+        case _ if not inference.peer_log_suffices(state):
             return replace(state, mode=Listening())
         case _:
-            return _considered(state)
+            return _decide_phase3(state)
 
 
-def _considered(state: RobotState) -> RobotState:
-    """Both logs in hand: weigh the hypotheses; then claim, or plan what both do next."""
+def _decide_phase3(state: RobotState) -> RobotState:
+    """Evaluate both logs in phase 3: update the hypotheses, then claim a pose or plan the manoeuvres.
+
+    Both robots compute the same pair of manoeuvres from the same logs, and each executes its own.
+    """
     mission, role = state.config.mission, state.config.role
     if state.belief.encounter_tick is None:
         state = replace(state, belief=replace(state.belief, encounter_tick=state.tick))
     pair = inference.pair_of(state)
     mutual = pair.ranges.counts[2]
-    if mutual < FEW:
-        return _blindly(state)
+    if mutual < FEWEST_MUTUAL_RANGES:
+        return _drive_without_hypotheses(state)
     known = state.belief.pair
-    searched = not known or any(state.belief.ranges_at_last_search < count <= mutual for count in SEARCHED)
+    searched = not known or any(state.belief.ranges_at_last_search < count <= mutual for count in SEARCH_AT)
     scored = search(pair) if searched else follow(known, pair)
     if searched:
         state = replace(state, belief=replace(state.belief, ranges_at_last_search=mutual))
-    checked = CHECKED_WITH_OUTLIERS if mission.noise.outliers else CHECKED
-    judged = inference.with_pair(state, scored, pair, checked)
-    if (judged.belief.blocking_reason is None or _against(judged, DOUBTFUL)) and not searched:
+    required_ranges = CHECKED_WITH_OUTLIERS if mission.noise.outliers else CHECKED
+    tested = inference.with_pair(state, scored, pair, required_ranges)
+    if (tested.belief.blocking_reason is None or _p_value_below(tested, DOUBTFUL)) and not searched:
         scored, searched = search(pair), True
-        judged = inference.with_pair(state, scored, pair, checked)
-    judged = inference.finished(judged, scored)
+        tested = inference.with_pair(state, scored, pair, required_ranges)
+    tested = inference.with_convergence_check(tested, scored)
     if searched:
-        judged = _doubted(judged)
-    if judged.verdict is not None:
-        return judged
-    few = len(pair.places) < 2 * checked
-    if judged.belief.blocking_reason is None and not (few and _against(judged, WARY)):
-        return claimed(judged)
-    if role == "a" and len(pair.places) >= ENOUGH * (1 + state.belief.returns):
-        return _homeward(judged)
+        tested = _with_consistency_test(tested)
+    if tested.verdict is not None:
+        return tested
+    few_ranges = len(pair.places) < 2 * required_ranges
+    if tested.belief.blocking_reason is None and not (few_ranges and _p_value_below(tested, WARY)):
+        return claim_pose(tested)
+    if role == "a" and len(pair.places) >= MANY_MUTUAL_RANGES * (1 + state.belief.returns):
+        return _return_to_anchor(tested)
     if not scored:
-        return _blindly(judged)
-    a, b = active_sensing.together(
-        inference.held_together(scored, pair), pair.apart, state.mutual[-1].range, mission
+        return _drive_without_hypotheses(tested)
+    a, b = active_sensing.plan_together(
+        inference.pair_planning_hypotheses(scored, pair), pair.apart, state.mutual[-1].range, mission
     )
-    return replace(judged, mode=Surveying("peer", a if role == "a" else b))
+    return replace(tested, mode=Surveying("peer", a if role == "a" else b))
 
 
-def _against(state: RobotState, bound: float) -> bool:
-    """Whether what most speaks against the likeliest hypothesis is less probable than `bound`."""
-    against = state.belief.against
-    return against is not None and against.p_value < bound
+def _p_value_below(state: RobotState, bound: float) -> bool:
+    """Return whether the p-value of the consistency test is below `bound`; False without a test."""
+    inconsistency = state.belief.inconsistency
+    return inconsistency is not None and inconsistency.p_value < bound
 
 
-def _doubted(state: RobotState) -> RobotState:
-    """`state`, after a search of the whole plane; alarmed, if its peer is beyond belief over and over."""
-    findings = state.belief
-    against = findings.against
-    if against is None:
+def _with_consistency_test(state: RobotState) -> RobotState:
+    """Return `state` with the consistency test of a search, and with its verdict after LOOKS failed tests.
+
+    A test fails if its p-value is below UNBELIEVABLE. The failed tests must be consecutive.
+    """
+    belief = state.belief
+    inconsistency = belief.inconsistency
+    if inconsistency is None:
         return state
-    least = min(against.p_value, findings.p_value if findings.p_value is not None else 1.0)
-    doubts = findings.doubts + 1 if against.p_value < UNBELIEVABLE else 0
-    state = replace(state, belief=replace(findings, doubts=doubts, p_value=least))
-    return state.alarmed(against.alarm) if doubts >= LOOKS else state
+    least = min(inconsistency.p_value, belief.p_value if belief.p_value is not None else 1.0)
+    inconsistent_searches = belief.inconsistent_searches + 1 if inconsistency.p_value < UNBELIEVABLE else 0
+    state = replace(state, belief=replace(belief, inconsistent_searches=inconsistent_searches, p_value=least))
+    return state.inconsistent(inconsistency.alarm) if inconsistent_searches >= LOOKS else state
 
 
-def _blindly(state: RobotState) -> RobotState:
-    """While nothing is known of how the two lie: b stands, a goes straight on (Section III.C.a)."""
+def _drive_without_hypotheses(state: RobotState) -> RobotState:
+    """Drive without hypotheses about the poses: b stands, a drives straight on (Section III.C.a)."""
     mission = state.config.mission
     if state.config.role == "b" or not state.mutual:
         return replace(state, mode=Surveying("peer"))
-    step = range_seeking.stretch("peer", state.mutual[-1].range, mission)
+    step = range_seeking.step_length("peer", state.mutual[-1].range, mission)
     return replace(state, mode=Surveying("peer", Controls(step / mission.period, 0.0)))
 
 
-def claimed(state: RobotState) -> RobotState:
-    """The likeliest hypothesis is the one."""
+def claim_pose(state: RobotState) -> RobotState:
+    """Claim the pose of the most probable hypothesis."""
     return replace(state, mode=Done(3, Localised(state.belief.poses[0], state.belief.covariance)))

@@ -1,4 +1,8 @@
-"""From the first range of each other to a verdict: phase 3 as the planner goes through it (Section III.C)."""
+"""Phase 3 from the first mutual range to the verdict (Section III.C).
+
+With exact sensors, this module evaluates the placements of eq. (7). With noisy sensors, it calls `paper`. The
+`assured` planner handles noisy sensors in `assured`.
+"""
 
 from __future__ import annotations
 
@@ -10,17 +14,24 @@ from agent.estimation.exact import PairObservation, weigh_placements
 from agent.planning import paper, phase3_last_manoeuvre, precision
 from agent.planning.phase2_orbit import Orbiting, off_anchor
 from agent.planning.phase3_last_manoeuvre import LastManoeuvre, Standing, Waiting
-from agent.planning.range_seeking import Straight, stretch
+from agent.planning.range_seeking import Straight, step_length
 from agent.planning.state import MODE_NAMES, Done, RobotState
 from protocol.messages import Inconsistent, Localised
 from protocol.mission import SHORTEST_STEP
 
 PEER_RESTS = (MODE_NAMES[Standing], MODE_NAMES[Waiting])
-"""what it says then: two that move at once may do so in mirror image, and learn nothing"""
+"""The modes of the peer in which this robot may plan a manoeuvre.
+
+If both moved at once, they might do so in mirror image, and the new range would not select a placement.
+"""
 
 
-def meets(state: RobotState) -> bool:
-    """Whether phase 3 begins, once in contact: by the letter when both orbit, else as soon as it can."""
+def can_begin_phase3(state: RobotState) -> bool:
+    """Return whether phase 3 begins, once in contact.
+
+    `paper` requires that both robots are on their orbits. `assured` begins as soon as the peer's phase 1 has
+    ended and b is far enough from its anchor.
+    """
     if state.config.planner_name == "paper":
         return isinstance(state.mode, Orbiting) and (
             state.peer_state.phase == 3 or state.peer_state.state == state.mode_name
@@ -28,10 +39,10 @@ def meets(state: RobotState) -> bool:
     return state.peer_state.phase == 3 or (state.peer_state.start is not None and state.off_anchor)
 
 
-def lingers(state: RobotState) -> bool:
-    """Whether the robot stands still so as not to lose a peer with which phase 3 cannot begin yet.
+def must_wait(state: RobotState) -> bool:
+    """Return whether the robot stands still, to stay in range of a peer with which phase 3 cannot begin yet.
 
-    The peer is in phase 1, or has not been heard; or it is b, and too near its anchor.
+    The peer is then in phase 1, or none of its reports has been received, or it is b and too near its anchor.
     """
     return (
         state.config.planner_name == "assured"
@@ -40,84 +51,98 @@ def lingers(state: RobotState) -> bool:
     )
 
 
-def met(state: RobotState) -> RobotState:
-    """Phase 3 begins: b stops, a goes straight on (Section III.C.a)."""
-    findings = replace(state.belief, encounter_tick=state.tick)
+def begin_phase3(state: RobotState) -> RobotState:
+    """Begin phase 3: b stops, a drives straight on (Section III.C.a).
+
+    With a safety distance, a begins only when it knows that b stands far enough away.
+    """
+    belief = replace(state.belief, encounter_tick=state.tick)
     if state.config.role == "b":
-        return replace(state, mode=Standing(), belief=findings)
-    rho = state.mutual[-1].range if state.mutual else state.config.mission.sensing_range  # a drop-out
-    if state.config.mission.safety_distance and not _may_go(state):
+        return replace(state, mode=Standing(), belief=belief)
+    # the range was not measured
+    rho = state.mutual[-1].range if state.mutual else state.config.mission.sensing_range
+    if state.config.mission.safety_distance and not _may_drive_straight(state):
         return state
     straight = Straight("peer", state.odometry, rho)
-    return replace(state, mode=straight, belief=findings)
+    return replace(state, mode=straight, belief=belief)
 
 
-def _may_go(state: RobotState) -> bool:
-    """Whether a knows that b stands, and is far enough from it to go straight on."""
+def _may_drive_straight(state: RobotState) -> bool:
+    """Return whether a knows that b stands, and is far enough from b to drive straight on."""
     now = bool(state.mutual) and state.mutual[-1].tick == state.tick == state.peer_state.peer.through
-    return now and stretch("peer", state.mutual[-1].range, state.config.mission) >= SHORTEST_STEP
+    return now and step_length("peer", state.mutual[-1].range, state.config.mission) >= SHORTEST_STEP
 
 
-def considered(state: RobotState) -> RobotState:
-    """Both logs in hand: weigh the placements; then claim, plan the last manoeuvre, or go on.
+def decide_phase3(state: RobotState) -> RobotState:
+    """Return `state` after the evaluation of both logs, with a claim, a last manoeuvre, or the same mode.
 
-    Not before the peer has told of everything up to where this robot stands; and not twice of the same.
+    The state is unchanged until the peer's log covers every tick up to the one in which this robot stopped,
+    and while there is no new tick to evaluate.
     """
     if not state.config.mission.noise.exact:
-        return state if paper.waits(state) else paper.considered(state)
+        return state if paper.awaits_second_range(state) else paper.decide_phase3(state)
     assert isinstance(state.mode, Standing | Waiting)
     last = min(state.tick, state.peer_state.peer.through)
     if last < state.log.moved() or last == state.mode.through:
         return state
-    return _settled(replace(state, mode=replace(state.mode, through=last)))
+    return _decide_exact(replace(state, mode=replace(state.mode, through=last)))
 
 
-def _settled(state: RobotState) -> RobotState:
-    """The same, where sensors are exact.
+def _decide_exact(state: RobotState) -> RobotState:
+    """Return `state` after the evaluation of both logs with exact sensors (see `decide_phase3`).
 
-    The letter looks at the encounter alone; `assured` also at what was ranged, and what was silent, before.
+    `paper` uses the mutual ranges from the encounter on. `assured` also uses earlier ticks, including those
+    without detection.
     """
-    mission, planner_name, began = (
+    mission, planner_name, first_tick = (
         state.config.mission,
         state.config.planner_name,
         state.belief.encounter_tick,
     )
-    assert began is not None
-    pair_observations = state.pair_observations(began if planner_name == "paper" else 0)
-    ranged = [at for at in pair_observations if at.range is not None]
-    away = [at for at in ranged if off_anchor(at.b, state.config.rendezvous.b)]
-    base = phase3_last_manoeuvre.base(away, precision.drift(state))
-    if base is None:  # yet; or, where a report was missed, b was still driving as a went straight
-        again = isinstance(state.mode, Waiting) and state.peer_state.state == MODE_NAMES[Standing]
-        return met(state) if again and planner_name == "assured" else state
+    assert first_tick is not None
+    pair_observations = state.pair_observations(first_tick if planner_name == "paper" else 0)
+    observations_in_range = [at for at in pair_observations if at.range is not None]
+    away_from_m2 = [at for at in observations_in_range if off_anchor(at.b, state.config.rendezvous.b)]
+    base = phase3_last_manoeuvre.base(away_from_m2, precision.odometry_rounding(state))
+    if base is None:  # No base yet. Or a report was missed, and b was still driving while a went straight.
+        b_is_standing = isinstance(state.mode, Waiting) and state.peer_state.state == MODE_NAMES[Standing]
+        return begin_phase3(state) if b_is_standing and planner_name == "assured" else state
     if state.belief.peer_anchor is None:
         state = replace(state, belief=replace(state.belief, peer_anchor=precision.peer_anchor(state)))
-    off = precision.apart(state)
-    state = _weighed(state, pair_observations, base, off)
-    left = state.belief.placements
-    checked = phase3_last_manoeuvre.redundant(ranged, base)
-    if not left:
-        return state.alarmed(Inconsistent("a path that no placement brings together with the mutual ranges"))
-    if checked and len(left) == 1 and precision.pinned_down(state, left[0], ranged, off):
-        return replace(state, mode=Done(3, Localised(state.world_pose(left[0]))))
+    error_bound = precision.combined_error(state)
+    state = _select_placements(state, pair_observations, base, error_bound)
+    remaining = state.belief.placements
+    checked = phase3_last_manoeuvre.redundant(observations_in_range, base)
+    if not remaining:
+        return state.inconsistent(
+            Inconsistent("a path that contradicts the mutual ranges under every placement")
+        )
+    if (
+        checked
+        and len(remaining) == 1
+        and precision.pinned_down(state, remaining[0], observations_in_range, error_bound)
+    ):
+        return replace(state, mode=Done(3, Localised(state.world_pose(remaining[0]))))
     mover = state.config.role
-    alone = planner_name == "assured" and isinstance(
+    peer_has_ended = planner_name == "assured" and isinstance(
         state.peer_state.verdict, Localised
-    )  # the peer stands for good
-    if not alone and mover != (
+    )  # the peer has localised itself and does not move again
+    if not peer_has_ended and mover != (
         phase3_last_manoeuvre.turn(pair_observations) if checked and planner_name == "assured" else "b"
     ):
         return state
-    if planner_name == "assured" and not alone and state.peer_state.state not in PEER_RESTS:
+    if planner_name == "assured" and not peer_has_ended and state.peer_state.state not in PEER_RESTS:
         return state
     if planner_name == "paper" and state.belief.plan is not None:
-        failure = "does not settle where they are" if checked else "could not be taken: b left a's range"
+        failure = "does not select a placement" if checked else "could not be measured: b left a's range"
         return state.undecided(f"the third mutual range {failure}")
     a, b = pair_observations[-1].a, pair_observations[-1].b
-    if checked and len(left) == 1:
-        plan = phase3_last_manoeuvre.survey(mover, a, b, left[0], pair_observations, mission)
+    if checked and len(remaining) == 1:
+        plan = phase3_last_manoeuvre.most_informative_manoeuvre(
+            mover, a, b, remaining[0], pair_observations, mission
+        )
     else:
-        plan = phase3_last_manoeuvre.last_manoeuvre(mover, a, b, left, mission, planner_name)
+        plan = phase3_last_manoeuvre.last_manoeuvre(mover, a, b, remaining, mission, planner_name)
     if plan is None:
         return (
             state if planner_name == "assured" else state.undecided("no manoeuvre keeps the safety distance")
@@ -129,20 +154,24 @@ def _settled(state: RobotState) -> RobotState:
     )
 
 
-def _weighed(
+def _select_placements(
     state: RobotState,
     pair_observations: Sequence[PairObservation],
     base: tuple[PairObservation, PairObservation],
     floor: float,
 ) -> RobotState:
-    """The placements of eq. (7) that every range and every silent tick in `pair_observations` leave."""
-    reach, findings = state.config.mission.sensing_range, state.belief
-    if findings.candidates is None:
+    """Return `state` with the solutions of eq. (7) that agree with every tick in `pair_observations`.
+
+    A tick without a mutual range rules out the placements that predict both robots in range. `floor` is the
+    bound in m on the error of a predicted range.
+    """
+    reach, belief = state.config.mission.sensing_range, state.belief
+    if belief.candidates is None:
         solutions = phase3_last_manoeuvre.solve(state.config.anchor_distance, base)
-        silence = [
+        undetected = [
             pair_observation for pair_observation in pair_observations if pair_observation.range is None
         ]
-        unheard = weigh_placements(solutions, silence, reach, floor)
-        findings = replace(findings, placements=tuple(solutions), candidates=(len(solutions), len(unheard)))
-    left = weigh_placements(findings.placements, pair_observations, reach, floor)
-    return replace(state, belief=replace(findings, placements=left))
+        possible = weigh_placements(solutions, undetected, reach, floor)
+        belief = replace(belief, placements=tuple(solutions), candidates=(len(solutions), len(possible)))
+    remaining = weigh_placements(belief.placements, pair_observations, reach, floor)
+    return replace(state, belief=replace(belief, placements=remaining))

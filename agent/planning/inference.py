@@ -1,4 +1,4 @@
-"""What a mind makes of its logs under noise: where its anchor may be, and how the pair may lie in <W>."""
+"""The inference of one robot with noisy sensors: its anchor's position, and both robots' poses."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from protocol.motion import Covariance, Pose, compose, inverse, wrap
 
 
 def path_of(log: MotionLog, through: int, period: float) -> Track:
-    """The odometry of a log up to tick `through`."""
+    """Return the odometry of `log` up to tick `through`."""
     runs = log.runs
     ticks = [run.ticks for run in runs]
     v = np.repeat([run.v for run in runs], ticks)[:through]
@@ -31,10 +31,10 @@ def path_of(log: MotionLog, through: int, period: float) -> Track:
 
 
 def own_anchor(state: RobotState) -> tuple[ScoredHypothesis, ...]:
-    """Where the robot's anchor may lie in the frame of its odometry."""
+    """Return the hypotheses about the anchor in the frame of the odometry, the most probable first."""
     mission = state.config.mission
     path = path_of(state.log, state.tick, mission.period)
-    ranges = Ranges.of_lists(_told(state.log, state.tick), (), (), mission.noise)
+    ranges = Ranges.of_lists(_ranges_until(state.log, state.tick), (), (), mission.noise)
     possible = ranges.within(mission.sensing_range)
     if not len(possible.rho):
         return ()
@@ -42,19 +42,20 @@ def own_anchor(state: RobotState) -> tuple[ScoredHypothesis, ...]:
     return of_anchor(state.belief.own, path, possible, silent, mission.sensing_range, mission.noise)
 
 
-def _told(log: MotionLog, through: int) -> list[tuple[int, float]]:
+def _ranges_until(log: MotionLog, through: int) -> list[tuple[int, float]]:
+    """Return tick and range in m of each anchor range of `log` up to tick `through`."""
     return [(ranged.tick, ranged.range) for ranged in log.ranges if ranged.tick <= through]
 
 
 def with_own(state: RobotState, scored: Sequence[ScoredHypothesis]) -> RobotState:
-    """`state`, with these hypotheses of its anchor; where it stands now follows from the likeliest."""
+    """Return `state` with the hypotheses `scored` about its anchor, and with the most probable branch."""
     own = tuple([one.hypothesis for one in scored])
     branches = tuple([branch_of(state, one) for one in scored])
     return replace(state, belief=replace(state.belief, own=own, branches=branches, branch=branches[0]))
 
 
 def branch_of(state: RobotState, scored: ScoredHypothesis) -> Branch:
-    """The likeliest trajectory; its start is such that the odometry leads to where the robot is now."""
+    """Return the trajectory of `scored` as a branch, whose start and odometry lead to the present pose."""
     mx, my = scored.hypothesis.guess[:2]
     path = scored.fit.paths[0]
     frame = math.atan2(-my, -mx)
@@ -65,54 +66,60 @@ def branch_of(state: RobotState, scored: ScoredHypothesis) -> Branch:
     return Branch(wrap(-frame), start)
 
 
-def held_alone(scored: Sequence[ScoredHypothesis]) -> list[PlanningHypothesis]:
-    """For planning: the robot, relative to its anchor."""
-    held = []
+def anchor_planning_hypotheses(scored: Sequence[ScoredHypothesis]) -> list[PlanningHypothesis]:
+    """Return the hypotheses about the pose relative to the anchor, in the form that planning needs."""
+    hypotheses = []
     for one in scored:
         mx, my = one.hypothesis.guess[:2]
         path = one.fit.paths[0]
         now = np.array((path.x[-1] - mx, path.y[-1] - my, path.heading[-1]))
-        held.append(PlanningHypothesis(one.hypothesis.probability, now, one.fit.covariance))
-    return held
+        hypotheses.append(PlanningHypothesis(one.hypothesis.probability, now, one.fit.covariance))
+    return hypotheses
 
 
-def settled(scored: Sequence[ScoredHypothesis], mission: Mission) -> bool:
-    """Whether what is left to know of the anchor is worth less than moving on."""
+def is_anchor_known(scored: Sequence[ScoredHypothesis], mission: Mission) -> bool:
+    """Return whether the anchor's position is known well enough to end phase 1."""
     best = scored[0]
-    enough = ANCHOR_RANGES_WITH_OUTLIERS if mission.noise.outliers else ANCHOR_RANGES
+    required_ranges = ANCHOR_RANGES_WITH_OUTLIERS if mission.noise.outliers else ANCHOR_RANGES
     return (
-        int(np.count_nonzero(best.fit.weights > 0.5)) >= enough
+        int(np.count_nonzero(best.fit.weights > 0.5)) >= required_ranges
         and best.hypothesis.probability >= SURE_OF_BRANCH
         and deviation(float(np.trace(best.fit.covariance))) <= mission.foothold
     )
 
 
 SURE_OF_BRANCH = 0.999
-"""the probability at which a robot takes a branch for the right one and goes to meet its peer"""
+"""The probability from which on a robot accepts a branch and ends phase 1."""
 
 ANCHOR_RANGES, ANCHOR_RANGES_WITH_OUTLIERS = 5, 7
-"""to its anchor at the least, before a robot goes: two unknowns, and three that check them"""
+"""The minimum number of anchor ranges before phase 1 ends, without and with outliers.
+
+Two unknowns need two ranges. The others check them.
+"""
 
 
 def known_through(state: RobotState) -> int:
-    """The last tick that both logs cover."""
+    """Return the last tick that both logs cover."""
     return min(state.tick, state.peer_state.peer.through, state.peer_state.ranges_through)
 
 
-def answered(state: RobotState) -> bool:
-    """Whether the peer has told of everything up to where this robot has come to rest, or is now."""
+def peer_log_suffices(state: RobotState) -> bool:
+    """Return whether the peer's log reaches the tick of this robot's last motion."""
     return known_through(state) >= state.log.moved(state.config.mission.noise.standstill_bound)
 
 
 def pair_of(state: RobotState) -> PairRanges:
-    """All that both have measured: its own up to now, the peer's up to the last tick that both logs cover."""
+    """Return the ranges and odometry of both robots.
+
+    The own data reach up to now, and the peer's up to the last tick that both logs cover.
+    """
     peer, config = state.peer_state.peer, state.config
     mission, last = config.mission, known_through(state)
     logs, ends = ((state.log, peer), (state.tick, last, last))
     if config.role == "b":
         logs, ends = ((peer, state.log), (last, state.tick, last))
     mutual = [(ranged.tick, ranged.range) for ranged in state.mutual if ranged.tick <= last]
-    lists = [_told(log, end) for log, end in zip(logs, ends, strict=False)]
+    lists = [_ranges_until(log, end) for log, end in zip(logs, ends, strict=False)]
     ranges = Ranges.of_lists(lists[0], lists[1], mutual, mission.noise)
     silent = [missing(ranges.tick[ranges.rows(kind)], ends[kind] + 1) for kind in range(3)]
     ranges = ranges.within(mission.sensing_range)
@@ -128,73 +135,88 @@ def pair_of(state: RobotState) -> PairRanges:
     )
 
 
-def held_together(scored: Sequence[ScoredHypothesis], pair: PairRanges) -> list[PlanningHypothesis]:
-    """For planning: both poses relative to M1, and their covariance."""
+def pair_planning_hypotheses(
+    scored: Sequence[ScoredHypothesis], pair: PairRanges
+) -> list[PlanningHypothesis]:
+    """Return the hypotheses about both poses relative to M1, in the form that planning needs."""
     return [PlanningHypothesis(one.hypothesis.probability, *poses(one.fit, pair.apart)) for one in scored]
 
 
-def missing_for(
+def blocking_reason_for(
     scored: Sequence[ScoredHypothesis],
-    held: Sequence[PlanningHypothesis],
-    against: Inconsistency | None,
+    hypotheses: Sequence[PlanningHypothesis],
+    inconsistency: Inconsistency | None,
     pair: PairRanges,
     mission: Mission,
 ) -> str | None:
-    """What is lacking before a claim, there being ranges enough; None if it is nothing."""
-    if against is None:
+    """Return the first condition for a claim that is not met, or None; there are enough mutual ranges."""
+    if inconsistency is None:
         return "no hypothesis explains the ranges"
     probability = scored[0].hypothesis.probability
     if probability < mission.confidence:
-        return f"the likeliest of {len(scored)} hypotheses has the probability {probability:.6f}, of {mission.confidence:g}"
-    if not against.p_value >= DOUBTFUL:
-        return f"the likeliest hypothesis is in doubt: {against.what}"
-    _, covariance = bent(held[0], pair.apart)
+        return (
+            f"the most probable of {len(scored)} hypotheses has probability {probability:.6f}, "
+            f"required {mission.confidence:g}"
+        )
+    if not inconsistency.p_value >= DOUBTFUL:
+        return f"the most probable hypothesis fails the consistency test: {inconsistency.what}"
+    _, covariance = to_second_order(hypotheses[0], pair.apart)
     for i, robot in ((0, "a"), (3, "b")):
         position = deviation(covariance[i, i] + covariance[i + 1, i + 1])
         if not position <= mission.accuracy:
-            return f"{robot}'s position is known to {position:.3g} m, of {mission.accuracy:g}"
+            return f"the sigma of {robot}'s position is {position:.3g} m, required {mission.accuracy:g}"
         heading = deviation(covariance[i + 2, i + 2])
         if not heading <= HEADING_ACCURACY:
-            return f"{robot}'s heading is known to {heading:.3g} rad, of {HEADING_ACCURACY:g}"
+            return f"the sigma of {robot}'s heading is {heading:.3g} rad, required {HEADING_ACCURACY:g}"
     return None
 
 
-def finished(state: RobotState, scored: Sequence[ScoredHypothesis]) -> RobotState:
-    """`state`, which claims nothing by a fit that has not found its minimum."""
+def with_convergence_check(state: RobotState, scored: Sequence[ScoredHypothesis]) -> RobotState:
+    """Return `state` with a blocking reason if the fit of the most probable hypothesis has not converged."""
     if state.belief.blocking_reason is not None or scored[0].fit.last_step <= FINISHED:
         return state
-    missing = f"the likeliest hypothesis still moves, by {scored[0].fit.last_step:.3g} sigmas"
-    return replace(state, belief=replace(state.belief, blocking_reason=missing))
+    blocking_reason = (
+        f"the fit of the most probable hypothesis has not converged: its last step is "
+        f"{scored[0].fit.last_step:.3g} sigmas"
+    )
+    return replace(state, belief=replace(state.belief, blocking_reason=blocking_reason))
 
 
 def with_pair(
     state: RobotState, scored: Sequence[ScoredHypothesis], pair: PairRanges, mutual: int
 ) -> RobotState:
-    """`state`, with these hypotheses of how both lie in <W>; a claim needs `mutual` mutual ranges."""
+    """Return `state` with the hypotheses `scored` about both robots' poses in <W>.
+
+    A claim needs `mutual` mutual ranges from different places.
+    """
     config = state.config
     robot, m1 = (0, config.anchor) if config.role == "a" else (1, config.peer_anchor)
-    held = held_together(scored, pair)
+    hypotheses = pair_planning_hypotheses(scored, pair)
     enough = len(pair.places) >= mutual
-    against = doubt(scored[0].fit, pair) if enough and scored else None
-    missing = missing_for(scored, held, against, pair, config.mission)
-    claims = [claim(one, robot, pair) for one in held]
+    inconsistency = doubt(scored[0].fit, pair) if enough and scored else None
+    blocking_reason = blocking_reason_for(scored, hypotheses, inconsistency, pair, config.mission)
+    claims = [claim(one, robot, pair) for one in hypotheses]
     first, _ = state.belief.candidates or (len(scored), 0)
-    findings = replace(
+    belief = replace(
         state.belief,
         pair=tuple(one.hypothesis for one in scored),
         poses=tuple(Pose(m1.x + pose.x, m1.y + pose.y, pose.heading) for pose, _ in claims),
         covariance=claims[0][1] if claims else None,
         candidates=(first, len(scored)),
-        against=against,
-        blocking_reason=missing if enough else f"{len(pair.places)} mutual ranges, of {mutual}",
+        inconsistency=inconsistency,
+        blocking_reason=blocking_reason
+        if enough
+        else f"{len(pair.places)} of {mutual} required mutual ranges",
     )
-    return replace(state, belief=findings)
+    return replace(state, belief=belief)
 
 
-def claim(held: PlanningHypothesis, robot: int, pair: PairRanges) -> tuple[Pose, Covariance]:
-    """The pose of one robot, relative to M1, as the mean and the covariance of what is left of the best
-    hypothesis. Ranges confine a robot to an arc, so both are taken to second order (see `bent`)."""
-    mean, covariance = bent(held, pair.apart)
+def claim(hypothesis: PlanningHypothesis, robot: int, pair: PairRanges) -> tuple[Pose, Covariance]:
+    """Return the mean and the covariance of one robot's pose relative to M1.
+
+    Ranges confine a robot to an arc, so both are computed to second order (see `to_second_order`).
+    """
+    mean, covariance = to_second_order(hypothesis, pair.apart)
     i = 3 * robot
     x, y, heading = mean[i : i + 3].tolist()
     block = covariance[i : i + 3, i : i + 3]
@@ -203,17 +225,18 @@ def claim(held: PlanningHypothesis, robot: int, pair: PairRanges) -> tuple[Pose,
     )
 
 
-def bent(held: PlanningHypothesis, m2: tuple[float, float]) -> tuple[Array, Array]:
-    """Mean and covariance of both poses, where it is range and bearing that are Gaussian: b's from M2, a's
-    from b.
+def to_second_order(hypothesis: PlanningHypothesis, m2: tuple[float, float]) -> tuple[Array, Array]:
+    """Return the mean and the covariance of both poses, if ranges and bearings are Gaussian.
 
-    To second order: where ranges are far better known than bearings, what is possible is an arc, which an
-    ellipse of first order does not reach.
+    These are the range and the bearing of b from M2, and those of a from b.
+
+    Both are computed to second order. If ranges are much more accurate than bearings, the possible positions
+    form an arc, which a first-order ellipse does not cover. `m2` is the position of M2 relative to M1.
     """
-    mean, covariance = held.poses.copy(), held.covariance
+    mean, covariance = hypothesis.poses.copy(), hypothesis.covariance
     bx, by = mean[3] - m2[0], mean[4] - m2[1]
     ax, ay = mean[0] - mean[3], mean[1] - mean[4]
-    # by (range, bearing) of b, then of a from b: gradients by the poses
+    # gradients of range and bearing of b, then of a from b, with respect to the poses
     rows = np.zeros((4, 6))
     for k, (x, y), plus, minus in ((0, (bx, by), 3, None), (2, (ax, ay), 0, 3)):
         rho = max(math.hypot(x, y), SIGMA_FLOOR)
@@ -231,14 +254,14 @@ def bent(held: PlanningHypothesis, m2: tuple[float, float]) -> tuple[Array, Arra
             second[i + 1, k + 1, k + 1] = -y
             second[i, k, k + 1] = second[i, k + 1, k] = -y / rho
             second[i + 1, k, k + 1] = second[i + 1, k + 1, k] = x / rho
-    turned = second @ polar
-    mean += 0.5 * np.trace(turned, axis1=1, axis2=2)
-    covariance = covariance + 0.5 * np.einsum("iab,jba->ij", turned, turned)
+    scaled_curvature = second @ polar
+    mean += 0.5 * np.trace(scaled_curvature, axis1=1, axis2=2)
+    covariance = covariance + 0.5 * np.einsum("iab,jba->ij", scaled_curvature, scaled_curvature)
     return mean, covariance
 
 
 def _limited(polar: Array) -> Array:
-    """A bearing that is hardly known is no small angle: its variance counts up to one radian's."""
+    """Limit the variance of each bearing to 1 rad^2: the expansion holds for small angles only."""
     scale = np.ones(4)
     for k in (1, 3):
         scale[k] = min(1.0, 1.0 / math.sqrt(max(polar[k, k], 1e-300)))

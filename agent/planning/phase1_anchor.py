@@ -1,4 +1,4 @@
-"""Phase 1: all that one anchor can tell (Section III.A)."""
+"""Phase 1: the manoeuvre to a further range to the own anchor (Section III.A, eqs. (3) to (5))."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from protocol.mission import RANGE_MARGIN, Mission, PlannerName, third_point_tur
 from protocol.motion import Controls, Pose, chord, compose
 
 PREFERENCE = 1e-9
-"""a later choice must be better than an earlier one by more than rounding"""
+"""The relative improvement, above rounding errors, that a later candidate needs to replace an earlier one."""
 
 
 SIGMAS = 3.0
-"""of a range: how far inside R a point must lie under noise to count on its range"""
+"""The distance inside R, in standard deviations of a range, at which a noisy point counts as in range."""
 
 
 class ThirdPoint(msgspec.Struct, frozen=True):
-    """Drives to where the branches that are left predict different ranges (eqs. (3) to (5))."""
+    """The robot drives to a point where the remaining branches predict different ranges (eqs. (3) to (5))."""
 
     branches: tuple[Branch, ...]
     origin: Pose
@@ -37,14 +37,19 @@ def third_point(
     margin: float = RANGE_MARGIN,
     pinning: bool = False,
 ) -> Controls | None:
-    """The manoeuvre whose end tells best which of `places` (poses in the anchor's frame) the robot is at.
+    """Return the manoeuvre whose end point best distinguishes the poses `places` in the anchor's frame.
 
-    Eq. (4) has its best turn rate where the branches mirror each other along the heading, and is best
-    straight ahead where they mirror across it (after a circle); both are tried, with the longest chord that
-    surely leaves one branch in range, eq. (5). The letter drives forward, `assured` either way. None where
-    the letter's own bound leaves no way to go. With `pinning`, one branch is left, and the ranges do not
-    fix it well enough: then the end is best that is farthest off the line from the anchor through p_0,
-    where a range tells most of the heading.
+    If the branches mirror each other along the heading, eq. (4) gives the best turn rate. If they mirror each
+    other across it, as after a circle, driving straight is best. Both are compared, each with the longest
+    chord that keeps at least one branch in range (eq. (5)). `paper` drives forward only, `assured` also
+    backward.
+
+    `margin` is the distance inside R, in m, at which a point is certainly in range. With `pinning`, one
+    branch is left, but the ranges do not determine its heading accurately enough. The best end point is then
+    the one farthest from the line through the anchor and p_0, because a range depends most on the heading
+    there.
+
+    The result is None if no manoeuvre satisfies eq. (5).
     """
     best: Controls | None = None
     best_value = 0.0
@@ -52,7 +57,8 @@ def third_point(
     rim = mission.sensing_range - max(margin, SIGMAS * mission.noise.anchor_sigma)
     turn_rate = third_point_turn_rate(mission)
     turn_rates = [turn_rate] if planner_name == "paper" else [turn_rate, -turn_rate]
-    if len(places) > 1 or pinning:  # one branch was found on a radius: there, straight ahead checks nothing
+    # A single branch was found on a radius. A straight manoeuvre along that radius would check nothing.
+    if len(places) > 1 or pinning:
         turn_rates.append(0.0)
     for omega in turn_rates:
         unit = chord(1.0, omega, mission.period)
@@ -74,22 +80,26 @@ def third_point(
 
 
 def _outward(place: Pose, half_turn: float, forward: float) -> tuple[float, float]:
-    """m: the parts of the position, seen from the anchor, along and across the chord to come."""
+    """Return the components in m of the position, relative to the anchor, along and across the next chord."""
     course = place.heading + half_turn
     c, s = forward * math.cos(course), forward * math.sin(course)
     return place.x * c + place.y * s, place.y * c - place.x * s
 
 
 def _reach(along: float, across: float, rim: float) -> float:
-    """m: how far a robot can go before it is out of `rim`, eq. (5); negative where it is already."""
+    """Return how far in m the robot can drive before it leaves the circle of radius `rim` (eq. (5)).
+
+    The result is negative if the robot is outside.
+    """
     inside = rim * rim - across * across
     return math.sqrt(inside) - along if inside >= 0.0 else -math.inf
 
 
 def _separation(length: float, along: Sequence[float]) -> float:
-    """m^2: the least difference of the squared ranges that the branches predict, |d_+^2 - d_-^2|.
+    """Return the smallest difference |d_+^2 - d_-^2| in m^2 of the squared ranges that the branches predict.
 
-    One branch has nothing to be told from; there the longest way is worth most, to check it.
+    For a single branch the result is `length`: there is nothing to distinguish, and the longest chord gives
+    the best check.
     """
     if len(along) == 1:
         return length
@@ -97,5 +107,5 @@ def _separation(length: float, along: Sequence[float]) -> float:
 
 
 def local(branches: Sequence[Branch], odometry: Pose) -> list[Pose]:
-    """Where the robot is in the frame of its anchor, by each branch."""
+    """Return the robot's current pose in its anchor's frame for each of `branches`."""
     return [compose(branch.start, odometry) for branch in branches]

@@ -1,4 +1,4 @@
-"""Phase 2: to the orbit about the own anchor, and round it until the peer is met (Section III.B)."""
+"""Phase 2: the way to the orbit about the own anchor, and the orbit until the robots meet (Section III.B)."""
 
 from __future__ import annotations
 
@@ -6,83 +6,86 @@ import math
 
 import msgspec
 
-from agent.planning.range_seeking import arrived, straight, turn
+from agent.planning.range_seeking import arrival_tolerances, straight, turn
 from protocol.mission import Mission
 from protocol.motion import Controls, Pose, compose, wrap
 from protocol.orbits import Orbit
 
 
 class Aligning(msgspec.Struct, frozen=True):
-    """Turns by -mu, to head straight away from the anchor."""
+    """The robot turns by -mu on the spot, until it heads radially away from its anchor."""
 
     heading: float
-    """rad, of the odometry, to turn to"""
+    """The target heading in rad, in the frame of the odometry."""
 
 
 class Radial(msgspec.Struct, frozen=True):
-    """Drives along the radius until it is on the orbit: outward, or back."""
+    """The robot drives along the radius to its orbit, outward or inward."""
 
 
 class Tangent(msgspec.Struct, frozen=True):
-    """Turns from the radius onto the orbit: a by +90 degrees, b by -90."""
+    """The robot turns from the radius to the tangent of its orbit: a by +90 degrees, b by -90 degrees."""
 
     heading: float
-    """rad, of the odometry, to turn to"""
+    """The target heading in rad, in the frame of the odometry."""
 
 
 class Orbiting(msgspec.Struct, frozen=True):
-    """Drives round its anchor, eq. (6); or waits there, where that is its part of the plan."""
+    """The robot drives on its orbit (eq. (6)), or waits at its place if its orbit has no speed."""
 
     command: Controls | None = None
-    """under noise: what leads back to the circle; or tells more, where it waits"""
+    """Noisy sensors: the controls of pure pursuit, or of active sensing while the robot waits."""
     since: int = 0
-    """under noise: the tick in which it got there"""
+    """Noisy sensors: the tick in which the robot reached its orbit."""
 
 
 Meeting = Aligning | Radial | Tangent | Orbiting
 
 
 def orientation(local: Pose) -> float:
-    """mu in rad: the heading relative to the line from the anchor through the robot."""
+    """Return mu in rad: the heading relative to the line from the anchor through the robot."""
     if local.x == 0.0 and local.y == 0.0:
         return 0.0
     return wrap(local.heading - math.atan2(local.y, local.x))
 
 
 def onward(state: Meeting, odometry: Pose, start: Pose, orbit: Orbit, mission: Mission) -> Meeting:
-    """The state at `odometry`, whose tick 0 is `start` in the anchor's frame: what is done is passed over."""
-    there, facing = arrived(mission)
+    """Return the mode of phase 2 at the pose `odometry`. Completed steps are skipped.
+
+    `start` is the pose of tick 0 in the anchor's frame.
+    """
+    distance_tolerance, angle_tolerance = arrival_tolerances(mission)
     while True:
         match state:
-            case Aligning(heading) if abs(heading - odometry.heading) <= facing:
+            case Aligning(heading) if abs(heading - odometry.heading) <= angle_tolerance:
                 state = Radial()
-            case Radial() if abs(left_to_orbit(odometry, start, orbit)) <= there:
+            case Radial() if abs(left_to_orbit(odometry, start, orbit)) <= distance_tolerance:
                 if orbit.v == 0.0:
                     return Orbiting()
                 state = Tangent(odometry.heading + math.copysign(math.pi / 2, orbit.omega))
-            case Tangent(heading) if abs(heading - odometry.heading) <= facing:
+            case Tangent(heading) if abs(heading - odometry.heading) <= angle_tolerance:
                 return Orbiting()
             case _:
                 return state
 
 
 def left_to_orbit(odometry: Pose, start: Pose, orbit: Orbit) -> float:
-    """m: how much farther from the anchor the orbit is."""
+    """Return the distance in m from the robot outward to its orbit; negative outside the orbit."""
     local = compose(start, odometry)
     return orbit.radius - math.hypot(local.x, local.y)
 
 
 def off_anchor(local: Pose, orbit: Orbit) -> bool:
-    """Whether b, at `local` in its anchor's frame, is far enough from its anchor to be met there.
+    """Return whether robot b, at `local` in its anchor's frame, is far enough from its anchor for phase 3.
 
-    On its anchor, its ranges to a would not tell its heading: eq. (7) has a line of solutions. Half way
-    to where it waits is far enough.
+    If b is on its anchor, the mutual ranges do not depend on its heading, and eq. (7) has a continuum of
+    solutions. Half the distance to its waiting place is far enough.
     """
     return math.hypot(local.x, local.y) >= 0.5 * orbit.radius
 
 
 def controls(state: Meeting, odometry: Pose, start: Pose, orbit: Orbit, mission: Mission) -> Controls:
-    """What `state` drives from `odometry`."""
+    """Return the controls of the mode `state` at the pose `odometry`."""
     match state:
         case Aligning(heading) | Tangent(heading):
             return turn(odometry, heading, mission)
@@ -93,9 +96,9 @@ def controls(state: Meeting, odometry: Pose, start: Pose, orbit: Orbit, mission:
 
 
 def pursuit(local: Pose, orbit: Orbit, mission: Mission) -> Controls:
-    """Round the anchor, back to the circle that noise has led away from (pure pursuit).
+    """Return the controls that lead back to the orbit after odometry or actuation noise (pure pursuit).
 
-    Along the arc to the point of the circle that lies two ticks ahead; from the circle that is eq. (6).
+    The robot drives an arc to the point of the orbit LOOKAHEAD ticks ahead. On the orbit, this is eq. (6).
     """
     ahead = math.atan2(local.y, local.x) + LOOKAHEAD * orbit.omega * mission.period
     x, y = orbit.radius * math.cos(ahead) - local.x, orbit.radius * math.sin(ahead) - local.y
@@ -105,4 +108,4 @@ def pursuit(local: Pose, orbit: Orbit, mission: Mission) -> Controls:
 
 
 LOOKAHEAD = 2.0
-"""ticks"""
+"""The distance of the pursued point, in ticks of the orbit's speed."""

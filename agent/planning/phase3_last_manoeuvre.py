@@ -1,4 +1,4 @@
-"""Phase 3: the last manoeuvres, and which of the placements of eq. (7) is true (Section III.C)."""
+"""Phase 3: the last manoeuvres, which select the true solution of eq. (7) (Section III.C)."""
 
 from __future__ import annotations
 
@@ -22,46 +22,57 @@ Array = NDArray[np.float64]
 Point = float | Array
 
 TURN_RATES = 721
-"""values of omega_2 tried in eq. (8), from -omega_max to omega_max: every half degree in Section IV"""
+"""The number of values of omega_2 compared in eq. (8), from -omega_max to omega_max.
+
+With the parameters of Section IV, there is one every half degree.
+"""
 
 SPEEDS = (1.0, -1.0, 0.75, -0.75, 0.5, -0.5, 0.25, -0.25, 0.1, -0.1)
-"""values of v_2 tried, over A_0 / T_s: v_max, or less where that would come near R in one tick"""
+"""The values of v_2 compared, in units of A_0 / T_s: v_max, or less if one tick would come near R."""
 
 ELSEWHERE = 1e-6
-"""m: a range taken nearer than this to where another was says nothing new"""
+"""The distance in m within which two measurement points count as one, so the second range adds nothing."""
 
-ON_THE_OTHER = 1e-6
-"""of a's way between two ranges: nearer to M1 than this, b may be on it, and eq. (7) has a's turn about M1 by
-1e-16 over this at the best"""
+B_ON_M1 = 1e-6
+"""The ratio of a distance to a's path between two ranges, below which b may be on M1.
 
-FAINT = 1e-8
-"""of (D + R)^2 for phi and of D^2 for psi, the most that a range tells: added to the information there is, so
-that the first of two missing ranges counts"""
+Eq. (7) then determines a's rotation about M1 no better than 1e-16 divided by this ratio.
+"""
+
+REGULARISATION = 1e-8
+"""The regularisation of the information matrix: a fraction of (D + R)^2 for phi and of D^2 for psi.
+
+These are the largest contributions of one range. Without the regularisation, the first of two missing ranges
+would not increase the determinant.
+"""
 
 
 class Standing(msgspec.Struct, frozen=True):
-    """b stands, and waits for a's second range; or, back from a manoeuvre, for word from a."""
+    """Robot b stands still. It waits for a's second range or, after its own manoeuvre, for a's report."""
 
     through: int = -1
-    """ranges are weighed through this tick"""
+    """The last tick whose measurements have been evaluated."""
 
 
 class Waiting(msgspec.Struct, frozen=True):
-    """a stands: it has its second range, and b makes the last manoeuvre; a too, where that is not enough."""
+    """Robot a stands still. It has its second range and waits for b's last manoeuvre.
+
+    Robot a makes a further manoeuvre if b's last one was not sufficient.
+    """
 
     through: int = -1
-    """ranges are weighed through this tick"""
+    """The last tick whose measurements have been evaluated."""
 
 
 class LastManoeuvre(msgspec.Struct, frozen=True):
-    """Drives to where the placements that are left predict different ranges."""
+    """The robot drives to a point where the remaining placements predict different ranges."""
 
     command: Controls
     origin: Pose
 
 
 class Returning(msgspec.Struct, frozen=True):
-    """Has left the peer's range, and drives the same arc backwards to tell it."""
+    """The robot has left the peer's range. It drives the same arc backwards, to be able to report again."""
 
     command: Controls
     origin: Pose
@@ -72,81 +83,82 @@ State = Resting | LastManoeuvre | Returning
 
 
 class Question(NamedTuple):
-    """Which of `candidates` is true: what the last manoeuvre is to answer."""
+    """The problem that the last manoeuvre solves: which of `candidates` is the true placement."""
 
     mover: Role
     a: Pose
-    """in <a(M1)>"""
+    """The pose of a in <a(M1)>."""
     b: Pose
-    """in <b(M2)>"""
+    """The pose of b in <b(M2)>."""
     candidates: tuple[Placement, ...]
 
 
 class Plan(NamedTuple):
-    """A last manoeuvre, and what it is expected to tell."""
+    """A last manoeuvre and its expected result."""
 
     command: Controls
     separation_m2: float | None
-    """J of eq. (8): the least difference of two predicted squared ranges; none for one candidate"""
+    """J of eq. (8) in m^2: the smallest difference of predicted squared ranges; None for one candidate."""
     question: Question
 
 
 class Reach(NamedTuple):
-    """The manoeuvres that are compared, and where each ends, in the frame of the mover's anchor."""
+    """The S x W manoeuvres that are compared, and their end points in the frame of the mover's anchor."""
 
     v: Array
-    """(S, 1)"""
+    """The speeds in m/s; (S, 1)."""
     omega: Array
-    """(W,)"""
+    """The turn rates in rad/s; (W,)."""
     x: Array
-    """(S, W)"""
+    """The end points in m; (S, W)."""
     y: Array
 
 
 class Compared(NamedTuple):
-    """What each of the manoeuvres in `reach` would tell."""
+    """The value of each manoeuvre in `reach`."""
 
     reach: Reach
     gap: Array
-    """J in m^2, (S, W); for one candidate, by how much the squared range would shrink"""
+    """J in m^2, (S, W). For one candidate: the decrease of the squared range."""
     value: Array
-    """the same; -inf for manoeuvres that are not to be taken"""
+    """The same as `gap`, with -inf for manoeuvres that are not allowed."""
 
 
 def base(
     pair_observations: Sequence[PairObservation], floor: float
 ) -> tuple[PairObservation, PairObservation] | None:
-    """The two ranges that eq. (7) is solved from: the first two between which only a has moved.
+    """Return the two ranges for which eq. (7) is solved: the first two between which only a has moved.
 
-    b has not moved if it is where it was to `floor` m, the rounding of both odometries. Not two ranges by
-    which b may stand on M1: there any turn of a about it would do.
+    Robot b has not moved if its two positions are within `floor` m, the rounding error of both odometries.
+    Pairs of ranges at which b may be on M1 are skipped: every rotation of a about M1 would solve eq. (7). The
+    result is None if there is no such pair.
     """
     ranged: list[PairObservation] = []
     for pair_observation in pair_observations:
         if pair_observation.range is not None and not (
             ranged
             and (ranged[-1].a, ranged[-1].b)
-            == (pair_observation.a, pair_observation.b)  # both have stood since
+            == (pair_observation.a, pair_observation.b)  # neither robot has moved in between
         ):
             ranged.append(pair_observation)
     for first in ranged:
         for second in ranged:
             stood, moved = travelled(first.b, second.b) <= floor, travelled(first.a, second.a) > ELSEWHERE
             if first.tick < second.tick and stood and moved:
-                near = ON_THE_OTHER * travelled(first.a, second.a)
-                if not (_as_far(first, near) and _as_far(second, near)):
+                near = B_ON_M1 * travelled(first.a, second.a)
+                if not (_b_may_be_on_m1(first, near) and _b_may_be_on_m1(second, near)):
                     return first, second
     return None
 
 
-def _as_far(pair_observation: PairObservation, near: float) -> bool:
-    """Return whether a is as far from its own anchor as from b, to `near` m."""
+def _b_may_be_on_m1(pair_observation: PairObservation, near: float) -> bool:
+    """Return whether a is as far from its own anchor as from b, to `near` m, so that b may be on M1."""
     assert pair_observation.range is not None
     return abs(math.hypot(pair_observation.a.x, pair_observation.a.y) - pair_observation.range) <= near
 
 
 def solve(distance: float, base: tuple[PairObservation, PairObservation]) -> list[Placement]:
-    """The placements that eq. (7) leaves after two ranges; `distance` is D."""
+    """Return the solutions of eq. (7) for the two ranges `base`; `distance` is D in m."""
     first, second = base
     assert first.range is not None
     assert second.range is not None
@@ -156,7 +168,7 @@ def solve(distance: float, base: tuple[PairObservation, PairObservation]) -> lis
 def redundant(
     pair_observations: Sequence[PairObservation], base: tuple[PairObservation, PairObservation]
 ) -> bool:
-    """Whether there is a range more, from elsewhere, than the two that the placements were made from."""
+    """Return whether there is a range from another place than the two ranges of `base`."""
     return any(
         pair_observation.range is not None
         and all(
@@ -169,7 +181,7 @@ def redundant(
 
 
 def turn(pair_observations: Sequence[PairObservation]) -> Role:
-    """Whose move it is: the other's than whose was the last. b moves first."""
+    """Return the robot that moves next: the one that did not move last. Robot b moves first."""
     for before, now in pairwise(reversed(pair_observations)):
         if travelled(before.b, now.b) > 0.0:
             return "a"
@@ -179,7 +191,7 @@ def turn(pair_observations: Sequence[PairObservation]) -> Role:
 
 
 def advanced(state: LastManoeuvre | Returning, pose: Pose, in_contact: bool, rest: Resting) -> State:
-    """The state after a tick that led to `pose`; in the end it is `rest`."""
+    """Return the mode after a tick that led to `pose`: `rest`, or back into the peer's range."""
     match state:
         case LastManoeuvre(command) if not in_contact:
             return Returning(Controls(-command.v, -command.omega), pose)
@@ -198,12 +210,17 @@ def last_manoeuvre(
     mission: Mission,
     planner_name: PlannerName,
 ) -> Plan | None:
-    """The manoeuvre after which the ranges that `candidates` predict differ most (eq. (8), on squares).
+    """Return the manoeuvre that best distinguishes `candidates` by the range after it (eq. (8)).
 
-    Of `mover`, in the paper always b; `a` is in <a(M1)> and `b` in <b(M2)>. By enumeration. The letter
-    drives at v_max; `assured` takes the best of the manoeuvres with the fewest candidates out of range,
-    which silence then names. A single candidate is checked by the range that changes most, towards it:
-    silence would check nothing. None where every manoeuvre comes nearer than the safety distance.
+    It maximises the smallest difference of the predicted ranges, in squares.
+
+    `mover` is the robot that moves, in the paper always b. `a` is given in <a(M1)> and `b` in <b(M2)>. The
+    maximum is found by enumeration. `paper` drives at v_max. `assured` compares several speeds, and only
+    manoeuvres that leave the fewest candidates out of range: no detection selects those candidates.
+
+    With one candidate, the manoeuvre is a check: it approaches the candidate so that the squared range
+    decreases most, since no detection would check nothing. The result is None if every manoeuvre violates the
+    safety distance.
     """
     question = Question(mover, a, b, tuple(candidates))
     reach, gap, value = compared(question, mission, planner_name)
@@ -215,12 +232,12 @@ def last_manoeuvre(
 
 
 def compared(question: Question, mission: Mission, planner_name: PlannerName) -> Compared:
-    """What `last_manoeuvre` chooses from: the largest value."""
+    """Return all manoeuvres with their values. `last_manoeuvre` takes the largest value."""
     mover, a, b, candidates = question
     reach = reachable(a if mover == "a" else b, mission, planner_name)
     squared: list[Array] = []
     for candidate in candidates:
-        (ax, ay), (bx, by) = _placed(mover, a, b, candidate, reach.x, reach.y)
+        (ax, ay), (bx, by) = _positions_in_b(mover, a, b, candidate, reach.x, reach.y)
         squared.append(np.square(ax - bx) + np.square(ay - by))
     if len(squared) == 1:
         gap = travelled(b, candidates[0].place(a)) ** 2 - squared[0]
@@ -236,7 +253,7 @@ def compared(question: Question, mission: Mission, planner_name: PlannerName) ->
     return Compared(reach, gap, value)
 
 
-def survey(
+def most_informative_manoeuvre(
     mover: Role,
     a: Pose,
     b: Pose,
@@ -244,22 +261,23 @@ def survey(
     pair_observations: Sequence[PairObservation],
     mission: Mission,
 ) -> Plan | None:
-    """The manoeuvre of `mover` after which one more range would pin down `placement` best; none as above.
+    """Return the manoeuvre after which a range determines `placement` best, or None (see `last_manoeuvre`).
 
-    For a placement that alone fits, and that the ranges in `pair_observations` do not determine: both robots and
-    their anchors on one line. By the determinant of the information, which takes both robots to raise.
+    It applies to the only remaining placement if the ranges in `pair_observations` do not determine it,
+    because both robots and their anchors lie on one line. The criterion is the determinant of the information
+    matrix. Both robots have to move to raise it.
     """
     question = Question(mover, a, b, (placement,))
     reach = reachable(a if mover == "a" else b, mission, "assured")
-    (ax, ay), (bx, by) = _placed(mover, a, b, placement, reach.x, reach.y)
+    (ax, ay), (bx, by) = _positions_in_b(mover, a, b, placement, reach.x, reach.y)
     dx, dy = ax - bx, ay - by
     apart = np.maximum(np.hypot(dx, dy), ELSEWHERE)
     by_phi = (dy * (ax - placement.x) - dx * (ay - placement.y)) / apart
     by_psi = (dy * placement.x - dx * placement.y) / apart
     pp, pq, qq = information(placement, pair_observations)
     distance = math.hypot(placement.x, placement.y)
-    faint_p, faint_q = FAINT * (distance + mission.sensing_range) ** 2, FAINT * distance**2
-    value = (pp + by_phi**2 + faint_p) * (qq + by_psi**2 + faint_q) - (pq + by_phi * by_psi) ** 2
+    ridge_p, ridge_q = REGULARISATION * (distance + mission.sensing_range) ** 2, REGULARISATION * distance**2
+    value = (pp + by_phi**2 + ridge_p) * (qq + by_psi**2 + ridge_q) - (pq + by_phi * by_psi) ** 2
     value = np.where(apart <= mission.sensing_range - RANGE_MARGIN, value, -np.inf)
     value = np.where(_keeps_apart(question, reach, mission), value, -np.inf)
     row, column = _best(value)
@@ -269,21 +287,22 @@ def survey(
 
 
 def _keeps_apart(question: Question, reach: Reach, mission: Mission) -> NDArray[np.bool]:
-    """Which manoeuvres keep the safety distance, whichever of the candidates is true; (S, W)."""
+    """Return which manoeuvres keep the safety distance for every candidate; (S, W)."""
     mover, a, b, candidates = question
     v, omega = np.broadcast_arrays(reach.v, reach.omega)
     if not mission.safety_distance:
         return np.ones(v.shape, dtype=np.bool)
     here = a if mover == "a" else b
     least = [
-        nearest(here, v, omega, _seen(mover, a, b, candidate), mission.period) for candidate in candidates
+        nearest(here, v, omega, _standing_position(mover, a, b, candidate), mission.period)
+        for candidate in candidates
     ]
-    kept: NDArray[np.bool] = np.min(least, axis=0) >= mission.safety_distance
-    return kept
+    allowed: NDArray[np.bool] = np.min(least, axis=0) >= mission.safety_distance
+    return allowed
 
 
-def _seen(mover: Role, a: Pose, b: Pose, placement: Placement) -> tuple[float, float]:
-    """Where the one that stands is, in the frame of the mover's anchor."""
+def _standing_position(mover: Role, a: Pose, b: Pose, placement: Placement) -> tuple[float, float]:
+    """Return the position of the robot that does not move, in the frame of the mover's anchor."""
     if mover == "b":
         there = placement.place(a)
         return there.x, there.y
@@ -293,13 +312,13 @@ def _seen(mover: Role, a: Pose, b: Pose, placement: Placement) -> tuple[float, f
 
 
 def _best(value: Array) -> tuple[int, int]:
-    """Row and column of the largest; of several, the first."""
+    """Return the row and the column of the largest value; the first one of several."""
     row, column = np.unravel_index(np.argmax(value), value.shape)
     return int(row), int(column)
 
 
 def reachable(pose: Pose, mission: Mission, planner_name: PlannerName) -> Reach:
-    """The manoeuvres that are compared, from `pose`."""
+    """Return the manoeuvres that are compared, from `pose`."""
     omega = np.linspace(-mission.max_turn_rate, mission.max_turn_rate, TURN_RATES)
     half = 0.5 * mission.period * omega
     unit = mission.period * np.sinc(half / math.pi)
@@ -312,10 +331,10 @@ def reachable(pose: Pose, mission: Mission, planner_name: PlannerName) -> Reach:
     return Reach(speed, omega, x, y)
 
 
-def _placed(
+def _positions_in_b(
     mover: Role, a: Pose, b: Pose, placement: Placement, x: Array, y: Array
 ) -> tuple[tuple[Point, Point], tuple[Point, Point]]:
-    """Where a and b are in <b(M2)>: `mover` at (x, y) in the frame of its anchor, the other where it is."""
+    """Return the positions of a and b in <b(M2)>, if `mover` is at (x, y) in the frame of its anchor."""
     if mover == "b":
         there = placement.place(a)
         return (there.x, there.y), (x, y)

@@ -1,12 +1,13 @@
-"""The state machine of one robot: pure, so that simulation, network, replay and recovery agree to the bit.
+"""The planner: one robot's state machine as pure functions over frozen values.
 
-One tick has two halves, since two robots in contact tell each other what they have just sensed before
-either decides:
+A tick has two halves, because two robots in contact exchange their new measurements before either decides:
 
-    observe(mind, sense)  -> mind       folds in what the sensors say; `report(mind)` is then what to tell
-    decide(mind, reports) -> mind       folds in what was heard; `drive(mind)` is then what to do
+    observe(state, observation) -> state    adds the sensor data; `report(state)` is the message to the peer
+    decide(state, reports)      -> state    adds the peer's reports; `command(state)` is the motion command
 
-No I/O, no clock, no randomness. What the robot is doing is one frozen value, `state.mode`.
+`estimate(state)` returns the pose hypotheses for viewers. There is no I/O, no clock and no randomness, so
+simulation, network, replay and recovery make decisions that are identical to the bit. The current activity of
+the robot is one frozen value, `state.mode`.
 """
 
 from __future__ import annotations
@@ -50,11 +51,14 @@ from protocol.mission import RANGE_MARGIN
 from protocol.motion import ORIGIN, REST, Controls, Pose, step
 from protocol.rounding import SAME
 
-# --- a tick -----------------------------------------------------------------------------------------
+# --- one tick -----------------------------------------------------------------------------------------
 
 
 def observe(state: RobotState, observation: Observation) -> RobotState:
-    """What the robot knows once it has sensed: where it drove, what was in range and what was silent."""
+    """Return `state` with the sensor data of one tick: odometry, anchor range, contact and mutual range.
+
+    The mode is also advanced, as far as it depends on the robot's own sensors.
+    """
     log, odometry, leg = state.log, state.odometry, state.leg
     if observation.executed is not None:
         v, omega = observation.executed.v, observation.executed.omega
@@ -63,15 +67,15 @@ def observe(state: RobotState, observation: Observation) -> RobotState:
         if ticks == 1:
             leg = odometry
         odometry = step(leg, v, omega, ticks * state.config.mission.period)
-    if observation.anchor_range is not None and not _again(state, observation):
+    if observation.anchor_range is not None and not _repeats_last_range(state, observation):
         log = log.ranged(observation.anchor_range)
-    mutual, near = state.mutual, False
+    mutual, in_contact = state.mutual, False
     for contact in observation.contacts:
         if contact.peer == state.config.peer:
-            near = True
+            in_contact = True
             if contact.range is not None:
                 mutual = (*mutual, Ranged(observation.tick, contact.range))
-    sensed = RobotState(
+    observed = RobotState(
         state.config,
         state.mode,
         observation.tick,
@@ -80,23 +84,26 @@ def observe(state: RobotState, observation: Observation) -> RobotState:
         mutual,
         state.belief,
         state.peer_state,
-        near,
+        in_contact,
         leg,
     )
-    return _advanced(sensed, observation.anchor_range)
+    return _advance_mode(observed, observation.anchor_range)
 
 
 def report(state: RobotState) -> Report:
-    """What the peer has not acknowledged yet."""
+    """Return the report of this tick: the part of the log that the peer has not acknowledged.
+
+    If the configuration contains an attack, the report holds the falsified log (see `protocol.attack`).
+    """
     since, ranges_since = state.peer_state.acknowledged, state.peer_state.ranges_acknowledged
     log, start = state.log, state.belief.branch.start if state.belief.branch and state.phase > 1 else None
     if (attack := state.config.attack) is not None:
-        findings = state.belief
-        log = false_reports.told(
-            log, attack, findings.phase1_done_tick, findings.encounter_tick, state.config.mission.period
+        belief = state.belief
+        log = false_reports.falsified_log(
+            log, attack, belief.phase1_done_tick, belief.encounter_tick, state.config.mission.period
         )
         start = false_reports.start(start, attack) if start is not None else None
-    news = log.after(since, ranges_since)
+    unacknowledged = log.after(since, ranges_since)
     return Report(
         tick=state.tick,
         robot=state.config.robot,
@@ -104,10 +111,10 @@ def report(state: RobotState) -> Report:
         state=state.mode_name,
         start=start,
         since=since,
-        through=news.through,
-        runs=news.runs,
+        through=unacknowledged.through,
+        runs=unacknowledged.runs,
         ranges_since=ranges_since,
-        ranges=news.ranges,
+        ranges=unacknowledged.ranges,
         heard=state.peer_state.peer.through,
         ranges_heard=len(state.peer_state.peer.ranges),
         verdict=state.verdict,
@@ -115,27 +122,27 @@ def report(state: RobotState) -> Report:
 
 
 def decide(state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
-    """What the robot is set to do once it has heard its peer."""
+    """Return `state` with the peer's `reports` and with the mode that follows from them."""
     if reports:
-        state = _heard(state, reports)
+        state = _with_reports(state, reports)
         if state.verdict is not None:
             return state
     if not state.in_contact:
         return state
-    if _surveys(state):
-        return assured.heard(state)
+    if _uses_active_sensing(state):
+        return assured.after_reports(state)
     match state.mode:
-        case Aligning() | Radial() | Tangent() | Orbiting() if encounter.meets(state):
-            return encounter.met(state)
+        case Aligning() | Radial() | Tangent() | Orbiting() if encounter.can_begin_phase3(state):
+            return encounter.begin_phase3(state)
         case Standing() | Waiting():
-            return encounter.considered(state)
+            return encounter.decide_phase3(state)
         case _:
             return state
 
 
 def command(state: RobotState) -> Command:
-    """What the robot does over the tick to come."""
-    controls = _controls(state)
+    """Return the command for the next tick, with the phase, the mode and the verdict."""
+    controls = _safe_controls(state)
     return Command(
         state.tick,
         state.config.robot,
@@ -148,12 +155,12 @@ def command(state: RobotState) -> Command:
 
 
 def estimate(state: RobotState) -> Estimate:
-    """What the robot holds possible."""
-    left = state.belief.branches
-    if not left and state.belief.branch is not None:
-        left = (state.belief.branch,)
-    elif not left and isinstance(state.mode, ThirdPoint):
-        left = state.mode.branches
+    """Return all poses that the robot considers possible in its anchor's frame and in <W>."""
+    branches_left = state.belief.branches
+    if not branches_left and state.belief.branch is not None:
+        branches_left = (state.belief.branch,)
+    elif not branches_left and isinstance(state.mode, ThirdPoint):
+        branches_left = state.mode.branches
     if state.belief.poses:
         world: tuple[Pose, ...] = state.belief.poses
     elif isinstance(state.verdict, Localised):
@@ -163,7 +170,7 @@ def estimate(state: RobotState) -> Estimate:
     return Estimate(
         tick=state.tick,
         robot=state.config.robot,
-        local=tuple(phase1_anchor.local(left, state.odometry)),
+        local=tuple(phase1_anchor.local(branches_left, state.odometry)),
         world=world,
         localised=isinstance(state.verdict, Localised),
         probabilities=tuple(one.probability for one in state.belief.pair or state.belief.own),
@@ -171,48 +178,55 @@ def estimate(state: RobotState) -> Estimate:
     )
 
 
-def _heard(state: RobotState, reports: Sequence[Report]) -> RobotState:
-    """`state`, with all that `reports` tell; and its verdict, if that cannot be so, or the peer gives up."""
-    for told in reports:
-        heard = peer_state.hear(state.peer_state, told)
-        doubt = (
-            plausibility.objection(state.peer_state, heard, told, state.config)
+def _with_reports(state: RobotState, reports: Sequence[Report]) -> RobotState:
+    """Return `state` with the data of `reports`, and with a verdict if a report gives reason for one.
+
+    The verdict is Inconsistent if a report is implausible, and Undecided if the peer has given up.
+    """
+    for received in reports:
+        updated = peer_state.with_report(state.peer_state, received)
+        objection = (
+            plausibility.objection(state.peer_state, updated, received, state.config)
             if state.verdict is None
             else None
         )
-        state = replace(state, peer_state=heard)
-        if doubt is not None:
-            return state.alarmed(doubt)
+        state = replace(state, peer_state=updated)
+        if objection is not None:
+            return state.inconsistent(objection)
     if state.verdict is None:
         match state.peer_state.verdict:
             case Undecided(reason):
-                return state.undecided(f"{state.config.peer} says: {reason}")
-            case Inconsistent(claim):
-                return state.undecided(f"{state.config.peer} does not believe it: {claim}")
+                return state.undecided(f"{state.config.peer} reports: {reason}")
+            case Inconsistent(contradiction):
+                return state.undecided(f"{state.config.peer} found a contradiction: {contradiction}")
     return state
 
 
-# --- what a tick changes ----------------------------------------------------------------------------
+# --- mode transitions ---------------------------------------------------------------------------------
 
 
-def _advanced(state: RobotState, anchor_range: float | None) -> RobotState:
-    """`state` in the state that its own senses lead to."""
-    if _surveys(state) and not isinstance(state.mode, Asleep):
-        return assured.sensed(state, anchor_range)
+def _advance_mode(state: RobotState, anchor_range: float | None) -> RobotState:
+    """Return `state` with the mode that follows from the robot's own sensors."""
+    if _uses_active_sensing(state) and not isinstance(state.mode, Asleep):
+        return assured.after_observation(state, anchor_range)
     match state.mode:
         case Orbiting(None) | Standing() | Waiting() | Done():
             return state
         case Aligning() | Radial() | Tangent() | Orbiting():
-            return _on_to_orbit(state, state.mode)
+            return _continue_phase2(state, state.mode)
         case Straight(beacon) | Backing(beacon) | Turning(beacon) | Circling(beacon):
             measured = state.in_contact if beacon == "peer" else anchor_range is not None
             mission, planner_name = state.config.mission, state.config.planner_name
-            onward = range_seeking.onward(state.mode, state.odometry, measured, mission, planner_name)
-            if onward is not None:
-                return state if onward is state.mode else replace(state, mode=onward)
-            return replace(state, mode=Waiting()) if beacon == "peer" else _second_range(state)
+            next_mode = range_seeking.onward(state.mode, state.odometry, measured, mission, planner_name)
+            if next_mode is not None:
+                return state if next_mode is state.mode else replace(state, mode=next_mode)
+            return replace(state, mode=Waiting()) if beacon == "peer" else _after_second_range(state)
         case ThirdPoint(_, origin):
-            return _third_range(state, state.mode) if range_seeking.moved(origin, state.odometry) else state
+            return (
+                _after_third_range(state, state.mode)
+                if range_seeking.moved(origin, state.odometry)
+                else state
+            )
         case LastManoeuvre(_, origin) | Returning(_, origin) if range_seeking.moved(origin, state.odometry):
             rest = Standing() if state.config.role == "b" else Waiting()
             return replace(
@@ -220,18 +234,21 @@ def _advanced(state: RobotState, anchor_range: float | None) -> RobotState:
                 mode=phase3_last_manoeuvre.advanced(state.mode, state.odometry, state.in_contact, rest),
             )
         case Asleep():
-            return _released(state, anchor_range)
+            return _start_phase1(state, anchor_range)
         case _:
             return state
 
 
-def _surveys(state: RobotState) -> bool:
-    """Whether sensors are noisy, and more than one look at them may be taken."""
+def _uses_active_sensing(state: RobotState) -> bool:
+    """Return whether the robot uses active sensing: planner `assured` with noisy sensors."""
     return state.config.planner_name == "assured" and not state.config.mission.noise.exact
 
 
-def _again(state: RobotState, observation: Observation) -> bool:
-    """Whether the anchor's range is the last one over again, from where the robot has stood since phase 1."""
+def _repeats_last_range(state: RobotState, observation: Observation) -> bool:
+    """Return whether the anchor range only repeats the last one of a robot that has not moved since.
+
+    Such a range tells nothing new with exact sensors. It is dropped from the end of phase 1 on.
+    """
     return (
         state.belief.branch is not None
         and observation.executed == REST
@@ -240,112 +257,131 @@ def _again(state: RobotState, observation: Observation) -> bool:
     )
 
 
-def _released(state: RobotState, rho0: float | None) -> RobotState:
+def _start_phase1(state: RobotState, rho0: float | None) -> RobotState:
+    """Start phase 1 with the first anchor range `rho0` in m; None if the anchor was not detected."""
     if rho0 is None and state.config.mission.noise.drop_outs:
-        return state  # and listens
+        return state  # the robot waits for its first range
     if rho0 is None:
         return state.undecided("the anchor is out of range at the start")
-    if state.config.mission.noise.exact and rho0 <= SAME * precision.drifted(state, state.log, state.tick):
-        # it is on its anchor: the heading is radial by definition, and nothing is left to find out
-        return _located(
+    if state.config.mission.noise.exact and rho0 <= SAME * precision.range_rounding(
+        state, state.log, state.tick
+    ):
+        # The robot is on its anchor. The heading is radial by definition, so phase 1 has nothing to
+        # determine.
+        return _end_phase1(
             state, Branch(0.0, ORIGIN), "on-anchor", precision.anchor(state, ORIGIN, state.log).error
         )
     return replace(state, mode=Straight("anchor", state.odometry, rho0))
 
 
-def _second_range(state: RobotState) -> RobotState:
-    """The branches +-alpha, less what silence on the way rules out."""
+def _after_second_range(state: RobotState) -> RobotState:
+    """Continue phase 1 with the branches +alpha and -alpha that the second range allows (eq. (2))."""
     if not state.config.mission.noise.exact:
         state, likely = paper.with_branches(state)
         if isinstance(state.mode, Circling) and len(likely) == 1:
-            return _located(state, likely[0], "circle")
-        return _to_third_point(state, likely, RANGE_MARGIN)
+            return _end_phase1(state, likely[0], "circle")
+        return _start_third_point(state, likely, RANGE_MARGIN)
     rho0, rho = state.log.ranges[0].range, state.log.ranges[-1].range
     possible = branches(rho0, state.odometry, rho)
     state = replace(state, belief=replace(state.belief, possible=possible))
-    return _weighed(state, possible, "circle" if isinstance(state.mode, Circling) else None)
+    return _select_branches(state, possible, "circle" if isinstance(state.mode, Circling) else None)
 
 
-def _third_range(state: RobotState, mode: ThirdPoint) -> RobotState:
-    """The branch that explains the third range, or its absence: the virtual measurement."""
+def _after_third_range(state: RobotState, mode: ThirdPoint) -> RobotState:
+    """Continue phase 1 after the third range. A missing range is the paper's virtual measurement."""
     measured = state.log.ranges[-1].tick == state.tick
     kind: messages.BranchKind = "three-ranges" if measured else "three-ranges-virtual"
     if not state.config.mission.noise.exact:
         state, likely = paper.with_branches(state)
-        return _located(state, likely[0], kind) if likely else _to_third_point(state, likely, RANGE_MARGIN)
-    return _weighed(state, mode.branches, kind)
+        return (
+            _end_phase1(state, likely[0], kind) if likely else _start_third_point(state, likely, RANGE_MARGIN)
+        )
+    return _select_branches(state, mode.branches, kind)
 
 
-def _weighed(
+def _select_branches(
     state: RobotState, candidates: tuple[Branch, ...], kind: messages.BranchKind | None
 ) -> RobotState:
-    """Phase 1 goes on with those of `candidates` that explain all its ticks; it ends if one may be known.
+    """Select the branches of `candidates` that agree with every tick of phase 1, and end phase 1 if possible.
 
-    That takes ranges that fix the anchor as exactly as the claim needs; the letter takes no more of them.
-    `kind` is how it ends; None where it goes on for another range in any case.
+    Phase 1 ends if one branch is left. `assured` also requires that the ranges determine the anchor's
+    position as accurately as a claim needs. `paper` takes no further ranges. `kind` is how phase 1 ends; with
+    None, another range is taken in any case.
     """
     mission, as_published = state.config.mission, state.config.planner_name == "paper"
-    floor = precision.drifted(state, state.log, state.tick)
+    floor = precision.range_rounding(state, state.log, state.tick)
     margin = precision.margin(mission, floor)
-    left = weigh_branches(candidates, state.seen(), mission.sensing_range, floor, margin)
-    left = precision.merged(state, left)
-    if kind is not None and len(left) == 1:
-        branch, known = precision.fitted(state, left[0])
-        if known.enough or as_published:
-            return _located(state, branch, kind, known.error)
-    if len(left) > 1 and as_published and isinstance(state.mode, ThirdPoint):
-        return state.undecided("the third range does not tell +alpha from -alpha")
-    return _to_third_point(state, left, margin)
+    remaining = weigh_branches(candidates, state.seen(), mission.sensing_range, floor, margin)
+    remaining = precision.merged(state, remaining)
+    if kind is not None and len(remaining) == 1:
+        branch, accuracy = precision.fitted(state, remaining[0])
+        if accuracy.enough or as_published:
+            return _end_phase1(state, branch, kind, accuracy.error)
+    if len(remaining) > 1 and as_published and isinstance(state.mode, ThirdPoint):
+        return state.undecided("the third range does not distinguish +alpha from -alpha")
+    return _start_third_point(state, remaining, margin)
 
 
-def _to_third_point(state: RobotState, left: tuple[Branch, ...], margin: float) -> RobotState:
-    if not left:
+def _start_third_point(state: RobotState, remaining: tuple[Branch, ...], margin: float) -> RobotState:
+    """Plan the manoeuvre to the next measurement point of phase 1 for the `remaining` branches.
+
+    `margin` is the distance inside R, in m, at which a point is certainly in range.
+    """
+    if not remaining:
         return state.undecided("no pose explains the anchor ranges")
     mission, planner_name = state.config.mission, state.config.planner_name
-    pinning = planner_name == "assured" and len(left) == 1 and mission.noise.exact
-    places = phase1_anchor.local(left, state.odometry)
+    pinning = planner_name == "assured" and len(remaining) == 1 and mission.noise.exact
+    places = phase1_anchor.local(remaining, state.odometry)
     controls = phase1_anchor.third_point(places, mission, planner_name, margin=margin, pinning=pinning)
     if controls is None:
-        return state.undecided("eq. (5) leaves no way to a third range")
-    return replace(state, mode=ThirdPoint(left, state.odometry, controls))
+        return state.undecided("eq. (5) allows no manoeuvre to a third range")
+    return replace(state, mode=ThirdPoint(remaining, state.odometry, controls))
 
 
-def _located(state: RobotState, branch: Branch, kind: messages.BranchKind, off: float = 0.0) -> RobotState:
-    """Phase 1 is done: its pose relative to the anchor is known, and that it may be `off` m elsewhere."""
-    findings = replace(
-        state.belief, branch=branch, branch_kind=kind, phase1_done_tick=state.tick, own_anchor=off
+def _end_phase1(
+    state: RobotState, branch: Branch, kind: messages.BranchKind, anchor_error: float = 0.0
+) -> RobotState:
+    """End phase 1: store `branch` and its anchor error in m, and start phase 2."""
+    belief = replace(
+        state.belief, branch=branch, branch_kind=kind, phase1_done_tick=state.tick, own_anchor=anchor_error
     )
-    state = replace(state, belief=findings)
+    state = replace(state, belief=belief)
     mu = phase2_orbit.orientation(state.local_pose)
-    return _on_to_orbit(state, Aligning(state.odometry.heading - mu))
+    return _continue_phase2(state, Aligning(state.odometry.heading - mu))
 
 
-def _on_to_orbit(state: RobotState, mode: phase2_orbit.Meeting) -> RobotState:
-    onward = phase2_orbit.onward(mode, state.odometry, state.start, state.orbit, state.config.mission)
-    if isinstance(onward, Orbiting) and not state.config.mission.noise.exact:
-        onward = Orbiting(phase2_orbit.pursuit(state.local_pose, state.orbit, state.config.mission))
-    return state if onward is state.mode else replace(state, mode=onward)
+def _continue_phase2(state: RobotState, mode: phase2_orbit.Meeting) -> RobotState:
+    """Continue phase 2 from `mode`. With noisy sensors, the robot follows its orbit by pure pursuit."""
+    next_mode = phase2_orbit.onward(mode, state.odometry, state.start, state.orbit, state.config.mission)
+    if isinstance(next_mode, Orbiting) and not state.config.mission.noise.exact:
+        next_mode = Orbiting(phase2_orbit.pursuit(state.local_pose, state.orbit, state.config.mission))
+    return state if next_mode is state.mode else replace(state, mode=next_mode)
 
 
-# --- what a mind implies ----------------------------------------------------------------------------
+# --- commands -----------------------------------------------------------------------------------------
 
 
-def _controls(state: RobotState) -> Controls:
-    """What its state has it do; less, where it is in range of a peer of which it knows no more."""
-    controls, mission = _intended(state), state.config.mission
-    blind = state.phase < 3 or isinstance(state.mode, Retreating)
-    if not (mission.safety_distance and state.in_contact and blind):
+def _safe_controls(state: RobotState) -> Controls:
+    """Return the controls for the next tick, limited so that the safety distance is kept.
+
+    The limit applies in contact while the robot does not plan with the peer's position: before phase 3, and
+    on the way back into range.
+    """
+    controls, mission = _mode_controls(state), state.config.mission
+    plans_alone = state.phase < 3 or isinstance(state.mode, Retreating)
+    if not (mission.safety_distance and state.in_contact and plans_alone):
         return controls
-    if not state.mutual or state.mutual[-1].tick != state.tick:  # a drop-out
+    if not state.mutual or state.mutual[-1].tick != state.tick:  # the range was not measured
         return REST
     return separation.slowed(
-        controls, separation.BOTH * separation.leeway(state.mutual[-1].range, mission), mission
+        controls, separation.SHARE_OF_EACH * separation.leeway(state.mutual[-1].range, mission), mission
     )
 
 
-def _intended(state: RobotState) -> Controls:
+def _mode_controls(state: RobotState) -> Controls:
+    """Return the controls of the current mode."""
     match state.mode:
-        case Aligning() | Radial() | Tangent() | Orbiting() if encounter.lingers(state):
+        case Aligning() | Radial() | Tangent() | Orbiting() if encounter.must_wait(state):
             return REST
         case Orbiting(command):
             return command or Controls(state.orbit.v, state.orbit.omega)
@@ -360,6 +396,6 @@ def _intended(state: RobotState) -> Controls:
         case Surveying(command=controls) | Retreating(controls):
             return controls
         case Homing():
-            return range_seeking.homeward(state.mode, state.odometry, state.config.mission) or REST
+            return range_seeking.homing_controls(state.mode, state.odometry, state.config.mission) or REST
         case _:
             return REST

@@ -1,6 +1,6 @@
-"""Whether what a peer tells can be so: against what it told before, what it can drive, and what it measured.
+"""Plausibility checks of a peer's reports: against its earlier reports, its limits and its own measurements.
 
-What the mutual ranges say of it is weighed where they are: `meeting`, and under noise `survey`.
+The mutual ranges are evaluated elsewhere: in `encounter`, and with noisy sensors in `inference`.
 """
 
 from __future__ import annotations
@@ -16,91 +16,99 @@ from protocol.mission import Mission
 from protocol.motion import wrap
 
 SLACK = 1e-9
-"""of v_max and omega_max: rounding"""
+"""The relative tolerance of v_max and omega_max for rounding."""
 
 NOISY = 6.0
-"""standard deviations: more than this is no noise of wheels or odometry"""
+"""The largest plausible noise of actuation and odometry, in standard deviations."""
 
 EXACT = 1e-6
-"""m and rad: where sensors are exact, what is told of one tick agrees so far"""
+"""The tolerance in m and rad within which the data of one tick agree, with exact sensors."""
 
 
 def objection(
     before: PeerState, after: PeerState, report: Report, config: RobotConfig
 ) -> Inconsistent | None:
-    """What in `report` cannot be so, which led from `before` to `after`; None if all of it may be."""
+    """Return the first contradiction in `report`, which changed the peer's state from `before` to `after`.
+
+    The result is None if the report is plausible.
+    """
     return (
-        _second_story(before, report, config.mission)
-        or _impossible_drive(report, config.mission)
+        _changed_report(before, report, config.mission)
+        or _exceeded_limit(report, config.mission)
         or (_ranges_off_path(before, after, config.mission) if config.mission.noise.exact else None)
         or (_off_orbit(after, report, config) if config.mission.noise.exact else None)
     )
 
 
-def _second_story(before: PeerState, report: Report, mission: Mission) -> Inconsistent | None:
-    """What was told once is told the same ever after."""
+def _changed_report(before: PeerState, report: Report, mission: Mission) -> Inconsistent | None:
+    """Return a contradiction if the report differs from an earlier report about the same ticks."""
     last = min(report.through, before.peer.through)
     if report.since < last:
-        told = MotionLog(report.through - report.since, report.runs)
-        if told.between(0, last - report.since) != before.peer.between(report.since, last):
-            return Inconsistent(f"manoeuvres over [{report.since}, {last}] that it told otherwise before")
+        reported = MotionLog(report.through - report.since, report.runs)
+        if reported.between(0, last - report.since) != before.peer.between(report.since, last):
+            return Inconsistent(f"manoeuvres over [{report.since}, {last}] that contradict an earlier report")
     known = before.peer.ranges[report.ranges_since :][: len(report.ranges)]
     if known != report.ranges[: len(known)]:
-        return Inconsistent("ranges to its anchor that it told otherwise before")
+        return Inconsistent("ranges to its anchor that contradict an earlier report")
     if mission.noise.exact and before.start is not None and report.start not in (None, before.start):
-        return Inconsistent("a start that it told otherwise before")
+        return Inconsistent("a start that contradicts an earlier report")
     return None
 
 
-def _impossible_drive(report: Report, mission: Mission) -> Inconsistent | None:
-    """Nobody drives faster than v_max, or turns faster than omega_max."""
+def _exceeded_limit(report: Report, mission: Mission) -> Inconsistent | None:
+    """Return a contradiction if a speed exceeds v_max or a turn rate exceeds omega_max."""
     noise = mission.noise
-    speed = _most(mission.max_speed, noise.actuation.v, noise.odometry.v, noise.standstill_bound[0])
-    rate = _most(
+    speed = _largest_measurement(
+        mission.max_speed, noise.actuation.v, noise.odometry.v, noise.standstill_bound[0]
+    )
+    rate = _largest_measurement(
         mission.max_turn_rate, noise.actuation.omega, noise.odometry.omega, noise.standstill_bound[1]
     )
     for run in report.runs:
-        for what, value, most in (("v", abs(run.v), speed), ("omega", abs(run.omega), rate)):
-            if value > most:
-                return Inconsistent(f"{what} = {value:.6g}, of {most:.6g} at the most", value - most)
+        for name, value, largest in (("v", abs(run.v), speed), ("omega", abs(run.omega), rate)):
+            if value > largest:
+                return Inconsistent(f"{name} = {value:.6g}, limit {largest:.6g}", value - largest)
     return None
 
 
-def _most(asked: float, by_wheels: float, by_odometry: float, floor: float) -> float:
-    """What is hardly ever measured to be more, where `asked` is the most that is asked for."""
-    return asked * (1.0 + SLACK + NOISY * math.hypot(by_wheels, by_odometry)) + floor
+def _largest_measurement(limit: float, actuation: float, odometry: float, floor: float) -> float:
+    """Return the largest plausible measurement of a speed of at most `limit`, with both kinds of noise."""
+    return limit * (1.0 + SLACK + NOISY * math.hypot(actuation, odometry)) + floor
 
 
 def _ranges_off_path(before: PeerState, after: PeerState, mission: Mission) -> Inconsistent | None:
-    """Its ranges to its anchor are those of the path that it tells; those that are news are looked at."""
-    book, start = after.peer, after.start
+    """Return a contradiction if a range to the peer's anchor does not agree with the reported path.
+
+    Only ranges that could not be checked before are checked.
+    """
+    log, start = after.peer, after.start
     if start is None:
         return None
-    for place, ranged in enumerate(book.ranges):
-        seen = place < len(before.peer.ranges) and ranged.tick <= before.peer.through
-        if ranged.tick > book.through or (seen and before.start is not None):
+    for index, ranged in enumerate(log.ranges):
+        checked = index < len(before.peer.ranges) and ranged.tick <= before.peer.through
+        if ranged.tick > log.through or (checked and before.start is not None):
             continue
-        pose = book.pose(start, ranged.tick, mission.period)
-        off = abs(math.hypot(pose.x, pose.y) - ranged.range)
-        if off > EXACT * max(1.0, ranged.range):
+        pose = log.pose(start, ranged.tick, mission.period)
+        residual = abs(math.hypot(pose.x, pose.y) - ranged.range)
+        if residual > EXACT * max(1.0, ranged.range):
             return Inconsistent(
-                f"a range to its anchor at tick {ranged.tick} that is not of the path it tells", off
+                f"a range to its anchor at tick {ranged.tick} that contradicts its path", residual
             )
     return None
 
 
 def _off_orbit(after: PeerState, report: Report, config: RobotConfig) -> Inconsistent | None:
-    """Who orbits is on its circle, and heads along it."""
+    """Return a contradiction if an orbiting peer is off its orbit, or does not head along it."""
     plan = config.rendezvous
     orbit = plan.b if config.role == "a" else plan.a
     if report.state != MODE_NAMES[Orbiting] or after.start is None or after.peer.through != report.tick:
         return None
     pose = after.peer.pose(after.start, report.tick, config.mission.period)
-    off = abs(math.hypot(pose.x, pose.y) - orbit.radius)
-    if off > EXACT * max(1.0, orbit.radius):
-        return Inconsistent(f"a place off the orbit that it is on at tick {report.tick}", off)
-    along = math.copysign(0.5 * math.pi, orbit.omega)
-    askew = abs(wrap(pose.heading - math.atan2(pose.y, pose.x) - along))
-    if orbit.v != 0.0 and askew > EXACT:
-        return Inconsistent(f"a heading that is none of the orbit that it is on at tick {report.tick}", askew)
+    residual = abs(math.hypot(pose.x, pose.y) - orbit.radius)
+    if residual > EXACT * max(1.0, orbit.radius):
+        return Inconsistent(f"a position off its orbit at tick {report.tick}", residual)
+    tangent = math.copysign(0.5 * math.pi, orbit.omega)
+    heading_residual = abs(wrap(pose.heading - math.atan2(pose.y, pose.x) - tangent))
+    if orbit.v != 0.0 and heading_residual > EXACT:
+        return Inconsistent(f"a heading off the tangent of its orbit at tick {report.tick}", heading_residual)
     return None

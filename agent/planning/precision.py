@@ -25,18 +25,18 @@ def size(state: RobotState) -> float:
     return state.config.anchor_distance + state.config.mission.sensing_range
 
 
-def drifted(state: RobotState, log: MotionLog, tick: int) -> float:
+def range_rounding(state: RobotState, log: MotionLog, tick: int) -> float:
     """Return the bound in m on the rounding error of a range at `tick`, from the odometry of `log`."""
-    return _rounded(size(state), log.until(tick), state.config.mission.period)
+    return _path_rounding(size(state), log.until(tick), state.config.mission.period)
 
 
-def _rounded(extent: float, runs: Sequence[Segment], period: float) -> float:
+def _path_rounding(extent: float, runs: Sequence[Segment], period: float) -> float:
     """Return the bound in m on the rounding error of a range after `runs`; `extent` is `size`."""
-    path = turned = 0.0
+    path = rotation = 0.0
     for run in runs:
         path += abs(run.v) * run.ticks
-        turned += abs(run.omega) * run.ticks
-    return rounding(extent, len(runs), path * period, turned * period)
+        rotation += abs(run.omega) * run.ticks
+    return rounding(extent, len(runs), path * period, rotation * period)
 
 
 def margin(mission: Mission, floor: float) -> float:
@@ -52,21 +52,25 @@ class Known(msgspec.Struct, frozen=True):
     """The anchor error after the first of a robot's anchor ranges."""
 
     error: float
-    """m: the bound on the error of the anchor's position"""
+    """The bound in m on the error of the anchor's position."""
     ranges: int
-    """the number of ranges that give this error"""
+    """The number of ranges that give this error."""
     enough: bool = False
-    """whether phase 1 may end"""
+    """True if phase 1 may end."""
 
 
 def anchor(state: RobotState, start: Pose, log: MotionLog) -> Known:
     """Return the smallest anchor error of the robot of `log`, whose branch begins at `start`.
 
-    Phase 1 may end in three cases. Either the error is at most WELL of `required_anchor_error`; or it is at most
-    `required_anchor_error`, and the last range hardly reduced it (BETTER); or OUT_AND_BACK ranges did not reduce it. In
-    the last case rounding grows faster than the ranges inform, and `pinned_down` decides in the encounter
-    whether the error is small enough. Later ranges are ignored, so that both robots of a pair, which have
-    the same ranges, compute the same result.
+    Phase 1 may end in three cases:
+
+    - The error is at most WELL times `required_anchor_error`.
+    - The error is at most `required_anchor_error`, and the last range hardly reduced it (BETTER).
+    - OUT_AND_BACK ranges did not reduce the error. The rounding error then grows faster than the information,
+      and `pinned_down` decides in the encounter whether the anchor error is small enough.
+
+    Later ranges are ignored, so that both robots of a pair, which have the same ranges, compute the same
+    result.
     """
     mission, extent = state.config.mission, size(state)
     enough = required_anchor_error(extent, state.config.anchor_distance, mission.sensing_range)
@@ -77,14 +81,14 @@ def anchor(state: RobotState, start: Pose, log: MotionLog) -> Known:
         if one.tick > log.through:
             break
         runs = log.until(one.tick)
-        floor = _rounded(extent, runs, mission.period)
+        floor = _path_rounding(extent, runs, mission.period)
         ranged.append((follow(ORIGIN, runs, mission.period), one.range, floor))
         if len(ranged) == 1 and start.x > enough:
-            continue  # the range at the start does not depend on the heading
+            continue  # The range at the start does not depend on the heading.
         before, error = error, anchor_error(start, ranged)
         if error < least or len(ranged) <= FITTED:
             least, ranges = error, len(ranged)
-        # branches that `weigh_branches` merged later differ by its larger floor
+        # Branches that `weigh_branches` merged later differ by its larger floor.
         known = least + SAME * (floor - ranged[ranges - 1][2])
         stalled = len(ranged) >= FITTED and error > BETTER * before
         spent = len(ranged) - ranges == OUT_AND_BACK
@@ -125,38 +129,41 @@ def peer_anchor(state: RobotState) -> float:
     return anchor(state, state.peer_state.start, state.peer_state.peer).error
 
 
-def drift(state: RobotState) -> float:
-    """Return the bound in m on both odometries' rounding, added up until now."""
-    return _drift(state, min(state.tick, state.peer_state.peer.through))
+def odometry_rounding(state: RobotState) -> float:
+    """Return the bound in m on the sum of both odometries' rounding errors until now."""
+    return _odometry_rounding_until(state, min(state.tick, state.peer_state.peer.through))
 
 
-def _drift(state: RobotState, tick: int) -> float:
-    return drifted(state, state.log, tick) + drifted(state, state.peer_state.peer, tick)
+def _odometry_rounding_until(state: RobotState, tick: int) -> float:
+    """Return the bound in m on the sum of both odometries' rounding errors until `tick`."""
+    return range_rounding(state, state.log, tick) + range_rounding(state, state.peer_state.peer, tick)
 
 
-def apart(state: RobotState) -> float:
-    """Return the bound in m on both anchors' errors and both odometries' rounding, added up until now."""
-    return _apart(state, min(state.tick, state.peer_state.peer.through))
+def combined_error(state: RobotState) -> float:
+    """Return the bound in m on both anchor errors and both odometries' rounding errors until now."""
+    return _combined_error_until(state, min(state.tick, state.peer_state.peer.through))
 
 
-def _apart(state: RobotState, tick: int) -> float:
+def _combined_error_until(state: RobotState, tick: int) -> float:
+    """Return the bound in m on both anchor errors and both odometries' rounding errors until `tick`."""
     own, peers = state.belief.own_anchor, state.belief.peer_anchor
     assert peers is not None
-    return own + peers + _drift(state, tick)
+    return own + peers + _odometry_rounding_until(state, tick)
 
 
 def pinned_down(
-    state: RobotState, placement: Placement, ranged: Sequence[PairObservation], off: float
+    state: RobotState, placement: Placement, ranged: Sequence[PairObservation], error_bound: float
 ) -> bool:
-    """Return whether the sightings in `ranged` determine `placement` to SURE; `off` is `apart`.
+    """Return whether the observations in `ranged` determine `placement` to SURE.
 
-    Only rounding between the first and the last sighting makes the errors of their ranges differ. Rounding
-    before the first one shifts all ranges alike, as an anchor error does.
+    `error_bound` is `combined_error`. Only rounding between the first and the last observation makes the
+    errors of their ranges differ. Rounding before the first one shifts all ranges alike, as an anchor error
+    does.
     """
     first, last = ranged[0].tick, ranged[-1].tick
     period, extent = state.config.mission.period, size(state)
     floor = 0.0
     for log in (state.log, state.peer_state.peer):
-        floor += 0.5 * _rounded(extent, log.between(first, last), period)
-    turned = turn_error(placement, ranged, floor, _apart(state, first))
-    return off + turned * max(1.0, extent) <= SURE
+        floor += 0.5 * _path_rounding(extent, log.between(first, last), period)
+    rotation_error = turn_error(placement, ranged, floor, _combined_error_until(state, first))
+    return error_bound + rotation_error * max(1.0, extent) <= SURE

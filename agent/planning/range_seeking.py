@@ -1,8 +1,8 @@
-"""How a robot takes a second range of a beacon (Section III.A.2): straight ahead, else about where it was.
+"""The search for a second range to a beacon (Section III.A.2): straight ahead, else on a circle.
 
-In between, `assured` looks straight behind: sooner than round a circle, and mostly in range.
-
-Phase 1 does it with the anchor, and a does it again in phase 3, with b in the anchor's place.
+The beacon is the anchor in phase 1, and robot b in phase 3, where robot a takes its second mutual range.
+After the straight, `assured` also tries the point straight behind before the circle: it is reached sooner
+than a point of the circle, and is mostly in range.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from protocol.mission import Mission, PlannerName
 from protocol.motion import REST, TAU, Controls, Pose, wrap
 
 ARRIVED = 1e-9
-"""rad, and of A_0: nearer than this is there; the odometry knows the rest"""
+"""The tolerance in rad, and relative to A_0, at which a target is reached. The odometry is exact."""
 
 CLOSE = 0.05
-"""rad, and of A_0: nearer than this is there, where wheels are noisy"""
+"""The same tolerance with noisy actuation or sensors."""
 
 Beacon = Literal["anchor", "peer"]
 
 
 class Straight(msgspec.Struct, frozen=True):
-    """Drives A_0 ahead; then looks whether the beacon ranges it there."""
+    """The robot drives A_0 straight ahead from `origin`, and then checks for a range to the beacon."""
 
     beacon: Beacon
     origin: Pose
     rho0: float
-    """m: the range at `origin`"""
+    """The range to the beacon at `origin` in m."""
 
 
 class Backing(msgspec.Struct, frozen=True):
-    """Has left the beacon's range ahead, and drives back to A_0 behind `origin`."""
+    """The robot was out of range ahead. It drives back to the point A_0 behind `origin`."""
 
     beacon: Beacon
     origin: Pose
@@ -43,7 +43,7 @@ class Backing(msgspec.Struct, frozen=True):
 
 
 class Turning(msgspec.Struct, frozen=True):
-    """Has left the beacon's range, and turns by pi / 2 on the spot, to have `origin` on its left."""
+    """The robot is out of range. It turns by pi / 2 on the spot, so that `origin` is on its left."""
 
     beacon: Beacon
     origin: Pose
@@ -52,7 +52,7 @@ class Turning(msgspec.Struct, frozen=True):
 
 
 class Circling(msgspec.Struct, frozen=True):
-    """Drives a circle of radius A_0 about `origin`, until the beacon ranges it."""
+    """The robot drives a circle of radius A_0 about `origin` until it measures a range to the beacon."""
 
     beacon: Beacon
     origin: Pose
@@ -60,7 +60,7 @@ class Circling(msgspec.Struct, frozen=True):
 
 
 class Homing(msgspec.Struct, frozen=True):
-    """Has lost its anchor, and drives back to where it was ranged last."""
+    """The robot has lost its anchor. It drives back to the place of the last anchor range."""
 
     place: Pose
 
@@ -68,42 +68,45 @@ class Homing(msgspec.Struct, frozen=True):
 Seeking = Straight | Backing | Turning | Circling
 
 
-def stretch(beacon: Beacon, rho0: float, mission: Mission) -> float:
-    """m: how far a robot goes from where it ranged `beacon` at `rho0` m: A_0; less towards a peer nearby."""
+def step_length(beacon: Beacon, rho0: float, mission: Mission) -> float:
+    """Return the length in m of the straight from a point with range `rho0` in m to `beacon`.
+
+    The length is A_0, or less to keep a safety distance from the peer.
+    """
     step = mission.first_straight
     return step if beacon == "anchor" else min(step, leeway(rho0, mission))
 
 
-def arrived(mission: Mission) -> tuple[float, float]:
-    """m and rad: how near is there."""
+def arrival_tolerances(mission: Mission) -> tuple[float, float]:
+    """Return the tolerances in m and rad within which a target is reached."""
     share = ARRIVED if mission.noise.exact else CLOSE
     return share * mission.first_straight, share
 
 
 def travelled(origin: Pose, pose: Pose) -> float:
-    """m, as the crow flies."""
+    """Return the distance in m between two poses."""
     return math.hypot(pose.x - origin.x, pose.y - origin.y)
 
 
 def moved(origin: Pose, pose: Pose) -> bool:
-    """Whether a manoeuvre begun at `origin` has been executed; in real time it may not have been."""
+    """Return whether the manoeuvre that began at `origin` was executed; in real time it may not be."""
     return pose != origin
 
 
-def ahead(origin: Pose, pose: Pose) -> float:
-    """m from `origin` to `pose`, along the heading there; negative behind it."""
+def distance_ahead(origin: Pose, pose: Pose) -> float:
+    """Return the distance in m from `origin` to `pose` along the heading of `origin`; negative behind it."""
     return (pose.x - origin.x) * math.cos(origin.heading) + (pose.y - origin.y) * math.sin(origin.heading)
 
 
 def onward(
     state: Seeking, pose: Pose, measured: bool, mission: Mission, planner_name: PlannerName
 ) -> Seeking | None:
-    """The state after a tick that led to `pose`; None once there is a second range."""
-    there, facing = arrived(mission)
-    step = stretch(state.beacon, state.rho0, mission)
+    """Return the mode after a tick that led to `pose`, or None once the second range is measured."""
+    distance_tolerance, angle_tolerance = arrival_tolerances(mission)
+    step = step_length(state.beacon, state.rho0, mission)
     match state:
         case Straight(beacon, origin, rho0):
-            if travelled(origin, pose) < step - there:
+            if travelled(origin, pose) < step - distance_tolerance:
                 return state
             if measured:
                 return None
@@ -111,23 +114,23 @@ def onward(
                 return Backing(beacon, origin, rho0)
             return Turning(beacon, origin, rho0, pose.heading + math.pi / 2)
         case Backing(beacon, origin, rho0):
-            if ahead(origin, pose) > there - step:
+            if distance_ahead(origin, pose) > distance_tolerance - step:
                 return state
             return None if measured else Turning(beacon, origin, rho0, pose.heading - math.pi / 2)
         case Turning(beacon, origin, rho0, heading):
-            return state if abs(heading - pose.heading) > facing else Circling(beacon, origin, rho0)
+            return state if abs(heading - pose.heading) > angle_tolerance else Circling(beacon, origin, rho0)
         case Circling():
             return None if measured else state
 
 
 def controls(state: Seeking, pose: Pose, mission: Mission) -> Controls:
-    """What `state` drives from `pose`."""
-    step = stretch(state.beacon, state.rho0, mission)
+    """Return the controls of the mode `state` at `pose`."""
+    step = step_length(state.beacon, state.rho0, mission)
     match state:
         case Straight(_, origin):
             return straight(step - travelled(origin, pose), mission)
         case Backing(_, origin):
-            return straight(-step - ahead(origin, pose), mission)
+            return straight(-step - distance_ahead(origin, pose), mission)
         case Turning(heading=heading):
             return turn(pose, heading, mission)
         case Circling(_, _, rho0):
@@ -139,37 +142,43 @@ def controls(state: Seeking, pose: Pose, mission: Mission) -> Controls:
             return Controls(omega * step, omega)
 
 
-def homeward(state: Homing, pose: Pose, mission: Mission) -> Controls | None:
-    """What leads on to its place, backwards where that is the shorter turn; None once there."""
-    there, facing = arrived(mission)
+def homing_controls(state: Homing, pose: Pose, mission: Mission) -> Controls | None:
+    """Return the controls that lead to the place of `state`, or None once the robot is there.
+
+    The robot drives backward if that needs the smaller turn.
+    """
+    distance_tolerance, angle_tolerance = arrival_tolerances(mission)
     distance = travelled(pose, state.place)
-    if distance <= there:
+    if distance <= distance_tolerance:
         return None
-    askew = wrap(math.atan2(state.place.y - pose.y, state.place.x - pose.x) - pose.heading)
-    forward = abs(askew) <= math.pi / 2
-    left = askew if forward else wrap(askew + math.pi)
-    if abs(left) > facing:
-        return turn(pose, pose.heading + left, mission)
+    bearing_error = wrap(math.atan2(state.place.y - pose.y, state.place.x - pose.x) - pose.heading)
+    forward = abs(bearing_error) <= math.pi / 2
+    remaining_turn = bearing_error if forward else wrap(bearing_error + math.pi)
+    if abs(remaining_turn) > angle_tolerance:
+        return turn(pose, pose.heading + remaining_turn, mission)
     return straight(distance if forward else -distance, mission)
 
 
 def inside_arc(rho0: float, radius: float, reach: float) -> float:
-    """2 pi - 2 eta in rad (Section III.A.2): how much of the circle of `radius`, about a point `rho0` from
-    the beacon, is within its `reach`; all in m."""
-    rho0 = min(rho0, reach)  # an outlier may be longer
+    """Return 2 pi - 2 eta in rad (Section III.A.2): the part of a circle that is in range of the beacon.
+
+    The circle has the radius `radius` and its centre is `rho0` from the beacon, whose range is `reach`; all
+    in m.
+    """
+    rho0 = min(rho0, reach)  # an outlier may be longer than R
     cosine = (reach * reach - rho0 * rho0 - radius * radius) / (2.0 * radius * rho0) if rho0 > 0.0 else 1.0
     return TAU - 2.0 * math.acos(min(1.0, max(-1.0, cosine)))
 
 
 def turn(pose: Pose, heading: float, mission: Mission) -> Controls:
-    """Towards `heading` on the spot, as far as one tick allows."""
-    left = (heading - pose.heading) / mission.period
-    if left == 0.0:
+    """Return the controls of a turn on the spot towards `heading`, limited to one tick."""
+    rate = (heading - pose.heading) / mission.period
+    if rate == 0.0:
         return REST
-    return Controls(0.0, math.copysign(min(abs(left), mission.max_turn_rate), left))
+    return Controls(0.0, math.copysign(min(abs(rate), mission.max_turn_rate), rate))
 
 
 def straight(distance: float, mission: Mission) -> Controls:
-    """Ahead by `distance` m, or back where it is negative, as far as one tick allows."""
-    left = distance / mission.period
-    return Controls(math.copysign(min(abs(left), mission.max_speed), left), 0.0)
+    """Return the controls of a straight by `distance` m (backward if negative), limited to one tick."""
+    speed = distance / mission.period
+    return Controls(math.copysign(min(abs(speed), mission.max_speed), speed), 0.0)

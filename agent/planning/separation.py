@@ -1,4 +1,4 @@
-"""How two robots that range each other keep `safety_distance`, wherever each may think that the other is."""
+"""The safety distance between two robots in range of each other, for all poses that may be true."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from protocol.motion import Controls, Pose
 Array = NDArray[np.float64]
 
 CHORDS = 16
-"""of an arc that is looked at: half a circle of 1 m is 1.5 mm from them at the most"""
+"""The number of chords per arc. Half a circle of 1 m arc length is at most 1.5 mm from its chords."""
 
 SIGMAS = 3.0
-"""by which a noisy range may be too long"""
+"""The assumed largest error of a noisy range, in standard deviations."""
 
-BOTH = 0.5
-"""of the way that is left: what each may take, where the other may be driving, too"""
+SHARE_OF_EACH = 0.5
+"""The share of the remaining distance that each robot may use while the other one may be driving too."""
 
 
 def leeway(rho: float, mission: Mission) -> float:
-    """m that a robot may go, whichever way, `rho` m from a peer that stands."""
+    """Return how far in m a robot may go in any direction, `rho` m from a peer that stands still."""
     if not mission.safety_distance:
         return math.inf
     return max(0.0, rho - SIGMAS * mission.noise.mutual_sigma - mission.safety_distance)
 
 
 def slowed(controls: Controls, metres: float, mission: Mission) -> Controls:
-    """The same arc, as far along it as `metres`."""
+    """Return `controls` with the same arc, shortened to the length `metres` in m."""
     length = abs(controls.v) * mission.period
     if length <= metres:
         return controls
@@ -38,9 +38,10 @@ def slowed(controls: Controls, metres: float, mission: Mission) -> Controls:
 
 
 def nearest(pose: Pose, v: Array, omega: Array, point: tuple[float, float], period: float) -> Array:
-    """m: how near the arcs from `pose` come to `point`, at the least; of the shape of `v` and `omega`.
+    """Return the smallest distance in m between `point` and each arc from `pose`; the shape is that of `v`.
 
-    By their chords, and how far an arc may be from its own.
+    The result is a lower bound: the distance to the chords, minus the largest distance of an arc from its
+    chord.
     """
     x, y = np.full(v.shape, pose.x - point[0]), np.full(v.shape, pose.y - point[1])
     half = 0.5 * omega * period / CHORDS

@@ -1,4 +1,4 @@
-"""Everything that one robot knows, as one value; and what it is doing, as one of the states of the paper."""
+"""The complete state of one robot as one frozen value, and its mode: one type per state of the paper."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from protocol.orbits import Orbit
 
 
 class Asleep(msgspec.Struct, frozen=True):
-    """Has not sensed anything yet."""
+    """The robot has not measured its first anchor range yet."""
 
 
 class Done(msgspec.Struct, frozen=True):
-    """Has come to its verdict; stands, and keeps telling the peer."""
+    """The robot has reached its verdict. It stands still and continues to send reports to its peer."""
 
     phase: int
     verdict: messages.Verdict
@@ -64,75 +64,85 @@ MODE_NAMES: dict[type, str] = {
 
 
 class Belief(msgspec.Struct, frozen=True):
-    """What phases 1 and 3 have found out, beside the state."""
+    """The results of phases 1 and 3: hypotheses, counts and the reasons for and against a claim.
+
+    Fields marked "exact sensors" or "noisy sensors" are set only in that case.
+    """
 
     possible: tuple[Branch, ...] = ()
-    """where sensors are exact: what the first two ranges left, before silence was weighed"""
+    """Exact sensors: the branches that the first two anchor ranges allow."""
     branch: Branch | None = None
-    """the one that is left after phase 1"""
+    """The branch selected at the end of phase 1. With noisy sensors, the most probable branch so far."""
     branch_kind: messages.BranchKind | None = None
     phase1_done_tick: int | None = None
-    """the tick in which phase 1 was over, for the first time"""
+    """The tick in which phase 1 ended for the first time."""
     encounter_tick: int | None = None
-    """the tick in which phase 3 began"""
+    """The tick in which phase 3 began."""
     placements: tuple[Placement, ...] = ()
-    """those of eq. (7) that are left"""
+    """The solutions of eq. (7) that no measurement has ruled out."""
     candidates: tuple[int, int] | None = None
-    """how many there were at first: all of them, and what silence left"""
+    """The number of candidates at the beginning, and after their evaluation.
+
+    Exact sensors: the solutions of eq. (7), and those that agree with the ticks without detection. Noisy
+    sensors: the hypotheses of the first search, and the present ones.
+    """
     plan: Plan | None = None
     own_anchor: float = 0.0
-    """where sensors are exact: how far off, in m, its anchor may be, by the ranges of phase 1"""
+    """Exact sensors: the bound in m on the error of the own anchor's position, from the ranges of phase 1."""
     peer_anchor: float | None = None
-    """the same of its peer's"""
+    """Exact sensors: the same bound in m for the peer and its anchor."""
     own: tuple[Hypothesis, ...] = ()
-    """under noise: of where its anchor is"""
+    """Noisy sensors: the hypotheses about the position of the own anchor, the most probable first."""
     branches: tuple[Branch, ...] = ()
-    """by each of these"""
+    """The branch that corresponds to each hypothesis in `own`."""
     pair: tuple[Hypothesis, ...] = ()
-    """under noise: of how both lie in <W>"""
+    """Noisy sensors: the hypotheses about both robots' poses in <W>, the most probable first."""
     poses: tuple[Pose, ...] = ()
-    """in <W>, by each of these"""
+    """The robot's pose in <W> under each hypothesis in `pair`."""
     covariance: Covariance | None = None
-    """of the first"""
+    """The covariance of the first pose in `poses`."""
     blocking_reason: str | None = None
-    """under noise: what there is to know yet, before it can claim"""
+    """Noisy sensors: the condition that still prevents a claim; None if every condition is met."""
     ranges_at_last_search: int = 0
-    """under noise: how many mutual ranges there were when the whole plane was last searched"""
-    against: Inconsistency | None = None
-    """under noise: what most speaks against the first"""
+    """Noisy sensors: the number of mutual ranges at the latest search of the whole plane for hypotheses."""
+    inconsistency: Inconsistency | None = None
+    """Noisy sensors: the result of the consistency test of the most probable hypothesis."""
     p_value: float | None = None
-    """under noise: the least of all searches of the whole plane"""
-    doubts: int = 0
-    """under noise: how often on end the ranges have spoken against what the peer tells"""
+    """Noisy sensors: the smallest p-value of all searches of the whole plane."""
+    inconsistent_searches: int = 0
+    """Noisy sensors: the number of consecutive searches whose consistency test failed."""
     returns: int = 0
-    """under noise: how often it went back to its anchor"""
+    """Noisy sensors: the number of times that the robot drove back to its anchor."""
 
 
 class RobotState(msgspec.Struct, frozen=True):
-    """Everything that a robot knows."""
+    """Everything that a robot knows, and what it is doing (`mode`). The planner maps it to the next one."""
 
     config: RobotConfig
     mode: Mode = Asleep()
     tick: int = -1
     odometry: Pose = ORIGIN
-    """now, in the frame of tick 0"""
+    """The current pose in the frame of the pose at tick 0, by dead reckoning."""
     log: MotionLog = MotionLog()
     mutual: tuple[Ranged, ...] = ()
     belief: Belief = Belief()
     peer_state: PeerState = PeerState()
     in_contact: bool = False
-    """whether the peer is in range in this tick"""
+    """True if the peer is in range in this tick."""
     leg: Pose = ORIGIN
-    """the odometry when the last run of the log began"""
+    """The odometry at the beginning of the last segment of the log."""
 
     @property
     def orbit(self) -> Orbit:
-        """This robot's part of the rendezvous."""
+        """Return the orbit of this robot in phase 2."""
         return self.config.rendezvous.of(self.config.role)
 
     @property
     def off_anchor(self) -> bool:
-        """Whether b, be it this robot or the peer, is where it can be met; phase 1 is done by both."""
+        """Return whether robot b is far enough from its anchor for phase 3 (see `phase2_orbit.off_anchor`).
+
+        Robot b is this robot or the peer. The pose of the peer is known only after its phase 1.
+        """
         assert self.peer_state.start is not None
         if self.config.role == "b":
             local = self.local_pose
@@ -142,7 +152,7 @@ class RobotState(msgspec.Struct, frozen=True):
 
     @property
     def phase(self) -> int:
-        """The paper's: 1, 2 or 3."""
+        """Return the phase of the paper: 1, 2 or 3."""
         match self.mode:
             case Orbiting() | Aligning() | Radial() | Tangent():
                 return 2
@@ -159,7 +169,7 @@ class RobotState(msgspec.Struct, frozen=True):
 
     @property
     def mode_name(self) -> str:
-        """The state in a word."""
+        """Return the name of the mode that reports, commands and recordings use."""
         match self.mode:
             case Done(_, Localised()):
                 return "localised"
@@ -172,30 +182,30 @@ class RobotState(msgspec.Struct, frozen=True):
 
     @property
     def verdict(self) -> messages.Verdict | None:
-        """What it has come to, if it has."""
+        """Return the verdict, or None if the robot has not reached one."""
         return self.mode.verdict if isinstance(self.mode, Done) else None
 
     def undecided(self, reason: str) -> RobotState:
-        """It cannot go on, and does not guess."""
+        """Return this state, ended with the verdict Undecided: the robot cannot continue."""
         return replace(self, mode=Done(self.phase, Undecided(reason)))
 
-    def alarmed(self, alarm: Inconsistent) -> RobotState:
-        """The peer tells what cannot be so."""
-        return replace(self, mode=Done(self.phase, alarm))
+    def inconsistent(self, contradiction: Inconsistent) -> RobotState:
+        """Return this state, ended with the verdict Inconsistent: the peer's reports are contradictory."""
+        return replace(self, mode=Done(self.phase, contradiction))
 
     @property
     def start(self) -> Pose:
-        """Where tick 0 lies in the frame of its anchor; known from phase 2 on."""
+        """Return the pose of tick 0 in the frame of the robot's anchor; known from phase 2 on."""
         assert self.belief.branch is not None
         return self.belief.branch.start
 
     @property
     def local_pose(self) -> Pose:
-        """Where it is in the frame of its anchor; known from phase 2 on."""
+        """Return the current pose in the frame of the robot's anchor; known from phase 2 on."""
         return compose(self.start, self.odometry)
 
     def world_pose(self, placement: Placement) -> Pose:
-        """Where it is in <W>, if that is how <a(M1)> lies in <b(M2)>."""
+        """Return the current pose in <W> if `placement` is the placement of <a(M1)> in <b(M2)>."""
         own, peer = self.config.anchor, self.config.peer_anchor
         m1, m2 = (own, peer) if self.config.role == "a" else (peer, own)
         turn = math.atan2(m1.y - m2.y, m1.x - m2.x) - math.atan2(placement.y, placement.x)
@@ -204,16 +214,17 @@ class RobotState(msgspec.Struct, frozen=True):
         return compose(Pose(own.x, own.y, turn), self.local_pose)
 
     def seen(self) -> list[tuple[Pose, float | None]]:
-        """Every tick of phase 1: the odometry, and the anchor's range or its silence.
+        """Return the odometry pose of each tick of phase 1, and the anchor range or None.
 
-        Not beyond: from phase 2 on the log leaves out the ranges that say nothing new.
+        The result is not valid after phase 1: from phase 2 on, the log leaves out anchor ranges that repeat
+        the last one.
         """
         ranges = {ranged.tick: ranged.range for ranged in self.log.ranges}
         track = self.log.track(ORIGIN, 0, self.tick, self.config.mission.period)
         return [(pose, ranges.get(tick)) for tick, pose in enumerate(track)]
 
     def pair_observations(self, first: int) -> list[PairObservation]:
-        """Every tick from `first` on that both robots' logs cover: where both were, and the range between."""
+        """Return both poses and the mutual range of each tick from `first` on that both logs cover."""
         last = min(self.tick, self.peer_state.peer.through)
         if self.peer_state.start is None or last < first:
             return []
