@@ -311,7 +311,7 @@ def test_a_tick_that_an_agent_has_left_out_is_missed(folder: Path) -> None:
     told = [one for one in messages(folder / A) if getattr(one, "tick", None) != 12]
     written(folder / A, told)
     assert [one.line for one in audit(folder).violations] == [
-        "tick 13, a, order: a Observation of tick 13 is out of order"
+        "tick 13, a, order: an Observation of tick 13 is out of order"
     ]
 
 
@@ -806,7 +806,7 @@ def test_journals_that_are_none_are_refused(honest: Path, folder: Path) -> None:
     world, a = list(journal_file.read(honest / WORLD_JOURNAL)), list(journal_file.read(honest / A))
     assert f"{A} is the journal of b" in spoilt(folder, A, list(journal_file.read(honest / B)))
     assert f"{A}: " in spoilt(folder, A, [*a[:5], encode(load("paper-1"))])
-    assert f"{A}: an agent's journal begins with its Briefing" in spoilt(folder, A, [*a[:1], *a[2:]])
+    assert f"{A}: an agent's journal must begin with a RobotConfig" in spoilt(folder, A, [*a[:1], *a[2:]])
     assert f"{WORLD_JOURNAL}: " in spoilt(folder, WORLD_JOURNAL, [])
     assert f"{WORLD_JOURNAL}: " in spoilt(folder, WORLD_JOURNAL, [*world[:1], *world[2:]])
     scenario = load("paper-1")
