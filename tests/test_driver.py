@@ -269,9 +269,7 @@ def test_it_is_over_when_the_peer_is_silent_for_too_long() -> None:
 
 
 def test_b_begins_when_a_does_and_counts_a_s_ticks(stage: Stage) -> None:
-    """b is seven ticks late. It passes through them at once without moving, and then drives in the ticks of
-    a.
-    """
+    """b is seven ticks late: it passes through these at once without moving, then drives in a's ticks."""
     driver = Recorded()
     driver.clock = stage.monotonic
     config = briefed(parse(ASSURED, "assured"), "b", MANOEUVRE_S)

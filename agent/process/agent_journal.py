@@ -91,9 +91,7 @@ class Past(msgspec.Struct, frozen=True):
         return tuple([compose(frame, pose) for pose in odometry])
 
     def contact(self, tick: int) -> Contact | None:
-        """Return the contact with the peer in the Observation of `tick`; None if there is none, or no such
-        tick.
-        """
+        """Return the contact with the peer in the Observation of `tick`; None if there is none."""
         contacts = self.steps[tick].observation.contacts if tick < len(self.steps) else ()
         return contacts[0] if contacts else None
 

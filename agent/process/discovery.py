@@ -18,9 +18,7 @@ from protocol.wire import MalformedFrame, decode
 QUERY_S = 2.0
 """The seconds to wait for the answer to one query."""
 SESSION_S = 3.0
-"""The seconds to search for a world through one session, or to wait for a robot's former process to
-disappear.
-"""
+"""The seconds to search through one session, or to wait for a robot's former process to disappear."""
 ASK_AGAIN_S = 0.05
 """The seconds between two searches for a world."""
 
@@ -28,8 +26,7 @@ ASK_AGAIN_S = 0.05
 REFUSED_S = 1.0
 """The seconds for which a refusal must persist, without a RobotConfig from any world, to be accepted."""
 MOST_WORLDS = 8
-"""The largest number of worlds that are asked for a RobotConfig; any process may announce any number of them.
-"""
+"""The largest number of worlds that are asked, because a process may announce any number of them."""
 
 
 class Unwelcome(Exception):

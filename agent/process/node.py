@@ -142,8 +142,9 @@ class AgentProcess:
         self._link.attach(link)
 
     def _next(self, until: float | None) -> Arrival:
-        """Return the next arrival, or NOTHING after `until`. Repeat the stored answers when a repetition is
-        due.
+        """Return the next arrival, or NOTHING after `until`.
+
+        Meanwhile, repeat the stored answers when a repetition is due.
 
         Raises WorldLinkLost if nothing arrives from the world for too long.
         """
@@ -278,9 +279,7 @@ class AgentProcess:
         self._give_up = time.monotonic() + self._timeout
 
     def _answer_end(self, end: MissionEnd) -> MissionEnd:
-        """Answer every repetition of the MissionEnd until the world confirms that it has journaled the
-        answer.
-        """
+        """Answer every repetition of the MissionEnd until the world confirms that it has the answer."""
         assert self._final_report is not None
         frame = encode(self._final_report)
         self._link.command(frame)

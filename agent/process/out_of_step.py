@@ -58,10 +58,10 @@ class OutOfStep:
         raise NoWorld(f"{late}: the world is at tick {tick}, {self._robot} at tick {known}")
 
     def persists(self, message: Observation | MissionEnd, bound_s: float) -> bool:
-        """Return whether only messages like `message` have arrived for `bound_s` seconds; until then, refuse
-        it.
+        """Return whether only messages like `message` have arrived for `bound_s` seconds.
 
-        In lockstep the world repeats one message. In real time its Observations advance.
+        Until then, the message is refused. In lockstep the world repeats one message. In real time its
+        Observations advance.
         """
         now = time.monotonic()
         advances = self._real_time and isinstance(message, Observation)
@@ -70,5 +70,5 @@ class OutOfStep:
         if self._world_there and now - self._latest[1] >= bound_s:
             return True
         if not advances:
-            self._inbox.refused["observation"] += 1  # reported once it is accepted
+            self._inbox.refused["observation"] += 1  # counted only: the error is reported once it is accepted
         return False

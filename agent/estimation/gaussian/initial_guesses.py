@@ -188,10 +188,7 @@ def placements(of_a: Array, of_b: Array, pair: PairRanges) -> list[tuple[float, 
     radii = [np.hypot(x, y) for x, y in place]
     near, far = (0, 1) if float(np.mean(radii[0])) < float(np.mean(radii[1])) else (1, 0)
     sign = 1.0 if far == 0 else -1.0
-    dx, dy = (
-        sign * pair.apart[0],
-        sign * pair.apart[1],
-    )  # from the anchor of the far robot to that of the near one
+    dx, dy = sign * pair.apart[0], sign * pair.apart[1]  # from the far robot's anchor to the near one's
     scan = np.linspace(-math.pi, math.pi, SCAN, endpoint=False)
     c, s = np.cos(scan), np.sin(scan)
     seeds = []
