@@ -88,7 +88,7 @@ class PairRanges(NamedTuple):
 
     @property
     def places(self) -> Places:
-        """Return the indices of the mutual ranges before which a robot had moved since the previous one."""
+        """Return the indices of the first mutual range, and of each that follows a motion of a robot."""
         ticks = self.ranges.tick[self.ranges.rows(2)]
         moved = np.zeros(len(ticks), bool)
         moved[:1] = True
