@@ -1,4 +1,4 @@
-"""Who may do what: each of it tried with sessions of its own, through a router that carries the rules."""
+"""The access rules: each permission is tried with a session per role, through a router that enforces them."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ MAY = {
         ("see", "a alive"),
     },
 }
-"""the whole matrix, written out; what is not here must not be possible"""
+"""The complete matrix of what each role may do; everything else must fail."""
 
 
 def key_functions() -> set[Callable[..., str]]:
@@ -75,15 +75,18 @@ def test_every_role_of_a_rule_is_one_that_there_is() -> None:
         assert {rule.by, *rule.to} <= there
 
 
-# --- tried for real -------------------------------------------------------------------------------------
+# --- tried at a router ----------------------------------------------------------------------------------
 
 
 class Network(NamedTuple):
-    """A router, and sessions of others at it."""
+    """A router, and a function that opens further sessions at it."""
 
     open: Callable[[str], zenoh.Session]
     world: zenoh.Session
-    """which may say and hear anything of a mission; it answers, and is alive, under every key"""
+    """The session of the world, which may send and receive every key of a mission.
+
+    It answers queries and shows a liveliness token under every key.
+    """
 
 
 @pytest.fixture(scope="module", params=["a router between", "the world is the router"])
@@ -121,7 +124,10 @@ def undeclare(declared: Any) -> None:
 
 
 def heard(declared: Any) -> set[str]:
-    """The keys of what has come. A channel holds it as soon as it has; a callback would be called later."""
+    """Return the keys of the samples received so far.
+
+    A channel contains a sample as soon as it arrives; a callback would be called later.
+    """
     found = set()
     while (sample := declared.try_recv()) is not None:
         found.add(str(sample.key_expr))
@@ -136,7 +142,7 @@ def answers(who: zenoh.Session, key: str) -> list[str]:
 
 
 class Participant:
-    """Somebody at the router, and what becomes of what they try."""
+    """A session of one role at the router, and the result of each operation."""
 
     def __init__(self, network: Network, name: str) -> None:
         self.session = network.open(name)
@@ -145,21 +151,24 @@ class Participant:
         until(lambda: answers(self.session, self._own), f"{name} is answered")
 
     def _settled(self) -> None:
-        """What either has said has passed the router: a question and its answer have, on the same links."""
-        assert "world" in answers(self.session, self._own)  # its own answer, if any, never leaves it
+        """Wait until everything sent by either session has passed the router.
+
+        A query and its answer then have, too, on the same links.
+        """
+        assert "world" in answers(self.session, self._own)  # an answer of its own never leaves its session
 
     def put(self, key: str) -> bool:
-        """Whether what they put comes to the world."""
+        """Return whether the world receives a put of this session."""
         return self._passes(self._world, key, self.session)
 
     def hear(self, key: str) -> bool:
-        """Whether what the world puts comes to them."""
+        """Return whether this session receives a put of the world."""
         return self._passes(self.session, key, self._world)
 
     def _passes(self, hearer: zenoh.Session, key: str, speaker: zenoh.Session) -> bool:
         declared = hearer.declare_subscriber(key)
         self._settled()
-        self._settled()  # the world's declaration passes when its first answer has
+        self._settled()  # the world's declaration has passed once its first answer has
         speaker.put(key, b"?")
         self._settled()
         came = heard(declared)
@@ -167,7 +176,7 @@ class Participant:
         return bool(came)
 
     def answer(self, key: str) -> bool:
-        """Whether the world's question is answered by them."""
+        """Return whether this session can answer a query of the world."""
         declared: Any = self.session.declare_queryable(key, partial(answer, "it"))
         self._settled()
         found = answers(self._world, key)
@@ -175,12 +184,12 @@ class Participant:
         return "it" in found
 
     def ask(self, key: str) -> bool:
-        """Whether they are answered by the world."""
+        """Return whether the world answers a query of this session."""
         return answers(self.session, key) == ["world"]
 
     def show(self, key: str) -> bool:
-        """Whether the world takes them for alive there."""
-        elsewhere = key.replace("tandem/r/", "tandem/s/")  # where the world itself is not
+        """Return whether the world sees a liveliness token of this session."""
+        elsewhere = key.replace("tandem/r/", "tandem/s/")  # a run in which the world shows no token
         token = session.show_alive(self.session, elsewhere)
         self._settled()
         found = session.alive(self._world, elsewhere, BOUND_S)
@@ -188,7 +197,7 @@ class Participant:
         return found == [keys.parse(elsewhere)]
 
     def see(self, key: str) -> bool:
-        """Whether they are told that somebody is alive there, asking or listening."""
+        """Return whether this session sees liveliness tokens, both by query and by subscription."""
         asked = session.alive(self.session, key, BOUND_S)
         looking: Any = self.session.liveliness()
         declared = looking.declare_subscriber(key, history=True)

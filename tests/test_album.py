@@ -1,4 +1,4 @@
-"""The paper's figures of any record: what they show is what the journals say, and any run has them."""
+"""The paper's figures of any recording: they show what the journals contain, for any run."""
 
 from __future__ import annotations
 
@@ -97,12 +97,12 @@ def pair(folder: Path, number: int = 0) -> PairRecord:
 
 
 def found(figure: Figure, gid: str) -> list[Artist]:
-    """What is drawn under names of that form."""
+    """Return the artists whose gid matches the pattern `gid`."""
     return figure.findobj(lambda one: re.fullmatch(gid, one.get_gid() or "") is not None)
 
 
 def line(figure: Figure, gid: str) -> list[tuple[float, float]]:
-    """The points of the first line of that name."""
+    """Return the points of the first line whose gid matches."""
     one = found(figure, gid)[0]
     assert isinstance(one, Line2D)
     return list(zip(np.asarray(one.get_xdata()).tolist(), np.asarray(one.get_ydata()).tolist(), strict=True))
@@ -118,7 +118,7 @@ def drawn(figure: Figure | Absent) -> Figure:
 
 
 def cut(journal: Path, count: int) -> None:
-    """Leave the first `count` frames of it, and a torn one."""
+    """Truncate the journal to its first `count` frames and a torn one."""
     left = list(frames(journal))[:count]
     journal.write_bytes(b"".join([msgpack.packb(frame) for frame in left]) + b"\xc4\x10torn")
 
@@ -129,7 +129,7 @@ def copied(folder: Path, there: Path) -> Path:
     return there
 
 
-# --- what they show -------------------------------------------------------------------------------------
+# --- contents -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("name", "simulation"), [("paper-1", 0), ("paper-2", 1)])
@@ -181,7 +181,7 @@ def test_what_is_compared_is_what_was_chosen_from(recordings: Path) -> None:
 
 
 def test_a_plan_of_a_is_seen_from_a(recordings: Path) -> None:
-    """A distance is the same from either end: b's candidates about a, and a's about b."""
+    """The distances are symmetric: b's candidates around a, and a's around b."""
     told = pair(recorded("paper-1", recordings))
     ((_, plan),) = manoeuvre.planned(told, "b")
     turned = manoeuvre.scene(plan._replace(question=plan.question._replace(mover="a")))
@@ -352,7 +352,7 @@ def test_the_letters_plan_under_noise_is_drawn_in_bs_own_frame(recordings: Path)
     assert any("in b's own frame" in text.get_text() for text in figure.texts)
 
 
-# --- whatever the run -----------------------------------------------------------------------------------
+# --- any run --------------------------------------------------------------------------------------------
 
 ABSENT = {"undecided": {"phase-1-a", "plan-a-b", "encounter-a-b"}}
 
@@ -436,7 +436,7 @@ def test_no_plan_is_said_to_be_none_where_only_a_journal_is_missing(recordings: 
 
 
 def _turned(frame: bytes, tick: int) -> bytes:
-    """A Command of that tick with a bit more of a turn."""
+    """Return the frame; the Command of `tick` gets a slightly larger turn rate."""
     try:
         command = decode(frame, Command)
     except MalformedFrame:
@@ -467,7 +467,7 @@ def test_the_same_record_gives_the_same_bytes_in_each_format(recordings: Path, t
         pdf = runs[0][f"{name}.pdf"]
         assert b"CreationDate" not in pdf
         assert b"/Subtype /Type3" not in pdf
-        assert b"/FontFile2" in pdf  # TrueType, embedded
+        assert b"/FontFile2" in pdf  # an embedded TrueType font
 
 
 def test_a_terminal_shows_how_far_it_is_and_each_file_on_a_line_of_its_own(

@@ -142,7 +142,7 @@ def test_what_double_precision_allows_is_not(reach: float, distance: float) -> N
     assert infeasibility(Mission(reach, 1.0, 0.9 * reach, 3.0), distance) is None
 
 
-# --- the draws ----------------------------------------------------------------------------------------
+# --- random draws -------------------------------------------------------------------------------------
 
 
 def test_a_trial_follows_from_its_seed_and_number_alone() -> None:

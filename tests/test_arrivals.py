@@ -1,4 +1,4 @@
-"""Whatever key a frame, a token or a question arrives under, no process ends of it, and nothing changes."""
+"""Frames, tokens and queries under any key end no process and change no decision."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_a_key_names_its_kind_run_robot_and_peer(kind: Callable[..., str]) -> No
 
 
 def spoilt(key: str) -> Iterator[str]:
-    """Keys of the same look that are none."""
+    """Yield invalid keys that resemble `key`."""
     chunks = key.split("/")
     for i, chunk in enumerate(chunks):
         for other in (
@@ -120,9 +120,10 @@ FRAMES = [
 
 
 def attack(link: zenoh.Session) -> list[zenoh.LivelinessToken]:
-    """Put, delete, ask and show tokens under every wildcard and odd key; tokens come and go.
+    """Put, delete, query and show tokens under every wildcard and malformed key.
 
-    Everything is delivered: by default Zenoh drops what a busy receiver does not take at once.
+    Some tokens appear and disappear. Every frame is delivered; by default Zenoh drops a frame if the receiver
+    is busy.
     """
     all_of_it = zenoh.CongestionControl.BLOCK
     for key in (*WILD, *ODD):
@@ -144,7 +145,7 @@ def attack(link: zenoh.Session) -> list[zenoh.LivelinessToken]:
 
 
 def test_wildcards_odd_keys_and_deletions_end_no_process_and_change_nothing(tmp_path: Path) -> None:
-    """Robot d is not there yet, so the tick stands still while everyone listens."""
+    """Robot d is absent, so the tick does not advance while every process listens."""
     scenario, out, alone = tmp_path / "pairs.toml", tmp_path / "out", tmp_path / "alone"
     scenario.write_text(several_pairs(2))
     with world(scenario, "--run", RUN, "--out", out) as (clock, endpoint), ExitStack() as others:

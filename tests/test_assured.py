@@ -1,4 +1,4 @@
-"""What `assured` does beyond the letter: seen in whole missions, from ordinary and from awkward starts."""
+"""The planner `assured` beyond the paper: whole missions, from ordinary and from difficult starts."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ class Setting(NamedTuple):
 
 SECTION_IV = Setting()
 CLOSE = Setting(7.0, 5.0)
-"""where many meet on the way to their orbits"""
+"""A setting in which many pairs meet on the way to their orbits."""
 WIDE = Setting(10.0, 15.0)
-"""where they are in range of each other wherever they wait"""
+"""A setting in which the robots are in range of each other wherever they wait."""
 SLOW = Setting(10.0, 1.0, 1.0, 0.9, 0.2)
-"""where b's last manoeuvre cannot keep every placement in range"""
+"""A setting in which b's last manoeuvre cannot keep every placement in range."""
 SHORTENED = Setting(3.0, 1.0)
-"""where the first straight is less than one tick at full speed"""
+"""A setting in which the first straight takes less than one tick at full speed."""
 
 
 def text_of(
@@ -64,7 +64,10 @@ def text_of(
     frame: Pose = ORIGIN,
     max_ticks: int | None = None,
 ) -> str:
-    """A scenario file. The anchors are at (0, 0) and (D, 0), the starts where they are given: in `frame`."""
+    """Return the text of a scenario file.
+
+    The anchors are at (0, 0) and (D, 0). They and the starts are given in the frame `frame`.
+    """
 
     def robot(name: str, anchor: Pose, start: Pose | None) -> str:
         there = compose(frame, anchor)
@@ -86,17 +89,17 @@ def text_of(
 
 @cache
 def drawn(setting: Setting, seed: int, planner_name: str = "assured") -> Recording:
-    """The mission with starts drawn from `seed`."""
+    """Return the recording of the mission with starts drawn from `seed`."""
     return play(parse(text_of(setting, seed=seed, planner_name=planner_name), "assured"))
 
 
 def released(setting: Setting, a: Pose | None, b: Pose | None, frame: Pose = ORIGIN) -> Recording:
-    """The mission with these starts; one that is left out is drawn."""
+    """Return the recording of the mission with these starts; a start that is None is drawn."""
     return play(parse(text_of(setting, a, b, seed=11, frame=frame), "assured"))
 
 
 def steps_of(folder: Path, setting: Setting, seed: int) -> Iterator[Step]:
-    """The ticks of the mission with starts drawn from `seed`, with all that the robots know."""
+    """Yield the ticks of the mission with starts drawn from `seed`, with the states of the robots."""
     path = folder / "assured.toml"
     path.write_text(text_of(setting, seed=seed))
     return steps(str(path))
@@ -119,17 +122,17 @@ def in_contact(recording: Recording, moment: TickRecord) -> bool:
 
 
 def met(recording: Recording) -> int:
-    """The tick in which phase 3 begins."""
+    """Return the tick in which phase 3 begins."""
     return next(m.truth.tick for m in recording.moments if any(d.phase == 3 for d in m.commands.values()))
 
 
 def claimed(recording: Recording) -> int:
-    """The tick of the first claim."""
+    """Return the tick of the first claim."""
     return next(m.truth.tick for m in recording.moments if any(d.verdict for d in m.commands.values()))
 
 
 def states(recording: Recording, robot: str) -> list[tuple[int, str]]:
-    """Phase and state of `robot`, one after the other."""
+    """Return the successive phases and states of `robot`."""
     found: list[tuple[int, str]] = []
     for moment in recording.moments:
         command = moment.commands[robot]
@@ -138,11 +141,11 @@ def states(recording: Recording, robot: str) -> list[tuple[int, str]]:
     return found
 
 
-# --- phase 3 begins as soon as it can -----------------------------------------------------------------
+# --- phase 3 begins as soon as possible ---------------------------------------------------------------
 
 
 def off_anchor(recording: Recording, moment: TickRecord) -> bool:
-    """Whether b is at least half way to where it waits, R / 8 from its anchor."""
+    """Return whether b is at least half way to its waiting position, R / 8 from its anchor."""
     anchor, place = recording.scenario.robots[1].anchor, moment.truth.local[1]
     return (
         math.hypot(place.x - anchor.x, place.y - anchor.y) >= recording.scenario.mission.sensing_range / 16.0
@@ -155,7 +158,7 @@ def off_anchor(recording: Recording, moment: TickRecord) -> bool:
 def test_phase_3_begins_in_the_first_tick_of_contact_in_which_both_know_their_anchors(
     setting: Setting, on_the_way: int
 ) -> None:
-    """Whether they are in orbit or not: at least `on_the_way` of 60 are not."""
+    """The robots need not be in orbit: in at least `on_the_way` of 60 missions they are not."""
     before_orbit = 0
     for seed in range(60):
         recording = drawn(setting, seed)
@@ -188,7 +191,7 @@ def test_who_is_done_with_phase_1_stands_still_while_a_peer_in_range_is_not(sett
 
 
 def test_a_stands_still_while_b_in_range_drives_off_its_anchor() -> None:
-    """On its anchor, b's ranges would not tell how it is turned."""
+    """While b is at its anchor, its ranges contain no information about its rotation."""
     recording = released(CLOSE._replace(speed=0.1), Pose(4.0, 0.5, 1.0), Pose(7.0, 0.0, 2.0))
     waited = [
         moment.commands["a"]
@@ -218,7 +221,7 @@ def test_once_both_orbit_phase_3_begins_within_the_bound(setting: Setting) -> No
 def test_however_long_b_has_waited_the_first_report_tells_the_whole_way(
     reach: float, a_ranges: int, tmp_path: Path
 ) -> None:
-    """Also where a report cannot hold all the ranges that there are to tell: a's, less than 6 m from M1."""
+    """Also if one report cannot contain all ranges: a's, when it is always within 6 m of M1."""
     for seed in (0, 2):
         waited = 0
         for moment in steps_of(tmp_path, Setting(reach=reach, period=0.05), seed):
@@ -233,11 +236,11 @@ def test_however_long_b_has_waited_the_first_report_tells_the_whole_way(
         assert {command.phase for command in moment.commands.values()} == {3}
 
 
-# --- what was sensed before phase 3 counts ------------------------------------------------------------
+# --- observations before phase 3 count ----------------------------------------------------------------
 
 
 def encounter(recording: Recording) -> list[TickRecord]:
-    """The ticks from the beginning of phase 3 until b sets out on its last manoeuvre, or the claim."""
+    """Return the ticks from the beginning of phase 3 until b's last manoeuvre begins, or until the claim."""
     moments = recording.moments[met(recording) :]
     end = next(
         i
@@ -248,7 +251,7 @@ def encounter(recording: Recording) -> list[TickRecord]:
 
 
 def test_silence_before_phase_3_rules_placements_out() -> None:
-    """Of missions in which there was none since."""
+    """Only missions without a tick of no detection in phase 3 are counted."""
     fewer = 0
     for seed in range(150):
         recording = drawn(CLOSE, seed)
@@ -261,7 +264,7 @@ def test_silence_before_phase_3_rules_placements_out() -> None:
 
 
 def test_ranges_before_phase_3_make_a_last_manoeuvre_needless() -> None:
-    """Who has them claims after the two ranges that eq. (7) is made from."""
+    """A robot with earlier ranges claims after the two ranges that eq. (7) uses."""
     spared = 0
     for seed in range(150):
         recording = drawn(CLOSE, seed)
@@ -291,11 +294,11 @@ def test_without_what_was_sensed_before_phase_3_more_placements_would_be_left(tm
     assert more >= 6
 
 
-# --- nobody claims without a check --------------------------------------------------------------------
+# --- no claim without a check -------------------------------------------------------------------------
 
 
 def places(moment: TickRecord) -> tuple[float, ...]:
-    """m: of a and of b."""
+    """Return the positions of a and b in m."""
     a, b = moment.truth.local
     return a.x, a.y, b.x, b.y
 
@@ -316,11 +319,11 @@ def test_nobody_claims_before_ranges_from_three_different_places(setting: Settin
     assert single >= 5 or setting != CLOSE
 
 
-# --- a second range: straight ahead, straight behind, round a circle ----------------------------------
+# --- a second range: straight ahead, straight behind, on a circle -------------------------------------
 
 
 def sought(recording: Recording, robot: str, phase: int) -> list[str]:
-    """What `robot` did in `phase` to get a second range."""
+    """Return the successive states of `robot` in `phase` while it sought a second range."""
     words = ("straight", "backing", "turning", "circling")
     return [word for of, word in states(recording, robot) if of == phase and word in words]
 
@@ -351,7 +354,7 @@ def test_the_letter_never_looks_behind() -> None:
 
 
 def known(recording: Recording, robot: str) -> int:
-    """The tick at which phase 1 ends."""
+    """Return the tick at which phase 1 ends."""
     return next(moment.truth.tick for moment in recording.moments if moment.commands[robot].phase > 1)
 
 
@@ -374,7 +377,7 @@ def test_to_look_behind_is_never_slower_than_to_circle_for_who_turns_slowly_and_
 
 
 def left_out(state: RobotState, v: float, omega: float, candidates: tuple[Placement, ...]) -> list[Placement]:
-    """Those by which a is out of range of b, who is at `state`, once b has driven (v, omega)."""
+    """Return the candidates by which a is out of range of b after b drives (v, omega) for a tick."""
     mission = state.config.mission
     end = step(state.local_pose, v, omega, mission.period)
     a = state.pair_observations(state.tick)[-1].a
@@ -383,7 +386,7 @@ def left_out(state: RobotState, v: float, omega: float, candidates: tuple[Placem
 
 
 def grid(mission: Mission) -> Iterator[tuple[float, float]]:
-    """Some of the manoeuvres among which b chooses."""
+    """Yield some of the manoeuvres from which b chooses."""
     unit = mission.first_straight / mission.period
     rates = [mission.max_turn_rate * (2 * i / (TURN_RATES - 1) - 1) for i in range(0, TURN_RATES, 24)]
     return ((unit * speed, rate) for speed, rate in product(SPEEDS, rates))
@@ -438,7 +441,7 @@ def test_b_sets_out_only_once_a_stands(setting: Setting) -> None:
                 assert (moment.commands["a"].v, moment.commands["a"].omega) == (0.0, 0.0), seed
 
 
-# --- how exact a placement is -------------------------------------------------------------------------
+# --- accuracy of a placement --------------------------------------------------------------------------
 
 angles = st.floats(-math.pi, math.pi)
 coordinates = st.floats(-20.0, 20.0)
@@ -453,7 +456,7 @@ def sighted(placement: Placement, a: Pose, b: Pose) -> PairObservation:
 def ranges_of(
     distance: float, phi: float, psi: float, pair_observations: list[PairObservation]
 ) -> list[float]:
-    """m: as predicted where M1 lies in the direction psi of M2, and <a(M1)> is turned by phi."""
+    """Return the predicted ranges (m) with M1 at the bearing psi from M2 and <a(M1)> rotated by phi."""
     placement = Placement(phi, distance * math.cos(psi), distance * math.sin(psi))
     found = [sighted(placement, one.a, one.b).range for one in pair_observations if one.range is not None]
     return [rho for rho in found if rho is not None]
@@ -506,7 +509,10 @@ OPEN = {
     ),
     "one range": (GENERAL, [((5.0, 1.0), (0.3, 0.1))]),
 }
-"""Double roots of eq. (7), and less: a placement, and where a and b were when they were ranged"""
+"""Placements that the ranges leave undetermined, such as double roots of eq. (7).
+
+Each case has a placement and the positions of a and b at each range.
+"""
 
 
 def seen_at(
@@ -532,7 +538,7 @@ def test_one_more_range_from_elsewhere_pins_a_double_root_down() -> None:
     assert turn_error(placement, seen_at(placement, *places, ((5.0, 2.0), (8.0, 1.0))), 1e-12, 1e-12) < 1e-10
 
 
-# --- wherever in the plane ----------------------------------------------------------------------------
+# --- anywhere in the plane ----------------------------------------------------------------------------
 
 FRAMES = [
     Pose(9e5, -9e5, 0.0),
@@ -556,21 +562,21 @@ def test_a_mission_is_the_same_wherever_in_the_plane_it_is(frame: Pose) -> None:
             assert states(there, robot) == states(here, robot), seed
 
 
-# --- starts that are anything but random --------------------------------------------------------------
+# --- special starts -----------------------------------------------------------------------------------
 
 
 def drawn_pose(setting: Setting, seed: int) -> Pose:
-    """Where a is drawn."""
+    """Return the drawn start of a."""
     return drawn(setting, seed).scenario.robots[0].start
 
 
 def mirrored(setting: Setting, a: Pose) -> Pose:
-    """What b's start is to be for the two to be each other's image."""
+    """Return the start of b that mirrors that of a."""
     return Pose(setting.distance - a.x, a.y, math.pi - a.heading)
 
 
 def shifted(setting: Setting, a: Pose) -> Pose:
-    """What b's start is to be for both to stand alike to their anchors."""
+    """Return the start of b that has the same pose relative to its anchor as a."""
     return Pose(setting.distance + a.x, a.y, a.heading)
 
 
@@ -585,7 +591,7 @@ def test_two_that_start_alike_localise(setting: Setting, of_a: Callable[[Setting
 @pytest.mark.parametrize("setting", [Setting(4.0), Setting(2.0), Setting(5.0, 5.0), CLOSE])
 @pytest.mark.parametrize("apart", [0.0, 1e-9, 1e-3, 0.5])
 def test_two_that_start_together_localise(setting: Setting, apart: float) -> None:
-    """On each other, or nearly; with headings that are the same, opposite or neither."""
+    """Starts at the same place or nearly so, with headings that are equal, opposite or neither."""
     middle = setting.distance / 2
     for turn, (x, y), heading in product(
         (0.0, math.pi, 1.0), ((0.0, 0.0), (0.1, 0.3), (-0.2, -0.6)), (0.0, 0.4, 2.0, 3.5, 5.0)
@@ -598,13 +604,13 @@ OFFSETS = (0.0, *(sign * 10.0**-n for n in (12, 9, 6, 3) for sign in (1, -1)))
 RADIAL_AND_TANGENT = (0.0, math.pi, math.pi / 2, -math.pi / 2)
 HARD = [SECTION_IV, Setting(2.0), SECTION_IV._replace(distance=30.0), WIDE, Setting(period=0.05), SLOW]
 INSIDE = (0.0, 1e-12, 1e-9, 1e-6, 1e-3)
-"""m: rho_0"""
+"""Values of rho_0 in m."""
 AT_THE_RIM = (-1e-12, 0.0)
-"""m: rho_0 - R"""
+"""Values of rho_0 - R in m."""
 
 
 def hard(setting: Setting) -> Iterator[tuple[float, float]]:
-    """rho_0 and heading of starts next to where formulas break down."""
+    """Yield rho_0 and heading of starts close to the singularities of the formulas."""
     radii = (*INSIDE, *(setting.reach + rim for rim in AT_THE_RIM))
     offsets = OFFSETS if setting.period == 1.0 else OFFSETS[::4]
     return ((rho0, heading + offset) for rho0, heading, offset in product(radii, RADIAL_AND_TANGENT, offsets))
@@ -625,7 +631,7 @@ def test_both_localise_from_mirrored_starts_at_the_edge_of_what_can_be_told(sett
 
 
 def in_line(a: Pose) -> bool:
-    """Whether a start, that b mirrors, leads neither out of the line through the anchors; see below."""
+    """Return whether a start mirrored by b keeps both robots on the line through the anchors; see below."""
     return a.x <= 1e-9 and abs(math.sin(a.heading)) < 0.1
 
 
@@ -634,7 +640,7 @@ def in_line(a: Pose) -> bool:
 def test_two_on_their_anchors_who_head_along_the_line_between_these_localise(
     heading_a: float, heading_b: float
 ) -> None:
-    """Nothing that they do then leads out of that line, on which ranges do not tell how anybody is turned."""
+    """The robots then never leave this line, on which ranges contain no information about rotations."""
     assert_localised(released(SECTION_IV, Pose(0.0, 0.0, heading_a), Pose(10.0, 0.0, heading_b)))
 
 
@@ -646,7 +652,7 @@ def test_who_turns_slowly_gets_through_phase_1_from_next_to_its_anchor(rho0: flo
         assert play(parse(text, "assured")).moments[-1].commands["a"].phase > 1, heading
 
 
-# --- what is too small and too large ------------------------------------------------------------------
+# --- limits of size -----------------------------------------------------------------------------------
 
 
 @given(st.floats(0.1, 1.5), st.floats(0.05, 1.0), st.floats(0.2, math.pi))

@@ -1,4 +1,4 @@
-"""The judge: an honest record keeps every rule, and whatever is planted in one is found, named and placed."""
+"""The audit: a correct recording passes every rule, and each planted violation is found and located."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ from world.scenario import Scenario
 from world.simulation import Course
 
 Found = tuple[int | None, str | None, str]
-"""tick, robot and rule of a violation"""
+"""The tick, robot and rule of a violation."""
 NOISE = f"""
 name = "noise"
 seed = SEED
@@ -80,7 +80,7 @@ id = "b"
 anchor = [6.0, 0.0]
 """
 LAST = 48
-"""the tick in which paper-1 ends"""
+"""The tick in which paper-1 ends."""
 A, B = agent_journal("a"), agent_journal("b")
 
 
@@ -89,7 +89,7 @@ def noise(seed: int, planner_name: str) -> Scenario:
 
 
 def kept(scenario: Scenario) -> dict[str, list[bytes]]:
-    """The journals of its run in this process."""
+    """Return the journals of a run in this process."""
     books = {name: MemoryJournal() for name in in_process.journals(scenario)}
     in_process.played(scenario, books)
     return {name: book.frames for name, book in books.items()}
@@ -103,7 +103,7 @@ def checks(findings: Findings) -> dict[str, int]:
     return {one.rule: one.checks for one in findings.counts}
 
 
-# --- honest runs ----------------------------------------------------------------------------------------
+# --- correct runs ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -169,7 +169,7 @@ def test_a_run_in_real_time_in_which_drives_were_missed_keeps_every_rule(tmp_pat
 
 
 def test_a_run_that_failed_was_failed_by_nobody_on_record() -> None:
-    """The world ends it when nobody answers any more; a robot that did answers the MissionEnd."""
+    """The world ends a run without answers; a robot that did answer also answers the MissionEnd."""
     scenario = load("paper-1")
     books = {name: MemoryJournal() for name in in_process.journals(scenario)}
     course = Course(scenario, books[WORLD_JOURNAL])
@@ -192,7 +192,7 @@ def test_a_run_that_failed_was_failed_by_nobody_on_record() -> None:
     assert findings.violations[0].what == "its journal breaks off here, expected MissionEnd and Farewell"
 
 
-# --- a record that breaks off -----------------------------------------------------------------------------
+# --- truncated recordings ---------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -205,9 +205,9 @@ def test_a_journal_that_breaks_off_anywhere_breaks_no_other_rule(
     name: str, paper_1: dict[str, list[bytes]]
 ) -> None:
     whole = paper_1[name]
-    for count in range(2 * (name == WORLD_JOURNAL), len(whole)):  # its scenario at least
+    for count in range(2 * (name == WORLD_JOURNAL), len(whole)):  # at least its scenario
         findings = judge(paper_1 | {name: whole[:count]})
-        if name == WORLD_JOURNAL and count >= len(whole) - 2:  # a FinalReport is lacking, or both
+        if name == WORLD_JOURNAL and count >= len(whole) - 2:  # one FinalReport is absent, or both
             assert {one.what for one in findings.violations} == {"the world has no FinalReport of it"}
             continue
         (violation,) = findings.violations
@@ -231,7 +231,7 @@ def test_a_robot_that_has_left_no_journal_is_named(paper_1: dict[str, list[bytes
     assert checks(findings)["decision"] == 2 * (LAST + 1) + 3 + 1
 
 
-# --- what is planted ----------------------------------------------------------------------------------------
+# --- planted violations -------------------------------------------------------------------------------------
 
 
 def messages(path: Path) -> list[Any]:
@@ -239,13 +239,13 @@ def messages(path: Path) -> list[Any]:
 
 
 def written(path: Path, told: Iterable[Any]) -> None:
-    """The journal of these messages, each in a frame with a good CRC."""
+    """Write a journal of these messages, each in a frame with a correct CRC."""
     path.write_bytes(b"".join([msgpack.packb(encode(message)) for message in told]))
 
 
 @pytest.fixture(scope="session")
 def honest(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The record of paper-1."""
+    """The recording of paper-1."""
     folder = tmp_path_factory.mktemp("honest")
     in_process.play(load("paper-1"), folder)
     return folder
@@ -253,12 +253,12 @@ def honest(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(honest: Path, tmp_path: Path) -> Path:
-    """A copy of it."""
+    """A copy of the recording of paper-1."""
     return Path(shutil.copytree(honest, tmp_path / "record"))
 
 
 def plant(path: Path, *edits: tuple[Callable[[Any], bool], Callable[[Any], Any]]) -> None:
-    """Change the one message that each of `edits` picks, to another, or to several, or to none."""
+    """Replace the single message that each of `edits` selects by another message, by several, or by none."""
     told = messages(path)
     for picks, change in edits:
         (place,) = [i for i, message in enumerate(told) if picks(message)]
@@ -268,7 +268,7 @@ def plant(path: Path, *edits: tuple[Callable[[Any], bool], Callable[[Any], Any]]
 
 
 def of(kind: type, tick: int | None = None, robot: str | None = None) -> Callable[[Any], bool]:
-    """Picks the message of that kind, tick and robot."""
+    """Return a function that selects a message by kind, tick and robot."""
     return lambda message: (
         isinstance(message, kind)
         and (tick is None or getattr(message, "tick", None) == tick)
@@ -311,7 +311,7 @@ def test_a_tick_that_an_agent_has_left_out_is_missed(folder: Path) -> None:
     told = [one for one in messages(folder / A) if getattr(one, "tick", None) != 12]
     written(folder / A, told)
     assert [one.line for one in audit(folder).violations] == [
-        "tick 13, a, order: a Observation of tick 13 is out of order"
+        "tick 13, a, order: an Observation of tick 13 is out of order"
     ]
 
 
@@ -330,7 +330,8 @@ def test_a_drive_that_the_world_has_changed_is_found_and_leads_elsewhere(folder:
     findings = audit(folder)
     assert found(findings)[:2] == [(40, "b", "order"), (41, "b", "observation")]
     assert {(robot, rule) for tick, robot, rule in found(findings)[1:]} <= {
-        ("a", "observation"), ("b", "observation"), ("a", "contact"), ("b", "contact"), (None, "claim"), ("b", "claim")
+        ("a", "observation"), ("b", "observation"), ("a", "contact"), ("b", "contact"),
+        (None, "claim"), ("b", "claim"),
     }  # fmt: skip
 
 
@@ -344,7 +345,8 @@ def test_a_report_that_was_missed_in_lockstep_is_found(folder: Path) -> None:
     plant(folder / A, (of(Report, LAST, "b"), lambda _: DeadlineMissed(LAST, "b")))
     findings = audit(folder)
     assert (LAST, "a", "order") in found(findings)
-    assert {rule for _, _, rule in found(findings)} == {"order", "decision", "claim"}  # by two ranges
+    # "claim", because it then rests on two ranges only
+    assert {rule for _, _, rule in found(findings)} == {"order", "decision", "claim"}
     assert {(tick, robot) for tick, robot, _ in found(findings)} == {(LAST, "a")}
 
 
@@ -404,7 +406,7 @@ def test_robots_that_were_told_different_durations_of_a_tick_are_found(folder: P
 
 
 def plant_scenario(folder: Path, change: Callable[[Scenario], Scenario]) -> None:
-    """Change the scenario, and every briefing that follows from it."""
+    """Change the scenario, and each RobotConfig that follows from it."""
     plant(folder / WORLD_JOURNAL, (of(Scenario), change))
     (told,) = [one for one in messages(folder / WORLD_JOURNAL) if isinstance(one, Scenario)]
     for name in (A, B):
@@ -412,7 +414,7 @@ def plant_scenario(folder: Path, change: Callable[[Scenario], Scenario]) -> None
 
 
 def with_robots(**fields: Any) -> Callable[[Scenario], Scenario]:
-    """Change these fields of every robot."""
+    """Return a function that sets these fields of every robot."""
     return lambda told: replace(told, robots=tuple([replace(robot, **fields) for robot in told.robots]))
 
 
@@ -487,7 +489,7 @@ def test_a_sense_that_tells_of_another_manoeuvre_is_found(folder: Path) -> None:
 
 
 FAR = Report(20, "a", 2, "orbiting", None, 0, 0, (), 0, (), 0, 0)
-"""of a tick in which nobody is near"""
+"""A report of a tick without contact."""
 
 
 def test_a_report_that_was_sent_out_of_contact_is_found(folder: Path) -> None:
@@ -509,7 +511,7 @@ def test_a_report_that_was_heard_out_of_contact_is_found(folder: Path) -> None:
 
 
 def test_a_late_report_from_out_of_contact_is_found(folder: Path) -> None:
-    """Heard in contact, and listed; but not sent in contact."""
+    """The report is received in contact and listed, but was not sent in contact."""
     late = replace(FAR, tick=45)
     plant(folder / A, (of(Observation, 45), lambda observation: [observation, late]))
     plant(
@@ -535,7 +537,8 @@ def test_a_report_that_no_sense_has_listed_is_found(folder: Path) -> None:
     findings = audit(folder)
     assert found(findings)[0] == (47, "a", "contact")
     assert what(findings, "contact") == ["it heard the reports of ticks [47,47], expected [47]"]
-    assert {(robot, rule) for _, robot, rule in found(findings)[1:]} == {("a", "decision")}  # it counts them
+    # the state counts received reports
+    assert {(robot, rule) for _, robot, rule in found(findings)[1:]} == {("a", "decision")}
 
 
 def test_a_report_that_was_listed_and_not_heard_is_found(folder: Path) -> None:
@@ -543,7 +546,8 @@ def test_a_report_that_was_listed_and_not_heard_is_found(folder: Path) -> None:
     findings = audit(folder)
     assert found(findings)[0] == (LAST, "b", "contact")
     assert what(findings, "contact") == ["it heard the reports of ticks [], expected [48]"]
-    assert set(found(findings)[1:]) == {(LAST, "b", "decision"), (LAST, "b", "claim")}  # by two ranges
+    # "claim", because it then rests on two ranges only
+    assert set(found(findings)[1:]) == {(LAST, "b", "decision"), (LAST, "b", "claim")}
 
 
 def test_a_report_that_was_changed_on_its_way_is_found(folder: Path) -> None:
@@ -611,7 +615,7 @@ def test_a_manoeuvre_beyond_the_limits_is_found(folder: Path) -> None:
 
 
 def lied(folder: Path, change: Callable[[Report], Report]) -> Findings:
-    """Of a record in which a has told b otherwise, in its report of tick 48."""
+    """Return the findings for a recording in which a's report of tick 48 to b is changed."""
     for name in (A, B):
         plant(folder / name, (of(Report, LAST, "a"), change))
     return audit(folder)
@@ -626,7 +630,7 @@ def test_a_manoeuvre_that_was_told_otherwise_is_found(folder: Path) -> None:
 
 @pytest.mark.parametrize("tick", [5, 7])
 def test_a_range_that_was_told_otherwise_is_found(tick: int, folder: Path) -> None:
-    """Another than was measured; or one where nothing was."""
+    """One range differs from the measured one, or belongs to a tick without a measurement."""
 
     def change(report: Report) -> Report:
         first, second, third = report.ranges
@@ -689,7 +693,7 @@ def test_a_claim_without_a_redundant_range_is_found(folder: Path) -> None:
 
 
 def test_ranges_taken_twice_in_the_same_place_are_not_redundant(folder: Path) -> None:
-    """In real time: neither moved before the third range."""
+    """In real time, no robot moved before the third range."""
     pose = read(folder).moments[47].truth.poses[0]
     for name in (A, WORLD_JOURNAL):
         plant(folder / name, (of(Command, LAST, "a"), claims(pose)))
@@ -735,7 +739,8 @@ def test_a_run_that_ends_before_the_referee_says_so_is_found(folder: Path) -> No
         plant(folder / name, (of(Command, LAST), to(verdict=None)))
         plant(folder / WORLD_JOURNAL, (of(Command, LAST, robot), to(verdict=None)))
     findings = audit(folder)
-    assert (LAST, None, "order") in found(findings)  # the End of tick 48 has no place after its Commands
+    # the MissionEnd of tick 48 is out of order after these Commands
+    assert (LAST, None, "order") in found(findings)
     assert {rule for _, _, rule in found(findings)} == {"order", "decision"}
 
 
@@ -795,7 +800,7 @@ def test_a_journal_that_cannot_be_understood_is_refused_and_named(name: str, fol
 
 
 def spoilt(folder: Path, name: str, frames: Sequence[bytes]) -> str:
-    """Why a record with this journal cannot be judged."""
+    """Return why a recording with this journal cannot be audited."""
     (folder / name).write_bytes(b"".join([msgpack.packb(frame) for frame in frames]))
     with pytest.raises(CorruptJournal) as error:
         audit(folder)
@@ -806,7 +811,7 @@ def test_journals_that_are_none_are_refused(honest: Path, folder: Path) -> None:
     world, a = list(journal_file.read(honest / WORLD_JOURNAL)), list(journal_file.read(honest / A))
     assert f"{A} is the journal of b" in spoilt(folder, A, list(journal_file.read(honest / B)))
     assert f"{A}: " in spoilt(folder, A, [*a[:5], encode(load("paper-1"))])
-    assert f"{A}: an agent's journal begins with its Briefing" in spoilt(folder, A, [*a[:1], *a[2:]])
+    assert f"{A}: an agent's journal must begin with a RobotConfig" in spoilt(folder, A, [*a[:1], *a[2:]])
     assert f"{WORLD_JOURNAL}: " in spoilt(folder, WORLD_JOURNAL, [])
     assert f"{WORLD_JOURNAL}: " in spoilt(folder, WORLD_JOURNAL, [*world[:1], *world[2:]])
     scenario = load("paper-1")

@@ -1,4 +1,4 @@
-"""A stranger puts nonsense on every key: it is refused, told once and counted, and the mission goes on."""
+"""Malformed frames on every key are refused, reported once and counted, and the mission is not affected."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from tests.storm import rage, stranger_at
 
 RUN = "mine"
 TIMES = 3
-"""each frame is put so often, and must be told of once"""
+"""The number of times that each frame is sent; it must be reported once."""
 VOLLEYS = 12
 STORM = 3000
 SETTLED_MB = 8.0
@@ -52,22 +52,22 @@ GENUINE = {
     "command": (Command(0, "a", 0.5, 0.5, 1, "straight"), 1 << 20),
     "report": (Report(0, "b", 1, "straight", ORIGIN, 0, 0, (), 0, (), 0, 0), 4096),
 }
-"""by topic: what robot a gets, says, and is told by its peer, b; and the longest frame in bytes"""
+"""For each topic, a valid message that robot a receives or sends, and the longest frame in bytes."""
 
 TRUSTED = {
     "observation": keys.observation(RUN, "a"),
     "command": keys.command(RUN, "a"),
     "report": keys.report(RUN, "b", "a"),
 }
-"""the keys that somebody acts on"""
+"""The keys whose frames change the state of a process."""
 WATCHED = [keys.truth(RUN), keys.estimate(RUN, "a"), keys.config(RUN, "a")]
-"""those that nobody of the mission listens to"""
+"""The keys to which no process of the mission subscribes."""
 GHOST, OTHER = keys.command(RUN, "ghost"), keys.command(RUN, "b")
-"""a Command comes by them that says it is from somebody else, or from nobody"""
+"""The keys of a robot that does not exist, and of one that did not send the Command put there."""
 
 
 def framed(content: object, version: int = 1) -> bytes:
-    """A frame whose CRC is as it should be, whatever is in it."""
+    """Return a frame with a correct CRC and any content."""
     body = content if isinstance(content, bytes) else msgspec.msgpack.encode(content)
     return struct.pack(">BI", version, zlib.crc32(body)) + body
 
@@ -79,7 +79,7 @@ def flipped(frame: bytes, bit: int) -> bytes:
 
 
 def bad_frames(topic: str) -> dict[bytes, str]:
-    """Every kind of nonsense for a key that carries `topic`, and the pattern of what is said of it."""
+    """Return malformed frames of every kind for a key of `topic`, with the pattern of each error message."""
     message, limit = GENUINE[topic]
     frame = encode(message)
     said = msgspec.msgpack.decode(frame[5:])
@@ -116,13 +116,13 @@ def bad_frames(topic: str) -> dict[bytes, str]:
         framed(b"\xc1"): "malformed",
         framed(b"\x91" * 4000): "Expected",
     }
-    if topic == "observation":  # it costs the robot its link, and never arrives: see below
+    if topic == "observation":  # it closes the robot's link and never arrives; see below
         del frames[bytes(limit + 1)]
     return frames
 
 
 def publishers(link: zenoh.Session) -> dict[str, zenoh.Publisher]:
-    """One for each key, once everybody listens: a put before that would be lost."""
+    """Return a publisher for each key, once all subscribers match; an earlier put would be lost."""
     found = {key: session.publisher(link, key) for key in (*TRUSTED.values(), *WATCHED, GHOST, OTHER)}
     heard: set[str] = set()
     for key in (*TRUSTED.values(), GHOST, OTHER):
@@ -143,13 +143,13 @@ def volley(stranger: Mapping[str, zenoh.Publisher], nonsense: Mapping[str, Mappi
 
 
 def complaints(command: TandemProcess, key: str) -> list[str]:
-    """What it has said of frames on `key`."""
+    """Return the messages of `command` about frames on `key`."""
     said = re.findall(rf"refused a frame on {re.escape(key)}: (.*)", command.err)
     return [str(why) for why in said]
 
 
 def refused_on(key: str, command: TandemProcess, frames: Mapping[bytes, str]) -> None:
-    """It has complained of every kind, and of each only once."""
+    """Assert that `command` reported each kind of frame, and each only once."""
     told = complaints(command, key)
     for frame, pattern in frames.items():
         assert any(re.search(pattern, why) for why in told), (frame[:40], told)
@@ -157,7 +157,7 @@ def refused_on(key: str, command: TandemProcess, frames: Mapping[bytes, str]) ->
 
 
 def test_nonsense_before_the_first_tick_is_refused_told_once_and_counted(tmp_path: Path) -> None:
-    """Robot d is not there yet, so the tick stands still while everyone else listens."""
+    """Robot d is absent, so the tick does not advance while every other process listens."""
     scenario, out, alone = tmp_path / "pairs.toml", tmp_path / "out", tmp_path / "alone"
     scenario.write_text(several_pairs(2))
     nonsense = {key: bad_frames(topic) for topic, key in TRUSTED.items()}
@@ -228,20 +228,20 @@ def test_a_mission_under_fire_goes_on_as_if_nothing_happened(tmp_path: Path) -> 
     summary = json.loads((out / "summary.json").read_text())
     assert (summary["outcome"], summary["ticks"]) == ("localised", LONG_TICKS)
     assert summary["robots"]["a"]["reports_refused"] > 0
-    for robot in ("a", "b"):  # all but the FinalReport, which counts what was refused
+    for robot in ("a", "b"):  # all frames but the FinalReport, which counts refused frames
         path = f"agent-{robot}.journal"
         assert list(read(out / path))[:-1] == list(read(alone / path))[:-1]
 
 
 @pytest.mark.parametrize("topic", GENUINE)
 def test_the_frame_that_the_nonsense_is_made_of_is_itself_understood(topic: str) -> None:
-    """Else all of it would be refused for one and the same reason."""
+    """Otherwise every frame would be refused for the same reason."""
     message, _ = GENUINE[topic]
     assert msgspec.msgpack.decode(encode(message)[5:], type=type(message)) == message
 
 
 def test_a_storm_of_mutated_frames_on_every_key_disturbs_nothing(tmp_path: Path) -> None:
-    """Each process refuses all that it must, and nothing else; memory settles in the first half."""
+    """Each process refuses exactly the invalid frames; its memory stops growing in the first half."""
     tally = rage(STORM, seed=7, distance=40.0, folder=tmp_path)
     assert (tally.frames, tally.statuses, tally.outcome, tally.same) == (STORM, [0, 0, 0], "localised", True)
     for process, sizes in tally.memory.items():
@@ -251,7 +251,7 @@ def test_a_storm_of_mutated_frames_on_every_key_disturbs_nothing(tmp_path: Path)
     assert "Traceback" not in tally.said
 
 
-# --- what a robot makes of well-formed frames, with this test for its world and its peer ----------------
+# --- well-formed frames, with this test as the world and the peer ---------------------------------------
 
 
 def test_a_robot_refuses_what_is_out_of_step_and_hears_a_repeated_report_once(tmp_path: Path) -> None:
@@ -271,7 +271,7 @@ def test_a_robot_refuses_what_is_out_of_step_and_hears_a_repeated_report_once(tm
         peer_says = session.publisher(link, keys.report(RUN, "b", "a"))
 
         def play(tick: int, *reports: Report) -> None:
-            """Its Command of `tick` comes, and no other."""
+            """Send an Observation and `reports`, and expect the Command of `tick` and no other."""
             for report in reports:
                 peer_says.put(encode(report))
             world_says.put(encode(observation(tick)))
@@ -310,11 +310,11 @@ def answer(said: Inbox, kind: type[Message]) -> Any:
     return decode(arrival.frame, kind)
 
 
-# --- a flood ------------------------------------------------------------------------------------------
+# --- a flood of frames --------------------------------------------------------------------------------
 
 
 def flooded(topic: Topic, key: str, size: int) -> tuple[Inbox, int]:
-    """An inbox in which frames of `size` bytes wait on `key`, and how many came beyond its room."""
+    """Return an inbox full of frames of `size` bytes on `key`, and the number of refused frames."""
     full = Inbox("test")
     room = inbox.ROOM_BYTES // (size + len(key) + inbox.ARRIVAL_BYTES)
     for _ in range(room + 1000):

@@ -1,4 +1,4 @@
-"""Bad input is one line that names the file and the field, exit status 2; never a traceback or a trace."""
+"""Invalid input is reported in one line with the file and the field, with exit status 2 and no traceback."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def refused(ended: Ended, *words: str) -> None:
 
 
 def refused_scenario(text: str | bytes, folder: Path, field: str) -> None:
-    """Its file is named, and the field; nothing is left beside it."""
+    """Assert that the error names the file and the field, and that no other file is written."""
     file = folder / "mine.toml"
     file.write_bytes(text.encode() if isinstance(text, str) else text)
     refused(tandem("run", "mine.toml", "--out", "out", cwd=folder), f"mine.toml: {field}")
@@ -38,7 +38,7 @@ def changed(text: str, was: str, new: str) -> str:
     return text.replace(was, new, 1)
 
 
-# --- a scenario's file ------------------------------------------------------------------------------
+# --- scenario files ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -186,16 +186,16 @@ AMOUNTS = {
     "noise.actuation": ("0.01", "[0.01]", '"1 %"'),
     "noise": ("0.01", "[]", '"little"', "true"),
 }
-"""what the fields of noise may not be"""
+"""Invalid values for the fields of `noise`."""
 
 
 def with_noise(field: str, value: str) -> str:
-    """GOOD with that field of its mission: dotted keys of TOML are tables in tables."""
+    """Return GOOD with that field in its mission table; dotted TOML keys are nested tables."""
     return changed(GOOD, "[mission]\n", f"[mission]\n{field} = {value}\n")
 
 
 def refused_text(text: str, field: str) -> None:
-    """As `refused_scenario`, without a process."""
+    """Assert the same as `refused_scenario`, without a process."""
     with pytest.raises(BadScenario) as bad:
         parse(text, "mine.toml")
     assert str(bad.value).startswith(f"mine.toml: {field}")
@@ -416,7 +416,7 @@ def test_a_port_in_use_is_one_line(tmp_path: Path) -> None:
     assert list(tmp_path.glob("out/*")) == []
 
 
-# --- where the record goes --------------------------------------------------------------------------
+# --- the folder of the recording --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("out", ["file", "file/out", "/proc/out", "/proc/self/fdinfo"])

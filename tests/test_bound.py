@@ -1,4 +1,4 @@
-"""The Cramér-Rao bound of what was driven: it is the Fisher information's, and claims are as wide."""
+"""The Cramér-Rao bound of a driven trajectory equals the Fisher information's, and claims are as wide."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ def bounds(recording: Recording, tick: int | None = None) -> tuple[float, float]
 
 
 def with_noise(recording: Recording, noise: Noise) -> Recording:
-    """The same trajectories, as if they had been driven with these sensors."""
+    """Return the same trajectories, with the noise of other sensors."""
     scenario = recording.scenario
     return replace(recording, scenario=replace(scenario, mission=replace(scenario.mission, noise=noise)))
 
 
 def ends_and_ranges(recording: Recording, starts: Sequence[float]) -> tuple[Array, Array]:
-    """x, y of a and b in the end, and every true range, had they started there and driven the same."""
+    """Return the final x, y of a and b and all true ranges, for other starts and the same commands."""
     scenario = recording.scenario
     poses = [[Pose(*starts[:3])], [Pose(*starts[3:])]]
     for moment in recording.moments[:-1]:
@@ -59,7 +59,7 @@ def ends_and_ranges(recording: Recording, starts: Sequence[float]) -> tuple[Arra
 
 
 def by_differences(recording: Recording, sigma: float) -> tuple[float, float]:
-    """The bound from the Fisher information of the six unknowns of the start, by finite differences."""
+    """Return the bound from the Fisher information of the six unknowns, by finite differences."""
     starts = np.array(
         [value for pose in recording.moments[0].truth.poses for value in (pose.x, pose.y, pose.heading)]
     )

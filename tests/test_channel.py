@@ -1,4 +1,4 @@
-"""The air between two robots: what a fault plan says may befall a report befalls it, and nothing else."""
+"""The radio channel between two robots: each report meets the faults of the fault plan, and no others."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from world.faults import (
 )
 
 N = 10_000
-"""ticks, where a statistic is looked at"""
+"""The number of ticks of a statistical test."""
 A_TO_B, BOTH_WAYS = LinkSelector("a", "b", both=False), LinkSelector("a", "b", both=True)
 
 chances = st.sampled_from([0.0, 0.1, 0.5, 1.0])
@@ -51,14 +51,14 @@ plans = st.lists(faults, max_size=4)
 meetings = st.lists(st.tuples(st.booleans(), st.integers(1, 15)), min_size=1, max_size=8).map(
     lambda spells: [together for together, ticks in spells for _ in range(ticks)]
 )
-"""in which ticks the two are in contact"""
+"""The contact of the two robots, tick by tick."""
 seeds = st.integers(0, 2**63 - 1)
 
 
 def flown(
     plan: Sequence[Fault], contact: Sequence[bool], seed: int = 1, way: tuple[str, str] = ("a", "b")
 ) -> list[LinkState]:
-    """The air of a link, tick after tick."""
+    """Return the state of a link, tick by tick."""
     links, air, found = of_plan(plan, *way), LinkState(), []
     for tick, together in enumerate(contact):
         air = carried(air, links, seed, tick, in_contact=together)
@@ -67,7 +67,7 @@ def flown(
 
 
 def came(airs: Sequence[LinkState]) -> list[tuple[int, int, bool]]:
-    """Every copy that came: the tick in which it did, that of its report, and whether it was damaged."""
+    """Return each arrived copy: the tick of arrival, the tick of its report, and whether it was damaged."""
     return [
         (now, tick, damaged)
         for now, air in enumerate(airs)
@@ -77,11 +77,11 @@ def came(airs: Sequence[LinkState]) -> list[tuple[int, int, bool]]:
 
 
 def heard_at_once(plan: Sequence[Fault], ticks: int = N, seed: int = 1) -> list[bool]:
-    """Of each tick's report, the two being in contact throughout: whether it is heard in its tick."""
+    """Return, for each tick of permanent contact, whether its report is received in the same tick."""
     return [tick in air.heard for tick, air in enumerate(flown(plan, [True] * ticks, seed))]
 
 
-# --- whatever the plan --------------------------------------------------------------------------------
+# --- any plan -----------------------------------------------------------------------------------------
 
 
 @given(meetings, seeds)
@@ -238,7 +238,7 @@ def test_bandwidth_that_is_enough_loses_nothing() -> None:
     assert {later - earlier for earlier, later in pairwise(i for i, one in enumerate(slow) if one)} <= {3, 4}
 
 
-# --- where and when -----------------------------------------------------------------------------------
+# --- links and ticks of a fault -----------------------------------------------------------------------
 
 
 @given(windows, windows, meetings)
@@ -282,7 +282,7 @@ def test_every_link_every_fault_and_every_seed_has_draws_of_its_own() -> None:
     assert len(set(fates)) == len(fates)
 
 
-# --- one draw shifts no other -------------------------------------------------------------------------
+# --- independence of random draws ---------------------------------------------------------------------
 
 ROUGH = (
     Fault(duplicate=0.5),
@@ -292,7 +292,7 @@ ROUGH = (
 
 
 def fates(airs: Sequence[LinkState]) -> dict[int, Counter[tuple[int, bool]]]:
-    """Of each report: when its copies came, and which were damaged."""
+    """Return, for each report, the ticks of arrival of its copies, and which were damaged."""
     found: dict[int, Counter[tuple[int, bool]]] = {}
     for now, tick, damaged in came(airs):
         found.setdefault(tick, Counter())[now, damaged] += 1
@@ -301,7 +301,7 @@ def fates(airs: Sequence[LinkState]) -> dict[int, Counter[tuple[int, bool]]]:
 
 @pytest.mark.parametrize("loss", [0.0, 0.2, 0.5, 0.9])
 def test_more_or_less_loss_shifts_no_other_draw(loss: float) -> None:
-    """More is lost of what was lost before; what comes still comes as it came before."""
+    """A higher loss loses a superset of the reports; the others arrive unchanged."""
     contact = [True] * 2000
     less, more = [
         fates(flown([ROUGH[0], replace(ROUGH[1], loss=share), ROUGH[2]], contact))
@@ -328,7 +328,7 @@ def test_what_is_not_in_contact_shifts_no_draw() -> None:
     assert all(now_and_then.get(tick) == always.get(tick) for tick in early)
 
 
-# --- how long a mission may have to wait --------------------------------------------------------------
+# --- the bound on a mission's delay -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""`tandem check-driver`: the example keeps the contract, and each broken driver is told what it breaks."""
+"""`tandem check-driver`: the example driver passes, and for each broken driver the violation is reported."""
 
 from __future__ import annotations
 

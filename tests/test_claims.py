@@ -1,4 +1,4 @@
-"""What a robot claims of its pose with a covariance, and what a run then says of it."""
+"""Claimed poses with a covariance, and how the results of a run report them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from world.referee import Judgement
 from world.tick import World, advance, release
 
 FLOOR = 1e-6
-"""m and rad, below which no sigma counts"""
+"""The least standard deviation in m and rad."""
 NOISY = f"""
 name = "noisy"
 {SECTION_IV}
@@ -49,7 +49,7 @@ start = [4.0, 0.0, 4.0]
 """
 EXACT = NOISY.replace("noise", "# noise").replace('"# noisy"', '"noisy"')
 SURE = Covariance(0.0009, 0.0002, -0.0001, 0.0016, 0.0003, 0.0004)
-"""sigmas of 0.05 m and 0.02 rad"""
+"""A covariance with sigmas of 0.05 m and 0.02 rad."""
 
 
 def covariance_of(p: NDArray[np.float64]) -> Covariance:
@@ -65,7 +65,7 @@ def off(pose: Pose, by: float) -> Pose:
 
 
 def claimed(text: str, covariance: Covariance | None, *, by: float = 0.03) -> Recording:
-    """Robot a claims at once, `by` so many metres off; b never does, and time is up a tick later."""
+    """Return a recording in which a claims at once, `by` m off, b never claims, and time runs out."""
     scenario = parse("max_ticks = 1\n" + text, "noisy")
     world = release(scenario)
     first = {
@@ -115,7 +115,7 @@ def test_nees_of_a_singular_covariance_counts_no_sigma_below_a_micrometre() -> N
     nothing = Covariance(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     assert nees(here, here, nothing) == 0.0
     assert nees(Pose(2.0 * FLOOR, 0.0, 3.0 * FLOOR), here, nothing) == pytest.approx(13.0)
-    along = Covariance(0.02, 0.02, 0.0, 0.02, 0.0, 0.01)  # x and y err by the same
+    along = Covariance(0.02, 0.02, 0.0, 0.02, 0.0, 0.01)  # x and y have the same error
     assert nees(Pose(0.2, 0.2, 0.0), here, along) == pytest.approx(2.0)
     assert nees(Pose(FLOOR, -FLOOR, 0.0), here, along) == pytest.approx(2.0)
     assert nees(Pose(0.1, -0.1, 0.0), here, along) == pytest.approx(0.02 / FLOOR**2)
@@ -170,7 +170,7 @@ def test_the_papers_missions_leave_one_hypothesis_and_no_probability(tmp_path: P
         assert (told[robot]["hypotheses"], told[robot]["probability"]) == (1, None)
 
 
-# --- a sweep's rows and figures ---------------------------------------------------------------------
+# --- rows and figures of a sweep --------------------------------------------------------------------
 
 HONEST = ["cov_xx", "cov_xy", "cov_xh", "cov_yy", "cov_yh", "cov_hh"]
 SWEEP = 'name = "noisy"\nscenario = "noisy.toml"\ntrials = 3\n'
@@ -212,7 +212,7 @@ def test_a_row_counts_the_claims_within_three_times_the_accuracy() -> None:
 
 
 def results_of(rows: list[trial.TrialRow], folder: Path) -> execution.Results:
-    """Of a sweep of one cell."""
+    """Return the results of a sweep with one cell."""
     (folder / "noisy.toml").write_text(NOISY)
     (folder / "sweep.toml").write_text(SWEEP)
     sweep = spec.load(str(folder / "sweep.toml"))
@@ -232,7 +232,7 @@ def test_a_summary_has_the_mean_nees_with_its_band_and_the_rate_within_three_tim
     rows += [trial.lost(0, 3, 1, "lost", None), row_of(claimed(EXACT, None, by=0.0), 4)]
     figures = figures_of(rows, tmp_path)
     assert (figures.trials, figures.claims, figures.within_3_accuracy) == (5, 4, 0.75)
-    assert rows[2].outcome == "wrong"  # and no trial on the right hypothesis
+    assert rows[2].outcome == "wrong"  # and no trial with the right hypothesis
     assert figures.nees_mean == pytest.approx(np.mean([row.nees for row in rows[:2]]))
     assert (figures.nees_low, figures.nees_high) == pytest.approx(
         (chi2.ppf(0.005, 6) / 2, chi2.ppf(0.995, 6) / 2)
@@ -248,7 +248,7 @@ def test_without_claims_a_summary_has_no_nees_and_no_rate(tmp_path: Path) -> Non
 
 
 def test_a_trial_with_two_claims_counts_once_in_the_mean_nees() -> None:
-    """The errors of a pair go together: twice as many claims are not twice as much evidence."""
+    """The errors of a pair are correlated, so two claims of a pair are not independent."""
     scenario = parse("max_ticks = 1\n" + NOISY, "noisy")
     world = release(scenario)
     poses = world.truth.poses
@@ -285,7 +285,7 @@ PLAYED = play(load("paper-1"))
 
 
 def missing_at(recording: Recording, robot: str, ticks: Container[int]) -> Recording:
-    """The record without that robot's Commands of `ticks`, and without its FinalReport."""
+    """Return the recording without that robot's Commands of `ticks`, and without its FinalReport."""
     moments = [
         replace(one, commands={who: command for who, command in one.commands.items() if who != robot})
         if one.truth.tick in ticks

@@ -1,4 +1,4 @@
-"""Sweeps over kills: each trial is held against the mission without kills, and leaves nobody behind."""
+"""Sweeps over kills: each trial equals the mission without kills, and leaves no process running."""
 
 from __future__ import annotations
 
@@ -48,19 +48,22 @@ HUNG = 'name = "hung"\nscenario = "endless.toml"\ntrials = 2\ntrial_timeout = '
 
 @pytest.fixture(autouse=True)
 def nothing_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Every temporary folder is in tmp_path, so the processes of a test are known by their arguments."""
+    """Assert that no process of a test remains.
+
+    All temporary folders are in tmp_path, which identifies the processes by their arguments.
+    """
     temporary_in(tmp_path, monkeypatch)
     yield
     until(lambda: not left(tmp_path), "no process is left")
 
 
 def left(tmp_path: Path) -> list[int]:
-    """The processes in whose command a path in `tmp_path` stands."""
+    """Return the processes with a path in `tmp_path` in their command line."""
     found = []
     for pid in filter(str.isdigit, os.listdir("/proc")):
         try:
             words = Path(f"/proc/{pid}/cmdline").read_bytes().decode().replace("\0", " ").split()
-        except OSError:  # ended meanwhile
+        except OSError:  # the process has ended
             continue
         if any(word.startswith(f"{tmp_path}/") for word in words):
             found.append(int(pid))
@@ -124,11 +127,11 @@ def test_however_a_trial_ends_its_processes_end_with_it(how: str, tmp_path: Path
     if "hung" in how:
         rows = pq.read_table(tmp_path / "out" / "trials.parquet").to_pylist()
         killed, hung = [row["error"] for row in rows]
-        assert killed.startswith("died: killed by SIGKILL")  # and what it said last, if it came to that
+        assert killed.startswith("died: killed by SIGKILL")  # and its last line of output, if there was one
         assert hung == "hung: no answer within 10 s"
 
 
-# --- what a scenario says -----------------------------------------------------------------------------
+# --- scenarios with kills -----------------------------------------------------------------------------
 
 
 def test_what_a_scenario_leaves_open_follows_from_the_seed() -> None:
@@ -189,11 +192,11 @@ def test_who_starts_nobody_again_refuses_a_scenario_with_kills(tmp_path: Path) -
     refused(world, "mine.toml: kill: a world starts nobody again; `tandem run` does")
 
 
-# --- the sweeps that ship --------------------------------------------------------------------------
+# --- shipped sweeps --------------------------------------------------------------------------------
 
 
 def killed(name: str, seed: int) -> list[tuple[Any, ...]]:
-    """What each cell of the sweep comes to: who, when and where."""
+    """Return the kills of each cell of the sweep: process, tick and point."""
     tables = [msgspec.convert(cell.table["kill"], list[KillTable]) for cell in cells(spec.load(name))]
     return [
         tuple((kill.who, kill.tick, kill.point) for kill in drawn(table, seed, ("a", "b")))

@@ -1,4 +1,4 @@
-"""The compose file, the container file and the systemd unit fit the commands, and play missions."""
+"""The compose file, the container file and the systemd unit match the commands, and run missions."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ UNIT = DEPLOY / "tandem-agent@.service"
 
 
 def services(**environment: str) -> dict[str, dict[str, Any]]:
-    """Those of the compose file, with its variables replaced as a compose command does."""
+    """Return the services of the compose file, with its variables substituted as compose does."""
     text = re.sub(
         r"\$\{(\w+):-([^}]*)\}", lambda found: environment.get(found[1], found[2]), COMPOSE.read_text()
     )
@@ -39,12 +39,12 @@ def services(**environment: str) -> dict[str, dict[str, Any]]:
 
 
 def ours() -> dict[str, dict[str, Any]]:
-    """The services that run a command of `tandem`."""
+    """Return the services that run a `tandem` command."""
     return {name: one for name, one in services().items() if "build" in one}
 
 
 def unit() -> dict[str, list[str]]:
-    """What the unit says, by field; of a field that comes more than once, all."""
+    """Return the values of each field of the systemd unit."""
     found: dict[str, list[str]] = {}
     for line in UNIT.read_text().splitlines():
         if line and line[0] not in "#[":
@@ -54,7 +54,7 @@ def unit() -> dict[str, list[str]]:
 
 
 def valid(file: Path) -> bool:
-    """Whether `file` is valid by the compose specification."""
+    """Return whether `file` is valid by the compose specification."""
     check = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.compose-spec"]
     return subprocess.run([*check, file], check=False, capture_output=True).returncode == 0
 

@@ -1,4 +1,4 @@
-"""What the README refers to runs."""
+"""The program `docs/rendezvous.py`, which the README refers to, prints its figures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`tandem doctor`: each check passes where all is well, and is provoked to fail; no mission is disturbed."""
+"""`tandem doctor`: each check passes in a correct setup and fails in a broken one, without side effects."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from tests.test_topologies import Router, connect, listen, record_of, routing, s
 
 
 def findings(ended: Ended, mark: str) -> list[str]:
-    """What the lines of that mark say; all lines have one, and the status goes with them."""
+    """Return the text of the lines with that mark; every line has a mark, and the exit status agrees."""
     assert ended.err == ""
     lines = ended.out.splitlines()
     assert all(re.match(r"(ok |fix|--) ", line) for line in lines), ended.out
@@ -48,7 +48,7 @@ def findings(ended: Ended, mark: str) -> list[str]:
 
 
 def only_fix(ended: Ended, *words: str) -> None:
-    """One thing is to be done, and it is said in these words."""
+    """Assert that there is exactly one finding to fix, and that it contains these words."""
     (found,) = findings(ended, "fix")
     for word in words:
         assert word in found
@@ -128,7 +128,7 @@ def test_a_port_with_the_remains_of_an_old_link_is_free() -> None:
         server.listen()
         with socket.create_connection(("127.0.0.1", port)) as client:
             accepted, _ = server.accept()
-            accepted.close()  # who closes first keeps the port for a minute
+            accepted.close()  # the side that closes first keeps the port for a minute
             client.recv(1)
     assert findings(tandem("doctor", "--listen", endpoint), "fix") == []
 
@@ -212,10 +212,8 @@ def test_a_certificate_that_does_not_name_where_its_owner_listens_is_told(keys: 
 
 def test_a_certificate_is_not_valid_before_its_time(mine: Path) -> None:
     found = list(papers(configured(mine / KEYED), now=0.0))
-    assert [one.mark for one in found if "is not valid before" in one.text] == [
-        "fix",
-        "fix",
-    ]  # its own, the CA's
+    # one of the robot and one of the CA
+    assert [one.mark for one in found if "is not valid before" in one.text] == ["fix", "fix"]
 
 
 # --- the network ----------------------------------------------------------------------------------------
@@ -247,7 +245,7 @@ def test_who_listens_and_never_says_a_word_is_waited_for_within_bounds_and_until
     with socket.create_server(("127.0.0.1", 0)) as mute:
         endpoint = f"tcp/127.0.0.1:{mute.getsockname()[1]}"
         with TandemProcess(command, *connect(endpoint)) as stopped:
-            mute.accept()[0].close()  # it has come as far as that
+            mute.accept()[0].close()  # the command has connected
             stopped.tell(Signals.SIGINT)
             assert stopped.ended(within=5.0).status == -Signals.SIGINT
         ended = tandem(command, *connect(endpoint))
@@ -265,7 +263,7 @@ def test_a_network_without_missions_is_said_to_be_one() -> None:
 
 @contextmanager
 def of_another_version(keys: Path) -> Iterator[str]:
-    """The endpoint of a world that answers by a later version of the protocol."""
+    """Yield the endpoint of a world that answers with a later version of the protocol."""
     endpoint = free_endpoint("tls")
     with session.open_router(configured(keys / "world" / KEYED, listen=[endpoint])) as link:
 
@@ -322,7 +320,7 @@ def test_clocks_are_compared_as_far_as_can_be_told(ahead: float, took: float, ma
 
 
 def let_read_truth(settings: dict[str, Any]) -> None:
-    """A rule that somebody has added, who wanted to see something."""
+    """Add a rule that permits reading the ground truth."""
     rules = settings["access_control"]
     rules["rules"].append(
         {
@@ -342,12 +340,12 @@ def enforce_nothing(settings: dict[str, Any]) -> None:
 
 
 def enforce(_settings: dict[str, Any]) -> None:
-    """As it is."""
+    """Leave the rules unchanged."""
 
 
 @contextmanager
 def router_by(keys: Path, change: Callable[[dict[str, Any]], None], folder: Path) -> Iterator[str]:
-    """The endpoint of a router, whose configuration somebody has had a hand in."""
+    """Yield the endpoint of a router with a modified configuration."""
     own = shutil.copytree(keys / "router", folder / "router")
     settings = json.loads((own / KEYED).read_text().partition("\n")[2])
     change(settings)
@@ -360,7 +358,7 @@ def router_by(keys: Path, change: Callable[[dict[str, Any]], None], folder: Path
 def start(
     keys: Path, endpoint: str, out: Path, stack: ExitStack, who: str, *arguments: str | Path
 ) -> TandemProcess:
-    """A part of a mission, by the keys of `who`."""
+    """Start a process of a mission with the keys of `who`."""
     where = ("--connect", endpoint, "--keys", keys / who, "--out", out, "-q")
     return stack.enter_context(TandemProcess(*arguments, *where))
 
@@ -444,14 +442,17 @@ def test_what_cannot_be_tried_without_a_mission_that_moves_is_not_said_to_be_wel
     assert untried.startswith(f"rules: reading {READ}: mine did not move within 0.2 s")
 
 
-# --- nobody is disturbed --------------------------------------------------------------------------------
+# --- no mission is disturbed ----------------------------------------------------------------------------
 
 
 @pytest.mark.long
 def test_a_mission_beside_which_all_is_tried_leaves_the_record_of_one_alone(
     keys: Path, tmp_path: Path
 ) -> None:
-    """Where no rule keeps the doctor from doing harm: before b comes, while all move, and by several."""
+    """No rule restricts the doctor here.
+
+    It runs before b joins, while all robots move, and several times at once.
+    """
     expected, out = record_of(LONG, tmp_path), tmp_path / "out"
     with router_by(keys, enforce_nothing, tmp_path) as endpoint, ExitStack() as stack:
         part = partial(start, keys, endpoint, out, stack)

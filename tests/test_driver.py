@@ -1,4 +1,4 @@
-"""A robot moves by Commands of its own agent, of this tick, in time, and by nothing else."""
+"""A driver executes only Commands of its own agent, of the current tick and in time."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ from world.hardware.driver_journal import DrivenTick, DriverPast
 from world.hardware.termination import LAST_WORDS, Ending
 
 Answer = Callable[[int], Iterable[bytes]]
-"""what somebody says to the Observation of a tick"""
+"""The frames that are sent in answer to the Observation of a tick."""
 LINK = cast(zenoh.Session, None)
-"""a stage needs none"""
+"""A placeholder; a stage needs no session."""
 MANOEUVRE_S = 0.1
 SCENARIO = parse(PAPER_1, "paper-1")
 BRIEFING = briefed(SCENARIO, "a", MANOEUVRE_S)
@@ -50,7 +50,7 @@ def stage(monkeypatch: pytest.MonkeyPatch) -> Stage:
 
 
 class Recorded:
-    """A driver that does nothing but to note what it was told, and when."""
+    """A driver that only records its commands and their times."""
 
     def __init__(self, fails_at: int | None = None, reading: Reading | None = None) -> None:
         self.commands: list[tuple[float, float]] = []
@@ -88,9 +88,10 @@ Play = Callable[..., tuple[Field, MissionEnd, list[MissionEnd]]]
 
 @pytest.fixture
 def played(stage: Stage) -> Play:
-    """Plays a mission of a with that driver, and an agent that says `answer` to each Observation, `after` a while.
+    """Return a function that runs a mission of a with a driver and a simulated agent.
 
-    The field, the MissionEnd that it came to, and those that it told.
+    The agent sends `answer` to each Observation, `after` some seconds. The function returns the field, the
+    MissionEnd that it reached, and those that it sent.
     """
 
     def play(
@@ -201,7 +202,7 @@ def test_an_agent_that_never_answers_ends_the_mission_after_the_patience(played:
 def test_an_agent_that_only_appears_over_and_over_ends_the_mission_after_the_patience(
     stage: Stage, played: Play
 ) -> None:
-    """One that dies at once is started again each time, and has answered nothing."""
+    """An agent that dies at once is restarted each time, and has sent no answer."""
     for second in range(1000):
         stage.comes("alive", keys.robot_alive("r", "a"), after=float(second))
     _, end, _ = played(Recorded(), lambda _: [], ticks=1000, timeout=3.0)
@@ -211,7 +212,7 @@ def test_an_agent_that_only_appears_over_and_over_ends_the_mission_after_the_pat
     assert stage.now < 20.0
 
 
-# --- the end ------------------------------------------------------------------------------------------
+# --- the end of a mission -----------------------------------------------------------------------------
 
 
 def report(tick: int, heard: int, verdict: Verdict | None) -> Report:
@@ -221,7 +222,7 @@ def report(tick: int, heard: int, verdict: Verdict | None) -> Report:
 def ended(
     own: Verdict | None, said: Report | None, timeout: float = 60.0, ticks: int = 30
 ) -> MissionEnd | None:
-    """The End of a mission in which a comes to `own` at tick 10, and hears `said` at tick 12."""
+    """Return the MissionEnd if a reaches the verdict `own` at tick 10 and receives `said` at tick 12."""
     ending = Ending(BRIEFING, 25, timeout)
     for tick in range(ticks):
         if tick == 12 and said is not None:
@@ -268,7 +269,7 @@ def test_it_is_over_when_the_peer_is_silent_for_too_long() -> None:
 
 
 def test_b_begins_when_a_does_and_counts_a_s_ticks(stage: Stage) -> None:
-    """Late by seven ticks, it goes through those at once, standing; then it drives in a's."""
+    """b is seven ticks late: it passes through these at once without moving, then drives in a's ticks."""
     driver = Recorded()
     driver.clock = stage.monotonic
     config = briefed(parse(ASSURED, "assured"), "b", MANOEUVRE_S)
@@ -283,7 +284,7 @@ def test_b_begins_when_a_does_and_counts_a_s_ticks(stage: Stage) -> None:
     stage.answer = answer
     stage.alive("b")
     later = 0.5 + 2.5 * MANOEUVRE_S
-    for tick, after in ((7, 0.5), (0, later), (500, later)):  # 0 is of an a that lost its past
+    for tick, after in ((7, 0.5), (0, later), (500, later)):  # tick 0 is of an a that lost its journal
         stage.comes("tick-start", keys.tick_start("r", "a"), encode(TickStart(tick, "a")), after)
     field.attach(LINK)
     end = field.play(10.0, lambda: None)
@@ -297,7 +298,7 @@ def test_b_begins_when_a_does_and_counts_a_s_ticks(stage: Stage) -> None:
 
 
 def past_of(ticks: int, *, robot: str) -> DriverPast:
-    """What a driver has on record that has come so far, driving in every second tick."""
+    """Return the recording of a driver after `ticks` ticks, which drove in every second one."""
     observations = [Observation(tick, robot, REST if tick else None, 2.0) for tick in range(ticks)]
     return DriverPast(
         tuple(
@@ -311,7 +312,7 @@ def past_of(ticks: int, *, robot: str) -> DriverPast:
 
 @pytest.mark.parametrize(("robot", "peer"), ["ab", "ba"])
 def test_a_robot_that_was_down_catches_up_with_its_peer_standing(robot: str, peer: str, stage: Stage) -> None:
-    """However many ticks it was down; then it goes on in the peer's."""
+    """For any number of ticks without the process; it then continues in the ticks of the peer."""
     driver = Recorded()
     driver.clock = stage.monotonic
     config = briefed(parse(ASSURED, "assured"), robot, MANOEUVRE_S)
@@ -352,7 +353,7 @@ def test_an_a_that_was_not_down_does_not_go_by_its_peers_ticks(stage: Stage, pla
 
 
 def test_a_b_that_was_killed_before_tick_0_begins_though_a_waits_for_it(stage: Stage) -> None:
-    """a is there, and says nothing; when it does, it turns out to be behind, and b waits for it."""
+    """a is present, but sends nothing. When it does, it is behind, and b waits for it."""
     driver = Recorded()
     driver.clock = stage.monotonic
     config = briefed(parse(ASSURED, "assured"), "b", MANOEUVRE_S)

@@ -211,7 +211,7 @@ def test_an_agent_whose_world_dies_ends_within_its_patience(tmp_path: Path) -> N
     assert ended.status == 3
     assert ended.err.splitlines() == [
         f"tandem agent a: the world has gone; waiting {TIMEOUT} s for it",
-        f"tandem agent a: nothing heard from the world for {TIMEOUT} s",
+        f"tandem agent a: nothing received from the world for {TIMEOUT} s",
     ]
 
 

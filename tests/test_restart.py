@@ -535,7 +535,7 @@ def test_an_agents_record_in_which_it_sensed_otherwise_is_no_use(recording: Path
     path.write_bytes(journal_file.packed(list(journal_file.read(path))[:4]))
     with TandemProcess("agent", "b", "--connect", paper_2):  # whose briefings are those of paper-1
         ended = tandem("agent", "a", "--connect", paper_2, "--out", recording)
-    said = "the record is another run's: in this one, a senses otherwise at tick 0"
+    said = "the recording is of another run: the Observation of a at tick 0 differs"
     assert (ended.status, ended.err) == (3, f"tandem agent a: {said}\n")
 
 
@@ -547,7 +547,7 @@ def test_a_record_on_which_it_decided_otherwise_is_refused(recording: Path) -> N
     assert command.tick == 12
     frames[place] = encode(replace(command, v=command.v / 2.0))
     path.write_bytes(journal_file.packed(frames))
-    says = f"{path}: on record it decided otherwise at tick 12: the journal is another version's"
+    says = f"{path}: the recorded decision differs at tick 12: the journal was written by another version"
     refuses(recording, "agent", "a", "--connect", free_endpoint(), says=says)
 
 
@@ -574,7 +574,7 @@ def test_a_world_that_has_lost_its_record_is_told_so(recording: Path, paper_1: s
         ended = tandem("agent", "a", "--connect", paper_1, "--out", recording)
     tick = past(journal_file.read(recording / "agent-a.journal"), "a").steps[-1].observation.tick
     assert ended.status == 3
-    said = f"started again without its record: the world is at tick 0, a knows it up to {tick}"
+    said = f"the world was restarted without its recording: the world is at tick 0, a at tick {tick}"
     assert ended.err.splitlines()[-1] == f"tandem agent a: {said}"  # it may have told of a torn write before
 
 

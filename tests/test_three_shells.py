@@ -102,7 +102,7 @@ def test_an_agent_without_a_world_says_so_and_gives_up(tmp_path: Path) -> None:
     ended = tandem("agent", "a", "--connect", endpoint, "--connect-timeout", "6", "--out", tmp_path / "out")
     assert ended.status == 3
     assert ended.err.splitlines() == [
-        f"tandem agent a: no world at {endpoint} yet; looking for one for 6 s: {NOBODY}",
+        f"tandem agent a: no world at {endpoint} yet; searching for up to 6 s: {NOBODY}",
         f"tandem agent a: no world at {endpoint}; gave up after 6 s: {NOBODY}",
     ]
     assert not (tmp_path / "out").exists()
@@ -181,7 +181,7 @@ def test_an_agent_that_is_answered_nonsense_alone_looks_on_and_says_why() -> Non
         link.declare_queryable(keys.config("mine", "*"), lambda query: query.reply(query.key_expr, b"junk"))
         ended = tandem("agent", "a", "--connect", endpoint, "--connect-timeout", "1")
     assert ended.status == 3
-    assert "gave up after 1 s: the world's briefing is not understood: 4 bytes" in ended.err
+    assert "gave up after 1 s: the world's RobotConfig cannot be decoded: 4 bytes" in ended.err
 
 
 def test_an_agent_that_meets_several_runs_must_be_told_which() -> None:

@@ -230,7 +230,7 @@ def test_a_tick_that_is_left_out_is_no_record(folders: tuple[Path, Path], tmp_pa
     (tmp_path / "agent-a.journal").write_bytes(b"".join([msgpack.packb(frame) for frame in frames]))
     ended = tandem("export", tmp_path)
     assert (ended.status, ended.out) == (2, "")
-    assert ended.err.endswith("agent-a.journal: a Observation of tick 6 is out of order\n")
+    assert ended.err.endswith("agent-a.journal: an Observation of tick 6 is out of order\n")
 
 
 def test_the_audit_holds_robots_to_their_limits_and_to_what_they_sensed(folders: tuple[Path, Path]) -> None:

@@ -1,7 +1,7 @@
-"""The closed forms of Section III: what two ranges leave possible, in the plane.
+"""The closed forms of Section III for two ranges in the plane: the angle alpha and the placements of eq. (7).
 
-Frames: <a(M1)> and <b(M2)> are centred in the robot's own anchor, with the x-axis through its first
-position p_0. Points are in m, angles in rad. Everything here is a function of its arguments.
+The frames <a(M1)> and <b(M2)> are centred in the robot's own anchor, with the x-axis through its first
+position p_0. Points are in m, angles in rad. All functions are pure.
 """
 
 from __future__ import annotations
@@ -12,19 +12,22 @@ from typing import NamedTuple
 from protocol.motion import Pose, compose, wrap
 
 SLACK = 1e-7
-"""of a triangle's three sides: by so much may rounding break its inequality; residuals weigh later what that
-lets in. Sides are sums of some thousand numbers up to a thousand times as long: 1e-16 of 1e6 is less"""
+"""The fraction of a triangle's perimeter by which rounding may violate the triangle inequality.
+
+A later test of the residuals rejects whatever this admits wrongly. A side is the sum of some thousand terms,
+each up to a thousand times as long as the side, and 1e-16 of 1e6 is less than this fraction.
+"""
 
 SAME = 1e-9
-"""rad, and of the lengths at hand: placements nearer than this are one (a double root)"""
+"""The angle in rad, and the fraction of a length, below which two placements are the same (a double root)."""
 
 
 def included_angle(near: float, far: float, moved: float) -> float | None:
-    """alpha of eq. (2): the turn, at a point `near` m from a beacon, away from the outward radial direction.
+    """Return alpha of eq. (2), in [0, pi] rad: the angle from the outward radial direction to the motion.
 
-    Going `moved` m in that direction leads to a point `far` m from the beacon. In [0, pi]; None where
-    no triangle has these sides. At the beacon itself every direction is radial: 0. By Kahan's formula
-    for an angle from three sides, which loses no digits where eq. (2) does: near 0 and pi.
+    The robot is `near` m from a beacon, and a straight motion of `moved` m takes it to a distance of `far` m.
+    Return None if no triangle has these sides, and 0 at the beacon, where every direction is radial. Kahan's
+    formula for an angle from three sides is used because eq. (2) loses digits near 0 and pi.
     """
     if near == 0.0:
         return 0.0
@@ -39,14 +42,14 @@ def included_angle(near: float, far: float, moved: float) -> float | None:
 
 
 class Placement(NamedTuple):
-    """A rigid placement of <a(M1)> in <b(M2)>, a solution of eq. (7): turn by phi, then shift by T."""
+    """A placement of <a(M1)> in <b(M2)> that solves eq. (7): a rotation by phi, then a shift by T."""
 
     phi: float
     x: float
     y: float
 
     def place(self, pose: Pose) -> Pose:
-        """`pose`, of <a(M1)>, in <b(M2)>."""
+        """Return `pose`, given in <a(M1)>, in <b(M2)>."""
         return compose(Pose(self.x, self.y, self.phi), pose)
 
 
@@ -58,18 +61,18 @@ def placements(
     rho1: float,
     rho2: float,
 ) -> list[Placement]:
-    """Every solution of eq. (7), at most four, in closed form.
+    """Return all solutions of eq. (7), at most four, in closed form.
 
-    `distance` is D; b stands at `p1b` in <b(M2)>; a went from `p1a` to `p2a` in <a(M1)>, and was ranged
-    from b at `rho1` and `rho2` m. Two triangles (the +-alpha branches) fix where M1 lies about p1b, and
-    D then leaves two points each. Double roots are given once. Empty where nothing fits; also where b
-    stands on M1, since then any turn about it does.
+    `distance` is D in m. b is at `p1b` in <b(M2)>. a moved from `p1a` to `p2a` in <a(M1)>, and its ranges to
+    b there were `rho1` and `rho2` m. Two triangles (the branches +-alpha) determine where M1 lies relative to
+    p1b, and D leaves two points for each. A double root is returned once. The list is empty if there is no
+    solution, and also if b is at M1, because then every rotation about b is a solution.
     """
     dx, dy = p2a.x - p1a.x, p2a.y - p1a.y
     moved = math.hypot(dx, dy)
     if moved == 0.0:
         return []
-    if rho1 == 0.0:  # every direction is radial from there; the triangle is known from its other end
+    if rho1 == 0.0:  # there every direction is radial; the other end of the motion determines the triangle
         if rho2 == 0.0:
             return []
         return placements(distance, p1b, p2a, p1a, rho2, rho1)
@@ -101,10 +104,10 @@ def same_placement(one: Placement, other: Placement, tolerance: float) -> bool:
 
 
 def circle_intersections(x: float, y: float, radius: float, distance: float) -> list[tuple[float, float]]:
-    """Where (m) the circle of `radius` about (x, y) meets that of radius `distance` about the origin.
+    """Return the intersections (m) of the circles of `radius` about (x, y) and `distance` about the origin.
 
-    A tangent point is given once. Empty where they do not meet, or are the same circle, or the first is
-    a point, to rounding.
+    A tangent point is returned once. The list is empty if the circles do not meet, if they are equal, or if
+    the first is a point, each up to rounding.
     """
     apart = math.hypot(x, y)
     if min(apart, radius) < SAME * (apart + radius + distance):

@@ -1,9 +1,9 @@
-"""What a robot still holds possible: branches in phase 1, placements in phase 3.
+"""Estimation with exact sensors: the possible branches in phase 1, and the possible placements in phase 3.
 
-Closed forms make the candidates, measurements weigh them. The sensors are exact here, so weighing is an
-exact test with a floor in m, of `protocol.rounding`, and a candidate that passes is only polished: where
-the closed form is well conditioned that is the identity, and next to a double root it restores the digits
-lost there.
+Closed forms yield the candidates, and all measurements test them. The sensors are exact, so the test has a
+fixed tolerance in m, the floor of `protocol.rounding`. A candidate that passes is refined by Gauss-Newton.
+This changes nothing where the closed form is well conditioned, and restores the digits that are lost next to
+a double root.
 """
 
 from __future__ import annotations
@@ -18,46 +18,46 @@ from protocol.motion import Pose, compose, wrap
 from protocol.rounding import SAME, same_turn
 
 POLISHING_STEPS = 12
-"""Gauss-Newton steps at the most; they end when the fit gets no better, mostly after one"""
+"""The maximum number of Gauss-Newton steps; most fits stop improving after one."""
 
 FITTED = 3
-"""anchor ranges from which on the heading is fitted to all of them; two are met exactly"""
+"""The number of anchor ranges from which the heading is fitted to all of them; two are met exactly."""
 
 DAMPING = 1e-9
-"""of a fit's curvature, added to it: so a step goes only where the ranges tell something"""
+"""The fraction of a fit's curvature that is added to it, so that a step stays within what is determined."""
 
 CLOSEST = 1e-12
-"""of D: a shorter range weighs no more than this one"""
+"""The fraction of D below which a range is weighted like a range of that length."""
 
 SINGULAR = 1e-14
-"""how nearly parallel two columns may be before they count as one (the sine of their angle, squared)"""
+"""The squared sine of the angle between two columns below which they are treated as parallel."""
 
 
 class Branch(msgspec.Struct, frozen=True):
-    """One of the two trajectories +-alpha that two ranges leave possible (Section III.A)."""
+    """One of the two trajectories +-alpha that are consistent with two ranges (Section III.A)."""
 
     alpha: float
-    """rad, of eq. (2), signed"""
+    """The signed angle alpha of eq. (2) in rad."""
     start: Pose
-    """where tick 0 of the odometry lies in the frame of the anchor: (rho_0, 0, heading)"""
+    """The pose of tick 0 of the odometry in the frame of the anchor: (rho_0, 0, heading)."""
 
     @property
     def anchor(self) -> tuple[float, float]:
-        """Where the anchor lies in the frame of the odometry, in m."""
+        """Return the position (m) of the anchor in the frame of the odometry."""
         c, s = math.cos(self.start.heading), math.sin(self.start.heading)
         return -self.start.x * c, self.start.x * s
 
     def distance(self, odometry: Pose) -> float:
-        """From the anchor, in m."""
+        """Return the distance (m) from the anchor at the pose `odometry`."""
         place = compose(self.start, odometry)
         return math.hypot(place.x, place.y)
 
 
 def branches(rho0: float, measured_at: Pose, rho: float) -> tuple[Branch, ...]:
-    """The trajectories that fit the range `rho0` at tick 0 and `rho` at the odometry pose `measured_at`.
+    """Return the trajectories with the range `rho0` at tick 0 and `rho` at the odometry pose `measured_at`.
 
-    Two, mirror images of each other; one where the motion was radial; none where the ranges contradict
-    the odometry (eq. (2)).
+    There are two, mirror images of each other. There is one if the motion was radial, and none if the ranges
+    contradict the odometry (eq. (2)).
     """
     alpha = included_angle(rho0, rho, math.hypot(measured_at.x, measured_at.y))
     if alpha is None:
@@ -74,12 +74,14 @@ def weigh_branches(
     floor: float,
     margin: float,
 ) -> tuple[Branch, ...]:
-    """Those of `candidates` that explain every odometry pose in `seen` with its range, or its silence.
+    """Return those of `candidates` that are consistent with every pose in `seen`, ranged or not detected.
 
-    `floor` is by how much (m) rounding may put a predicted range off. `margin` is how far inside the range a
-    point must lie to count on it: half of that is left for what two ranges leave open of a heading.
+    `floor` is the largest error (m) of a predicted range from rounding. `margin` is how far (m) inside R a
+    point must be for a detection to be certain. Half of it is reserved for the error of a heading from two
+    ranges.
 
-    Two that put the anchor in the same place are one: so near the anchor, or so nearly radial, they are.
+    Two branches with the anchor at the same position are merged. This happens very close to the anchor, or if
+    the motion is almost radial.
     """
     seen = tuple(seen)
     ranged = [(pose, rho) for pose, rho in seen if rho is not None]
@@ -97,13 +99,13 @@ def weigh_branches(
 
 
 def anchor_error(start: Pose, ranged: Sequence[tuple[Pose, float, float]]) -> float:
-    """Return how far (m) the anchor may be from where the branch that begins at `start` puts it.
+    """Return how far (m) the anchor may be from its position in the branch that begins at `start`.
 
-    To first order, by the odometry and the range of each in `ranged`, and by how much (m) rounding may
-    put that range off, its floor. They are fitted in squares: at a point that lies y off the line from
-    the anchor through p_0, the slope of the squared range by the heading is 2 rho_0 y, and its error 2
-    floor (rho + rho_0), with that of rho_0. Whatever the heading, the anchor is rho_0 away: no more than
-    2 rho_0 of error is left, on the anchor none. What `weigh_branches` merges, it puts off, too.
+    Each element of `ranged` is an odometry pose, a range, and that range's floor: its largest error (m) from
+    rounding. The bound is of first order. The fit uses squared ranges. At a point y off the line from the
+    anchor through p_0, the derivative of the squared range with respect to the heading is 2 rho_0 y, and its
+    error is 2 floor (rho + rho_0), including the error of rho_0. The anchor is rho_0 away at any heading, so
+    the error is at most 2 rho_0, and zero on the anchor. The merging in `weigh_branches` adds to it.
     """
     rho0 = start.x
     c, s = math.cos(start.heading), math.sin(start.heading)
@@ -117,14 +119,14 @@ def anchor_error(start: Pose, ranged: Sequence[tuple[Pose, float, float]]) -> fl
 
 
 def _meets(predicted: float, rho: float, rho0: float, floor: float) -> bool:
-    """Return whether `rho` may be `predicted`; nearer than rho_0 in squares, as it is fitted."""
+    """Return whether `rho` agrees with `predicted`. Ranges below rho_0 are compared in squares, as fitted."""
     return abs(predicted - rho) * (predicted + rho) <= 2.0 * floor * max(rho, rho0)
 
 
 def polished(branch: Branch, ranged: Sequence[tuple[Pose, float]]) -> Branch:
-    """The same branch with the heading that fits all ranges best, in squares (Gauss-Newton).
+    """Return the branch with the heading that fits all squared ranges best (Gauss-Newton).
 
-    Two ranges are met exactly by construction, and near a radial heading they say nothing more.
+    Two ranges are met exactly by construction. Near a radial heading they contain no further information.
     """
     if len(ranged) < FITTED:
         return branch
@@ -148,7 +150,7 @@ def polished(branch: Branch, ranged: Sequence[tuple[Pose, float]]) -> Branch:
 
 
 class PairObservation(msgspec.Struct, frozen=True):
-    """One tick of an encounter: both robots in the frames of their own anchors, and the range between."""
+    """One tick of an encounter: each pose in the frame of the robot's anchor, and the mutual range (m)."""
 
     tick: int
     a: Pose
@@ -157,7 +159,7 @@ class PairObservation(msgspec.Struct, frozen=True):
 
 
 RangedPair = tuple[Pose, Pose, float]
-"""where a and b were, each in its anchor's frame, and the range (m) between them"""
+"""The poses of a and b, each in the frame of its own anchor, and the range (m) between them."""
 
 
 def weigh_placements(
@@ -166,9 +168,9 @@ def weigh_placements(
     sensing_range: float,
     floor: float,
 ) -> tuple[Placement, ...]:
-    """Return those of `candidates` that explain every sighting, be it a range or silence.
+    """Return those of `candidates` that are consistent with every observation, ranged or not detected.
 
-    `floor` is by how much (m) rounding, that of phase 1 included, may put a predicted range off.
+    `floor` is the largest error (m) of a predicted range from rounding, that of phase 1 included.
     """
     left: list[Placement] = []
     ranged = [(seen.a, seen.b, seen.range) for seen in pair_observations if seen.range is not None]
@@ -208,11 +210,11 @@ def _explains_silence(placement: Placement, silent: Iterable[tuple[Pose, Pose]],
 def turn_error(
     placement: Placement, pair_observations: Sequence[PairObservation], floor: float, anchors: float
 ) -> float:
-    """Return how far (rad), at the most, either robot may be turned about its anchor off `placement`.
+    """Return the largest angle (rad) by which either robot may be rotated about its anchor from `placement`.
 
-    To first order, of least squares over all ranges in `pair_observations`: each is off by `floor` m on its own,
-    and all of them together by the two anchors, which are off by `anchors` m in all. Infinite where they
-    leave a turn open, next to a double root of eq. (7).
+    The bound is of first order, for a least-squares fit to all ranges in `pair_observations`. Each range has
+    its own error of at most `floor` m. The two anchors add an error of at most `anchors` m that is common to
+    all ranges. The result is infinite if a rotation is undetermined, next to a double root of eq. (7).
     """
     slopes = tuple(_slopes(placement, pair_observations))
     pp, pq, qq = _information(slopes)
@@ -222,7 +224,7 @@ def turn_error(
     alone_a = alone_b = ax = ay = bx = by = 0.0
     for p, q, ux, uy in slopes:
         of_psi = pp * q - pq * p
-        of_a = qq * p - pq * q - of_psi  # in <W>, b is turned by -psi and a by phi - psi
+        of_a = qq * p - pq * q - of_psi  # in <W>, b is rotated by -psi and a by phi - psi
         alone_a, alone_b = alone_a + abs(of_a), alone_b + abs(of_psi)
         ax, ay, bx, by = ax + of_a * ux, ay + of_a * uy, bx + of_psi * ux, by + of_psi * uy
     turned_a = floor * alone_a + anchors * math.hypot(ax, ay)
@@ -233,9 +235,9 @@ def turn_error(
 def information(
     placement: Placement, pair_observations: Sequence[PairObservation]
 ) -> tuple[float, float, float]:
-    """What the ranges in `pair_observations` tell of phi and of psi, the bearing of M1 in <b(M2)>.
+    """Return the Fisher information (1 / rad^2) about phi and psi, where psi is the bearing of M1 in <b(M2)>.
 
-    The Fisher information for ranges of 1 m standard deviation, in 1 / rad^2: of phi, mixed, of psi.
+    The ranges have a standard deviation of 1 m. The elements are (phi, phi), (phi, psi) and (psi, psi).
     """
     return _information(_slopes(placement, pair_observations))
 
@@ -252,7 +254,7 @@ def _information(slopes: Iterable[tuple[float, float, float, float]]) -> tuple[f
 def _slopes(
     placement: Placement, pair_observations: Sequence[PairObservation]
 ) -> Iterator[tuple[float, float, float, float]]:
-    """Yield, for each range, its derivatives by phi and by psi (m / rad), and the direction from b to a."""
+    """Yield the derivatives of each range by phi and psi (m / rad), and the direction from b to a."""
     tx, ty = placement.x, placement.y
     for pair_observation in pair_observations:
         if pair_observation.range is None:
@@ -266,12 +268,13 @@ def _slopes(
 
 
 def _polished_placement(placement: Placement, measured: Sequence[RangedPair]) -> Placement:
-    """The placement nearby that fits all ranges best; M1 stays D from M2 (Gauss-Newton).
+    """Return the placement near `placement` that fits all ranges best, with M1 at D from M2 (Gauss-Newton).
 
-    The squares are weighed so that an error is one of the range: a tiny one would not count beside others.
+    The fit uses squared ranges, weighted so that a residual is an error of the range itself. Otherwise a
+    short range would have no influence beside longer ones.
 
-    The unknowns are phi and the bearing psi of M1 in <b(M2)>. Two ranges determine them exactly; more
-    of them tell apart what eq. (7) alone gives as a double root.
+    The unknowns are phi and the bearing psi of M1 in <b(M2)>. Two ranges determine them exactly. More ranges
+    separate solutions that eq. (7) alone yields as a double root.
     """
     distance = math.hypot(placement.x, placement.y)
     closest = CLOSEST * distance

@@ -1,4 +1,4 @@
-"""What an agent's journal tells: the briefing, then tick after tick what came in and what was answered."""
+"""Reader of an agent's journal: the RobotConfig, then the inputs and answers of each tick."""
 
 from __future__ import annotations
 
@@ -31,38 +31,38 @@ from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 
 
 class Step(msgspec.Struct, frozen=True):
-    """One tick, in the order of the journal; what is none or empty did not come, or not any more."""
+    """One tick of the journal. A field is None or empty if the journal contains no such frame."""
 
     observation: Observation
     frame: bytes
-    """that the Observation came in"""
+    """The frame of the Observation."""
     report: FramedReport | None = None
-    """to the peer, in contact"""
+    """The robot's report to its peer; None without contact."""
     heard: tuple[FramedReport, ...] = ()
     missed: tuple[str, ...] = ()
-    """peers whose report did not come in time"""
+    """The peers whose report did not arrive in time."""
     command: Command | None = None
     estimate: Estimate | None = None
 
 
 class Past(msgspec.Struct, frozen=True):
-    """A journal, whole or up to where it breaks off."""
+    """The content of a journal, complete or up to the point where it ends."""
 
     config: RobotConfig
     steps: tuple[Step, ...]
     end: MissionEnd | None = None
     final_report: FinalReport | None = None
     environment: Environment | None = None
-    """where it was written; none of an older recording"""
+    """The environment in which the journal was written; None for older recordings."""
 
     @property
     def estimates(self) -> tuple[Estimate, ...]:
-        """What the robot held possible, tick by tick."""
+        """Return the estimates, in the order of the ticks."""
         return tuple([step.estimate for step in self.steps if step.estimate is not None])
 
     @property
     def claim(self) -> tuple[int, Localised] | None:
-        """The first that it made, and in which tick."""
+        """Return the robot's first claim and its tick, or None."""
         for step in self.steps:
             if step.command is not None and isinstance(step.command.verdict, Localised):
                 return step.observation.tick, step.command.verdict
@@ -70,44 +70,50 @@ class Past(msgspec.Struct, frozen=True):
 
     @property
     def odometry(self) -> tuple[Pose, ...]:
-        """Its poses in the frame of tick 0, dead-reckoned from what it measured itself to have driven."""
+        """Return the pose at each tick in the frame of tick 0, by dead reckoning from the odometry."""
         poses, period = [ORIGIN], self.config.mission.period
         for step in self.steps[1:]:
-            done = step.observation.executed or REST
-            poses.append(motion.step(poses[-1], done.v, done.omega, period))
+            executed = step.observation.executed or REST
+            poses.append(motion.step(poses[-1], executed.v, executed.omega, period))
         return tuple(poses[: len(self.steps)])
 
     @property
     def path(self) -> tuple[Pose, ...]:
-        """Where it was in the plane, by its claim: its odometry, laid through it. Empty, if it made none."""
+        """Return the pose at each tick in the plane: the odometry, aligned with the claimed pose.
+
+        Empty if the robot claimed no pose.
+        """
         claim, odometry = self.claim, self.odometry
         if claim is None:
             return ()
-        tick, said = claim
-        frame = compose(said.pose, inverse(odometry[tick]))
+        tick, verdict = claim
+        frame = compose(verdict.pose, inverse(odometry[tick]))
         return tuple([compose(frame, pose) for pose in odometry])
 
     def contact(self, tick: int) -> Contact | None:
-        """With its peer, as it sensed it at `tick`; none, too, where that is not on record."""
+        """Return the contact with the peer in the Observation of `tick`; None if there is none."""
         contacts = self.steps[tick].observation.contacts if tick < len(self.steps) else ()
         return contacts[0] if contacts else None
 
 
 class OutOfOrder(CorruptJournal):
-    """A frame that is sound, and stands where none of its kind can."""
+    """A well-formed frame at a position where its kind is not allowed."""
 
     def __init__(self, message: msgspec.Struct, place: int, source: object) -> None:
         self.place = place
-        """how many frames stand before it"""
+        """The number of frames before it."""
         self.tick: int | None = getattr(message, "tick", None)
         at = f" of tick {self.tick}" if self.tick is not None else ""
         kind = type(message).__name__
-        self.what = f"{'an' if kind[0] in 'AE' else 'a'} {kind}{at} is out of order"
+        self.what = f"{'an' if kind[0] in 'AEIO' else 'a'} {kind}{at} is out of order"
         super().__init__(f"{source}: {self.what}")
 
 
 def past(frames: Iterable[bytes], source: object) -> Past:
-    """What `frames` tell. Raises CorruptJournal, whose text begins with `source`."""
+    """Return the content of a journal's `frames`.
+
+    Raises CorruptJournal, with a text that begins with `source`.
+    """
     frames = list(frames)
     environment = named_in(frames)
     first = int(environment is not None)
@@ -118,7 +124,7 @@ def past(frames: Iterable[bytes], source: object) -> Past:
     for place, frame in enumerate(frames[first:], first):
         message = _message(frame, source)
         if place == first and not isinstance(message, RobotConfig):
-            raise CorruptJournal(f"{source}: an agent's journal begins with its Briefing")
+            raise CorruptJournal(f"{source}: an agent's journal must begin with a RobotConfig")
         match message:
             case RobotConfig() if place == first:
                 config = message
@@ -130,19 +136,19 @@ def past(frames: Iterable[bytes], source: object) -> Past:
                 steps.append(Step(message, frame))
             case Report() | DeadlineMissed() | Command() | Estimate() if steps and end is None:
                 assert config is not None
-                onward = _with(steps[-1], message, frame, config.robot)
-                if onward is None:
+                extended = _extended(steps[-1], message, frame, config.robot)
+                if extended is None:
                     raise OutOfOrder(message, place, source)
-                steps[-1] = onward
+                steps[-1] = extended
             case _:
                 raise OutOfOrder(message, place, source)
     if config is None:
-        raise CorruptJournal(f"{source}: there is no RobotConfig in it")
+        raise CorruptJournal(f"{source}: it contains no RobotConfig")
     return Past(config, tuple(steps), end, final_report, environment)
 
 
 def _answered(steps: Sequence[Step]) -> bool:
-    """Whether the latest of them has come to its Command, so that the next may come."""
+    """Return whether the latest step has its Command, so that the next tick may follow."""
     return not steps or steps[-1].command is not None
 
 
@@ -153,8 +159,8 @@ def _message(frame: bytes, source: object) -> Any:
         raise CorruptJournal(f"{source}: {error}") from None
 
 
-def _with(step: Step, message: object, frame: bytes, robot: str) -> Step | None:
-    """`step`, and what came next in it; none where that cannot come next."""
+def _extended(step: Step, message: object, frame: bytes, robot: str) -> Step | None:
+    """Return `step` extended by `message`, or None if `message` cannot follow."""
     match message:
         case Estimate(tick=step.observation.tick) if step.command is not None and step.estimate is None:
             return replace(step, estimate=message)

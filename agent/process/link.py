@@ -1,4 +1,4 @@
-"""How an agent hears and is heard: over one Zenoh session after the other, each as if it were the first."""
+"""The Zenoh link of an agent, which can be attached to one session after another."""
 
 from __future__ import annotations
 
@@ -13,28 +13,31 @@ from protocol.network import keys, session
 from protocol.network.inbox import NOTHING, Arrival, Inbox
 
 SILENCE_S = 3.0
-"""a link over which the world has said nothing for so long is replaced, though Zenoh gives one up after
-`session.LEASE_S` and connects again: now and then nothing comes over such a link, for good"""
+"""The seconds without a frame from the world after which a session is replaced.
+
+Zenoh itself drops a link after `session.LEASE_S` and reconnects, but occasionally nothing ever arrives over
+the reconnected link.
+"""
 
 
 class WorldLinkLost(Exception):
-    """Nothing comes over this link any more; over another the world may be there."""
+    """Nothing arrives over this session any more; the world may be reachable over a new one."""
 
 
 class AgentLink:
-    """One robot's in one run. Nothing is heard or said before a session is attached."""
+    """The link of one robot in one run. It needs an attached session to send or receive."""
 
     def __init__(self, config: RobotConfig, run: str, inbox: Inbox) -> None:
         self._id = config.robot
         self._peer = config.peer
         self._run = run
         self._inbox = inbox
-        self._silence = SILENCE_S + (config.tick_s or 0.0)
+        self._link_timeout = SILENCE_S + (config.tick_s or 0.0)
         self.estimate_wanted = False
-        """whether anybody listens to estimates"""
+        """Whether any viewer subscribes to estimates."""
 
     def attach(self, link: zenoh.Session) -> None:
-        """From now on, this is the session over which it hears and is heard."""
+        """Use `link` to send and receive from now on."""
         me, peer, run = self._id, self._peer, self._run
         self._command = session.publisher(link, keys.command(run, me))
         self._report = session.publisher(link, keys.report(run, me, peer))
@@ -45,34 +48,37 @@ class AgentLink:
         session.watch_liveliness(link, keys.world_alive(run), self._inbox)
         self._show_alive = partial(session.show_alive, link, keys.robot_alive(run, me))
         self._token = self._show_alive()
-        self._heard_at = time.monotonic()
+        self._received_at = time.monotonic()
 
     def next(self, until: float) -> Arrival:
-        """What arrives next, NOTHING after `until`, by the clock. Raises LinkLost after long silence."""
-        lost = self._heard_at + self._silence
+        """Return the next arrival, or NOTHING once the monotonic clock reaches `until`.
+
+        Raises WorldLinkLost if no Observation has arrived for too long.
+        """
+        lost = self._received_at + self._link_timeout
         arrival = self._inbox.next(min(until, lost) - time.monotonic())
         if arrival.topic == "observation":
-            self._heard_at = time.monotonic()
+            self._received_at = time.monotonic()
         elif arrival is NOTHING and time.monotonic() >= lost:
             raise WorldLinkLost
         return arrival
 
     def appear(self) -> None:
-        """Go and come, as the world sees it."""
-        gone: Any = self._token  # its method is not typed
+        """Withdraw the liveliness token and declare it again, so that the world sees the robot reappear."""
+        gone: Any = self._token  # undeclare() is untyped
         gone.undeclare()
         self._token = self._show_alive()
 
     def command(self, frame: bytes) -> None:
-        """Say a Command, or a FinalReport, to the world."""
+        """Send a Command or a FinalReport to the world."""
         self._command.put(frame)
 
     def report(self, frame: bytes) -> None:
-        """Say a Report to the peer."""
+        """Send a Report to the peer."""
         self._report.put(frame)
 
     def estimate(self, frame: bytes) -> None:
-        """Say an Estimate to whoever listens."""
+        """Send an Estimate to the viewers."""
         self._estimate.put(frame)
 
     def _want_estimate(self, wanted: bool) -> None:

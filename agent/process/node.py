@@ -1,9 +1,10 @@
-"""The agent's process: Zenoh in, journal, planner, Zenoh out. It knows nothing but what it is told.
+"""The agent process: it receives frames over Zenoh, journals them, runs the planner and sends its answers.
 
-It reacts to what arrives and never steps twice: a Observation heard again makes it send again what it
-answered, so whatever is lost, late or doubled costs time and changes nothing. So does a process that is
-killed, its peer's or the world's: whoever is started again is told again what it must know. So do a process
-that is stopped, and a link that goes down: one over which nothing comes any more is replaced.
+The process reacts only to arriving frames, and it never steps twice. A repeated Observation makes it send its
+stored answers again, so a lost, late or duplicated frame costs time but changes no decision. The same holds
+when this process, the peer's process or the world is killed: a restarted process receives again everything
+that it needs. A suspended process and a broken link are handled in the same way. A link over which nothing
+arrives is replaced by a new one.
 """
 
 from __future__ import annotations
@@ -25,19 +26,25 @@ from protocol.network.inbox import Arrival, Inbox
 from protocol.wire import MalformedFrame, decode, encode
 
 REPORT_SHARE = 0.5
-"""of a tick in real time: how long to wait for the peer's report"""
+"""The fraction of a tick to wait for the peer's report, in real time."""
 FIELD_SHARE = 0.1
-"""the same without a world, where the rest of the tick is for the manoeuvre"""
+"""The same fraction in hardware mode, which needs the rest of the tick for the manoeuvre."""
 LAST_WORD_S = 0.5
-"""how long what the world has said may outlast its sign of life"""
+"""The seconds for which frames of the world may still arrive after its liveliness token has disappeared."""
 ENDED_S = 1.0
-"""how long an End of another tick must be said; the world says its own for twice as long, or more"""
+"""The seconds for which a MissionEnd of another tick must be repeated before it is accepted.
+
+The world repeats its own MissionEnd for at least twice as long.
+"""
 AGAIN_S = 0.05
-"""how often to say again what was said: to one frame may answer as many as there are reports to tell"""
+"""The least seconds between two repetitions of the stored answers.
+
+One received frame may cause as many frames as there are reports to repeat.
+"""
 
 
 class AgentProcess:
-    """One robot in one run, over one link after the other."""
+    """One robot in one run, over a sequence of links."""
 
     def __init__(
         self,
@@ -48,236 +55,252 @@ class AgentProcess:
         timeout: float = 30.0,
         on_kill_point: Callable[[str, int], None] | None = None,
     ) -> None:
-        """`timeout` (s) bounds the wait for the world; `on_kill_point` is told how far each tick has come."""
+        """Continue from `memory`, in the run named `run`.
+
+        `timeout` is the longest time in s to wait for the world. `on_kill_point` is called with the name of
+        each step within a tick and the tick, so that a scheduled kill can happen there.
+        """
         config = memory.config
         self._id = config.robot
         self._inbox = inbox
         self._timeout = timeout
         self._tick_s = config.tick_s
-        self._silence = timeout + (self._tick_s or 0.0)
-        """how long to wait for something new from the world"""
-        self._give_up = time.monotonic() + self._silence
+        self._world_timeout = timeout + (self._tick_s or 0.0)
+        """The longest time in s between two new frames from the world."""
+        self._give_up = time.monotonic() + self._world_timeout
         self._on_kill_point = on_kill_point
         self._robot = memory.robot
         self._observation = memory.observation
-        """the latest"""
+        """The latest Observation."""
         self._due: float | None = None
-        """in real time: when to go on without the reports that it lists"""
+        """The time (monotonic clock) after which listed reports are no longer awaited; None in lockstep."""
         if self._observation is not None and self._robot.command is None:
             self._set_due()
         real_time = self._tick_s is not None
         self._link = AgentLink(config, run, inbox)
-        self._disorder = OutOfStep(self._id, inbox, self._link.appear, real_time=real_time)
-        self._post = Post(inbox, memory.heard, real_time=real_time)
-        self._gone = False
-        """whether it has been told that the world has gone"""
-        self._said_again = 0.0
-        """when all was last said again"""
-        self._again: float | None = None
-        """when to do so once more, if it was asked for too soon"""
-        self._told = deque(memory.told, maxlen=REPORTS_TOLD)
-        """its own latest reports"""
+        self._out_of_step = OutOfStep(self._id, inbox, self._link.appear, real_time=real_time)
+        self._report_buffer = Post(inbox, memory.heard, real_time=real_time)
+        self._loss_reported = False
+        """Whether the loss of the world has been reported to the user."""
+        self._repeated_at = 0.0
+        """The time (monotonic clock) of the last repetition."""
+        self._repeat_at: float | None = None
+        """The time of the next repetition, if one was requested within AGAIN_S of the last."""
+        self._own_reports = deque(memory.told, maxlen=REPORTS_TOLD)
+        """The robot's own latest reports."""
         self.end: MissionEnd | None = memory.end if memory.final_report is not None else None
-        """once the world has said it"""
+        """The MissionEnd, once it is accepted."""
         self._final_report = memory.final_report
 
     def play(self) -> MissionEnd:
-        """The run over the link that it is attached to, to its MissionEnd.
+        """Run the mission over the attached link and return its MissionEnd.
 
-        Raises LinkLost; NoWorld; or Interrupted when told to stop.
+        Raises WorldLinkLost if nothing arrives over this link, NoWorld if the world is absent for too long,
+        and Interrupted when the process is asked to stop.
         """
         while self.end is None:
             arrival = self._next(self._due)
             match arrival.topic:
                 case "observation":
-                    message = self._accepted(arrival)
-                    if isinstance(message, MissionEnd) and self._is_over(message):
+                    message = self._decoded(arrival)
+                    if isinstance(message, MissionEnd) and self._is_accepted(message):
                         self._conclude(message)
-                    elif isinstance(message, Observation) and self._on_sense(message, arrival.frame):
-                        self._give_up = time.monotonic() + self._silence
+                    elif isinstance(message, Observation) and self._on_observation(message, arrival.frame):
+                        self._give_up = time.monotonic() + self._world_timeout
                 case "report":
-                    self._post.take(arrival, self._known)
+                    self._report_buffer.take(arrival, self._latest_tick)
                 case "gone" | "alive":
-                    self._disorder.world(there=arrival.topic == "alive")
-                    self._notice(gone=arrival.topic == "gone")
+                    self._out_of_step.world(there=arrival.topic == "alive")
+                    self._note_world(gone=arrival.topic == "gone")
                 case _:
                     pass
             if self.end is None:
-                self._decide_when_all_is_heard()
-                self._check_patience()
-        return self._part(self.end)
+                self._decide_when_reports_complete()
+                self._check_timeout()
+        return self._answer_end(self.end)
 
     def unanswered(self) -> None:
-        """Wait a moment for another link. Raises NoWorld when that has been too long, or Interrupted."""
-        self._notice(gone=True)
-        self._inbox.next(ASK_AGAIN_S)
-        self._check_patience()
+        """Wait briefly between two attempts to open a link.
 
-    def _notice(self, *, gone: bool) -> None:
-        """Tell once that the world has gone: its sign of life may have ended before it was seen."""
-        if gone and not self._gone:
-            self._inbox.say(f"the world has gone; waiting {self._silence:g} s for it")
-        self._gone = gone
+        Raises NoWorld if the world is absent for too long, or Interrupted.
+        """
+        self._note_world(gone=True)
+        self._inbox.next(ASK_AGAIN_S)
+        self._check_timeout()
+
+    def _note_world(self, *, gone: bool) -> None:
+        """Report the loss of the world to the user, once per loss.
+
+        The liveliness token may have disappeared before this process saw it.
+        """
+        if gone and not self._loss_reported:
+            self._inbox.say(f"the world has gone; waiting {self._world_timeout:g} s for it")
+        self._loss_reported = gone
 
     def attach(self, link: zenoh.Session) -> None:
-        """From now on, this is the session over which it hears and is heard."""
+        """Use `link` to send and receive from now on."""
         self._link.attach(link)
 
     def _next(self, until: float | None) -> Arrival:
-        """What arrives next, NOTHING after `until`; says again what is asked for, once that is due.
+        """Return the next arrival, or NOTHING after `until`.
 
-        Raises LinkLost if the world is silent for too long.
+        Meanwhile, repeat the stored answers when a repetition is due.
+
+        Raises WorldLinkLost if nothing arrives from the world for too long.
         """
-        if self._again is not None and time.monotonic() >= self._again:
-            self._say_again()
-        return self._link.next(min(until or self._give_up, self._give_up, self._again or self._give_up))
+        if self._repeat_at is not None and time.monotonic() >= self._repeat_at:
+            self._repeat_answers()
+        return self._link.next(min(until or self._give_up, self._give_up, self._repeat_at or self._give_up))
 
-    def _check_patience(self) -> None:
+    def _check_timeout(self) -> None:
         if time.monotonic() > self._give_up:
-            raise NoWorld(f"nothing heard from the world for {self._silence:g} s")
+            raise NoWorld(f"nothing received from the world for {self._world_timeout:g} s")
 
     @property
-    def _known(self) -> int:
-        """The tick of its latest Observation."""
+    def _latest_tick(self) -> int:
+        """The tick of the latest Observation, or -1."""
         return self._observation.tick if self._observation is not None else -1
 
-    # --- what arrives ---
+    # --- arrivals ---
 
-    def _accepted(self, arrival: Arrival) -> Observation | MissionEnd | None:
+    def _decoded(self, arrival: Arrival) -> Observation | MissionEnd | None:
         try:
             message: Observation | MissionEnd = decode(arrival.frame, Observation | MissionEnd)
         except MalformedFrame as error:
             self._inbox.refuse(arrival, error)
             return None
         if isinstance(message, Observation) and message.robot != self._id:
-            self._inbox.refuse(arrival, f"it is meant for '{message.robot}'")
+            self._inbox.refuse(arrival, f"it is addressed to '{message.robot}'")
             return None
         return message
 
-    def _is_over(self, end: MissionEnd) -> bool:
-        return end.tick == self._known or self._disorder.persists(end, ENDED_S)
+    def _is_accepted(self, end: MissionEnd) -> bool:
+        return end.tick == self._latest_tick or self._out_of_step.persists(end, ENDED_S)
 
-    def _on_sense(self, observation: Observation, frame: bytes) -> bool:
-        """Whether it is in step. Raises NoWorld."""
-        if observation.tick == self._known + 1:
+    def _on_observation(self, observation: Observation, frame: bytes) -> bool:
+        """Process an Observation and return whether it is in step. Raises NoWorld."""
+        if observation.tick == self._latest_tick + 1:
             if self._on_kill_point is not None:
                 self._on_kill_point("observation", observation.tick)
-            if self._due is not None:  # the world goes on; what has not come is missed
+            if self._due is not None:  # the world has advanced; absent reports count as missed
                 self._due = 0.0
-                self._decide_when_all_is_heard()
-            self._disorder.over()
+                self._decide_when_reports_complete()
+            self._out_of_step.over()
             self._observation = observation
             self._set_due()
-            told = self._robot.observation(observation, frame)
-            if told is not None:
-                self._told.append(told)
-                self._send_report(told)
+            framed = self._robot.observation(observation, frame)
+            if framed is not None:
+                self._own_reports.append(framed)
+                self._send_report(framed)
             return True
         if observation == self._observation:
-            self._disorder.over()
-            self._say_again()
+            self._out_of_step.over()
+            self._repeat_answers()
             return True
-        self._disorder.observation(observation, self._known)
+        self._out_of_step.observation(observation, self._latest_tick)
         return False
 
     def _set_due(self) -> None:
         if self._tick_s is not None and self._observation is not None:
-            in_field = any(contact.heard is None for contact in self._observation.contacts)
-            self._due = time.monotonic() + (FIELD_SHARE if in_field else REPORT_SHARE) * self._tick_s
+            hardware_mode = any(contact.heard is None for contact in self._observation.contacts)
+            self._due = time.monotonic() + (FIELD_SHARE if hardware_mode else REPORT_SHARE) * self._tick_s
 
-    # --- what is done about it ---
+    # --- answers ---
 
-    def _decide_when_all_is_heard(self) -> None:
+    def _decide_when_reports_complete(self) -> None:
         if self._observation is None or self._robot.command is not None:
             return
-        heard: list[FramedReport] = []
+        received: list[FramedReport] = []
         missed: list[str] = []
         for contact in self._observation.contacts:
             listed = contact.heard
             if listed is None:
-                heard += self._post.waiting(self._observation.tick)
-                listed = () if self._post.of(self._observation.tick) else (self._observation.tick,)
+                received += self._report_buffer.waiting(self._observation.tick)
+                listed = () if self._report_buffer.of(self._observation.tick) else (self._observation.tick,)
             for tick in listed:
-                told = self._post.of(tick)
-                if told is not None:
-                    heard.append(told)
+                framed = self._report_buffer.of(tick)
+                if framed is not None:
+                    received.append(framed)
                 elif self._due is None or time.monotonic() < self._due:
                     return
                 else:
                     missed.append(contact.peer)
-        command = self._robot.decide(heard, missed)
+        command = self._robot.decide(received, missed)
         self._due = None
-        self._send_drive(command.tick)
+        self._send_command(command.tick)
         if self._robot.journaled or self._link.estimate_wanted:
             estimate = self._robot.estimate()
             if self._link.estimate_wanted:
                 self._link.estimate(estimate)
-        self._post.list(told.report.tick for told in heard)
+        self._report_buffer.list(framed.report.tick for framed in received)
         for contact in self._observation.contacts:
-            self._post.list(contact.damaged)
-        self._post.forget(command.tick - REPORTS_KEPT, self._robot.unheard)
+            self._report_buffer.list(contact.damaged)
+        self._report_buffer.forget(command.tick - REPORTS_KEPT, self._robot.unheard)
 
-    def _send_report(self, told: FramedReport) -> None:
-        self._link.report(told.frame)
+    def _send_report(self, framed: FramedReport) -> None:
+        self._link.report(framed.frame)
         if self._on_kill_point is not None:
-            self._on_kill_point("report", told.report.tick)
+            self._on_kill_point("report", framed.report.tick)
 
-    def _send_drive(self, tick: int) -> None:
+    def _send_command(self, tick: int) -> None:
         if self._on_kill_point is not None:
             self._on_kill_point("journal", tick)
         self._link.command(self._robot.drive_frame)
         if self._on_kill_point is not None:
             self._on_kill_point("command", tick)
 
-    def _say_again(self) -> None:
-        """All that whoever was started again may have lost: earlier reports, too, if the peer is near."""
+    def _repeat_answers(self) -> None:
+        """Send the stored answers again, for a process that was restarted and may have lost them.
+
+        In contact these include earlier reports to the peer.
+        """
         now = time.monotonic()
-        if now < self._said_again + AGAIN_S:
-            self._again = self._said_again + AGAIN_S
+        if now < self._repeated_at + AGAIN_S:
+            self._repeat_at = self._repeated_at + AGAIN_S
             return
-        self._said_again, self._again = now, None
+        self._repeated_at, self._repeat_at = now, None
         if self._robot.told is not None:
             oldest = self._robot.told.report.tick - REPORTS_TOLD
-            for told in self._told:
-                if told.report.tick > oldest:
-                    self._send_report(told)
+            for framed in self._own_reports:
+                if framed.report.tick > oldest:
+                    self._send_report(framed)
         if self._robot.command is not None:
-            self._send_drive(self._robot.command.tick)
+            self._send_command(self._robot.command.tick)
 
     def _conclude(self, end: MissionEnd) -> None:
-        self._post.forget(end.tick + REPORTS_KEPT + 1, self._robot.unheard)
+        self._report_buffer.forget(end.tick + REPORTS_KEPT + 1, self._robot.unheard)
         self._final_report = self._robot.final_report(
             end,
             reports_refused=self._inbox.refused["report"],
-            reports_unheard=self._post.unheard,
+            reports_unheard=self._report_buffer.unheard,
             frames_refused=self._inbox.refused.total(),
         )
         self.end = end
         self._give_up = time.monotonic() + self._timeout
 
-    def _part(self, end: MissionEnd) -> MissionEnd:
-        """Answer the MissionEnd, as often as it is said, until the world says that it has the answer on record."""
+    def _answer_end(self, end: MissionEnd) -> MissionEnd:
+        """Answer every repetition of the MissionEnd until the world confirms that it has the answer."""
         assert self._final_report is not None
         frame = encode(self._final_report)
         self._link.command(frame)
-        self._disorder.over()
+        self._out_of_step.over()
         gone = False
         while (now := time.monotonic()) < self._give_up:
             arrival = self._next(now + LAST_WORD_S if gone else None)
             if arrival.topic == "observation":
                 if arrival.frame == frame:
                     break
-                message = self._accepted(arrival)
+                message = self._decoded(arrival)
                 if isinstance(message, Observation):
-                    self._disorder.observation(message, end.tick)
+                    self._out_of_step.observation(message, end.tick)
                 elif message is not None:
-                    self._disorder.over()
+                    self._out_of_step.over()
                     self._link.command(frame)
             elif arrival.topic == "alive":
-                self._disorder.world(there=True)
+                self._out_of_step.world(there=True)
             elif arrival.topic == "gone":
-                self._disorder.world(there=False)
-                gone = True  # what it said before may be on its way
+                self._out_of_step.world(there=False)
+                gone = True  # frames that the world sent before may still arrive
             elif gone and arrival.topic == "nothing":
                 self._inbox.say(
                     f"the world has gone after its MissionEnd; waiting {self._timeout:g} s for it"

@@ -1,4 +1,4 @@
-"""What the world says out of step with what an agent knows, and when that is believed."""
+"""Messages of the world that do not fit the tick of the agent, and the rule for accepting them."""
 
 from __future__ import annotations
 
@@ -10,61 +10,65 @@ from protocol.messages import MissionEnd, Observation
 from protocol.network.inbox import Inbox
 
 BEHIND_S = 3.0
-"""how long the world must go on saying what is out of step, and nothing else, to be believed: a stranger may
-say anything, and in real time what lies between may be outstanding"""
+"""The seconds for which the world must send only messages that are out of step, before they are accepted.
+
+An unknown process may send anything, and in real time the ticks in between may still be on the way.
+"""
 
 
 class OutOfStep:
-    """What has been said out of step, with nothing in step since."""
+    """The messages received out of step since the last message in step."""
 
     def __init__(self, robot: str, inbox: Inbox, appear: Callable[[], None], *, real_time: bool) -> None:
-        """`appear` has the world tell what was missed."""
+        """Start with no message out of step. `appear` makes the world send missed ticks again."""
         self._robot = robot
         self._inbox = inbox
         self._appear = appear
         self._real_time = real_time
-        self._odd: tuple[Observation | MissionEnd, float] | None = None
-        """the latest, and since when"""
+        self._latest: tuple[Observation | MissionEnd, float] | None = None
+        """The latest message, and the time (monotonic clock) of the first in the series."""
         self._world_there = True
 
     def over(self) -> None:
-        """Something in step has been said."""
-        self._odd = None
+        """Forget the series, because a message in step has arrived."""
+        self._latest = None
 
     def world(self, *, there: bool) -> None:
-        """The world has come, or gone; while it is gone, nobody is believed."""
-        self._world_there, self._odd = there, None
+        """Note that the world has appeared or gone. While it is gone, no message out of step is accepted."""
+        self._world_there, self._latest = there, None
 
     def observation(self, observation: Observation, known: int) -> None:
-        """The world is elsewhere, if it stays there: one of the two has lost its past, or comes too late.
+        """Handle an Observation out of step. Raises NoWorld if the world keeps sending such Observations.
 
-        `known` is the latest tick in step. In real time it tells what lies between. Raises NoWorld.
+        In that case the agent or the world has lost its recording, or the agent is too late. `known` is the
+        latest tick in step. In real time the world can still send the ticks in between.
         """
         tick = observation.tick
         if self._real_time and tick < known:
-            return  # told once more of what was missed
-        if self._real_time and tick > known and self._odd is None:
-            self._appear()  # who appears is told what it has missed
+            return  # a repetition of a tick that was already processed
+        if self._real_time and tick > known and self._latest is None:
+            self._appear()  # the world sends the missed ticks to a robot that appears
         if not self.persists(observation, BEHIND_S):
             return
         if tick == known:
             raise NoWorld(
-                f"the record is another run's: in this one, {self._robot} senses otherwise at tick {tick}"
+                f"the recording is of another run: the Observation of {self._robot} at tick {tick} differs"
             )
-        late = "too late" if tick > known else "started again without its record"
-        raise NoWorld(f"{late}: the world is at tick {tick}, {self._robot} knows it up to {known}")
+        late = "too late" if tick > known else "the world was restarted without its recording"
+        raise NoWorld(f"{late}: the world is at tick {tick}, {self._robot} at tick {known}")
 
     def persists(self, message: Observation | MissionEnd, bound_s: float) -> bool:
-        """Whether the world has said `message`, and nothing in step, for `bound_s`; until then it is refused.
+        """Return whether only messages like `message` have arrived for `bound_s` seconds.
 
-        In lockstep it would say the same over and over; in real time its Observations go on.
+        Until then, the message is refused. In lockstep the world repeats one message. In real time its
+        Observations advance.
         """
         now = time.monotonic()
-        goes_on = self._real_time and isinstance(message, Observation)
-        if self._odd is None or not (message == self._odd[0] or goes_on):
-            self._odd = message, now
-        if self._world_there and now - self._odd[1] >= bound_s:
+        advances = self._real_time and isinstance(message, Observation)
+        if self._latest is None or not (message == self._latest[0] or advances):
+            self._latest = message, now
+        if self._world_there and now - self._latest[1] >= bound_s:
             return True
-        if not goes_on:
-            self._inbox.refused["observation"] += 1  # it is told once it is believed
+        if not advances:
+            self._inbox.refused["observation"] += 1  # counted only: the error is reported once it is accepted
         return False

@@ -1,6 +1,6 @@
-"""What a robot remembers when its process is started again: its journal, folded.
+"""Recovery of a robot's state from its journal when its process is restarted.
 
-The planner decides everything once more, and what it decides must be what is on record.
+The planner computes every decision again, and each must equal the recorded one.
 """
 
 from __future__ import annotations
@@ -18,64 +18,70 @@ from protocol.messages import FinalReport, MissionEnd, Observation, RobotConfig
 from protocol.wire import encode
 
 REPORTS_KEPT = 64
-"""ticks for which a report of the peer is kept that no Observation has listed yet"""
+"""The number of ticks for which a report of the peer is stored that no Observation has listed yet."""
 REPORTS_TOLD = REPORTS_KEPT - 4
-"""ticks for which a robot can say its own again; less, or the peer would count them twice"""
+"""The number of ticks for which a robot can repeat its own reports.
+
+It is smaller than REPORTS_KEPT. Otherwise the peer would count a report twice.
+"""
 
 
 class Memory(msgspec.Struct, frozen=True):
-    """A robot and what its process must know beside its mind; of a new robot, nothing."""
+    """A robot, with the state of its process. Only `config` and `robot` are set for a new robot."""
 
     config: RobotConfig
     robot: Robot
     observation: Observation | None = None
-    """the latest"""
+    """The latest Observation."""
     told: tuple[FramedReport, ...] = ()
-    """its latest reports"""
+    """The robot's own latest reports."""
     heard: tuple[FramedReport, ...] = ()
-    """the peer's latest"""
+    """The latest reports received from the peer."""
     end: MissionEnd | None = None
     final_report: FinalReport | None = None
-    """what it has answered to the MissionEnd"""
+    """The answer to the MissionEnd."""
 
 
 def remember(recording: Retrace) -> Memory | None:
-    """What `recording` tells; None if there is nothing in it.
+    """Return the state that follows from `recording`, or None if the journal contains no RobotConfig.
 
-    Raises CorruptJournal if it tells no mission, or one in which other decisions were taken.
+    Raises CorruptJournal if the journal is not that of an agent, or if the recorded decisions differ.
     """
     if environment.is_blank(recording.frames):
         return None
-    named = environment.named_in(recording.frames)
-    lived = past(recording.frames, recording.path)
-    robot = Robot(lived.config)
+    recorded_with = environment.named_in(recording.frames)
+    journal = past(recording.frames, recording.path)
+    robot = Robot(journal.config)
     robot.keep(recording)
-    recording.write(*[encode(one) for one in (named, lived.config) if one is not None])
-    told: deque[FramedReport] = deque(maxlen=REPORTS_TOLD)
-    for step in lived.steps:
+    recording.write(*[encode(one) for one in (recorded_with, journal.config) if one is not None])
+    own_reports: deque[FramedReport] = deque(maxlen=REPORTS_TOLD)
+    for step in journal.steps:
         try:
             report = robot.observation(step.observation, step.frame)
-            if report is not None:  # though it be torn on record
-                told.append(report)
+            if report is not None:  # although its frame may be torn in the journal
+                own_reports.append(report)
             if step.command is not None:
                 robot.decide(step.heard, step.missed)
                 robot.estimate()
         except ReplayMismatch:
             raise CorruptJournal(
-                f"{recording.path}: on record it decided otherwise at tick {step.observation.tick}: "
-                + (environment.otherwise(named, environment.of_robot()) or "the journal is another version's")
+                f"{recording.path}: the recorded decision differs at tick {step.observation.tick}: "
+                + (
+                    environment.otherwise(recorded_with, environment.of_robot())
+                    or "the journal was written by another version"
+                )
             ) from None
-    if lived.final_report is not None:  # counts what the wire brought, too, which no fold can
+    if journal.final_report is not None:  # it also counts received frames, which a replay cannot reproduce
         recording.write(*recording.frames[-2:])
-    observation = lived.steps[-1].observation if lived.steps else None
+    observation = journal.steps[-1].observation if journal.steps else None
     now = observation.tick if observation is not None else 0
-    latest = lived.steps[-REPORTS_KEPT:]
+    latest = journal.steps[-REPORTS_KEPT:]
     return Memory(
-        config=lived.config,
+        config=journal.config,
         robot=robot,
         observation=observation,
-        told=tuple(told),
+        told=tuple(own_reports),
         heard=tuple([one for step in latest for one in step.heard if now - one.report.tick <= REPORTS_KEPT]),
-        end=lived.end if lived.final_report is not None else None,
-        final_report=lived.final_report,
+        end=journal.end if journal.final_report is not None else None,
+        final_report=journal.final_report,
     )

@@ -1,4 +1,4 @@
-"""The peer's reports as they come, until a Observation lists them, or nobody has asked for them for long."""
+"""A buffer for the peer's reports, which stores each until an Observation lists it or it is too old."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode
 
 
 class Post:
-    """What has come, by the tick in which it was told."""
+    """The received reports, by tick."""
 
     def __init__(self, inbox: Inbox, heard: Sequence[FramedReport], *, real_time: bool) -> None:
-        """`heard` are those that a process which was started again has on record."""
+        """Start with `heard`, the reports in the journal of a restarted process."""
         self._inbox = inbox
         self._real_time = real_time
-        self._reports = {told.report.tick: told for told in heard}
+        self._reports = {framed.report.tick: framed for framed in heard}
         self._listed = set(self._reports)
-        """those of them that a Observation has listed"""
+        """The ticks of reports that an Observation has listed."""
         self.unheard = 0
-        """those that went without"""
+        """The number of reports that were received, but never listed."""
 
     def take(self, arrival: Arrival, known: int) -> None:
-        """Keep it, or refuse it; `known` is the tick of the latest Observation."""
+        """Store the report in `arrival`, or refuse it. `known` is the tick of the latest Observation."""
         try:
             report = decode(arrival.frame, Report, MAX_REPORT_BYTES)
         except MalformedFrame as error:
@@ -45,14 +45,14 @@ class Post:
         elif (
             self._reports.setdefault(report.tick, FramedReport(report, arrival.frame)).frame != arrival.frame
         ):
-            self._inbox.refuse(arrival, "it was told otherwise before")
+            self._inbox.refuse(arrival, "it differs from an earlier report of this tick")
 
     def of(self, tick: int) -> FramedReport | None:
-        """What was told in `tick`, once it has come."""
+        """Return the report of `tick`, or None if it has not arrived."""
         return self._reports.get(tick)
 
     def waiting(self, known: int) -> list[FramedReport]:
-        """What has come and was never heard, of ticks up to `known`, the oldest first."""
+        """Return the reports of ticks up to `known` that were never listed, oldest first."""
         return [
             self._reports[tick]
             for tick in sorted(self._reports)
@@ -60,11 +60,11 @@ class Post:
         ]
 
     def list(self, ticks: Iterable[int]) -> None:
-        """A Observation has listed those of these `ticks`."""
+        """Mark the reports of `ticks` as listed by an Observation."""
         self._listed.update(ticks)
 
     def forget(self, before: int, asked_for: Collection[int]) -> None:
-        """Those of ticks `before`, counting what nobody has `asked_for`, nor listed."""
+        """Delete the reports of ticks below `before`, and count those neither in `asked_for` nor listed."""
         for tick in [tick for tick in self._reports if tick < before]:
             del self._reports[tick]
             self.unheard += tick not in self._listed and tick not in asked_for

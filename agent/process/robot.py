@@ -1,6 +1,6 @@
-"""A robot between its wires: planner, radio and journal, whatever carries the frames.
+"""One robot without its transport: the planner, the reports and the journal.
 
-The process over Zenoh and the in-process mission drive the same `Robot`, so they journal the same bytes.
+The agent process over Zenoh and the run in one process use the same `Robot`, so they journal the same bytes.
 """
 
 from __future__ import annotations
@@ -26,55 +26,58 @@ from protocol.wire import encode
 
 
 class FramedReport(msgspec.Struct, frozen=True):
-    """A report and the frame that it came in, or goes out in."""
+    """A report together with the frame in which it was received or is sent."""
 
     report: Report
     frame: bytes
 
 
 class Robot:
-    """One robot's mind, and the record of what went in and came out of it."""
+    """The state of one robot, and the journal of its inputs and outputs."""
 
     def __init__(self, config: RobotConfig, journal: Sink | None = None) -> None:
         self.mind = RobotState(config)
         self.told: FramedReport | None = None
-        """the report of this tick, if there was anyone to hear it"""
+        """The report of this tick; None if no peer is in contact."""
         self.command: Command | None = None
-        """the Command of this tick; none before it is decided"""
+        """The Command of this tick; None until it is decided."""
         self.reports_sent = 0
         self.damaged = 0
-        """reports that came damaged"""
+        """The number of reports that were received damaged."""
         self.unheard: set[int] = set()
-        """ticks in which the peer said a report that has not come yet"""
+        """The ticks of contact from which the peer's report has not been received yet."""
         self.bytes_sent = 0
-        self._frame: bytes | None = None
+        self._command_frame: bytes | None = None
         self._unwritten: bytes | None = None
-        """a Observation that nothing has followed from yet; journaled with the Command, before that is sent"""
+        """An Observation without a report; it is journaled with the Command, before the Command is sent."""
         self._journal = journal
         if journal is not None:
             journal.write(encode(environment.of_robot()), encode(config))
 
     def keep(self, journal: Sink | None) -> None:
-        """Go on journaling there."""
+        """Write to `journal` from now on."""
         self._journal = journal
 
     @property
     def journaled(self) -> bool:
-        """Whether there is a record to keep."""
+        """Return whether frames are written to a journal."""
         return self._journal is not None
 
     @property
     def drive_frame(self) -> bytes:
-        """What to send of this tick's Command, once there is one."""
-        if self._frame is None:
+        """Return the frame of this tick's Command, which must have been decided."""
+        if self._command_frame is None:
             assert self.command is not None
-            self._frame = encode(self.command)
-        return self._frame
+            self._command_frame = encode(self.command)
+        return self._command_frame
 
     def observation(self, observation: Observation, frame: bytes | None = None) -> FramedReport | None:
-        """Fold in what was sensed (it came in `frame`); the report to send, if anyone is there to hear it."""
+        """Update the state with an Observation, and return the report to send; None if no peer is in contact.
+
+        `frame` is the encoded Observation, if it was received as one.
+        """
         self.mind = planner.observe(self.mind, observation)
-        self.told = self.command = self._frame = None
+        self.told = self.command = self._command_frame = None
         for contact in observation.contacts:
             self.unheard.add(observation.tick)
             self.unheard.difference_update(contact.heard or (), contact.damaged)
@@ -91,12 +94,15 @@ class Robot:
         return self.told
 
     def decide(self, heard: Sequence[FramedReport] = (), missed: Sequence[str] = ()) -> Command:
-        """Fold in what was heard; the drive for the tick. `missed` are peers whose report did not come."""
-        self.mind = planner.decide(self.mind, [told.report for told in heard])
-        self.unheard.difference_update([told.report.tick for told in heard])
+        """Update the state with the received reports, and return the Command of this tick.
+
+        `missed` names the peers whose reports did not arrive in time.
+        """
+        self.mind = planner.decide(self.mind, [framed.report for framed in heard])
+        self.unheard.difference_update([framed.report.tick for framed in heard])
         self.command = planner.command(self.mind)
         if self._journal is not None:
-            frames = [told.frame for told in heard]
+            frames = [framed.frame for framed in heard]
             frames += [encode(DeadlineMissed(self.mind.tick, peer)) for peer in missed]
             if self._unwritten is not None:
                 frames.insert(0, self._unwritten)
@@ -105,9 +111,9 @@ class Robot:
         return self.command
 
     def estimate(self) -> bytes:
-        """The frame of what the robot holds possible, for whoever watches; once a tick, after the Command.
+        """Return the frame of the Estimate of this tick, for viewers. Call it once a tick, after `decide`.
 
-        Nobody waits for it, so it is made and journaled when the Command is on its way.
+        No process waits for an Estimate, so it is computed and journaled after the Command has been sent.
         """
         frame = encode(planner.estimate(self.mind))
         if self._journal is not None:
@@ -117,24 +123,25 @@ class Robot:
     def final_report(
         self, end: MissionEnd, *, reports_refused: int = 0, reports_unheard: int = 0, frames_refused: int = 0
     ) -> FinalReport:
-        """The mission is over: how it went, seen from inside, and what the wire brought that was no use."""
-        state, findings = self.mind, self.mind.belief
-        plan = findings.plan
+        """Return the robot's summary of the finished mission, and journal it after `end`.
+
+        The arguments count the frames that the transport refused and the reports that no Observation listed.
+        """
+        state, belief = self.mind, self.mind.belief
+        plan = belief.plan
         final_report = FinalReport(
             robot=state.config.robot,
             anchor_ranges=len(state.log.ranges),
             mutual_ranges=len(state.mutual),
-            branch=findings.branch_kind,
-            alpha=findings.branch.alpha if findings.branch is not None else None,
-            candidates=findings.candidates,
+            branch=belief.branch_kind,
+            alpha=belief.branch.alpha if belief.branch is not None else None,
+            candidates=belief.candidates,
             last_turn_rate=plan.command.omega if plan is not None else None,
             separation_m2=plan.separation_m2 if plan is not None else None,
-            hypotheses=(
-                len(findings.pair or findings.placements) if findings.candidates is not None else None
-            ),
-            probability=findings.pair[0].probability if findings.pair else None,
-            blocking_reason=findings.blocking_reason,
-            p_value=findings.p_value,
+            hypotheses=(len(belief.pair or belief.placements) if belief.candidates is not None else None),
+            probability=belief.pair[0].probability if belief.pair else None,
+            blocking_reason=belief.blocking_reason,
+            p_value=belief.p_value,
             reports_sent=self.reports_sent,
             reports_heard=state.peer_state.heard,
             reports_refused=reports_refused + self.damaged,

@@ -1,4 +1,4 @@
-"""Under noise: how well a fit explains the ranges, and with it whether the peer can have told the truth."""
+"""Consistency tests: whether the residuals of a fit are compatible with the noise and the known anchors."""
 
 from __future__ import annotations
 
@@ -12,24 +12,28 @@ from agent.estimation.gaussian.range_model import PairRanges
 from protocol.messages import Inconsistent
 
 DOUBTFUL = 1e-3
-"""less probable than this, a fit is not what a robot claims by: it takes more ranges"""
+"""The p-value below which a robot does not claim by a fit, but measures more ranges."""
 
 WARY = 1e-2
-"""the same, while a robot has not got twice as many mutual ranges as a claim takes"""
+"""The same bound while a robot has fewer than twice the mutual ranges that a claim requires."""
 
 UNBELIEVABLE = 2e-4
-"""less probable than this, and so over again, it is not chance that the peer has against it"""
+"""The p-value below which a search counts towards LOOKS: chance alone does not repeat it."""
 
 LOOKS = 5
-"""searches of the whole plane, each with more ranges, before an alarm: one may have missed the truth"""
+"""The number of consecutive inconsistent searches before a robot ends with `inconsistent`.
+
+Each search covers the whole plane with more ranges than the last, because one search may miss the true
+hypothesis.
+"""
 
 
 FINISHED = 0.1
-"""sigmas: a fit whose last step was longer than this has not found its minimum"""
+"""The length in sigmas of the last step above which a fit has not reached its minimum."""
 
 
 class Inconsistency(NamedTuple):
-    """What speaks most against a fit."""
+    """The least favourable test of a fit: a description, its sigmas and its p-value."""
 
     what: str
     sigmas: float
@@ -37,40 +41,42 @@ class Inconsistency(NamedTuple):
 
     @property
     def alarm(self) -> Inconsistent:
-        """The same, as a verdict on the peer."""
+        """Return the verdict on the peer for this result."""
         return Inconsistent(self.what, self.sigmas, self.p_value)
 
 
 def doubt(fit: Fit, pair: PairRanges) -> Inconsistency:
-    """The less probable of two: all residuals as they are, and the distance of the anchors that they imply.
+    """Return the less probable of two tests: all residuals, and the distance between the anchors.
 
-    What a robot drove from its anchor to the encounter stands in no range of its own; it is the distance
-    between the anchors, which is known, that it has to fit.
+    The motion of a robot between its anchor and the encounter affects no single range. It is tested only by
+    the distance between the anchors that the fit implies, because this distance is known.
     """
     free = max(len(fit.residuals) - 6, 1)
     sigmas = _normal(fit.chi2, free)
-    misfit = 0.5 * math.erfc(sigmas / math.sqrt(2.0))
-    stretched = abs(_stretched(fit, pair)) if fit.last_step <= FINISHED else 0.0
-    apart = math.erfc(stretched / math.sqrt(2.0))
-    if apart < misfit:
-        return Inconsistency(
-            "a way that puts the anchors at another distance from each other", stretched, apart
-        )
-    what = f"what fits the ranges badly: chi-square {fit.chi2:.3g} for {free} degrees of freedom"
-    return Inconsistency(what, max(sigmas, 0.0), misfit)
+    p_residuals = 0.5 * math.erfc(sigmas / math.sqrt(2.0))
+    score = abs(_distance_score(fit, pair)) if fit.last_step <= FINISHED else 0.0
+    p_distance = math.erfc(score / math.sqrt(2.0))
+    if p_distance < p_residuals:
+        return Inconsistency("motion that implies another distance between the anchors", score, p_distance)
+    what = (
+        "measurements and reports that contradict each other: "
+        f"chi-square {fit.chi2:.3g} for {free} degrees of freedom"
+    )
+    return Inconsistency(what, max(sigmas, 0.0), p_residuals)
 
 
 def _normal(chi2: float, free: int) -> float:
-    """The chi-square of `free` degrees of freedom, as a standard normal variable (Wilson and Hilferty).
+    """Return a chi-square with `free` degrees of freedom as a standard normal variable (Wilson and Hilferty).
 
-    Rounding may leave one below zero to a fit that has not found its minimum (see `inference.finished`).
+    Rounding may make the chi-square of a fit that has not reached its minimum negative (see
+    `inference.finished`).
     """
     spread = 2.0 / (9.0 * free)
     return float(((max(chi2, 0.0) / free) ** (1.0 / 3.0) - (1.0 - spread)) / math.sqrt(spread))
 
 
-def _stretched(fit: Fit, pair: PairRanges) -> float:
-    """Sigmas by which the ranges would have the anchors at another distance (the score test, Rao 1948)."""
+def _distance_score(fit: Fit, pair: PairRanges) -> float:
+    """Return by how many sigmas the ranges favour another distance of the anchors (score test, Rao 1948)."""
     mutual = pair.ranges.rows(2)
     length = math.hypot(*pair.apart)
     c, s = math.cos(fit.guess[2]), math.sin(fit.guess[2])
@@ -89,4 +95,4 @@ def _stretched(fit: Fit, pair: PairRanges) -> float:
 
 
 LEAST = 1e-3
-"""1 / m^2: the ranges then hardly tell the distance, and nothing follows"""
+"""The information (1 / m^2) below which the ranges do not determine the distance, and the score is 0."""

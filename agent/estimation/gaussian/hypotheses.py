@@ -1,7 +1,8 @@
-"""What a robot, or the pair, still holds possible under noise: hypotheses, each a fit, with their probability.
+"""Hypotheses about the poses of one robot or of both, with their probabilities, under noise.
 
-Each begins at a seed (see `seeding`) and is fitted to all ranges; ranges and silence weigh it. A hypothesis
-dies of its probability, never of one measurement.
+Each hypothesis begins at an initial guess (see `initial_guesses`) and is fitted to all ranges. Ranges and
+ticks without a detection determine its probability. A hypothesis is dropped when its probability becomes
+small, and no single measurement excludes it.
 """
 
 from __future__ import annotations
@@ -19,39 +20,45 @@ from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, Range
 from protocol.noise import Noise
 
 ODDS_KEPT = 1e-7
-"""a hypothesis that is less likely than this is given up"""
+"""The probability, relative to the likeliest hypothesis, below which a hypothesis is dropped."""
 
 SAME_SIGMAS = 1.0
-"""two fits nearer to each other than this are one, in sigmas"""
+"""The distance in sigmas below which two fits are the same hypothesis."""
 
 ROUGH_STEPS = 2
-"""of Gauss-Newton, from a seed; then it shows which are worth more"""
+"""The Gauss-Newton steps from an initial guess before the likely fits are selected."""
 
 WARM_STEPS = 1
-"""of Gauss-Newton, from the guess of a tick ago; before a claim it is done to the end"""
+"""The Gauss-Newton steps from the guess of the previous tick; before a claim, the fit must converge."""
 
 
 class Hypothesis(NamedTuple):
-    """One way in which all that was measured may have come about."""
+    """One possible explanation of all measurements."""
 
     guess: tuple[float, ...]
-    """see `ranging.predict`: of each robot, where its anchor lies in the frame of its odometry, and how
-    that frame is turned in <W>"""
+    """The fitted guess, in the layout of `range_model.predict`.
+
+    It contains for each robot the position of its anchor in the frame of its odometry, and the rotation of
+    this frame in <W>.
+    """
     probability: float
-    """the probability that it is the true one; of all that are left they sum to 1"""
+    """The probability that this hypothesis is true; the probabilities of all remaining ones sum to 1."""
 
 
 class ScoredHypothesis(NamedTuple):
-    """A hypothesis and the fit that it is."""
+    """A hypothesis with its fit."""
 
     hypothesis: Hypothesis
     fit: Fit
     silence: float
-    """the log of how likely it makes it to have been in range where it was, and out of it where it was not"""
+    """The log-likelihood of the detections and of the ticks without one, given this fit."""
 
 
 def with_probability(fits: Sequence[tuple[Fit, float]]) -> tuple[ScoredHypothesis, ...]:
-    """The likeliest first, each once; of those that are left. A fit comes with what silence says of it."""
+    """Return the hypotheses for `fits`, likeliest first, without duplicates and without improbable ones.
+
+    Each fit is paired with the log-likelihood of its detections and of its ticks without one.
+    """
     scored = [(one.log_likelihood + 0.5 * _log_volume(one) + silent, one, silent) for one, silent in fits]
     scored.sort(key=lambda one: -one[0])
     left: list[tuple[float, Fit, float]] = []
@@ -76,10 +83,11 @@ def _same(one: Fit, other: Fit) -> bool:
 
 
 def silence(beyond: Array, sigma: float, drop_outs: float) -> float:
-    """The log-likelihood of as many silent ticks, by how far `beyond` R (m) each was predicted to be.
+    """Return the log-likelihood of no detection at several ticks.
 
-    What the prediction is off by, of standard deviation `sigma`, is common to all of them: they are one
-    path. A tick that was in range after all is silent with the probability `drop_outs`.
+    `beyond` is the predicted distance (m) beyond R at each of these ticks. The prediction has an error of
+    standard deviation `sigma` (m), which is common to all ticks because they lie on one path. A tick within R
+    has no detection with the probability `drop_outs`.
     """
     if not len(beyond):
         return 0.0
@@ -95,11 +103,11 @@ def silence(beyond: Array, sigma: float, drop_outs: float) -> float:
 
 
 SILENT = 12
-"""silent ticks, the ones nearest to the beacon, that are looked at"""
+"""The maximum number of ticks without a detection that are evaluated, those closest to the beacon."""
 
 
 def _log_cdf(x: float) -> float:
-    """Of the normal distribution."""
+    """Return the logarithm of the standard normal distribution function."""
     if x > -30.0:
         return math.log(0.5 * math.erfc(-x / math.sqrt(2.0)))
     return -0.5 * x * x - math.log(-x * math.sqrt(2.0 * math.pi))
@@ -116,8 +124,10 @@ def of_anchor(
     sensing_range: float,
     noise: Noise,
 ) -> tuple[ScoredHypothesis, ...]:
-    """Where its anchor may lie in the frame of a robot's odometry: phase 1. `before` is what was left a
-    tick ago; at the ticks `silent` there was no range."""
+    """Return the hypotheses about a robot's anchor in the frame of its odometry, in phase 1.
+
+    `before` contains the hypotheses of the previous tick. `silent` contains the ticks without a range.
+    """
     known = tuple(before)
     lost = bool(len(silent)) and silent[-1] == len(path.x) - 1
     if known and len(ranges.rho) > SEED_RANGES and not lost:
@@ -129,14 +139,14 @@ def of_anchor(
         steps = STEPS
     fits = [fit(guess, [path], ranges, noise, steps=steps) for guess in starts]
     return with_probability(
-        [(one, _within(one, 0, silent, ranges.tick, sensing_range, noise)) for one in fits]
+        [(one, _anchor_log_likelihood(one, 0, silent, ranges.tick, sensing_range, noise)) for one in fits]
     )
 
 
-def _within(
+def _anchor_log_likelihood(
     one: Fit, robot: int, silent: Places, ranged: Places, sensing_range: float, noise: Noise
 ) -> float:
-    """Of being out of its anchor's range at the ticks `silent`, and in it at those `ranged`."""
+    """Return the log-likelihood of detections by the anchor at `ranged`, and of none at `silent` (ticks)."""
     columns = slice(3 * robot, 3 * robot + 2)
     place = one.covariance[columns, columns]
     mx, my = one.guess[columns]
@@ -159,21 +169,24 @@ def _within(
 
 
 EDGE = 0.005
-"""of R: how sharp the rim of a range is taken to be, beside what is not known of the pose"""
+"""The assumed uncertainty of R, as a fraction of R, which is added to the uncertainty of the pose."""
 
 CLEAR = 0.5
-"""of R: a tick so far out of range tells nothing by its silence"""
+"""The fraction of R beyond R from which a tick without a detection contains no information."""
 
 
 def missing(ticks: Places, end: int) -> Places:
-    """The ticks before `end` that are not among `ticks`."""
+    """Return the ticks before `end` that are not among `ticks`."""
     silent = np.ones(end, bool)
     silent[ticks] = False
     return np.flatnonzero(silent)
 
 
 def _log_volume(one: Fit) -> float:
-    """Of the posterior, in the unknowns: how many guesses share the likelihood of the best one."""
+    """Return twice the logarithm of the posterior's volume in the unknowns, up to a constant.
+
+    It counts how many guesses share the likelihood of the best one.
+    """
     return -float(np.linalg.slogdet(one.information)[1])
 
 
@@ -181,9 +194,10 @@ def _log_volume(one: Fit) -> float:
 
 
 def search(pair: PairRanges) -> tuple[ScoredHypothesis, ...]:
-    """How the two may lie in <W>, wherever that is: branch of a, branch of b, and placement.
+    """Return the hypotheses about both robots in <W>, from a search of the whole plane.
 
-    First by fits that take the odometry's drift for noise of the ranges; then the likely ones in full.
+    The search combines the branches of a, the branches of b and their placements. The first fits treat
+    odometry noise as noise of the ranges. The likely ones are then fitted with the full model.
     """
     of_a, of_b = (
         anchors(path, pair.ranges.only(robot), pair.sensing_range, pair.noise)
@@ -200,26 +214,28 @@ def search(pair: PairRanges) -> tuple[ScoredHypothesis, ...]:
 
 
 def follow(before: Sequence[Hypothesis], pair: PairRanges) -> tuple[ScoredHypothesis, ...]:
-    """What is left of what was held `before`, after another tick."""
+    """Return the hypotheses that follow from those of the previous tick, `before`."""
     return _fitted([np.array(one.guess) for one in before], pair, WARM_STEPS)
 
 
 def _fitted(guesses: Sequence[Array], pair: PairRanges, steps: int) -> tuple[ScoredHypothesis, ...]:
     fits = [fit(guess, pair.paths, pair.ranges, pair.noise, pair.apart, steps) for guess in guesses]
-    return with_probability([(one, _silence(one, pair)) for one in fits])
+    return with_probability([(one, _detection_log_likelihood(one, pair)) for one in fits])
 
 
-def _silence(one: Fit, pair: PairRanges) -> float:
-    """The log of how likely the fit makes it who was in range of what, and when."""
+def _detection_log_likelihood(one: Fit, pair: PairRanges) -> float:
+    """Return the log-likelihood of all detections and ticks without one, given the fit."""
     weight = 0.0
     for robot in (0, 1):
         ranged = pair.ranges.tick[pair.ranges.rows(robot)]
-        weight += _within(one, robot, pair.silent[robot], ranged, pair.sensing_range, pair.noise)
-    return weight + _together(one, pair)
+        weight += _anchor_log_likelihood(
+            one, robot, pair.silent[robot], ranged, pair.sensing_range, pair.noise
+        )
+    return weight + _mutual_log_likelihood(one, pair)
 
 
-def _together(one: Fit, pair: PairRanges) -> float:
-    """Of being out of each other's range at the silent ticks."""
+def _mutual_log_likelihood(one: Fit, pair: PairRanges) -> float:
+    """Return the log-likelihood of no mutual detection at the ticks without a mutual range."""
     silent = pair.silent[2]
     if not len(silent):
         return 0.0

@@ -1,8 +1,8 @@
-"""Seeds: where closed forms say that fits may begin, from a few ranges and without regard to silence.
+"""Initial guesses for the fits, from closed forms of a few ranges; ticks without a detection are ignored.
 
-Of an anchor: where the circles of two ranges meet. Of a placement: one robot is turned through all its
-headings, and a mutual range leaves two of the other's. Each is polished by Gauss-Newton on all ranges of its
-kind, odometry's drift taken for noise of theirs.
+The guesses for an anchor are the intersections of two range circles. For a placement, one robot is rotated
+through all headings, and a mutual range leaves two headings of the other. Each guess is refined by
+Gauss-Newton on all ranges of its kind, with odometry noise treated as noise of the ranges.
 """
 
 from __future__ import annotations
@@ -18,34 +18,40 @@ from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, Range
 from protocol.noise import Noise, VelocityNoise
 
 SEED_RANGES = 10
-"""with so many ranges to the anchor, where it may lie is settled but for the hypotheses that are left"""
+"""The largest number of ranges that initial guesses are made from.
+
+With more ranges to the anchor, only the remaining hypotheses about its position are followed.
+"""
 
 NEAR = 0.02
-"""of R: what seeds may be off, and how near each other they are one"""
+"""The expected error of an initial guess, as a fraction of R; guesses closer than this are merged."""
 
 SCAN = 72
-"""headings of the robot nearer to its anchor that are tried"""
+"""The number of headings that are tried for the robot nearer to its anchor."""
 
 BENT = 0.1
-"""of R: seeds nearer than this are one; along what the ranges leave open, a fit finds its way"""
+"""The distance, as a fraction of R, below which placements are merged.
+
+A fit moves by itself along directions that the ranges leave undetermined.
+"""
 
 POLISHINGS = 4
-"""steps of Gauss-Newton on a seed"""
+"""The number of Gauss-Newton steps on an initial guess."""
 
 FINER, FINER_TURN = 0.1, 0.2
-"""by how much less a seed, and a heading, is taken to be off at each of them"""
+"""The factors by which the expected errors of a position and of a heading decrease at each of these steps."""
 
 TURN = 0.3
-"""rad: no heading is turned by more in one of them"""
+"""The largest change of a heading (rad) in one of these steps."""
 
 TWINS = 0.3
-"""sigmas of a range: seeds nearer than this are one, too"""
+"""The distance in sigmas of a range below which guesses are merged, in addition to the limits above."""
 
 SHORTEST = 0.1
-"""m: a lever on a heading is taken to be no shorter"""
+"""The least lever (m) that is assumed for a heading."""
 
 MOST = 6
-"""hypotheses that are followed at once"""
+"""The maximum number of hypotheses that are followed at once."""
 
 
 def anchors(
@@ -55,20 +61,23 @@ def anchors(
     noise: Noise,
     known: Sequence[Sequence[float]] = (),
 ) -> Array:
-    """Where its anchor may lie in the frame of a robot's odometry (m), by its ranges alone; (n, 2)."""
+    """Return initial guesses for the anchor (m) in the frame of the odometry, from the ranges; shape (n, 2).
+
+    `known` contains earlier guesses, which are refined as well.
+    """
     points = np.concatenate((np.array(known).reshape(-1, 2), _crossings(path, ranges)))
     if not len(points):
         return points
-    variance = np.square(ranges.sigma) + _loosened(path, ranges, noise)
+    variance = np.square(ranges.sigma) + _odometry_variance(path, ranges, noise)
     return _polished(points, path, ranges, np.sqrt(variance), noise, sensing_range)
 
 
-def _loosened(path: Track, ranges: Ranges, noise: Noise) -> Array:
-    """m^2: about how much drift may move a range, without its correlations."""
+def _odometry_variance(path: Track, ranges: Ranges, noise: Noise) -> Array:
+    """Return the approximate variance (m^2) that odometry noise adds to each range, without correlations."""
     if noise.odometry == VelocityNoise():
         return np.zeros_like(ranges.rho)
-    drift = wander(path, noise.odometry, path)
-    turn, bx, by, xx, _, yy = drift.sums
+    model = wander(path, noise.odometry, path)
+    turn, bx, by, xx, _, yy = model.sums
     lever = path.period
     position = xx + yy + 2.0 * lever * (path.y * bx - path.x * by) + lever**2 * (path.x**2 + path.y**2) * turn
     along: Array = 0.5 * np.maximum(position, 0.0)[np.minimum(ranges.tick, len(path.v))]
@@ -76,9 +85,9 @@ def _loosened(path: Track, ranges: Ranges, noise: Noise) -> Array:
 
 
 def _crossings(path: Track, ranges: Ranges) -> Array:
-    """Where the circles of each two ranges meet, in the frame of the odometry, m; shape (n, 2).
+    """Return the intersections (m) of each two range circles, in the frame of the odometry; shape (n, 2).
 
-    Circles that noise has kept apart meet half way.
+    If noise keeps two circles apart, a point between them is used.
     """
     if len(ranges.rho) < 2:
         return np.empty((0, 2))
@@ -108,18 +117,18 @@ def _crossings(path: Track, ranges: Ranges) -> Array:
 def _polished(
     points: Array, path: Track, ranges: Ranges, sigma: Array, noise: Noise, sensing_range: float
 ) -> Array:
-    """The most likely of `points`, each once, moved to where all ranges fit best; shape (n, 2)."""
+    """Return the most likely of `points` after refinement on all ranges, without duplicates; shape (n, 2)."""
     x, y, rho = path.x[ranges.tick], path.y[ranges.tick], ranges.rho
     near = NEAR * sensing_range
 
-    def look(points: Array) -> tuple[Array, Array, Array, Array]:
+    def residuals_at(points: Array) -> tuple[Array, Array, Array, Array]:
         dx, dy = x - points[:, :1], y - points[:, 1:]
         distance = np.maximum(np.hypot(dx, dy), SIGMA_FLOOR)
         return rho - distance, dx / distance, dy / distance, distance
 
     for step in range(POLISHINGS):
         s = np.hypot(sigma, near * FINER**step)
-        residual, ux, uy, _ = look(points)
+        residual, ux, uy, _ = residuals_at(points)
         weight = mixture(residual, s, noise)[1] / np.square(s)
         xx, xy, yy = (np.sum(weight * a * b, 1) for a, b in ((ux, ux), (ux, uy), (uy, uy)))
         gx, gy = -np.sum(weight * ux * residual, 1), -np.sum(weight * uy * residual, 1)
@@ -129,43 +138,44 @@ def _polished(
         change = np.stack(((yy * gx - xy * gy) / determinant, (xx * gy - xy * gx) / determinant), 1)
         longest = np.maximum(np.abs(change).max(1, keepdims=True), 1e-12)
         points = points + change * np.minimum(1.0, 0.5 * sensing_range / longest)
-    likely = mixture(look(points)[0], np.hypot(sigma, near * FINER**POLISHINGS), noise)[0]
+    likely = mixture(residuals_at(points)[0], np.hypot(sigma, near * FINER**POLISHINGS), noise)[0]
     return _best(points, likely, near * FINER + TWINS * float(np.min(sigma)))
 
 
 def _best(points: Array, likely: Array, near: float) -> Array:
-    """The likeliest few, no two of them nearer to each other than `near`."""
+    """Return the most likely points, with at least `near` m between any two."""
     return _distinct(points, likely, near, MOST, lambda one, others: np.abs(others - one).sum(1))
 
 
 UNLIKELY = 25.0
-"""in log-likelihood: a seed that is so far behind the best is left"""
+"""The difference in log-likelihood to the best guess beyond which a guess is dropped."""
 
 
 # --- a pair -----------------------------------------------------------------------------------------
 
 
 def without_drift(pair: PairRanges) -> PairRanges:
-    """The same, with ranges as much less sure as the odometry's drift makes them."""
+    """Return `pair` with exact odometry, and with its noise added to the variances of the ranges."""
     if pair.noise.odometry == VelocityNoise():
         return pair
     variance = np.square(pair.ranges.sigma)
     for robot, path in enumerate(pair.paths):
-        loosened = _loosened(path, pair.ranges, pair.noise)
-        loosened[pair.ranges.rows(1 - robot)] = 0.0
-        variance = variance + loosened
+        added = _odometry_variance(path, pair.ranges, pair.noise)
+        added[pair.ranges.rows(1 - robot)] = 0.0
+        variance = variance + added
     ranges = pair.ranges._replace(sigma=np.sqrt(variance))
     return pair._replace(ranges=ranges, noise=replace(pair.noise, odometry=VelocityNoise()))
 
 
 def placements(of_a: Array, of_b: Array, pair: PairRanges) -> list[tuple[float, float]]:
-    """Headings of the odometry frames in <W> that may explain the mutual ranges, the likeliest few.
+    """Return the most likely rotations (rad) of the two odometry frames in <W>, given the mutual ranges.
 
-    The anchors are at `of_a` and `of_b` (m) in these frames.
+    `of_a` and `of_b` are the positions (m) of the anchors in these frames.
 
-    The robot nearer to its anchor is turned through all its headings; one mutual range then leaves two
-    headings of the other, where the circles about its anchor and about the first robot meet (Section III.C
-    with one circle turned), and the others tell which.
+    The robot nearer to its anchor is rotated through all headings. One mutual range then leaves two headings
+    of the other robot, at the intersections of the circles about its anchor and about the first robot
+    (Section III.C with one circle rotated). The other mutual ranges determine which of the headings are
+    likely.
     """
     mutual = pair.ranges.rows(2)
     ticks, rho, sigma = pair.ranges.tick[mutual], pair.ranges.rho[mutual], pair.ranges.sigma[mutual]
@@ -178,7 +188,7 @@ def placements(of_a: Array, of_b: Array, pair: PairRanges) -> list[tuple[float, 
     radii = [np.hypot(x, y) for x, y in place]
     near, far = (0, 1) if float(np.mean(radii[0])) < float(np.mean(radii[1])) else (1, 0)
     sign = 1.0 if far == 0 else -1.0
-    dx, dy = sign * pair.apart[0], sign * pair.apart[1]  # from the far one's anchor to the near one's
+    dx, dy = sign * pair.apart[0], sign * pair.apart[1]  # from the far robot's anchor to the near one's
     scan = np.linspace(-math.pi, math.pi, SCAN, endpoint=False)
     c, s = np.cos(scan), np.sin(scan)
     seeds = []
@@ -192,9 +202,9 @@ def placements(of_a: Array, of_b: Array, pair: PairRanges) -> list[tuple[float, 
         seeds += [np.stack((scan, bearing + opening), 1), np.stack((scan, bearing - opening), 1)]
     turns = np.concatenate(seeds)
     lever = np.array([max(float(np.mean(radii[robot])), SHORTEST) for robot in (near, far)])
-    wandered = sum([_loosened(path, pair.ranges, pair.noise)[mutual][some] for path in pair.paths])
+    odometry = sum([_odometry_variance(path, pair.ranges, pair.noise)[mutual][some] for path in pair.paths])
     turns = _turned(
-        turns, [place[near], place[far]], rho, np.sqrt(np.square(sigma) + wandered), (dx, dy), lever, pair
+        turns, [place[near], place[far]], rho, np.sqrt(np.square(sigma) + odometry), (dx, dy), lever, pair
     )
     found = [(float(one), float(other)) for one, other in turns]
     return found if near == 0 else [(other, one) for one, other in found]
@@ -209,10 +219,10 @@ def _turned(
     lever: Array,
     pair: PairRanges,
 ) -> Array:
-    """The most likely of `turns` (near, far), polished by Gauss-Newton on the mutual ranges alone."""
+    """Return the most likely of `turns` (near, far) after refinement by Gauss-Newton on the mutual ranges."""
     coarse = 3.0 * math.tau / SCAN * float(lever[0])
 
-    def look(turns: Array) -> tuple[Array, Array, Array]:
+    def residuals_at(turns: Array) -> tuple[Array, Array, Array]:
         (x1, y1), (x2, y2) = place
         c1, s1, c2, s2 = (f(turns[:, i : i + 1]) for i in (0, 1) for f in (np.cos, np.sin))
         nx, ny = c1 * x1 - s1 * y1, s1 * x1 + c1 * y1
@@ -225,7 +235,7 @@ def _turned(
 
     for step in range(POLISHINGS):
         s = np.hypot(sigma, coarse * FINER_TURN**step)
-        residual, by_near, by_far = look(turns)
+        residual, by_near, by_far = residuals_at(turns)
         weight = mixture(residual, s, pair.noise)[1] / np.square(s)
         nn, nf, ff = (
             np.sum(weight * a * b, 1) for a, b in ((by_near, by_near), (by_near, by_far), (by_far, by_far))
@@ -237,13 +247,13 @@ def _turned(
         change = np.stack(((ff * gn - nf * gf) / determinant, (nn * gf - nf * gn) / determinant), 1)
         longest = np.maximum(np.abs(change).max(1, keepdims=True), 1e-12)
         turns = turns + change * np.minimum(1.0, TURN / longest)
-    likely = mixture(look(turns)[0], np.hypot(sigma, FINER * coarse), pair.noise)[0]
+    likely = mixture(residuals_at(turns)[0], np.hypot(sigma, FINER * coarse), pair.noise)[0]
     near = BENT * pair.sensing_range + TWINS * float(np.min(sigma))
     return _best_turns(turns, likely, lever, near, MOST)
 
 
 def _best_turns(turns: Array, likely: Array, lever: Array, near: float, most: int) -> Array:
-    """The likeliest of `turns`, no two of which lead nearer to each other than `near` (m)."""
+    """Return the most likely of `turns`, whose resulting positions differ by more than `near` m."""
     apart = lambda one, others: np.abs(np.remainder(others - one + math.pi, math.tau) - math.pi) @ lever  # noqa: E731
     return _distinct(turns, likely, near, most, apart)
 
@@ -251,7 +261,7 @@ def _best_turns(turns: Array, likely: Array, lever: Array, near: float, most: in
 def _distinct(
     points: Array, likely: Array, near: float, most: int, apart: Callable[[Array, Array], Array]
 ) -> Array:
-    """The likeliest of `points`, no two of them nearer to each other than `near`."""
+    """Return the most likely of `points`, with more than `near` between any two by the metric `apart`."""
     left = np.flatnonzero(likely >= np.max(likely) - UNLIKELY)
     left = left[np.argsort(-likely[left], kind="stable")]
     chosen: list[int] = []

@@ -1,11 +1,12 @@
-"""Least squares over all ranges of a robot, or of both, with the odometry's drift along the path.
+"""Least squares over all ranges of one robot or of both, with odometry noise along the path.
 
-Unknown are, for each robot, where its anchor lies in the frame of its odometry, and how that frame is
-turned in <W>; and the errors of the odometry at every tick, of which there are many. So the fit is done in
-the space of the ranges: what the odometry's noise makes of each two of them is a covariance. Gauss-Newton,
-with the path corrected at each step, ends at the maximum a posteriori of the whole factor graph.
+The unknowns are, for each robot, the position of its anchor in the frame of its odometry and the rotation of
+that frame in <W>, and also the odometry errors at every tick. Because there are so many of the latter, the
+fit is done in the space of the ranges, where odometry noise becomes a covariance between each two ranges.
+Gauss-Newton, with the path corrected at each step, converges to the maximum a posteriori of the whole factor
+graph.
 
-With exact odometry there is no such covariance, and the fit is that of two or six unknowns.
+With exact odometry there is no such covariance, and the fit has only two or six unknowns.
 """
 
 from __future__ import annotations
@@ -32,81 +33,87 @@ from agent.estimation.gaussian.range_model import Ranges, mixture, outliers, pre
 from protocol.noise import Noise, VelocityNoise
 
 STEPS = 8
-"""of Gauss-Newton at the most"""
+"""The maximum number of Gauss-Newton steps."""
 
 STILL = 1e-4
-"""sigmas: a step shorter than this is the last"""
+"""The length of a step in sigmas below which the iteration stops."""
 
 SETTLED = 1e-2
-"""weights that change by less than this are what they will be"""
+"""The change of a weight below which the weights have converged."""
 
 LEAP = 1.0
-"""m and rad: no step is longer"""
+"""The largest change of an unknown, in m and rad, in one step."""
 
 RIDGE = 1e-12
-"""of the information, added to it, so that what the ranges leave open has a large variance and not none"""
+"""The fraction of the information that is added to its diagonal, and an absolute part of the same size.
+
+With it, the variance of an unknown that the ranges leave undetermined is large but finite.
+"""
 
 FAR = 100.0
-"""m: how little an outlier is taken to tell"""
+"""The standard deviation (m) of a range with the weight 0."""
 
 GRAIN = 1e-12
-"""of the largest variance that drift makes: no range is taken to be better, so that floats can tell it"""
+"""The least variance of a range, as a fraction of the largest variance from odometry noise.
+
+With less, the covariance would be singular in floating point.
+"""
 
 BLIND = 1e-9
-"""of a range's information: what the others say of it is taken to be no less than this"""
+"""The least precision of a range's prediction, as a fraction of that with a known guess."""
 
 
 class Fit(NamedTuple):
-    """The most probable guess near where it was begun, and what is known about it."""
+    """The most probable guess in the neighbourhood of the initial one, with its uncertainty."""
 
     guess: Array
     paths: tuple[Track, ...]
-    """as driven, by this fit"""
+    """The paths with the odometry errors corrected."""
     errors: tuple[Errors, ...]
-    """of the odometry, by this fit; none where it is exact"""
+    """The estimated odometry errors of each path; empty if odometry is exact."""
     log_likelihood: float
-    """of the ranges, the odometry's errors integrated out"""
+    """The log-likelihood of the ranges, with the odometry errors integrated out."""
     residuals: Array
-    """m; (N,)"""
+    """The measured minus the predicted ranges (m); shape (N,)."""
     weights: Array
-    """how probable it is that each range is no outlier; (N,)"""
+    """The probability that each range is an inlier; shape (N,)."""
     covariance: Array
-    """of the guess: (2, 2) of one robot's, whose heading is unknowable, or (6, 6)"""
+    """The covariance of the guess: (2, 2) for one robot, whose rotation is not observable, or (6, 6)."""
     information: Array
-    """its inverse"""
+    """The inverse of the covariance."""
     chi2: float
-    """the squared innovations, over their covariance"""
+    """The squared innovations, weighted by their inverse covariance."""
     last_step: float
-    """sigmas: the step of Gauss-Newton that would have come next"""
+    """The length of the next Gauss-Newton step, in sigmas."""
     ticks: Places
-    """of the ranges"""
+    """The tick of each range; shape (N,)."""
     directions: tuple[Array, ...]
-    """see `Predicted`"""
+    """The derivatives of the ranges with respect to the positions; see `Predicted`."""
     drifts: tuple[OdometryNoiseModel, ...]
-    """along each path; none where odometry is exact"""
+    """The noise model along each path; empty if odometry is exact."""
     system: NormalEquations
 
 
 class NormalEquations(NamedTuple):
-    """One step of Gauss-Newton: what is left to explain, and in which units."""
+    """One Gauss-Newton step in the space of the ranges."""
 
     jacobian: Array
-    """(N, unknowns)"""
+    """The derivatives of the ranges with respect to the unknowns; shape (N, unknowns)."""
     innovation: Array
-    """m: what the ranges are off from where the odometry, uncorrected, puts them; (N,)"""
+    """The difference (m) of the ranges from their prediction with uncorrected odometry; shape (N,)."""
     covariance: Array
-    """m^2: of the ranges; (N, N), or its diagonal where odometry is exact"""
+    """The covariance (m^2) of the ranges; shape (N, N), or (N,) for its diagonal if odometry is exact."""
     weighted: Array
-    """its inverse, times the Jacobian and the innovation; (N, unknowns + 1)"""
+    """The Jacobian and the innovation, multiplied by the inverse covariance; shape (N, unknowns + 1)."""
     inverse: Array | None
-    """of the covariance, where its diagonal is asked for"""
+    """The inverse covariance, if it is needed for outliers and odometry is noisy."""
     information: Array
     of_guess: Array
-    """the covariance of the guess"""
+    """The covariance of the guess, the inverse of the information."""
     change: Array
-    """of the guess"""
+    """The change of the guess in this step."""
     multipliers: Array
-    """the innovation that is left after the change, weighted; (N,)"""
+    """The innovation that remains after the change, multiplied by the inverse covariance; shape (N,)."""
 
 
 def fit(
@@ -117,42 +124,45 @@ def fit(
     apart: tuple[float, float] = (0.0, 0.0),
     steps: int = STEPS,
 ) -> Fit:
-    """Gauss-Newton from `guess` (see `predict`); outliers lose their weight on the way."""
+    """Return the Gauss-Newton fit that begins at `guess` (see `predict`).
+
+    The weights of outliers decrease during the iteration. `apart` is M2 - M1 (m) in <W>.
+    """
     free = slice(0, 2) if len(measured) == 1 else slice(0, 6)
     paths: tuple[Track, ...] = tuple(measured)
     drifts: tuple[OdometryNoiseModel, ...] = ()
     errors: tuple[Errors, ...] = ()
     guess, weights = guess.copy(), np.ones_like(ranges.rho)
-    drifting = noise.odometry != VelocityNoise()
+    noisy_odometry = noise.odometry != VelocityNoise()
     for step in range(steps + 1):
         predicted = predict(guess, paths, ranges, apart)
         residuals = ranges.rho - predicted.distance
-        wandered, innovation = None, residuals
-        if drifting:
+        odometry, innovation = None, residuals
+        if noisy_odometry:
             seen = predicted.seen(paths, ranges)
             drifts = tuple(
                 [wander(path, noise.odometry, was) for path, was in zip(paths, measured, strict=True)]
             )
-            wandered = _wandered(drifts, seen)
-            for drift, rows, error in zip(drifts, seen, errors, strict=False):
-                innovation = innovation + shifted(drift, rows, error)
+            odometry = _odometry_covariance(drifts, seen)
+            for model, rows, error in zip(drifts, seen, errors, strict=False):
+                innovation = innovation + shifted(model, rows, error)
         if noise.outliers and step == 0:
-            loose = np.zeros_like(residuals) if wandered is None else np.diagonal(wandered)
+            loose = np.zeros_like(residuals) if odometry is None else np.diagonal(odometry)
             weights = mixture(residuals, np.sqrt(np.square(ranges.sigma) + loose), noise)[1]
         variance = _variance(ranges.sigma, weights)
-        system = _solved(predicted.jacobian[:, free], innovation, variance, wandered, bool(noise.outliers))
-        trust = _trust(system, weights, ranges.sigma, noise) if noise.outliers else weights
+        system = _solved(predicted.jacobian[:, free], innovation, variance, odometry, bool(noise.outliers))
+        updated = _inlier_probabilities(system, weights, ranges.sigma, noise) if noise.outliers else weights
         change = system.change
         last_step = math.sqrt(abs(float(change @ system.information @ change)))
-        still = last_step < STILL and float(np.max(np.abs(trust - weights))) < SETTLED
-        if step == steps or (still and (errors or not drifting)):  # a path is corrected at least once
+        still = last_step < STILL and float(np.max(np.abs(updated - weights))) < SETTLED
+        if step == steps or (still and (errors or not noisy_odometry)):  # the path is corrected at least once
             break
-        weights = trust
+        weights = updated
         change = change * min(1.0, LEAP / max(float(np.max(np.abs(change))), LEAP))
         guess[free] += change
-        if drifting:
+        if noisy_odometry:
             left = system.weighted[:, -1] - system.weighted[:, :-1] @ change
-            errors = tuple([attributed(drift, rows, left) for drift, rows in zip(drifts, seen, strict=True)])
+            errors = tuple([attributed(model, rows, left) for model, rows in zip(drifts, seen, strict=True)])
             paths = tuple([error.corrected(was) for error, was in zip(errors, measured, strict=True)])
     chi2 = float(system.innovation @ system.multipliers)
     return Fit(
@@ -173,30 +183,30 @@ def fit(
     )
 
 
-def _wandered(drifts: Sequence[OdometryNoiseModel], seen: Sequence[Projection]) -> Array:
-    """m^2: the covariance that all robots' odometry makes between the ranges; (N, N)."""
-    first, *others = [spread(drift, rows) for drift, rows in zip(drifts, seen, strict=True)]
+def _odometry_covariance(drifts: Sequence[OdometryNoiseModel], seen: Sequence[Projection]) -> Array:
+    """Return the covariance (m^2) of the ranges from the odometry noise of all robots; shape (N, N)."""
+    first, *others = [spread(model, rows) for model, rows in zip(drifts, seen, strict=True)]
     for other in others:
         first += other
     return first
 
 
 def _variance(sigma: Array, weights: Array) -> Array:
-    """m^2: of each range; large where it has no weight."""
+    """Return the variance (m^2) of each range, which is large for a small weight."""
     variance: Array = np.square(sigma) / np.maximum(weights, np.square(sigma / FAR))
     return variance
 
 
 def _solved(
-    jacobian: Array, innovation: Array, variance: Array, wandered: Array | None, invert: bool
+    jacobian: Array, innovation: Array, variance: Array, odometry: Array | None, invert: bool
 ) -> NormalEquations:
     columns = np.column_stack((jacobian, innovation))
     covariance, inverse = variance, None
     weighted: Array
-    if wandered is None:
+    if odometry is None:
         weighted = columns / variance[:, None]
     else:
-        covariance = wandered + np.diag(variance + GRAIN * float(np.max(np.diagonal(wandered))))
+        covariance = odometry + np.diag(variance + GRAIN * float(np.max(np.diagonal(odometry))))
         if invert:
             inverse = inverse_of(covariance)
             weighted = np.dot(inverse, columns)
@@ -213,17 +223,17 @@ def _solved(
 
 
 def deviation(variance: float) -> float:
-    """The standard deviation; infinite where rounding has left a variance that is none."""
+    """Return the standard deviation; infinite if rounding made the variance negative."""
     return math.sqrt(variance) if variance >= 0.0 else math.inf
 
 
 def inverse_of(matrix: Array) -> Array:
-    """Of one matrix, or of each of several."""
+    """Return the inverse of a matrix, or of each matrix in a stack."""
     return np.asarray(np.linalg.inv(matrix), np.float64)
 
 
-def _trust(system: NormalEquations, weights: Array, sigma: Array, noise: Noise) -> Array:
-    """How probable it is that each range is no outlier, by what all the others predict of it."""
+def _inlier_probabilities(system: NormalEquations, weights: Array, sigma: Array, noise: Noise) -> Array:
+    """Return the probability that each range is an inlier, given the prediction from all other ranges."""
     alone = 1.0 / system.covariance if system.inverse is None else np.diagonal(system.inverse)
     explained = np.sum((system.weighted[:, :-1] @ system.of_guess) * system.weighted[:, :-1], 1)
     precision = np.maximum(alone - explained, BLIND * alone)
@@ -235,7 +245,7 @@ def _trust(system: NormalEquations, weights: Array, sigma: Array, noise: Noise) 
 def _log_likelihood(
     system: NormalEquations, chi2: float, residuals: Array, weights: Array, sigma: Array, noise: Noise
 ) -> float:
-    """Of what is no outlier, by its covariance; and of outliers by their bias."""
+    """Return the log-likelihood of the inliers by their covariance, and of the outliers by their bias."""
     good = weights > 0.5
     if system.covariance.ndim == 2:
         volume = float(np.linalg.slogdet(system.covariance)[1])
@@ -253,13 +263,13 @@ def _log_likelihood(
 
 
 SOFT = 0.1
-"""of the least bias: how sharply its density ends, where the range itself is exact"""
+"""The least smoothing of the ends of the outlier density, as a fraction of the least bias."""
 
 
 def poses(fitted: Fit, apart: tuple[float, float]) -> tuple[Array, Array]:
-    """Of both robots at the last tick, relative to M1 along the axes of <W>: x, y, heading of a, then of b.
+    """Return both poses at the last tick, relative to M1 along the axes of <W>, in m and rad.
 
-    The mean (6,) and the covariance (6, 6), in m and rad.
+    The result is the mean of x, y, heading of a, then of b, shape (6,), and the covariance, shape (6, 6).
     """
     mean, turn = np.empty(6), np.zeros((6, 6))
     ends = []
@@ -279,11 +289,11 @@ def poses(fitted: Fit, apart: tuple[float, float]) -> tuple[Array, Array]:
     if not fitted.drifts:
         return mean, turn @ system.of_guess @ turn.T
     prior, cross = np.zeros((6, 6)), np.zeros((6, len(system.innovation)))
-    for robot, (path, drift, u, end) in enumerate(
+    for robot, (path, model, u, end) in enumerate(
         zip(fitted.paths, fitted.drifts, fitted.directions, ends, strict=True)
     ):
         rows = slice(3 * robot, 3 * robot + 3)
-        both = spread(drift, end.then(Projection.positions(path, fitted.ticks, u)))
+        both = spread(model, end.then(Projection.positions(path, fitted.ticks, u)))
         prior[rows, rows], cross[rows] = both[:3, :3], both[:3, 3:]
     gain = np.linalg.solve(system.covariance, cross.T).T
     left = turn - gain @ system.jacobian

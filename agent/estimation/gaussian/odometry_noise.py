@@ -1,7 +1,7 @@
-"""The path that a robot's odometry tells of, and what the odometry's noise makes of it.
+"""The path from a robot's odometry, and the covariance that odometry noise causes along it.
 
-Noise at one tick moves every later position, so errors are correlated along the path; their covariance
-between any two ticks follows from sums up to the earlier one.
+Noise at one tick moves every later position, so errors are correlated along the path. The covariance between
+any two ticks follows from sums up to the earlier one.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ class Track(NamedTuple):
     """A robot's odometry over [0, k], in the frame of tick 0."""
 
     v: Array
-    """m/s, over each tick; (k,)"""
+    """The forward velocity (m/s) over each tick; shape (k,)."""
     omega: Array
-    """rad/s"""
+    """The angular velocity (rad/s) over each tick; shape (k,)."""
     period: float
-    """s"""
+    """The sampling period T_s (s)."""
     x: Array
-    """m, at each tick; (k + 1,)"""
+    """The position (m) at each tick; shape (k + 1,)."""
     y: Array
     heading: Array
-    """rad, not wrapped"""
+    """The heading (rad, not wrapped) at each tick; shape (k + 1,)."""
     shift: Array
-    """s: what each m/s of v moves the robot by, over each tick; (2, k)"""
+    """The displacement per unit of v (s) over each tick; shape (2, k)."""
 
 
 def track(v: Array, omega: Array, period: float) -> Track:
-    """Dead reckoning, eq. (1a), from the origin."""
+    """Return the path from dead reckoning with eq. (1a), from the origin."""
     turn = period * omega
     heading = _summed(turn)
     half = 0.5 * turn
@@ -50,43 +50,46 @@ def track(v: Array, omega: Array, period: float) -> Track:
 
 
 def _sinc(half: Array) -> Array:
-    """sin(x) / x"""
+    """Return sin(x) / x."""
     safe = np.where(half == 0.0, 1.0, half)
     return np.where(half == 0.0, 1.0, np.sin(safe) / safe)
 
 
 def _summed(values: Array) -> Array:
-    """Of all before each tick, along the last axis; (..., k) -> (..., k + 1)."""
+    """Return the sums of all values before each tick, along the last axis; (..., k) -> (..., k + 1)."""
     sums = np.zeros((*values.shape[:-1], values.shape[-1] + 1))
     np.cumsum(values, axis=-1, out=sums[..., 1:])
     return sums
 
 
 class OdometryNoiseModel(NamedTuple):
-    """What noise in a track's v and omega does to it: sums along it, up to each tick.
+    """Prefix sums from which the covariance of a path follows, for noise in its v and omega.
 
     Noise e in omega at tick j moves the position at a later tick t, along u, by (lever - u . b_j) e, where
-    lever = T_s u . perp(p_t); noise e in v moves it by u . shift_j e.
+    lever = T_s u . perp(p_t). Noise e in v moves it by u . shift_j e.
     """
 
     variances: Array
-    """(m/s)^2 and (rad/s)^2, of v and omega at each tick; (2, k)"""
+    """The variances of v and omega, (m/s)^2 and (rad/s)^2, at each tick; shape (2, k)."""
     b: Array
-    """m s; (2, k)"""
+    """The vector b_j (m s) at each tick; shape (2, k)."""
     shift: Array
-    """s; (2, k)"""
+    """The displacement per unit of v (s) at each tick; shape (2, k)."""
     sums: Array
-    """of q_omega; q_omega b, its x and y; q_omega b b' + q_v shift shift', its xx, xy, yy; (6, k + 1)"""
+    """The prefix sums of six terms up to each tick; shape (6, k + 1).
+
+    The terms are q_omega; the x and y of q_omega b; the xx, xy and yy of q_omega b b' + q_v shift shift'.
+    """
 
 
-def wander(path: Track, drift: VelocityNoise, measured: Track) -> OdometryNoiseModel:
-    """Of `path`, whose odometry measured what `measured` says, with noise of `drift`."""
+def wander(path: Track, noise: VelocityNoise, measured: Track) -> OdometryNoiseModel:
+    """Return the prefix sums for the corrected `path`; the size of the noise follows from `measured`."""
     k, period = len(path.v), path.period
     variances = np.empty((2, k))
-    variances[0] = np.square(drift.v * measured.v) + drift.v_floor**2
-    variances[1] = np.square(drift.omega * measured.omega) + drift.omega_floor**2
+    variances[0] = np.square(noise.v * measured.v) + noise.v_floor**2
+    variances[1] = np.square(noise.omega * measured.omega) + noise.omega_floor**2
     sx, sy = path.shift
-    # along the chord, omega changes its length; across it, its direction, by half of what it turns the robot
+    # omega changes the length of the chord, and rotates it by half the angle by which it rotates the robot
     slope = path.v * _shortening(0.5 * period * path.omega, period)
     across = 0.5 * period * path.v
     b = np.empty((2, k))
@@ -106,7 +109,7 @@ def wander(path: Track, drift: VelocityNoise, measured: Track) -> OdometryNoiseM
 
 
 def _shortening(half: Array, period: float) -> Array:
-    """s: by what part a chord changes with omega, d(ln A) / d omega; `half` is omega T_s / 2."""
+    """Return the relative change of a chord with omega, d(ln A) / d omega, in s; `half` is omega T_s / 2."""
     safe = np.where(np.abs(half) < SLIGHT, 1.0, half)
     by_half = np.where(np.abs(half) < SLIGHT, -half / 3.0, 1.0 / np.tan(safe) - 1.0 / safe)
     shortening: Array = 0.5 * period * by_half
@@ -114,26 +117,29 @@ def _shortening(half: Array, period: float) -> Array:
 
 
 SLIGHT = 1e-4
-"""rad: less than this, a turn shortens a chord as its series says"""
+"""The half turn in rad below which the series of the derivative is used."""
 
 
 class Projection(NamedTuple):
-    """Along what each of N rows looks at a robot: its tick, a direction, and its lever on noise in omega."""
+    """Linear functionals of a robot's trajectory, one for each of N rows: a tick, a direction and a lever."""
 
     tick: Places
     u: Array
-    """(2, N), in the frame of the odometry; 0 where the row does not look at this robot"""
+    """The direction in the frame of the odometry, or 0 if the row is of another robot; shape (2, N)."""
     lever: Array
-    """m s; T_s where the row is a heading"""
+    """The lever on noise in omega (m s); T_s if the row is a heading."""
 
     @staticmethod
     def positions(path: Track, tick: Places, u: Array) -> Projection:
-        """Rows that look at its position; those that do not, as their u is 0, may be of later ticks."""
+        """Return the rows for the robot's position at `tick` along `u`.
+
+        Rows with u = 0 do not involve this robot, and their tick may be beyond its path.
+        """
         tick = np.minimum(tick, len(path.v))
         return Projection(tick, u, path.period * (u[1] * path.x[tick] - u[0] * path.y[tick]))
 
     def then(self, more: Projection) -> Projection:
-        """These rows and `more` of the same robot."""
+        """Return these rows followed by `more` of the same robot."""
         return Projection(
             np.concatenate((self.tick, more.tick)),
             np.concatenate((self.u, more.u), axis=1),
@@ -141,10 +147,10 @@ class Projection(NamedTuple):
         )
 
 
-def spread(drift: OdometryNoiseModel, rows: Projection) -> Array:
-    """m^2: the covariance, between N rows, that noise in the odometry makes; (N, N)."""
+def spread(model: OdometryNoiseModel, rows: Projection) -> Array:
+    """Return the covariance (m^2) of N rows that is caused by odometry noise; shape (N, N)."""
     at = np.minimum(rows.tick[:, None], rows.tick)
-    c0, bx, by, xx, xy, yy = drift.sums[:, at]
+    c0, bx, by, xx, xy, yy = model.sums[:, at]
     (ux, uy), lever = rows.u, rows.lever
     column, left, above = lever[:, None], ux[:, None], uy[:, None]
     cross = column * (bx * ux + by * uy)
@@ -154,34 +160,37 @@ def spread(drift: OdometryNoiseModel, rows: Projection) -> Array:
 
 
 class Errors(NamedTuple):
-    """What a fit holds the odometry's errors to be; shapes (k,)."""
+    """The odometry errors in v (m/s) and omega (rad/s) that a fit estimates; shapes (k,)."""
 
     v: Array
     omega: Array
 
     def corrected(self, measured: Track) -> Track:
-        """The path that was driven."""
+        """Return the path with these errors added to the `measured` velocities."""
         return track(measured.v + self.v, measured.omega + self.omega, measured.period)
 
 
-def shifted(drift: OdometryNoiseModel, rows: Projection, errors: Errors) -> Array:
-    """m: by how much `errors` move what the rows look at, to first order; shape (N,)."""
+def shifted(model: OdometryNoiseModel, rows: Projection, errors: Errors) -> Array:
+    """Return by how much (m) `errors` change the value of each row, to first order; shape (N,)."""
     moves = np.empty((3, len(errors.v)))
     moves[0] = errors.omega
-    moves[1:] = errors.v * drift.shift - errors.omega * drift.b
+    moves[1:] = errors.v * model.shift - errors.omega * model.b
     turned, x, y = _summed(moves)[:, rows.tick]
     move: Array = rows.lever * turned + rows.u[0] * x + rows.u[1] * y
     return move
 
 
-def attributed(drift: OdometryNoiseModel, rows: Projection, residuals: Array) -> Errors:
-    """The odometry's errors that go with `residuals`, weighted by their inverse covariance; shape (N,)."""
-    k = drift.b.shape[1]
+def attributed(model: OdometryNoiseModel, rows: Projection, residuals: Array) -> Errors:
+    """Return the odometry errors that explain `residuals` best.
+
+    The residuals are weighted by their inverse covariance; shape (N,).
+    """
+    k = model.b.shape[1]
     after = np.zeros((3, k + 1))
     for sums, weight in zip(after, (rows.lever, *rows.u), strict=True):
         np.add.at(sums, rows.tick, residuals * weight)
     lever, x, y = np.cumsum(after[:, :0:-1], axis=1)[:, ::-1]
-    q_v, q_omega = drift.variances
+    q_v, q_omega = model.variances
     return Errors(
-        q_v * (x * drift.shift[0] + y * drift.shift[1]), q_omega * (lever - x * drift.b[0] - y * drift.b[1])
+        q_v * (x * model.shift[0] + y * model.shift[1]), q_omega * (lever - x * model.b[0] - y * model.b[1])
     )

@@ -1,7 +1,8 @@
-"""The ranges of one robot or of both, what a guess predicts of them, and how likely that makes them.
+"""The measurement model: predicted ranges for a guess, and their likelihood.
 
-A guess holds, for each robot, where its anchor lies in the frame of its odometry, and how that frame is
-turned in <W>. Outliers are a mixture: a range is good, or too long by a bias that is uniform.
+A guess contains, for each robot, the position of its anchor in the frame of its odometry and the rotation of
+that frame in <W>. Outliers follow a mixture: a range is an inlier, or too long by a uniformly distributed
+bias.
 """
 
 from __future__ import annotations
@@ -16,25 +17,25 @@ from agent.estimation.gaussian.odometry_noise import Array, Places, Projection, 
 from protocol.noise import Noise
 
 SIGMA_FLOOR = 1e-6
-"""m: no range is taken to be better than this"""
+"""The least standard deviation (m) that is assumed for a range."""
 
 ELSEWHERE = 0.01
-"""of R: a range from no farther off than this says again what the last one said"""
+"""The fraction of R that a robot must have moved for a range to count as one from another place."""
 
 IMPOSSIBLE = 6.0
-"""sigmas beyond R: a range so long is an outlier, whatever the guess"""
+"""The number of sigmas beyond R from which a range is an outlier under any guess."""
 
 
 class Ranges(NamedTuple):
-    """N ranges: those of robot 0 to its anchor, then those of robot 1 to its own, then those between them."""
+    """N ranges: robot 0 to its anchor, then robot 1 to its own, then the mutual ranges."""
 
     rho: Array
-    """m"""
+    """The measured ranges (m); shape (N,)."""
     tick: Places
     sigma: Array
-    """m"""
+    """The standard deviation (m) of each range; shape (N,)."""
     counts: tuple[int, int, int]
-    """how many there are of each kind"""
+    """The number of ranges of each of the three kinds."""
 
     @staticmethod
     def of_lists(
@@ -43,7 +44,7 @@ class Ranges(NamedTuple):
         mutual: Sequence[tuple[int, float]],
         noise: Noise,
     ) -> Ranges:
-        """Ticks and ranges, as the robots have logged them."""
+        """Return the ranges from three lists of (tick, range in m), as the robots log them."""
         lists = (first, second, mutual)
         counts = (len(first), len(second), len(mutual))
         sigmas = (noise.anchor_sigma, noise.anchor_sigma, noise.mutual_sigma)
@@ -55,17 +56,17 @@ class Ranges(NamedTuple):
         )
 
     def rows(self, kind: int) -> slice:
-        """Where those of a kind are: 0, 1: of this robot to its anchor; 2: mutual."""
+        """Return the rows of a kind: 0 and 1 are the ranges of that robot to its anchor, 2 is mutual."""
         begin = sum(self.counts[:kind])
         return slice(begin, begin + self.counts[kind])
 
     def only(self, kind: int) -> Ranges:
-        """The ranges of one robot to its anchor, as if there were no other."""
+        """Return the ranges of one robot to its anchor, as the ranges of a single robot."""
         rows = self.rows(kind)
         return Ranges(self.rho[rows], self.tick[rows], self.sigma[rows], (self.counts[kind], 0, 0))
 
     def within(self, sensing_range: float) -> Ranges:
-        """Without those that are so long that they cannot but be outliers, who knows by how much."""
+        """Return the ranges without those that are too long to be anything but outliers."""
         possible = self.rho <= sensing_range + IMPOSSIBLE * self.sigma
         if np.all(possible):
             return self
@@ -74,20 +75,20 @@ class Ranges(NamedTuple):
 
 
 class PairRanges(NamedTuple):
-    """All that both robots have measured; robot 0 is the paper's a."""
+    """The measurements of both robots; robot 0 is the paper's a."""
 
     paths: tuple[Track, Track]
     ranges: Ranges
     silent: tuple[Places, Places, Places]
-    """the ticks at which a, b and the two together were not ranged"""
+    """The ticks without a range: of a to its anchor, of b to its anchor, and between the two."""
     apart: tuple[float, float]
-    """m: M2 - M1 in <W>"""
+    """The vector M2 - M1 (m) in <W>."""
     sensing_range: float
     noise: Noise
 
     @property
     def places(self) -> Places:
-        """Which of the mutual ranges were taken from elsewhere than the last: one robot had moved."""
+        """Return the indices of the first mutual range, and of each that follows a motion of a robot."""
         ticks = self.ranges.tick[self.ranges.rows(2)]
         moved = np.zeros(len(ticks), bool)
         moved[:1] = True
@@ -98,27 +99,31 @@ class PairRanges(NamedTuple):
 
 
 class Predicted(NamedTuple):
-    """What a guess predicts of N ranges."""
+    """The ranges that a guess predicts, and their derivatives."""
 
     distance: Array
-    """m; (N,)"""
+    """The predicted ranges (m); shape (N,)."""
     jacobian: Array
-    """by the guess; (N, 3 robots)"""
+    """The derivatives with respect to the guess; shape (N, 3 robots)."""
     directions: tuple[Array, ...]
-    """along what each range looks at each robot, in the frame of its odometry; 0 where it does not; (2, N)"""
+    """The derivatives with respect to each robot's position, in the frame of its odometry; shapes (2, N).
+
+    They are 0 if a range does not involve the robot.
+    """
 
     def seen(self, paths: Sequence[Track], ranges: Ranges) -> list[Projection]:
-        """The same, as rows along the paths."""
+        """Return the derivatives as rows along the paths."""
         return [
             Projection.positions(path, ranges.tick, u) for path, u in zip(paths, self.directions, strict=True)
         ]
 
 
 def predict(guess: Array, paths: Sequence[Track], ranges: Ranges, apart: tuple[float, float]) -> Predicted:
-    """`guess`: of each robot the anchor's x, y in the frame of its odometry, and the frame's heading in <W>.
+    """Return the ranges that `guess` predicts.
 
-    `apart` is M2 - M1 in <W>, in m. With one path there are only ranges to its anchor, which do not tell the
-    heading: shape (3,), or (6,).
+    `guess` contains for each robot the x and y (m) of its anchor in the frame of its odometry, and the
+    rotation (rad) of this frame in <W>; shape (3,) or (6,). `apart` is M2 - M1 (m) in <W>. With a single path
+    there are only ranges to its anchor, and they do not determine the rotation.
     """
     n, ticks = len(ranges.rho), ranges.tick
     distance, jacobian = np.empty(n), np.zeros((n, len(guess)))
@@ -150,11 +155,11 @@ def predict(guess: Array, paths: Sequence[Track], ranges: Ranges, apart: tuple[f
 
 
 TINY = 1e-12
-"""m: nearer than this, a direction is none"""
+"""The distance (m) below which a direction is not defined."""
 
 
 def placed(guess: Array, path: Track, ticks: Places) -> tuple[Array, Array]:
-    """m: where a robot is at `ticks`, relative to its anchor, along the axes of <W>."""
+    """Return the position (m) of a robot at `ticks`, relative to its anchor, along the axes of <W>."""
     mx, my, theta = guess
     c, s = math.cos(theta), math.sin(theta)
     x, y = path.x[ticks] - mx, path.y[ticks] - my
@@ -162,8 +167,10 @@ def placed(guess: Array, path: Track, ticks: Places) -> tuple[Array, Array]:
 
 
 def mixture(residuals: Array, sigma: Array, noise: Noise) -> tuple[Array, Array]:
-    """The log-likelihood of residuals (m), summed over the last axis; and how probable it is that each is no
-    outlier, of the same shape."""
+    """Return the log-likelihood of the residuals (m), and the probability that each is an inlier.
+
+    The log-likelihood is summed over the last axis; the probabilities have the shape of the residuals.
+    """
     good = inliers(residuals, sigma, noise)
     if not noise.outliers:
         return np.sum(good, -1), np.ones_like(residuals)
@@ -172,13 +179,16 @@ def mixture(residuals: Array, sigma: Array, noise: Noise) -> tuple[Array, Array]
 
 
 def inliers(residuals: Array, sigma: Array, noise: Noise) -> Array:
-    """The log-density of each residual, and that it is no outlier."""
+    """Return the joint log-density of each residual and of its being an inlier."""
     density: Array = -0.5 * np.square(residuals / sigma) - np.log(sigma)
     return density + (math.log1p(-noise.outliers) - 0.5 * math.log(2.0 * math.pi))
 
 
 def outliers(residuals: Array, sigma: Array, noise: Noise) -> Array:
-    """The log-density of each residual, and that it is an outlier: a uniform bias, with soft ends."""
+    """Return the joint log-density of each residual and of its being an outlier.
+
+    The bias is uniform, and the ends of its density are smoothed by `sigma`.
+    """
     least, most = noise.outlier_bias
     beyond = np.maximum(np.maximum(least - residuals, residuals - most), 0.0)
     density: Array = -np.log(np.maximum(most - least, sigma)) - 0.5 * np.square(beyond / sigma)
