@@ -382,7 +382,7 @@ class FinalReport(Message, frozen=True):
     probability: Probability | None
     """The probability of the most probable hypothesis; None with exact sensors."""
     blocking_reason: Text | None
-    """The condition that still prevents a claim, for a user; None if there is none, and with exact sensors."""
+    """The condition that still prevents a claim, for a user; None if there is none, or with exact sensors."""
     p_value: Probability | None
     """The smallest p-value of all consistency tests; None with exact sensors, and if there was no test."""
     reports_sent: Count

@@ -36,7 +36,7 @@ def observation(run: str, robot: str) -> str:
 
 
 def command(run: str, robot: str) -> str:
-    """Return the key on which that robot sends each Command to the world, and FinalReport after the mission."""
+    """Return the key on which that robot sends Commands, and a FinalReport at the end, to the world."""
     return f"{ROOT}/{run}/robot/{robot}/command"
 
 
