@@ -1,9 +1,9 @@
 """The orbits of phase 2, on which the two robots of a pair meet, and the time this takes (Section III.B).
 
-With the `paper` planner, both robots orbit, in opposite directions. With `assured`, b waits beside its anchor,
-and a orbits on a circle that crosses b's sensing range wherever b waits. `docs/rendezvous.py` compares all
-pairs of circles with constant speeds. The fastest of them are of this kind, with b exactly on its anchor, and
-5 % faster.
+With the `paper` planner, both robots orbit, in opposite directions. With `assured`, b waits beside its
+anchor, and a orbits on a circle that crosses b's sensing range wherever b waits. `docs/rendezvous.py`
+compares all pairs of circles with constant speeds. The fastest of them are of this kind, with b exactly on
+its anchor, and 5 % faster.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def tick_budget(mission: Mission, plan: Rendezvous) -> int:
 
 
 def half_arc(distance: float, sensing_range: float) -> float:
-    """Return Omega in rad: half the angle between the intersections of the two orbits, seen from an anchor."""
+    """Return Omega in rad: half the angle between the crossings of the two orbits, seen from an anchor."""
     return math.acos(distance / (distance + sensing_range))
 
 
@@ -105,7 +105,7 @@ def orbiting(mission: Mission, distance: float) -> Rendezvous:
 
 
 def searching(mission: Mission, distance: float) -> Rendezvous:
-    """Return orbits on which b waits R / 8 from its anchor, and a crosses b's range slowly enough for a range.
+    """Return orbits on which b waits R / 8 from its anchor, and a crosses b's range slowly.
 
     The radius is the one with the shortest mean time to the meeting: the way out to the orbit, and half of
     the way round. If R is so large that the robots are in range of each other wherever they wait, a waits,
@@ -152,7 +152,7 @@ CLEARANCE_LIMIT = 0.4
 
 
 def half_passage(apart: float, radius: float, reach: float) -> float:
-    """Return half the angle in rad of the arc within `reach` m of a point, on a circle of `radius` m about M1.
+    """Return half the arc, in rad, of a circle of `radius` m about M1 that is within `reach` m of a point.
 
     The point is `apart` m from M1. For `apart` in [D - r, D + r], the angle has its minimum at an end: its
     cosine is convex in `apart` if the circle is larger than `reach`, and increases with `apart` otherwise.
