@@ -129,7 +129,7 @@ class Contact(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_field
     range: Range | None
     """The measured mutual distance, in m; None for a drop-out. Both robots get the same value."""
     heard: tuple[Tick, ...] | None
-    """The ticks of the peer's Reports that are received in this tick, in increasing order.
+    """The ticks of the peer's Reports that are received in this tick, in the order of their arrival.
 
     The agent waits for exactly these. None in hardware mode, where the Reports that arrive during the tick
     count.

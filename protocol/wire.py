@@ -60,7 +60,7 @@ def decode(frame: bytes, kind: Any, limit: int = MAX_SENT_BYTES) -> Any:
     """Return the message in `frame`, which must be a `kind` (a message or a union of messages).
 
     Raises MalformedFrame if the frame is truncated, is longer than `limit` bytes, has another version or a
-    wrong checksum, is not msgpack or another kind of message, or has a field of a wrong type or out of bounds.
+    wrong checksum, is not msgpack or another kind of message, or has a field of a wrong type or value.
     """
     if not _HEAD.size < len(frame) <= limit:
         raise MalformedFrame(f"{len(frame)} bytes, outside {_HEAD.size + 1} to {limit}")

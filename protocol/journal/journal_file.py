@@ -59,7 +59,7 @@ class MemoryJournal:
 
 
 class Journal:
-    """A journal that is open for writing. It is a new file: an existing one is only resumed by a `Retrace`."""
+    """A journal that is open for writing. Its file is new: only a `Retrace` appends to an existing one."""
 
     def __init__(self, path: Path, *, fsync: bool = False, file: int | None = None) -> None:
         """Create the file at `path`, or take `file`, the descriptor of a file that is open and locked.
@@ -123,7 +123,10 @@ def _sync_folder(folder: Path) -> None:
 
 
 def lock(file: int, path: Path) -> None:
-    """Lock `file` until it is closed. If another process has the lock, close `file` and raise CannotRecord."""
+    """Lock `file` until it is closed.
+
+    If another process has the lock, close `file` and raise CannotRecord.
+    """
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

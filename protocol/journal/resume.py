@@ -24,7 +24,7 @@ class Retrace:
     def __init__(self, path: Path, *, fsync: bool = False) -> None:
         """Open, lock and read the journal at `path`.
 
-        Raises CannotRecord if it cannot be opened, or another process has it; CorruptJournal if it is damaged.
+        Raises CannotRecord if it cannot be opened or is in use, CorruptJournal if it is damaged.
         """
         self.path = path
         self._fsync = fsync
