@@ -320,7 +320,7 @@ def test_what_is_no_record_is_refused(tmp_path: Path) -> None:
     (empty / "world.journal").write_bytes(b"\xc1 no journal")
     refused(draw(empty), "world.journal: damaged at byte 0")
     (empty / "world.journal").write_bytes(b"")
-    refused(draw(empty), "world.journal: there is no scenario in it")
+    refused(draw(empty), "world.journal: it contains no scenario")
     assert [path.name for path in empty.iterdir()] == ["world.journal"]
 
 

@@ -60,7 +60,7 @@ def test_every_lie_about_a_drive_or_a_start_is_an_alarm(attack: Attack, liar: st
         assert outcome(recording) == "inconsistent", seed
         assert recording.end is not None
         peer = "b" if liar == "a" else "a"
-        assert (recording.end.reason or "").startswith(f"{peer}: {liar} tells "), recording.end.reason
+        assert (recording.end.reason or "").startswith(f"{peer}: {liar} reports "), recording.end.reason
 
 
 def _tells_otherwise(recording: Recording, liar: str, attack: Attack) -> bool:

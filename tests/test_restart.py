@@ -518,7 +518,7 @@ def _remembered(path: Path) -> None:
 
 
 def test_the_worlds_record_of_another_scenario_is_refused(recording: Path) -> None:
-    says = f"{recording / 'world.journal'}: the record of another scenario, paper-1"
+    says = f"{recording / 'world.journal'}: a recording of another scenario, paper-1"
     refuses(recording, "world", "paper-2", "--listen", free_endpoint(), says=says)
 
 

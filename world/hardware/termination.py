@@ -81,7 +81,7 @@ class Ending:
         ):
             match verdict:
                 case Inconsistent(claim):
-                    return MissionEnd(tick, "inconsistent", f"{who}: {other} tells {claim}")
+                    return MissionEnd(tick, "inconsistent", f"{who}: {other} reports {claim}")
                 case Undecided(reason):
                     return MissionEnd(tick, "undecided", f"{who}: {reason}")
         for who, verdict in ((self._me, self.verdict), (self._peer, self._peers)):
