@@ -196,7 +196,7 @@ def test_a_robot_that_falls_silent_fails_the_run_within_the_patience(endless: Pa
         os.kill(process_of(out, "agent", "b"), SIGSTOP)
         ended = run.ended(SOON_S)
     assert ended.status != 0
-    assert re.search(r"no answer from b( \(not there\))? at tick ", ended.out + ended.err)
+    assert re.search(r"no answer from b( \(not connected\))? at tick ", ended.out + ended.err)
     assert f"for {TIMEOUT} s" in ended.out + ended.err
     assert not processes_of(out)
 
@@ -217,7 +217,7 @@ def test_an_agent_whose_world_dies_ends_within_its_patience(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("comes", ["nobody", "a"])
 def test_a_world_whose_robot_never_comes_fails_and_says_who_was_missing(comes: str, tmp_path: Path) -> None:
-    missing = {"nobody": "a (not there), b (not there)", "a": "b (not there)"}[comes]
+    missing = {"nobody": "a (not connected), b (not connected)", "a": "b (not connected)"}[comes]
     reason = f"no answer from {missing} at tick 0 for {TIMEOUT} s"
     endpoint = free_endpoint()
     with ExitStack() as stack:

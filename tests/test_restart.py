@@ -144,7 +144,7 @@ def test_a_process_that_is_never_started_again_ends_the_run_at_once(who: str, tm
 def test_a_robot_that_comes_back_too_late_fails_the_run_by_the_patience(tmp_path: Path) -> None:
     kill = ("--kill", "a@17+600s", "--timeout", "5")
     ended = tandem("run", "paper-1", "-q", "--out", tmp_path / "out", *kill)
-    assert ended[:2] == (3, "failed after 16 ticks (no answer from a (not there) at tick 17 for 5 s)\n")
+    assert ended[:2] == (3, "failed after 16 ticks (no answer from a (not connected) at tick 17 for 5 s)\n")
     assert not processes_of(tmp_path / "out")
 
 

@@ -79,8 +79,9 @@ def judge(
     """Return the outcome once all results are known or `max_ticks` is reached; None before.
 
     A claim is compared with the true pose at the tick of the claim, which is in `claimed`, or with the
-    current one if `claimed` is None. The run does not wait for a robot whose peer is undecided or inconsistent,
-    because it can no longer be localised. A claim below the required accuracy does not count as localised.
+    current one if `claimed` is None. The run does not wait for a robot whose peer is undecided or
+    inconsistent, because it can no longer be localised. A claim below the required accuracy does not count
+    as localised.
     """
     open_cases = [
         robot.id
