@@ -212,7 +212,7 @@ def test_a_record_of_another_mission_is_refused(pair: Pair, tmp_path: Path) -> N
         *("--out", tmp_path / "a"),
     )
     assert other.status == 2
-    assert "another run's: its briefing is not this mission's; choose another folder" in other.err
+    assert "it belongs to another mission: its RobotConfig differs; choose another folder" in other.err
 
 
 def test_a_driver_that_cannot_resume_is_refused_and_not_moved(pair: Pair, tmp_path: Path) -> None:

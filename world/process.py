@@ -63,7 +63,7 @@ class WorldProcess:
         """Run `course`, which may be a resumed one, under the run name `run`.
 
         `rate` is the speed of real time; None for lockstep. `timeout` (s) limits each wait for an answer.
-        `on_kill_point` is called at each point at which the process can be killed, with its name and the tick.
+        `on_kill_point` is called with the name and tick of each point at which the process can be killed.
         """
         self._run = run
         scenario = course.world.scenario
