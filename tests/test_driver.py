@@ -177,7 +177,7 @@ def test_a_drive_that_comes_late_is_not_driven(played: Play) -> None:
         (Recorded(reading=Reading(Controls(float("nan"), 0.0))), "a's driver: sense(1): Expected"),
         (Recorded(reading=Reading(REST, -1.0)), "a's driver: sense(0): Expected"),
         (Recorded(reading=Reading(REST, None, float("inf"))), "a's driver: sense(0): Expected"),
-        (Recorded(reading="2.0"), "a's driver: sense(0): gives str, expected a Reading"),  # type: ignore[arg-type]
+        (Recorded(reading="2.0"), "a's driver: sense(0): returns str, expected a Reading"),  # type: ignore[arg-type]
     ],
 )
 def test_a_driver_that_cannot_go_on_ends_the_mission_and_stands(

@@ -220,7 +220,7 @@ def test_a_robot_whose_peer_does_not_come_has_not_moved(tmp_path: Path) -> None:
         *("--connect-timeout", "2", "--out", tmp_path / "out"),
     )
     assert ended.status == 3
-    assert ended.err.endswith("b: not there; nobody has moved\n")
+    assert ended.err.endswith("b: not connected; no robot has moved\n")
     assert ended.err.count("\n") == 1
     assert processes_of(tmp_path / "out") == {}
 
