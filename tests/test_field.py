@@ -233,7 +233,7 @@ def test_a_robot_whose_peer_does_not_come_has_not_moved(tmp_path: Path) -> None:
         (("a", "--mission", "{faults}"), "fault: without a world, the radio is as it is"),
         (("a", "--mission", "paper-1", "--option", "colour"), "--option: 'colour' is no option"),
         (("a", "--mission", "paper-1", "--rate", "1e8"), "--rate: 1e+08 makes a tick of 1 s last"),
-        (("a", "--mission", "paper-1", "--listen", "7447"), "--listen: '7447' is no endpoint"),
+        (("a", "--mission", "paper-1", "--listen", "7447"), "--listen: '7447' is not an endpoint"),
         (
             ("a", "--mission", "paper-1", "--out", "{record}"),
             "driver-a.journal is not",

@@ -245,8 +245,8 @@ def take_away(own: Path, _keys: Path) -> None:
     ("spoil", "words"),
     [
         (expire, "this certificate has expired; check the certificate"),
-        (give_foreign, "this certificate is not of an authority that it trusts; check the certificate"),
-        (take_away, "it asks for a certificate, and there is none; check the certificate"),
+        (give_foreign, "it does not trust the authority of this certificate; check the certificate"),
+        (take_away, "it requires a certificate, and there is none; check the certificate"),
     ],
 )
 def test_who_has_no_good_certificate_is_not_let_in_and_told_why(
@@ -264,7 +264,7 @@ def test_a_world_of_another_authority_is_not_believed(mine: Path, tmp_path: Path
     with world_of(other) as endpoint:
         ended = tandem("agent", "a", "--connect", endpoint, "--keys", mine, "--connect-timeout", "2")
     assert ended.status == 3
-    assert "its certificate is refused here: unable to get local issuer certificate" in ended.err
+    assert "its certificate is not valid here: unable to get local issuer certificate" in ended.err
 
 
 def test_a_world_whose_certificate_has_expired_is_not_believed(
@@ -275,7 +275,7 @@ def test_a_world_whose_certificate_has_expired_is_not_believed(
     with world_of(tmp_path / "old") as endpoint:
         ended = tandem("agent", "a", "--connect", endpoint, "--keys", mine, "--connect-timeout", "2")
     assert ended.status == 3
-    assert "its certificate is refused here: certificate has expired" in ended.err
+    assert "its certificate is not valid here: certificate has expired" in ended.err
 
 
 def test_a_world_by_another_name_than_its_certificates_is_not_believed(keys: Path, mine: Path) -> None:
@@ -284,7 +284,7 @@ def test_a_world_by_another_name_than_its_certificates_is_not_believed(keys: Pat
         with session.open_router(configured(keys / "world" / KEYED, listen=[elsewhere])):
             ended = tandem("agent", "a", "--connect", elsewhere, "--keys", mine, "--connect-timeout", "2")
     assert ended.status == 3
-    assert "its certificate is refused here: IP address mismatch" in ended.err
+    assert "its certificate is not valid here: IP address mismatch" in ended.err
 
 
 def test_a_robot_that_the_rules_do_not_name_is_told_to_check_them(keys: Path, tmp_path: Path) -> None:
@@ -339,7 +339,7 @@ def test_a_page_whose_certificate_is_refused_says_so(keys: Path, tmp_path: Path)
     own = shutil.copytree(keys / "viewer", tmp_path / "viewer")
     take_away(own, keys)
     with world_of(keys) as endpoint, TandemProcess("watch", "--connect", endpoint, "--keys", own) as page:
-        page.until_says(f"no router at {endpoint} yet: it asks for a certificate, and there is none")
+        page.until_says(f"no router at {endpoint} yet: it requires a certificate, and there is none")
 
 
 # --- what is no way to the network ----------------------------------------------------------------------
@@ -352,7 +352,7 @@ def test_a_page_whose_certificate_is_refused_says_so(keys: Path, tmp_path: Path)
         ("{mode: 'client', ", "line 1: expected identifier or string"),
         ("{\n nonsense: 1}", "unknown field `nonsense`, expected one of"),
         ("{transport: {unicast: {lowlatency: 'yes'}}}", "expected a boolean"),
-        ("{mode: 'peer'}", "mode: 'peer', but who only connects is a client here; leave it out"),
+        ("{mode: 'peer'}", "mode: 'peer', but a process that only connects is a client here; leave it out"),
         ("{connect: {endpoints: ['somewhere']}}", "Endpoints must be of the form"),
         (
             "{transport: {link: {tls: {root_ca_certificate: 'nowhere.pem'}}}}",
@@ -378,7 +378,7 @@ def test_a_command_refuses_a_wrong_configuration(part: tuple[str, ...], tmp_path
     file = tmp_path / "mine.json5"
     file.write_text("{mode: 'peer'}")
     ended = tandem(*part, "--connect", free_endpoint(), "--config", file)
-    mistaken(ended, f"--config: {file}: mode: 'peer', but who only connects is a client here")
+    mistaken(ended, f"--config: {file}: mode: 'peer', but a process that only connects is a client here")
 
 
 def test_a_configuration_may_say_where_to_connect(tmp_path: Path) -> None:

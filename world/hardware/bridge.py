@@ -266,7 +266,7 @@ class Field:
             raise DriverFailed(f"drive({v:g}, {omega:g}): {type(error).__name__}: {error}") from error
 
     def _wait_for_command(self, tick: int) -> Command | None:
-        """Return the Command of this tick; None if it does not arrive while a manoeuvre still fits the tick."""
+        """Return the Command of this tick; None if it arrives too late for a manoeuvre in the tick."""
         while (left := self._next - self._manoeuvre_s - time.monotonic()) > 0.0:
             command = self._take(self._inbox.next(left))
             if command is not None and command.tick == tick:

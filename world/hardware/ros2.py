@@ -2,8 +2,8 @@
 
 The bridge maps each topic to the Zenoh key of the same name, with messages in CDR. The driver publishes
 geometry_msgs/Twist, and subscribes to nav_msgs/Odometry and sensor_msgs/Range. It decides by the time of
-arrival whether a message is fresh, and ignores the stamps, so the clocks need not be synchronised. It needs the
-extra `ros`.
+arrival whether a message is fresh, and ignores the stamps, so the clocks need not be synchronised. It needs
+the extra `ros`.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ class Ros2:
         self._publisher.start()
 
     def resume(self, tick: int, mark: tuple[float, ...]) -> None:  # noqa: ARG002  # the mark is a pose
-        """Continue from the pose of the latest recorded reading. The base must not have reset its odometry."""
+        """Continue from the pose of the latest recorded reading. The odometry must not have been reset."""
         with self._changed:
             self._last = Pose(*mark)
             pose, came = self._pose or (self._last, -math.inf)
