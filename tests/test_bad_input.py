@@ -155,8 +155,8 @@ def test_a_value_out_of_bounds_is_named(was: str, new: str, field: str, tmp_path
 @pytest.mark.parametrize(
     ("was", "new", "why"),
     [
-        ("max_speed = 1.0", "max_speed = 9e-5", "a tick moves a robot by 9e-05 m at most"),
-        ("period = 1.0", "period = 5e-5", "a tick moves a robot by 5e-05 m at most"),
+        ("max_speed = 1.0", "max_speed = 9e-5", "a robot moves at most 9e-05 m in a tick"),
+        ("period = 1.0", "period = 5e-5", "a robot moves at most 5e-05 m in a tick"),
         ("sensing_range = 3.0", "sensing_range = 2000.0", "ranges up to 2000 m"),
         ("anchor = [10.0", "anchor = [1e6", "manoeuvres of 1 m are too short to compute a pose"),
     ],
