@@ -1,4 +1,4 @@
-"""Keys: what `tandem keys` makes, who is refused without, and what is said of it."""
+"""Certificates: the files of `tandem keys`, and the refusal of participants without a valid one."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def mistaken(ended: Ended, *words: str) -> None:
-    """A mistake of the user's: one line, that has these words."""
+    """Assert that the process reports a user's mistake in one line that contains these words."""
     assert ended.status == 2, ended
     assert ended.out == ""
     assert re.fullmatch(r"tandem[^\n]*: [^\n]+\n", ended.err), ended.err
@@ -42,7 +42,7 @@ def mistaken(ended: Ended, *words: str) -> None:
         assert word in ended.err
 
 
-# --- what is made ---------------------------------------------------------------------------------------
+# --- the files ------------------------------------------------------------------------------------------
 
 
 def test_everybody_has_a_folder_with_all_that_one_machine_needs(keys: Path) -> None:
@@ -52,7 +52,7 @@ def test_everybody_has_a_folder_with_all_that_one_machine_needs(keys: Path) -> N
         assert sorted(path.name for path in own.iterdir()) == ["ca.pem", "cert.pem", "key.pem", KEYED]
         assert own.joinpath("ca.pem").read_bytes() == keys.joinpath("ca.pem").read_bytes()
         context = ssl.create_default_context(cafile=own / "ca.pem")
-        context.load_cert_chain(own / "cert.pem", own / "key.pem")  # raises if they do not go together
+        context.load_cert_chain(own / "cert.pem", own / "key.pem")  # raises if they do not match
         certificate = x509.load_pem_x509_certificate((own / "cert.pem").read_bytes())
         certificate.verify_directly_issued_by(x509.load_pem_x509_certificate((own / "ca.pem").read_bytes()))
         assert certificate.subject.rfc4514_string() == f"CN={name}"
@@ -192,12 +192,12 @@ def test_a_folder_of_keys_may_lie_anywhere(keys: Path, mine: Path, tmp_path: Pat
             assert part.ended().status == 0
 
 
-# --- who is refused -------------------------------------------------------------------------------------
+# --- refused participants -------------------------------------------------------------------------------
 
 
 @contextmanager
 def world_of(keys: Path, name: str = "world") -> Iterator[str]:
-    """The endpoint of somebody who shows that a world is there."""
+    """Yield the endpoint of a process that declares the liveliness token of a world."""
     endpoint = free_endpoint("tls")
     with session.open_router(configured(keys / name / KEYED, listen=[endpoint])) as link:
         _token = session.show_alive(link, tree.world_alive("mine"))
@@ -211,7 +211,7 @@ def authority_of(keys: Path) -> certificates.Authority:
 
 
 def last(own: Path, keys: Path, lasts: timedelta) -> None:
-    """Its certificate is one that ends so long from now."""
+    """Replace the certificate by one that expires after this time."""
     key = load_pem_private_key((own / "key.pem").read_bytes(), None)
     assert isinstance(key, ec.EllipticCurvePrivateKey)
     name = "world" if own.name == "world" else "agent-a"
@@ -220,12 +220,12 @@ def last(own: Path, keys: Path, lasts: timedelta) -> None:
 
 
 def expire(own: Path, keys: Path) -> None:
-    """Its certificate is one that has ended an hour ago."""
+    """Replace the certificate by one that expired an hour ago."""
     last(own, keys, timedelta(hours=-1))
 
 
 def give_foreign(own: Path, _keys: Path) -> None:
-    """Its certificate is of another authority, though it knows the right one."""
+    """Replace the certificate by one of another authority. The trusted authority stays the right one."""
     other = own.parent / "others"
     assert tandem("keys", other, "--robots", "a").status == 0
     for name in ("cert.pem", "key.pem"):
@@ -233,7 +233,7 @@ def give_foreign(own: Path, _keys: Path) -> None:
 
 
 def take_away(own: Path, _keys: Path) -> None:
-    """It has no certificate."""
+    """Remove the certificate."""
     settings = json.loads((own / KEYED).read_text().partition("\n")[2])
     tls = settings["transport"]["link"]["tls"]
     for name in [name for name in tls if name.startswith(("connect_", "listen_"))]:
@@ -342,7 +342,7 @@ def test_a_page_whose_certificate_is_refused_says_so(keys: Path, tmp_path: Path)
         page.until_says(f"no router at {endpoint} yet: it requires a certificate, and there is none")
 
 
-# --- what is no way to the network ----------------------------------------------------------------------
+# --- invalid configurations -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -431,7 +431,7 @@ def test_flags_that_do_not_go_together_are_told(arguments: tuple[str, ...], word
     mistaken(tandem(*(one.format(keys=keys) for one in arguments)), words)
 
 
-# --- who is warned --------------------------------------------------------------------------------------
+# --- warnings -------------------------------------------------------------------------------------------
 
 
 def test_who_listens_beyond_this_machine_without_keys_is_warned(keys: Path) -> None:
