@@ -17,7 +17,7 @@ TAU = 2.0 * math.pi
 
 
 class Pose(msgspec.Struct, frozen=True, array_like=True, gc=False, forbid_unknown_fields=True):
-    """A position and a heading in a frame. It also stands for the frame with its origin and x-axis there."""
+    """A position and a heading in a frame. A pose also defines the frame with its origin and x-axis there."""
 
     x: Coordinate
     """The x coordinate, in m."""

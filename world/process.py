@@ -26,7 +26,7 @@ from protocol.wire import MalformedFrame, decode, encode
 from world.referee import Judgement
 from world.simulation import Course
 
-SILENCE_S = 3.0
+LINK_TIMEOUT_S = 3.0
 """The time in s without a message after which a replaceable link is replaced. Agents do the same."""
 REPEAT_S = 0.25
 """The period in s in which an unanswered message is repeated."""
@@ -35,7 +35,7 @@ REPEAT_TO_ALL_S = 1.0
 
 It is shorter than the time after which an agent replaces its link.
 """
-FAREWELL_S = 2.0
+FINAL_REPORT_TIMEOUT_S = 2.0
 """The time in s to wait for the FinalReport of a robot that did not answer in the last tick."""
 
 
@@ -104,10 +104,10 @@ class WorldProcess:
     def attach(self, link: zenoh.Session, *, replaceable: bool = False) -> None:
         """Send and receive over the session `link` from now on.
 
-        If it is `replaceable`, `play` raises RobotsLinkLost if nothing is received for SILENCE_S and a tick.
+        If it is `replaceable`, `play` raises RobotsLinkLost if nothing is received for LINK_TIMEOUT_S and a tick.
         """
         run, inbox = self._run, self._inbox
-        self._link_timeout = SILENCE_S + self._tick_s if replaceable else math.inf
+        self._link_timeout = LINK_TIMEOUT_S + self._tick_s if replaceable else math.inf
         self._link_deadline = time.monotonic() + self._link_timeout
         self._observation = {
             robot: session.publisher(link, keys.observation(run, robot)) for robot in self._robots
@@ -309,7 +309,7 @@ class WorldProcess:
         """Send `end` to all robots until they have answered or are gone, and return the FinalReports.
 
         Robots that answered in the last tick are waited for up to the timeout, because they may be restarted.
-        The `expected` ones and all others that are connected are waited for up to FAREWELL_S.
+        The `expected` ones and all others that are connected are waited for up to FINAL_REPORT_TIMEOUT_S.
         """
         frames = dict.fromkeys(self._robots, encode(end))
         received = self._final_reports = {**self._course.phase1_done_tick, **self._final_reports}
@@ -320,10 +320,10 @@ class WorldProcess:
         while True:
             required = set(self._course.witnesses) - received.keys()
             others = self._alive.union(expected) - received.keys()
-            give_up = began + (self._timeout if required else FAREWELL_S)
+            give_up = began + (self._timeout if required else FINAL_REPORT_TIMEOUT_S)
             if now >= give_up or not (required or others):
                 return list(received.values())
-            if required and now >= began + FAREWELL_S and not printed:
+            if required and now >= began + FINAL_REPORT_TIMEOUT_S and not printed:
                 printed = True
                 names = ", ".join(sorted(required))
                 self._inbox.say(f"waiting {self._timeout:g} s for the FinalReport of {names}")

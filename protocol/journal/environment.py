@@ -19,7 +19,7 @@ from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 
 PACKAGE = "tandem-ranging"
 LONGEST = 64
-"""the maximum number of characters of a version"""
+"""The maximum number of characters of a version."""
 LEVELS = (
     ("x86-64-v4", {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}),
     ("x86-64-v3", {"avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "movbe"}),

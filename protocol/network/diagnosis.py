@@ -17,8 +17,10 @@ STEP_S = 2.0
 ALERT_S = 0.5
 """The time in s in which a router refuses a certificate after the TLS handshake."""
 
-MUTE = "something listens there, but links fail; check that it is a Zenoh router, user and password, and tls/"
-TOLD = {
+NO_LINK = (
+    "something listens there, but links fail; check that it is a Zenoh router, user and password, and tls/"
+)
+ALERTS = {
     "certificate_expired": "this certificate has expired",
     "unknown_ca": "it does not trust the authority of this certificate",
     "decrypt_error": "it does not trust the authority of this certificate",
@@ -47,7 +49,7 @@ def _why(endpoints: Endpoints, endpoint: str) -> str:
         with socket.create_connection(where, STEP_S) as link:
             if is_encrypted(endpoint):
                 return _refused(endpoints, link, where[0])
-            return _mute(link)
+            return _no_link(link)
     except socket.gaierror:
         return f"there is no host '{where[0]}'; check the address"
     except ConnectionRefusedError:
@@ -71,7 +73,7 @@ def _refused(endpoints: Endpoints, link: socket.socket, host: str) -> str:
         return f"the certificates here cannot be used: {error}"
     try:
         with context.wrap_socket(link, server_hostname=host) as secured:
-            return _mute(secured)
+            return _no_link(secured)
     except ssl.SSLCertVerificationError as error:
         return f"its certificate is not valid here: {error.verify_message}; check certificates and dates"
     except ssl.SSLError as error:
@@ -84,7 +86,7 @@ def _refused(endpoints: Endpoints, link: socket.socket, host: str) -> str:
 
 def _alert(error: ssl.SSLError) -> str:
     reason = (error.reason or "").lower()
-    for name, meaning in TOLD.items():
+    for name, meaning in ALERTS.items():
         if reason.endswith(name):
             return f"{meaning}; check the certificate"
     if "wrong_version" in reason or "record_layer" in reason:
@@ -92,7 +94,7 @@ def _alert(error: ssl.SSLError) -> str:
     return f"TLS fails: {reason.replace('_', ' ') or error}; check the certificate"
 
 
-def _mute(link: socket.socket) -> str:
+def _no_link(link: socket.socket) -> str:
     """Return the cause if the link itself works: the router closes it, or does not answer."""
     link.settimeout(ALERT_S)
     try:
@@ -101,4 +103,4 @@ def _mute(link: socket.socket) -> str:
         closed = False
     if closed:
         return "it closes the link; check that it is a Zenoh router, and tls/ or tcp/"
-    return MUTE
+    return NO_LINK

@@ -41,7 +41,7 @@ from world.hardware.termination import Ending
 
 REPEAT_S = 0.25
 """The period in s in which the MissionEnd is repeated."""
-FAREWELL_S = 2.0
+FINAL_REPORT_TIMEOUT_S = 2.0
 """The time in s to wait for the agent's FinalReport."""
 ASTRAY = 64
 """The maximum number of ticks by which a TickStart of a may differ from b's tick.
@@ -355,7 +355,7 @@ class Field:
 
     def _finish(self, end: MissionEnd) -> None:
         """Send `end` to the agent until it sends its FinalReport, and acknowledge that."""
-        give_up = time.monotonic() + FAREWELL_S
+        give_up = time.monotonic() + FINAL_REPORT_TIMEOUT_S
         while (now := time.monotonic()) < give_up and self._id in self._alive:
             self._observation.put(encode(end))
             repeat = min(now + REPEAT_S, give_up)

@@ -85,7 +85,7 @@ class DriverPast(msgspec.Struct, frozen=True):
 
     @property
     def may_lack(self) -> bool:
-        """Whether frames may be missing: writes were not synced, and the computer has been rebooted since."""
+        """True if frames may be missing: writes were not synced, and the computer has been rebooted since."""
         start = self.start
         return self.end is None and start is not None and not start.synced and start.boot != boot()
 
