@@ -17,7 +17,7 @@ STEP_S = 2.0
 ALERT_S = 0.5
 """The time in s in which a router refuses a certificate after the TLS handshake."""
 
-NO_LINK = (
+MUTE = (
     "something listens there, but links fail; check that it is a Zenoh router, user and password, and tls/"
 )
 ALERTS = {
@@ -103,4 +103,4 @@ def _no_link(link: socket.socket) -> str:
         closed = False
     if closed:
         return "it closes the link; check that it is a Zenoh router, and tls/ or tcp/"
-    return NO_LINK
+    return MUTE
