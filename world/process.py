@@ -104,7 +104,7 @@ class WorldProcess:
     def attach(self, link: zenoh.Session, *, replaceable: bool = False) -> None:
         """Send and receive over the session `link` from now on.
 
-        If it is `replaceable`, `play` raises RobotsLinkLost after LINK_TIMEOUT_S and a tick without a message.
+        If it is `replaceable`, `play` raises RobotsLinkLost after LINK_TIMEOUT_S and a tick without messages.
         """
         run, inbox = self._run, self._inbox
         self._link_timeout = LINK_TIMEOUT_S + self._tick_s if replaceable else math.inf
