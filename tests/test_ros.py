@@ -75,7 +75,7 @@ def test_a_range_out_of_reach_is_none(rho: float, reach: float, found: float | N
 def test_bytes_that_are_no_message_are_refused(payload: bytes) -> None:
     with pytest.raises(ValueError, match=r"not a sensor_msgs/msg/Range"):
         ros2.ranged(payload, 3.0)
-    with pytest.raises(ValueError, match=r"no nav_msgs/msg/Odometry"):
+    with pytest.raises(ValueError, match=r"not a nav_msgs/msg/Odometry"):
         ros2.odometry(payload)
 
 
