@@ -1,1 +1,1 @@
-"""What both sides of the wire must agree on, and nothing else."""
+"""The definitions that all processes share: messages, units, mission parameters, journals and the network."""

@@ -11,11 +11,14 @@ import resource
 from pathlib import Path
 
 SESSION_FILES = 20
-"""descriptors that a Zenoh session needs besides one per link: 14 to 16 measured on two cores"""
+"""The descriptors of a Zenoh session besides one per link: 14 to 16 were measured on two cores."""
 SESSION_BYTES = 900 << 20
-"""bytes of address space that its threads reserve, and mostly do not use: 830 MB measured on two cores"""
+"""The address space in bytes that its threads reserve and hardly use: 830 MB were measured on two cores."""
 START_BYTES = 240 << 20
-"""the same for the interpreter and the libraries: 150 MB measured on two cores, more on more cores"""
+"""The address space in bytes of the interpreter and the libraries.
+
+150 MB were measured on two cores. It grows with the number of cores.
+"""
 
 
 def need_files(more: int, what: str) -> None:

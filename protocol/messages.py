@@ -1,7 +1,35 @@
-"""Everything that crosses the wire or enters a journal: frozen structs, encoded as tagged msgpack arrays.
+"""The messages of the protocol: every frame on the network, and every frame in the journal of an agent.
 
-Units and bounds are in the types. Each message names its tick and, where one robot says it, the robot;
-so a frame explains itself wherever it is found.
+The journal of a world also contains its scenario (`world/scenario.py`), and that of a driver its marks
+(`world/hardware/driver_journal.py`).
+
+A message is a frozen struct. It is encoded as a msgpack array: first the tag (the class name in kebab case,
+such as "robot-config"), then the fields in the order in which they are declared here. `protocol/wire.py`
+adds the version and the checksum. `protocol/network/keys.py` defines the key on which each message is sent.
+
+Units are SI: m, s, rad, and their quotients. Positions and headings are given either in <W>, the world
+frame, or in a robot's anchor frame, which has its origin at the robot's anchor. Tick k begins at k T_s.
+Decoding checks the type and the bounds of every field, which are part of the types in `protocol/units.py`.
+
+============== ====================================== ==========================================
+Message        Direction                              When
+============== ====================================== ==========================================
+RobotConfig    world -> robot                         once, in answer to the robot's query
+Observation    world -> robot                         every tick
+Report         robot -> its peer                      every tick in which the two are in contact
+Command        robot -> world                         every tick
+Estimate       robot -> viewers                       every tick
+GroundTruth    world -> viewers                       every tick with a subscriber
+MissionEnd     world -> robot                         once, after the last tick
+FinalReport    robot -> world, and back as an         once, in answer to MissionEnd
+               acknowledgement
+TickStart      driver -> driver of the peer           every tick, in hardware mode
+DeadlineMissed journals only                          each missed deadline, in real time
+Environment    journals only                          once, as the first frame
+============== ====================================== ==========================================
+
+In hardware mode, the driver's process takes the place of the world. All messages are repeated if needed,
+and receiving one twice has no effect.
 """
 
 from __future__ import annotations
@@ -29,31 +57,47 @@ from protocol.units import (
 )
 
 Outcome = Literal["localised", "undecided", "inconsistent", "wrong", "failed"]
-"""How a run ended; only the first is a success."""
+"""The outcome of a run. Only `localised` is a success.
+
+- `localised`: all robots claim poses, and all claims are correct.
+- `undecided`: a robot has no claim when it stops or at `max_ticks`, or one below the required accuracy.
+- `inconsistent`: the measurements and reports of a robot contradict each other.
+- `wrong`: a claimed pose differs from the true one by more than its tolerance.
+- `failed`: a process did not answer within the timeout, or a driver raised an error.
+"""
 
 BranchKind = Literal["three-ranges", "three-ranges-virtual", "circle", "on-anchor"]
-"""How phase 1 told +alpha from -alpha."""
+"""The observation by which phase 1 distinguished the branches +alpha and -alpha (Section III.A).
+
+- `three-ranges`: a third range to the anchor.
+- `three-ranges-virtual`: no detection at the third point, where one branch predicts a range.
+- `circle`: no detection along the circle that led back into range, where one branch predicts ranges.
+- `on-anchor`: none was needed. The robot started on its anchor, where both branches are the same.
+"""
 
 Probability = Annotated[float, Meta(ge=0.0, le=1.0)]
-"""the probability of a hypothesis, given what has been measured"""
+"""The probability of a hypothesis, given all measurements so far."""
 
 MAX_TEXT = 300
-"""characters (Unicode code points)"""
+"""The maximum number of characters (Unicode code points) of a Text."""
 Text = Annotated[str, Meta(max_length=MAX_TEXT)]
-"""in words, of what can be of any length; whoever holds one cuts it (`_cut`)"""
+"""A message for a user. The struct that contains one cuts longer text with `_cut`."""
 Phase = Annotated[int, Meta(ge=1, le=3)]
+"""The phase of the planning algorithm (Section III): 1 anchor, 2 orbit, 3 last manoeuvres."""
 Word = Annotated[str, Meta(max_length=32)]
+"""The name of a planner's state, such as "orbiting"."""
 
 MAX_REPORT_RUNS = 70
+"""The maximum number of segments in a Report, so that its frame fits in `wire.MAX_REPORT_BYTES`."""
 MAX_REPORT_RANGES = 70
-"""so many at the most that a report's frame stays within `wire.MAX_REPORT_BYTES`"""
+"""The maximum number of ranges in a Report, for the same reason."""
 
 
-def _cut(said: msgspec.Struct, field: str) -> None:
-    """Cut the text in `field` to its bound, and escape what no frame can hold: half of a surrogate pair."""
-    words: str | None = getattr(said, field)
-    if words is not None:
-        force_setattr(said, field, words.encode("utf-8", "backslashreplace").decode()[:MAX_TEXT])
+def _cut(struct: msgspec.Struct, field: str) -> None:
+    """Cut the text in `field` to MAX_TEXT characters. Escape lone surrogates, which UTF-8 cannot encode."""
+    text: str | None = getattr(struct, field)
+    if text is not None:
+        force_setattr(struct, field, text.encode("utf-8", "backslashreplace").decode()[:MAX_TEXT])
 
 
 def _tag(name: str) -> str:
@@ -62,40 +106,52 @@ def _tag(name: str) -> str:
 
 
 class Message(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag=_tag):
-    """A frame's content."""
+    """The base class of all messages."""
+
+
+# --- parts of messages ---
 
 
 class Ranged(msgspec.Struct, frozen=True, array_like=True, gc=False, forbid_unknown_fields=True):
-    """A range and the tick it was measured in."""
+    """A measured range with the tick of its measurement."""
 
     tick: Tick
+    """The tick of the measurement."""
     range: Range
+    """The measured distance, in m."""
 
 
 class Contact(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """A robot within range of this one, now."""
+    """The contact with a robot within range R in this tick."""
 
     peer: RobotId
+    """The other robot."""
     range: Range | None
+    """The measured mutual distance, in m; None for a drop-out. Both robots get the same value."""
     heard: tuple[Tick, ...] | None
-    """the ticks of those of the peer's reports that reach this robot now, in order; none without a world:
-    what arrives within the tick counts"""
+    """The ticks of the peer's Reports that are received in this tick, in the order of their arrival.
+
+    The agent waits for exactly these. None in hardware mode, where the Reports that arrive during the tick
+    count.
+    """
     damaged: tuple[Tick, ...] = ()
-    """of those that reach it damaged, and are refused"""
+    """The ticks of the peer's Reports that arrive damaged in this tick, and are refused."""
 
 
 class Localised(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="localised"):
-    """The claim to know one's pose in the world frame."""
+    """The claim of a robot that its pose is known."""
 
     pose: Pose
+    """The claimed pose in <W>: m, m and rad."""
     covariance: Covariance | None = None
-    """of its error; none where sensors are exact, and what is left is rounding"""
+    """The covariance of the error of `pose`; None with exact sensors, where only rounding errors remain."""
 
 
 class Undecided(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="undecided"):
-    """The robot cannot go on, and does not guess."""
+    """The result of a robot that stops without a claim."""
 
     reason: Text
+    """The reason, for a user."""
 
     def __post_init__(self) -> None:
         _cut(self, "reason")
@@ -104,199 +160,269 @@ class Undecided(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fie
 class Inconsistent(
     msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="inconsistent"
 ):
-    """The peer tells what cannot be so."""
+    """The result of a robot whose measurements contradict its peer's reports, or these each other."""
 
     claim: Text
-    """of the peer"""
+    """The content of the peer's reports that is contradicted, for a user."""
     residual: Annotated[float, Meta(ge=0.0, le=1e15)] | None = None
-    """by how much it cannot: m, m/s or rad; under noise sigmas; none where nothing comes near it"""
+    """The size of the contradiction: in m, m/s or rad with exact sensors, and in standard deviations with
+    noise; None if no hypothesis gives a residual."""
     p_value: Probability = 0.0
-    """how probable that much is, if the peer is honest"""
+    """The probability of a residual at least as large if the peer's reports are true."""
 
     def __post_init__(self) -> None:
         _cut(self, "claim")
 
 
 Verdict = Localised | Undecided | Inconsistent
+"""The final result of a robot. It does not change once it has been sent in a Command or Report."""
 
 
 Version = Annotated[str, Meta(max_length=64)]
+"""The version of a library, or the name of an instruction set."""
+
+
+# --- journals only ---
 
 
 class Environment(Message, frozen=True):
-    """The first frame of a journal: what the last bits of its numbers depend on beside the inputs."""
+    """The first frame of a journal: the versions on which the last bits of the recorded numbers depend."""
 
     tandem: Version
+    """The version of Tandem."""
     c_library: Version
+    """The name and version of the C library."""
     instruction_set: Version
+    """The instruction set of the processor, such as "x86-64-v3"."""
     numpy: Version | None = None
-    """and the instructions that it uses; none in a world's journal, which is made without, nor the next"""
+    """The version of numpy and the instructions that it uses; None in the journal of a world, which does not
+    use it."""
     linear_algebra: Version | None = None
+    """The name and version of numpy's linear algebra library; None in the journal of a world."""
+
+
+class DeadlineMissed(Message, frozen=True):
+    """A placeholder in a journal for a message that did not arrive before the deadline, in real time only."""
+
+    tick: Tick
+    """The tick of the missing message."""
+    robot: RobotId
+    """The sender of the missing message: of a Command in a world's journal, of a Report in an agent's."""
+
+
+# --- from the world to a robot ---
 
 
 class RobotConfig(Message, frozen=True):
-    """Everything that a robot needs to start."""
+    """The configuration of a robot: everything that its agent needs to start."""
 
     robot: RobotId
+    """The robot that is configured."""
     peer: RobotId
+    """The robot that it has to meet."""
     role: Role
+    """The role of this robot in the pair; its peer has the other one."""
     anchor: Anchor
-    """its own"""
+    """The position of the robot's own anchor in <W>, in m."""
     peer_anchor: Anchor
+    """The position of the peer's anchor in <W>, in m."""
     mission: Mission
+    """The parameters of the mission, the same for all robots."""
     planner_name: PlannerName
+    """The name of the planner."""
     rendezvous: Rendezvous
+    """The orbits of both robots in phase 2."""
     attack: Attack | None
-    """what it is told to tell its peer, instead of the truth"""
+    """The false data that the robot injects into its Reports; None for an honest robot."""
     tick_s: Annotated[float, Meta(gt=0.0, le=1e6)] | None
-    """s of wall time that a tick lasts; none in lockstep, where no decision depends on a time-out"""
+    """The duration of a tick in s of wall time; None in lockstep, where a tick has no deadline."""
 
     @property
     def anchor_distance(self) -> float:
-        """D in m."""
+        """The distance D between the two anchors, in m."""
         return math.hypot(self.anchor.x - self.peer_anchor.x, self.anchor.y - self.peer_anchor.y)
 
 
 class Observation(Message, frozen=True):
-    """World to one robot: what its sensors say at tick k."""
+    """The measurements of one robot at tick k."""
 
     tick: Tick
+    """The tick k."""
     robot: RobotId
+    """The robot that receives this."""
     executed: Controls | None
-    """over [k - 1, k]; none at tick 0"""
+    """The odometry: measured v in m/s and omega in rad/s over [k - 1, k]; None at tick 0."""
     anchor_range: Range | None
+    """The measured distance to the robot's own anchor, in m; None out of range, and for a drop-out."""
     contacts: tuple[Contact, ...] = ()
-
-
-class Report(Message, frozen=True):
-    """Robot to robot: what the peer has not acknowledged of this robot's log, up to tick k.
-
-    Manoeuvres and ranges are acknowledged each for themselves: what many ranges there may be to tell must
-    not hold up where the robot is.
-    """
-
-    tick: Tick
-    robot: RobotId
-    """who says it"""
-    phase: Phase
-    state: Word
-    start: Pose | None
-    """where tick 0 of its odometry lies in the frame of its own anchor; none before phase 1 is done"""
-    since: Tick
-    through: Tick
-    """the log below covers the manoeuvres over [since, through]"""
-    runs: Annotated[tuple[Segment, ...], Meta(max_length=MAX_REPORT_RUNS)]
-    ranges_since: Count
-    """the log below has the ranges after the first so many"""
-    ranges: Annotated[tuple[Ranged, ...], Meta(max_length=MAX_REPORT_RANGES)]
-    """to its own anchor"""
-    heard: Tick
-    """the peer's manoeuvres are known through this tick"""
-    ranges_heard: Count
-    """and so many of the peer's ranges"""
-    verdict: Verdict | None = None
-
-
-class Command(Message, frozen=True):
-    """Robot to world: what it does over [k, k + 1], and what it knows of itself."""
-
-    tick: Tick
-    robot: RobotId
-    v: Velocity
-    omega: AngularVelocity
-    phase: Phase
-    state: Word
-    verdict: Verdict | None = None
-
-
-class Estimate(Message, frozen=True):
-    """Robot to viewers: what it holds possible at tick k."""
-
-    tick: Tick
-    robot: RobotId
-    local: tuple[Pose, ...]
-    """its pose in the frame of its own anchor, one for each branch that is left"""
-    world: tuple[Pose, ...]
-    """its pose in the world frame, one for each placement that is left"""
-    localised: bool
-    probabilities: tuple[Probability, ...] = ()
-    """of each in `world`, or while there is none of each in `local`, the likeliest first; they sum to 1.
-    None where sensors are exact: what is possible there is equally so"""
-    covariance: Covariance | None = None
-    """of the first in `world`"""
-
-
-class GroundTruth(Message, frozen=True):
-    """World to viewers: where everyone really is at tick k."""
-
-    tick: Tick
-    poses: dict[RobotId, Pose]
-
-
-class DeadlineMissed(Message, frozen=True):
-    """Only in journals, and only in real time: what tick k did without, for it did not come in time."""
-
-    tick: Tick
-    robot: RobotId
-    """whose Command (in the world's journal) or Report (in an agent's)"""
-
-
-class TickStart(Message, frozen=True):
-    """Without a world, one robot's driver to its peer's: tick k has begun."""
-
-    tick: Tick
-    robot: RobotId
+    """The contacts at tick k; empty if no robot is within range R."""
 
 
 class MissionEnd(Message, frozen=True):
-    """World to robots: the mission is over."""
+    """The end of the mission, sent in place of the next Observation."""
 
     tick: Tick
+    """The last tick."""
     outcome: Outcome
+    """The outcome of the run."""
     reason: Text | None
+    """The reason for the outcome, for a user; None if it is `localised`."""
 
     def __post_init__(self) -> None:
         _cut(self, "reason")
 
 
+# --- from a robot ---
+
+
+class Report(Message, frozen=True):
+    """The part of a robot's motion log, up to tick k, that its peer has not acknowledged.
+
+    Manoeuvres and ranges are acknowledged separately, so that a long backlog of ranges never delays the
+    manoeuvres, from which the peer computes where this robot is.
+    """
+
+    tick: Tick
+    """The tick k in which this is sent."""
+    robot: RobotId
+    """The sender."""
+    phase: Phase
+    """The phase of the sender's planner."""
+    state: Word
+    """The state of the sender's planner."""
+    start: Pose | None
+    """The sender's pose at tick 0 in its anchor frame: m, m and rad; None until phase 1 is done."""
+    since: Tick
+    """The tick at which `runs` begins."""
+    through: Tick
+    """The tick at which `runs` ends: it contains the manoeuvres over [since, through]."""
+    runs: Annotated[tuple[Segment, ...], Meta(max_length=MAX_REPORT_RUNS)]
+    """The measured manoeuvres over [since, through], run-length encoded, in m/s and rad/s."""
+    ranges_since: Count
+    """The number of the sender's anchor ranges that precede `ranges`."""
+    ranges: Annotated[tuple[Ranged, ...], Meta(max_length=MAX_REPORT_RANGES)]
+    """The sender's ranges to its own anchor, in m, in increasing order of their ticks."""
+    heard: Tick
+    """The acknowledgement of manoeuvres: the sender has the receiver's manoeuvres over [0, heard]."""
+    ranges_heard: Count
+    """The acknowledgement of ranges: the sender has this many of the receiver's anchor ranges."""
+    verdict: Verdict | None = None
+    """The sender's final result; None until it has one."""
+
+
+class Command(Message, frozen=True):
+    """The controls of a robot over [k, k + 1], and its final result."""
+
+    tick: Tick
+    """The tick k of the Observation that this answers."""
+    robot: RobotId
+    """The sender."""
+    v: Velocity
+    """The forward velocity, in m/s. The world limits it to +-v_max."""
+    omega: AngularVelocity
+    """The angular velocity, in rad/s, counter-clockwise. The world limits it to +-omega_max."""
+    phase: Phase
+    """The phase of the sender's planner."""
+    state: Word
+    """The state of the sender's planner."""
+    verdict: Verdict | None = None
+    """The sender's final result; None until it has one. The world keeps the first."""
+
+
+class Estimate(Message, frozen=True):
+    """The poses that a robot considers possible at tick k."""
+
+    tick: Tick
+    """The tick k."""
+    robot: RobotId
+    """The sender."""
+    local: tuple[Pose, ...]
+    """The possible poses in the robot's anchor frame, one for each remaining branch: m, m and rad."""
+    world: tuple[Pose, ...]
+    """The possible poses in <W>, one for each remaining placement: m, m and rad."""
+    localised: bool
+    """True if the robot claims its pose."""
+    probabilities: tuple[Probability, ...] = ()
+    """The probabilities of the poses in `world`, or of those in `local` while `world` is empty.
+
+    They are in the order of the poses, most probable first, and sum to 1. Empty with exact sensors, where
+    all remaining poses are equally probable.
+    """
+    covariance: Covariance | None = None
+    """The covariance of the error of the first pose in `world`; None with exact sensors."""
+
+
 class FinalReport(Message, frozen=True):
-    """Robot to world, the answer to MissionEnd: how it went, seen from inside."""
+    """The statistics of a robot about its mission, in answer to MissionEnd.
+
+    The world sends it back to the robot to acknowledge that it is in the recording.
+    """
 
     robot: RobotId
+    """The sender."""
     anchor_ranges: Count
+    """The number of ranges measured to the robot's own anchor."""
     mutual_ranges: Count
+    """The number of ranges measured to the peer."""
     branch: BranchKind | None
+    """The observation that decided the branch in phase 1; None if phase 1 was not finished."""
     alpha: Angle | None
-    """of eq. (2), signed"""
+    """The signed angle alpha of eq. (2), in rad; None if phase 1 was not finished."""
     candidates: tuple[Count, Count] | None
-    """solutions of eq. (7), before and after silence"""
+    """The number of solutions of eq. (7): all of them, and those that predict no detection where there was
+    none. With noise, the number of hypotheses at first and last. None if the robots did not meet."""
     last_turn_rate: AngularVelocity | None
-    """omega_2 of eq. (8), of the latest; a plans one only where b's has not settled it"""
+    """The latest planned omega_2 of eq. (8), in rad/s; None if none was planned. Robot a plans one only
+    if that of b did not decide."""
     separation_m2: Annotated[float, Meta(ge=0.0, le=1e15)] | None
-    """J of eq. (8); none where one candidate was left, and nothing to be told apart"""
+    """The cost J of eq. (8) for `last_turn_rate`, with squared ranges, in m^2; None if no manoeuvre was
+    planned, or if there was only one candidate."""
     hypotheses: Count | None
-    """about the poses of both, that are left in the end"""
+    """The number of remaining hypotheses about the poses of both robots; None if the robots did not meet."""
     probability: Probability | None
-    """of the likeliest of them; none where sensors are exact"""
+    """The probability of the most probable hypothesis; None with exact sensors."""
     blocking_reason: Text | None
-    """under noise: what there was to know yet, before it could claim"""
+    """The condition that still prevents a claim, for a user; None if there is none, or with exact sensors."""
     p_value: Probability | None
-    """under noise: the least with which the ranges spoke against what the peer told"""
+    """The smallest p-value of all consistency tests; None with exact sensors, and if there was no test."""
     reports_sent: Count
+    """The number of Reports sent."""
     reports_heard: Count
+    """The number of the peer's Reports received and used."""
     reports_refused: Count
-    """malformed, or not from whom they said"""
+    """The number of the peer's Reports refused: damaged, malformed, or not from their stated sender."""
     reports_unheard: Count
-    """that arrived, though they were not sent in contact"""
+    """The number of the peer's Reports that arrived, but that no Observation listed."""
     reports_lost: Count
-    """that were sent in contact, and never heard"""
+    """The number of the peer's Reports that were sent in contact, and never received."""
     frames_refused: Count
-    """of all kinds"""
+    """The number of refused frames of all kinds."""
     bytes_sent: Count
-    """of reports"""
+    """The total size of the Reports sent, in bytes."""
 
     def __post_init__(self) -> None:
         _cut(self, "blocking_reason")
+
+
+# --- to viewers, and between drivers ---
+
+
+class GroundTruth(Message, frozen=True):
+    """The true poses of all robots at tick k."""
+
+    tick: Tick
+    """The tick k."""
+    poses: dict[RobotId, Pose]
+    """The true pose of each robot in <W>: m, m and rad."""
+
+
+class TickStart(Message, frozen=True):
+    """The start of tick k at one robot's driver, from which the peer's driver sets its clock."""
+
+    tick: Tick
+    """The tick k."""
+    robot: RobotId
+    """The robot of the sending driver."""
 
 
 OfRobot = (
@@ -310,4 +436,4 @@ OfRobot = (
     | MissionEnd
     | FinalReport
 )
-"""what stands in an agent's journal"""
+"""The messages in the journal of an agent."""

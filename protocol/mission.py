@@ -1,4 +1,4 @@
-"""What the robots can do and see, and what follows from it (Section II)."""
+"""The parameters of a mission (Section II), and the checks whether a robot can localise itself with them."""
 
 from __future__ import annotations
 
@@ -14,90 +14,103 @@ from protocol.rounding import EPSILON, SAME, SURE, required_anchor_error, roundi
 from protocol.units import Clearance, Coordinate, Duration, Length, Speed, TurnRate
 
 PlannerName = Literal["assured", "paper"]
-"""`paper` plays the paper to the letter; `assured` also cures what fails in it."""
+"""The name of a planner: `paper` is the algorithm as published, `assured` also handles its failure cases."""
 
 Role = Literal["a", "b"]
-"""a moves first when the two meet, b stands (Section III.C)."""
+"""The role of a robot in its pair: when the two meet, a moves first, and b stops (Section III.C)."""
 
 OPTIMAL_TURN = 2.331122370414423
-"""rad: omega_1 T_s that maximises eq. (4); the positive root of tan(u / 2) = u."""
+"""The angle omega_1 T_s in rad that maximises eq. (4): the positive root of tan(u / 2) = u."""
 
 RANGE_MARGIN = 1e-6
-"""m: how far inside R a point must lie to count on its range; eq. (5) puts one exactly on R."""
+"""The distance inside R, in m, from which a range is expected. Eq. (5) puts a point exactly on R."""
 
 FIRST_STRAIGHT_LIMIT = 0.9
-"""A_0 / R at most: a longer first straight could lead to a circle that never touches the disc."""
+"""The maximum of A_0 / R. After a longer first straight, the circle about q_0 might never be in range."""
 
 
 SHORTEST_STEP = 1e-4
-"""m: with manoeuvres A_0 that are shorter, places would be no farther apart than RANGE_MARGIN leaves of
-them"""
+"""The minimum of A_0 in m. Positions closer to each other are hardly distinct beside RANGE_MARGIN."""
 
 AMPLIFIED = 500.0
-"""EPSILON of the size, in a range of the encounter, that A_0 (D + R) / max(1, R / D) must be able to bear:
-found on random settings, where `assured` gets on with any that it allows"""
+"""The assumed rounding error of a mutual range, in units of EPSILON (D + R).
+
+`infeasibility` divides it by the length A_0 of a manoeuvre, which gives an error of the pose. The value was
+found on random settings: `assured` localises in all settings that it allows.
+"""
 
 MOST_RANGES = 1e4
-"""(sigma / accuracy)^2 at most: so many ranges it takes to average sigma down to the accuracy, each of them
-in a tick of its own; a mission has some hundred"""
+"""The maximum of (sigma / accuracy)^2, the number of ranges whose mean has the required accuracy.
+
+Each range takes a tick. A typical mission has about a hundred.
+"""
 
 
 class Anchor(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """Where a ranging anchor stands in the world frame."""
+    """The position of a ranging anchor in the world frame <W>."""
 
     x: Coordinate
+    """The x coordinate, in m."""
     y: Coordinate
+    """The y coordinate, in m."""
 
 
 class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the robots can do and see; the same for all of them (Section II)."""
+    """The limits, sensors and required accuracy of the robots; the same for all of them (Section II)."""
 
     sensing_range: Length
-    """R: anchors and robots are ranged up to this distance, bounds included"""
+    """The sensing range R in m: the largest distance, inclusive, at which anchors and robots are ranged."""
     period: Duration
-    """T_s"""
+    """The sampling period T_s in s, the duration of a tick."""
     max_speed: Speed
-    """v_max"""
+    """The maximum forward speed v_max in m/s."""
     max_turn_rate: TurnRate
-    """omega_max"""
+    """The maximum turn rate omega_max in rad/s."""
     accuracy: Length = 0.1
-    """m: how well both robots must know where they are before they claim to: the root of the trace of the
-    covariance of their position"""
+    """The accuracy in m that both robots need for a claim: the maximum square root of the trace of the
+    covariance of their position."""
     confidence: Annotated[float, Meta(ge=0.5, lt=1.0)] = 0.9999
-    """how probable the hypothesis must be that they claim"""
+    """The minimum probability of a hypothesis that is claimed."""
     safety_distance: Clearance = 0.0
-    """m: two robots that range each other come no nearer"""
+    """The minimum distance in m between two robots that are in contact."""
     noise: Noise = Noise()
+    """The noise of sensors and motion."""
 
     @property
     def first_straight(self) -> float:
-        """A_0 in m: one tick at full speed, shortened where it would come near R."""
+        """The length A_0 in m of the first manoeuvre: one tick at v_max, at most FIRST_STRAIGHT_LIMIT R."""
         return min(self.max_speed * self.period, FIRST_STRAIGHT_LIMIT * self.sensing_range)
 
     @property
     def foothold(self) -> float:
-        """m: how well a robot has to know where its anchor is before it goes to meet the peer.
+        """The accuracy in m to which a robot must know its anchor's position before phase 2.
 
-        The root of the trace of the covariance. The anchors are the two points that fix both robots in <W>.
+        This is the maximum square root of the trace of the covariance. The anchors are the two points that
+        fix both robots in <W>.
         """
         return min(self.accuracy, FOOTHOLD * self.sensing_range)
 
 
 HEADING_ACCURACY = 0.2
-"""rad: how well they must know their headings before they claim to, as a standard deviation; with a heading
-less well known than this the ellipse is no likeness of what is possible"""
+"""The maximum standard deviation in rad of a claimed heading.
+
+With a larger one, the linearised covariance no longer describes the distribution of the position.
+"""
 
 FOOTHOLD = 0.05
-"""of R: with a worse one, the orbit's margin would take too much of R"""
+"""The maximum of `foothold`, as a fraction of R. A larger one makes the margin of the orbit too large."""
 
 
 def infeasibility(mission: Mission, distance: float) -> str | None:
-    """Why robots with anchors `distance` m (D) apart could not be sure of their poses; None if they can."""
+    """Return why robots with anchors `distance` m (D) apart cannot localise themselves, or None if they can.
+
+    This is about rounding errors. `noise_infeasibility` checks the noise.
+    """
     step, reach = mission.first_straight, mission.sensing_range
     if step < SHORTEST_STEP * (1.0 - EPSILON):
         return (
-            f"a tick moves a robot by {step:.3g} m at most; from less than {SHORTEST_STEP:g} m, ranges tell "
-            "nothing for sure: raise max_speed or period"
+            f"a robot moves at most {step:.3g} m in a tick, and ranges are only distinct from "
+            f"{SHORTEST_STEP:g} m on: raise max_speed or period"
         )
     size = distance + reach
     if AMPLIFIED * EPSILON * size * max(1.0, reach / distance) * max(1.0, size) / step > SURE:
@@ -108,24 +121,28 @@ def infeasibility(mission: Mission, distance: float) -> str | None:
         return None
     return (
         f"with {distance:.6g} m between the anchors and ranges up to {reach:.6g} m, manoeuvres of "
-        f"{step:.3g} m are too short for a pose to be sure to a micrometre in double precision, by the "
-        f"{which} ranges: raise max_speed or period"
+        f"{step:.3g} m are too short to compute a pose from {which} ranges to a micrometre in double "
+        "precision: raise max_speed or period"
     )
 
 
 MARGIN = 1.2
-"""by which phase 1 must be able to find an anchor better than it has to: its manoeuvres are not the best
-ones"""
+"""The factor by which the best anchor error of phase 1 must be below the required one.
+
+The manoeuvres of phase 1 are not optimal, so it does not reach the best error.
+"""
 
 
 def _anchor_error(mission: Mission, size: float) -> float:
-    """Return how exactly (m) phase 1 finds the anchor from the worst starts, both on the rim.
+    """Return the anchor error in m that phase 1 reaches from the worst starts, which are on the rim of range.
 
-    The ranges are off by `rounding`, and the fit of the heading (`belief.anchor_error`) by that over the
-    way off the radius. Heading along the radius, the first two ranges tell nothing of it, and each further
-    tick leads A_0 on and turns by as much as it can. Heading along the tangent, the second range is that at
-    the end of a circle of radius A_0, after a quarter turn on the spot and at most two thirds of the way
-    round.
+    Each range has an error of `rounding`. The fitted heading has that error divided by the distance driven
+    across the radius. There are two worst cases:
+
+    - The robot heads along the radius. Its first two ranges contain no information about its heading. In each
+      further tick it drives A_0, and turns as much as it can.
+    - The robot heads along the tangent. It measures its second range on a circle of radius A_0, after a
+      quarter turn on the spot and at most two thirds of the circle.
     """
     step, reach = mission.first_straight, mission.sensing_range
     turn = min(third_point_turn_rate(mission) * mission.period, math.pi)
@@ -141,55 +158,54 @@ def _anchor_error(mission: Mission, size: float) -> float:
 
 
 def safety_infeasibility(mission: Mission) -> str | None:
-    """The field, and why `safety_distance` could not be kept; None if it can."""
+    """Return the field name and why robots cannot keep `safety_distance`, or None if they can."""
     warned = mission.sensing_range - 2.0 * mission.max_speed * mission.period
     if mission.safety_distance <= max(0.0, warned):
         return None
     return (
-        f"safety_distance: {mission.safety_distance:.6g} m, where two robots that come into range of each "
-        f"other at max_speed may be {max(0.0, warned):.6g} m apart before they know "
-        "(sensing_range - 2 max_speed period)"
+        f"safety_distance: {mission.safety_distance:.6g} m, but robots that approach each other at max_speed "
+        f"may be {max(0.0, warned):.6g} m apart at their first contact (sensing_range - 2 max_speed period)"
     )
 
 
 MOST_OUTLIERS = 0.25
-"""of all ranges: with half of them, 2 claims of 23 tried were wrong"""
+"""The maximum fraction of outliers among all ranges. With 0.5, 2 of 23 claims were wrong."""
 
 
 def noise_infeasibility(mission: Mission) -> str | None:
-    """The field, and why no robot could be sure of its pose with such noise; None if it can."""
+    """Return the field and why robots cannot localise themselves with this noise, or None if they can."""
     noise, reach, accuracy = mission.noise, mission.sensing_range, mission.accuracy
     if noise.exact:
         return None
     for name, sigma in (("anchor_sigma", noise.anchor_sigma), ("mutual_sigma", noise.mutual_sigma)):
         if sigma > reach:
             return (
-                f"noise.{name}: a range that errs by {sigma:.6g} m says less than that there is one, up to "
-                f"mission.sensing_range = {reach:.6g} m"
+                f"noise.{name}: a range with an error of {sigma:.6g} m contains no more information than its "
+                f"detection within mission.sensing_range = {reach:.6g} m"
             )
         if (sigma / accuracy) ** 2 > MOST_RANGES:
             return (
-                f"accuracy: {accuracy:.3g} m is the mean of more than {MOST_RANGES:g} ranges with "
+                f"accuracy: {accuracy:.3g} m takes the mean of more than {MOST_RANGES:g} ranges with "
                 f"mission.noise.{name} = {sigma:.3g} m"
             )
     if noise.outliers > MOST_OUTLIERS:
-        return f"noise.outliers: with more than {MOST_OUTLIERS:g} of them, those that agree may all be wrong"
-    if accuracy > reach * math.sqrt(0.5):  # the root of the trace, of a point anywhere in a disc of radius R
+        return f"noise.outliers: with more than {MOST_OUTLIERS:g}, all ranges that agree may be outliers"
+    if accuracy > reach * math.sqrt(0.5):  # the root of the trace for a uniform distribution on the disc of R
         return (
-            f"accuracy: a robot anywhere in range of its anchor knows where it is to {accuracy:.3g} m, where "
+            f"accuracy: any robot in range of its anchor knows its position to {accuracy:.3g} m, as "
             f"mission.sensing_range = {reach:.3g} m"
         )
-    for wheels, drift in (("actuation", noise.actuation), ("odometry", noise.odometry)):
-        if drift.v_floor > mission.max_speed:
-            return f"noise.{wheels}.v_floor: more than mission.max_speed = {mission.max_speed:.6g} m/s"
-        if drift.omega_floor > mission.max_turn_rate:
+    for field, velocity in (("actuation", noise.actuation), ("odometry", noise.odometry)):
+        if velocity.v_floor > mission.max_speed:
+            return f"noise.{field}.v_floor: more than mission.max_speed = {mission.max_speed:.6g} m/s"
+        if velocity.omega_floor > mission.max_turn_rate:
             return (
-                f"noise.{wheels}.omega_floor: more than mission.max_turn_rate = "
+                f"noise.{field}.omega_floor: more than mission.max_turn_rate = "
                 f"{mission.max_turn_rate:.6g} rad/s"
             )
     return None
 
 
 def third_point_turn_rate(mission: Mission) -> float:
-    """omega_1 in rad/s: the best of eq. (4) within omega_max."""
+    """Return the turn rate omega_1 in rad/s that maximises eq. (4) within omega_max."""
     return min(OPTIMAL_TURN / mission.period, mission.max_turn_rate)

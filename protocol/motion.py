@@ -1,7 +1,7 @@
-"""What a manoeuvre does: the exact unicycle step of eq. (1a), and poses in SE(2).
+"""The motion model: the exact unicycle step of eq. (1a), and poses in SE(2).
 
-The world moves the robots with `step`, and the robots dead-reckon with the same `step`: there is one
-motion model, on scalars. (Arrays overtake it only from some fifteen robots on, and one pair is the rule.)
+The world moves the robots with `step`, and the robots dead-reckon with the same function. It works on
+scalars: arrays are faster only from about fifteen robots on, and most missions have two.
 """
 
 from __future__ import annotations
@@ -17,64 +17,79 @@ TAU = 2.0 * math.pi
 
 
 class Pose(msgspec.Struct, frozen=True, array_like=True, gc=False, forbid_unknown_fields=True):
-    """A position and a heading in some frame; also the frame that has its origin and x-axis there."""
+    """A position and a heading in a frame. A pose also defines the frame with its origin and x-axis there."""
 
     x: Coordinate
+    """The x coordinate, in m."""
     y: Coordinate
+    """The y coordinate, in m."""
     heading: Angle
-    """counter-clockwise from the x-axis, not wrapped"""
+    """The heading theta in rad, counter-clockwise from the x-axis, not wrapped."""
 
 
 ORIGIN = Pose(0.0, 0.0, 0.0)
+"""The pose at the origin of a frame, heading along its x-axis."""
 
 
 class Covariance(msgspec.Struct, frozen=True, array_like=True, gc=False, forbid_unknown_fields=True):
-    """Of the error of a pose, in m^2, m rad and rad^2: the upper triangle, row by row."""
+    """The covariance of the error of a pose (x, y, heading): the upper triangle, row by row."""
 
     xx: Moment
+    """The variance of x, in m^2."""
     xy: Moment
+    """The covariance of x and y, in m^2."""
     xh: Moment
+    """The covariance of x and the heading, in m rad."""
     yy: Moment
+    """The variance of y, in m^2."""
     yh: Moment
+    """The covariance of y and the heading, in m rad."""
     hh: Moment
+    """The variance of the heading, in rad^2."""
 
     @property
     def position_sigma(self) -> float:
-        """m: the root of the trace of the position's part."""
+        """The square root of the trace of the covariance of the position, in m."""
         return math.sqrt(max(0.0, self.xx + self.yy))
 
     @property
     def heading_sigma(self) -> float:
-        """rad"""
+        """The standard deviation of the heading, in rad."""
         return math.sqrt(max(0.0, self.hh))
 
 
 class Segment(msgspec.Struct, frozen=True, array_like=True, gc=False, forbid_unknown_fields=True):
-    """Equal manoeuvres, one after the other."""
+    """A sequence of equal manoeuvres in consecutive ticks, which form one arc."""
 
     ticks: TickCount
+    """The number of ticks."""
     v: Velocity
+    """The forward velocity, in m/s."""
     omega: AngularVelocity
+    """The angular velocity, in rad/s."""
 
 
 class Controls(msgspec.Struct, frozen=True, array_like=True, gc=False, forbid_unknown_fields=True):
-    """v_k and omega_k, held over one tick."""
+    """The control inputs v_k and omega_k of eq. (1a), constant over one tick."""
 
     v: Velocity
+    """The forward velocity, in m/s."""
     omega: AngularVelocity
+    """The angular velocity, in rad/s."""
 
 
 REST = Controls(0.0, 0.0)
+"""The controls of a robot at rest."""
 
 
 def chord(v: float, omega: float, period: float) -> float:
-    """A_k of eq. (1a): the straight distance in m, signed like `v`, between the ends of one manoeuvre."""
+    """Return A_k of eq. (1a): the distance in m between the ends of a manoeuvre, with the sign of `v`."""
     half = 0.5 * period * omega
     return v * period if half == 0.0 else v * period * (math.sin(half) / half)
 
 
 def step(pose: Pose, v: float, omega: float, period: float) -> Pose:
-    """The pose after driving (v, omega) for `period` seconds (eq. (1a), exact for any period)."""
+    """Return the pose after driving `v` m/s and `omega` rad/s for `period` s: eq. (1a), exact."""
     half = 0.5 * period * omega
     length = chord(v, omega, period)
     course = pose.heading + half
@@ -84,7 +99,7 @@ def step(pose: Pose, v: float, omega: float, period: float) -> Pose:
 
 
 def arc(start: Pose, run: Segment, period: float) -> list[Pose]:
-    """Return the pose after each tick of `run`: what `step` gives from `start`, over k times `period`."""
+    """Return the poses after each tick of `run`: those that `step` gives from `start` after k `period` s."""
     v, omega = run.v, run.omega
     x, y, heading = start.x, start.y, start.heading
     sin, cos = math.sin, math.cos
@@ -99,7 +114,7 @@ def arc(start: Pose, run: Segment, period: float) -> list[Pose]:
 
 
 def follow(start: Pose, runs: Iterable[Segment], period: float) -> Pose:
-    """The pose at the end of `runs`. Equal manoeuvres are one arc, so each run costs one step."""
+    """Return the pose after driving `runs` from `start`, with one step for each run."""
     pose = start
     for run in runs:
         pose = step(pose, run.v, run.omega, run.ticks * period)
@@ -107,7 +122,7 @@ def follow(start: Pose, runs: Iterable[Segment], period: float) -> Pose:
 
 
 def compose(frame: Pose, local: Pose) -> Pose:
-    """`local`, given in `frame`, in the coordinates that `frame` itself is given in."""
+    """Return the pose `local`, given in `frame`, in the frame in which `frame` itself is given."""
     c, s = math.cos(frame.heading), math.sin(frame.heading)
     return Pose(
         frame.x + c * local.x - s * local.y,
@@ -117,12 +132,12 @@ def compose(frame: Pose, local: Pose) -> Pose:
 
 
 def inverse(pose: Pose) -> Pose:
-    """The frame that `pose` is given in, as a pose in the frame that `pose` is."""
+    """Return the inverse transformation: `compose(pose, inverse(pose))` is ORIGIN."""
     c, s = math.cos(pose.heading), math.sin(pose.heading)
     return Pose(-c * pose.x - s * pose.y, s * pose.x - c * pose.y, -pose.heading)
 
 
 def wrap(angle: float) -> float:
-    """The same direction in (-pi, pi]."""
+    """Return `angle`, in rad, wrapped to (-pi, pi]."""
     wrapped = math.remainder(angle, TAU)
     return math.pi if wrapped <= -math.pi else wrapped

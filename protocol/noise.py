@@ -1,4 +1,4 @@
-"""How far sensors and wheels are to be trusted: what the world draws from, and what every robot is told."""
+"""The noise of sensors and motion. The world draws from it, and every robot knows it (`Mission.noise`)."""
 
 from __future__ import annotations
 
@@ -16,52 +16,52 @@ Bias = Annotated[float, Meta(ge=0.0, le=1e6)]
 
 
 class VelocityNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """White noise on the v and omega of each tick: a fraction of each, and an absolute part."""
+    """White Gaussian noise on the v and omega of each tick, with a proportional and an absolute part.
+
+    The variances of the two parts are added.
+    """
 
     v: Fraction = 0.0
-    """of v, a standard deviation"""
+    """The proportional standard deviation of v, as a fraction of v."""
     omega: Fraction = 0.0
-    """of omega"""
+    """The proportional standard deviation of omega, as a fraction of omega."""
     v_floor: Floor = 0.0
-    """m/s, added in squares"""
+    """The absolute standard deviation of v, in m/s."""
     omega_floor: Floor = 0.0
-    """rad/s, added in squares"""
+    """The absolute standard deviation of omega, in rad/s."""
 
     def variances(self, v: float, omega: float) -> tuple[float, float]:
-        """Of the noise on a manoeuvre, in (m/s)^2 and (rad/s)^2."""
+        """Return the variances of v and omega for a manoeuvre, in (m/s)^2 and (rad/s)^2."""
         return (self.v * v) ** 2 + self.v_floor**2, (self.omega * omega) ** 2 + self.omega_floor**2
 
 
 class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
-    """Of ranges: Gaussian, outliers and drop-outs; of wheels: how they move the robot, and are measured.
-
-    Left out, everything is exact.
-    """
+    """The noise of ranges, actuation and odometry. By default, everything is exact."""
 
     anchor_sigma: Sigma = 0.0
-    """m, of a range to an anchor"""
+    """The standard deviation of a range to an anchor, in m."""
     mutual_sigma: Sigma = 0.0
-    """m, of a range between robots"""
+    """The standard deviation of a range between robots, in m."""
     outliers: Probability = 0.0
-    """that a range has no line of sight, and is too long"""
+    """The probability that a range is an outlier: without line of sight, and therefore too long."""
     outlier_bias: tuple[Bias, Bias] = (0.3, 2.0)
-    """m: by how much then, uniform between these, the least and the most"""
+    """The minimum and maximum of the uniformly distributed bias of an outlier, in m."""
     drop_outs: Probability = 0.0
-    """that a range within R is not measured"""
+    """The probability that a range within R is not measured."""
     actuation: VelocityNoise = VelocityNoise()
-    """how what is executed differs from what was asked for"""
+    """The difference between commanded and executed velocities."""
     odometry: VelocityNoise = VelocityNoise()
-    """how what the odometry measures differs from what was executed"""
+    """The difference between executed and measured velocities."""
 
     @cached_property
     def exact(self) -> bool:
-        """Whether there is none: then a range is a fact, and so is silence."""
+        """True if there is no noise. Then each range is exact, and no detection means out of range."""
         ranges = self.anchor_sigma or self.mutual_sigma or self.outliers or self.drop_outs
         return not ranges and self.actuation == self.odometry == VelocityNoise()
 
     @property
     def standstill_bound(self) -> tuple[float, float]:
-        """m/s and rad/s: more than this is hardly ever measured by a robot that was told to stand."""
+        """The bounds in m/s and rad/s that the odometry of a robot at rest hardly ever exceeds."""
         return (
             UNREST * math.hypot(self.actuation.v_floor, self.odometry.v_floor),
             UNREST * math.hypot(self.actuation.omega_floor, self.odometry.omega_floor),
@@ -69,4 +69,4 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
 
 
 UNREST = 6.0
-"""standard deviations"""
+"""The number of standard deviations in `standstill_bound`."""

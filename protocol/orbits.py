@@ -1,8 +1,9 @@
-"""How the two robots of a pair meet: where each orbits, and how long that takes at most (Section III.B).
+"""The orbits of phase 2, on which the two robots of a pair meet, and the time this takes (Section III.B).
 
-The paper has both orbit, in opposite senses. In `assured`, b waits beside its anchor and a goes round on
-the circle that passes b's range whichever way b lies. Of all pairs of circles and constant speeds, those
-that `docs/rendezvous.py` finds to meet soonest are of this kind, with b on its anchor, and gain 5 %.
+With the `paper` planner, both robots orbit, in opposite directions. With `assured`, b waits beside its
+anchor, and a orbits on a circle that crosses b's sensing range wherever b waits. `docs/rendezvous.py`
+compares all pairs of circles with constant speeds. The fastest of them are of this kind, with b exactly on
+its anchor, and 5 % faster.
 """
 
 from __future__ import annotations
@@ -17,46 +18,56 @@ from protocol.motion import TAU
 from protocol.units import AngularVelocity, Range, Time, Velocity
 
 WAITING_PLACE = 0.125
-"""of R: how far from its anchor b waits. Not on it: there its ranges would not tell its heading; and not
-farther than that takes, since each metre lengthens a's way round by two pi"""
+"""The distance of waiting b from its anchor, as a fraction of R.
+
+On the anchor, b's ranges would contain no information about its heading. Each further metre makes a's circle
+2 pi m longer.
+"""
 
 PASSAGE = 1.5
-"""ticks at least that a is in b's range at each pass: one, to be measured, and room to go straight on"""
+"""The minimum duration in ticks of a's passage through b's range.
+
+One tick is needed for a range, and the rest is room for the next manoeuvre, which is straight.
+"""
 
 RADII = 400
-"""of a's orbit that are compared: twice as many change no meeting by a tick"""
+"""The number of radii of a's orbit that are compared. Twice as many change no meeting by a tick."""
 
 
 class Orbit(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """A circle about the robot's own anchor, driven without end; or, with no speed, a place on it."""
+    """A circle about the robot's own anchor; with speed 0, a position at this distance from the anchor."""
 
     radius: Range
+    """The radius, in m."""
     v: Velocity
+    """The forward velocity, in m/s; 0 to wait."""
     omega: AngularVelocity
-    """its sign is the sense"""
+    """The angular velocity, in rad/s; positive is counter-clockwise."""
 
 
 class Rendezvous(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """How the two robots of a pair orbit so that they meet; worked out once, then told to both."""
+    """The orbits of both robots of a pair, computed once and sent to both in their RobotConfig."""
 
     a: Orbit
+    """The orbit of a."""
     b: Orbit
+    """The orbit of b."""
     bound: Time
-    """s: T_max, the longest that both orbit before they are in range of each other"""
+    """The upper bound T_max in s of the time on the orbits until the robots are in range of each other."""
 
     def of(self, role: Role) -> Orbit:
-        """The part of who plays `role`."""
+        """Return the orbit of the robot with this role."""
         return self.a if role == "a" else self.b
 
 
 @cache
 def rendezvous(mission: Mission, distance: float, planner_name: PlannerName) -> Rendezvous:
-    """The plan for anchors `distance` m (D) apart."""
+    """Return the orbits of the planner for anchors `distance` m (D) apart."""
     return orbiting(mission, distance) if planner_name == "paper" else searching(mission, distance)
 
 
 def tick_budget(mission: Mission, plan: Rendezvous) -> int:
-    """max_ticks where the scenario names none: twice T_max, and ample time for phases 1 and 3."""
+    """Return the default of `max_ticks`: twice T_max, and ample time for phases 1 and 3."""
     turn = math.ceil(TAU / (mission.max_turn_rate * mission.period))
     reach = max(plan.a.radius, plan.b.radius) + mission.sensing_range
     radial = math.ceil(reach / (mission.max_speed * mission.period))
@@ -65,21 +76,21 @@ def tick_budget(mission: Mission, plan: Rendezvous) -> int:
     return 2 * math.ceil(plan.bound / mission.period) + 2 * circle + radial + 6 * turn + 50
 
 
-# --- the paper's --------------------------------------------------------------------------------------
+# --- the orbits of the `paper` planner ----------------------------------------------------------------
 
 
 def half_arc(distance: float, sensing_range: float) -> float:
-    """Omega in rad: half the angle, seen from an anchor, between the crossings of the paper's orbits."""
+    """Return Omega in rad: half the angle between the crossings of the two orbits, seen from an anchor."""
     return math.acos(distance / (distance + sensing_range))
 
 
 def longest_meeting(mission: Mission, distance: float, omega_b: float) -> float:
-    """T_max in s, in continuous time: b's way round, and twice over the arc 2 Omega."""
+    """Return T_max in s: the time in which b completes its circle, with the arc 2 Omega travelled twice."""
     return (TAU + 2.0 * half_arc(distance, mission.sensing_range)) / abs(omega_b)
 
 
 def orbiting(mission: Mission, distance: float) -> Rendezvous:
-    """The paper's orbits, eq. (6): of radius (D + R) / 2, in opposite senses."""
+    """Return the orbits of eq. (6): both have the radius (D + R) / 2, and the directions are opposite."""
     radius = 0.5 * (distance + mission.sensing_range)
     omega_a = min(mission.max_turn_rate, mission.max_speed / radius)
     omega_b = -half_arc(distance, mission.sensing_range) / math.pi * omega_a
@@ -90,17 +101,19 @@ def orbiting(mission: Mission, distance: float) -> Rendezvous:
     )
 
 
-# --- one waits, one searches --------------------------------------------------------------------------
+# --- the orbits of the `assured` planner --------------------------------------------------------------
 
 
 def searching(mission: Mission, distance: float) -> Rendezvous:
-    """b waits R / 8 from its anchor; a orbits where it passes b's range, and so slowly that it is measured.
+    """Return orbits on which b waits R / 8 from its anchor, and a crosses b's range slowly.
 
-    Of the radii that do, the one on which a is there soonest: on its way out, and half round in the mean.
-    Where R is so far beyond D that both are in range of each other wherever they wait, a waits too.
+    The radius is the one with the shortest mean time to the meeting: the way out to the orbit, and half of
+    the way round. If R is so large that the robots are in range of each other wherever they wait, a waits,
+    too.
 
-    The bound: wherever b waits, at least `2 half` of a's circle is in its range. From outside, a has at most
-    `TAU - 2 half` to drive until it is in; and as omega T_s is less than `2 half`, no tick jumps the passage.
+    The bound follows from the geometry. Wherever b waits, at least `2 half` rad of a's circle are in its
+    range. From outside, a travels at most `TAU - 2 half` rad until it is in range. It never steps over the
+    passage, because omega T_s is less than `2 half`.
     """
     reach, period = mission.sensing_range - RANGE_MARGIN - clearance(mission, distance), mission.period
     waiting = Orbit(WAITING_PLACE * mission.sensing_range, 0.0, 0.0)
@@ -108,7 +121,7 @@ def searching(mission: Mission, distance: float) -> Rendezvous:
     if far < reach:
         return Rendezvous(Orbit(min(reach - far, waiting.radius), 0.0, 0.0), waiting, 0.0)
     best = math.inf
-    for i in range(1, RADII):  # more of them near the smallest, where the best mostly is
+    for i in range(1, RADII):  # denser near the smallest radius, where the best one usually is
         radius = (far - reach) + (near + reach - (far - reach)) * (i / RADII) ** 2
         half = min(half_passage(near, radius, reach), half_passage(far, radius, reach))
         omega = min(mission.max_turn_rate, mission.max_speed / radius, 2.0 * half / (PASSAGE * period))
@@ -121,25 +134,28 @@ def searching(mission: Mission, distance: float) -> Rendezvous:
 
 
 def clearance(mission: Mission, distance: float) -> float:
-    """m: by how much a and b may be nearer or farther than they think, for what a robot knows when phase 1 is
-    done and how its odometry drifts on the way; none where sensors and wheels are exact."""
+    """Return the margin in m for the error of the distance between a and b; 0 with exact sensors and motion.
+
+    The error comes from the anchor's position after phase 1, and from odometry noise on the orbit.
+    """
     if mission.noise.exact:
         return 0.0
     known = mission.foothold
-    drift = mission.noise.odometry.omega * math.pi / 2 * distance
-    return min(CLEARANCE_SIGMAS * math.hypot(known, drift), CLEARANCE_LIMIT * mission.sensing_range)
+    odometry_error = mission.noise.odometry.omega * math.pi / 2 * distance
+    return min(CLEARANCE_SIGMAS * math.hypot(known, odometry_error), CLEARANCE_LIMIT * mission.sensing_range)
 
 
 CLEARANCE_SIGMAS = 3.0
+"""The number of standard deviations in the margin."""
 CLEARANCE_LIMIT = 0.4
-"""of R: with less left of it, a's way round would take too long"""
+"""The maximum of the margin, as a fraction of R. With a larger one, a's orbit would take too long."""
 
 
 def half_passage(apart: float, radius: float, reach: float) -> float:
-    """rad: half the arc, of a circle of `radius` about M1, that is within `reach` of a point `apart` from M1.
+    """Return half the arc, in rad, of a circle of `radius` m about M1 that is within `reach` m of a point.
 
-    On [D - r, D + r] it is least at an end: its cosine is convex in `apart` where the circle is larger
-    than the reach, and grows with it where it is smaller.
+    The point is `apart` m from M1. For `apart` in [D - r, D + r], the angle has its minimum at an end: its
+    cosine is convex in `apart` if the circle is larger than `reach`, and increases with `apart` otherwise.
     """
     cosine = (apart * apart + radius * radius - reach * reach) / (2.0 * apart * radius)
     return math.acos(min(1.0, max(-1.0, cosine)))

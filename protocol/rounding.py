@@ -20,7 +20,7 @@ from __future__ import annotations
 from protocol.motion import TAU
 
 EPSILON = 2.0**-52
-"""2 u"""
+"""Twice the unit roundoff: 2 u."""
 
 RANGED = 4.0
 """The rounding of a range, in u `size`: two differences, the hypotenuse, and the rotation of a frame."""
@@ -32,10 +32,10 @@ A measured range differs from the two that they predict by at most one floor eac
 """
 
 TOLERANCE = 1e-6
-"""m and rad: the largest error of a correct claim, with exact sensors"""
+"""The largest error in m and rad of a correct claim, with exact sensors."""
 
 SURE = 0.5 * TOLERANCE
-"""m and rad: the largest error from rounding with which a claim is made.
+"""The largest rounding error in m and rad with which a claim is made.
 
 The other half of TOLERANCE is left for the placements that are merged (`same_turn`).
 """

@@ -1,4 +1,7 @@
-"""Frame <-> message. A frame is one version byte, the CRC-32 of the body, and the body in msgpack."""
+"""The encoding of messages as frames.
+
+A frame is one version byte, the CRC-32 of the body in four bytes (big-endian), and the body in msgpack.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +12,13 @@ from typing import Any, TypeVar, overload
 import msgspec
 
 VERSION = 1
+"""The version of the protocol."""
 MAX_SENT_BYTES = 1 << 15
-"""a low-latency Zenoh link breaks, instead of refusing, from some 48 kB on"""
+"""The maximum size of a frame on the network. From about 48 kB on, a low-latency Zenoh link breaks."""
 MAX_REPORT_BYTES = 4096
+"""The maximum size of a Report's frame."""
 MAX_FRAME_BYTES = 1 << 20
-"""in a journal, whose scenario names every robot"""
+"""The maximum size of a frame in a journal: the scenario in a world's journal contains all robots."""
 
 _HEAD = struct.Struct(">BI")
 _encoder = msgspec.msgpack.Encoder()
@@ -23,27 +28,27 @@ M = TypeVar("M")
 
 
 class MalformedFrame(ValueError):
-    """The one error for every frame that cannot be understood; its text says why."""
+    """A frame cannot be decoded. The text of the error is the reason."""
 
 
 def encode(message: msgspec.Struct) -> bytes:
-    """The frame of `message`."""
-    said = _encoder.encode(message)
-    return _HEAD.pack(VERSION, zlib.crc32(said)) + said
+    """Return the frame of `message`."""
+    payload = _encoder.encode(message)
+    return _HEAD.pack(VERSION, zlib.crc32(payload)) + payload
 
 
 def body(frame: bytes) -> bytes:
-    """What stands in `frame` behind its head: msgpack."""
+    """Return the body of `frame`, in msgpack."""
     return frame[_HEAD.size :]
 
 
 def is_sound(frame: bytes) -> bool:
-    """Whether `frame` is one of this version, and undamaged, whatever it says."""
+    """Return whether `frame` has this version and the right checksum. Its body is not decoded."""
     return len(frame) > _HEAD.size and _HEAD.unpack_from(frame) == (VERSION, zlib.crc32(frame[_HEAD.size :]))
 
 
 def version_of(frame: bytes) -> int | None:
-    """The version of the protocol that `frame` is of, if it is long enough to be a frame."""
+    """Return the protocol version of `frame`; None if it is too short to be a frame."""
     return frame[0] if len(frame) > _HEAD.size else None
 
 
@@ -52,26 +57,26 @@ def decode(frame: bytes, kind: type[M], limit: int = ...) -> M: ...
 @overload
 def decode(frame: bytes, kind: Any, limit: int = ...) -> Any: ...
 def decode(frame: bytes, kind: Any, limit: int = MAX_SENT_BYTES) -> Any:
-    """The message in `frame`, which must be a `kind` (a message or a union of messages).
+    """Return the message in `frame`, which must be a `kind` (a message or a union of messages).
 
-    Raises MalformedFrame when the frame is truncated, longer than `limit` bytes, of another version,
-    damaged (CRC), not msgpack, of another kind, or has a field of the wrong type or out of bounds.
+    Raises MalformedFrame if the frame is truncated, is longer than `limit` bytes, has another version or a
+    wrong checksum, is not msgpack or another kind of message, or has a field of a wrong type or value.
     """
     if not _HEAD.size < len(frame) <= limit:
         raise MalformedFrame(f"{len(frame)} bytes, outside {_HEAD.size + 1} to {limit}")
     version, crc = _HEAD.unpack_from(frame)
     if version != VERSION:
         raise MalformedFrame(f"protocol version {version}, this is version {VERSION}")
-    said = memoryview(frame)[_HEAD.size :]
-    if zlib.crc32(said) != crc:
+    payload = memoryview(frame)[_HEAD.size :]
+    if zlib.crc32(payload) != crc:
         raise MalformedFrame("damaged: the CRC does not match")
     try:
-        return (_decoders.get(kind) or prepare(kind)).decode(said)
+        return (_decoders.get(kind) or prepare(kind)).decode(payload)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise MalformedFrame(str(error)) from None
 
 
 def prepare(kind: Any) -> msgspec.msgpack.Decoder[Any]:
-    """Return the decoder of `kind`, which takes milliseconds to make and is made once."""
+    """Return the decoder of `kind`. Creating it takes milliseconds, so it is stored for `decode`."""
     decoder = _decoders[kind] = msgspec.msgpack.Decoder(kind)
     return decoder

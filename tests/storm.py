@@ -407,7 +407,7 @@ def rage(
                 _look(processes, tally)
         tally.statuses = [process.ended().status for process in processes.values()]
         tally.said = "".join(process.err for process in processes.values())
-        totals = re.search(r"refused (\d+) frames in all(?:, and left aside (\d+))?", clock.err)
+        totals = re.search(r"refused (\d+) frames in all(?:, and discarded (\d+))?", clock.err)
     result = json.loads((out / "summary.json").read_text())
     tally.outcome = result["outcome"]
     tally.refused = {robot: result["robots"][robot]["frames_refused"] for robot in PLAYED}

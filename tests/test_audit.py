@@ -676,8 +676,8 @@ def test_a_claim_that_is_less_accurate_than_was_asked_is_found(folder: Path) -> 
     for name in (A, WORLD_JOURNAL):
         plant(folder / name, (of(Command, LAST, "a"), claims(pose, vague)))
     assert what(audit(folder), "claim") == [
-        "it claims a position known to 4.47e+07 m, of 0.1",
-        "it ends localised, expected undecided (a claims a position known to 4.47e+07 m, of 0.1)",
+        "it claims a position known to 4.47e+07 m, required 0.1",
+        "it ends localised, expected undecided (a claims a position known to 4.47e+07 m, required 0.1)",
     ]
 
 

@@ -332,7 +332,7 @@ def test_what_floods_a_topic_is_bounded_counted_and_told_once(
         waiting += 1
     assert inbox.ROOM_BYTES / 2 < waiting * (size + 208) <= inbox.ROOM_BYTES
     assert full.refused == {"report": dropped}
-    assert capsys.readouterr().err == "test: refused a frame on some/key: too many wait\n"
+    assert capsys.readouterr().err == "test: refused a frame on some/key: the queue is full\n"
     full.put("report", "some/key", b"again")
     assert full.next(0.0) == Arrival("report", "some/key", b"again")
 

@@ -155,10 +155,10 @@ def test_a_value_out_of_bounds_is_named(was: str, new: str, field: str, tmp_path
 @pytest.mark.parametrize(
     ("was", "new", "why"),
     [
-        ("max_speed = 1.0", "max_speed = 9e-5", "a tick moves a robot by 9e-05 m at most"),
-        ("period = 1.0", "period = 5e-5", "a tick moves a robot by 5e-05 m at most"),
+        ("max_speed = 1.0", "max_speed = 9e-5", "a robot moves at most 9e-05 m in a tick"),
+        ("period = 1.0", "period = 5e-5", "a robot moves at most 5e-05 m in a tick"),
         ("sensing_range = 3.0", "sensing_range = 2000.0", "ranges up to 2000 m"),
-        ("anchor = [10.0", "anchor = [1e6", "manoeuvres of 1 m are too short for a pose to be sure"),
+        ("anchor = [10.0", "anchor = [1e6", "manoeuvres of 1 m are too short to compute a pose"),
     ],
 )
 @pytest.mark.parametrize("planner_name", ["paper", "assured"])
@@ -238,29 +238,29 @@ def test_noise_misspelt_is_named(field: str, says: str) -> None:
         (
             "noise.anchor_sigma",
             "3.1",
-            "noise.anchor_sigma: a range that errs by 3.1 m says less than that there",
+            "noise.anchor_sigma: a range with an error of 3.1 m contains no more",
         ),
         (
             "noise.mutual_sigma",
             "9.0",
-            "noise.mutual_sigma: a range that errs by 9 m says less than that there",
+            "noise.mutual_sigma: a range with an error of 9 m contains no more",
         ),
         (
             "noise",
             "{outliers = 0.1}\naccuracy = 2.2",
-            "accuracy: a robot anywhere in range of its anchor knows",
+            "accuracy: any robot in range of its anchor knows",
         ),
         (
             "noise.anchor_sigma",
             "0.11\naccuracy = 0.001",
-            "accuracy: 0.001 m is the mean of more than 10000 ranges",
+            "accuracy: 0.001 m takes the mean of more than 10000 ranges",
         ),
         (
             "noise.mutual_sigma",
             "0.11\naccuracy = 0.001",
-            "accuracy: 0.001 m is the mean of more than 10000 ranges",
+            "accuracy: 0.001 m takes the mean of more than 10000 ranges",
         ),
-        ("noise.outliers", "0.26", "noise.outliers: with more than 0.25 of them, those that agree may all"),
+        ("noise.outliers", "0.26", "noise.outliers: with more than 0.25, all ranges that agree may"),
         ("noise.actuation.v_floor", "1.1", "noise.actuation.v_floor: more than mission.max_speed = 1 m/s"),
         (
             "noise.odometry.omega_floor",
@@ -398,7 +398,7 @@ ENDPOINTS = [
 def test_an_endpoint_that_does_not_parse_is_refused(
     command: tuple[str, ...], endpoint: str, tmp_path: Path
 ) -> None:
-    refused(tandem(*command, endpoint, "--out", "out", cwd=tmp_path), f"{command[-1]}: ", "is no endpoint")
+    refused(tandem(*command, endpoint, "--out", "out", cwd=tmp_path), f"{command[-1]}: ", "is not an endpoint")
     assert list(tmp_path.iterdir()) == []
 
 

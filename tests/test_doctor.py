@@ -223,7 +223,7 @@ def test_an_endpoint_where_nobody_is_is_told_with_what_to_check() -> None:
     nowhere = free_endpoint()
     with world("paper-1", "--run", "mine") as (_, endpoint):
         ended = tandem("doctor", *connect(nowhere, endpoint))
-    only_fix(ended, f"router: no router at {nowhere}: nobody listens there; check the address")
+    only_fix(ended, f"router: no router at {nowhere}: nothing listens there; check the address")
     said = findings(ended, "ok")
     assert f"router: {endpoint} answers, in the clear" in said
     assert any(re.fullmatch(r"clock: the router's is this host's, to 0\.\d+ s", one) for one in said)

@@ -178,7 +178,7 @@ def test_a_drive_that_comes_late_is_not_driven(played: Play) -> None:
         (Recorded(reading=Reading(Controls(float("nan"), 0.0))), "a's driver: sense(1): Expected"),
         (Recorded(reading=Reading(REST, -1.0)), "a's driver: sense(0): Expected"),
         (Recorded(reading=Reading(REST, None, float("inf"))), "a's driver: sense(0): Expected"),
-        (Recorded(reading="2.0"), "a's driver: sense(0): gives str, expected a Reading"),  # type: ignore[arg-type]
+        (Recorded(reading="2.0"), "a's driver: sense(0): returns str, expected a Reading"),  # type: ignore[arg-type]
     ],
 )
 def test_a_driver_that_cannot_go_on_ends_the_mission_and_stands(
@@ -242,11 +242,11 @@ LOCALISED = Localised(ORIGIN)
     [
         (LOCALISED, report(12, 11, LOCALISED), 12 + LAST_WORDS, "localised", None),
         (LOCALISED, report(12, 9, LOCALISED), 25, "localised", None),
-        (LOCALISED, report(12, 11, None), 25, "undecided", "a is localised; b was not heard to be"),
-        (LOCALISED, None, 25, "undecided", "a is localised; b was not heard to be"),
+        (LOCALISED, report(12, 11, None), 25, "undecided", "a is localised; no result of b received"),
+        (LOCALISED, None, 25, "undecided", "a is localised; no result of b received"),
         (LOCALISED, report(12, 11, Undecided("why")), 12 + LAST_WORDS, "undecided", "b: why"),
-        (LOCALISED, report(12, 11, Inconsistent("lies")), 12 + LAST_WORDS, "inconsistent", "b: a tells lies"),
-        (Inconsistent("lies"), report(12, 11, LOCALISED), 12 + LAST_WORDS, "inconsistent", "a: b tells lies"),
+        (LOCALISED, report(12, 11, Inconsistent("x")), 12 + LAST_WORDS, "inconsistent", "b: a reports x"),
+        (Inconsistent("x"), report(12, 11, LOCALISED), 12 + LAST_WORDS, "inconsistent", "a: b reports x"),
         (Undecided("why"), report(12, 11, None), 25, "undecided", "a: why"),
         (None, report(12, 11, LOCALISED), 25, "undecided", "max_ticks: a not localised by then"),
     ],

@@ -1,4 +1,4 @@
-"""Nothing hangs: told to stop, or robbed of a process, a run ends, says why and leaves nobody behind."""
+"""A run that is stopped, or loses a process, ends with a reason, and no process is left running."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ from tests.commands import (
 from tests.series import series
 
 AT_ONCE_S = 15.0
-"""half the patience of 30 s: who ends within it was told to, or saw why, and did not wait for an answer"""
+"""Half the timeout of 30 s, in s. A process that ends within it did not wait for the timeout."""
 SOON_S = 25.0
-"""for what has a patience of PATIENCE seconds; less than the 30 s of who was not told of it"""
+"""The time in s in which a process with `--timeout` TIMEOUT ends. It is less than the default of 30 s."""
 TIMEOUT = "5"
-"""s; longer than a busy machine takes to connect a process"""
+"""The timeout in s. It is longer than a busy machine takes to connect a process."""
 
 draw = Random(7).random
 Moment = Callable[[TandemProcess, Path], bool]
@@ -77,7 +77,7 @@ LAST_MOMENTS: dict[str, Moment] = {
 
 @pytest.fixture
 def endless(tmp_path: Path) -> Path:
-    """A scenario that does not end by itself."""
+    """Return the file of a scenario that does not end during a test."""
     path = tmp_path / "endless.toml"
     path.write_text(ENDLESS)
     return path
@@ -85,13 +85,13 @@ def endless(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def long(tmp_path: Path) -> Path:
-    """A scenario that takes its time."""
+    """Return the file of a scenario with a long run."""
     path = tmp_path / "long.toml"
     path.write_text(LONG)
     return path
 
 
-# --- told to stop -----------------------------------------------------------------------------------
+# --- stopped by a signal ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("number", series([SIGINT, SIGTERM]), ids=["SIGINT", "SIGTERM"])
@@ -121,7 +121,7 @@ def test_a_run_that_is_told_to_stop_as_it_ends_says_either(
     assert not processes_of(out)
     if ended.status == 130:
         assert ended[1:] == ("", f"tandem run: stopped by {number.name}\n")
-    else:  # the signal may come after its last word
+    else:  # the signal may arrive after the FinalReport
         assert ended.status in (0, -number)
         assert ended[1:] == (f"localised after {LONG_TICKS} ticks\n", "")
 
@@ -169,7 +169,7 @@ def test_an_agent_that_looks_for_a_world_can_be_told_to_stop() -> None:
         assert agent.ended(AT_ONCE_S) == (130, "", "tandem agent a: stopped by SIGINT\n")
 
 
-# --- robbed of a process ----------------------------------------------------------------------------
+# --- loss of a process ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("child", ["world", "agent a", "agent b"])
@@ -196,7 +196,7 @@ def test_a_robot_that_falls_silent_fails_the_run_within_the_patience(endless: Pa
         os.kill(process_of(out, "agent", "b"), SIGSTOP)
         ended = run.ended(SOON_S)
     assert ended.status != 0
-    assert re.search(r"no answer from b( \(not there\))? at tick ", ended.out + ended.err)
+    assert re.search(r"no answer from b( \(not connected\))? at tick ", ended.out + ended.err)
     assert f"for {TIMEOUT} s" in ended.out + ended.err
     assert not processes_of(out)
 
@@ -217,7 +217,7 @@ def test_an_agent_whose_world_dies_ends_within_its_patience(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("comes", ["nobody", "a"])
 def test_a_world_whose_robot_never_comes_fails_and_says_who_was_missing(comes: str, tmp_path: Path) -> None:
-    missing = {"nobody": "a (not there), b (not there)", "a": "b (not there)"}[comes]
+    missing = {"nobody": "a (not connected), b (not connected)", "a": "b (not connected)"}[comes]
     reason = f"no answer from {missing} at tick 0 for {TIMEOUT} s"
     endpoint = free_endpoint()
     with ExitStack() as stack:
@@ -263,11 +263,11 @@ def test_processes_end_when_their_launcher_is_killed(endless: Path, tmp_path: Pa
         until(lambda: not processes_of(out), "all have ended")
 
 
-# --- what stays -------------------------------------------------------------------------------------
+# --- processes that stay open -----------------------------------------------------------------------
 
 
 def test_a_page_that_stays_is_not_ended_by_another_process_that_ends_late() -> None:
-    """It ends by a second byte, which comes once the end of a late agent has been taken from the inbox."""
+    """A second byte ends it, which is sent after the end of a late agent has been taken from the inbox."""
     script = "import sys; sys.stdin.buffer.read(2)"
     with subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE) as process:
 

@@ -1,4 +1,4 @@
-"""The versions that a journal names, and what a replay says where only they explain a difference."""
+"""The versions in a journal, and the message of a replay that differs because of them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def recording(tmp_path: Path) -> Path:
 
 
 def changed(path: Path, kind: type, change: Callable[..., object | None], first: int = 0) -> None:
-    """Write the journal anew, the first message of `kind` from tick `first` on as `change` makes it."""
+    """Rewrite the journal with the first message of `kind` from tick `first` on replaced by `change`."""
     frames: list[bytes] = []
     done = False
     for frame in journal_file.read(path):
@@ -56,7 +56,7 @@ def elsewhere(path: Path) -> None:
 
 
 def turned(by: float) -> Callable[[Estimate], Estimate]:
-    """An estimate of the first pose that is off `by` a part."""
+    """Return a function that changes the first pose of an Estimate by the relative amount `by`."""
 
     def turn(one: Estimate) -> Estimate:
         first, *others = one.local

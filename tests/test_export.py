@@ -1,4 +1,4 @@
-"""A record opens in other people's tools: run.mcap in MCAP's readers and viewers, tables in pandas' like."""
+"""The exports of a recording can be read by other tools: run.mcap by MCAP readers, tables by pandas."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ A, B = agent_journal("a"), agent_journal("b")
 
 
 def exported(scenario: Scenario, folder: Path) -> Path:
-    """The record of its run, and what is exported of it."""
+    """Return the folder of the recording and exports of a run of `scenario`."""
     in_process.play(scenario, folder)
     export(folder, folder)
     return folder
@@ -74,25 +74,25 @@ def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def noisy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Hypotheses have probability and covariances."""
+    """Return a run whose hypotheses have probabilities and covariances."""
     return exported(load("noisy"), tmp_path_factory.mktemp("noisy"))
 
 
 @pytest.fixture(scope="module")
 def faulty(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Reports are lost and late."""
+    """Return a run in which Reports are lost and delayed."""
     return exported(load("random", faults=["loss=0.3, delay=0..2"]), tmp_path_factory.mktemp("faulty"))
 
 
 def told(path: Path) -> Iterator[tuple[Any, Any, Any]]:
-    """Schema, channel and message of each message, in the order of the file."""
+    """Yield the schema, channel and content of each message, in the order of the file."""
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         yield from reader.iter_messages(log_time_order=False)
 
 
 def seen(path: Path, topic: str) -> list[Any]:
-    """What viewers see on a topic."""
+    """Return the messages on a topic."""
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
         return [one.decoded_message for one in reader.iter_decoded_messages(topics=[topic])]
@@ -165,7 +165,7 @@ def test_every_viewers_channel_decodes_with_its_own_schema(faulty: Path) -> None
 
 
 def test_every_frame_is_as_its_channels_schema_says(faulty: Path) -> None:
-    """An array of its name and its fields, to which the schema gives titles."""
+    """A frame is an array of its tag and fields, whose titles are in the schema."""
     for schema, channel, message in told(faulty / "run.mcap"):
         if channel.topic.startswith("/journal/"):
             assert (schema.encoding, schema.name.split(".")[0]) == ("jsonschema", "tandem")
@@ -318,13 +318,13 @@ def test_frames_are_rows_with_their_fields_by_name(faulty: Path) -> None:
             assert (said["robot"], said["anchor_range"]) == (observation.robot, observation.anchor_range)
 
 
-# --- records that are not whole, or come from several hosts -------------------------------------------
+# --- recordings that are incomplete, or from several hosts --------------------------------------------
 
 
 def test_journals_gathered_from_several_hosts_export_as_one(paper_1: Path, tmp_path: Path) -> None:
     gathered = tmp_path / "gathered"
     gathered.mkdir()
-    for name in (WORLD_JOURNAL, A, B):  # each from a host of its own: nothing else comes along
+    for name in (WORLD_JOURNAL, A, B):  # each from a host of its own, without any other file
         (gathered / name).write_bytes((paper_1 / name).read_bytes())
     assert tandem("export", gathered).status == 0
     assert {name: (gathered / name).read_bytes() for name in FILES} == {
@@ -372,7 +372,7 @@ def test_what_is_no_record_and_what_cannot_be_written_are_refused(paper_1: Path,
     assert ended.err.startswith(f"tandem export: --out: {tmp_path / 'file'} cannot be written: ")
 
 
-# --- a run that exports, and one that is served -----------------------------------------------------------
+# --- exports during a run, and the Foxglove server --------------------------------------------------------
 
 
 @pytest.mark.parametrize("mode", [[], ["--in-process"]])
@@ -401,7 +401,7 @@ def test_a_run_tells_its_outcome_though_it_cannot_export(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(export_bar, "MODULES", ("no_such_module",))
-    monkeypatch.setattr(run, "stop_by_signal", lambda _: None)  # of the tests' own process
+    monkeypatch.setattr(run, "stop_by_signal", lambda _: None)  # it would affect the process of the tests
     for quiet, said in ((True, ""), (False, "tandem run: not exported: needs no_such_module")):
         words = ["run", "paper-1", "--in-process", "--out", str(tmp_path / str(quiet)), *["-q"] * quiet]
         assert run.main(parser().parse_args(words)) == 0
@@ -412,7 +412,7 @@ def test_a_run_tells_its_outcome_though_it_cannot_export(
 
 
 def test_a_run_that_was_told_to_export_and_could_not_has_failed(tmp_path: Path) -> None:
-    (tmp_path / "out" / "run.mcap").mkdir(parents=True)  # which nothing can be written in place of
+    (tmp_path / "out" / "run.mcap").mkdir(parents=True)  # a directory cannot be replaced by a file
     for told, status in (("--export", 3), ("--no-export", 0)):
         out = shutil.copytree(tmp_path / "out", tmp_path / told)
         ended = tandem("run", "paper-1", "-q", "--in-process", "--out", out, told)
@@ -454,11 +454,11 @@ def test_ctrl_c_ends_an_export_and_leaves_nothing_half_written(paper_1: Path, tm
 
 
 STANDING = {"/stage", "/a/pose", "/b/trail", "/contact", "/a/belief", "/journal/world/command"}
-"""on which there is something, whenever one comes"""
+"""The topics that have a message at any time."""
 
 
 async def watched(port: int, until: str) -> dict[str, str]:
-    """Topics with their schemas, once a log line begins with `until`, and all of STANDING was told."""
+    """Return the schemas by topic, after a log line starts with `until` and all of STANDING are received."""
     async with websockets.connect(
         f"ws://127.0.0.1:{port}",
         subprotocols=[websockets.Subprotocol("foxglove.sdk.v1")],
@@ -473,7 +473,7 @@ async def watched(port: int, until: str) -> dict[str, str]:
             frame = await link.recv()
             if isinstance(frame, str):
                 said = json.loads(frame)
-                assert said["op"] != "status", said  # such as: there is no such channel
+                assert said["op"] != "status", said  # for example an unknown channel
                 if said["op"] == "advertise":
                     assert not told, "a channel is added while somebody looks"
                     topics |= {channel["id"]: channel for channel in said["channels"]}
@@ -537,7 +537,7 @@ ORIGINS = {
     "http://elsewhere.example": 403,
     "null": 403,
 }
-"""of pages that ask for what --foxglove serves, with what is answered"""
+"""The origins of pages that connect to --foxglove, with the status of the answer."""
 
 
 def test_of_web_pages_only_foxglove_s_app_and_those_named_see_a_run() -> None:
@@ -553,7 +553,7 @@ def test_of_web_pages_only_foxglove_s_app_and_those_named_see_a_run() -> None:
         with pytest.raises(ConnectionError):
             asked(port, {"X-Much": "x" * 100_000})
         assert asked(port, {}) == 101
-        # the server of the SDK is nowhere that a page could know
+        # no page can find the port of the SDK's own server
         listening = {place for place in listened_by(processes_of(str(port))) if place[1] != port}
         assert all(host.startswith("127.") and host != "127.0.0.1" for host, _ in listening)
         assert len(listening) == 1
@@ -577,7 +577,7 @@ def test_a_crowd_of_viewers_is_turned_away_and_leaves_room_for_those_that_come_a
 
 
 def asked(port: int, heads: dict[str, str]) -> int:
-    """The status with which a WebSocket handshake with `heads` is answered."""
+    """Return the status of the answer to a WebSocket handshake with these headers."""
     connection = asking(port, heads)
     status = connection.getresponse().status
     connection.close()
@@ -585,7 +585,7 @@ def asked(port: int, heads: dict[str, str]) -> int:
 
 
 def asking(port: int, heads: dict[str, str]) -> http.client.HTTPConnection:
-    """A connection that has asked for a WebSocket handshake with `heads`."""
+    """Return a connection on which a WebSocket handshake with these headers has been sent."""
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=BOUND_S)
     usual = {
         "Connection": "Upgrade",
@@ -599,7 +599,7 @@ def asking(port: int, heads: dict[str, str]) -> http.client.HTTPConnection:
 
 
 def listened_by(pids: Iterable[int]) -> set[tuple[str, int]]:
-    """The addresses of IPv4 and ports on which those processes listen."""
+    """Return the IPv4 addresses and ports on which these processes listen."""
     inodes = {
         os.readlink(link)
         for pid in pids

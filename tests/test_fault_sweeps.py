@@ -1,4 +1,4 @@
-"""Sweeps over faults: those that ship say what their labels say, and rows count what was lost."""
+"""Sweeps over faults: the shipped ones match their labels, and table rows count the lost Reports."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ WINDOWS = (0, 1, 5, 10, 20, 50)
 
 
 def scenarios(name: str) -> list[Scenario]:
-    """One for each cell of the sweep `name`, with the same seed; all of them face the same starts."""
+    """Return one scenario for each cell of the sweep `name`. All have the same seed and starts."""
     sweep = spec.load(name)
     found = []
     for cell in cells(sweep):
@@ -39,7 +39,7 @@ def scenarios(name: str) -> list[Scenario]:
 
 
 def there(scenario: Scenario) -> Fault:
-    """The one of its faults that is there."""
+    """Return the only fault of `scenario` that is active."""
     (fault,) = [fault for fault in scenario.faults if fault.ticks == (0, ALWAYS)]
     return fault
 

@@ -1,4 +1,4 @@
-"""Fault plans as a user writes them: in a file, or on the command line; mistakes are one line."""
+"""Fault plans in files and on the command line. Each mistake is reported in one line."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ ROUGH_SAID = [
     "a <-> b: partition, contact_ticks=4..9",
 ]
 RANDOM = PAPER_1.replace("start", "# start").replace('"paper"', '"assured"')
-"""its starts are drawn"""
+"""A scenario with random starts."""
 
 
 def test_a_file_and_the_command_line_say_the_same(tmp_path: Path) -> None:
@@ -206,7 +206,7 @@ def test_a_mistake_about_faults_is_one_line_and_status_2(tmp_path: Path) -> None
 
 
 def test_the_sections_of_a_scenario_are_all_that_a_plan_needs() -> None:
-    """Two robots, a fault, and nothing else said of either."""
+    """A scenario of two robots and a fault needs no further settings."""
     text = f'name = "x"\n{SECTION_IV}' + "".join(
         f'[[robot]]\nid = "{robot}"\nanchor = [{x}, 0.0]\n' for robot, x in (("a", 0.0), ("b", 10.0))
     )

@@ -1,4 +1,4 @@
-"""Fault plans: what missions make of them, and that every mode makes the same."""
+"""Fault plans: their effect on missions, which is the same in all modes of execution."""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ NOISE = "anchor_sigma = 0.1\nmutual_sigma = 0.1\nactuation = {v = 0.001}\nodomet
 
 
 def localises(recording: Recording) -> bool:
-    """Everyone has claimed, and nobody wrongly."""
+    """Return whether all robots have claimed correct poses."""
     assert recording.end is not None
     return recording.end.outcome == "localised"
 
 
-# --- what missions make of them -----------------------------------------------------------------------
+# --- the effect on missions ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("seed", series([1, 2, 3, 4]))
@@ -102,7 +102,7 @@ def test_a_partition_costs_what_it_lasts_since_nobody_goes_on_unanswered(begin: 
 
 @pytest.mark.parametrize("delay", [1, 7, 20])
 def test_a_delay_costs_three_times_what_it_lasts(delay: int) -> None:
-    """Once before they can meet, once before the last manoeuvre, and once before the claim."""
+    """The robots wait for a Report before they can meet, before the last manoeuvre and before the claim."""
     for seed in range(1, 9):
         prompt, late = (
             in_process.play(load("random", seed=seed, faults=faults)) for faults in ([], [f"delay={delay}"])
@@ -159,12 +159,12 @@ def test_what_was_heard_refused_and_lost_adds_up_to_what_the_world_let_through(
         assert said.reports_heard == sum([len(contact.heard or ()) for _, contact in contacts])
         assert said.reports_refused == sum([len(contact.damaged) for _, contact in contacts])
         assert said.reports_lost == len({tick for tick, _ in contacts} - came)
-        if plan in {"a delay", "damage"}:  # nothing comes twice
+        if plan in {"a delay", "damage"}:  # no Report is received twice
             assert said.reports_heard + said.reports_refused + said.reports_lost == peers.reports_sent
 
 
 def observations(folder: Path, robot: str) -> Iterator[Observation]:
-    """What `robot` sensed, by its own journal."""
+    """Yield the Observations in the journal of `robot`."""
     for frame in frames(folder, f"agent-{robot}.journal"):
         message = decode(
             frame,
@@ -178,11 +178,11 @@ def frames(folder: Path, name: str) -> list[bytes]:
     return list(journal_file.read(folder / name))
 
 
-# --- every mode makes the same of them ----------------------------------------------------------------
+# --- the same effect in all modes ---------------------------------------------------------------------
 
 
 class Played(NamedTuple):
-    """A mission as processes, and in one process: their records."""
+    """The recordings of a mission with separate processes, and in one process."""
 
     processes: Path
     in_one: Path

@@ -1,4 +1,4 @@
-"""Without a world: robots with drivers of their own, each in its process, agree on where they are."""
+"""Hardware mode: robots with their own drivers, each in a process of its own, localise themselves."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from tests.series import series
 
 STARTS = {"a": "2.4,-1.2,4.8", "b": "11.3,-0.4,3.6"}
 ASSURED = "max_ticks = 120\n" + PAPER_1.replace('"paper"', '"assured"').replace('"paper-1"', '"field"')
-"""of the variant for which standing still is no harm; at `--rate 4` it is over after 38 s in any case"""
+"""A scenario with the planner that tolerates missed ticks. With `--rate 4` it ends after at most 38 s."""
 
 
 @contextmanager
 def beacon() -> Iterator[str]:
-    """The third process, and where it is."""
+    """Yield the endpoint of a simulated body of both robots, in a third process."""
     command = [sys.executable, "-P", "docs/rover.py", "--reach", "3"]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": "."}
@@ -48,7 +48,7 @@ def beacon() -> Iterator[str]:
 
 @contextmanager
 def pair(out: Path, *more: str | Path, protocol: str = "tcp") -> Iterator[dict[str, TandemProcess]]:
-    """Both robots of paper-1's geometry, on their way."""
+    """Yield both robots of paper-1's geometry, running."""
     (out / "field.toml").write_text(ASSURED)
     endpoint = free_endpoint(protocol)
     with beacon() as air:
@@ -79,9 +79,9 @@ def pose(ended: Ended, robot: str, word: str) -> tuple[float, ...]:
 
 
 def both_have_ended(out: Path, robots: dict[str, TandemProcess]) -> None:
-    """Neither is accused, each record follows from what came in, and each claim is true.
+    """Assert that no result is inconsistent, each journal can be replayed, and each claim is correct.
 
-    In real time nobody promises more; but robots that had every Command in time localise.
+    In real time no more is guaranteed. Robots that received every Command in time are localised, too.
     """
     ends = {name: robot.ended() for name, robot in robots.items()}
     late = any(f"{name}: stood 0 of" not in ended.out for name, ended in ends.items())
@@ -220,7 +220,7 @@ def test_a_robot_whose_peer_does_not_come_has_not_moved(tmp_path: Path) -> None:
         *("--connect-timeout", "2", "--out", tmp_path / "out"),
     )
     assert ended.status == 3
-    assert ended.err.endswith("b: not there; nobody has moved\n")
+    assert ended.err.endswith("b: not connected; no robot has moved\n")
     assert ended.err.count("\n") == 1
     assert processes_of(tmp_path / "out") == {}
 
@@ -233,7 +233,7 @@ def test_a_robot_whose_peer_does_not_come_has_not_moved(tmp_path: Path) -> None:
         (("a", "--mission", "{faults}"), "fault: without a world, the radio is as it is"),
         (("a", "--mission", "paper-1", "--option", "colour"), "--option: 'colour' is no option"),
         (("a", "--mission", "paper-1", "--rate", "1e8"), "--rate: 1e+08 makes a tick of 1 s last"),
-        (("a", "--mission", "paper-1", "--listen", "7447"), "--listen: '7447' is no endpoint"),
+        (("a", "--mission", "paper-1", "--listen", "7447"), "--listen: '7447' is not an endpoint"),
         (
             ("a", "--mission", "paper-1", "--out", "{recording}"),
             "driver-a.journal is not",

@@ -1,4 +1,4 @@
-"""`tandem robot`, killed at any moment, goes on from its record by the same command."""
+"""`tandem robot`, killed at any moment, resumes from its journals with the same command."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from world.hardware.driver_journal import DriverPast
 
 
 class Pair:
-    """Both robots, and how to start one of them again by the same command."""
+    """Both robots, which can be restarted with the same command."""
 
     def __init__(self, out: Path, open_ones: ExitStack, driver_of_a: str = "docs.rover:Rover") -> None:
         self._drivers = {"a": driver_of_a, "b": "docs.rover:Rover"}
@@ -57,9 +57,9 @@ class Pair:
         return self._out / name / f"{whose}-{name}.journal"
 
     def kill(self, *names: str) -> None:
-        """All processes of these robots, at once."""
+        """Kill all processes of these robots at once."""
         for name in names:
-            self.robots[name].tell(SIGKILL)  # unless it has ended
+            self.robots[name].tell(SIGKILL)  # if it is still running
         for name in names:
             self.robots[name].ended()
 
@@ -78,7 +78,7 @@ def pair(tmp_path: Path) -> Iterator[Pair]:
 
 
 def all_is_well(out: Path, pair: Pair) -> None:
-    """Both come to their end; each tick is on record once; neither audit nor replay finds anything."""
+    """Assert that both robots end, each tick is journaled once, and audit and replay find nothing."""
     both_have_ended(out, pair.robots)
     for name in "ab":
         assert [step.observation.tick for step in told(out, name).steps] == list(
@@ -107,7 +107,7 @@ def test_a_robot_that_is_killed_goes_on_from_its_record(pair: Pair, killed: str,
 def test_both_robots_that_lose_power_at_once_go_on_from_what_is_left_of_their_records(
     pair: Pair, tmp_path: Path
 ) -> None:
-    """Of each journal the last write is torn: the driver's, as its Observation was never sent; the agent's, too."""
+    """The last write of each journal is torn. The driver's Observation was never sent."""
     for name in "ab":
         pair.robots[name].until_written(pair.path(name), 3000)
     pair.kill("a", "b")
@@ -126,7 +126,7 @@ def test_both_robots_that_lose_power_at_once_go_on_from_what_is_left_of_their_re
 
 @pytest.mark.long
 def test_a_reading_that_is_lost_with_the_process_is_taken_again(tmp_path: Path) -> None:
-    """Neither journal has it, so nobody was told: what was driven before it is told once."""
+    """Neither journal contains it, so it was never sent. The motion before it is reported once."""
     with ExitStack() as open_ones:
         pair = Pair(tmp_path, open_ones, "tests.broken_drivers:LosesAReading")
         assert pair.robots["a"].ended().status == -SIGKILL
@@ -141,7 +141,7 @@ def test_a_reading_that_is_lost_with_the_process_is_taken_again(tmp_path: Path) 
 def test_a_recording_that_a_power_cut_may_have_shortened_is_refused(
     fsync: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What was told may be missing, unless each write was synced; a kill takes nothing along."""
+    """Frames that were sent may be missing unless each write was synced. A kill loses no frames."""
     config, inbox = load("paper-1").config("a"), Inbox("robot")
     path = tmp_path / "driver-a.journal"
     driver: Any = SimpleNamespace(stop=lambda: None, resume=lambda *_: None)
@@ -191,11 +191,11 @@ def test_a_robot_that_is_killed_before_it_knows_its_mission_begins_it(pair: Pair
 def test_what_a_robot_drives_as_it_goes_down_is_told_and_no_more_than_was_asked_for(
     pair: Pair, tmp_path: Path
 ) -> None:
-    """Its body drives the manoeuvre that had begun to its end at the most; then it stands."""
+    """The robot at most completes the current manoeuvre, and then rests."""
     pair.robots["a"].until_written(pair.path("a"), 2500)
     pair.kill("a")
     pair.again("a")
-    all_is_well(tmp_path, pair)  # where it is follows from all that it has told
+    all_is_well(tmp_path, pair)  # the peer computes its position from all its Reports
     steps = told(tmp_path, "a").steps
     for before, step in pairwise(steps):
         assert before.command is not None
@@ -212,7 +212,7 @@ def test_a_record_of_another_mission_is_refused(pair: Pair, tmp_path: Path) -> N
         *("--out", tmp_path / "a"),
     )
     assert other.status == 2
-    assert "another run's: its briefing is not this mission's; choose another folder" in other.err
+    assert "it belongs to another mission: its RobotConfig differs; choose another folder" in other.err
 
 
 def test_a_driver_that_cannot_resume_is_refused_and_not_moved(pair: Pair, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""A record's pictures: what is in them is what the record says, and whatever the record, there is one."""
+"""The figures of a recording: they show its data, and every recording has one."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ BRIEF = PAPER_1.replace('name = "paper"', 'name = "assured"').replace("seed = 1"
 
 @pytest.fixture(scope="session")
 def noisy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The record of the shipped scenario."""
+    """Return the recording of the shipped scenario."""
     return recorded(load("noisy"), tmp_path_factory.mktemp("noisy"))
 
 
 @pytest.fixture(scope="session")
 def drawn(noisy: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Its pictures."""
+    """Return the folder of its figures."""
     folder = copied(noisy, tmp_path_factory.mktemp("drawn"))
     assert draw(folder).status == 0
     return folder / "figures"
@@ -63,7 +63,7 @@ def draw(folder: Path) -> Ended:
 
 
 def picture(folder: Path, robot: str) -> Path:
-    """That of one robot, drawn in this process."""
+    """Return the figure of one robot, drawn in this process."""
     recording = read(folder)
     place = [one.id for one in recording.scenario.robots].index(robot)
     story = Story(recording, place, estimates(folder, robot))
@@ -74,7 +74,7 @@ def picture(folder: Path, robot: str) -> Path:
 
 
 def texts(svg: Path) -> set[str]:
-    """Every line of text in it, which Matplotlib leaves as comments beside the outlines."""
+    """Return the lines of text in `svg`, which Matplotlib writes as comments beside the outlines."""
     return {
         line
         for text in re.findall(r"<!-- (.*?) -->", svg.read_text(), re.DOTALL)
@@ -83,7 +83,7 @@ def texts(svg: Path) -> set[str]:
 
 
 def line(axes: Axes, gid: str) -> tuple[list[Any], list[Any]]:
-    """The x and y of the line of that name."""
+    """Return the x and y of the line with this id."""
     (found,) = [one for one in axes.lines if one.get_gid() == gid]
     return np.asarray(found.get_xdata()).tolist(), np.asarray(found.get_ydata()).tolist()
 
@@ -93,12 +93,12 @@ def ids(svg: Path) -> set[str]:
 
 
 def cut(journal: Path, count: int) -> None:
-    """Leave the first `count` frames of it, and a torn one."""
+    """Cut the journal after its first `count` frames, and add a torn one."""
     left = list(frames(journal))[:count]
     journal.write_bytes(b"".join([msgpack.packb(frame) for frame in left]) + b"\xc4\x10torn")
 
 
-# --- what is in them ------------------------------------------------------------------------------------
+# --- content --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.long
@@ -174,7 +174,7 @@ def test_what_is_drawn_over_time_is_what_the_robot_said_held_against_the_truth(n
     assert likeliest[0] == [one.tick for one in said]
     assert likeliest[1] == pytest.approx(
         [one.probabilities[0] for one in said], abs=1e-5
-    )  # 99.9995 % is the edge
+    )  # the limit is 99.9995 %
     assert max(likeliest[1]) < 1.0
     before = line(probability, "probability-1-anchor")
     assert before[0] == [one.tick for one in story.held if not one.world]
@@ -202,7 +202,7 @@ def test_an_ellipse_holds_what_is_within_3_sigma(noisy: Path) -> None:
 @pytest.mark.long
 def test_the_same_record_gives_the_same_picture(noisy: Path, drawn: Path, tmp_path: Path) -> None:
     again = copied(noisy, tmp_path)
-    for _ in range(2):  # over what is there, too
+    for _ in range(2):  # the second time, over existing files
         svg = picture(again, "b")
         assert svg.read_bytes() == (drawn / svg.name).read_bytes()
     assert "<dc:date>" not in svg.read_text()
@@ -242,7 +242,7 @@ def test_odds_are_said_in_as_many_digits_as_they_have(probability: float, said: 
     assert belief.percent(probability) == said
 
 
-# --- whatever the record --------------------------------------------------------------------------------
+# --- all kinds of recordings ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("noise", ["", NOISE])
@@ -320,7 +320,7 @@ def test_what_is_no_record_is_refused(tmp_path: Path) -> None:
     (empty / "world.journal").write_bytes(b"\xc1 no journal")
     refused(draw(empty), "world.journal: damaged at byte 0")
     (empty / "world.journal").write_bytes(b"")
-    refused(draw(empty), "world.journal: there is no scenario in it")
+    refused(draw(empty), "world.journal: it contains no scenario")
     assert [path.name for path in empty.iterdir()] == ["world.journal"]
 
 

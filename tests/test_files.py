@@ -1,4 +1,4 @@
-"""Files that a user names, or Tandem writes: of the right kind, whole or absent, and never through a link."""
+"""Files that a user names or Tandem writes: regular, complete or absent, and never written through a link."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def fifo(path: Path) -> None:
 def listening(path: Path) -> None:
     with socket.socket(socket.AF_UNIX) as one:
         here = Path.cwd()
-        os.chdir(path.parent)  # a socket's path is short
+        os.chdir(path.parent)  # the path of a socket must be short
         try:
             one.bind(path.name)
         finally:
@@ -110,12 +110,12 @@ def test_a_byte_order_mark_is_accepted_in_scenarios_and_sweeps(tmp_path: Path) -
         one_line(tandem.ended(), "small.toml: axis[0].field: 'v'")
 
 
-# --- what is written --------------------------------------------------------------------------------------
+# --- written files ----------------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def no_room() -> Iterator[Callable[[int], None]]:
-    """Sets how many bytes a file of this process can have, as a full disk does."""
+    """Yield a function that limits the size in bytes of files of this process, like a full disk."""
     before, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.getsignal(signal.SIGXFSZ)
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     yield lambda room: resource.setrlimit(resource.RLIMIT_FSIZE, (room, before[1]))
@@ -164,7 +164,7 @@ resource.setrlimit(resource.RLIMIT_FSIZE, (9_500, resource.RLIM_INFINITY))
 from compose.cli.main import main
 main(sys.argv[1:])
 """
-"""journals fit, ticks.csv does not"""
+"""A scenario whose journals fit the limit, and whose ticks.csv does not."""
 
 
 @pytest.mark.parametrize("how", [["--in-process"], []])

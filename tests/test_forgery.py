@@ -1,4 +1,4 @@
-"""Whoever has one robot's certificate cannot make a viewer believe what only others may say."""
+"""A participant with one robot's certificate cannot forge messages of others for a viewer."""
 
 from __future__ import annotations
 
@@ -62,11 +62,11 @@ FORGED: dict[str, Message] = {
     "a belief to come": Estimate(LAST, "a", (HERE,), (HERE,), localised=True),
 }
 OF_A = (Key(keys.command, RUN, "a"), Key(keys.report, RUN, "a", "b"), Key(keys.estimate, RUN, "a"))
-"""keys that its certificate lets robot a put frames under"""
+"""The keys on which the certificate of robot a permits frames."""
 
 
 def told(heard: Heard) -> dict[str, Any]:
-    """All that is known, as text."""
+    """Return all known data, as text."""
     known = heard.known
     return {
         "ticks": repr(known.ticks),
@@ -78,7 +78,7 @@ def told(heard: Heard) -> dict[str, Any]:
 
 @pytest.fixture
 def heard() -> Heard:
-    """A mission in tick 0, of which the world has spoken."""
+    """Return a mission at tick 0, of which a message of the world has been received."""
     one = Heard(RUN)
     for robot in "ab":
         one.take(Key(keys.config, RUN, robot), encode(load("paper-1").config(robot)))
@@ -110,7 +110,7 @@ def test_a_viewer_takes_what_a_key_carries(heard: Heard) -> None:
 
 
 def test_a_tick_is_none_before_the_world_has_said_it(heard: Heard) -> None:
-    """A robot may be a little ahead of the world, which may come by another way; the world makes no leap."""
+    """Messages of a robot may overtake those of the world a little, but the world does not skip ticks."""
     unheard, own, observation = Heard(RUN), OF_A[0], Key(keys.observation, RUN, "a")
     unheard.take(own, encode(command(LAST, "a")))
     assert unheard.known.last == -1
@@ -135,7 +135,7 @@ def shown(address: str) -> dict[str, Any]:
 
 @pytest.mark.long
 def test_with_one_robots_certificate_nobody_forges_end_truth_ticks_or_another_robot(tmp_path: Path) -> None:
-    """While b is not there yet, the mission stands in tick 0; then it goes on, and is shown as it is."""
+    """The mission stays in tick 0 until b is connected. It then continues and is displayed correctly."""
     scenario, folder, endpoint = tmp_path / "paper.toml", tmp_path / "keys", free_endpoint("tls")
     scenario.write_text(PAPER_1)
     assert tandem("keys", folder, "--robots", "a,b").status == 0

@@ -1,4 +1,4 @@
-"""The closed forms and the motion model, on random truths."""
+"""The closed forms and the motion model, for random true poses."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from protocol.motion import TAU, Pose, Segment, chord, compose, follow, step, wr
 
 EXACT = 1e-9
 FLOOR = 1e-7
-"""m: what rounding may do to ranges of up to 1000 m, and to what they are computed from"""
+"""The maximum rounding error in m of ranges up to 1000 m, and of the values they are computed from."""
 ROUNDING = 1e-7
-"""m: residuals of any solution, however ill-conditioned"""
+"""The maximum residual in m of any solution, including ill-conditioned ones."""
 DOUBLE_ROOT = 1e-1
-"""m and rad: two square roots, one after the other, of what rounding leaves"""
+"""The maximum error in m and rad at a double root: the square root of the square root of rounding."""
 
 angles = st.floats(-math.pi, math.pi)
 headings = st.floats(-50.0, 50.0)
@@ -36,7 +36,7 @@ def apart(one: Pose, other: Pose) -> float:
 
 
 def separation(placement: Placement, a: Pose, b: Pose) -> float:
-    """m: between a at `a` in <a(M1)> and b at `b` in <b(M2)>, if this is how they lie."""
+    """Return the distance in m between `a` in <a(M1)> and `b` in <b(M2)>, given this placement."""
     return apart(placement.place(a), b)
 
 
@@ -218,7 +218,7 @@ def test_a_radial_way_has_one_branch(rho0: float, moved: float, alpha: float) ->
 @given(st.floats(0.5, 3.0), angles, st.floats(0.3, 2.0))
 @example(1.0, -2.75, 2.0)
 def test_a_third_range_leaves_the_true_branch_as_it_was(rho0: float, alpha: float, omega: float) -> None:
-    """Polishing is the identity on what is exact, and the mirror image does not survive."""
+    """Refinement does not change an exact branch, and the mirrored branch is ruled out."""
     assume(abs(math.sin(alpha)) > 0.3)
     truth = Pose(rho0, 0.0, alpha)
     second = Pose(1.0, 0.0, 0.0)
@@ -234,7 +234,7 @@ def test_a_third_range_leaves_the_true_branch_as_it_was(rho0: float, alpha: floa
 def test_silence_where_a_branch_would_have_been_heard_rules_it_out(
     rho0: float, angle: float, side: float, omega: float
 ) -> None:
-    """R lies between the two distances that the branches predict, and nothing is heard."""
+    """There is no detection, and R is between the two ranges that the branches predict."""
     alpha = side * angle
     truth = Pose(rho0, 0.0, alpha)
     second = Pose(1.0, 0.0, 0.0)
@@ -255,7 +255,7 @@ def test_silence_where_a_branch_would_have_been_heard_rules_it_out(
 
 
 class Encounter(NamedTuple):
-    """A truth of eq. (7), and what is measured of it."""
+    """True poses for eq. (7), with the measurements."""
 
     truth: Placement
     p1b: Pose
@@ -272,7 +272,7 @@ class Encounter(NamedTuple):
         return placements(self.distance, self.p1b, self.p1a, self.p2a, self.rho1, self.rho2)
 
     def residual(self, placement: Placement) -> float:
-        """m: by how much it misses the three equations."""
+        """Return the residual of the three equations in m."""
         return max(
             abs(math.hypot(placement.x, placement.y) - self.distance),
             abs(separation(placement, self.p1a, self.p1b) - self.rho1),
@@ -281,7 +281,7 @@ class Encounter(NamedTuple):
 
     @property
     def is_tame(self) -> bool:
-        """Whether no two solutions are close to each other, and no side of a triangle is short."""
+        """Return whether all solutions are separate, and no side of a triangle is short."""
         moved, reach = (
             apart(self.p1a, self.p2a),
             math.hypot(self.truth.x - self.p1b.x, self.truth.y - self.p1b.y),
@@ -295,7 +295,7 @@ class Encounter(NamedTuple):
 
 
 def _height(one: float, other: float, base: float) -> float:
-    """Of the triangle over `base`."""
+    """Return the height of the triangle over `base`, in m."""
     along = (one * one - other * other + base * base) / (2.0 * base)
     return math.sqrt(max(one * one - along * along, 0.0))
 
@@ -312,7 +312,7 @@ def _from(placement: Placement, pose: Pose) -> Pose:
 
 @st.composite
 def encounters(draw: st.DrawFn) -> Encounter:
-    """Two robots anywhere, as phase 3 finds them, or as no phase 3 ever does."""
+    """Draw an encounter of two robots at any positions, including ones that are impossible in phase 3."""
     distance, bearing = draw(st.floats(0.5, 20.0)), draw(angles)
     truth = Placement(draw(angles), distance * math.cos(bearing), distance * math.sin(bearing))
     p1b, p1a = draw(poses), draw(poses)
@@ -352,7 +352,7 @@ def test_the_placements_are_all_different(encounter: Encounter) -> None:
 
 @given(encounters())
 def test_the_placements_are_the_same_whoever_counts_as_first(encounter: Encounter) -> None:
-    """Eq. (7) is symmetric in a's two points."""
+    """Eq. (7) is symmetric in the two points of a."""
     assume(encounter.is_tame)
     swapped = placements(
         encounter.distance, encounter.p1b, encounter.p2a, encounter.p1a, encounter.rho2, encounter.rho1
@@ -364,7 +364,7 @@ def test_the_placements_are_the_same_whoever_counts_as_first(encounter: Encounte
 
 @given(encounters())
 def test_a_turn_of_bs_frame_turns_every_placement_with_it(encounter: Encounter) -> None:
-    """The wall that the frame of M2 is hung on: rotated by 1 rad, the solutions rotate."""
+    """If the frame of M2 is rotated by 1 rad, the solutions rotate with it."""
     assume(encounter.is_tame)
     frame = Pose(0.0, 0.0, 1.0)
     rotated = placements(
@@ -384,14 +384,14 @@ def test_a_turn_of_bs_frame_turns_every_placement_with_it(encounter: Encounter) 
 
 @given(encounters())
 def test_a_tame_encounter_has_four_placements_or_two(encounter: Encounter) -> None:
-    """Each of +-alpha has two intersections or none; the other sign's circle may miss that of D."""
+    """Each of +-alpha has two intersections or none. The circle of one sign may not intersect that of D."""
     assume(encounter.is_tame)
     assert len(encounter.solutions()) in (2, 3, 4)
 
 
 @given(encounters())
 def test_a_robot_that_met_its_peer_head_on_is_placed(encounter: Encounter) -> None:
-    """rho_1 = 0: a stood on b; the triangle is known from its other end."""
+    """With rho_1 = 0, a was at the position of b. The triangle is known from its other end."""
     truth, p1b, p2a = encounter.truth, encounter.p1b, encounter.p2a
     on_b = _from(truth, p1b)
     moved = apart(on_b, p2a)
@@ -407,7 +407,7 @@ def test_a_robot_that_met_its_peer_head_on_is_placed(encounter: Encounter) -> No
 
 @given(encounters(), st.sampled_from([1.0, -1.0]))
 def test_a_radial_way_has_at_most_two_placements(encounter: Encounter, side: float) -> None:
-    """a goes straight away from b, or straight towards it: the branches +-alpha coincide."""
+    """Robot a moves straight away from b or towards it, so the branches +-alpha coincide."""
     assume(encounter.rho1 > 0.5)
     on_b = _from(encounter.truth, encounter.p1b)
     away = math.atan2(encounter.p1a.y - on_b.y, encounter.p1a.x - on_b.x)
@@ -424,7 +424,7 @@ def test_a_radial_way_has_at_most_two_placements(encounter: Encounter, side: flo
 
 
 def test_touching_circles_and_a_radial_way_have_one_placement() -> None:
-    """M2, b, a and M1 in one line, a on its way along it: D is rho_1 and both radii, laid end to end."""
+    """M2, b, a and M1 are collinear, and a moves along the line: D is the sum of rho_1 and both radii."""
     found = placements(10.0, Pose(4.0, 0.0, 0.0), Pose(-5.0, 0.0, 0.0), Pose(-4.5, 0.0, 0.0), 1.0, 1.5)
     assert found == [pytest.approx((0.0, 10.0, 0.0), abs=EXACT)]
 
@@ -443,11 +443,11 @@ def test_nothing_is_placed_where_nothing_fits(rho1: float, rho2: float, p2a: Pos
     assert placements(10.0, Pose(5.0, 0.0, 0.0), Pose(5.0, 0.0, 0.0), p2a, rho1, rho2) == []
 
 
-# --- weighing placements ------------------------------------------------------------------------------
+# --- scoring placements -------------------------------------------------------------------------------
 
 
 def sightings_of(encounter: Encounter, third: Pose) -> list[PairObservation]:
-    """Its two ranges, and one more after b has moved to `third`."""
+    """Return the two ranges of `encounter`, and a third one after b has moved to `third`."""
     return [
         PairObservation(0, encounter.p1a, encounter.p1b, encounter.rho1),
         PairObservation(1, encounter.p2a, encounter.p1b, encounter.rho2),
@@ -459,7 +459,7 @@ def sightings_of(encounter: Encounter, third: Pose) -> list[PairObservation]:
 def test_a_third_range_leaves_the_true_placement_as_it_was(
     encounter: Encounter, way: float, course: float
 ) -> None:
-    """Polishing is the identity on what is exact; what it leaves explains every range."""
+    """Refinement does not change an exact placement, and the remaining ones explain every range."""
     assume(encounter.is_tame)
     third = step(Pose(encounter.p1b.x, encounter.p1b.y, course), way, 0.0, 1.0)
     assume(separation(encounter.truth, encounter.p2a, third) > 0.3)

@@ -1,8 +1,8 @@
-"""The fit of a mission is the optimum of the whole factor graph, as gtsam finds it.
+"""The least-squares fit of a mission is the optimum of the complete factor graph, computed by gtsam.
 
-Fifty missions are played and recorded. What both robots had measured when they claimed is read back from
-their journals, twice: into a mind, for the fit that the claim came of; and into a graph of every pose and
-every manoeuvre, which has nothing in common with `agent.estimation.gaussian.least_squares` but the model.
+Fifty missions are run and recorded. The measurements up to the claims are read from the journals twice: into
+a RobotState, for the fit that led to the claim, and into a graph of all poses and manoeuvres. The graph
+shares only the model with `agent.estimation.gaussian.least_squares`.
 """
 
 from __future__ import annotations
@@ -49,16 +49,16 @@ Array = NDArray[np.float64]
 
 MISSIONS = 50
 AGREED = 0.01
-"""sigmas: how far a pose may be from gtsam's"""
+"""The maximum difference of a pose from gtsam's, in standard deviations."""
 AGREED_COVARIANCE = 0.01
-"""of the product of the two sigmas: how far an entry of the covariance may be from gtsam's"""
+"""The maximum difference of a covariance element, as a fraction of the product of its two sigmas."""
 STILL = 1e-7
-"""m, m/s and rad: gtsam's Gauss-Newton ends where a step changes all poses and manoeuvres by less"""
+"""The size of a step, in m, m/s and rad, below which gtsam's Gauss-Newton iteration ends."""
 STEPS = 200
-"""until then, at the most"""
+"""The maximum number of steps."""
 
 SIGMAS = ((0.01, 0.01), (0.02, 0.05), (0.1, 0.1))
-"""m, of ranges to anchors and between robots"""
+"""The standard deviations in m of ranges to anchors and between robots."""
 DRIFTS = (
     VelocityNoise(),
     VelocityNoise(0.001, 0.001),
@@ -66,7 +66,7 @@ DRIFTS = (
     VelocityNoise(0.001, 0.01, 0.02, 0.005),
 )
 SETTINGS = tuple(product(SIGMAS, DRIFTS))
-"""missions go through them in turn; neither T_s nor v_max is 1 in any, so that none can be forgotten"""
+"""The settings of the missions, in turn. T_s and v_max are never 1, so a missing factor is detected."""
 
 
 def noisy(number: int) -> Noise:
@@ -75,7 +75,7 @@ def noisy(number: int) -> Noise:
 
 
 def accuracy(noise: Noise) -> float:
-    """m: what can be had with such noise in a few ticks."""
+    """Return an accuracy in m that is reached with this noise within a few ticks."""
     if noise.odometry.omega >= 0.01:
         return 0.3
     return 0.03 if noise.mutual_sigma <= 0.01 else 0.1
@@ -98,21 +98,21 @@ TEXT = """
     """
 
 
-# --- the record ---------------------------------------------------------------------------------------
+# --- the recording ------------------------------------------------------------------------------------
 
 
 class Measured(NamedTuple):
-    """What one robot had sensed."""
+    """The measurements of one robot."""
 
     odometry: list[Controls]
-    """over each tick"""
+    """The odometry of each tick."""
     anchor: list[tuple[int, float]]
-    """the ticks and the ranges, in m"""
+    """The ticks and the anchor ranges, in m."""
     mutual: list[tuple[int, float]]
 
 
 def recorded(number: int, folder: Path) -> None:
-    """Play a mission; its record goes to `folder`."""
+    """Run a mission, and write its recording to `folder`."""
     scenario, noise = parse(TEXT.format(seed=number), "recorded"), noisy(number)
     mission = replace(scenario.mission, noise=noise, accuracy=accuracy(noise))
     recording = play(replace(scenario, mission=mission), folder)
@@ -121,7 +121,7 @@ def recorded(number: int, folder: Path) -> None:
 
 
 def said(folder: Path, robot: str) -> Iterator[Observation | Report | Command]:
-    """What the journal of `robot` has in and out, until it claims."""
+    """Yield the messages in the journal of `robot` until its claim."""
     frames = journal_file.read(folder / f"agent-{robot}.journal")
     for frame in islice(frames, 2, None):
         match decode(frame, Observation | Report | Command | Estimate | MissionEnd | FinalReport):
@@ -155,9 +155,9 @@ def measured(folder: Path, robot: str) -> Measured:
 
 
 def remembered(folder: Path, robot: str) -> tuple[RobotState, Localised]:
-    """A mind that has sensed and heard what the robot had when it claimed, and the claim.
+    """Return a RobotState with all data that the robot had when it claimed, and the claim.
 
-    It has come to a verdict before it began, so it decides nothing, and takes no time.
+    The state has a result from the start, so it makes no decisions, and is computed quickly.
     """
     config = decode(list(journal_file.read(folder / f"agent-{robot}.journal"))[1], RobotConfig)
     state = RobotState(config, Done(1, Undecided("was not asked")))
@@ -181,13 +181,13 @@ def remembered(folder: Path, robot: str) -> tuple[RobotState, Localised]:
 
 
 class Optimum(NamedTuple):
-    """What gtsam makes of the graph."""
+    """The optimum of the graph, computed by gtsam."""
 
     mean: Array
-    """of both poses in the last tick, as `smoothing.poses` has them"""
+    """The poses of both robots at the last tick, in the order of `least_squares.poses`."""
     covariance: Array
     error: float
-    """half the sum of squares"""
+    """Half the sum of squared residuals."""
 
 
 def pose_of(robot: int, tick: int) -> int:
@@ -195,7 +195,7 @@ def pose_of(robot: int, tick: int) -> int:
 
 
 def manoeuvre_of(robot: int, tick: int) -> int:
-    """The key of the v and omega that were driven over [tick, tick + 1]."""
+    """Return the key of the executed v and omega over [tick, tick + 1]."""
     return int(gtsam.symbol("vw"[robot], tick))
 
 
@@ -204,7 +204,7 @@ def anchor_of(robot: int) -> int:
 
 
 def arc(robot: int, tick: int, period: float) -> gtsam.CustomFactor:
-    """The unicycle's exact step: over a tick the pose goes along an exponential of SE(2)."""
+    """Return the factor of the exact unicycle step: an exponential map of SE(2) over a tick."""
     keys = [pose_of(robot, tick), manoeuvre_of(robot, tick), pose_of(robot, tick + 1)]
 
     def broken(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
@@ -225,7 +225,7 @@ def arc(robot: int, tick: int, period: float) -> gtsam.CustomFactor:
 def graph_of(
     robots: Sequence[Measured], noise: Noise, period: float, anchors: Sequence[Array]
 ) -> gtsam.NonlinearFactorGraph:
-    """Every pose, every manoeuvre, every range of both; no prior on where they began."""
+    """Return the graph of all poses, manoeuvres and ranges of both robots, without priors on the starts."""
     graph = gtsam.NonlinearFactorGraph()
     for robot, (seen, anchor) in enumerate(zip(robots, anchors, strict=True)):
         graph.add(gtsam.NonlinearEqualityPoint2(anchor_of(robot), anchor))
@@ -233,7 +233,7 @@ def graph_of(
             sigmas = np.sqrt(noise.odometry.variances(told.v, told.omega))
             white = gtsam.noiseModel.Constrained.MixedSigmas(
                 1.0, sigmas
-            )  # where one is 0, it is a constraint
+            )  # a sigma of 0 makes it a constraint
             key = manoeuvre_of(robot, tick)
             graph.add(gtsam.PriorFactorPoint2(key, np.array((told.v, told.omega)), white))
             graph.add(arc(robot, tick, period))
@@ -249,7 +249,7 @@ def graph_of(
 def begun(
     robots: Sequence[Measured], starts: Sequence[Pose], period: float, anchors: Sequence[Array]
 ) -> gtsam.Values:
-    """As if the odometry were exact, from `starts`."""
+    """Return the initial values: exact odometry from `starts`."""
     values = gtsam.Values()
     for robot, (seen, start) in enumerate(zip(robots, starts, strict=True)):
         values.insert(anchor_of(robot), anchors[robot])
@@ -263,7 +263,7 @@ def begun(
 
 
 def optimum(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, last: Sequence[int]) -> Optimum:
-    """By gtsam's Gauss-Newton. Step by step, for its `optimize` ends where the error grows for once."""
+    """Return the optimum, by single Gauss-Newton steps: gtsam's `optimize` ends when the error grows once."""
     for _ in range(STEPS):
         optimiser = gtsam.GaussNewtonOptimizer(graph, values)
         optimiser.iterate()
@@ -275,7 +275,7 @@ def optimum(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, last: Seque
         raise AssertionError("gtsam has found no optimum")
     local = gtsam.Marginals(graph, values).jointMarginalCovariance(last).fullMatrix()
     mean, turn = np.empty(6), np.zeros((6, 6))
-    for robot, key in enumerate(last):  # gtsam's covariance is along the robot's own axes
+    for robot, key in enumerate(last):  # gtsam's covariance is in the frame of the robot
         pose, i = values.atPose2(key), 3 * robot
         mean[i : i + 3] = pose.x(), pose.y(), pose.theta()
         turn[i : i + 2, i : i + 2] = pose.rotation().matrix()
@@ -287,7 +287,7 @@ def optimum(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, last: Seque
 
 
 class Compared(NamedTuple):
-    """One mission."""
+    """The results of both methods for one mission."""
 
     config: RobotConfig
     claimed: Localised
@@ -316,7 +316,7 @@ def mission(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
 
 
 def nudged(fit: Fit, anchors: Sequence[Array], draw: np.random.Generator) -> list[Pose]:
-    """Where both may have begun instead, by what we hold to be known of it."""
+    """Return random starts of both robots, drawn from the estimated distribution."""
     guess = draw.multivariate_normal(fit.guess, fit.covariance)
     starts = []
     for (mx, my, turn), (x, y) in zip(guess.reshape(2, 3).tolist(), anchors, strict=True):
@@ -325,7 +325,7 @@ def nudged(fit: Fit, anchors: Sequence[Array], draw: np.random.Generator) -> lis
 
 
 def wrapped(change: Array) -> Array:
-    """A difference of two means, with headings between -pi and pi."""
+    """Return the difference of two means, with headings wrapped to [-pi, pi]."""
     change = change.copy()
     change[2::3] = np.remainder(change[2::3] + math.pi, math.tau) - math.pi
     return change

@@ -1,4 +1,4 @@
-"""Starts and settings next to where formulas break down, which random starts never hit."""
+"""Starts and settings close to singularities, which random starts do not reach."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def assert_localised(scenario: Scenario) -> None:
 
 
 def with_start(rho0: float, heading: float) -> Scenario:
-    """Robot a starts on the x-axis, `rho0` m from its anchor; b anywhere."""
+    """Return a scenario in which a starts on the x-axis, `rho0` m from its anchor."""
     scenario = load("random", seed=11)
     a, b = scenario.robots
     return replace(scenario, robots=(replace(a, start=replace(a.start, x=rho0, y=0.0, heading=heading)), b))

@@ -1,4 +1,4 @@
-"""The house stands: arrows point down, the heart is pure, and nobody carries what they do not use."""
+"""The architecture: imports point down, planners are pure, and processes load only what they use."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ BELOW = {
     "world": {"world", "protocol"},
     "compose": {"compose", "agent", "world", "protocol"},
 }
-"""what each room may import of the house"""
+"""The packages of the project that each package may import."""
 
 SHELL = {
     "protocol.network.session",
@@ -35,7 +35,7 @@ SHELL = {
     "protocol.journal.resume",
     "protocol.network.inbox",
 }
-"""the rooms' windows: files, networks, clocks"""
+"""The modules for I/O (files, networks, clocks) that each package may import."""
 
 PURE = {
     *(
@@ -95,7 +95,7 @@ def tree(module: str) -> ast.Module:
 
 
 def imports(source: ast.Module) -> Iterator[str]:
-    """Every module that is imported, wherever in `source` that is done."""
+    """Yield all modules that `source` imports, at any place."""
     for node in ast.walk(source):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -116,7 +116,7 @@ def room(module: str) -> str:
     return module.partition(".")[0]
 
 
-# --- arrows point down --------------------------------------------------------------------------------
+# --- imports point down -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("module", [module for room in BELOW for module in modules(room)])
@@ -165,7 +165,7 @@ def f():
     ]
 
 
-# --- the heart is pure --------------------------------------------------------------------------------
+# --- planners are pure --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("module", sorted(PURE))
@@ -193,7 +193,7 @@ def test_a_pure_module_names_nothing_that_acts_or_changes_by_itself(module: str)
 
 @pytest.mark.parametrize("module", sorted(PURE))
 def test_a_pure_module_keeps_no_variable(module: str) -> None:
-    """Whatever stands at its top is a definition or a constant of a type that cannot change."""
+    """Each top-level statement is a definition, or a constant of an immutable type."""
     for node in tree(module).body:
         value = node.value if isinstance(node, ast.Assign | ast.AnnAssign) else None
         if isinstance(value, ast.List | ast.Set | ast.ListComp | ast.SetComp | ast.DictComp):
@@ -205,7 +205,7 @@ def test_a_pure_module_keeps_no_variable(module: str) -> None:
 
 
 def frozen(value: object) -> bytes:
-    """Every bit of a value, as the wire would carry it; states that are of another type look different."""
+    """Return all bits of a value as encoded on the wire. States of different types differ."""
     return repr(value).encode()
 
 
@@ -261,11 +261,11 @@ def test_a_mind_and_a_world_cannot_be_changed() -> None:
             setattr(value, field, None)
 
 
-# --- nobody carries what they do not use --------------------------------------------------------------
+# --- processes load only what they use ----------------------------------------------------------------
 
 
 def loaded_by(module: str) -> set[str]:
-    """The top-level packages that a process has loaded once it has imported `module`."""
+    """Return the top-level packages that a process has loaded after importing `module`."""
     code = f"import sys, {module}; print(*{{name.partition('.')[0] for name in sys.modules}})"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return set(found.stdout.split())

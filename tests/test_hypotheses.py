@@ -1,4 +1,4 @@
-"""What is possible under noise: nothing true is lost, what is alike stays alike, probability are probabilities."""
+"""Hypotheses under noise: the true one is kept, symmetric ones stay equal, and probabilities sum to 1."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from protocol.noise import Noise, VelocityNoise
 
 REACH = 3.0
 NONE = np.array([], np.intp)
-"""no ticks"""
+"""An empty array of ticks."""
 
 
-# --- silence ------------------------------------------------------------------------------------------
+# --- no detection -------------------------------------------------------------------------------------
 
 
 def by_quadrature(beyond: Sequence[float], sigma: float, drop_outs: float) -> float:
-    """The mean over the common error: a tick that it moves into range is silent by a drop-out only."""
+    """Return the mean over the common error. In ticks that it moves into range, there is a drop-out."""
     error = np.linspace(-9.0, 9.0, 40_001)
     density = np.exp(-0.5 * error**2) / math.sqrt(2.0 * math.pi)
     out = np.array(beyond)[:, None] + sigma * error > 0.0
@@ -69,7 +69,7 @@ RANGES = Noise(anchor_sigma=SIGMA, mutual_sigma=SIGMA)
 def alone(
     commands: Sequence[tuple[float, float]], anchor: tuple[float, float], seed: int
 ) -> tuple[ScoredHypothesis, ...]:
-    """What a robot holds that has driven so from the origin, with its anchor there."""
+    """Return the hypotheses of a robot that has driven so from the origin, with its anchor there."""
     v, omega = np.array(commands).T
     path = track(v, omega, 1.0)
     true = np.hypot(path.x - anchor[0], path.y - anchor[1])
@@ -81,7 +81,7 @@ def alone(
 
 @pytest.mark.parametrize("seed", range(10))
 def test_mirror_images_are_as_likely_until_a_range_tells(seed: int) -> None:
-    """Straight on, a robot does not know on which side its anchor is."""
+    """On a straight path, a robot cannot distinguish the sides of its anchor."""
     anchor = (1.2, 0.9)
     straight = [(0.5, 0.0)] * 4
     one, other = alone(straight, anchor, seed)
@@ -96,11 +96,11 @@ def test_mirror_images_are_as_likely_until_a_range_tells(seed: int) -> None:
 # --- the pair -----------------------------------------------------------------------------------------
 
 APART = (4.0, 0.0)
-"""m: M2 - M1"""
+"""The vector from M1 to M2, in m."""
 
 
 class Driven:
-    """A robot that has driven at random, and what its odometry says of it."""
+    """A robot that has driven at random, with its odometry."""
 
     def __init__(
         self, start: Pose, commands: Array, drift: VelocityNoise, draws: np.random.Generator
@@ -114,7 +114,7 @@ class Driven:
         self.track = track(measured[:, 0], measured[:, 1], 1.0)
 
     def guess(self, anchor: tuple[float, float]) -> list[float]:
-        """The truth, as a guess says it."""
+        """Return the true pose in the form of a guess."""
         start = self.poses[0]
         c, s = math.cos(start.heading), math.sin(start.heading)
         dx, dy = anchor[0] - start.x, anchor[1] - start.y
@@ -122,7 +122,7 @@ class Driven:
 
 
 def told(distances: Sequence[float], sigma: float, draws: np.random.Generator) -> list[tuple[int, float]]:
-    """The ranges of those that are within R, by tick."""
+    """Return the ranges within R, by tick."""
     return [
         (tick, max(0.0, rho + sigma * float(draws.standard_normal())))
         for tick, rho in enumerate(distances)
@@ -135,7 +135,7 @@ def distance(one: Pose, x: float, y: float) -> float:
 
 
 def drawn(seed: int, noise: Noise) -> tuple[PairRanges, Array]:
-    """A pair that drives about between its anchors; and the truth, as a guess."""
+    """Return a pair that moves between its anchors, and the truth in the form of a guess."""
     draws = np.random.default_rng(seed)
     robots = []
     for x in (1.2, 2.8):
@@ -153,7 +153,7 @@ def drawn(seed: int, noise: Noise) -> tuple[PairRanges, Array]:
 
 
 def sigmas(one: ScoredHypothesis, other: Array) -> float:
-    """How far apart the two are, by the covariance of the first."""
+    """Return the distance of the two, in standard deviations of the first."""
     error = one.fit.guess - other
     error[2::3] = np.remainder(error[2::3] + math.pi, math.tau) - math.pi
     return math.sqrt(float(error @ one.fit.information @ error))
@@ -165,7 +165,7 @@ def sigmas(one: ScoredHypothesis, other: Array) -> float:
     ids=["fine", "coarse", "odometry"],
 )
 def test_the_truth_is_among_the_hypotheses_and_their_odds_are_a_distribution(noise: Noise) -> None:
-    """The fit that is begun at the truth is one of those that are found without it, and mostly the first."""
+    """The fit that starts at the truth is also found without it, and is usually the first."""
     tried, first = 0, 0
     for seed in range(24):
         pair, truth = drawn(seed, noise)
@@ -183,7 +183,7 @@ def test_the_truth_is_among_the_hypotheses_and_their_odds_are_a_distribution(noi
 
 
 ENOUGH = 4
-"""ranges of each kind"""
+"""The number of ranges of each kind."""
 
 
 def test_where_ranges_are_fine_the_truth_is_as_near_as_the_covariance_says() -> None:
@@ -211,13 +211,13 @@ def test_a_range_that_is_too_long_to_be_one_has_no_say() -> None:
 # --- the limit of exact sensors -----------------------------------------------------------------------
 
 EXACT = 1e-6
-"""m: sigma; what the robots hold an exact range to be at best"""
+"""The smallest sigma in m that the robots assume for an exact range."""
 
 
 def met(corner: bool, start: Pose, standing: Pose) -> tuple[PairRanges, list[Placement]]:
-    """a has taken three ranges of b, which stands; and eq. (7) by them, in <b(M2)>.
+    """Return three ranges from a to b, which rests, and the solutions of eq. (7) for them in <b(M2)>.
 
-    Both know where their anchors are: by ranges along an L. M2 is 10 m from M1.
+    Both robots know the positions of their anchors, from ranges along an L. M2 is 10 m from M1.
     """
     ell = [(0.5, 0.0), (0.5, 0.0), (0.0, math.pi / 2), (0.5, 0.0)]
     last = [(0.4, 0.0), (0.0, math.pi / 2 if corner else 0.0), (0.4, 0.0)]
@@ -235,7 +235,7 @@ def met(corner: bool, start: Pose, standing: Pose) -> tuple[PairRanges, list[Pla
         noise,
     )
     pair = PairRanges((a.track, b.track), ranges, (NONE, NONE, NONE), (10.0, 0.0), REACH, noise)
-    # <a(M1)> along <W>, so that <b(M2)>, too, is where it is but for M2: placements are T = -M2
+    # <a(M1)> has the axes of <W>, and so has <b(M2)>: the true placement is T = -M2
     here = Pose(b.poses[-1].x - 10.0, b.poses[-1].y, b.poses[-1].heading)
     found = closed_forms.placements(10.0, here, a.poses[13], a.poses[14], looks[0], looks[1])
     third = [one for one in found if abs(distance(one.place(a.poses[16]), here.x, here.y) - looks[2]) < 1e-9]
@@ -244,7 +244,7 @@ def met(corner: bool, start: Pose, standing: Pose) -> tuple[PairRanges, list[Pla
 
 
 def seen(one: Pose, other: Pose) -> Placement:
-    """`one` in the frame of `other`."""
+    """Return `one` in the frame of `other`."""
     c, s = math.cos(other.heading), math.sin(other.heading)
     dx, dy = one.x - other.x, one.y - other.y
     return Placement(wrap(one.heading - other.heading), c * dx + s * dy, c * dy - s * dx)

@@ -1,4 +1,4 @@
-"""What was journaled is read back: all of it, up to where a write was torn."""
+"""All journaled frames are read back, up to a torn write."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FRAMES = [encode(message) for message in EXAMPLES]
 
 
 def written(path: Path, frames: list[bytes]) -> bytes:
-    """What a journal of `frames` is on disk."""
+    """Return the bytes of a journal of `frames` on disk."""
     with Journal(path) as book:
         for frame in frames:
             book.write(frame)
@@ -112,7 +112,7 @@ def test_garbage_in_the_middle_is_found_and_the_file_is_named(
 def test_an_existing_journal_is_not_overwritten(tmp_path: Path) -> None:
     path = tmp_path / "a.journal"
     data = written(path, FRAMES)
-    with pytest.raises(RecordExists, match=r"a\.journal is there already"):
+    with pytest.raises(RecordExists, match=r"a\.journal already exists"):
         Journal(path)
     assert path.read_bytes() == data
 

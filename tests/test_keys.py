@@ -1,4 +1,4 @@
-"""Keys: what `tandem keys` makes, who is refused without, and what is said of it."""
+"""Certificates: the files of `tandem keys`, and the refusal of participants without a valid one."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def mistaken(ended: Ended, *words: str) -> None:
-    """A mistake of the user's: one line, that has these words."""
+    """Assert that the process reports a user's mistake in one line that contains these words."""
     assert ended.status == 2, ended
     assert ended.out == ""
     assert re.fullmatch(r"tandem[^\n]*: [^\n]+\n", ended.err), ended.err
@@ -42,7 +42,7 @@ def mistaken(ended: Ended, *words: str) -> None:
         assert word in ended.err
 
 
-# --- what is made ---------------------------------------------------------------------------------------
+# --- the files ------------------------------------------------------------------------------------------
 
 
 def test_everybody_has_a_folder_with_all_that_one_machine_needs(keys: Path) -> None:
@@ -52,7 +52,7 @@ def test_everybody_has_a_folder_with_all_that_one_machine_needs(keys: Path) -> N
         assert sorted(path.name for path in own.iterdir()) == ["ca.pem", "cert.pem", "key.pem", KEYED]
         assert own.joinpath("ca.pem").read_bytes() == keys.joinpath("ca.pem").read_bytes()
         context = ssl.create_default_context(cafile=own / "ca.pem")
-        context.load_cert_chain(own / "cert.pem", own / "key.pem")  # raises if they do not go together
+        context.load_cert_chain(own / "cert.pem", own / "key.pem")  # raises if they do not match
         certificate = x509.load_pem_x509_certificate((own / "cert.pem").read_bytes())
         certificate.verify_directly_issued_by(x509.load_pem_x509_certificate((own / "ca.pem").read_bytes()))
         assert certificate.subject.rfc4514_string() == f"CN={name}"
@@ -192,12 +192,12 @@ def test_a_folder_of_keys_may_lie_anywhere(keys: Path, mine: Path, tmp_path: Pat
             assert part.ended().status == 0
 
 
-# --- who is refused -------------------------------------------------------------------------------------
+# --- refused participants -------------------------------------------------------------------------------
 
 
 @contextmanager
 def world_of(keys: Path, name: str = "world") -> Iterator[str]:
-    """The endpoint of somebody who shows that a world is there."""
+    """Yield the endpoint of a process that declares the liveliness token of a world."""
     endpoint = free_endpoint("tls")
     with session.open_router(configured(keys / name / KEYED, listen=[endpoint])) as link:
         _token = session.show_alive(link, tree.world_alive("mine"))
@@ -211,7 +211,7 @@ def authority_of(keys: Path) -> certificates.Authority:
 
 
 def last(own: Path, keys: Path, lasts: timedelta) -> None:
-    """Its certificate is one that ends so long from now."""
+    """Replace the certificate by one that expires after this time."""
     key = load_pem_private_key((own / "key.pem").read_bytes(), None)
     assert isinstance(key, ec.EllipticCurvePrivateKey)
     name = "world" if own.name == "world" else "agent-a"
@@ -220,12 +220,12 @@ def last(own: Path, keys: Path, lasts: timedelta) -> None:
 
 
 def expire(own: Path, keys: Path) -> None:
-    """Its certificate is one that has ended an hour ago."""
+    """Replace the certificate by one that expired an hour ago."""
     last(own, keys, timedelta(hours=-1))
 
 
 def give_foreign(own: Path, _keys: Path) -> None:
-    """Its certificate is of another authority, though it knows the right one."""
+    """Replace the certificate by one of another authority. The trusted authority stays the right one."""
     other = own.parent / "others"
     assert tandem("keys", other, "--robots", "a").status == 0
     for name in ("cert.pem", "key.pem"):
@@ -233,7 +233,7 @@ def give_foreign(own: Path, _keys: Path) -> None:
 
 
 def take_away(own: Path, _keys: Path) -> None:
-    """It has no certificate."""
+    """Remove the certificate."""
     settings = json.loads((own / KEYED).read_text().partition("\n")[2])
     tls = settings["transport"]["link"]["tls"]
     for name in [name for name in tls if name.startswith(("connect_", "listen_"))]:
@@ -245,8 +245,8 @@ def take_away(own: Path, _keys: Path) -> None:
     ("spoil", "words"),
     [
         (expire, "this certificate has expired; check the certificate"),
-        (give_foreign, "this certificate is not of an authority that it trusts; check the certificate"),
-        (take_away, "it asks for a certificate, and there is none; check the certificate"),
+        (give_foreign, "it does not trust the authority of this certificate; check the certificate"),
+        (take_away, "it requires a certificate, and there is none; check the certificate"),
     ],
 )
 def test_who_has_no_good_certificate_is_not_let_in_and_told_why(
@@ -264,7 +264,7 @@ def test_a_world_of_another_authority_is_not_believed(mine: Path, tmp_path: Path
     with world_of(other) as endpoint:
         ended = tandem("agent", "a", "--connect", endpoint, "--keys", mine, "--connect-timeout", "2")
     assert ended.status == 3
-    assert "its certificate is refused here: unable to get local issuer certificate" in ended.err
+    assert "its certificate is not valid here: unable to get local issuer certificate" in ended.err
 
 
 def test_a_world_whose_certificate_has_expired_is_not_believed(
@@ -275,7 +275,7 @@ def test_a_world_whose_certificate_has_expired_is_not_believed(
     with world_of(tmp_path / "old") as endpoint:
         ended = tandem("agent", "a", "--connect", endpoint, "--keys", mine, "--connect-timeout", "2")
     assert ended.status == 3
-    assert "its certificate is refused here: certificate has expired" in ended.err
+    assert "its certificate is not valid here: certificate has expired" in ended.err
 
 
 def test_a_world_by_another_name_than_its_certificates_is_not_believed(keys: Path, mine: Path) -> None:
@@ -284,7 +284,7 @@ def test_a_world_by_another_name_than_its_certificates_is_not_believed(keys: Pat
         with session.open_router(configured(keys / "world" / KEYED, listen=[elsewhere])):
             ended = tandem("agent", "a", "--connect", elsewhere, "--keys", mine, "--connect-timeout", "2")
     assert ended.status == 3
-    assert "its certificate is refused here: IP address mismatch" in ended.err
+    assert "its certificate is not valid here: IP address mismatch" in ended.err
 
 
 def test_a_robot_that_the_rules_do_not_name_is_told_to_check_them(keys: Path, tmp_path: Path) -> None:
@@ -339,10 +339,10 @@ def test_a_page_whose_certificate_is_refused_says_so(keys: Path, tmp_path: Path)
     own = shutil.copytree(keys / "viewer", tmp_path / "viewer")
     take_away(own, keys)
     with world_of(keys) as endpoint, TandemProcess("watch", "--connect", endpoint, "--keys", own) as page:
-        page.until_says(f"no router at {endpoint} yet: it asks for a certificate, and there is none")
+        page.until_says(f"no router at {endpoint} yet: it requires a certificate, and there is none")
 
 
-# --- what is no way to the network ----------------------------------------------------------------------
+# --- invalid configurations -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -352,7 +352,7 @@ def test_a_page_whose_certificate_is_refused_says_so(keys: Path, tmp_path: Path)
         ("{mode: 'client', ", "line 1: expected identifier or string"),
         ("{\n nonsense: 1}", "unknown field `nonsense`, expected one of"),
         ("{transport: {unicast: {lowlatency: 'yes'}}}", "expected a boolean"),
-        ("{mode: 'peer'}", "mode: 'peer', but who only connects is a client here; leave it out"),
+        ("{mode: 'peer'}", "mode: 'peer', but a process that only connects is a client here; leave it out"),
         ("{connect: {endpoints: ['somewhere']}}", "Endpoints must be of the form"),
         (
             "{transport: {link: {tls: {root_ca_certificate: 'nowhere.pem'}}}}",
@@ -378,7 +378,7 @@ def test_a_command_refuses_a_wrong_configuration(part: tuple[str, ...], tmp_path
     file = tmp_path / "mine.json5"
     file.write_text("{mode: 'peer'}")
     ended = tandem(*part, "--connect", free_endpoint(), "--config", file)
-    mistaken(ended, f"--config: {file}: mode: 'peer', but who only connects is a client here")
+    mistaken(ended, f"--config: {file}: mode: 'peer', but a process that only connects is a client here")
 
 
 def test_a_configuration_may_say_where_to_connect(tmp_path: Path) -> None:
@@ -431,7 +431,7 @@ def test_flags_that_do_not_go_together_are_told(arguments: tuple[str, ...], word
     mistaken(tandem(*(one.format(keys=keys) for one in arguments)), words)
 
 
-# --- who is warned --------------------------------------------------------------------------------------
+# --- warnings -------------------------------------------------------------------------------------------
 
 
 def test_who_listens_beyond_this_machine_without_keys_is_warned(keys: Path) -> None:

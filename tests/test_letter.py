@@ -1,4 +1,4 @@
-"""The paper to the letter under noise: its manoeuvres and no others, and no claim that it cannot make."""
+"""The `paper` planner under noise: only the manoeuvres of the paper, and no unfounded claims."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ITS_OWN = {
     "asleep", "straight", "turning", "circling", "third-point", "aligning", "radial", "tangent", "orbiting",
     "standing", "waiting", "last-manoeuvre", "returning", "localised", "undecided",
 }  # fmt: skip
-"""the states of the paper, as with exact sensors"""
+"""The states of the paper, which are the same as with exact sensors."""
 
 
 @pytest.mark.parametrize("noise", [FINE, SIGMA], ids=["fine", "coarse"])
@@ -58,11 +58,11 @@ def test_the_letter_claims_nothing_that_is_wrong(noise: str) -> None:
 @pytest.mark.parametrize(
     ("sigma", "seed"),
     [
-        (0.0, 4317446595173490544),  # four of its twelve ranges would pass for outliers, and a be 8 m off
+        (0.0, 4317446595173490544),  # with four of twelve ranges taken for outliers, a would be off by 8 m
         (0.0, 4991156251998122645),
         (0.001, 4846399667304868315),
         (0.01, 5527597677499313376),
-        (0.0, 6948019990109848974),  # a fit here does not converge, and its chi-square is below zero
+        (0.0, 6948019990109848974),  # a fit does not converge, and its chi-square is negative
     ],
 )
 def test_where_there_are_outliers_the_letters_ranges_are_never_enough(sigma: float, seed: int) -> None:

@@ -1,4 +1,4 @@
-"""The sweep over lies: its labels say what is told, and its pictures what became of it."""
+"""The sweep over attacks: its labels describe the false data, and its figures show the outcomes."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ values = [[0.0, 0.0], [0.01, 0.01]]
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> execution.Results:
-    """A few missions with a few lies, played."""
+    """Return the results of a few missions with a few attacks."""
     folder = tmp_path_factory.mktemp("attacks")
     (folder / "few.toml").write_text(SPEC)
     progress = execution.Progress(say=lambda _: None, begin=lambda *_: None, done=lambda _: None)

@@ -1,4 +1,4 @@
-"""A peer that lies is found out: by what it told before, or can drive, or by ranges. Nobody else is."""
+"""An attacker is detected by its earlier Reports, its speed limits or ranges. An honest peer never is."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ FINE = "noise = {anchor_sigma = 0.01, mutual_sigma = 0.01}\n"
 
 
 def mission(seed: int, lies: dict[str, Attack], noise: str = "") -> Recording:
-    """A random mission, in which those robots tell those lies."""
+    """Return the recording of a random mission with these attacks."""
     text = shipped()["random"].read_text().replace("[mission]\n", f"[mission]\n{noise}")
     scenario = parse(text, "random", seed=seed)
     robots = tuple(replace(robot, attack=lies.get(robot.id)) for robot in scenario.robots)
@@ -60,11 +60,11 @@ def test_every_lie_about_a_drive_or_a_start_is_an_alarm(attack: Attack, liar: st
         assert outcome(recording) == "inconsistent", seed
         assert recording.end is not None
         peer = "b" if liar == "a" else "a"
-        assert (recording.end.reason or "").startswith(f"{peer}: {liar} tells "), recording.end.reason
+        assert (recording.end.reason or "").startswith(f"{peer}: {liar} reports "), recording.end.reason
 
 
 def _tells_otherwise(recording: Recording, liar: str, attack: Attack) -> bool:
-    """Whether there was anything to lie about: in that part of its log the robot has driven."""
+    """Return whether the attack changes anything: whether the robot has moved in that part of its log."""
     phases = {"phase-1": 1, "orbit": 2, "encounter": 3}
     return attack.part == "all" or any(
         command.phase == phases[attack.part]
@@ -75,7 +75,7 @@ def _tells_otherwise(recording: Recording, liar: str, attack: Attack) -> bool:
 
 
 def test_turning_its_whole_story_about_its_anchor_tells_nothing_false() -> None:
-    """The frame of an anchor has no direction of its own: nobody can find out, and nobody is misled."""
+    """An anchor frame has no direction of its own, so this cannot be detected, and misleads no robot."""
     for seed in range(6):
         for liar in ("a", "b"):
             assert outcome(mission(seed, {liar: Attack("reframe", 1.0)})) == "localised"
@@ -112,7 +112,7 @@ def test_the_liar_hears_that_it_is_not_believed_and_gives_up() -> None:
     ids=lambda attack: f"{attack.kind}-{attack.part}",
 )
 def test_under_noise_a_lie_that_is_large_beside_it_is_an_alarm(attack: Attack) -> None:
-    """Of a, whose way from its anchor to the encounter stands in no range of its own."""
+    """Robot a is the attacker: no anchor range depends on its path from the anchor to the encounter."""
     for seed in range(3):
         recording = mission(seed, {"a": attack}, FINE)
         assert outcome(recording) == "inconsistent", seed
@@ -137,17 +137,17 @@ def test_under_noise_the_honest_are_believed() -> None:
         assert outcome(mission(seed, {}, FINE)) == "localised", seed
 
 
-# --- what is held against a report --------------------------------------------------------------------
+# --- consistency of a Report --------------------------------------------------------------------------
 
 
 def told_to_a(phase: int) -> tuple[Step, Report]:
-    """The first report that a hears in `phase` of b, and the step in which it does."""
+    """Return the first Report of b that a receives in `phase` of b, and the step in which it does."""
     step = next(step for step in steps("paper-1") if step.heard["a"] and step.heard["a"][0].phase == phase)
     return step, step.heard["a"][0]
 
 
 def objection(step: Step, *reports: Report) -> Inconsistent | None:
-    """Of a, to the last of `reports`, after it has heard the others."""
+    """Return the objection of a to the last of `reports`, after it has received the others."""
     state = step.observed["a"]
     for report in reports[:-1]:
         state = replace(state, peer_state=peer_state.with_report(state.peer_state, report))
@@ -207,7 +207,7 @@ def _claim(alarm: Inconsistent | None) -> str:
     return alarm.claim if alarm is not None else ""
 
 
-# --- lying --------------------------------------------------------------------------------------------
+# --- false data ---------------------------------------------------------------------------------------
 
 runs = st.builds(Segment, st.integers(1, 5), st.floats(-1.0, 1.0), st.floats(-3.0, 3.0))
 logs = st.lists(runs, min_size=1, max_size=8).map(
@@ -221,7 +221,7 @@ ticks = st.none() | st.integers(0, 40)
 def test_a_liar_tells_the_same_story_as_it_grows(
     log: MotionLog, attack: Attack, parted: int | None, later: int | None, seen: int
 ) -> None:
-    """What it told of its first ticks it still tells when there are more of them."""
+    """The reported first ticks stay the same when the log grows."""
     met = None if parted is None or later is None else parted + later
     seen = min(seen, log.through)
     young = MotionLog(seen, log.between(0, seen))

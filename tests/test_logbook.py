@@ -1,4 +1,4 @@
-"""What two robots tell each other of their logs arrives whole, whatever the channel does on the way."""
+"""Motion logs are transferred completely between two robots, over any channel."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from protocol.motion import ORIGIN, Pose, Segment, step
 from protocol.wire import MAX_REPORT_BYTES, decode, encode
 
 Tick = tuple[float, float, float | None]
-"""v and omega over one tick, and the anchor range at its end, if there is one"""
+"""The v and omega over one tick, and the anchor range at its end, or None: m/s, rad/s and m."""
 
 MIND = RobotState(load("paper-1").config("a"))
 
@@ -38,7 +38,7 @@ ticks = st.builds(
 
 
 def prefixes(driven: list[Tick]) -> list[MotionLog]:
-    """The log of a robot that was in range at its start, after each of its ticks."""
+    """Return the log of a robot after each of its ticks. It is in range at the start."""
     book = MotionLog().ranged(1.5)
     grown = [book]
     for v, omega, distance in driven:
@@ -50,13 +50,13 @@ def prefixes(driven: list[Tick]) -> list[MotionLog]:
 
 
 def told(book: MotionLog, radio: PeerState) -> Report:
-    """What the planner tells, having this log and this radio."""
+    """Return the Report of a planner with this log and this state of the peer."""
     return planner.report(replace(MIND, log=book, peer_state=radio, tick=book.through))
 
 
 @st.composite
 def deliveries(draw: st.DrawFn) -> tuple[list[MotionLog], list[tuple[int, int]]]:
-    """A growing log, and (tick of the report, what it takes for acknowledged), in the order of arrival."""
+    """Draw a growing log, and the (tick, acknowledged tick) of its Reports, in the order of arrival."""
     books = prefixes(draw(ticks))
     last = len(books) - 1
     tellings = draw(st.lists(st.tuples(st.integers(0, last), st.integers(0, last)), max_size=20))
@@ -96,7 +96,7 @@ def test_reports_in_any_order_repeated_and_lost_give_back_the_log(
 
 
 class Side:
-    """A robot on a channel that loses, delays and doubles what it is told."""
+    """A robot on a channel that loses, delays and duplicates Reports."""
 
     def __init__(self, driven: list[Tick]) -> None:
         self.books = prefixes(driven)
@@ -149,7 +149,7 @@ def test_an_overtaken_report_does_not_bring_back_an_old_state() -> None:
     assert (radio.state, radio.verdict, radio.latest, radio.heard) == ("standing", Undecided("lost"), 7, 2)
 
 
-# --- the size of a report -----------------------------------------------------------------------------
+# --- the size of a Report -----------------------------------------------------------------------------
 
 
 @given(ticks)
@@ -168,7 +168,7 @@ def test_a_report_fits_its_frame_and_tells_as_much_as_fits(driven: list[Tick]) -
 
 
 def longest_log(begin: int, ticks_a_run: int) -> MotionLog:
-    """More than a report can carry: no two manoeuvres in a row alike; as many ranges as both limits allow."""
+    """Return a log that exceeds a Report: each manoeuvre differs from the previous one, with many ranges."""
     more = MAX_REPORT_RANGES - MAX_REPORT_RUNS
     book = MotionLog().drove(0.0, 0.0, begin) if begin else MotionLog()
     for i in range(2 * MAX_REPORT_RUNS):
@@ -184,7 +184,7 @@ VERDICTS = {
     "none": None,
     "localised": Localised(Pose(1.0, 2.0, 3.0)),
     "undecided": Undecided("eq. (5) leaves no way to a third range"),
-    "the peer's": Undecided("\U0001f916" * 300),  # a repeats b's reason, whatever b says
+    "the peer's": Undecided("\U0001f916" * 300),  # a repeats the reason of b
 }
 
 
@@ -208,7 +208,7 @@ def test_the_longest_report_that_there_is_fits_its_frame(begin: int, verdict: st
     assert size <= MAX_REPORT_BYTES
 
 
-# --- what a log says ----------------------------------------------------------------------------------
+# --- the content of a log -----------------------------------------------------------------------------
 
 
 @given(ticks, st.data())

@@ -480,7 +480,7 @@ def test_a_claim_is_wrong_beyond_five_of_its_sigmas_and_the_reason_says_of_which
         onward = advance(world, {"a": claims(0, "a", claim, sure), "b": claims(0, "b", b)})
         assert isinstance(onward, Judgement)
         assert onward.outcome == (outcome or "localised")
-        assert outcome is None or (onward.reason or "").endswith("rad off, of sigmas 0.05 m and 0.02 rad")
+        assert outcome is None or (onward.reason or "").endswith("rad off, with sigmas 0.05 m and 0.02 rad")
 
 
 # --- the record ---------------------------------------------------------------------------------------

@@ -115,7 +115,7 @@ def test_an_endpoint_that_does_not_answer_is_told_beside_one_that_does() -> None
     with world("paper-1", "--run", "mine") as (_, endpoint):
         ended = tandem("ps", "--connect", nowhere, "--connect", endpoint)
     assert ended.status == 3
-    why = "nobody listens there; check the address, and that the router runs"
+    why = "nothing listens there; check the address, and that the router runs"
     assert ended.err == f"tandem ps: no router at {nowhere}: {why}\n"
     assert ended.out.startswith(f"mine at {endpoint}, tick 0")
 

@@ -144,7 +144,7 @@ def test_a_process_that_is_never_started_again_ends_the_run_at_once(who: str, tm
 def test_a_robot_that_comes_back_too_late_fails_the_run_by_the_patience(tmp_path: Path) -> None:
     kill = ("--kill", "a@17+600s", "--timeout", "5")
     ended = tandem("run", "paper-1", "-q", "--out", tmp_path / "out", *kill)
-    assert ended[:2] == (3, "failed after 16 ticks (no answer from a (not there) at tick 17 for 5 s)\n")
+    assert ended[:2] == (3, "failed after 16 ticks (no answer from a (not connected) at tick 17 for 5 s)\n")
     assert not processes_of(tmp_path / "out")
 
 
@@ -518,7 +518,7 @@ def _remembered(path: Path) -> None:
 
 
 def test_the_worlds_record_of_another_scenario_is_refused(recording: Path) -> None:
-    says = f"{recording / 'world.journal'}: the record of another scenario, paper-1"
+    says = f"{recording / 'world.journal'}: a recording of another scenario, paper-1"
     refuses(recording, "world", "paper-2", "--listen", free_endpoint(), says=says)
 
 

@@ -152,7 +152,7 @@ def test_stopped_for_longer_than_the_patience_a_process_fails_the_run(
     if name == "world":
         assert f"nothing received from the world for {PATIENCE_S:g} s" in said
     else:
-        assert f"no answer from {name[-1]} (not there) at tick " in said
+        assert f"no answer from {name[-1]} (not connected) at tick " in said
         assert f" for {PATIENCE_S:g} s" in said
     assert not processes_of(out)
 

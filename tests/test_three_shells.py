@@ -18,11 +18,11 @@ from protocol.wire import encode
 from tests.commands import TandemProcess, journals, processes_of, several_pairs, tandem, world
 from tests.series import series
 
-NOBODY = "nobody listens there; check the address, and that the router runs"
+NOBODY = "nothing listens there; check the address, and that the router runs"
 
 
 def unanswered() -> None:
-    raise AssertionError("nobody listens there")
+    raise AssertionError("nothing listens there")
 
 
 @pytest.fixture(scope="module")

@@ -181,7 +181,7 @@ def test_a_router_may_come_last(tmp_path: Path) -> None:
     with ExitStack() as stack:
         mission = parts(tmp_path / "scenario.toml", out, flags, stack)
         for part in mission.values():
-            part.until_says("nobody listens there; check the address, and that the router runs")
+            part.until_says("nothing listens there; check the address, and that the router runs")
         stack.enter_context(routing(Router(x), tmp_path))
         same(mission, out, expected)
 
@@ -196,7 +196,7 @@ def test_an_agent_that_is_a_router_says_where_it_cannot_listen() -> None:
 def test_a_world_whose_router_is_not_there_says_what_to_check_and_gives_up(tmp_path: Path) -> None:
     x = free_endpoint()
     ended = tandem("world", "paper-1", "--connect", x, "--timeout", "1", "--out", tmp_path / "out")
-    what = "nobody listens there; check the address, and that the router runs"
+    what = "nothing listens there; check the address, and that the router runs"
     assert ended == (3, "", f"tandem world: no router at {x}; gave up after 1 s: {what}\n")
     assert not (tmp_path / "out").exists()
 
@@ -206,7 +206,7 @@ def test_a_world_that_listens_says_what_to_check_of_a_router_that_is_not_there_a
 ) -> None:
     x, y = free_endpoint(), free_endpoint()
     with TandemProcess("world", "paper-1", *listen(y), *connect(x), "--out", tmp_path) as world:
-        world.until_says(f"no router at {x} yet: nobody listens there")
+        world.until_says(f"no router at {x} yet: nothing listens there")
         robots = [TandemProcess("agent", robot, *connect(y)) for robot in "ab"]
         for robot in robots:
             with robot:

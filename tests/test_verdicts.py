@@ -96,10 +96,10 @@ def judged(text: str, a: Covariance | None, *, off: float = 0.0) -> Judgement | 
     ("position", "heading", "what"),
     [
         (0.0999, 0.199, None),
-        (0.101, 0.01, "a claims a position known to 0.101 m, of 0.1"),
-        (0.01, 0.201, "a claims a heading known to 0.201 rad, of 0.2"),
-        (4.5e7, 0.01, "a claims a position known to 4.5e+07 m, of 0.1"),
-        (3e7, 3e7, "a claims a position known to 3e+07 m, of 0.1"),
+        (0.101, 0.01, "a claims a position known to 0.101 m, required 0.1"),
+        (0.01, 0.201, "a claims a heading known to 0.201 rad, required 0.2"),
+        (4.5e7, 0.01, "a claims a position known to 4.5e+07 m, required 0.1"),
+        (3e7, 3e7, "a claims a position known to 3e+07 m, required 0.1"),
     ],
 )
 def test_a_robot_that_knows_its_pose_less_well_than_was_asked_is_not_localised(

@@ -472,7 +472,7 @@ def test_ctrl_c_ends_the_page_with_somebody_watching(paper_1: Path) -> None:
             [".", "--connect", "tcp/127.0.0.1:7447"],
             "--connect: a record needs no network; leave out one of the two",
         ),
-        (["--connect", "here"], "--connect: 'here' is no endpoint; one looks like tcp/127.0.0.1:7447"),
+        (["--connect", "here"], "--connect: 'here' is not an endpoint; expected one such as tcp/127.0.0.1:7447"),
         (
             [".", "--port", "65536"],
             "argument --port: 65536 is not a port, from 0 (one that is free) to 65535",

@@ -1,1 +1,1 @@
-"""What is true, and the process that owns it."""
+"""The simulator: true poses, sensors, the radio channel, and the process that runs them."""

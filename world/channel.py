@@ -1,7 +1,7 @@
-"""Which reports reach whom in this tick: the air between two robots, one way.
+"""The channel model: which Reports are received on a link, the way from one robot to its peer, in each tick.
 
-Without faults every report is heard in the tick in which it is sent. A report is heard only if the tick of
-sending and the tick of hearing are both in contact.
+Without faults, every Report is received in the tick in which it is sent. A Report is only received if the
+robots are in contact both when it is sent and when it is due.
 """
 
 from __future__ import annotations
@@ -16,58 +16,64 @@ from world.random_streams import uniform
 
 
 class InFlight(NamedTuple):
-    """A copy of a report under way."""
+    """A copy of a Report that has been sent, and is not due yet."""
 
     due: int
-    """the tick in which it comes"""
+    """The tick in which it is received."""
     tick: int
-    """of the report"""
+    """The tick in which it was sent."""
     overtaken: bool
-    """whether it comes after those that were sent in the tick in which it is due"""
+    """True if it is received after the Reports that are sent in the tick in which it is due."""
     damaged: bool
+    """True if it arrives damaged."""
     copy: int
-    """which of the copies: bit i is set where the fault at place i has made it"""
+    """The identity of the copy: bit i is set if the fault at index i has duplicated it."""
 
 
 class LinkState(msgspec.Struct, frozen=True):
-    """One link, after a tick: what it carries, and what has come in it."""
+    """The state of a link at one tick."""
 
     heard: tuple[int, ...] = ()
-    """the ticks of the reports that came in this tick, in order"""
+    """The ticks of the Reports that are received in this tick, in the order of their arrival."""
     damaged: tuple[int, ...] = ()
-    """of those that came damaged"""
+    """The ticks of the Reports that arrive damaged in this tick."""
     flying: tuple[InFlight, ...] = ()
+    """The copies that are not due yet."""
     contacts: int = 0
-    """ticks in which the two have been in contact"""
+    """The number of ticks so far in which the two robots were in contact."""
     bursts: tuple[bool, ...] = ()
-    """of each fault of the link: whether it is in a burst"""
+    """For each fault of the link, whether it is in a burst."""
     room: tuple[float, ...] = ()
-    """of each: how many reports may come yet"""
+    """For each fault of the link, the number of Reports for which its bandwidth still has room."""
 
 
 class LinkFaults(NamedTuple):
-    """The faults on one link, each with its place in the plan."""
+    """The faults that affect one link."""
 
     sender: str
+    """The robot that sends."""
     receiver: str
+    """The robot that receives."""
     faults: tuple[tuple[int, Fault], ...]
+    """The faults, each with its index in the fault plan."""
 
     @property
     def name(self) -> str:
-        """a->b"""
+        """The name of the link, such as "a->b", which keys its random numbers."""
         return f"{self.sender}->{self.receiver}"
 
 
 def of_plan(plan: Sequence[Fault], sender: str, receiver: str) -> LinkFaults:
-    """What of `plan` is on the way from `sender` to `receiver`."""
+    """Return the faults of `plan` that affect the link from `sender` to `receiver`."""
     on_it = [(i, fault) for i, fault in enumerate(plan) if fault.on(sender, receiver)]
     return LinkFaults(sender, receiver, tuple(on_it))
 
 
 def carried(air: LinkState, links: LinkFaults, seed: int, tick: int, *, in_contact: bool) -> LinkState:
-    """The air one tick on: at `tick`, in which the sender says its report if the two are in contact.
+    """Return the state of the link at `tick`, given its state `air` at the tick before.
 
-    What is due out of contact is lost.
+    The sender sends a Report at `tick` if the robots are in contact. Reports that are due while they are not
+    in contact are lost.
     """
     flying = air.flying
     bursts = air.bursts or (False,) * len(links.faults)
@@ -81,7 +87,7 @@ def carried(air: LinkState, links: LinkFaults, seed: int, tick: int, *, in_conta
         )
         flying += tuple(_sent(links, bursts, active, seed, tick))
     due = sorted([one for one in flying if one.due <= tick], key=lambda one: one.overtaken)
-    coming, room = _let_through(due if in_contact else [], links, air, tick)
+    coming, room = _limited(due if in_contact else [], links, air, tick)
     return LinkState(
         heard=tuple([one.tick for one in coming if not one.damaged]),
         damaged=tuple([one.tick for one in coming if one.damaged]),
@@ -93,7 +99,10 @@ def carried(air: LinkState, links: LinkFaults, seed: int, tick: int, *, in_conta
 
 
 def _burst(burst: bool | None, fault: Fault, draw: float) -> bool:
-    """The chain's next state; its first is as if it had always gone on, as it does outside windows."""
+    """Return whether the link is in a burst next, in a Gilbert-Elliott chain.
+
+    The first state is drawn from the stationary distribution. The chain also runs outside the fault's window.
+    """
     if burst is None:
         return draw < fault.bursty
     return draw >= fault.burst_end if burst else draw < fault.burst_start
@@ -106,18 +115,18 @@ def _draw(seed: int, fault: int, what: str, links: LinkFaults, tick: int) -> flo
 def _sent(
     links: LinkFaults, bursts: Sequence[bool], active: Sequence[bool], seed: int, tick: int
 ) -> list[InFlight]:
-    """The copies of the report of `tick` that are not lost at once."""
+    """Return the copies of the Report of `tick` that are not lost, after all active faults."""
     copies = [InFlight(tick, tick, overtaken=False, damaged=False, copy=0)]
-    for (i, fault), burst, there in zip(links.faults, bursts, active, strict=True):
-        if there:
-            copies = [copy for one in copies for copy in _befallen(one, i, fault, burst, links, seed)]
+    for (i, fault), burst, is_active in zip(links.faults, bursts, active, strict=True):
+        if is_active:
+            copies = [copy for one in copies for copy in _faulty(one, i, fault, burst, links, seed)]
     return copies
 
 
-def _befallen(
+def _faulty(
     one: InFlight, place: int, fault: Fault, burst: bool, links: LinkFaults, seed: int
 ) -> list[InFlight]:
-    """What becomes of a copy."""
+    """Return the copies that the fault at index `place` makes of `one`: none if it is lost."""
 
     def happens(what: str, chance: float, copy: int = one.copy) -> bool:
         return chance > 0.0 and _draw(seed, place, f"{what}/{copy}", links, one.tick) < chance
@@ -139,12 +148,13 @@ def _befallen(
     return copies
 
 
-def _let_through(
+def _limited(
     due: Sequence[InFlight], links: LinkFaults, air: LinkState, tick: int
 ) -> tuple[list[InFlight], tuple[float, ...]]:
-    """Those of `due` for which every fault's bandwidth has room, and the room that is left.
+    """Return those of `due` that fit the bandwidth of every fault, and the room that remains.
 
-    What is left is kept, up to one report's: else of 0.6 a tick only one in two ticks would come.
+    Up to one Report of unused room is carried over to the next tick. If it were dropped after each Report, a
+    bandwidth of 0.6 Reports per tick would only let one through in two ticks.
     """
     rates = [
         fault.reports_per_tick if fault.active(tick, air.contacts) else None for _, fault in links.faults

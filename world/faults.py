@@ -1,4 +1,4 @@
-"""What may befall the reports on their way: a fault plan, of which every accident follows from the seed."""
+"""The faults of the radio: a fault plan, from which the channel draws all losses with the scenario's seed."""
 
 from __future__ import annotations
 
@@ -12,86 +12,92 @@ from msgspec import Meta
 from protocol.units import RobotId, Tick
 
 MAX_DELAY = 50
-"""ticks, of all the faults on a link together"""
+"""The maximum delay in ticks, of all faults on a link together."""
 MAX_FAULTS = 8
-"""on a link: each may double what those before it have doubled"""
+"""The maximum number of faults on a link. Each may duplicate the copies that the previous ones made."""
 LATEST = MAX_DELAY + MAX_FAULTS
-"""ticks after which no report is heard, each fault having reordered it, too; agents keep it longer"""
+"""The maximum delay in ticks, with reordering by each fault. Agents store Reports for longer."""
 
 Chance = Annotated[float, Meta(ge=0.0, le=1.0)]
+"""A probability."""
 Delay = Annotated[int, Meta(ge=0, le=MAX_DELAY)]
+"""A delay, in ticks."""
 Window = tuple[Tick, Tick]
-"""ticks, the first inside and the last outside"""
+"""An interval of ticks, which includes the first and excludes the second."""
 
 
 class LinkSelector(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """From one robot to its peer, or both ways."""
+    """The link from one robot to its peer, or the links in both directions."""
 
     sender: RobotId
+    """The robot that sends."""
     receiver: RobotId
+    """The robot that receives."""
     both: bool
+    """True to select the opposite link, too."""
 
     def leads(self, sender: str, receiver: str) -> bool:
-        """Whether a report from `sender` to `receiver` takes it."""
+        """Return whether the link from `sender` to `receiver` is selected."""
         if (self.sender, self.receiver) == (sender, receiver):
             return True
         return self.both and (self.sender, self.receiver) == (receiver, sender)
 
 
 class Fault(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """What may befall a report on a link; several faults befall it one after the other."""
+    """A fault of the radio. Several faults on a link are applied to each Report, in their order."""
 
     link: LinkSelector | None = None
-    """all of them, where there is none"""
+    """The affected links; None for all links."""
     loss: Chance = 0.0
-    """the probability that it is lost"""
+    """The probability that a Report is lost."""
     burst_start: Chance = 0.0
-    """per tick in contact, the probability that a burst begins (Gilbert and Elliott's chain)"""
+    """The probability per tick in contact that a burst of losses begins, in a Gilbert-Elliott chain."""
     burst_end: Chance = 1.0
-    """and that it ends: the mean length of a burst is 1 / burst_end"""
+    """The probability per tick in contact that a burst ends. The mean length of a burst is 1 / burst_end."""
     burst_loss: Chance = 1.0
-    """the probability that a report is lost in a burst"""
+    """The probability that a Report is lost during a burst."""
     partition: bool = False
-    """all are lost"""
+    """True to lose all Reports."""
     delay: tuple[Delay, Delay] = (0, 0)
-    """ticks until it is heard, uniform between these, both included"""
+    """The minimum and maximum of the uniformly distributed delay, in ticks, both inclusive."""
     duplicate: Chance = 0.0
-    """the probability that it comes twice, each with a delay of its own"""
+    """The probability that a Report is received twice. The two copies have independent delays."""
     reorder: Chance = 0.0
-    """the probability that it comes a tick later still, after what was sent then"""
+    """The probability that a Report is received one tick later, after the Reports that are sent then."""
     corrupt: Chance = 0.0
-    """the probability that it comes damaged, and is refused"""
+    """The probability that a Report arrives damaged, and is refused."""
     reports_per_tick: Annotated[float, Meta(gt=0.0, le=1e3)] | None = None
-    """how many may come in a tick, in the mean; what is more is lost"""
+    """The mean number of Reports that fit in a tick; None for no limit. Reports beyond it are lost."""
     ticks: Window | None = None
-    """when the fault is there; always, where neither window is given"""
+    """The ticks in which the fault is active; None for all ticks."""
     contact_ticks: Window | None = None
-    """likewise, counted in ticks in which the two have been in contact"""
+    """The ticks in contact in which the fault is active, counted from the first contact; None for all."""
 
     def on(self, sender: str, receiver: str) -> bool:
-        """Whether it is on the way from `sender` to `receiver`."""
+        """Return whether the fault affects the link from `sender` to `receiver`."""
         return self.link is None or self.link.leads(sender, receiver)
 
     def active(self, tick: int, contacts: int) -> bool:
-        """Whether it is there in `tick`, before which the two have been in contact in `contacts` ticks."""
+        """Return whether the fault is active at `tick`, after `contacts` earlier ticks in contact."""
         return _inside(self.ticks, tick) and _inside(self.contact_ticks, contacts)
 
     @property
     def bursty(self) -> float:
-        """The share of ticks in contact that are in a burst."""
+        """The mean fraction of ticks in contact that are in a burst."""
         return self.burst_start / (self.burst_start + self.burst_end) if self.burst_start else 0.0
 
     @property
     def let_through(self) -> float:
-        """The share of reports that it lets through where it is always there."""
+        """The mean fraction of Reports that are received undamaged while the fault is active."""
         share = (1.0 - self.loss) * (1.0 - self.corrupt) * (1.0 - self.bursty * self.burst_loss)
         return share * min(1.0, self.reports_per_tick or 1.0)
 
 
 def delivery_time_bound(plan: Sequence[Fault]) -> int:
-    """Ticks within which a report gets through that is told again every tick; hardly ever it takes more.
+    """Return the ticks within which a Report that is sent again in every tick is almost certainly received.
 
-    Windows of no contact are counted whole; what never lets anything through is not waited for.
+    The whole length of a window without any delivery is added. A fault without a window that never delivers
+    anything is not counted: no time would be long enough.
     """
     through, burst, ticks = 1.0, 1.0, 0
     for fault in plan:
@@ -106,7 +112,7 @@ def delivery_time_bound(plan: Sequence[Fault]) -> int:
 
 
 UNLUCKY = 20.0
-"""times its mean: a wait so long has the probability e^-20"""
+"""The factor between the mean waiting time and the bound. A longer wait has the probability e^-20."""
 
 
 def _inside(window: Window | None, tick: int) -> bool:

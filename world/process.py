@@ -1,11 +1,12 @@
-"""The world's process: its clock is the barrier of the tick.
+"""The process of the world: it sends Observations, waits for Commands, and so is the clock of all robots.
 
-Lockstep goes as fast as the answers come, and no decision depends on a time-out. A robot that has not
-answered is sent its Observation again when it appears, and every REPEAT_S; and so is its peer, whose reports it may
-have lost. That one rule serves late starters, lost messages and restarted agents; and a world that is started
-again, which says to everyone what it would have said. Everyone is sent its Observation again every REPEAT_TO_ALL_S,
-so that no link falls silent meanwhile. In real time a tick lasts its period, and a robot whose Command did not
-come stands still.
+In lockstep, a tick lasts until all robots have answered, and no decision depends on a timeout. In real time,
+a tick lasts its period, and a robot without a Command rests for that tick.
+
+In lockstep, the world repeats an unanswered Observation when the robot appears, and every REPEAT_S. It also
+repeats that of the robot's peer, which then sends its Report again. This covers late starters, lost messages,
+restarted agents and a restarted world. Every REPEAT_TO_ALL_S, the world repeats the Observations of all
+robots, so that their agents do not take the link for lost.
 """
 
 from __future__ import annotations
@@ -25,27 +26,29 @@ from protocol.wire import MalformedFrame, decode, encode
 from world.referee import Judgement
 from world.simulation import Course
 
-SILENCE_S = 3.0
-"""a replaceable link over which no robot has said anything for so long is replaced, as an agent's is"""
+LINK_TIMEOUT_S = 3.0
+"""The time in s without a message after which a replaceable link is replaced. Agents do the same."""
 REPEAT_S = 0.25
-"""how often what is unanswered is said again"""
+"""The period in s in which an unanswered message is repeated."""
 REPEAT_TO_ALL_S = 1.0
-"""how often everyone is told again, as long as somebody has not answered; less than the silence after which
-an agent replaces its link"""
-FAREWELL_S = 2.0
-"""how long the world waits for the last word of robots that had not answered any more"""
+"""The period in s in which messages are repeated to all robots while one has not answered.
+
+It is shorter than the time after which an agent replaces its link.
+"""
+FINAL_REPORT_TIMEOUT_S = 2.0
+"""The time in s to wait for the FinalReport of a robot that did not answer in the last tick."""
 
 
 class NoAnswer(TimeoutError):
-    """Somebody did not answer within the patience; says who."""
+    """Robots did not answer within the timeout. The text of the error names them."""
 
 
 class RobotsLinkLost(Exception):
-    """Nothing comes over this link any more; over another the robots may be there."""
+    """Nothing is received over this link any more. The robots may be reachable over another one."""
 
 
 class WorldProcess:
-    """One run, over one session after the other. Nothing is heard or said before one is attached."""
+    """One run, over one session after another. A session has to be attached before `play`."""
 
     def __init__(
         self,
@@ -57,9 +60,10 @@ class WorldProcess:
         timeout: float = 30.0,
         on_kill_point: Callable[[str, int], None] | None = None,
     ) -> None:
-        """`course` may have come some way. `rate` is real time's speed, lockstep without.
+        """Run `course`, which may be a resumed one, under the run name `run`.
 
-        `timeout` (s) bounds every wait for an answer; `on_kill_point` is told how far each tick has come.
+        `rate` is the speed of real time; None for lockstep. `timeout` (s) limits each wait for an answer.
+        `on_kill_point` is called with the name and tick of each point at which the process can be killed.
         """
         self._run = run
         scenario = course.world.scenario
@@ -73,31 +77,38 @@ class WorldProcess:
         self._robots = [robot.id for robot in scenario.robots]
         self._peers = {robot.id: robot.peer for robot in scenario.robots}
         self._repeat = self._repeat_to_all = math.inf
-        """when what is unanswered is said again, and when it is said to everyone"""
+        """The times of the next repetition to robots that have not answered, and to all robots."""
         self._alive: set[str] = set()
+        """The robots with a liveliness token."""
         self._answered = time.monotonic()
-        """when a robot last appeared, or answered something new"""
+        """The time at which a robot last appeared, or sent a new answer."""
         self._late = 0
-        """Drives of ticks that are over"""
+        """The number of discarded Commands of earlier ticks."""
         self._latest: dict[str, int] = {}
-        """of each robot: the tick of the latest Command that came, in time or not"""
+        """The tick of the latest Command of each robot, in time or not."""
         self._truth_wanted = False
-        self._mute = math.inf
-        """when its link counts as lost, if nothing comes until then"""
-        self._silence = math.inf
+        """True while a viewer subscribes to GroundTruth."""
+        self._link_deadline = math.inf
+        """The time at which the link counts as lost if nothing is received until then."""
+        self._link_timeout = math.inf
+        """The time in s without a message after which the link counts as lost."""
         self._began: float | None = None
-        """when everyone had answered the first Sense"""
+        """The time at which all robots had answered the first Observation."""
         self.playing_s = 0.0
-        """wall time since then, to the MissionEnd"""
-        self._parting: float | None = None
-        """when the MissionEnd was first said"""
-        self._last_words: dict[str, FinalReport] = {}
+        """The wall time in s from then to the MissionEnd."""
+        self._ended: float | None = None
+        """The time at which the MissionEnd was first sent."""
+        self._final_reports: dict[str, FinalReport] = {}
+        """The FinalReports received so far, by robot."""
 
     def attach(self, link: zenoh.Session, *, replaceable: bool = False) -> None:
-        """From now on, this is the session over which it hears and is heard; `replaceable` by silence."""
+        """Send and receive over the session `link` from now on.
+
+        If it is `replaceable`, `play` raises RobotsLinkLost after LINK_TIMEOUT_S and a tick without messages.
+        """
         run, inbox = self._run, self._inbox
-        self._silence = SILENCE_S + self._tick_s if replaceable else math.inf
-        self._mute = time.monotonic() + self._silence
+        self._link_timeout = LINK_TIMEOUT_S + self._tick_s if replaceable else math.inf
+        self._link_deadline = time.monotonic() + self._link_timeout
         self._observation = {
             robot: session.publisher(link, keys.observation(run, robot)) for robot in self._robots
         }
@@ -105,19 +116,20 @@ class WorldProcess:
         session.on_matching(self._truth, self._want_truth)
         session.subscribe(link, keys.command(run, "*"), inbox, "command")
         session.watch_liveliness(link, keys.robot_alive(run, "*"), inbox)
-        session.answer(link, keys.config(run, "*"), self._brief)
+        session.answer(link, keys.config(run, "*"), self._config)
         self._token = session.show_alive(link, keys.world_alive(run))
 
     def play(self) -> MissionEnd:
-        """The run, to its MissionEnd.
+        """Run to the end of the mission, collect the FinalReports, and return the MissionEnd.
 
-        Raises LinkLost, to be played on over another; or Interrupted when told to stop.
+        Raises RobotsLinkLost, after which `play` continues over another session; Interrupted by a signal;
+        CannotRecord.
         """
         course = self._course
         due: float | None = None
         end = course.over
         expected = self._robots if end is not None else []
-        if course.tick > 0 and self._period is not None:  # its clock goes on; not everyone is back yet
+        if course.tick > 0 and self._period is not None:  # a resumed run does not wait for all robots
             due = time.monotonic() + self._period
         try:
             while end is None:
@@ -131,22 +143,25 @@ class WorldProcess:
                 self._began = time.monotonic() if self._began is None else self._began
                 if self._period is not None:
                     due = max((due or self._began) + self._period, time.monotonic())
-        except NoAnswer as silence:
-            end = course.end(Judgement("failed", str(silence)))
-        self._parting = time.monotonic() if self._parting is None else self._parting
-        self.playing_s = self._parting - self._began if self._began is not None else 0.0
-        course.final_reports(self._farewells(end, expected))
-        self._say_who_gave_none()
+        except NoAnswer as error:
+            end = course.end(Judgement("failed", str(error)))
+        self._ended = time.monotonic() if self._ended is None else self._ended
+        self.playing_s = self._ended - self._began if self._began is not None else 0.0
+        course.final_reports(self._collect_final_reports(end, expected))
+        self._print_missing_final_reports()
         self._put({robot: encode(final_report) for robot, final_report in course.phase1_done_tick.items()})
         if refused := self._inbox.refused.total():
-            late = f", and left aside {self._late} of ticks past" if self._late else ""
+            late = f", and discarded {self._late} Commands of earlier ticks" if self._late else ""
             self._inbox.say(f"refused {refused} frames in all{late}")
         return end
 
     # --- a tick ---
 
     def _answers(self, observations: list[Observation], due: float | None) -> dict[str, Command]:
-        """Everyone's Command; in real time, where `due` is when the tick ends, those that came until then."""
+        """Return the Command of each robot; in real time, those received until `due`, the end of the tick.
+
+        Raises NoAnswer, RobotsLinkLost and Interrupted.
+        """
         tick = self._course.tick
         frames = {observation.robot: encode(observation) for observation in observations}
         if self._on_kill_point is not None:
@@ -167,7 +182,7 @@ class WorldProcess:
                     commands[command.robot] = command
                     self._answered = now
             if arrival.topic == "alive" and arrival.source.robot in self._alive:
-                self._tell_missed(arrival.source.robot)
+                self._send_missed(arrival.source.robot)
                 self._put_again(frames, [arrival.source.robot])
             if due is None and now >= self._repeat:
                 self._put_all_again(frames, frames.keys() - commands.keys(), now)
@@ -182,17 +197,17 @@ class WorldProcess:
             self._observation[robot].put(frame)
 
     def _put_again(self, frames: Mapping[str, bytes], robots: Iterable[str]) -> None:
-        """To `robots`, and to their peers, whose reports they may have lost."""
+        """Send the `frames` of `robots` again, and those of their peers, which then repeat their Reports."""
         named = {*robots} & self._peers.keys()
         named |= {self._peers[robot] for robot in named}
         self._put({robot: frame for robot, frame in frames.items() if robot in named})
 
     def _set_repeat(self, now: float) -> None:
-        """Something new is said."""
+        """Set the times of the next repetitions, after new messages have been sent."""
         self._repeat, self._repeat_to_all = now + REPEAT_S, now + REPEAT_TO_ALL_S
 
     def _put_all_again(self, frames: Mapping[str, bytes], missing: Iterable[str], now: float) -> None:
-        """To those that are `blocking_reason`, and to everyone where the last time is long ago."""
+        """Repeat the `frames` of the robots that are `missing`, or of all robots if that is due."""
         self._repeat = now + REPEAT_S
         if now < self._repeat_to_all:
             self._put_again(frames, missing)
@@ -200,17 +215,17 @@ class WorldProcess:
             self._repeat_to_all = now + REPEAT_TO_ALL_S
             self._put(frames)
 
-    def _tell_missed(self, robot: str) -> None:
-        """In real time, what the others have been told while `robot` was away."""
+    def _send_missed(self, robot: str) -> None:
+        """Send the Observations of the ticks in which `robot` did not answer in time, in real time."""
         for observation in self._course.missed.get(robot, ()):
             self._observation[robot].put(encode(observation))
 
     def _next(self, timeout: float) -> Arrival:
         now = time.monotonic()
-        arrival = self._inbox.next(min(timeout, self._mute - now))
+        arrival = self._inbox.next(min(timeout, self._link_deadline - now))
         if arrival is not NOTHING:
-            self._mute = now + self._silence
-        elif time.monotonic() >= self._mute:
+            self._link_deadline = now + self._link_timeout
+        elif time.monotonic() >= self._link_deadline:
             raise RobotsLinkLost
         robot = arrival.source.robot
         if arrival.topic == "alive" and robot in self._robots:
@@ -222,7 +237,7 @@ class WorldProcess:
         return arrival
 
     def _accepted(self, arrival: Arrival, kind: Any) -> Command | FinalReport | None:
-        """The message that arrived, if it is one of `kind` and from the robot whose key it came by."""
+        """Return the message that arrived, if it is a `kind` from the robot of its key; None if refused."""
         try:
             message: Command | FinalReport = decode(arrival.frame, kind)
         except MalformedFrame as error:
@@ -234,7 +249,7 @@ class WorldProcess:
         return message
 
     def _answer(self, arrival: Arrival) -> Command | None:
-        """The Command that arrived, if it is of this tick."""
+        """Return the Command that arrived, if it is one of this tick; None otherwise."""
         command = self._accepted(arrival, Command)
         if not isinstance(command, Command):
             return None
@@ -250,30 +265,30 @@ class WorldProcess:
 
     def _who_is_missing(self, commands: Mapping[str, Command]) -> str:
         missing = [robot for robot in self._robots if robot not in commands]
-        names = ", ".join(robot if robot in self._alive else f"{robot} (not there)" for robot in missing)
+        names = ", ".join(robot if robot in self._alive else f"{robot} (not connected)" for robot in missing)
         return f"no answer from {names} at tick {self._course.tick} for {self._timeout:g} s"
 
-    def _say_who_gave_none(self) -> None:
-        """Tell of which robots there is no FinalReport, and why."""
+    def _print_missing_final_reports(self) -> None:
+        """Print the robots without a FinalReport, and why."""
         reasons: dict[str, list[str]] = {}
         for robot in self._robots:
             if robot not in self._course.phase1_done_tick:
-                reasons.setdefault(self._why_none(robot), []).append(robot)
+                reasons.setdefault(self._why_missing(robot), []).append(robot)
         for reason, robots in reasons.items():
             self._inbox.say(f"no FinalReport of {', '.join(robots)}: {reason}")
 
-    def _why_none(self, robot: str) -> str:
+    def _why_missing(self, robot: str) -> str:
         latest = self._latest.get(robot)
         if robot not in self._alive:
-            return "not there" if latest is None else f"gone; the last Command was of tick {latest}"
+            return "not connected" if latest is None else f"gone; the last Command was of tick {latest}"
         if latest is None:
-            return "there, but no Command has come"
+            return "connected, but it sent no Command"
         if latest < self._course.tick:
             slower = "; a lower --rate leaves more time for each tick" if self._period is not None else ""
             return f"behind, at tick {latest} of {self._course.tick}{slower}"
         return "no answer to the MissionEnd"
 
-    # --- beside the tick ---
+    # --- outside the tick ---
 
     def _show_truth(self) -> None:
         if self._truth_wanted:
@@ -284,43 +299,43 @@ class WorldProcess:
     def _want_truth(self, wanted: bool) -> None:
         self._truth_wanted = wanted
 
-    def _brief(self, robot: str) -> Message | str:
+    def _config(self, robot: str) -> Message | str:
         if robot not in self._robots:
             near = did_you_mean(robot, self._robots)
             return f"this world has no robot '{robot}'; it has {', '.join(self._robots)}{near}"
         return self._scenario.config(robot, self._period)
 
-    def _farewells(self, end: MissionEnd, expected: Collection[str]) -> list[FinalReport]:
-        """Tell everyone that it is over, until everyone has answered or left.
+    def _collect_final_reports(self, end: MissionEnd, expected: Collection[str]) -> list[FinalReport]:
+        """Send `end` to all robots until they have answered or are gone, and return the FinalReports.
 
-        Who answered in the last tick is waited for with patience, though it be started again; `expected`, and
-        whoever else is there, for FAREWELL_S.
+        Robots that answered in the last tick are waited for up to the timeout, because they may be restarted.
+        The `expected` ones and all others that are connected are waited for up to FINAL_REPORT_TIMEOUT_S.
         """
         frames = dict.fromkeys(self._robots, encode(end))
-        said = self._last_words = {**self._course.phase1_done_tick, **self._last_words}
+        received = self._final_reports = {**self._course.phase1_done_tick, **self._final_reports}
         now = time.monotonic()
-        began = self._parting or now
+        began = self._ended or now
         self._repeat = self._repeat_to_all = now
-        told = False
+        printed = False
         while True:
-            last_words = set(self._course.witnesses) - said.keys()
-            others = self._alive.union(expected) - said.keys()
-            give_up = began + (self._timeout if last_words else FAREWELL_S)
-            if now >= give_up or not (last_words or others):
-                return list(said.values())
-            if last_words and now >= began + FAREWELL_S and not told:
-                told = True
-                names = ", ".join(sorted(last_words))
-                self._inbox.say(f"waiting {self._timeout:g} s for the last word of {names}")
+            required = set(self._course.witnesses) - received.keys()
+            others = self._alive.union(expected) - received.keys()
+            give_up = began + (self._timeout if required else FINAL_REPORT_TIMEOUT_S)
+            if now >= give_up or not (required or others):
+                return list(received.values())
+            if required and now >= began + FINAL_REPORT_TIMEOUT_S and not printed:
+                printed = True
+                names = ", ".join(sorted(required))
+                self._inbox.say(f"waiting {self._timeout:g} s for the FinalReport of {names}")
             if now >= self._repeat:
-                self._put_all_again(frames, last_words | others, now)
+                self._put_all_again(frames, required | others, now)
             arrival = self._next(min(self._repeat, give_up) - now)
             if arrival.topic == "alive":
                 self._put_again(frames, [arrival.source.robot])
             if arrival.topic == "command":
                 last = self._accepted(arrival, Command | FinalReport)
                 if isinstance(last, FinalReport):
-                    said[last.robot] = last
+                    received[last.robot] = last
                 elif last is not None and last.tick <= end.tick:
                     self._latest[last.robot] = last.tick
             now = time.monotonic()

@@ -1,6 +1,7 @@
-"""Chance, keyed: what is drawn follows from (seed, sensor, robot, tick) and from nothing else.
+"""Random numbers, each a function of its key (seed, sensor, robot, tick).
 
-So one more outlier shifts no other draw, and any tick can be drawn again alone.
+Without a shared sequence, an additional outlier changes no other random number, and each tick can be
+recomputed on its own.
 """
 
 from __future__ import annotations
@@ -9,16 +10,16 @@ import hashlib
 import math
 
 _WORD = 1 << 52
-"""values that a uniform number may have: its floats are exact, and none is 0 or 1"""
+"""The number of values of a uniform number. All of them are exact floats, and none is 0 or 1."""
 
 
 def uniform(seed: int, sensor: str, robot: str, tick: int) -> float:
-    """In (0, 1), neither end included."""
+    """Return a uniformly distributed number in the open interval (0, 1)."""
     return _uniforms(seed, sensor, robot, tick)[0]
 
 
 def gaussian(seed: int, sensor: str, robot: str, tick: int) -> float:
-    """Of mean 0 and variance 1 (Box and Muller)."""
+    """Return a Gaussian number with mean 0 and variance 1, by the Box-Muller transform."""
     one, other = _uniforms(seed, sensor, robot, tick)
     return math.sqrt(-2.0 * math.log(one)) * math.cos(math.tau * other)
 

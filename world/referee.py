@@ -1,4 +1,4 @@
-"""How a run ended, judged by the truth."""
+"""The outcome of a run, decided by comparing the robots' results with the true poses."""
 
 from __future__ import annotations
 
@@ -15,23 +15,28 @@ from world.scenario import Scenario
 from world.truth import Truth
 
 SIGMAS = 5.0
-"""of those that it claims: farther off than this it is wrong where they are not"""
+"""The number of claimed standard deviations by which a claim may differ from the truth, with noise."""
 
 
 class Judgement(msgspec.Struct, frozen=True):
-    """The outcome of a run, and why it is no better."""
+    """The outcome of a run."""
 
     outcome: Outcome
+    """The outcome."""
     reason: str | None = None
+    """The reason, for a user; None if the outcome is `localised`."""
 
 
 def errors(claim: Pose, truth: Pose) -> tuple[float, float]:
-    """How far off `claim` is: m, and rad."""
+    """Return the error of the position in m, and of the heading in rad."""
     return math.hypot(claim.x - truth.x, claim.y - truth.y), abs(wrap(claim.heading - truth.heading))
 
 
 def tolerances(claim: Localised, mission: Mission) -> tuple[float, float]:
-    """How far off `claim` may be: m, and rad. No sigma counts for more than the mission asks for."""
+    """Return the maximum errors of a correct claim: of the position in m, and of the heading in rad.
+
+    They are 5 claimed standard deviations, of at most the required accuracy, and at least TOLERANCE.
+    """
     if claim.covariance is None or mission.noise.exact:
         return TOLERANCE, TOLERANCE
     return (
@@ -41,20 +46,20 @@ def tolerances(claim: Localised, mission: Mission) -> tuple[float, float]:
 
 
 def inaccuracy(claim: Localised, mission: Mission) -> str | None:
-    """What `claim` knows less well than the mission asks for, in words; None if there is nothing."""
+    """Return how `claim` misses the required accuracy, for a user; None if it does not."""
     covariance = claim.covariance
     if covariance is None:
         return None
     position, heading = covariance.position_sigma, covariance.heading_sigma
     if position > mission.accuracy:
-        return f"claims a position known to {position:.3g} m, of {mission.accuracy:g}"
+        return f"claims a position known to {position:.3g} m, required {mission.accuracy:g}"
     if heading > HEADING_ACCURACY:
-        return f"claims a heading known to {heading:.3g} rad, of {HEADING_ACCURACY:g}"
+        return f"claims a heading known to {heading:.3g} rad, required {HEADING_ACCURACY:g}"
     return None
 
 
 def mistake(claim: Localised, truth: Pose, mission: Mission) -> str | None:
-    """How far off `claim` is, in words, if that makes it wrong."""
+    """Return the errors of `claim`, for a user, if it is wrong; None if it is correct."""
     position, heading = errors(claim.pose, truth)
     far, askew = tolerances(claim, mission)
     if position <= far and heading <= askew:
@@ -62,7 +67,7 @@ def mistake(claim: Localised, truth: Pose, mission: Mission) -> str | None:
     off, covariance = f"{position:.3g} m and {heading:.3g} rad off", claim.covariance
     if covariance is None:
         return off
-    return f"{off}, of sigmas {covariance.position_sigma:.3g} m and {covariance.heading_sigma:.3g} rad"
+    return f"{off}, with sigmas {covariance.position_sigma:.3g} m and {covariance.heading_sigma:.3g} rad"
 
 
 def judge(
@@ -71,11 +76,12 @@ def judge(
     verdicts: Mapping[str, Verdict],
     claimed: Mapping[str, Pose] | None = None,
 ) -> Judgement | None:
-    """The judgement once nothing more can come, or time is up; None while the mission goes on.
+    """Return the outcome once all results are known or `max_ticks` is reached; None before.
 
-    A claim is held against where the robot was when it claimed, as `claimed` says; else against where it
-    is. A robot whose peer has given up cannot localise any more. A robot that claims a pose and knows it less
-    well than the mission asks for is not localised.
+    A claim is compared with the true pose at the tick of the claim, which is in `claimed`, or with the
+    current one if `claimed` is None. The run does not wait for a robot whose peer is undecided or
+    inconsistent, because it can no longer be localised. A claim below the required accuracy does not count
+    as localised.
     """
     open_cases = [
         robot.id
@@ -94,11 +100,11 @@ def judge(
 
 
 def _no_better(scenario: Scenario, verdicts: Mapping[str, Verdict], open_cases: Sequence[str]) -> Judgement:
-    """The judgement where no claim is wrong."""
+    """Return the outcome of a run without a wrong claim."""
     for robot in scenario.robots:
         verdict = verdicts.get(robot.id)
         if isinstance(verdict, Inconsistent):
-            return Judgement("inconsistent", f"{robot.id}: {robot.peer} tells {verdict.claim}")
+            return Judgement("inconsistent", f"{robot.id}: {robot.peer} reports {verdict.claim}")
     for robot in scenario.robots:
         match verdicts.get(robot.id):
             case Undecided(reason):

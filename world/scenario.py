@@ -1,4 +1,4 @@
-"""What the world is told before it starts: the mission, and who is where. Its journal begins with it."""
+"""The complete description of a mission from which a world starts. It is the second frame of its journal."""
 
 from __future__ import annotations
 
@@ -14,48 +14,64 @@ from world.faults import Fault
 
 
 class RobotSpec(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """One robot: whom it is to find, which anchor ranges it, and where it is released."""
+    """The specification of one robot."""
 
     id: RobotId
+    """The name of the robot."""
     peer: RobotId
+    """The robot that it has to meet."""
     role: Role
+    """The role of the robot in the pair."""
     anchor: Anchor
+    """The position of its anchor in <W>, in m."""
     start: Pose
+    """The true pose at tick 0 in <W>, which is unknown to the robot: m, m and rad."""
     rendezvous: Rendezvous
+    """The orbits of the pair."""
     attack: Attack | None = None
+    """The false data that the robot injects into its Reports; None for an honest robot."""
 
 
 class Scenario(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="scenario"):
-    """A validated mission, complete: nothing in it is left to be drawn or worked out."""
+    """A validated mission. All its random and derived values have been computed."""
 
     name: str
+    """The name of the scenario."""
     seed: int
+    """The seed of all random numbers."""
     max_ticks: Tick
+    """The tick at which the run ends at the latest."""
     mission: Mission
+    """The parameters of the mission."""
     planner_name: PlannerName
+    """The name of the planner of all robots."""
     robots: tuple[RobotSpec, ...]
+    """The robots, in pairs of peers."""
     faults: tuple[Fault, ...] = ()
-    """of the radio"""
+    """The fault plan of the radio."""
 
     def pairs(self) -> tuple[tuple[int, int], ...]:
-        """Which robots are each other's peer, by their place; a first."""
+        """Return the pairs of peers as indices into `robots`, with robot a first."""
         place = {robot.id: i for i, robot in enumerate(self.robots)}
         return tuple((place[one.id], place[one.peer]) for one in self.robots if one.role == "a")
 
     def robot(self, robot: str) -> RobotSpec:
-        """Raises KeyError if nobody is called that."""
-        for placed in self.robots:
-            if placed.id == robot:
-                return placed
+        """Return the specification of `robot`. Raises KeyError if there is no such robot."""
+        for spec in self.robots:
+            if spec.id == robot:
+                return spec
         raise KeyError(robot)
 
     def is_of(self, config: RobotConfig) -> bool:
-        """Whether that is what one of its robots is told, be it in real time or in lockstep."""
-        known = any(placed.id == config.robot for placed in self.robots)
+        """Return whether `config` is the configuration of one of the robots, with any `tick_s`."""
+        known = any(spec.id == config.robot for spec in self.robots)
         return known and self.config(config.robot, config.tick_s) == config
 
     def config(self, robot: str, tick_s: float | None = None) -> RobotConfig:
-        """What `robot` is told; nothing of where it is. `tick_s` is set in real time only."""
+        """Return the configuration of `robot`, without its pose. `tick_s` (s) is for real time only.
+
+        Raises KeyError if there is no such robot.
+        """
         own = self.robot(robot)
         return RobotConfig(
             robot=own.id,

@@ -1,6 +1,6 @@
-"""What can be measured: ranges to anchors and between peers, within R, bounds included; and odometry.
+"""The sensor models: ranges to anchors and between peers, up to and including R, and odometry.
 
-Where the mission has no noise they are exact, and nothing is drawn.
+Without noise, measurements are exact, and no random numbers are drawn.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from world.truth import Truth
 
 
 def anchor_ranges(truth: Truth, scenario: Scenario) -> list[float | None]:
-    """m: what each robot measures to its own anchor (eq. (1b)); none where that is out of range."""
+    """Return the measured range of each robot to its own anchor (eq. (1b)), in m; None if there is none."""
     reach, sigma = scenario.mission.sensing_range, scenario.mission.noise.anchor_sigma
     ranges: list[float | None] = []
     for pose, origin, robot in zip(truth.local, truth.origins, scenario.robots, strict=True):
@@ -31,14 +31,14 @@ def anchor_ranges(truth: Truth, scenario: Scenario) -> list[float | None]:
 
 
 class Mutual(NamedTuple):
-    """Of a pair that is in range of each other."""
+    """The measurement of a pair whose robots are in range of each other."""
 
     range: float | None
-    """m, as it is measured: once, and told to both; none if that failed"""
+    """The measured range in m, the same for both robots; None for a drop-out."""
 
 
 def mutual_ranges(truth: Truth, scenario: Scenario, pairs: Sequence[tuple[int, int]]) -> list[Mutual | None]:
-    """Of every pair; none where the two are out of range."""
+    """Return the measurement of each pair; None if its robots are out of range of each other."""
     reach, sigma = scenario.mission.sensing_range, scenario.mission.noise.mutual_sigma
     ranges: list[Mutual | None] = []
     for i, j in pairs:
@@ -55,7 +55,7 @@ def mutual_ranges(truth: Truth, scenario: Scenario, pairs: Sequence[tuple[int, i
 def measured(
     rho: float, sigma: float, scenario: Scenario, sensor: str, robot: str, tick: int
 ) -> float | None:
-    """m: what is measured where the distance is `rho`; none of a drop-out."""
+    """Return the range in m that is measured at the true distance `rho` m; None for a drop-out."""
     noise, seed = scenario.mission.noise, scenario.seed
     if not (sigma or noise.outliers or noise.drop_outs):
         return rho
@@ -70,19 +70,19 @@ def measured(
 
 
 def executed(asked: Controls, scenario: Scenario, robot: str, tick: int) -> Controls:
-    """What the wheels make of a command over [tick, tick + 1]."""
+    """Return the controls that the robot executes over [tick, tick + 1], given the commanded ones."""
     return _disturbed(asked, scenario.mission.noise.actuation, scenario.seed, "actuation", robot, tick)
 
 
 def odometry(driven: Controls, scenario: Scenario, robot: str, tick: int) -> Controls:
-    """What is measured, at `tick`, of what was driven over [tick - 1, tick]."""
+    """Return the odometry at `tick`, given the controls that were executed over [tick - 1, tick]."""
     return _disturbed(driven, scenario.mission.noise.odometry, scenario.seed, "odometry", robot, tick)
 
 
 def _disturbed(
-    controls: Controls, drift: VelocityNoise, seed: int, sensor: str, robot: str, tick: int
+    controls: Controls, noise: VelocityNoise, seed: int, sensor: str, robot: str, tick: int
 ) -> Controls:
-    v, omega = drift.variances(controls.v, controls.omega)
+    v, omega = noise.variances(controls.v, controls.omega)
     return Controls(
         controls.v + math.sqrt(v) * gaussian(seed, f"{sensor}-v", robot, tick) if v else controls.v,
         controls.omega + math.sqrt(omega) * gaussian(seed, f"{sensor}-omega", robot, tick)

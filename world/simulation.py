@@ -1,4 +1,4 @@
-"""The course of one run: the world's value, tick after tick, and its journal."""
+"""The simulation of one run, with its journal. It does no other I/O."""
 
 from __future__ import annotations
 
@@ -16,45 +16,49 @@ from world.world_journal import history
 
 
 class Course:
-    """Whatever carries the frames, the world goes through here, so every mode journals the same bytes.
+    """The simulation of one run. All modes of execution use it, so they all write the same journal.
 
-    The journal holds the scenario, every tick's Commands (in the scenario's order), MissionEnd and the FinalReports.
+    The journal contains the environment, the scenario, the Commands of each tick in the scenario's order,
+    MissionEnd and the FinalReports.
     """
 
     def __init__(self, scenario: Scenario, journal: Sink | None = None) -> None:
         self.world = release(scenario)
         self.over: MissionEnd | None = None
-        """once the run is"""
+        """The end of the run; None while it is running."""
         self.witnesses: tuple[str, ...] = ()
-        """who answered in the tick that was the last, if they ended the run"""
+        """The robots that answered in the last tick, if their results ended the run."""
         self.phase1_done_tick: dict[str, FinalReport] = {}
-        """what they said to that, as far as it is on record"""
+        """The journaled FinalReports, by robot."""
         self.missed: dict[str, list[Observation]] = {}
-        """what robots have sensed since they last answered in time; a process that comes back may not know"""
+        """The Observations of each robot since its last Command in time, which a restarted agent may lack."""
         self._journal = journal
         if journal is not None:
             journal.write(encode(environment.of_world()), encode(scenario))
 
     @property
     def tick(self) -> int:
-        """k"""
+        """The tick k."""
         return self.world.truth.tick
 
     def observations(self) -> list[Observation]:
-        """What every robot senses now, in the order of the scenario."""
+        """Return the Observation of each robot, in the order of the scenario."""
         return observations(self.world)
 
     def keep(self, journal: Sink) -> None:
-        """Go on journaling there."""
+        """Write all further frames to `journal`."""
         self._journal = journal
 
     def command(self, commands: Mapping[str, Command]) -> MissionEnd | None:
-        """One tick on; or the end. A robot that is not in `commands` stands still."""
+        """Journal and execute the Commands of this tick; return the MissionEnd, or None if the run continues.
+
+        A robot that is not in `commands` rests for this tick. Raises CannotRecord.
+        """
         self.recording(commands)
         return self.advance(commands)
 
     def recording(self, commands: Mapping[str, Command]) -> None:
-        """First half of `command`: the tick is on record."""
+        """Journal the Commands of this tick: the first half of `command`. Raises CannotRecord."""
         if self._journal is not None:
             self._journal.write(
                 *[
@@ -66,7 +70,7 @@ class Course:
             )
 
     def advance(self, commands: Mapping[str, Command]) -> MissionEnd | None:
-        """Second half of `command`: everyone has moved."""
+        """Execute the Commands of this tick: the second half of `command`."""
         if self.missed or len(commands) < len(self.world.scenario.robots):
             self._note_missed(commands)
         onward = advance(self.world, commands)
@@ -84,27 +88,30 @@ class Course:
                 self.missed.setdefault(observation.robot, []).append(observation)
 
     def end(self, judgement: Judgement) -> MissionEnd:
-        """The run is over."""
+        """End the run with this outcome, and journal and return the MissionEnd. Raises CannotRecord."""
         self.over = MissionEnd(self.tick, judgement.outcome, judgement.reason)
         if self._journal is not None:
             self._journal.write(encode(self.over))
         return self.over
 
     def final_reports(self, final_reports: Iterable[FinalReport]) -> None:
-        """What the robots answered to the MissionEnd; those that answered."""
-        said = {final_report.robot: final_report for final_report in final_reports}
+        """Journal the FinalReports that are not in the journal yet, in the order of the scenario.
+
+        Those of robots that precede a journaled one are dropped, to keep the order. Raises CannotRecord.
+        """
+        received = {final_report.robot: final_report for final_report in final_reports}
         ids = [robot.id for robot in self.world.scenario.robots]
         latest = max([ids.index(robot) for robot in self.phase1_done_tick], default=-1)
-        new = [said[robot] for robot in ids[latest + 1 :] if robot in said]
+        new = [received[robot] for robot in ids[latest + 1 :] if robot in received]
         self.phase1_done_tick |= {final_report.robot: final_report for final_report in new}
         if self._journal is not None and new:
             self._journal.write(*[encode(final_report) for final_report in new])
 
 
 def again(scenario: Scenario, recording: Retrace) -> Course:
-    """The course of the run that `recording` tells, as far as it has come; of none, if there is nothing in it.
+    """Return the simulation at the end of the journal `recording`; at tick 0 if the journal is empty.
 
-    Raises CorruptJournal, also if it is that of another scenario, or if the world once went on otherwise.
+    Raises CorruptJournal if the journal is damaged, has another scenario, or differs from this simulation.
     """
     course = Course(scenario)
     course.keep(recording)
@@ -117,20 +124,20 @@ def again(scenario: Scenario, recording: Retrace) -> Course:
 
 
 def _retrace(course: Course, recording: Retrace, named: Environment | None) -> None:
-    lived = history(recording.frames, recording.path)
-    if lived.disorder is not None:
-        raise CorruptJournal(f"{recording.path}: {lived.disorder.what}")
-    if lived.scenario != course.world.scenario:
-        raise CorruptJournal(f"{recording.path}: the record of another scenario, {lived.scenario.name}")
+    recorded = history(recording.frames, recording.path)
+    if recorded.disorder is not None:
+        raise CorruptJournal(f"{recording.path}: {recorded.disorder.what}")
+    if recorded.scenario != course.world.scenario:
+        raise CorruptJournal(f"{recording.path}: a recording of another scenario, {recorded.scenario.name}")
     try:
-        recording.write(*[encode(one) for one in (named, lived.scenario) if one is not None])
-        for tick in lived.ticks:
+        recording.write(*[encode(one) for one in (named, recorded.scenario) if one is not None])
+        for tick in recorded.ticks:
             course.command(tick.commands)
-        if lived.end is not None and course.over is None:
-            course.end(Judgement(lived.end.outcome, lived.end.reason))
-        course.final_reports(lived.final_reports.values())
+        if recorded.end is not None and course.over is None:
+            course.end(Judgement(recorded.end.outcome, recorded.end.reason))
+        course.final_reports(recorded.final_reports.values())
     except ReplayMismatch:
         raise CorruptJournal(
-            f"{recording.path}: on record the world went on otherwise at tick {course.tick}: "
+            f"{recording.path}: the recorded world differs from the recomputed one at tick {course.tick}: "
             + (environment.otherwise(named, environment.of_world()) or "the journal is another version's")
         ) from None

@@ -1,4 +1,4 @@
-"""One tick of the world, by value: Observation for everyone, then everyone's Command, and on."""
+"""One tick of the simulation, as pure functions: the Observations of a World, and the World after it."""
 
 from __future__ import annotations
 
@@ -16,24 +16,29 @@ from world.truth import Truth, asked
 
 
 class World(msgspec.Struct, frozen=True):
-    """The true state, what was driven to get there, and who has claimed what."""
+    """The complete state of the simulation at one tick."""
 
     scenario: Scenario
+    """The scenario of the run."""
     truth: Truth
+    """The true poses."""
     executed: tuple[Controls, ...] | None
-    """over the tick before, in the order of the scenario; none at tick 0"""
+    """The executed controls over the previous tick, in the order of the scenario; None at tick 0."""
     verdicts: dict[str, Verdict]
-    """everyone's first; nobody takes back what it has claimed"""
+    """The first result of each robot that has one."""
     claimed: dict[str, Pose]
-    """where each of those who claim to be localised was when it did: noise may move it from there"""
+    """The true pose in <W> of each localised robot at the tick of its claim. Noise may move it afterwards."""
     pairs: tuple[tuple[int, int], ...]
-    """which robots are each other's peer, by their place in the scenario"""
+    """The pairs of peers, as indices into the scenario's robots."""
     air: tuple[LinkState, ...] = ()
-    """in this tick: of each pair the link from the first to the second, then back; none without faults"""
+    """The state of the links: for each pair, from the first to the second robot, then back.
+
+    Empty without faults.
+    """
 
 
 def release(scenario: Scenario) -> World:
-    """The world at tick 0."""
+    """Return the world at tick 0."""
     pairs = scenario.pairs()
     origins = {place: scenario.robots[pair[0]].anchor for pair in pairs for place in pair}
     local = tuple(
@@ -46,7 +51,7 @@ def release(scenario: Scenario) -> World:
 
 
 def observations(world: World) -> list[Observation]:
-    """What every robot's sensors say now, in the order of the scenario."""
+    """Return the Observation of each robot at the current tick, in the order of the scenario."""
     scenario, truth, driven = world.scenario, world.truth, world.executed
     tick, robots = truth.tick, scenario.robots
     measured: Sequence[Controls | None] = driven or [None] * len(robots)
@@ -68,15 +73,15 @@ def observations(world: World) -> list[Observation]:
 
 
 def advance(world: World, commands: Mapping[str, Command]) -> World | Judgement:
-    """The world one tick later, or how the run ended. A robot without a Command stands still."""
+    """Return the world one tick later, or the outcome of the run. A robot without a Command rests."""
     scenario, truth = world.scenario, world.truth
     verdicts, claimed = world.verdicts, world.claimed
     driven = []
     exact = scenario.mission.noise.exact
     for place, robot in enumerate(scenario.robots):
         command = commands.get(robot.id)
-        done = asked(command, scenario.mission)
-        driven.append(done if exact else executed(done, scenario, robot.id, truth.tick))
+        controls = asked(command, scenario.mission)
+        driven.append(controls if exact else executed(controls, scenario, robot.id, truth.tick))
         if command is not None and command.verdict is not None and robot.id not in verdicts:
             verdicts = verdicts | {robot.id: command.verdict}
             if isinstance(command.verdict, Localised):
@@ -93,7 +98,7 @@ def advance(world: World, commands: Mapping[str, Command]) -> World | Judgement:
 def _carried(
     air: Sequence[LinkState], scenario: Scenario, truth: Truth, pairs: Sequence[tuple[int, int]]
 ) -> tuple[LinkState, ...]:
-    """The air of every link at the tick of `truth`, a tick after `air`."""
+    """Return the state of each link at the tick of `truth`, given its state `air` at the tick before."""
     if not air:
         return ()
     mutuals = mutual_ranges(truth, scenario, pairs)

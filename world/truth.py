@@ -1,4 +1,4 @@
-"""Where every robot is. Any number of them, in the order of the scenario."""
+"""The true poses of all robots, in the order of the scenario."""
 
 from __future__ import annotations
 
@@ -12,37 +12,45 @@ from protocol.motion import REST, Controls, Pose, step
 
 
 class Leg(msgspec.Struct, frozen=True, gc=False):
-    """Equal manoeuvres of one robot, so far."""
+    """The sequence of equal manoeuvres that a robot is driving."""
 
     begin: Pose
+    """The pose at its beginning, relative to the same origin as in Truth: m, m and rad."""
     ticks: int
+    """The number of ticks so far."""
     controls: Controls
+    """The executed velocities, in m/s and rad/s."""
 
 
 class Truth(msgspec.Struct, frozen=True):
-    """The true state at one tick.
+    """The true poses at one tick.
 
-    It is kept relative to the anchor of each pair's a, so that where in the plane the anchors stand
-    costs no digits.
+    Poses are stored relative to the anchor of robot a of the pair, so that rounding errors do not depend on
+    the position of the anchors in <W>.
     """
 
     tick: int
+    """The tick k."""
     local: tuple[Pose, ...]
-    """relative to `origins`; the axes are the world's"""
+    """The pose of each robot relative to its element of `origins`, with the axes of <W>: m, m and rad."""
     origins: tuple[Anchor, ...]
+    """The position of the anchor of the pair's robot a, for each robot, in <W>."""
     legs: tuple[Leg, ...] = ()
-    """what led each robot there: equal manoeuvres are one arc, so rounding does not grow with their number"""
+    """The current leg of each robot; empty at tick 0.
+
+    Equal manoeuvres are computed as one arc, so that rounding errors do not grow with their number.
+    """
 
     @property
     def poses(self) -> tuple[Pose, ...]:
-        """In the world frame."""
+        """The pose of each robot in <W>: m, m and rad."""
         return tuple(
             Pose(origin.x + pose.x, origin.y + pose.y, pose.heading)
             for origin, pose in zip(self.origins, self.local, strict=True)
         )
 
     def moved(self, controls: Sequence[Controls], period: float) -> Truth:
-        """Where everyone is one tick later, having driven `controls`."""
+        """Return the truth one tick later, after all robots have driven `controls` for `period` s."""
         legs: list[Leg] = []
         local: list[Pose] = []
         before = self.legs or [Leg(pose, 0, c) for pose, c in zip(self.local, controls, strict=True)]
@@ -54,7 +62,7 @@ class Truth(msgspec.Struct, frozen=True):
 
 
 def asked(command: Command | None, mission: Mission) -> Controls:
-    """The command that a Command gives: it saturates at v_max and omega_max; without a Command it is to rest."""
+    """Return the controls of `command`, limited to v_max and omega_max; REST for None."""
     if command is None:
         return REST
     return Controls(

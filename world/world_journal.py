@@ -1,4 +1,4 @@
-"""What a world's journal tells: the scenario, then tick after tick where everyone was and set out to do."""
+"""The content of a world's journal: the scenario, and for each tick the true poses and the Commands."""
 
 from __future__ import annotations
 
@@ -17,43 +17,54 @@ from world.tick import World, advance, release
 
 
 class Tick(msgspec.Struct, frozen=True):
-    """One tick of which every robot's Command is on record."""
+    """A tick with all its recorded Commands."""
 
     world: World
+    """The state at this tick, before the Commands are executed."""
     commands: dict[str, Command]
-    """none of a robot whose Command did not come in time"""
+    """The Commands, by robot. A robot that missed the deadline has none."""
 
 
 class UnexpectedFrame(msgspec.Struct, frozen=True):
-    """The first frame that stands where none such can; what comes after it is not read."""
+    """The first frame that must not be at its place. The frames after it are not read."""
 
     tick: int | None
+    """The tick of the frame; None if it has none."""
     what: str
+    """The description of the problem, for a user."""
 
 
 class History(msgspec.Struct, frozen=True):
-    """A journal, whole or up to where it breaks off."""
+    """The content of a journal, complete or up to where it breaks off."""
 
     scenario: Scenario
+    """The scenario."""
     ticks: tuple[Tick, ...]
+    """The complete ticks."""
     ahead: World | None
-    """at the tick after these; none once the referee has judged the last of them"""
+    """The state at the tick after these; None if the last of them ended the run."""
     judgement: Judgement | None
-    """the referee's, by the truth"""
+    """The recomputed outcome; None if the Commands did not end the run."""
     end: MissionEnd | None = None
+    """The recorded end; None if the journal breaks off before."""
     final_reports: dict[str, FinalReport] = {}
+    """The recorded FinalReports, by robot."""
     disorder: UnexpectedFrame | None = None
+    """The first frame out of order, if any."""
     environment: Environment | None = None
-    """where it was written; none of an older recording"""
+    """The environment of the world's process; None in an older recording."""
 
     @property
     def worlds(self) -> tuple[World, ...]:
-        """At every tick of which anything follows."""
+        """The states at all ticks, that of `ahead` included."""
         return (*[tick.world for tick in self.ticks], *([] if self.ahead is None else [self.ahead]))
 
 
 def history(frames: Iterable[bytes], source: object) -> History:
-    """What `frames` tell, the world moved by their Commands. Raises CorruptJournal, which names `source`."""
+    """Return the content of the journal with these frames, with the true poses recomputed from the Commands.
+
+    Raises CorruptJournal, with `source` as the journal's name.
+    """
     scenario, named, rest = opened(list(frames), source)
     reading = JournalReading(scenario)
     try:
@@ -66,9 +77,9 @@ def history(frames: Iterable[bytes], source: object) -> History:
 
 
 def opened(frames: Sequence[bytes], source: object) -> tuple[Scenario, Environment | None, Sequence[bytes]]:
-    """What a world's journal begins with, and the frames after it.
+    """Return the scenario and the environment at the beginning of a world's journal, and the other frames.
 
-    Raises CorruptJournal, which names `source`.
+    Raises CorruptJournal, with `source` as the journal's name.
     """
     named = named_in(frames)
     rest = frames if named is None else frames[1:]
@@ -76,33 +87,42 @@ def opened(frames: Sequence[bytes], source: object) -> tuple[Scenario, Environme
 
 
 class JournalReading:
-    """A world's journal after its scenario, frame by frame: as much of it as there is yet."""
+    """A reader of a world's journal after its scenario, frame by frame. The journal may still be growing."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
         self._ids = [robot.id for robot in scenario.robots]
-        self._said: dict[str, Command | DeadlineMissed] = {}
+        self._answers: dict[str, Command | DeadlineMissed] = {}
+        """The frames of the incomplete tick, by robot."""
         self.world: World = release(scenario)
-        """at the tick after the last one on record; at that one, once it has been judged"""
+        """The state at the tick after the last complete one, or at the last tick of the run."""
         self.ticks: list[Tick] = []
+        """The complete ticks."""
         self.judgement: Judgement | None = None
+        """The recomputed outcome."""
         self.end: MissionEnd | None = None
+        """The recorded end."""
         self.final_reports: dict[str, FinalReport] = {}
+        """The recorded FinalReports, by robot."""
         self.disorder: UnexpectedFrame | None = None
+        """The first frame out of order."""
 
     def take(self, frame: bytes) -> bool:
-        """Whether `frame` can come next; none is to be taken after one that cannot. Raises MalformedFrame."""
+        """Add the next frame, and return whether it is in order. Add no frame after one that is not.
+
+        Raises MalformedFrame.
+        """
         message = decode(frame, Command | DeadlineMissed | MissionEnd | FinalReport)
-        going_on = self.end is None and self.judgement is None
+        is_running = self.end is None and self.judgement is None
         tick = self.world.truth.tick
         match message:
             case Command() | DeadlineMissed() if (
-                going_on and message.tick == tick and message.robot == self._ids[len(self._said)]
+                is_running and message.tick == tick and message.robot == self._ids[len(self._answers)]
             ):
-                self._said[message.robot] = message
-                if len(self._said) == len(self._ids):
-                    self._go_on()
-            case MissionEnd() if message.tick == tick and self.end is None and not self._said:
+                self._answers[message.robot] = message
+                if len(self._answers) == len(self._ids):
+                    self._advance()
+            case MissionEnd() if message.tick == tick and self.end is None and not self._answers:
                 self.end = message
             case FinalReport() if self.end is not None and message.robot in _still_to_come(
                 self._ids, self.final_reports
@@ -113,10 +133,12 @@ class JournalReading:
                 return False
         return True
 
-    def _go_on(self) -> None:
-        commands = {robot: command for robot, command in self._said.items() if isinstance(command, Command)}
+    def _advance(self) -> None:
+        commands = {
+            robot: command for robot, command in self._answers.items() if isinstance(command, Command)
+        }
         self.ticks.append(Tick(self.world, commands))
-        self._said = {}
+        self._answers = {}
         onward = advance(self.world, commands)
         if isinstance(onward, Judgement):
             self.judgement = onward
@@ -124,7 +146,7 @@ class JournalReading:
             self.world = onward
 
     def told(self) -> History:
-        """What it has told so far."""
+        """Return the content that has been read so far."""
         ahead = self.world if self.judgement is None else None
         return History(
             self._scenario,
@@ -138,24 +160,24 @@ class JournalReading:
 
 
 def _scenario_of(frame: bytes, source: object) -> Scenario:
-    """The scenario that a world's journal begins with. Raises CorruptJournal, which names `source`."""
+    """Return the scenario in `frame`. Raises CorruptJournal, with `source` as the journal's name."""
     if not frame:
-        raise CorruptJournal(f"{source}: there is no scenario in it")
+        raise CorruptJournal(f"{source}: it contains no scenario")
     try:
         scenario = decode(frame, Scenario, MAX_FRAME_BYTES)
     except MalformedFrame as error:
         raise CorruptJournal(f"{source}: {error}") from None
-    obstacle = _unpaired(scenario)
-    if obstacle is not None:
-        raise CorruptJournal(f"{source}: {obstacle}")
+    problem = _unpaired(scenario)
+    if problem is not None:
+        raise CorruptJournal(f"{source}: {problem}")
     return scenario
 
 
 def _unpaired(scenario: Scenario) -> str | None:
-    """Why its robots are no pairs, if they are none."""
+    """Return why the robots of `scenario` do not form pairs, for a user; None if they do."""
     robots = {robot.id: robot for robot in scenario.robots}
     if not robots or len(robots) != len(scenario.robots):
-        return "its scenario has not got one robot of each name"
+        return "its scenario has no robots, or several of the same name"
     for robot in scenario.robots:
         peer = robots.get(robot.peer)
         if peer is None or peer.peer != robot.id or peer.role == robot.role:
@@ -164,7 +186,7 @@ def _unpaired(scenario: Scenario) -> str | None:
 
 
 def _still_to_come(ids: list[str], final_reports: Iterable[str]) -> list[str]:
-    """Who may say FinalReport next: they stand in the order of the scenario, and some may be lacking."""
+    """Return the robots whose FinalReport may be next. Those that sent one are in the scenario's order."""
     last = [ids.index(robot) for robot in final_reports][-1:]
     return ids[last[0] + 1 :] if last else ids
 

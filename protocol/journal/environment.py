@@ -19,7 +19,7 @@ from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 
 PACKAGE = "tandem-ranging"
 LONGEST = 64
-"""the maximum number of characters of a version"""
+"""The maximum number of characters of a version."""
 LEVELS = (
     ("x86-64-v4", {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}),
     ("x86-64-v3", {"avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "movbe"}),
@@ -118,11 +118,11 @@ def _kernels(folder: Path) -> str | None:
     for file in folder.glob("libscipy_openblas*"):
         for ending in ("64_", ""):
             try:
-                tell = getattr(ctypes.CDLL(str(file)), f"scipy_openblas_get_config{ending}")
+                get_config = getattr(ctypes.CDLL(str(file)), f"scipy_openblas_get_config{ending}")
             except (OSError, AttributeError):
                 continue
-            tell.restype = ctypes.c_char_p
-            words = tell().decode(errors="replace").split()
+            get_config.restype = ctypes.c_char_p
+            words = get_config().decode(errors="replace").split()
             core = [word for word in words[2:] if not word.isupper() and "=" not in word]
             return f"{' '.join(words[:2])} ({' '.join(core) or 'one kernel'})"
     return None
@@ -130,5 +130,5 @@ def _kernels(folder: Path) -> str | None:
 
 def _library(built: Mapping[str, Any]) -> str:
     """Return the linear algebra library that numpy was built with, such as "lapack 3.12.0"."""
-    said = built.get("Build Dependencies", {}).get("lapack", {})
-    return f"{said.get('name', 'unknown')} {said.get('version', '')}".strip()
+    library = built.get("Build Dependencies", {}).get("lapack", {})
+    return f"{library.get('name', 'unknown')} {library.get('version', '')}".strip()

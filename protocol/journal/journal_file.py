@@ -1,9 +1,9 @@
-"""Frames in and out of a process, on disk, in order: the record of a run.
+"""The file of a journal: the frames that a process receives and sends, in order. Journals are the recording.
 
-A journal is a plain stream of msgpack byte strings, one a frame, so that any msgpack library reads it.
-It holds no wall-clock time. Each write is one system call: a process that is killed loses nothing it
-had journaled, and at worst leaves a last frame torn, which reading ignores. Who writes a journal has it
-locked, so no two processes write one.
+A journal is a stream of msgpack byte strings, one for each frame, so any msgpack library can read it. It
+contains no wall-clock time. Each write is one system call, so a killed process loses no frame that it has
+journaled. At worst, the last frame is torn, and reading ignores it. The writer locks the file, so two
+processes never write the same journal.
 """
 
 from __future__ import annotations
@@ -23,48 +23,48 @@ from protocol.wire import MAX_FRAME_BYTES, is_sound
 
 _packer = msgpack.Packer()
 _LONGEST = b"\xc6" + MAX_FRAME_BYTES.to_bytes(4, "big")
-"""how the longest frame begins"""
+"""The head of the longest frame in msgpack."""
 _HEADS = {0xC4: 1, 0xC5: 2, 0xC6: 4}
-"""how a byte string begins in msgpack, and how many bytes its length then takes"""
+"""The first byte of a msgpack byte string -> the number of bytes of its length field."""
 
 
 class CannotRecord(OSError):
-    """A journal cannot be opened or written; the text says which, and why."""
+    """A journal cannot be opened or written. The text of the error names the file and the reason."""
 
 
 class RecordExists(CannotRecord):
-    """A journal would have been overwritten."""
+    """The file of a new journal exists already."""
 
 
 class CorruptJournal(ValueError):
-    """A journal that is damaged before its end."""
+    """A journal is damaged before its end, or its content is not valid."""
 
 
 class Sink(Protocol):
-    """What takes frames, in order."""
+    """The contract of a journal that is written."""
 
     def write(self, *frames: bytes) -> None:
-        """All of `frames`, at once."""
+        """Append all of `frames` in one operation."""
 
 
 class MemoryJournal:
-    """A journal that is kept in memory, for whoever judges the run as soon as it is over."""
+    """A journal in memory, for runs in one process."""
 
     def __init__(self) -> None:
         self.frames: list[bytes] = []
 
     def write(self, *frames: bytes) -> None:
-        """All of `frames`."""
+        """Append `frames`."""
         self.frames += frames
 
 
 class Journal:
-    """An open journal. A new file, never an old one: what is on record stays, and goes on by a `Retrace`."""
+    """A journal that is open for writing. Its file is new: only a `Retrace` appends to an existing one."""
 
     def __init__(self, path: Path, *, fsync: bool = False, file: int | None = None) -> None:
-        """`file` is one that is open and locked already.
+        """Create the file at `path`, or take `file`, the descriptor of a file that is open and locked.
 
-        Raises RecordExists if `path` is there otherwise, CannotRecord if it cannot be written.
+        Raises RecordExists if `path` exists and no `file` is given, CannotRecord if it cannot be written.
         """
         self.path = path
         self._fsync = fsync
@@ -78,15 +78,15 @@ class Journal:
                 _sync_folder(self.path.parent)
         except OSError as error:
             if self.path.exists():
-                raise RecordExists(f"{self.path} is there already; choose another folder") from None
+                raise RecordExists(f"{self.path} already exists; choose another folder") from None
             raise self._cannot(error) from None
         lock(file, self.path)
         return file
 
     def write(self, *frames: bytes) -> None:
-        """All of `frames`, in one write, on the disk's side of the process when it returns.
+        """Append all of `frames` in one system call, with `fsync` down to the disk.
 
-        Raises CannotRecord when the disk takes no more.
+        Raises CannotRecord if they cannot be written, for example because the disk is full.
         """
         data = packed(frames)
         try:
@@ -101,7 +101,7 @@ class Journal:
         return CannotRecord(f"{self.path} cannot be written: {error.strerror or error}")
 
     def close(self) -> None:
-        """Nothing is lost without it; it frees the file."""
+        """Close and unlock the file. Nothing is lost without it."""
         os.close(self._file)
 
     def __enter__(self) -> Journal:
@@ -114,7 +114,7 @@ class Journal:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Have the disk know the files that are in `folder` by now."""
+    """Write the directory entries of `folder` to the disk."""
     opened = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(opened)
@@ -123,7 +123,10 @@ def _sync_folder(folder: Path) -> None:
 
 
 def lock(file: int, path: Path) -> None:
-    """Have `file` alone while it is open. Raises CannotRecord, and closes it, if another process has it."""
+    """Lock `file` until it is closed.
+
+    If another process has the lock, close `file` and raise CannotRecord.
+    """
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -134,20 +137,20 @@ def lock(file: int, path: Path) -> None:
 
 
 def packed(frames: Iterable[bytes]) -> bytes:
-    """`frames` as they stand in a journal."""
+    """Return the bytes of `frames` in a journal."""
     return b"".join([_packer.pack(frame) for frame in frames])
 
 
 def read(path: Path) -> Iterator[bytes]:
-    """The frames of the journal at `path`, up to its end or its torn tail.
+    """Return the frames of the journal at `path`, without a torn last frame.
 
-    Raises OSError if it cannot be read, CorruptJournal where something stands that is no frame.
+    Raises OSError if it cannot be read, CorruptJournal if it contains anything but frames.
     """
     return iter(torn(path)[0])
 
 
 def torn(path: Path) -> tuple[list[bytes], int]:
-    """The frames of the journal at `path`, and how many bytes stand behind them: of a torn write.
+    """Return the frames of the journal at `path`, and the number of bytes of a torn last frame.
 
     Raises like `read`.
     """
@@ -159,7 +162,7 @@ def torn(path: Path) -> tuple[list[bytes], int]:
 
 
 def _holds_a_frame(rest: bytes) -> bool:
-    """Whether a whole frame stands in what looks like a torn one: then it is not its end that is missing."""
+    """Return whether `rest`, which looks like a torn frame, contains a complete one: then it is damaged."""
     for place in range(1, len(rest)):
         width = _HEADS.get(rest[place])
         if width is not None:
@@ -171,19 +174,19 @@ def _holds_a_frame(rest: bytes) -> bool:
 
 
 class Tail:
-    """A journal that may still be written, read as it grows."""
+    """A reader of a journal that may still be growing."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.whole = 0
-        """bytes of what has been read"""
+        """The number of bytes of the frames that have been read."""
         self.torn = b""
-        """what stood behind them the last time"""
+        """The bytes after them at the last read: an incomplete frame."""
 
     def news(self) -> list[bytes]:
-        """The frames that have come since the last time; what is torn waits for the rest.
+        """Return the frames that have been added since the last call. An incomplete frame is read later.
 
-        Raises OSError if it cannot be read, CorruptJournal where something stands that is no frame.
+        Raises OSError if it cannot be read, CorruptJournal if it contains anything but frames.
         """
         with open_file(self.path) as file:
             file.seek(self.whole)
@@ -195,7 +198,7 @@ class Tail:
         try:
             for frame in unpacker:
                 if not isinstance(frame, bytes) or len(frame) > MAX_FRAME_BYTES:
-                    raise ValueError("no frame")  # it is the file that is wrong
+                    raise ValueError("not a frame")
                 frames.append(frame)
                 whole = unpacker.tell()
             self.torn = data[whole:]

@@ -1,7 +1,8 @@
-"""A journal taken up where it breaks off, by a process that is started again.
+"""The resumption of a journal by a restarted process.
 
-Whoever folds what is on record writes it once more, to a `Retrace`, which compares; so nothing is added
-to a record that is not what this process would have written. Until `go_on`, nothing changes on disk.
+The process recomputes its state from the frames in the journal, and writes every frame again to a `Retrace`,
+which compares it with the recorded one. It therefore only adds to a journal that it would have written
+itself. Until `go_on`, nothing changes on disk.
 """
 
 from __future__ import annotations
@@ -14,18 +15,21 @@ from protocol.journal.journal_file import CannotRecord, Journal, lock, packed, t
 
 
 class ReplayMismatch(ValueError):
-    """Something else is on record than what is written to its Retrace."""
+    """A frame that was written to a Retrace differs from the recorded one."""
 
 
 class Retrace:
-    """An old journal, locked; its frames are met again, one by one, before any is added."""
+    """An existing journal, locked. All its frames have to be written again before new ones are appended."""
 
     def __init__(self, path: Path, *, fsync: bool = False) -> None:
-        """Raises CannotRecord if `path` cannot be opened, or another process has it; CorruptJournal."""
+        """Open, lock and read the journal at `path`.
+
+        Raises CannotRecord if it cannot be opened or is in use, CorruptJournal if it is damaged.
+        """
         self.path = path
         self._fsync = fsync
-        self._met = 0
-        self._more: list[bytes] = []
+        self._matched = 0
+        self._new: list[bytes] = []
         try:
             self._file = open_regular(path, os.O_RDWR | os.O_APPEND | os.O_NOFOLLOW)
         except OSError as error:
@@ -33,7 +37,7 @@ class Retrace:
         lock(self._file, path)
         try:
             self.frames, _ = torn(path)
-            """what is on record"""
+            """The recorded frames."""
         except OSError as error:
             self.close()
             raise CannotRecord(f"{path} cannot be read: {error.strerror or error}") from None
@@ -42,29 +46,33 @@ class Retrace:
             raise
 
     def write(self, *frames: bytes) -> None:
-        """Meet `frames` again; what is beyond the record is kept for `go_on`. Raises Otherwise."""
+        """Compare `frames` with the next recorded ones, and store those beyond the last one for `go_on`.
+
+        Raises ReplayMismatch if a frame differs.
+        """
         for frame in frames:
-            if self._met == len(self.frames):
-                self._more.append(frame)
-            elif frame == self.frames[self._met]:
-                self._met += 1
+            if self._matched == len(self.frames):
+                self._new.append(frame)
+            elif frame == self.frames[self._matched]:
+                self._matched += 1
             else:
                 raise ReplayMismatch
 
     def go_on(self) -> tuple[Journal, int]:
-        """The journal, to be written on, and how many bytes were cut off: what there was of a torn write.
+        """Return the journal, open for appending, and the number of bytes that were cut off its end.
 
-        Raises CannotRecord.
+        The bytes that are cut off are those of a torn frame, and of frames that were not written again. The
+        stored new frames are appended. Raises CannotRecord.
         """
-        kept = len(packed(self.frames[: self._met]))
-        cut = os.fstat(self._file).st_size - kept
+        size = len(packed(self.frames[: self._matched]))
+        cut = os.fstat(self._file).st_size - size
         journal = Journal(self.path, fsync=self._fsync, file=self._file)
         if cut:
-            os.ftruncate(self._file, kept)
-        if self._more:
-            journal.write(*self._more)
+            os.ftruncate(self._file, size)
+        if self._new:
+            journal.write(*self._new)
         return journal, cut
 
     def close(self) -> None:
-        """Leave it as it is."""
+        """Close the journal without changing it."""
         os.close(self._file)

@@ -1,8 +1,10 @@
-"""The rules of protocol/network/keys.py as a Zenoh router enforces them, by the common name of a certificate.
+"""The access rules of `protocol/network/keys.py` as a Zenoh configuration, which routers enforce.
 
-A router passes on what others say, and so may the world: these two may say anything of a mission.
-Robots and viewers may do what a rule allows them, and nothing else. What is declared tells who listens where;
-a robot is told so for every key of a kind that it uses, for without it would believe that nobody listens.
+A router identifies a participant by the common name of its certificate. Routers and the world forward
+messages of others, so they may send any message. Robots and viewers may only do what a rule allows.
+
+A robot also needs the declarations of subscribers and queryables, because Zenoh sends nothing if there is no
+receiver. It gets them for all keys of each kind that it uses.
 """
 
 from __future__ import annotations
@@ -14,19 +16,24 @@ from typing import Any, NamedTuple
 from protocol.network import keys
 
 ROUTER = "router"
+"""The common name in the certificate of a router."""
 WORLD = "world"
+"""The common name in the certificate of the world."""
 VIEWER = "viewer"
+"""The common name in the certificate of viewers."""
 CARRIERS = (ROUTER, WORLD)
-"""who passes on what others say"""
+"""The participants that forward messages of others."""
 
 
 class Passing(NamedTuple):
-    """A message that passes a router: "ingress" from a participant, "egress" to one."""
+    """A kind of Zenoh message that a router lets pass."""
 
     flow: str
+    """The direction: "ingress" from a participant, or "egress" to one."""
     message: str
+    """Zenoh's name of the kind of message."""
     every: bool = False
-    """under any key of the kind, not one's own alone: it tells who listens or answers"""
+    """True if it passes on all keys of the kind, and not only on those of the participant."""
 
 
 BY = {
@@ -38,7 +45,7 @@ BY = {
     ),
     "show": (Passing("ingress", "liveliness_token"),),
 }
-"""what passes for whoever does it, by the way of a rule"""
+"""The messages that pass for the participant that does the operation of a rule, by operation."""
 TO = {
     "put": (Passing("ingress", "declare_subscriber"), Passing("egress", "put")),
     "answer": (
@@ -52,24 +59,27 @@ TO = {
         Passing("egress", "liveliness_token"),
     ),
 }
-"""what passes for whoever hears it, asks, or looks for it"""
+"""The messages that pass for the participants that subscribe, query, or look for a token, by operation."""
 
 
 class Permit(NamedTuple):
-    """A message that may pass a router, from or to one participant."""
+    """A permission: a kind of Zenoh message that passes a router from or to one participant."""
 
     flow: str
+    """The direction: "ingress" from the participant, or "egress" to it."""
     message: str
+    """Zenoh's name of the kind of message."""
     key: str
+    """The key expression."""
 
 
 def agent(robot: str) -> str:
-    """The common name of a robot's certificate."""
+    """Return the common name in the certificate of a robot's agent."""
     return f"agent-{robot}"
 
 
 def permits(participant: str) -> set[Permit]:
-    """All that a robot ("agent-ID") or a viewer may say and be told."""
+    """Return all permissions of a participant: a robot ("agent-ID") or a viewer."""
     return {
         Permit(one.flow, one.message, _key(key, {}) if one.every else own)
         for key, rule in keys.RULES.items()
@@ -80,7 +90,7 @@ def permits(participant: str) -> set[Permit]:
 
 
 def _own(key: Callable[..., str], roles: Iterable[str], participant: str) -> Iterator[str]:
-    """The keys of a kind under which `participant` has one of these roles."""
+    """Yield the key expressions of the kind `key` on which `participant` has one of these roles."""
     robot = participant.removeprefix("agent-") if participant.startswith("agent-") else None
     for role in roles:
         if role in inspect.signature(key).parameters:
@@ -95,7 +105,7 @@ def _key(key: Callable[..., str], named: dict[str, str]) -> str:
 
 
 def access_control(robots: Iterable[str]) -> dict[str, Any]:
-    """The part `access_control` of a Zenoh configuration, for a router that these robots may reach."""
+    """Return the section `access_control` of the Zenoh configuration of a router, for these robots."""
     messages = sorted({one.message for ways in (BY, TO) for passing in ways.values() for one in passing})
     rules = [_rule("carried", ["ingress", "egress"], messages, [f"{keys.ROOT}/**"])]
     policies = [{"subjects": list(CARRIERS), "rules": ["carried"]}]

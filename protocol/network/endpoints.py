@@ -1,7 +1,7 @@
-"""How a process reaches the network: where it connects, where it listens, and by which Zenoh configuration.
+"""The network endpoints of a process, and its Zenoh configuration.
 
-Who listens is a router, who does not is a client; routers that are linked pass on what is said at any of
-them. What Tandem needs is laid over a configuration of the user's own.
+A process that listens is a router, and one that only connects is a client. Connected routers forward each
+other's messages. Tandem's own settings override those in the user's Zenoh configuration.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ import zenoh
 from protocol.files import open_file, read_text
 
 CONNECT_TIMEOUT_S = 1.0
-"""one attempt; a client makes as many as fit its patience"""
+"""The duration in s of one attempt to connect. A client repeats it until its connection timeout."""
 RETRY_MS = 50
-"""a link that was lost is tried again as often, and then less and less"""
+"""The time in ms before the first attempt to restore a lost link. It then increases."""
 LEASE_S = 2.0
-"""a link on which nothing has come for so long is given up, and made anew: its peer is stopped, or cut off"""
+"""The time in s without any data after which a link is closed and restored."""
 
 _ENDPOINT = re.compile(r"(tcp|tls|quic|ws)/(?P<host>\[[0-9A-Fa-f:.%\w]+\]|[^\s/:\[\]]+):(?P<port>\d{1,5})")
 _FILES = (
@@ -39,57 +39,57 @@ _FILES = (
     ),
     "transport/auth/usrpwd/dictionary_file",
 )
-"""what in a configuration names a file; a relative name starts at the configuration's folder"""
+"""The settings that name a file. A relative name starts at the folder of the configuration."""
 
 
 class BadEndpoint(ValueError):
-    """An endpoint that Zenoh could not use; its text says what one looks like."""
+    """An endpoint is malformed. The text of the error contains an example."""
 
 
 class BadConfiguration(ValueError):
-    """A Zenoh configuration that cannot be used; its text names the file, and what is wrong with it."""
+    """A Zenoh configuration cannot be used. The text of the error names the file and the reason."""
 
 
 class Endpoints(msgspec.Struct, frozen=True):
-    """How a process reaches the network."""
+    """The endpoints and the Zenoh configuration of a process."""
 
     connect: tuple[str, ...] = ()
-    """routers: a client is linked to one of them, a router to all"""
+    """The endpoints of routers. A client connects to one of them, a router to all."""
     listen: tuple[str, ...] = ()
-    """where it is a router itself; a client listens nowhere"""
+    """The endpoints on which a router listens; empty for a client."""
     settings: str = "{}"
-    """a Zenoh configuration, in JSON5"""
+    """The user's Zenoh configuration, in JSON5."""
     folder: str = ""
-    """where relative names of files in the configuration start"""
+    """The folder to which file names in the configuration are relative."""
 
     @property
     def mode(self) -> str:
-        """What it is in Zenoh's words."""
+        """The mode in Zenoh's terms: "router" or "client"."""
         return "router" if self.listen else "client"
 
     @property
     def participant(self) -> str | None:
-        """Whose configuration it is, if `tandem keys` made it."""
+        """The participant for which `tandem keys` made the configuration; None for other configurations."""
         about = self.setting("metadata")
         return about.get("participant") if isinstance(about, dict) else None
 
     @property
     def secured(self) -> bool:
-        """Whether all links are encrypted, and nobody is let in without a certificate."""
+        """True if all links are encrypted, and all participants need a certificate."""
         encrypted = all(is_encrypted(one) for one in (*self.connect, *self.listen))
         return encrypted and self.setting("transport/link/tls/enable_mtls") is True
 
     @property
     def exposed(self) -> tuple[str, ...]:
-        """Where it lets in whoever comes, from beyond this machine."""
+        """The endpoints that other machines can use without a certificate."""
         return () if self.secured else tuple(one for one in self.listen if not is_loopback(one))
 
     def setting(self, path: str) -> Any:
-        """What the configuration says at `path`, such as "transport/link/tls"; Zenoh's default if nothing."""
+        """Return the setting at `path`, such as "transport/link/tls", or Zenoh's default."""
         return json.loads(zenoh.Config.from_json5(self.settings).get_json(path))
 
     def file(self, path: str) -> Path | None:
-        """The file that the configuration names at `path`."""
+        """Return the path of the file that the setting at `path` names; None if it is not set."""
         name = self.setting(path)
         return Path(self.folder, name).resolve() if name is not None else None
 
@@ -98,30 +98,30 @@ class Endpoints(msgspec.Struct, frozen=True):
 
 
 def at(*connect: str) -> Endpoints:
-    """Those of a client of these routers."""
+    """Return the endpoints of a client of these routers."""
     return Endpoints(connect=connect)
 
 
 def listening(*listen: str) -> Endpoints:
-    """Those of a router that listens there."""
+    """Return the endpoints of a router that listens there."""
     return Endpoints(listen=listen)
 
 
 def check_endpoint(endpoint: str) -> None:
-    """Raises BadEndpoint if `endpoint` is not of the form protocol/host:port."""
+    """Raise BadEndpoint if `endpoint` is not of the form protocol/host:port."""
     match = _ENDPOINT.fullmatch(endpoint)
     if match is None or not 0 < int(match["port"]) < 65536:
-        raise BadEndpoint(f"'{endpoint}' is no endpoint; one looks like tcp/127.0.0.1:7447")
+        raise BadEndpoint(f"'{endpoint}' is not an endpoint; expected one such as tcp/127.0.0.1:7447")
 
 
 def place(endpoint: str) -> tuple[str, int] | None:
-    """Host and port; none if it has no such thing."""
+    """Return the host and port of `endpoint`; None if it has none."""
     match = _ENDPOINT.match(endpoint)
     return (match["host"].strip("[]"), int(match["port"])) if match is not None else None
 
 
 def is_loopback(endpoint: str) -> bool:
-    """Whether only this machine reaches it."""
+    """Return whether only this machine can reach `endpoint`."""
     where = place(endpoint)
     if where is None or where[0] == "localhost":
         return where is not None or endpoint.startswith("unix")
@@ -132,12 +132,12 @@ def is_loopback(endpoint: str) -> bool:
 
 
 def is_encrypted(endpoint: str) -> bool:
-    """Whether it is of a protocol that takes certificates."""
+    """Return whether the protocol of `endpoint` uses certificates."""
     return endpoint.startswith(("tls/", "quic/"))
 
 
 def configured(file: Path, connect: Sequence[str] = (), listen: Sequence[str] = ()) -> Endpoints:
-    """By the Zenoh configuration in `file`; where no endpoints are given, by those in it.
+    """Return the endpoints `connect` and `listen`, or those in `file` if both are empty, with its settings.
 
     Raises BadConfiguration.
     """
@@ -145,14 +145,14 @@ def configured(file: Path, connect: Sequence[str] = (), listen: Sequence[str] = 
     written = Endpoints(settings=settings, folder=str(file.parent))
     mode = written.setting("mode")
     if not connect and not listen:
-        connect = _said(written.setting("connect/endpoints"), mode or "client")
-        if (said := written.setting("listen/endpoints")) != Endpoints().setting("listen/endpoints"):
-            listen = _said(said, mode or "router")
+        connect = _for_mode(written.setting("connect/endpoints"), mode or "client")
+        if (found := written.setting("listen/endpoints")) != Endpoints().setting("listen/endpoints"):
+            listen = _for_mode(found, mode or "router")
     endpoints = Endpoints(tuple(connect), tuple(listen), settings, written.folder)
     if mode is not None and (connect or listen) and mode != endpoints.mode:
         does = "listens" if listen else "only connects"
         raise BadConfiguration(
-            f"{file}: mode: '{mode}', but who {does} is a {endpoints.mode} here; leave it out"
+            f"{file}: mode: '{mode}', but a process that {does} is a {endpoints.mode} here; leave it out"
         )
     for name in _FILES:
         if (path := endpoints.file(name)) is not None:
@@ -164,13 +164,13 @@ def configured(file: Path, connect: Sequence[str] = (), listen: Sequence[str] = 
 
 
 def zenoh_config(endpoints: Endpoints, first: int = 0) -> zenoh.Config:
-    """What Tandem needs, over what the endpoints' own configuration says; tries router `first` first."""
+    """Return the user's configuration with Tandem's settings. The router at index `first` is tried first."""
     config = zenoh.Config.from_json5(endpoints.settings)
     for name in _FILES:
         if (path := endpoints.file(name)) is not None:
             config.insert_json5(name, json.dumps(str(path)))
     client = endpoints.mode == "client"
-    if client and endpoints.participant is not None:  # there is nobody but the router, which may say anything
+    if client and endpoints.participant is not None:  # its only neighbour is the router, which may send all
         config.insert_json5("access_control/enabled", "false")
     turn = first % len(endpoints.connect) if endpoints.connect else 0
     for key, value in {
@@ -178,12 +178,12 @@ def zenoh_config(endpoints: Endpoints, first: int = 0) -> zenoh.Config:
         "listen/endpoints": endpoints.listen,
         "connect/endpoints": endpoints.connect[turn:] + endpoints.connect[:turn],
         "connect/timeout_ms": int(CONNECT_TIMEOUT_S * 1000),
-        "connect/exit_on_failure": client,  # a router is there for others, too
+        "connect/exit_on_failure": client,  # a router also serves others
         "connect/retry": {"period_init_ms": RETRY_MS, "period_max_ms": 1000, "period_increase_factor": 2.0},
         "scouting/delay": 0,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
-        "transport/link/tls/close_link_on_expiration": False,  # it panics where a low-latency link closes
+        "transport/link/tls/close_link_on_expiration": False,  # with low latency, Zenoh panics
         "transport/link/tx/lease": int(LEASE_S * 1000),
         "transport/unicast/lowlatency": True,
         "transport/unicast/qos/enabled": False,
@@ -193,13 +193,13 @@ def zenoh_config(endpoints: Endpoints, first: int = 0) -> zenoh.Config:
     return config
 
 
-def _said(endpoints: Any, mode: str) -> tuple[str, ...]:
-    """A list of endpoints, which a configuration may have for each mode."""
+def _for_mode(endpoints: Any, mode: str) -> tuple[str, ...]:
+    """Return the endpoints for `mode` of a setting that is one list, or one for each mode."""
     return tuple(endpoints.get(mode, ()) if isinstance(endpoints, dict) else endpoints)
 
 
 def _read(file: Path) -> str:
-    """The text of a configuration that Zenoh understands. Raises BadConfiguration."""
+    """Return the text of the Zenoh configuration in `file`. Raises BadConfiguration."""
     try:
         text = read_text(file)
         zenoh.Config.from_json5(text)
@@ -213,8 +213,8 @@ def _read(file: Path) -> str:
 
 
 def _what(complaint: str) -> str:
-    """Zenoh's complaint about a configuration, without the place in its own source."""
-    said = re.search(r"--> (?P<line>\d+):.*= (?P<what>[^\n]*)", complaint, re.DOTALL)
-    if said is None:
+    """Return Zenoh's error message about a configuration, without the position in Zenoh's source."""
+    found = re.search(r"--> (?P<line>\d+):.*= (?P<what>[^\n]*)", complaint, re.DOTALL)
+    if found is None:
         return complaint.partition(" at /")[0]
-    return f"line {said['line']}: {said['what'].partition(' at /')[0]}"
+    return f"line {found['line']}: {found['what'].partition(' at /')[0]}"

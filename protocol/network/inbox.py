@@ -1,4 +1,4 @@
-"""What arrives at a process: frames, signs of life, the word to stop; and what of it was refused."""
+"""The inbox of a process: received frames, liveliness changes and signals, and counts of refused frames."""
 
 from __future__ import annotations
 
@@ -11,75 +11,84 @@ from protocol.network.keys import NOWHERE, Key
 from protocol.output import say
 
 Topic = Literal["observation", "command", "report", "tick-start", "alive", "gone", "ended", "stop", "nothing"]
+"""The kind of an event: a received frame ("observation" to "tick-start"), a liveliness token that appeared or
+disappeared, the end of the agent's process, a signal to stop, or a timeout."""
 
 COMPLAINTS = 100
-"""kinds of malformed frames that are told, each once; the rest is only counted"""
+"""The maximum number of messages about refused frames. Further ones are only counted."""
 COMPLAINT = 300
-"""characters that are told of each"""
+"""The maximum number of characters of the key and reason in each message."""
 ROOM_BYTES = 1 << 22
-"""what may wait of one topic: thousands of frames, more than any mission has waiting"""
+"""The maximum size of the queue of one topic: thousands of frames, more than any mission needs."""
 ARRIVAL_BYTES = 200
-"""what a frame takes beside its own bytes, about"""
+"""The approximate memory that a queued frame takes in addition to its own bytes."""
 
 
 class Interrupted(Exception):
-    """The process was told to stop; its text is the signal."""
+    """The process received a signal to stop. The text of the error is the name of the signal."""
 
 
 class Arrival(NamedTuple):
-    """One thing that has arrived."""
+    """An event in the inbox."""
 
     topic: Topic
+    """The kind of event."""
     key: str = ""
+    """The key of the frame or token; for "stop", the name of the signal."""
     frame: bytes = b""
+    """The received frame; empty for other events."""
     source: Key = NOWHERE
-    """what `key` names"""
+    """The parsed `key`."""
 
 
 NOTHING = Arrival("nothing")
+"""The result of `Inbox.next` after its timeout."""
 
 
 class Inbox:
-    """A queue that callbacks and signal handlers fill, and one thread empties, with a bound on each wait.
+    """A queue that callbacks and signal handlers fill and one thread empties, with a timeout on each wait.
 
-    What comes faster than it is emptied must not grow without end. Each topic has ROOM_BYTES of its own, so a
-    flood of one leaves the others their room; a frame for which there is none is refused. Should that be one
-    that the mission needs, it is lost as on any bad link, and said again.
+    Its size is limited. Each topic has ROOM_BYTES of its own, so a flood of one topic does not affect the
+    others. A frame without room is refused. If the mission needs it, it is repeated, as after any loss.
     """
 
     def __init__(self, owner: str) -> None:
         self.refused = Counter[Topic]()
-        """frames that were malformed, under no key, not from whom they said, out of step, or without room"""
+        """The number of refused frames by topic.
+
+        A frame is refused if it is malformed, has an invalid key, a wrong sender or an unexpected tick, or if
+        the queue is full.
+        """
         self._owner = owner
         self._queue: SimpleQueue[Arrival] = SimpleQueue()
         self._complaints: set[tuple[str, str]] = set()
         self._waiting = Counter[Topic]()
-        """bytes"""
+        """The bytes of the queued frames, by topic."""
         self._turned_away = Counter[tuple[Topic, str, str]]()
-        """by topic, key and reason: frames that never waited here, until they are counted as refused"""
+        """The number of frames refused by `turn_away` since the last `next`, by topic, key and reason."""
         self._lock = threading.RLock()  # a signal handler may interrupt its holder
 
     def put(self, topic: Topic, key: str = "", frame: bytes = b"", source: Key = NOWHERE) -> None:
-        """From any thread, and from a signal handler."""
+        """Add an event. This may be called from any thread and from a signal handler."""
         arrival = Arrival(topic, key, frame, source)
         with self._lock:
             waiting = self._waiting[topic]
             if waiting and waiting + _size(arrival) > ROOM_BYTES:
-                self.turn_away(topic, key, "too many wait")
+                self.turn_away(topic, key, "the queue is full")
                 return
             self._waiting[topic] = waiting + _size(arrival)
         self._queue.put(arrival)
 
     def turn_away(self, topic: Topic, key: str, why: str) -> None:
-        """Refuse, from any thread, a frame that is not to wait here; `next` counts and tells it."""
+        """Refuse a frame without queueing it, from any thread. `next` then counts and prints it."""
         with self._lock:
-            told = topic, key[:COMPLAINT], why
-            if told not in self._turned_away and len(self._turned_away) >= COMPLAINTS:
-                told = topic, "other keys", why
-            self._turned_away[told] += 1
+            entry = topic, key[:COMPLAINT], why
+            if entry not in self._turned_away and len(self._turned_away) >= COMPLAINTS:
+                entry = topic, "other keys", why
+            self._turned_away[entry] += 1
 
     def next(self, timeout: float | None) -> Arrival:
-        """The next arrival; NOTHING after `timeout` seconds without. Raises Interrupted on "stop"."""
+        """Return the next event, or NOTHING after `timeout` s. Raises Interrupted for the topic "stop"."""
         try:
             arrival = self._queue.get(timeout=max(timeout, 0.0) if timeout is not None else None)
         except Empty:
@@ -95,7 +104,7 @@ class Inbox:
         return arrival
 
     def refuse(self, arrival: Arrival, why: object) -> None:
-        """Count a frame that cannot be used; tell of each kind once."""
+        """Count a refused frame, and print a message for the first with this key and reason."""
         self.refused[arrival.topic] += 1
         self._complain(arrival.key, str(why)[:COMPLAINT])
 
@@ -113,10 +122,10 @@ class Inbox:
             self.say(f"refused a frame on {key}: {why}")
 
     def say(self, line: str) -> None:
-        """Tell whoever watches the process."""
+        """Print `line` on standard error, with the name of the process."""
         say(f"{self._owner}: {line}", error=True)
 
 
 def _size(arrival: Arrival) -> int:
-    """About what it takes while it waits."""
+    """Return the approximate memory in bytes that `arrival` takes in the queue."""
     return len(arrival.frame) + len(arrival.key) + ARRIVAL_BYTES

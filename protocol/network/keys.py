@@ -36,7 +36,7 @@ def observation(run: str, robot: str) -> str:
 
 
 def command(run: str, robot: str) -> str:
-    """Return the key on which that robot sends each Command to the world, and FinalReport after the mission."""
+    """Return the key on which that robot sends Commands, and a FinalReport at the end, to the world."""
     return f"{ROOT}/{run}/robot/{robot}/command"
 
 
@@ -73,11 +73,11 @@ class Rule(NamedTuple):
     """
 
     way: Literal["put", "answer", "show"]
-    """the operation: put frames, answer queries, or declare a liveliness token"""
+    """The operation: put frames, answer queries, or declare a liveliness token."""
     by: str
-    """the participant that may do it"""
+    """The participant that may do it."""
     to: tuple[str, ...]
-    """the participants that may subscribe, query, or look for the token"""
+    """The participants that may subscribe, query, or look for the token."""
 
 
 RULES: Mapping[Callable[..., str], Rule] = MappingProxyType(
@@ -100,19 +100,19 @@ class Key(NamedTuple):
     """The parsed key of a received message."""
 
     kind: Callable[..., str] | None
-    """the function above that returns such keys; None for NOWHERE"""
+    """The function above that returns such keys; None for NOWHERE."""
     run: str
     robot: str = ""
-    """the robot of the key; for a report, its sender"""
+    """The robot of the key; for a Report, its sender."""
     peer: str = ""
-    """for a report, its receiver"""
+    """The receiver of a Report; empty for other keys."""
 
 
 NOWHERE = Key(None, "")
 """The key of messages that did not come over the network."""
 
 _LONGEST = 256
-"""the maximum number of characters of a key that is parsed"""
+"""The maximum number of characters of a key that is parsed."""
 _NAME = re.compile(NAME)
 _PATTERNS = {
     kind: re.compile(kind(**{name: f"(?P<{name}>[^/]+)" for name in signature(kind).parameters}))

@@ -1,9 +1,9 @@
 """Zenoh sessions that open, become ready and close without hanging.
 
-The world is the router and robots are its clients, so nothing else has to be installed; other routers may
-stand between (protocol/network/endpoints.py). What arrives goes into one queue per process: `recv()` of
-Zenoh has no time-out, and a queue has. Whoever subscribes first declares, then shows its liveliness token: a put before
-the match would be lost.
+By default, the world is the router and robots are its clients, so no separate router is needed. Other routers
+may be in between (protocol/network/endpoints.py). All arrivals go into one queue per process, because a queue
+has a timeout and Zenoh's `recv()` has none. A process first declares its subscribers, and then its liveliness
+token: a message that is sent before the subscriber is known would be lost.
 """
 
 from __future__ import annotations
@@ -28,16 +28,17 @@ from protocol.network.keys import Key
 from protocol.wire import encode
 
 CLOSE_TIMEOUT_S = 2.0
-"""Zenoh's own close can take ten seconds under loss; the process ends without it"""
+"""The time in s to wait for a session to close. Under loss it can take ten seconds."""
 LISTEN_AGAIN_S = 0.1
-"""how long to wait before trying once more to have a port"""
+"""The time in s between two attempts to listen on a port."""
 
 NO_KEY = "not a key of one mission and robot"
-"""why something that came under a wildcard, or under an unknown key, is refused"""
+"""The reason for refusing a message on a wildcard or an unknown key."""
 
 MSGPACK = zenoh.Encoding("application/msgpack")
+"""The encoding of frames."""
 REFUSAL = zenoh.Encoding.TEXT_PLAIN
-"""of an answer that says why there is none"""
+"""The encoding of an answer that is the reason for a refusal."""
 
 zenoh.init_log_from_env_or("off")
 
@@ -46,12 +47,12 @@ T = TypeVar("T")
 
 
 class CannotListen(OSError):
-    """The endpoint to listen on cannot be had; its text says why."""
+    """A process cannot listen on an endpoint. The text of the error names it and the reason."""
 
 
 @contextmanager
 def _closing(session: zenoh.Session) -> Iterator[zenoh.Session]:
-    """A session that is closed at the end, or left behind after CLOSE_TIMEOUT_S."""
+    """Yield `session`, and close it at the end. Give up after CLOSE_TIMEOUT_S."""
     try:
         yield session
     finally:
@@ -61,16 +62,17 @@ def _closing(session: zenoh.Session) -> Iterator[zenoh.Session]:
 
 
 def _check_limits() -> None:
-    """Raises OSError where a session could not be opened, or would hang."""
+    """Raise OSError if the process's limits do not allow a session."""
     limits.need_files(limits.SESSION_FILES, "a Zenoh session")
     limits.need_memory(limits.SESSION_BYTES, "a Zenoh session")
 
 
 @contextmanager
 def open_router(endpoints: Endpoints, wait: float = 0.0) -> Iterator[zenoh.Session]:
-    """The session of a router; waits `wait` seconds for where it listens to be free.
+    """Yield a session in router mode. Wait up to `wait` s until its endpoints are free.
 
-    Routers that it connects to may come later, and go. Raises CannotListen.
+    The routers to which it connects may start later, and restart. Raises CannotListen, and OSError if the
+    process's limits are too low.
     """
     _check_limits()
     give_up = time.monotonic() + wait
@@ -90,9 +92,10 @@ def open_router(endpoints: Endpoints, wait: float = 0.0) -> Iterator[zenoh.Sessi
 
 @contextmanager
 def open_client(endpoints: Endpoints, unanswered: Callable[[], None]) -> Iterator[zenoh.Session]:
-    """A session to a router that answers.
+    """Yield a session in client mode that is connected to a router.
 
-    Calls `unanswered` after each attempt of CONNECT_TIMEOUT_S in vain; it may raise to give up.
+    `unanswered` is called after each unsuccessful attempt of CONNECT_TIMEOUT_S. It may raise an error to give
+    up. Raises OSError if the process's limits are too low.
     """
     _check_limits()
     for attempt in count():
@@ -108,26 +111,26 @@ def open_client(endpoints: Endpoints, unanswered: Callable[[], None]) -> Iterato
 def open_session(
     endpoints: Endpoints, unanswered: Callable[[], None], wait: float = 0.0
 ) -> AbstractContextManager[zenoh.Session]:
-    """That of a router, or of a client, as `endpoints` say. Raises CannotListen, if it listens."""
+    """Return `open_router` if `endpoints` listens, and `open_client` otherwise. Raises CannotListen."""
     return open_router(endpoints, wait) if endpoints.listen else open_client(endpoints, unanswered)
 
 
 def subscribe(session: zenoh.Session, key: str, inbox: Inbox, topic: Topic) -> None:
-    """Put into `inbox` everything that is put under `key`."""
+    """Put all messages on `key` into `inbox`."""
     handler: zenoh.handlers.Callback[zenoh.Sample] = _at_once(lambda sample: deliver(sample, inbox, topic))
     session.declare_subscriber(key, handler)
 
 
 def _at_once(hand_over: Callable[[T], None]) -> zenoh.handlers.Callback[T]:
-    """A callback that the thread which receives calls itself; it must be short, and never wait for Zenoh.
+    """Return a callback that runs on the receiving thread. It must be short, and must not wait for Zenoh.
 
-    Otherwise each subscriber has a thread of its own, to which every message is handed on.
+    By default, Zenoh hands each message to a separate thread of the subscriber.
     """
     return zenoh.handlers.Callback(hand_over, indirect=False)
 
 
 def deliver(sample: zenoh.Sample, inbox: Inbox, topic: Topic) -> None:
-    """Put what has come into `inbox`, or have it refused there: a wildcard, an unknown key, a deletion."""
+    """Put the message into `inbox`, which refuses it if it is a deletion, or on a wildcard or unknown key."""
     key = str(sample.key_expr)
     source = keys.parse(key)
     if source is None:
@@ -139,7 +142,7 @@ def deliver(sample: zenoh.Sample, inbox: Inbox, topic: Topic) -> None:
 
 
 def watch_liveliness(session: zenoh.Session, key: str, inbox: Inbox) -> None:
-    """Put "alive" or "gone" into `inbox` for tokens under `key`, those already there included."""
+    """Put "alive" or "gone" into `inbox` for each token on `key`, including those that exist already."""
 
     def hand_over(sample: zenoh.Sample) -> None:
         topic: Topic = "alive" if sample.kind == zenoh.SampleKind.PUT else "gone"
@@ -154,23 +157,24 @@ def watch_liveliness(session: zenoh.Session, key: str, inbox: Inbox) -> None:
 
 
 def alive(session: zenoh.Session, key: str, timeout: float) -> list[Key]:
-    """The keys of the liveliness tokens under `key`, now; waits `timeout` seconds at the most."""
+    """Return the keys of the current liveliness tokens on `key`, within `timeout` s."""
     replies = session.liveliness().get(key, timeout=timeout)
     shown = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
     return [source for one in sorted(shown) if (source := keys.parse(one)) is not None]
 
 
 def linked(session: zenoh.Session) -> bool:
-    """Whether there is a link to a router."""
+    """Return whether the session has a link to a router."""
     return bool(session.info.routers_zid())
 
 
 def ask(
     session: zenoh.Session, key: str, timeout: float, is_understood: Callable[[bytes], bool] = lambda _: True
 ) -> bytes | str | None:
-    """Return the answer at `key`: a frame that `is_understood`, else a refusal in words, else any frame.
+    """Return the answer to a query on `key`, or None if there is none within `timeout` s.
 
-    None if nobody answers. Strangers may answer, too: whoever is understood is preferred.
+    Any participant may answer. A frame that `is_understood` is preferred to the text of a refusal, and that
+    to any other frame.
     """
     refusal: str | None = None
     strange: bytes | None = None
@@ -183,40 +187,40 @@ def ask(
             strange = strange or frame
         elif (
             reply.err is not None and reply.err.encoding == REFUSAL
-        ):  # Zenoh's own is that nobody answered in time
+        ):  # Zenoh's own errors, such as a timeout, have another encoding
             refusal = refusal or reply.err.payload.to_bytes()[:COMPLAINT].decode(errors="replace")
     return refusal if refusal is not None else strange
 
 
 def answer(session: zenoh.Session, key: str, reply: Callable[[str], Message | str]) -> None:
-    """Answer queries under `key` with what `reply` makes of the robot asked for: a message, or a refusal."""
+    """Answer queries on `key` with `reply`, which returns a message for a robot, or the text of a refusal."""
 
     def hand_over(query: zenoh.Query) -> None:
         asked = keys.parse(str(query.key_expr))
-        said = reply(asked.robot) if asked is not None else NO_KEY
-        if isinstance(said, str):
-            query.reply_err(said, encoding=REFUSAL)
+        answered = reply(asked.robot) if asked is not None else NO_KEY
+        if isinstance(answered, str):
+            query.reply_err(answered, encoding=REFUSAL)
         else:
-            query.reply(query.key_expr, encode(said), encoding=MSGPACK)
+            query.reply(query.key_expr, encode(answered), encoding=MSGPACK)
 
     session.declare_queryable(key, hand_over)
 
 
 def show_alive(session: zenoh.Session, key: str) -> zenoh.LivelinessToken:
-    """A token under `key`, for as long as this session lives. Declare whatever must be heard before it."""
+    """Declare a liveliness token on `key`, which lasts as long as the session. Declare subscribers before."""
     return session.liveliness().declare_token(key)
 
 
 def on_matching(publisher: zenoh.Publisher, tell: Callable[[bool], None]) -> None:
-    """Tell, now and on every change, whether anyone listens to `publisher`."""
+    """Call `tell`, now and on every change, with whether `publisher` has a subscriber."""
     handler: zenoh.handlers.Callback[zenoh.MatchingStatus] = _at_once(lambda status: tell(status.matching))
     publisher.declare_matching_listener(handler)
-    status: Any = publisher.matching_status  # declared as bool, which it is not
+    status: Any = publisher.matching_status  # its declared type, bool, is wrong
     tell(status.matching)
 
 
 def publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
-    """A publisher for the tick's path: nothing waits to be batched, nothing is dropped."""
+    """Return a publisher of frames on `key`. It neither batches nor drops messages."""
     return session.declare_publisher(
         key,
         encoding=MSGPACK,
@@ -226,12 +230,12 @@ def publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
 
 
 def leave(status: int) -> NoReturn:
-    """End the process, without the interpreter's own end.
+    """End the process with this exit status, without the shutdown of the interpreter.
 
-    A session that did not close would hang it; and a thread of Zenoh's that is just then in a callback, as it
-    may be for a moment after its session has closed, would abort the process.
+    The shutdown would hang if a session did not close. It would abort the process if one of Zenoh's threads
+    is in a callback, which is possible for a moment after a session has closed.
     """
     for stream in (sys.stdout, sys.stderr):
-        with suppress(OSError):  # nobody reads it any more
+        with suppress(OSError):  # the reader may be gone
             stream.flush()
     os._exit(status)

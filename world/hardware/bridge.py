@@ -1,9 +1,12 @@
-"""One robot without a world: its driver's Observations to its agent, its agent's Commands to the driver.
+"""The bridge between one robot's driver and its agent, in hardware mode.
 
-The agent is the one that a world has, in a process of its own: whatever becomes of it, its robot stands still
-within a manoeuvre. A tick is a manoeuvre of T_s and a moment at rest, in which is sensed, heard and decided.
-The two of a pair count the same ticks: a says when one begins, b goes by that, or by its own clock while it
-hears nothing.
+It sends Observations made from the driver's readings to the agent, and executes the agent's Commands with the
+driver. The agent is the same program as with a simulator. It runs in a process of its own, so if it ends, the
+robot stops after the current manoeuvre.
+
+A tick is a manoeuvre of T_s and a rest, for measurements, Reports and the decision. The robots of a pair
+count the same ticks. Robot a sends a TickStart at the start of each, from which b sets its clock. If none
+arrives, b uses its own clock.
 """
 
 from __future__ import annotations
@@ -37,33 +40,36 @@ from world.hardware.driver_journal import DriverPast, Mark
 from world.hardware.termination import Ending
 
 REPEAT_S = 0.25
-"""how often the MissionEnd is said again"""
-FAREWELL_S = 2.0
-"""how long to wait for the agent's last word"""
+"""The period in s in which the MissionEnd is repeated."""
+FINAL_REPORT_TIMEOUT_S = 2.0
+"""The time in s to wait for the agent's FinalReport."""
 ASTRAY = 64
-"""ticks that a's beat may be ahead of b; a beat of long ago is of an a that was started again, and lost"""
+"""The maximum number of ticks by which a TickStart of a may differ from b's tick.
+
+One of a much earlier tick was sent by an a that has been restarted without its journal.
+"""
 
 AT_ONCE = 1000
-"""messages that are taken without a look at the clock"""
+"""The maximum number of messages that are processed without checking the time."""
 UNKNOWN = -math.inf
-"""a time; clocks may begin at 0, and what is late lies before that"""
+"""An unknown time. It is less than any time, because monotonic clocks may start at 0."""
 
 UNHEARD = 4.0
-"""ticks within which a robot that goes on tells that it does"""
+"""The number of ticks within which a running robot sends a TickStart."""
 
 M = TypeVar("M", Command, TickStart, Report)
 
 
 class NoStart(TimeoutError):
-    """Somebody was not there within the wait; says who."""
+    """An agent was not connected within the connection timeout. The text of the error names it."""
 
 
 class DriverFailed(Exception):
-    """The driver cannot go on, or says what cannot be; its text says what."""
+    """The driver raised an error, or returned an invalid reading. The text of the error is the reason."""
 
 
 class Field:
-    """One robot's mission over one session."""
+    """The mission of one robot, over one session."""
 
     def __init__(
         self,
@@ -77,9 +83,10 @@ class Field:
         timeout: float = 30.0,
         journal: Sink | None = None,
     ) -> None:
-        """`manoeuvre_s` (s) is T_s by the clock; `timeout` (s) bounds every wait for an answer.
+        """Connect `driver` to the agent of `config` under the run name `run`.
 
-        What is measured and driven goes to `journal`, which begins with the briefing.
+        `manoeuvre_s` is the duration of a manoeuvre in s of wall time. `timeout` (s) limits each wait for an
+        answer. Observations and Commands are written to `journal`, which already contains the RobotConfig.
         """
         self._driver = driver
         self._config = config
@@ -94,29 +101,31 @@ class Field:
         self._max_ticks = max_ticks
         self._ending = Ending(config, max_ticks, self._timeout)
         self._end: MissionEnd | None = None
-        """once it is on record"""
-        self._again = False
-        """whether its process was killed before, be it before tick 0"""
+        """The journaled end of the mission; None before."""
+        self._restarted = False
+        """True if this process is a restarted one, even if it was killed before tick 0."""
         self._resumed = False
+        """True if this process is a restarted one that was killed after tick 0."""
         self._astray = ASTRAY
-        """ticks that the peer's beat may be ahead"""
+        """The number of ticks by which the peer's next TickStart may be ahead."""
         self._alive: set[str] = set()
+        """The robots with a liveliness token."""
         self._unanswered: deque[tuple[int, bytes]] = deque()
-        """Senses that the agent has not answered"""
+        """The ticks and frames of the Observations that the agent has not answered."""
         self._answered = 0.0
-        """when it last did; one that only appears, be it over and over, has not"""
+        """The time of the agent's last Command. An agent that only appears again does not count."""
         self._tick = -1
         self._next = UNKNOWN
-        """when the tick after this one begins"""
+        """The time at which the next tick begins."""
         self.missed = 0
-        """manoeuvres that the robot stood instead"""
+        """The number of ticks in which the robot rested because a Command was missing."""
 
     def resume(self, past: DriverPast, known: int) -> None:
-        """Go on where the driver's journal ends; `known` is the latest tick on the agent's.
+        """Continue at the end of the driver's journal. `known` is the latest tick in the agent's journal.
 
-        The robot stood while this process was down, so the peer may be any number of ticks ahead.
+        The robot rested while this process was down, so the peer may be any number of ticks ahead.
         """
-        self._again = True
+        self._restarted = True
         for one in past.ticks:
             for report in one.reports:
                 self._ending.told(report)
@@ -128,19 +137,19 @@ class Field:
 
     @property
     def tick(self) -> int:
-        """The latest that has begun; -1 before any."""
+        """The current tick; -1 before tick 0."""
         return self._tick
 
     @property
     def verdict(self) -> Verdict | None:
-        """What the robot has come to, if it has."""
+        """The robot's final result; None until it has one."""
         return self._ending.verdict
 
     def attach(self, link: zenoh.Session) -> None:
-        """This is the session over which the agent and the peer are reached."""
+        """Use the session `link` to communicate with the agent and the peer."""
         me, run, inbox = self._id, self.run, self._inbox
         self._observation = session.publisher(link, keys.observation(run, me))
-        self._beat = session.publisher(link, keys.tick_start(run, me))
+        self._tick_start = session.publisher(link, keys.tick_start(run, me))
         session.subscribe(link, keys.command(run, me), inbox, "command")
         session.subscribe(link, keys.tick_start(run, self._peer), inbox, "tick-start")
         session.subscribe(link, keys.report(run, self._peer, me), inbox, "report")
@@ -149,10 +158,11 @@ class Field:
         self._token = session.show_alive(link, keys.world_alive(run))
 
     def play(self, wait: float, ended: Callable[[], None]) -> MissionEnd:
-        """The whole mission; looks for agent and peer for `wait` seconds. The robot stands when this is over.
+        """Run the whole mission, stop the robot, and return the MissionEnd.
 
-        `ended` is called when the agent's process has ended; it may start it again, or raise. Raises NoStart;
-        whatever `ended` raises; Interrupted when told to stop.
+        `wait` is the time in s to wait for both agents to connect. `ended` is called when the agent's process
+        has ended. It may restart the process, or raise an error. Raises NoStart; the errors of `ended`;
+        Interrupted by a signal; CannotRecord.
         """
         self._ended = ended
         end = self._end
@@ -166,32 +176,33 @@ class Field:
             self._stop()
         if self._end is None:
             self._write(encode(end))
-        self._part(end)
+        self._finish(end)
         return end
 
     def _write(self, *frames: bytes) -> None:
-        """Put them on record. Raises CannotRecord."""
+        """Write `frames` to the journal. Raises CannotRecord."""
         if self._journal is not None:
             self._journal.write(*frames)
 
     # --- a tick ---
 
     def _gather(self, give_up: float) -> None:
-        """Until tick 0: a's begins when both agents are there, b's when a's has.
+        """Wait until tick 0 can begin: for a when both agents are connected, for b when a has begun.
 
-        Whoever resumes waits for its own agent only: the peer may have come to its end. A b that was killed
-        before tick 0 may have missed that a has begun, and that a now waits for it.
+        A resumed process only waits for its own agent, because the peer's mission may have ended. If b was
+        killed before tick 0, it may have missed the TickStart of an a that now waits for it. It therefore
+        begins after UNHEARD ticks without one. Raises NoStart.
         """
         unheard = time.monotonic() + UNHEARD * self._tick_s
         while not self._may_begin():
-            if self._again and {self._id, self._peer} <= self._alive and time.monotonic() >= unheard:
+            if self._restarted and {self._id, self._peer} <= self._alive and time.monotonic() >= unheard:
                 self._next = time.monotonic()
                 break
             if time.monotonic() >= give_up:
                 missing = [one for one in (self._id, self._peer) if one not in self._alive]
-                moved = "" if self._resumed else "; nobody has moved"
-                raise NoStart(f"{' and '.join(missing) or self._peer}: not there{moved}")
-            until = min(give_up, unheard) if self._again and unheard > time.monotonic() else give_up
+                moved = "" if self._resumed else "; no robot has moved"
+                raise NoStart(f"{' and '.join(missing) or self._peer}: not connected{moved}")
+            until = min(give_up, unheard) if self._restarted and unheard > time.monotonic() else give_up
             self._take(self._inbox.next(until - time.monotonic()))
         self._answered = time.monotonic()
 
@@ -207,18 +218,18 @@ class Field:
         tick = self._tick
         now = time.monotonic()
         self._next = (now if self._next == UNKNOWN else self._next) + self._tick_s
-        if not self._resumed or self._next > now:  # one that catches up says so once it is there
-            self._beat.put(encode(TickStart(tick, self._id)))
+        if not self._resumed or self._next > now:  # none while catching up: the peer would wait
+            self._tick_start.put(encode(TickStart(tick, self._id)))
         reading = self._reading(tick)
-        observation = _sense(reading, tick, self._config)
+        observation = _observation(reading, tick, self._config)
         self._write(*_mark(reading, tick, self._id), observation)
         self._unanswered.append((tick, observation))
         self._observation.put(observation)
-        command = self._awaited(tick)
+        command = self._wait_for_command(tick)
         until = time.monotonic()
         if command is not None:
             self._write(encode(command))
-            self._set_off(command)
+            self._drive(command)
             until = time.monotonic() + self._manoeuvre_s
         else:
             self.missed += 1
@@ -232,20 +243,20 @@ class Field:
     def _reading(self, tick: int) -> Reading:
         try:
             reading = self._driver.sense(tick)
-        except Exception as error:  # it is the user's own, and may raise anything
+        except Exception as error:  # a driver of the user may raise anything
             raise DriverFailed(f"sense({tick}): {type(error).__name__}: {error}") from error
         if not isinstance(reading, Reading):
-            raise DriverFailed(f"sense({tick}): gives {type(reading).__name__}, expected a Reading")
+            raise DriverFailed(f"sense({tick}): returns {type(reading).__name__}, expected a Reading")
         return reading
 
     def _stop(self) -> None:
         try:
             self._driver.stop()
-        except Exception as error:  # noqa: BLE001  # as above; and there is an MissionEnd to be told
+        except Exception as error:  # noqa: BLE001  # as above; the MissionEnd still has to be sent
             self._inbox.say(f"the driver does not stop: {type(error).__name__}: {error}")
 
-    def _set_off(self, command: Command) -> None:
-        """At v_max and omega_max at the most."""
+    def _drive(self, command: Command) -> None:
+        """Execute `command`, limited to v_max and omega_max. Raises DriverFailed."""
         mission = self._config.mission
         v = min(max(command.v, -mission.max_speed), mission.max_speed)
         omega = min(max(command.omega, -mission.max_turn_rate), mission.max_turn_rate)
@@ -254,8 +265,8 @@ class Field:
         except Exception as error:  # as above
             raise DriverFailed(f"drive({v:g}, {omega:g}): {type(error).__name__}: {error}") from error
 
-    def _awaited(self, tick: int) -> Command | None:
-        """The Command of this tick, if it comes before the manoeuvre would outlast the tick."""
+    def _wait_for_command(self, tick: int) -> Command | None:
+        """Return the Command of this tick; None if it arrives too late for a manoeuvre in the tick."""
         while (left := self._next - self._manoeuvre_s - time.monotonic()) > 0.0:
             command = self._take(self._inbox.next(left))
             if command is not None and command.tick == tick:
@@ -265,7 +276,7 @@ class Field:
     # --- what arrives ---
 
     def _take_waiting(self) -> None:
-        """Take what has arrived by now: with a driver whose `observation` lasts for a tick, nobody else looks."""
+        """Process the messages that have arrived, so that this is also done if `sense` takes a whole tick."""
         for _ in range(AT_ONCE):
             arrival = self._inbox.next(0.0)
             if arrival is NOTHING:
@@ -273,18 +284,18 @@ class Field:
             self._take(arrival)
 
     def _take(self, arrival: Arrival) -> Command | None:
-        """Do what is to be done about it; the agent's Command, if it is one, of whichever tick."""
+        """Process what has arrived, and return it if it is a Command of the agent, of any tick."""
         match arrival.topic:
             case "command":
-                return self._on_drive(arrival)
+                return self._on_command(arrival)
             case "tick-start":
-                self._on_beat(arrival)
+                self._on_tick_start(arrival)
             case "report":
                 self._on_report(arrival)
             case "alive":
                 self._alive.add(arrival.source.robot)
                 if arrival.source.robot == self._id:
-                    for _, frame in self._unanswered:  # while it was away
+                    for _, frame in self._unanswered:  # it may have missed them while it was restarted
                         self._observation.put(frame)
             case "gone":
                 self._alive.discard(arrival.source.robot)
@@ -295,7 +306,7 @@ class Field:
         return None
 
     def _accepted(self, arrival: Arrival, kind: type[M]) -> M | None:
-        """The message that arrived, if it is one of `kind` and from the robot whose key it came by."""
+        """Return the message that arrived, if it is a `kind` from the robot of its key; None if refused."""
         try:
             message: M = decode(arrival.frame, kind, MAX_REPORT_BYTES)
         except MalformedFrame as error:
@@ -306,7 +317,7 @@ class Field:
             return None
         return message
 
-    def _on_drive(self, arrival: Arrival) -> Command | None:
+    def _on_command(self, arrival: Arrival) -> Command | None:
         command = self._accepted(arrival, Command)
         if command is None or command.tick > self._tick:
             if command is not None:
@@ -317,22 +328,23 @@ class Field:
             self._answered = time.monotonic()
         return command
 
-    def _on_beat(self, arrival: Arrival) -> None:
-        """b's next tick begins as many ticks after that of a's as it is farther on: at once, if it is not.
+    def _on_tick_start(self, arrival: Arrival) -> None:
+        """Set the time of b's next tick from a TickStart of a.
 
-        An a that has been started again goes by b in the same way, as long as it is behind.
+        b's next tick begins as many ticks later as its number is higher, and at once if it is lower. A
+        restarted a sets its clock from b in the same way, as long as it is behind.
         """
-        beat = self._accepted(arrival, TickStart)
-        if beat is None:
+        tick_start = self._accepted(arrival, TickStart)
+        if tick_start is None:
             return
-        left = self._tick + 1 - beat.tick
+        left = self._tick + 1 - tick_start.tick
         if self._config.role == "a" and (left >= 0 or not self._resumed):
             return
         if -self._astray <= left <= (2 if self._resumed or self._astray == ASTRAY else ASTRAY):
             self._astray = ASTRAY
             self._next = time.monotonic() + left * self._tick_s
         else:
-            self._inbox.refuse(arrival, f"it is of tick {beat.tick}, this is tick {max(self._tick, 0)}")
+            self._inbox.refuse(arrival, f"it is of tick {tick_start.tick}, this is tick {max(self._tick, 0)}")
 
     def _on_report(self, arrival: Arrival) -> None:
         report = self._accepted(arrival, Report)
@@ -341,9 +353,9 @@ class Field:
 
     # --- the end ---
 
-    def _part(self, end: MissionEnd) -> None:
-        """Tell the agent that it is over, until it has said its last word, and that this has been heard."""
-        give_up = time.monotonic() + FAREWELL_S
+    def _finish(self, end: MissionEnd) -> None:
+        """Send `end` to the agent until it sends its FinalReport, and acknowledge that."""
+        give_up = time.monotonic() + FINAL_REPORT_TIMEOUT_S
         while (now := time.monotonic()) < give_up and self._id in self._alive:
             self._observation.put(encode(end))
             repeat = min(now + REPEAT_S, give_up)
@@ -351,15 +363,15 @@ class Field:
                 arrival = self._inbox.next(left)
                 if arrival.topic == "gone":
                     self._alive.discard(arrival.source.robot)
-                elif arrival.topic == "command" and _is_farewell(arrival.frame, self._id):
+                elif arrival.topic == "command" and _is_final_report(arrival.frame, self._id):
                     self._observation.put(arrival.frame)
                     return
-        why = "no answer to the MissionEnd" if self._id in self._alive else "its agent has gone"
+        why = "no answer to the MissionEnd" if self._id in self._alive else "its agent has ended"
         self._inbox.say(f"no FinalReport of {self._id}: {why}")
 
 
-def _sense(reading: Reading, tick: int, config: RobotConfig) -> bytes:
-    """The frame of the Observation that `reading` makes. Raises DriverFailed if it is none."""
+def _observation(reading: Reading, tick: int, config: RobotConfig) -> bytes:
+    """Return the frame of the Observation with `reading`. Raises DriverFailed if a value is invalid."""
     ranged = reading.mutual_range is not None
     contacts = (Contact(config.peer, reading.mutual_range, None),) if ranged or reading.contact else ()
     executed = reading.executed if tick > 0 else None
@@ -372,7 +384,7 @@ def _sense(reading: Reading, tick: int, config: RobotConfig) -> bytes:
 
 
 def _mark(reading: Reading, tick: int, robot: str) -> list[bytes]:
-    """The frame of the mark of `reading`, if it has one. Raises DriverFailed if it is none."""
+    """Return the frame of the mark of `reading`, if it has one. Raises DriverFailed if it is invalid."""
     if not reading.mark:
         return []
     try:
@@ -383,7 +395,7 @@ def _mark(reading: Reading, tick: int, robot: str) -> list[bytes]:
     return [frame]
 
 
-def _is_farewell(frame: bytes, robot: str) -> bool:
+def _is_final_report(frame: bytes, robot: str) -> bool:
     try:
         return decode(frame, FinalReport).robot == robot
     except MalformedFrame:

@@ -1,8 +1,8 @@
-"""The contract of a robot's own driver: wheels and sensors of one robot, in the world's place.
+"""The contract of a driver: the interface to the wheels and sensors of one robot, in hardware mode.
 
-What the world is to a robot, its hardware is without one: from both come Observations, to both go Commands, and an
-agent cannot tell which it has. So the contract stands in this room, and `world/hardware/bridge.py` plays by
-it. docs/driver.md tells a driver's author the same at length, and `tandem check-driver` tries a driver.
+In hardware mode, `world/hardware/bridge.py` takes the place of the simulator. It makes Observations from what
+the driver measures, and executes Commands with it, so an agent works in the same way in both modes. See
+docs/driver.md for a guide. `tandem check-driver` tests a driver against this contract.
 """
 
 from __future__ import annotations
@@ -14,58 +14,65 @@ import msgspec
 from protocol.motion import Controls
 
 THINKING = 0.25
-"""of T_s: by how much a tick lasts longer than its manoeuvre, for sensing, hearing and deciding at rest"""
+"""The duration of the rest in each tick, for measurements, Reports and the decision, as a fraction of T_s."""
 SENSING = 0.1
-"""of T_s: how long `observation` may take, so that there is time left to decide"""
+"""The maximum duration of `sense`, as a fraction of T_s. The rest of THINKING is for the decision."""
 
 
 class Reading(msgspec.Struct, frozen=True):
-    """What one robot's sensors say, standing, between two manoeuvres."""
+    """The measurements of one robot at rest, between two manoeuvres."""
 
     executed: Controls
-    """m/s and rad/s: what it drove since the reading before, as it was measured, as if held for T_s: `step`
-    of it (protocol/motion.py) leads from where it stood to where it stands. At tick 0 nobody looks at it"""
+    """The measured motion since the previous reading, in m/s and rad/s; ignored at tick 0.
+
+    These are the constant velocities that lead from the previous to the current pose in T_s, by `step`
+    (protocol/motion.py).
+    """
     anchor_range: float | None = None
-    """m, to its own anchor, now; none beyond R, or of a drop-out, if the mission has any"""
+    """The current range to the robot's own anchor, in m; None beyond R, and for a drop-out."""
     mutual_range: float | None = None
-    """m, to its peer, measured while both stood in this same tick; else none, as above"""
+    """The range to the peer, in m, measured in this tick with both robots at rest; None as for the anchor."""
     contact: bool = False
-    """whether the peer is near though no range was had; a range is a contact anyway"""
+    """True if the peer is within range without a measured range. A measured range always is a contact."""
     mark: tuple[float, ...] = ()
-    """numbers that are handed to `resume`, such as the odometer's at this reading"""
+    """The numbers that `resume` gets after a restart, such as the odometer's values at this reading."""
 
 
 class Driver(Protocol):
-    """Made of the robot's RobotConfig, the seconds that a manoeuvre lasts, and the user's options, as strings.
+    """The driver of one robot.
 
-    The laws: a robot moves only by `command`, for one manoeuvre at the most, and then stands until told
-    otherwise, whatever becomes of whoever told it; over a manoeuvre that was not interrupted,
-    `step(before, v, omega, T_s) = after`, within the mission's noise. One thread calls.
+    Its constructor takes the RobotConfig, the duration of a manoeuvre in s, and the user's options as keyword
+    arguments (strings). All calls come from one thread. A driver has to obey two laws:
+
+    - The robot only moves after `drive`, for at most one manoeuvre. It then rests until the next call, even
+      if the calling process has ended.
+    - A manoeuvre that is not interrupted satisfies `step(before, v, omega, T_s) = after` within the mission's
+      noise.
     """
 
     def sense(self, tick: int) -> Reading:
-        """What the sensors say in `tick`, which counts 0, 1, 2, ...; within SENSING of a manoeuvre.
+        """Return the measurements at `tick` (0, 1, 2, ...), within SENSING of a manoeuvre's duration.
 
-        What could not be measured is none only where the mission has drop-outs: otherwise silence is a fact.
-        Raises any exception if it cannot tell; then the mission is over for this robot.
+        A range within R may only be None if the mission has drop-outs: without them, None means out of range.
+        Raise any exception if a measurement fails. This ends the mission of this robot.
         """
 
     def drive(self, v: float, omega: float) -> None:
-        """Begin a manoeuvre: hold `v` m/s and `omega` rad/s from now, then stand. Returns at once."""
+        """Start a manoeuvre with `v` m/s and `omega` rad/s, and return at once. The robot stops by itself."""
 
     def stop(self) -> None:
-        """Stand still now. It comes at the end, too, whatever that was; and it may come twice."""
+        """Stop the robot now. This is always called at the end, and may be called several times."""
 
     def close(self) -> None:
-        """Let go of the hardware; nothing comes after that."""
+        """Release the hardware. This is the last call."""
 
 
 class Resumable(Driver, Protocol):
-    """A driver that goes on from a record after its process was killed; without `resume` none can."""
+    """A driver that can resume a mission after its process was killed."""
 
     def resume(self, tick: int, mark: tuple[float, ...]) -> None:
-        """Comes once after a restart, after `stop` and before the first `observation`.
+        """Continue after the recorded reading of `tick`, whose mark is `mark`.
 
-        The latest reading on record is that of `tick`, and carried `mark`. One that was taken after it is
-        lost, and is taken again: the next `executed` is what was driven since the reading on record.
+        This is called once after a restart, after `stop` and before the first `sense`. A later reading is not
+        in the recording and has to be repeated: the next `executed` is the motion since the recorded one.
         """

@@ -1,8 +1,8 @@
 """The journal of a robot's driver: the measurements and commands that a resume needs.
 
-A Observation is written before it is sent to the agent, and a Command before it is executed. After a kill, the
-journal therefore contains everything that was sent or executed, and at most the reading of one tick has to
-be repeated. After a power cut this holds only if each write was synced (`--fsync`). If not, the robot
+An Observation is written before it is sent to the agent, and a Command before it is executed. After a kill,
+the journal therefore contains everything that was sent or executed, and at most the reading of one tick has
+to be repeated. After a power cut this holds only if each write was synced (`--fsync`). If not, the robot
 refuses to resume: its Reports could contradict earlier ones, and its peer would find them inconsistent.
 """
 
@@ -20,7 +20,7 @@ from protocol.units import Finite, RobotId, Tick
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 
 MAX_MARK = 64
-"""the maximum number of values of a mark"""
+"""The maximum number of values of a mark."""
 
 
 def driver_journal(robot: str) -> str:
@@ -40,13 +40,13 @@ class ProcessStart(Message, frozen=True):
     """The start of the process that writes the frames after it."""
 
     boot: Annotated[str, msgspec.Meta(max_length=64)]
-    """identifies the boot of the computer; empty if the system does not tell"""
+    """The identifier of the computer's boot; empty if the system does not provide one."""
     synced: bool
-    """whether each write is synced to the disk before the process continues"""
+    """True if each write is synced to the disk before the process continues."""
 
 
 def boot() -> str:
-    """Return the identifier of this computer's current boot; "" if the system does not tell."""
+    """Return the identifier of this computer's current boot; "" if the system does not provide one."""
     try:
         return BOOT.read_text(encoding="ascii").strip()
     except OSError:
@@ -61,11 +61,11 @@ class DrivenTick(msgspec.Struct, frozen=True):
 
     observation: Observation
     frame: bytes
-    """the encoded Sense"""
+    """The frame of the Observation."""
     command: Command | None = None
-    """None if the agent missed the deadline"""
+    """The Command of the agent; None if it missed the deadline."""
     reports: tuple[Report, ...] = ()
-    """the peer's Reports that affect when the mission is over"""
+    """The peer's Reports that affect when the mission ends."""
 
 
 class DriverPast(msgspec.Struct, frozen=True):
@@ -73,10 +73,10 @@ class DriverPast(msgspec.Struct, frozen=True):
 
     ticks: tuple[DrivenTick, ...] = ()
     mark: tuple[float, ...] = ()
-    """the mark of the latest reading; empty if it has none"""
+    """The mark of the latest reading; empty if it has none."""
     end: MissionEnd | None = None
     start: ProcessStart | None = None
-    """the latest Start"""
+    """The latest start of the driver's process."""
 
     @property
     def tick(self) -> int:
@@ -85,7 +85,7 @@ class DriverPast(msgspec.Struct, frozen=True):
 
     @property
     def may_lack(self) -> bool:
-        """Whether frames may be missing: writes were not synced, and the computer has been rebooted since."""
+        """True if frames may be missing: writes were not synced, and the computer has been rebooted since."""
         start = self.start
         return self.end is None and start is not None and not start.synced and start.boot != boot()
 
@@ -105,7 +105,7 @@ def driver_past(frames: Sequence[bytes], config: RobotConfig, path: Path) -> Dri
         match message:
             case RobotConfig() if place == 0:
                 if message != config:
-                    raise CorruptJournal(f"{path}: another run's: its briefing is not this mission's")
+                    raise CorruptJournal(f"{path}: it belongs to another mission: its RobotConfig differs")
             case ProcessStart() if place > 0 and end is None:
                 start = message
             case Mark(tick) if tick == len(ticks):
@@ -122,7 +122,7 @@ def driver_past(frames: Sequence[bytes], config: RobotConfig, path: Path) -> Dri
             case MissionEnd() if end is None:
                 end = message
             case _:
-                raise CorruptJournal(f"{path}: a {type(message).__name__} is out of order")
+                raise CorruptJournal(f"{path}: frame {place + 1}, {type(message).__name__}, is out of order")
     return DriverPast(tuple(ticks), mark, end, start)
 
 

@@ -1,7 +1,9 @@
-"""A driver for a robot that speaks ROS 2, through zenoh-bridge-ros2dds: a topic's name is its key, in CDR.
+"""A driver for robots with ROS 2, through zenoh-bridge-ros2dds.
 
-Out goes geometry_msgs/Twist, in come nav_msgs/Odometry and sensor_msgs/Range. What is fresh is told by when
-it came, not by its stamp: no two clocks have to agree. Needs the extra `ros`.
+The bridge maps each topic to the Zenoh key of the same name, with messages in CDR. The driver publishes
+geometry_msgs/Twist, and subscribes to nav_msgs/Odometry and sensor_msgs/Range. It decides by the time of
+arrival whether a message is fresh, and ignores the stamps, so the clocks need not be synchronised. It needs
+the extra `ros`.
 """
 
 from __future__ import annotations
@@ -24,44 +26,50 @@ from world.hardware.driver import SENSING, Reading
 
 TWIST, ODOMETRY, RANGE = "geometry_msgs/msg/Twist", "nav_msgs/msg/Odometry", "sensor_msgs/msg/Range"
 CONNECT_S = 10.0
-"""how long to look for the bridge"""
+"""The time in s to wait for the bridge."""
 REPEATS = 10
-"""Twists in a manoeuvre: a base that hears none for a while stops, and must"""
+"""The number of Twists in a manoeuvre. A mobile base stops if it receives none for a while, as it should."""
 
 _types = get_typestore(Stores.ROS2_HUMBLE)
 
 
 def twist(v: float, omega: float) -> bytes:
-    """A geometry_msgs/Twist, in m/s and rad/s."""
+    """Return the geometry_msgs/Twist with `v` m/s and `omega` rad/s, in CDR."""
     vector = _types.types["geometry_msgs/msg/Vector3"]
     message = _types.types[TWIST](linear=vector(v, 0.0, 0.0), angular=vector(0.0, 0.0, omega))
     return bytes(_types.serialize_cdr(message, TWIST))
 
 
 def odometry(payload: bytes) -> Pose:
-    """The pose in a nav_msgs/Odometry; its heading in (-pi, pi]. Raises ValueError."""
+    """Return the pose in a nav_msgs/Odometry: m, m, and rad in (-pi, pi].
+
+    Raises ValueError if `payload` is not such a message, or a value is not finite.
+    """
     pose = _message(payload, ODOMETRY).pose.pose
     q = pose.orientation
     yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
     found = Pose(float(pose.position.x), float(pose.position.y), yaw)
     if not all(map(math.isfinite, (found.x, found.y, found.heading))):
-        raise ValueError("a pose that is no number")
+        raise ValueError("a pose that is not finite")
     return found
 
 
 def ranged(payload: bytes, reach: float) -> float | None:
-    """m: what a sensor_msgs/Range says; none beyond `reach`, or its own limits. Raises ValueError."""
+    """Return the range in a sensor_msgs/Range, in m; None beyond `reach` m or the limits of the message.
+
+    Raises ValueError if `payload` is not such a message, or the range is NaN.
+    """
     message = _message(payload, RANGE)
     rho = float(message.range)
     if math.isnan(rho):
-        raise ValueError("a range that is no number")
+        raise ValueError("a range that is not a number")
     return rho if message.min_range <= rho <= min(message.max_range, reach) else None
 
 
 def executed(before: Pose, after: Pose, period: float) -> Controls:
-    """What leads from `before` to `after` (headings not wrapped) if held for `period` s; eq. (1a), inverted.
+    """Return the constant controls that lead from `before` to `after` in `period` s: the inverse of eq. (1a).
 
-    What a robot slips sideways is lost.
+    Headings must not be wrapped. Lateral slip is ignored.
     """
     turn = after.heading - before.heading
     course = before.heading + 0.5 * turn
@@ -71,7 +79,7 @@ def executed(before: Pose, after: Pose, period: float) -> Controls:
 
 
 class Ros2:
-    """One robot behind a bridge."""
+    """The driver of one robot behind a bridge."""
 
     def __init__(
         self,
@@ -84,19 +92,24 @@ class Ros2:
         anchor_range: str = "anchor_range",
         peer_range: str = "peer_range",
     ) -> None:
-        """`connect` is the bridge's Zenoh endpoint, the rest are topics. Raises TimeoutError."""
+        """Connect to the bridge at the Zenoh endpoint `connect`. The other options are names of topics.
+
+        Raises TimeoutError if there is no bridge within CONNECT_S.
+        """
         self._mission = config.mission
         self._manoeuvre_s = manoeuvre_s
         self._changed = threading.Condition()
         self._pose: tuple[Pose, float] | None = None
-        """the latest, its heading not wrapped, and when it came"""
+        """The latest pose, with its heading not wrapped, and the time of its arrival."""
         self._ranges: dict[str, tuple[float | None, float]] = {}
-        """the latest by topic, and when it came"""
+        """The latest range by topic, and the time of its arrival."""
         self._last: Pose | None = None
-        """at the reading before"""
+        """The pose at the previous reading."""
         self._rest_since = time.monotonic()
+        """The time at which the robot stops, or has stopped."""
         self._command = threading.Event()
-        self._command.set()  # nothing to be ended
+        """The event that ends the current manoeuvre."""
+        self._command.set()  # there is no manoeuvre yet
         self._anchor, self._peer = anchor_range, peer_range
         self._open = ExitStack()
         give_up = time.monotonic() + CONNECT_S
@@ -113,14 +126,17 @@ class Ros2:
             link.declare_subscriber(topic, self._on_range(topic))
 
     def sense(self, tick: int) -> Reading:
-        """What came since it stands. Raises TimeoutError, if nothing came that must."""
+        """Return the messages that have arrived since the robot stopped.
+
+        Raises TimeoutError if odometry is missing, or a range without drop-outs in the mission.
+        """
         now = time.monotonic()
         since = min(self._rest_since, now)
         give_up = now + (SENSING * self._manoeuvre_s if tick else CONNECT_S)
         with self._changed:
             self._changed.wait_for(lambda: self._is_all_here(since), give_up - now)
             if self._pose is None or self._pose[1] < since:
-                raise TimeoutError("no odometry since the robot stands")
+                raise TimeoutError("no odometry since the robot stopped")
             pose, _ = self._pose
             driven = executed(self._last or pose, pose, self._mission.period)
             self._last = pose
@@ -128,24 +144,24 @@ class Ros2:
             return Reading(driven, *ranges, mark=(pose.x, pose.y, pose.heading))
 
     def drive(self, v: float, omega: float) -> None:
-        """Say it over and over, for the time of a manoeuvre; then to rest."""
+        """Start to publish the velocities repeatedly for the duration of a manoeuvre, and then zero."""
         self._end_drive()
         ended = self._command = threading.Event()
         faster = self._mission.period / self._manoeuvre_s  # 1 in real time
         payload, until = twist(v * faster, omega * faster), time.monotonic() + self._manoeuvre_s
         self._rest_since = until
 
-        def say() -> None:
+        def publish() -> None:
             while not ended.is_set() and (left := until - time.monotonic()) > 0.0:
                 self._cmd_vel.put(payload)
                 ended.wait(min(left, self._manoeuvre_s / REPEATS))
             self._cmd_vel.put(twist(0.0, 0.0))
 
-        self._saying = threading.Thread(target=say, daemon=True)
-        self._saying.start()
+        self._publisher = threading.Thread(target=publish, daemon=True)
+        self._publisher.start()
 
-    def resume(self, tick: int, mark: tuple[float, ...]) -> None:  # noqa: ARG002  # the odometer tells
-        """Go on from the odometry of the latest reading, which the bridge, or the base, has outlived."""
+    def resume(self, tick: int, mark: tuple[float, ...]) -> None:  # noqa: ARG002  # the mark is a pose
+        """Continue from the pose of the latest recorded reading. The odometry must not have been reset."""
         with self._changed:
             self._last = Pose(*mark)
             pose, came = self._pose or (self._last, -math.inf)
@@ -153,22 +169,22 @@ class Ros2:
             self._pose = Pose(pose.x, pose.y, heading), came
 
     def stop(self) -> None:
-        """Twist zero, now."""
+        """End the manoeuvre, and publish a Twist of zero."""
         self._end_drive()
         self._rest_since = min(self._rest_since, time.monotonic())
         self._cmd_vel.put(twist(0.0, 0.0))
 
     def close(self) -> None:
-        """Leave the bridge."""
+        """Stop the robot and disconnect from the bridge."""
         self.stop()
         self._open.close()
 
     def _end_drive(self) -> None:
         if not self._command.is_set():
             self._command.set()
-            self._saying.join()
+            self._publisher.join()
 
-    # --- what arrives, on threads of Zenoh's ---
+    # --- callbacks, on Zenoh's threads ---
 
     def _on_odometry(self, payload: bytes) -> None:
         try:
@@ -193,7 +209,7 @@ class Ros2:
 
         return take
 
-    # --- what is fresh ---
+    # --- freshness of messages ---
 
     def _is_all_here(self, since: float) -> bool:
         came = [self._pose[1] if self._pose else 0.0]
@@ -201,17 +217,22 @@ class Ros2:
         return len(came) == 3 and min(came) >= since
 
     def _fresh(self, topic: str, since: float) -> float | None:
-        """m: what came on `topic` since then. Raises TimeoutError, unless ranges may drop out."""
+        """Return the range in m that arrived on `topic` since then; None if it is out of range, or missing.
+
+        Raises TimeoutError if it is missing and the mission has no drop-outs.
+        """
         rho, came = self._ranges.get(topic, (None, -math.inf))
         if came >= since:
             return rho
         if not self._mission.noise.drop_outs:
-            raise TimeoutError(f"nothing on {topic} since the robot stands, and the mission has no drop-outs")
+            raise TimeoutError(
+                f"nothing on {topic} since the robot stopped, and the mission has no drop-outs"
+            )
         return None
 
 
 def _message(payload: bytes, kind: str) -> Any:
     try:
         return _types.deserialize_cdr(payload, kind)
-    except Exception as error:  # noqa: BLE001  # the library says of bytes that are no message whatever it says
-        raise ValueError(f"no {kind}: {error}") from None
+    except Exception as error:  # noqa: BLE001  # the library raises all kinds of errors for malformed bytes
+        raise ValueError(f"not a {kind}: {error}") from None

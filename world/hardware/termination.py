@@ -1,7 +1,7 @@
-"""When a mission without a world is over for one robot, by what it says itself and by what it was told.
+"""The end of a mission in hardware mode, for one robot, from its own result and the peer's Reports.
 
-Nobody there knows the truth, so nobody can call a claim wrong. A robot stays until it knows that its peer
-knows: reports go on a little after that, for the peer to learn the same.
+The true poses are unknown, so the outcome is never `wrong`. A robot stays until the peer has acknowledged its
+result. It then continues to send Reports for LAST_WORDS ticks, which contain its own acknowledgement.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from protocol.messages import (
 from world.referee import inaccuracy
 
 LAST_WORDS = 4
-"""ticks in which a robot goes on telling, once it knows all that it must"""
+"""The number of ticks in which a robot still sends Reports after both results are known and acknowledged."""
 
 
 class Ending:
-    """What is known of both verdicts."""
+    """The results of both robots, as far as they are known to this one."""
 
     def __init__(self, config: RobotConfig, max_ticks: int, timeout: float) -> None:
         self._peer = config.peer
@@ -34,31 +34,35 @@ class Ending:
         self._max_ticks = max_ticks
         self._timeout = timeout
         self.verdict: Verdict | None = None
-        """the robot's own"""
+        """The robot's own result; None until it has one."""
         self._at = 0
-        """the tick of that"""
+        """The tick of the result."""
         self._since = 0.0
-        """when it was, by the clock"""
+        """The time of the result, on the monotonic clock."""
         self._peers: Verdict | None = None
+        """The peer's result; None until it is received."""
         self._acknowledged = -1
-        """the peer knows this robot's manoeuvres through this tick, and what it said then"""
+        """The tick up to which the peer has acknowledged this robot's manoeuvres, and so its Report."""
         self._known: int | None = None
-        """in which tick all was known"""
+        """The tick in which both results were known and acknowledged."""
 
     def told(self, report: Report) -> bool:
-        """The peer has said `report`; whether anything follows from it."""
-        before = self._peers, self._heard
+        """Add the peer's `report`, and return whether it changes what is known."""
+        before = self._peers, self._is_acknowledged
         self._acknowledged = max(self._acknowledged, report.heard)
         self._peers = self._peers or report.verdict
-        return (self._peers, self._heard) != before
+        return (self._peers, self._is_acknowledged) != before
 
     @property
-    def _heard(self) -> bool:
-        """Whether the peer knows this robot's verdict."""
+    def _is_acknowledged(self) -> bool:
+        """True if the peer has received this robot's result."""
         return self.verdict is not None and self._acknowledged >= self._at
 
     def after(self, tick: int, command: Command | None, *, peer_there: bool) -> MissionEnd | None:
-        """The MissionEnd, if `tick` was the last, in which the robot gave `command`; else none."""
+        """Return the MissionEnd if `tick`, in which the agent sent `command`, was the last; None otherwise.
+
+        `peer_there` is whether the peer's agent has a liveliness token.
+        """
         if self.verdict is None and command is not None and command.verdict is not None:
             self.verdict, self._at, self._since = command.verdict, tick, time.monotonic()
         if self.verdict is None:
@@ -66,7 +70,7 @@ class Ending:
                 return MissionEnd(tick, "undecided", f"max_ticks: {self._me} not localised by then")
             return None
         gone = not peer_there and self._peers is not None
-        if self._known is None and self._peers is not None and (self._heard or gone):
+        if self._known is None and self._peers is not None and (self._is_acknowledged or gone):
             self._known = tick
         if self._known is not None and tick >= self._known + LAST_WORDS:
             return self._end(tick)
@@ -75,18 +79,18 @@ class Ending:
         return None
 
     def _end(self, tick: int) -> MissionEnd:
-        for who, other, verdict in (
+        for robot, other, verdict in (
             (self._me, self._peer, self.verdict),
             (self._peer, self._me, self._peers),
         ):
             match verdict:
                 case Inconsistent(claim):
-                    return MissionEnd(tick, "inconsistent", f"{who}: {other} tells {claim}")
+                    return MissionEnd(tick, "inconsistent", f"{robot}: {other} reports {claim}")
                 case Undecided(reason):
-                    return MissionEnd(tick, "undecided", f"{who}: {reason}")
-        for who, verdict in ((self._me, self.verdict), (self._peer, self._peers)):
+                    return MissionEnd(tick, "undecided", f"{robot}: {reason}")
+        for robot, verdict in ((self._me, self.verdict), (self._peer, self._peers)):
             if isinstance(verdict, Localised) and (vague := inaccuracy(verdict, self._mission)) is not None:
-                return MissionEnd(tick, "undecided", f"{who} {vague}")
+                return MissionEnd(tick, "undecided", f"{robot} {vague}")
         if isinstance(self._peers, Localised):
             return MissionEnd(tick, "localised", None)
-        return MissionEnd(tick, "undecided", f"{self._me} is localised; {self._peer} was not heard to be")
+        return MissionEnd(tick, "undecided", f"{self._me} is localised; no result of {self._peer} received")
