@@ -197,14 +197,14 @@ def test_a_kill_is_read_as_it_is_written() -> None:
     ],
 )
 def test_a_mistyped_kill_is_none(text: str) -> None:
-    with pytest.raises(BadKill, match="is no kill"):
+    with pytest.raises(BadKill, match="is not a kill"):
         parse(text)
 
 
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--kill", "a17"], "--kill: 'a17' is no kill"),
+        (["--kill", "a17"], "--kill: 'a17' is not a kill"),
         (["--kill"], "--kill"),
         (["--kill", "z@17"], "--kill: z@17: there is no 'z'; there are a, b, world"),
         (["--kill", "a@17", "--in-process"], "--kill: --in-process has no processes to kill"),
