@@ -31,7 +31,7 @@ DRAWN = "?"
 """The value of `who` or `point` that is drawn from the seed."""
 _Tick = Annotated[int, Meta(ge=0, le=999_999_999)]
 _FORM = re.compile(
-    r"(?P<who>[A-Za-z0-9_-]{1,32})@(?P<tick>[0-9]{1,9})(?::(?P<point>sense|report|journal|drive))?"
+    r"(?P<who>[A-Za-z0-9_-]{1,32})@(?P<tick>[0-9]{1,9})(?::(?P<point>observation|report|journal|command))?"
     r"(?:\+(?:(?P<never>never)|(?P<after>[0-9]{1,6}(?:\.[0-9]{1,6})?)s))?"
 )
 
