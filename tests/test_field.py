@@ -94,7 +94,7 @@ def both_have_ended(out: Path, robots: dict[str, TandemProcess]) -> None:
         assert not (out / name / "world.journal").exists()
         replayed = tandem("replay", out / name)
         assert replayed.status == 0, replayed.out
-        assert f"{name}, without a world: as recorded, to the bit" in replayed.out
+        assert f"{name}, hardware mode: as recorded, to the bit" in replayed.out
 
 
 def test_two_robots_find_out_where_they_are_without_a_world(tmp_path: Path) -> None:
@@ -117,7 +117,7 @@ def test_two_robots_find_out_where_they_are_without_a_world(tmp_path: Path) -> N
     shutil.copy(tmp_path / "b" / "agent-b.journal", tmp_path / "a")
     both = tandem("replay", tmp_path / "a")
     assert both.status == 0
-    assert "a and b, without a world: as recorded, to the bit" in both.out
+    assert "a and b, hardware mode: as recorded, to the bit" in both.out
 
 
 @pytest.mark.long

@@ -223,8 +223,8 @@ def test_where_it_tears_is_told(recording: Path) -> None:
     assert as_recorded.startswith("paper-1: as recorded, to the bit, in 49 ticks ")
     assert rest > 0
     assert tears == [
-        "no tick, b: it has left no journal",
-        f"tick {last.tick}, a: its journal breaks off here, expected MissionEnd and Farewell",
+        "no tick, b: its journal is missing",
+        f"tick {last.tick}, a: its journal breaks off here, expected MissionEnd and FinalReport",
         f"agent-a.journal ends with {rest} bytes of a torn write",
     ]
 

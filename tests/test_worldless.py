@@ -235,7 +235,7 @@ def test_the_audit_holds_robots_to_their_limits_and_to_what_they_sensed(folders:
     _, alone = folders
     ended = tandem("audit", alone)
     assert ended.status == 0, ended.out
-    assert "a and b, without a world: no violations" in ended.out
+    assert "a and b, hardware mode: no violations" in ended.out
     assert [line.split()[0] for line in ended.out.splitlines()[3:]] == [rule.__name__ for rule in RULES]
 
 
