@@ -8,7 +8,7 @@ from agent.peer import peer_state
 from agent.process.agent_journal import Step
 from agent.process.robot import Robot
 from compose.audit.evidence import Testified
-from compose.audit.findings import Checks, Violation, between, difference, said
+from compose.audit.findings import Checks, Violation, between, difference, quoted
 from protocol.messages import FinalReport, Message, MissionEnd, Report
 from protocol.mission import Mission
 from protocol.motion import Controls
@@ -137,10 +137,10 @@ def _log_violation(
         for _ in range(run.ticks):
             k += 1
             if driven[k] != Controls(run.v, run.omega):
-                what = f"it reported ({run.v:g}, {run.omega:g}) until tick {k}, expected {said(driven[k])}"
+                what = f"it reported ({run.v:g}, {run.omega:g}) until tick {k}, expected {quoted(driven[k])}"
                 return Violation("log", tick, robot, what)
     for one in report.ranges:
         if ranged[one.tick] != one.range:
-            what = f"it reported {one.range!r} m at tick {one.tick}, expected {said(ranged[one.tick])}"
+            what = f"it reported {one.range!r} m at tick {one.tick}, expected {quoted(ranged[one.tick])}"
             return Violation("log", tick, robot, what)
     return None

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from agent.process.agent_journal import Past, Step
 from agent.process.robot import FramedReport
 from compose.audit.evidence import Evidence, Testified
-from compose.audit.findings import Checks, Violation, between, difference, said
+from compose.audit.findings import Checks, Violation, between, difference, quoted
 from protocol.wire import encode
 
 
@@ -52,7 +52,7 @@ def _listed(robot: str, step: Step) -> Violation | None:
     if len(received) + len(step.missed) == len(listed) and _is_subsequence(received, listed):
         return None
     missed = f" and missed {len(step.missed)}" if step.missed else ""
-    what = f"it received the reports of ticks {said(received)}{missed}, expected {said(listed)}"
+    what = f"it received the reports of ticks {quoted(received)}{missed}, expected {quoted(listed)}"
     return Violation("contact", step.observation.tick, robot, what)
 
 

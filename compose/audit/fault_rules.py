@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from agent.process.agent_journal import Past
 from compose.audit.evidence import Evidence
-from compose.audit.findings import Checks, LinkStatistics, Violation, said
+from compose.audit.findings import Checks, LinkStatistics, Violation, quoted
 
 
 def faults(evidence: Evidence) -> Checks:
@@ -21,7 +21,7 @@ def faults(evidence: Evidence) -> Checks:
                 if listed == planned:
                     yield None
                 else:
-                    what = f"heard and damaged are {said(listed)}, expected {said(planned)}"
+                    what = f"heard and damaged are {quoted(listed)}, expected {quoted(planned)}"
                     yield Violation("faults", step.observation.tick, robot, what)
 
 

@@ -112,7 +112,7 @@ def findings_of(
     ticks: int,
     links: tuple[LinkStatistics, ...] = (),
 ) -> Findings:
-    """Return the findings of `rules` in `evidence`, whose versions differ from these as `versions` describes."""
+    """Return the findings of `rules` in `evidence`; `versions` describes its other versions, if it has any."""
     checks = {rule.__name__: list(rule(evidence)) for rule in rules}
     found = [one for some in checks.values() for one in some if one is not None]
     found.sort(key=lambda one: -1 if one.tick is None else one.tick)
@@ -141,13 +141,13 @@ def difference(found: msgspec.Struct, expected: msgspec.Struct) -> str:
         return "the frame differs, its content is the same"
     first = fields[0]
     more = f" (and {', '.join(fields[1:])})" if fields[1:] else ""
-    return f"{first} is {said(getattr(found, first))}, expected {said(getattr(expected, first))}{more}"
+    return f"{first} is {quoted(getattr(found, first))}, expected {quoted(getattr(expected, first))}{more}"
 
 
 def between(found: msgspec.Struct, expected: msgspec.Struct) -> Difference:
     """Return the first value, at any depth, in which the two messages differ."""
     field, one, other = _first("", found, expected)
-    return Difference(type(found).__name__, field, said(one), said(other), _close(found, expected))
+    return Difference(type(found).__name__, field, quoted(one), quoted(other), _close(found, expected))
 
 
 def _close(one: Any, other: Any) -> bool:
@@ -180,7 +180,7 @@ def _first(path: str, found: Any, expected: Any) -> tuple[str, Any, Any]:
     return path.removeprefix("."), found, expected
 
 
-def said(value: Any) -> str:
+def quoted(value: Any) -> str:
     """Return `value` as JSON, cut to MAX_VALUE characters."""
     text = msgspec.json.encode(value).decode()
     return text if len(text) <= MAX_VALUE else f"{text[: MAX_VALUE - 3]}..."
