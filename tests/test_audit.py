@@ -780,8 +780,8 @@ def test_what_is_no_record_is_refused(tmp_path: Path) -> None:
     file, empty = tmp_path / "file", tmp_path / "empty"
     file.write_text("")
     empty.mkdir()
-    refused(tandem("audit", tmp_path / "nowhere"), "nowhere holds no record: there is no world.journal")
-    refused(tandem("audit", empty), "empty holds no record: there is no world.journal")
+    refused(tandem("audit", tmp_path / "nowhere"), "nowhere contains no recording: there is no world.journal")
+    refused(tandem("audit", empty), "empty contains no recording: there is no world.journal")
     refused(tandem("audit", file), "file cannot be read: Not a directory")
     refused(tandem("audit", ""), "'' is no folder")
 

@@ -311,8 +311,8 @@ def test_the_end_says_how_many_deadlines_each_robot_missed_and_suggests_a_lower_
 @pytest.mark.parametrize(
     ("ticks", "why"),
     [
-        (range(1000), "no Command of it came in time"),
-        (range(9, 1000), "its last Command in time was of tick 8 of LAST"),
+        (range(1000), "none of its Commands arrived in time"),
+        (range(9, 1000), "its last Command that arrived in time is of tick 8 of LAST"),
         ((), "it did not answer the MissionEnd"),
     ],
 )
@@ -323,7 +323,7 @@ def test_the_summary_says_why_a_robot_has_no_farewell(ticks: Container[int], why
     assert told["b"]["no_farewell"] is None
     assert told["a"]["reports_sent"] is None
     cut = summary(replace(recording, end=None), "processes", 0.5)["robots"]
-    assert cut["a"]["no_farewell"] == "the record breaks off"
+    assert cut["a"]["no_farewell"] == "the recording breaks off"
 
 
 def test_the_table_of_many_robots_fits_a_narrow_terminal_and_explains_only_its_columns(

@@ -365,7 +365,7 @@ def test_a_robot_that_has_left_no_journal_is_named(paper_1: Path, tmp_path: Path
 def test_what_is_no_record_and_what_cannot_be_written_are_refused(paper_1: Path, tmp_path: Path) -> None:
     ended = tandem("export", tmp_path)
     assert (ended.status, ended.out) == (2, "")
-    assert ended.err == f"tandem export: {tmp_path} holds no record: there is no world.journal\n"
+    assert ended.err == f"tandem export: {tmp_path} contains no recording: there is no world.journal\n"
     (tmp_path / "file").touch()
     ended = tandem("export", paper_1, "--out", tmp_path / "file")
     assert ended.status == 2

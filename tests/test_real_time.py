@@ -140,4 +140,4 @@ def test_a_world_says_why_there_is_no_farewell_of_a_robot(tmp_path: Path) -> Non
     assert gone == "tandem world: no FinalReport of b: gone; the last Command was of tick 0"
     assert "deadlines missed, of 9: a 8, b 8; a lower --rate, such as --rate 10, leaves" in ended.out
     robots = json.loads((out / "summary.json").read_text())["robots"]
-    assert robots["a"]["no_farewell"] == "its last Command in time was of tick 0 of 9"
+    assert robots["a"]["no_farewell"] == "its last Command that arrived in time is of tick 0 of 9"

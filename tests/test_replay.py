@@ -242,4 +242,4 @@ def test_a_frame_of_a_wrong_length_is_no_tear(recording: Path) -> None:
 def test_what_is_no_record_is_refused(tmp_path: Path) -> None:
     ended = tandem("replay", tmp_path)
     assert (ended.status, ended.out) == (2, "")
-    assert ended.err == f"tandem replay: {tmp_path} holds no record: there is no world.journal\n"
+    assert ended.err == f"tandem replay: {tmp_path} contains no recording: there is no world.journal\n"

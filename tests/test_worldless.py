@@ -185,7 +185,7 @@ def test_whose_journal_is_shorter_takes_nothing_from_its_peer(
     assert trajectory.draw(told) == steps.draw(told) == Absent(NO_PLACES)
     mutual = line(drawn(over_time.ranges(told)), "mutual-range")
     assert mutual == line(drawn(over_time.ranges(known)), "mutual-range")
-    assert "; b: the record breaks off after" in told.title
+    assert "; b: the recording breaks off after" in told.title
 
 
 def test_paths_of_two_lengths_are_drawn(folders: tuple[Path, Path]) -> None:
@@ -215,7 +215,7 @@ def test_journals_of_two_runs_are_no_record(command: str, folders: tuple[Path, P
     (tmp_path / "agent-a.journal").write_bytes((tmp_path / "other" / "agent-a.journal").read_bytes())
     ended = tandem(command, tmp_path)
     assert (ended.status, ended.out) == (2, "")
-    assert ended.err.endswith("agent-b.journal: another run's: its briefing is not of a's peer\n")
+    assert ended.err.endswith("agent-b.journal: from another run: its configuration does not match a's\n")
 
 
 def test_a_tick_that_is_left_out_is_no_record(folders: tuple[Path, Path], tmp_path: Path) -> None:

@@ -112,7 +112,7 @@ def findings_of(
     ticks: int,
     links: tuple[LinkStatistics, ...] = (),
 ) -> Findings:
-    """Return the findings of `rules` in `evidence`; `versions` describes its other versions, if it has any."""
+    """Return the findings of `rules` in `evidence`; `versions` describes other versions, if it has any."""
     checks = {rule.__name__: list(rule(evidence)) for rule in rules}
     found = [one for some in checks.values() for one in some if one is not None]
     found.sort(key=lambda one: -1 if one.tick is None else one.tick)
