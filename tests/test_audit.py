@@ -586,7 +586,7 @@ def test_a_planner_that_fails_on_its_inputs_is_a_violation_and_no_crash(
     command = planner.command
     monkeypatch.setattr(planner, "command", fails)
     assert [one.line for one in audit(folder).violations] == [
-        "tick 12, a, decision: the planner cannot go on from its inputs: ZeroDivisionError: 12"
+        "tick 12, a, decision: the planner fails on its inputs: ZeroDivisionError: 12"
     ]
 
 

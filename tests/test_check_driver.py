@@ -74,10 +74,10 @@ def test_what_is_wrong_is_a_line_and_a_status(broken: str, said: str) -> None:
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("docs.rover", "'docs.rover' is no driver; one looks like MODULE:CLASS"),
+        ("docs.rover", "'docs.rover' is not a driver; expected MODULE:CLASS"),
         ("docs.nothing:Rover", "docs.nothing:Rover: there is no module 'docs.nothing'"),
         ("docs.rover:Nobody", "docs.rover:Nobody: there is no 'Nobody' in docs.rover"),
-        ("tests.broken_drivers:NoDriver", "is no driver: it has no drive, stop, close"),
+        ("tests.broken_drivers:NoDriver", "is not a driver: it has no drive, stop, close"),
     ],
 )
 def test_what_is_no_driver_is_one_line(name: str, said: str) -> None:
@@ -91,6 +91,6 @@ def test_what_is_no_driver_is_one_line(name: str, said: str) -> None:
 def test_an_option_that_a_driver_does_not_know_is_one_line() -> None:
     ended = tandem("check-driver", "docs.rover:Rover", "--option", "colour=red")
     assert ended.status == 2
-    assert "docs.rover:Rover: cannot be made: TypeError: " in ended.err
+    assert "docs.rover:Rover: cannot be created: TypeError: " in ended.err
     assert "colour" in ended.err
     assert ended.err.count("\n") == 1

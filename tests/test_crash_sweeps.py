@@ -152,7 +152,7 @@ def test_a_run_takes_the_kills_of_its_file_and_those_of_the_command_line(tmp_pat
     ended = tandem("run", "mine.toml", "-q", "--kill", "b@900", cwd=tmp_path)
     assert ended.status == 0, ended
     assert [line for line in ended.err.splitlines() if line.startswith("tandem run")] == [
-        "tandem run: world was killed at tick 5, and is started again",
+        "tandem run: world was killed at tick 5, and is restarted",
         "tandem run: --kill b@900: never came",
     ]
 

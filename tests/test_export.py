@@ -505,7 +505,7 @@ def test_a_viewer_sees_a_run_while_it_is_played_and_to_its_end(tmp_path: Path) -
     with TandemProcess(
         "run", scenario, "-q", "--rate", "40", "--foxglove", str(port), "--out", out
     ) as played:
-        played.until_says(f"what Foxglove's viewers show at ws://127.0.0.1:{port}")
+        played.until_says(f"the Foxglove server at ws://127.0.0.1:{port}")
         topics = asyncio.run(asyncio.wait_for(watched(port, "The mission ends: "), BOUND_S))
         played.until_says("until Ctrl-C")
         assert played.tell(Signals.SIGINT)

@@ -230,8 +230,8 @@ def test_a_robot_whose_peer_does_not_come_has_not_moved(tmp_path: Path) -> None:
     [
         (("c", "--mission", "paper-1"), "paper-1: there is no robot 'c'; there are a, b"),
         (("a", "--mission", "nowhere.toml"), "nowhere.toml: neither a file nor a shipped scenario"),
-        (("a", "--mission", "{faults}"), "fault: without a world, the radio is as it is"),
-        (("a", "--mission", "paper-1", "--option", "colour"), "--option: 'colour' is no option"),
+        (("a", "--mission", "{faults}"), "fault: not available in hardware mode"),
+        (("a", "--mission", "paper-1", "--option", "colour"), "--option: 'colour' is not an option"),
         (("a", "--mission", "paper-1", "--rate", "1e8"), "--rate: 1e+08 makes a tick of 1 s last"),
         (("a", "--mission", "paper-1", "--listen", "7447"), "--listen: '7447' is no endpoint"),
         (

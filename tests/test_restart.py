@@ -114,7 +114,7 @@ def test_a_robot_that_comes_back_later_is_waited_for_even_after_the_last_tick(
     undisturbed: Path, tmp_path: Path
 ) -> None:
     ended = tandem("run", "paper-1", "-q", "--out", tmp_path / "out", "--kill", "a@48:command+0.5s")
-    said = "tandem run: agent a was killed at tick 48, and is started again in 0.5 s\n"
+    said = "tandem run: agent a was killed at tick 48, and is restarted in 0.5 s\n"
     assert ended[:2] == (0, LOCALISED), ended
     assert ended.err.startswith(said)
     same(tmp_path / "out", undisturbed)
@@ -313,7 +313,7 @@ def test_torn_tails_are_cut_off_told_and_survived(tick: int, undisturbed: Path, 
     for name, end in ended.items():
         part = "world" if name == "world" else f"agent {name}"
         file = re.escape(f"{out / part.replace(' ', '-')}.journal")
-        said = rf"tandem {part}: {file}: the last \d+ bytes were torn, and are cut off"
+        said = rf"tandem {part}: {file}: the last \d+ bytes are of a torn write and are cut off"
         assert re.search(said, end.err, re.MULTILINE), ended
     assert f", again, at tick {tick}: waiting for a, b" in ended["world"].out
     same(out, undisturbed)

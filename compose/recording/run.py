@@ -100,7 +100,7 @@ class JournalFile(msgspec.Struct, frozen=True):
 def books(folder: Path) -> dict[str, JournalFile]:
     """Return the journals of the recording in `folder`, by file name; the world's is first.
 
-    Raises OSError if there is no journal or one cannot be read, CorruptJournal if one contains something other
+    Raises OSError if there is no journal or one cannot be read, CorruptJournal if one contains anything other
     than frames.
     """
     names = sorted([path.name for path in folder.glob(agent_journal("*"))])
