@@ -1,7 +1,7 @@
 """Checks that a driver conforms to the contract of world/hardware/driver.py, from an exercise.
 
-The checks have no ground truth. They compare the odometry with the commands, and the ranges to the anchor with
-the path from the odometry. The docstring of a check is its line in the output of `tandem check-driver`.
+The checks have no ground truth. They compare the odometry with the commands, and the ranges to the anchor
+with the path from the odometry. The docstring of a check is its line in the output of `tandem check-driver`.
 """
 
 from __future__ import annotations
@@ -102,8 +102,8 @@ def stops(_: Mission, tries: Sequence[Try]) -> str | None:
             part = one.reading.executed.v / one.asked.v
             if abs(part - one.share) > LIKE:
                 return (
-                    f"tick {tick}: it reports {part:.2f} of a manoeuvre that was stopped after {one.share:.2f} "
-                    "of its time"
+                    f"tick {tick}: it reports {part:.2f} of a manoeuvre that was stopped after "
+                    f"{one.share:.2f} of its time"
                 )
     return None
 
@@ -209,7 +209,7 @@ def _path(tries: Sequence[Try], mission: Mission) -> tuple[list[Pose], float]:
 
 
 def _fit(some: Sequence[tuple[Pose, float]], *, scaled: bool) -> tuple[tuple[float, float], float]:
-    """Return the anchor position in the odometry frame that fits the ranges best, and the scale of the ranges.
+    """Return the anchor position in the odometry frame that fits best, and the scale of the ranges.
 
     The scale is 1 unless `scaled`.
     """

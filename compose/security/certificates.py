@@ -1,8 +1,8 @@
 """Certificates for all participants of missions, and their Zenoh configurations.
 
 Each participant has a folder with its certificate and key, the authority's certificate, and a configuration.
-The configuration names these files, requires certificates of all other participants, and enforces the rules of
-protocol/network/access_control.py. Both Tandem (`--keys`) and the official Zenoh router can use it.
+The configuration names these files, requires certificates of all other participants, and enforces the rules
+of protocol/network/access_control.py. Both Tandem (`--keys`) and the official Zenoh router can use it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from protocol import files
 from protocol.network import access_control
 
 AUTHORITY_DAYS = 36_500
-"""The validity of the authority's certificate in days, and the maximum for all others."""
+"""The validity of the authority's certificate in days."""
 SKEW = timedelta(days=1)
 """The time by which a participant's clock may be behind."""
 SECRET = 0o600
@@ -44,7 +44,7 @@ LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
 
 class BadKeys(ValueError):
-    """The content of the folder was not created by `make`, or is damaged; the text says what is wrong."""
+    """A folder that `make` did not create, or that is damaged; the text says what is wrong."""
 
 
 class Authority(NamedTuple):
@@ -57,8 +57,8 @@ class Authority(NamedTuple):
 def make(folder: Path, robots: Sequence[str], hosts: Sequence[str], days: int) -> tuple[list[str], list[str]]:
     """Create the missing participants' folders in `folder`; return the created names and the existing ones.
 
-    The participants are the router, the world, the viewer and the agents of `robots` and of the robots that have
-    a folder. Certificates are valid for `days`. Those of the router and the world also name `hosts`. Existing
+    The participants are the router, the world, the viewer, and the agents of `robots` and of robots that have
+    a folder. Certificates are valid for `days`; those of the router and the world also name `hosts`. Existing
     certificates are not changed; all configurations are written again. Raises BadKeys or OSError.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -171,7 +171,7 @@ def issue(
     hosts: Sequence[str],
     lasts: timedelta,
 ) -> x509.Certificate:
-    """Return a certificate of `name` for connecting, and for listening at `hosts`, valid for `lasts` from now."""
+    """Return a certificate of `name` for connecting and for listening at `hosts`, valid for `lasts`."""
     now = datetime.now(UTC)
     key_id = x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key())
     uses = [ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH]
