@@ -361,9 +361,8 @@ def _start(robot: RobotTable, sensing_range: float, seed: int) -> Pose:
     """
     if robot.start is not None:
         x, y, heading = robot.start
-        return Pose(
-            x, y, heading if abs(heading) <= TAU else wrap(heading)
-        )  # sines of many turns lose digits
+        # many turns are removed here, because trigonometric functions of large angles lose digits
+        return Pose(x, y, heading if abs(heading) <= TAU else wrap(heading))
     draw = random.Random(f"{seed}/start/{robot.id}").random
     radius = WITHIN * sensing_range * math.sqrt(draw())
     bearing, heading = TAU * draw(), TAU * draw()
