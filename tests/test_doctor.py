@@ -367,10 +367,10 @@ def start(
 
 
 FORGED = (
-    "robot/a/tick-start, robot/a/observation, robot/b/command, robot/b/estimate, robot/b/to/a, world/truth"
+    "robot/a/observation, robot/a/tick-start, robot/b/command, robot/b/estimate, robot/b/to/a, world/truth"
 )
 FORGED_BY_VIEWER = (
-    "robot/a/tick-start, robot/a/command, robot/a/estimate, robot/a/observation, robot/a/to/a, world/truth"
+    "robot/a/command, robot/a/estimate, robot/a/observation, robot/a/tick-start, robot/a/to/a, world/truth"
 )
 READ = "robot/b/command, robot/b/observation, world/truth"
 
@@ -380,7 +380,7 @@ READ = "robot/b/command, robot/b/observation, world/truth"
     [
         (enforce, []),
         (enforce_nothing, [f"can publish {FORGED};", f"can read {READ} in mine;"]),
-        (let_read_truth, ["can put world/truth;", "can read world/truth in mine;"]),
+        (let_read_truth, ["can publish world/truth;", "can read world/truth in mine;"]),
     ],
 )
 def test_rules_are_tried_while_a_mission_runs(

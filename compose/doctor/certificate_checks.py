@@ -132,7 +132,7 @@ def _known(at: Path, shown: Mapping[str, Any], endpoints: Endpoints) -> Iterator
         else:
             yield fix(
                 f"names: {at} does not name {where[0]}, so clients will refuse it there; remove the folder, "
-                f"and create it again with `tandem keys --host {where[0]}"
+                f"and create it again with `tandem keys --host {where[0]}`"
             )
 
 
