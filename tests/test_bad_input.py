@@ -85,7 +85,7 @@ def test_an_unknown_field_is_named(was: str, typo: str, field: str, tmp_path: Pa
         (
             'id = "a"',
             'id = "a"\nattack = {kind = "radius", size = 0.1, part = "orbit"}',
-            "robot[0].attack.part: a lie of the radius is of the beginning, and so of all",
+            "robot[0].attack.part: an attack of kind radius changes the start",
         ),
         (
             'id = "a"',
@@ -230,7 +230,7 @@ def test_noise_misspelt_is_named(field: str, says: str) -> None:
         (
             "noise.outlier_bias",
             "[2.0, 0.3]",
-            "noise.outlier_bias: the least, 2 m, is more than the most, 0.3 m",
+            "noise.outlier_bias: the lower bound 2 m is above the upper bound 0.3 m",
         ),
         ("noise.outlier_bias", "[-0.1, 0.3]", "noise.outlier_bias[0]: "),
         ("noise.outlier_bias", "[0.3, nan]", "noise.outlier_bias[1]: "),
@@ -327,7 +327,7 @@ def test_robots_that_do_not_make_a_mission_are_refused(text: str, field: str, tm
 @pytest.mark.parametrize(
     ("source", "says"),
     [
-        ("paper-3", "paper-3: neither a file nor a scenario that ships"),
+        ("paper-3", "paper-3: neither a file nor a shipped scenario"),
         ("missing.toml", "missing.toml: neither a file"),
         ("folder", "folder: cannot be read: it is a directory"),
         ("two\nlines", "neither a file"),
@@ -468,9 +468,9 @@ def test_an_agents_record_is_never_overwritten(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("run noise", "noise is a sweep: `tandem sweep noise` plays it"),
-        ("world noise --listen tcp/127.0.0.1:7447", "noise is a sweep: `tandem sweep noise` plays it"),
-        ("sweep noisy", "noisy is a scenario: `tandem run noisy` plays it"),
+        ("run noise", "noise is a sweep; run it with `tandem sweep noise`"),
+        ("world noise --listen tcp/127.0.0.1:7447", "noise is a sweep; run it with `tandem sweep noise`"),
+        ("sweep noisy", "noisy is a scenario; run it with `tandem run noisy`"),
         ("run papr-1", "; did you mean 'paper-1'?"),
         ("run niose", "; did you mean 'noise'?"),
         ("sweep los", "; did you mean 'loss'?"),

@@ -26,19 +26,19 @@ def test_the_example_keeps_the_contract() -> None:
 @pytest.mark.parametrize(
     ("broken", "said"),
     [
-        ("TellsWhatWasAsked", "it tells 1.00 of a manoeuvre that was stopped after 0.5"),
-        ("TurnsInDegrees", "asked was (0 m/s, 1 rad/s): degrees?"),
-        ("RangesInFeet", "ranges are 3.281 times as long as the path that the odometry tells of"),
+        ("TellsWhatWasAsked", "it reports 1.00 of a manoeuvre that was stopped after 0.5"),
+        ("TurnsInDegrees", "expected (0 m/s, 1 rad/s): degrees?"),
+        ("RangesInFeet", "ranges are 3.281 times as long as on the path from the odometry"),
         ("RangesBeyondReach", "m to the anchor, beyond R = 3 m"),
         ("RepeatsStaleRanges", "is the range of tick 4, to the bit"),
         ("MissesRanges", "tick 4: no range, "),
-        ("TellsTheTickBefore", "it tells what was driven in tick 2"),
+        ("TellsTheTickBefore", "it reports what was driven in tick 2"),
         ("SkipsEverySecondTick", "it drove"),
-        ("DrivesWithoutEnd", "stands, as no drive comes: it drove"),
-        ("DrivesOnAfterStop", "it tells 1.00 of a manoeuvre that was stopped after 0.5"),
-        ("DrivesForTwiceAsLong", "m/s, 0 rad/s), asked was (0.5 m/s, 0 rad/s)"),
+        ("DrivesWithoutEnd", "at rest, without another command: it drove"),
+        ("DrivesOnAfterStop", "it reports 1.00 of a manoeuvre that was stopped after 0.5"),
+        ("DrivesForTwiceAsLong", "m/s, 0 rad/s), expected (0.5 m/s, 0 rad/s)"),
         ("DrivesInHalfTheTime", "1.00 of the manoeuvre was driven in 0.5"),
-        ("WaitsForItsWheels", "of a manoeuvre, expected 0.05 at the most: it must not wait"),
+        ("WaitsForItsWheels", "of a manoeuvre, expected at most 0.05: it must not wait"),
     ],
 )
 def test_a_broken_driver_is_told_what_it_breaks(
@@ -58,7 +58,7 @@ def test_a_broken_driver_is_told_what_it_breaks(
     [
         (
             "RangesInFeet",
-            "wrong  ranges to the anchor are in metres, and of the path that the odometry tells of: ",
+            "wrong  ranges to the anchor are in metres, and agree with the path from the odometry: ",
         ),
         ("SensesNonsense", "the exercise can be gone through: after 'arc': sense(5): Expected"),
         ("LosesItsSensors", "the exercise can be gone through: after 'straight': OSError: no such device"),
@@ -74,10 +74,10 @@ def test_what_is_wrong_is_a_line_and_a_status(broken: str, said: str) -> None:
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("docs.rover", "'docs.rover' is no driver; one looks like MODULE:CLASS"),
+        ("docs.rover", "'docs.rover' is not a driver; expected MODULE:CLASS"),
         ("docs.nothing:Rover", "docs.nothing:Rover: there is no module 'docs.nothing'"),
         ("docs.rover:Nobody", "docs.rover:Nobody: there is no 'Nobody' in docs.rover"),
-        ("tests.broken_drivers:NoDriver", "is no driver: it has no drive, stop, close"),
+        ("tests.broken_drivers:NoDriver", "is not a driver: it has no drive, stop, close"),
     ],
 )
 def test_what_is_no_driver_is_one_line(name: str, said: str) -> None:
@@ -91,6 +91,6 @@ def test_what_is_no_driver_is_one_line(name: str, said: str) -> None:
 def test_an_option_that_a_driver_does_not_know_is_one_line() -> None:
     ended = tandem("check-driver", "docs.rover:Rover", "--option", "colour=red")
     assert ended.status == 2
-    assert "docs.rover:Rover: cannot be made: TypeError: " in ended.err
+    assert "docs.rover:Rover: cannot be created: TypeError: " in ended.err
     assert "colour" in ended.err
     assert ended.err.count("\n") == 1

@@ -304,15 +304,15 @@ def test_the_end_says_how_many_deadlines_each_robot_missed_and_suggests_a_lower_
     last = recording.moments[-1].truth.tick
     said = capsys.readouterr().out.splitlines()[-1]
     assert said == (
-        f"deadlines missed, of {last}: a 7, b 1; a lower --rate, such as --rate 20, leaves more time for each"
+        f"deadlines missed, of {last}: a 7, b 1; a lower --rate, such as --rate 20, gives each robot more time"
     )
 
 
 @pytest.mark.parametrize(
     ("ticks", "why"),
     [
-        (range(1000), "no Command of it came in time"),
-        (range(9, 1000), "its last Command in time was of tick 8 of LAST"),
+        (range(1000), "none of its Commands arrived in time"),
+        (range(9, 1000), "its last Command that arrived in time is of tick 8 of LAST"),
         ((), "it did not answer the MissionEnd"),
     ],
 )
@@ -323,7 +323,7 @@ def test_the_summary_says_why_a_robot_has_no_farewell(ticks: Container[int], why
     assert told["b"]["no_farewell"] is None
     assert told["a"]["reports_sent"] is None
     cut = summary(replace(recording, end=None), "processes", 0.5)["robots"]
-    assert cut["a"]["no_farewell"] == "the record breaks off"
+    assert cut["a"]["no_farewell"] == "the recording breaks off"
 
 
 def test_the_table_of_many_robots_fits_a_narrow_terminal_and_explains_only_its_columns(
@@ -358,7 +358,7 @@ def test_the_table_gives_the_claimed_sigma_beside_the_error(capsys: pytest.Captu
     assert heading.index("sigma m") + len("sigma m") == a.index("5.0e-02") + len("5.0e-02")
     assert heading.index("error m") + len("error m") == a.index("3.0e-02") + len("3.0e-02")
     assert b.split()[4:] == ["-"] * 3 + ["-", "+", "-", "-", "/", "-"]
-    assert lines[-1].startswith("sigma: of the position, as claimed; m and rad; ")
+    assert lines[-1].startswith("sigma: claimed, of the position; poses in m and rad; ")
 
 
 def test_without_noise_the_table_has_no_sigma(capsys: pytest.CaptureFixture[str]) -> None:

@@ -155,7 +155,7 @@ def test_a_run_takes_the_kills_of_its_file_and_those_of_the_command_line(tmp_pat
     ended = tandem("run", "mine.toml", "-q", "--kill", "b@900", cwd=tmp_path)
     assert ended.status == 0, ended
     assert [line for line in ended.err.splitlines() if line.startswith("tandem run")] == [
-        "tandem run: world was killed at tick 5, and is started again",
+        "tandem run: world was killed at tick 5, and is restarted",
         "tandem run: --kill b@900: never came",
     ]
 
@@ -167,14 +167,14 @@ def test_a_run_takes_the_kills_of_its_file_and_those_of_the_command_line(tmp_pat
         ('who = ["a", "z"]', "kill[0].who: there is no 'z'"),
         ("who = 1", "kill[0].who: "),
         ("tick = -1", "kill[0].tick: "),
-        ("tick = [5, 2]", "kill[0].tick: from 5 to 2 is backwards"),
+        ("tick = [5, 2]", "kill[0].tick: the lower bound 5 is above the upper bound 2"),
         ("tick = [5]", "kill[0].tick: "),
         ('tick = "?"', "kill[0].tick: "),
         ('point = "commands"', "kill[0].point: "),
         ("after = -1.0", "kill[0].after: "),
         ('after = "later"', "kill[0].after: "),
         ('where = "observation"', "kill[0]: unknown field 'where'"),
-        ("tick = 5\n[[kill]]\ntick = [2, 1]", "kill[1].tick: from 2 to 1 is backwards"),
+        ("tick = 5\n[[kill]]\ntick = [2, 1]", "kill[1].tick: the lower bound 2 is above the upper bound 1"),
     ],
 )
 def test_a_kill_that_cannot_be_is_named_with_its_place(table: str, says: str) -> None:

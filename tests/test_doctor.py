@@ -79,7 +79,7 @@ def test_a_library_that_is_too_old_is_to_be_installed_anew(
     (tmp_path / "numpy-1.26.4.dist-info" / "METADATA").write_text("Name: numpy\nVersion: 1.26.4\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     with TandemProcess("doctor") as doctor:
-        only_fix(doctor.ended(), "versions: numpy 1.26.4; tandem-ranging", "needs <3,>=2.2: install it anew")
+        only_fix(doctor.ended(), "versions: numpy 1.26.4; tandem-ranging", "needs <3,>=2.2: install it again")
 
 
 @pytest.mark.parametrize(
@@ -103,13 +103,13 @@ def test_a_port_that_is_free_is_told_and_one_that_is_taken_is_to_be_freed() -> N
     with session.open_router(listening(taken)):
         ended = tandem("doctor", *listen(free, taken))
     assert f"port: {free} is free" in findings(ended, "ok")
-    only_fix(ended, f"port: {taken}: taken; end the process that has it")
+    only_fix(ended, f"port: {taken}: in use; end the process that uses it")
 
 
 @pytest.mark.parametrize(
     ("endpoint", "words"),
     [
-        ("tcp/192.0.2.1:7447", "no address of this machine; `ip address` lists those"),
+        ("tcp/192.0.2.1:7447", "not an address of this host; `ip address` lists them"),
         ("tcp/nowhere.invalid:7447", "there is no host 'nowhere.invalid'"),
     ],
 )
@@ -142,8 +142,8 @@ def test_keys_that_were_made_just_now_are_well(keys: Path) -> None:
         assert findings(ended, "fix") == []
         said = findings(ended, "ok")
         own = keys / name
-        assert f"key: only its owner reads {own / 'key.pem'}" in said
-        assert f"certificate: ca.pem signs {own / 'cert.pem'}, which is of {name}" in said
+        assert f"key: only its owner can read {own / 'key.pem'}" in said
+        assert f"certificate: {own / 'cert.pem'} is signed by ca.pem and is of {name}" in said
         assert f"names: certificate and configuration are of {name}" in said
         assert any(one.startswith(f"certificate: {own / 'cert.pem'} is valid until") for one in said)
 
@@ -178,10 +178,10 @@ def spoil(own: Path, _keys: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (expire, ("cert.pem has expired on 20", "make it anew by `tandem keys`")),
+        (expire, ("cert.pem expired on 20", "create it again with `tandem keys`")),
         (soon, ("cert.pem expires on 20", "in 20 days")),
-        (give_foreign, ("cert.pem is refused by", "ca.pem: unable to get local issuer certificate")),
-        (let_read, ("others than its owner can read", "chmod 600")),
+        (give_foreign, ("cert.pem is not accepted by", "ca.pem: unable to get local issuer certificate")),
+        (let_read, ("other users can read", "chmod 600")),
         (mix_keys, ("key.pem is not its key",)),
         (mix_names, ("cert.pem is of agent-b, and", f"{KEYED} of agent-a; copy the folder of agent-a")),
         (lock, ("certificate: ", "cert.pem: with key.pem and ca.pem it cannot be read")),
@@ -198,7 +198,7 @@ def test_a_key_that_is_not_well_is_told(
 
 def test_the_folder_of_another_robot_is_told(keys: Path, tmp_path: Path) -> None:
     wrong = shutil.copytree(keys / "agent-b", tmp_path / "agent-a")
-    words = f"names: the folder {wrong} holds the keys of agent-b; copy the one of agent-a"
+    words = f"names: the folder {wrong} contains the keys of agent-b; copy the folder of agent-a"
     only_fix(tandem("doctor", "--keys", wrong), words)
 
 
@@ -206,7 +206,7 @@ def test_a_certificate_that_does_not_name_where_its_owner_listens_is_told(keys: 
     where = free_endpoint("tls")
     assert findings(tandem("doctor", "--keys", keys / "world", "--listen", where), "fix") == []
     where = where.replace("127.0.0.1", "127.0.0.2")
-    words = ("cert.pem does not name 127.0.0.2", "with --host 127.0.0.2")
+    words = ("cert.pem does not name 127.0.0.2", "`tandem keys --host 127.0.0.2`")
     only_fix(tandem("doctor", "--keys", keys / "world", "--listen", where), *words)
 
 
@@ -226,15 +226,16 @@ def test_an_endpoint_where_nobody_is_is_told_with_what_to_check() -> None:
     only_fix(ended, f"router: no router at {nowhere}: nothing listens there; check the address")
     said = findings(ended, "ok")
     assert f"router: {endpoint} answers, in the clear" in said
-    assert any(re.fullmatch(r"clock: the router's is this host's, to 0\.\d+ s", one) for one in said)
-    assert said[-1] == "alive: mine: its world, all by this protocol version; not there: a, b"
+    agrees = re.compile(r"clock: the router's agrees with this host's within 0\.\d+ s")
+    assert any(map(agrees.fullmatch, said))
+    assert said[-1] == "alive: mine: its world, all with this protocol version; not alive: a, b"
 
 
 def test_who_is_refused_by_the_router_is_told_why_here_and_there(keys: Path, mine: Path) -> None:
     expire(mine, keys)
     with world_of(keys) as endpoint:
         own, link = findings(tandem("doctor", "--keys", mine, "--connect", endpoint), "fix")
-    assert "cert.pem has expired" in own
+    assert "cert.pem expired" in own
     assert link == f"router: no router at {endpoint}: this certificate has expired; check the certificate"
 
 
@@ -257,8 +258,8 @@ def test_a_network_without_missions_is_said_to_be_one() -> None:
     endpoint = free_endpoint()
     with session.open_router(listening(endpoint)):
         ended = tandem("doctor", *connect(endpoint))
-    assert findings(ended, "ok")[-1] == "alive: nobody; no mission is on this network"
-    assert findings(ended, "--") == ["rules: there are none to try without --keys"]
+    assert findings(ended, "ok")[-1] == "alive: no mission is running on this network"
+    assert findings(ended, "--") == ["rules: there are none to test without --keys"]
 
 
 @contextmanager
@@ -284,7 +285,7 @@ def test_a_world_of_another_protocol_version_is_told(who: str, keys: Path) -> No
         flags = ("--connect", endpoint, "--keys", keys / who, "--timeout", "0.2")
         only_fix(
             tandem("doctor", *flags),
-            f"versions: r speaks protocol version {VERSION + 1}, and this machine {VERSION}; install",
+            f"versions: r has protocol version {VERSION + 1}, and this machine {VERSION}; install",
         )
 
 
@@ -302,12 +303,12 @@ def test_a_robot_that_the_world_does_not_know_is_told(keys: Path, tmp_path: Path
 @pytest.mark.parametrize(
     ("ahead", "took", "mark", "words"),
     [
-        (0.001, 0.002, "ok", "this host's, to 0.002 s"),
+        (0.001, 0.002, "ok", "this host's within 0.002 s"),
         (5.0, 0.5, "ok", "between 4.500 and 5.000 s ahead"),
         (-3.0, 0.5, "ok", "between 3.000 and 3.500 s behind"),
         (APART_S + 2.0, 1.0, "fix", "ahead; set one of the two (`timedatectl`)"),
         (-APART_S - 0.1, 1.0, "fix", "behind; set one of the two (`timedatectl`)"),
-        (APART_S + 0.5, 1.0, "ok", "which no decision depends on"),
+        (APART_S + 0.5, 1.0, "ok", "decisions do not depend on it"),
     ],
 )
 def test_clocks_are_compared_as_far_as_can_be_told(ahead: float, took: float, mark: str, words: str) -> None:
@@ -376,8 +377,8 @@ READ = "robot/b/command, robot/b/observation, world/truth"
     ("change", "fixes"),
     [
         (enforce, []),
-        (enforce_nothing, [f"can put {FORGED};", f"can read {READ} in mine;"]),
-        (let_read_truth, ["can put world/truth;", "can read world/truth in mine;"]),
+        (enforce_nothing, [f"can publish {FORGED};", f"can read {READ} in mine;"]),
+        (let_read_truth, ["can publish world/truth;", "can read world/truth in mine;"]),
     ],
 )
 def test_rules_are_tried_while_a_mission_runs(
@@ -397,9 +398,9 @@ def test_rules_are_tried_while_a_mission_runs(
         assert line.startswith(f"rules: agent-a {words}")
     said = findings(ended, "ok")
     assert f"router: {endpoint} answers, over TLS" in said
-    assert "rules: what agent-a puts as Reports of a passes" in said
-    assert (f"rules: agent-a hears nothing of {READ} in mine" in said) is (not fixes)
-    assert said[-1] == "alive: mine: its world, by this protocol version; a's agent, too"
+    assert "rules: agent-a can publish Reports of a" in said
+    assert (f"rules: agent-a cannot read {READ} in mine" in said) is (not fixes)
+    assert said[-1] == "alive: mine: its world, with this protocol version; a's agent"
 
 
 @pytest.mark.parametrize(("change", "passes"), [(enforce, False), (enforce_nothing, True)])
@@ -409,10 +410,10 @@ def test_a_page_that_could_speak_is_told(
     with router_by(keys, change, tmp_path) as endpoint:
         ended = tandem("doctor", "--connect", endpoint, "--keys", keys / "viewer")
     if passes:
-        only_fix(ended, f"rules: viewer can put {FORGED_BY_VIEWER};")
+        only_fix(ended, f"rules: viewer can publish {FORGED_BY_VIEWER};")
     else:
         assert findings(ended, "fix") == []
-        assert any("robot/a/command" in one and "does not pass" in one for one in findings(ended, "ok"))
+        assert any("robot/a/command" in one and "cannot publish" in one for one in findings(ended, "ok"))
 
 
 def test_rules_that_do_not_name_the_robot_are_told(keys: Path, tmp_path: Path) -> None:
@@ -421,7 +422,7 @@ def test_rules_that_do_not_name_the_robot_are_told(keys: Path, tmp_path: Path) -
     with router_by(keys, enforce, tmp_path) as endpoint:
         ended = tandem("doctor", "--connect", endpoint, "--keys", everybody / "agent-c")
     only_fix(
-        ended, "rules: what agent-c puts as Reports of c does not pass; the router must enforce the rules"
+        ended, "rules: agent-c cannot publish Reports of c; the router must enforce the rules"
     )
 
 
@@ -439,7 +440,7 @@ def test_what_cannot_be_tried_without_a_mission_that_moves_is_not_said_to_be_wel
         ended = tandem("doctor", *flags)
     assert findings(ended, "fix") == []
     (untried,) = findings(ended, "--")
-    assert untried.startswith(f"rules: reading {READ}: mine did not move within 0.2 s")
+    assert untried.startswith(f"rules: reading {READ}: mine had no ticks within 0.2 s")
 
 
 # --- no mission is disturbed ----------------------------------------------------------------------------

@@ -365,7 +365,7 @@ def test_a_robot_that_has_left_no_journal_is_named(paper_1: Path, tmp_path: Path
 def test_what_is_no_record_and_what_cannot_be_written_are_refused(paper_1: Path, tmp_path: Path) -> None:
     ended = tandem("export", tmp_path)
     assert (ended.status, ended.out) == (2, "")
-    assert ended.err == f"tandem export: {tmp_path} holds no record: there is no world.journal\n"
+    assert ended.err == f"tandem export: {tmp_path} contains no recording: there is no world.journal\n"
     (tmp_path / "file").touch()
     ended = tandem("export", paper_1, "--out", tmp_path / "file")
     assert ended.status == 2
@@ -505,7 +505,7 @@ def test_a_viewer_sees_a_run_while_it_is_played_and_to_its_end(tmp_path: Path) -
     with TandemProcess(
         "run", scenario, "-q", "--rate", "40", "--foxglove", str(port), "--out", out
     ) as played:
-        played.until_says(f"what Foxglove's viewers show at ws://127.0.0.1:{port}")
+        played.until_says(f"the Foxglove server at ws://127.0.0.1:{port}")
         topics = asyncio.run(asyncio.wait_for(watched(port, "The mission ends: "), BOUND_S))
         played.until_says("until Ctrl-C")
         assert played.tell(Signals.SIGINT)

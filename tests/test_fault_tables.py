@@ -127,17 +127,17 @@ BAD_TABLES = [
     ("delay = [1.5, 2]", "fault[0].delay[0]: "),
     ("ticks = [-1, 5]", "fault[0].ticks[0]: "),
     ("contact_ticks = [0, 1.5]", "fault[0].contact_ticks[1]: "),
-    ("delay = [5, 2]", "fault[0].delay: from 5 to 2 is backwards"),
-    ("ticks = [5, 2]", "fault[0].ticks: from 5 to 2 is backwards"),
-    ("contact_ticks = [5, 2]", "fault[0].contact_ticks: from 5 to 2 is backwards"),
-    ("burst_start = 0.1\nburst_end = 0.0", "fault[0].burst_end: a burst that never ends is a partition"),
-    ('link = "a-b"', "fault[0].link: 'a-b' is none; one looks like a->b, a<->b or *"),
-    ('link = ""', "fault[0].link: '' is none"),
-    ('link = "a->c"', "fault[0].link: 'a' and 'c' are no pair of the scenario"),
-    ('link = "a->a"', "fault[0].link: 'a' and 'a' are no pair of the scenario"),
-    ("delay = 30\n[[fault]]\ndelay = 21", "fault[1].delay: from 'a' to 'b' up to 51 ticks in all"),
+    ("delay = [5, 2]", "fault[0].delay: the lower bound 5 is above the upper bound 2"),
+    ("ticks = [5, 2]", "fault[0].ticks: the lower bound 5 is above the upper bound 2"),
+    ("contact_ticks = [5, 2]", "fault[0].contact_ticks: the lower bound 5 is above the upper bound 2"),
+    ("burst_start = 0.1\nburst_end = 0.0", "fault[0].burst_end: must be above 0"),
+    ('link = "a-b"', "fault[0].link: 'a-b' is not a link; expected a->b, a<->b or *"),
+    ('link = ""', "fault[0].link: '' is not a link"),
+    ('link = "a->c"', "fault[0].link: 'a' and 'c' are not a pair of the scenario"),
+    ('link = "a->a"', "fault[0].link: 'a' and 'a' are not a pair of the scenario"),
+    ("delay = 30\n[[fault]]\ndelay = 21", "fault[1].delay: up to 51 ticks in total"),
     ("loss = 0.1\n" + "[[fault]]\n" * 8, "fault[8].link: more than 8 faults from 'a' to 'b'"),
-    ("partition = true\nticks = [0, 1000000000]", "fault: what befalls the reports could take "),
+    ("partition = true\nticks = [0, 1000000000]", "fault: the delivery of reports could take "),
 ]
 
 
@@ -156,16 +156,16 @@ def test_a_link_of_another_pair_takes_nothing_of_this_ones_room() -> None:
     text = several_pairs(2) + '[[fault]]\nlink = "a->b"\ndelay = 50\n'
     plan = parse(text, "mine.toml", faults=["b->a: delay=50", "c<->d: delay=50"]).faults
     assert [fault.delay for fault in plan] == [(50, 50)] * 3
-    with pytest.raises(BadScenario, match="--fault 'delay=1': delay: from 'a' to 'b' up to 51 ticks"):
+    with pytest.raises(BadScenario, match="--fault 'delay=1': delay: up to 51 ticks"):
         parse(text, "mine.toml", faults=["delay=1"])
-    with pytest.raises(BadScenario, match="'a' and 'c' are no pair"):
+    with pytest.raises(BadScenario, match="'a' and 'c' are not a pair"):
         parse(text, "mine.toml", faults=["a->c: delay=1"])
 
 
 SAID_BADLY = [
-    ("", "'' says nothing; one looks like a->b: loss=0.3, delay=0..3"),
-    ("a->b:", "says nothing"),
-    ("loss=0.1,", "says nothing"),
+    ("", "'' has an empty entry; expected the form a->b: loss=0.3, delay=0..3"),
+    ("a->b:", "has an empty entry"),
+    ("loss=0.1,", "has an empty entry"),
     ("loss", "loss: expected 'float', got 'bool'"),
     ("loss=2", "loss: expected 'float' <= 1.0"),
     ("loss=-1", "loss: expected 'float' >= 0.0"),
@@ -173,19 +173,19 @@ SAID_BADLY = [
     ("loss=nan", "loss: 'nan' is neither a number nor a range"),
     ("loss=0..1", "loss: expected 'float', got 'array'"),
     ("loss=0.1; delay=3", "loss: '0.1; delay=3' is neither a number nor a range"),
-    ("loss=0.1, loss=0.2", "loss: said twice"),
-    ("a->b: link=1", "link: said twice"),
+    ("loss=0.1, loss=0.2", "loss: given twice"),
+    ("a->b: link=1", "link: given twice"),
     ("los=0.1", "there is no 'los'; there are loss, burst_start, burst_end"),
     ("two\nlines=0.1", "there is no 'two"),
     ("delay=1..2..3", "delay: '1..2..3' is neither a number nor a range"),
-    ("delay=5..2", "delay: from 5 to 2 is backwards"),
+    ("delay=5..2", "delay: the lower bound 5 is above the upper bound 2"),
     ("delay=0..51", "delay[1]: expected 'int' <= 50"),
     ("ticks=0..1.5", "ticks[1]: expected 'int', got 'float'"),
     ("partition=yes", "partition: 'yes' is neither a number nor a range"),
-    ("a-b: loss=1", "link: 'a-b' is none; one looks like a->b, a<->b or *"),
-    ("a->b: b->a: loss=1", "link: 'a->b: b->a' is none"),
-    ("a->c: loss=1", "link: 'a' and 'c' are no pair of the scenario"),
-    ("burst_start=0.1, burst_end=0", "burst_end: a burst that never ends is a partition"),
+    ("a-b: loss=1", "link: 'a-b' is not a link; expected a->b, a<->b or *"),
+    ("a->b: b->a: loss=1", "link: 'a->b: b->a' is not a link"),
+    ("a->c: loss=1", "link: 'a' and 'c' are not a pair of the scenario"),
+    ("burst_start=0.1, burst_end=0", "burst_end: must be above 0"),
 ]
 
 
@@ -201,8 +201,8 @@ def test_a_mistake_about_faults_is_one_line_and_status_2(tmp_path: Path) -> None
     refused(tandem("run", "random", "--fault", "a->b: loss=2"), "--fault 'a->b: loss=2': loss: ")
     refused(tandem("run", "random", "--fault", "two\nlines=1"), "there is no 'two")
     listen = ("--listen", "tcp/127.0.0.1:7447")
-    refused(tandem("world", "random", *listen, "--fault", "x->y: loss=1"), "'x' and 'y' are no pair")
-    refused_scenario(RANDOM + "[[fault]]\ndelay = [5, 2]\n", tmp_path, "fault[0].delay: from 5 to 2")
+    refused(tandem("world", "random", *listen, "--fault", "x->y: loss=1"), "'x' and 'y' are not a pair")
+    refused_scenario(RANDOM + "[[fault]]\ndelay = [5, 2]\n", tmp_path, "fault[0].delay: the lower bound 5")
 
 
 def test_the_sections_of_a_scenario_are_all_that_a_plan_needs() -> None:

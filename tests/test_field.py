@@ -94,7 +94,7 @@ def both_have_ended(out: Path, robots: dict[str, TandemProcess]) -> None:
         assert not (out / name / "world.journal").exists()
         replayed = tandem("replay", out / name)
         assert replayed.status == 0, replayed.out
-        assert f"{name}, without a world: as recorded, to the bit" in replayed.out
+        assert f"{name}, hardware mode: as recorded, to the bit" in replayed.out
 
 
 def test_two_robots_find_out_where_they_are_without_a_world(tmp_path: Path) -> None:
@@ -117,7 +117,7 @@ def test_two_robots_find_out_where_they_are_without_a_world(tmp_path: Path) -> N
     shutil.copy(tmp_path / "b" / "agent-b.journal", tmp_path / "a")
     both = tandem("replay", tmp_path / "a")
     assert both.status == 0
-    assert "a and b, without a world: as recorded, to the bit" in both.out
+    assert "a and b, hardware mode: as recorded, to the bit" in both.out
 
 
 @pytest.mark.long
@@ -229,9 +229,9 @@ def test_a_robot_whose_peer_does_not_come_has_not_moved(tmp_path: Path) -> None:
     ("arguments", "said"),
     [
         (("c", "--mission", "paper-1"), "paper-1: there is no robot 'c'; there are a, b"),
-        (("a", "--mission", "nowhere.toml"), "nowhere.toml: neither a file nor a scenario that ships"),
-        (("a", "--mission", "{faults}"), "fault: without a world, the radio is as it is"),
-        (("a", "--mission", "paper-1", "--option", "colour"), "--option: 'colour' is no option"),
+        (("a", "--mission", "nowhere.toml"), "nowhere.toml: neither a file nor a shipped scenario"),
+        (("a", "--mission", "{faults}"), "fault: not available in hardware mode"),
+        (("a", "--mission", "paper-1", "--option", "colour"), "--option: 'colour' is not an option"),
         (("a", "--mission", "paper-1", "--rate", "1e8"), "--rate: 1e+08 makes a tick of 1 s last"),
         (("a", "--mission", "paper-1", "--listen", "7447"), "--listen: '7447' is not an endpoint"),
         (

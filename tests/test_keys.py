@@ -147,8 +147,8 @@ def mix(folder: Path) -> None:
     ("damage", "words"),
     [
         (spoil_authority, "its authority cannot be read"),
-        (lose_authority, "is not empty, and holds no ca.pem with ca-key.pem"),
-        (lose_key, "has no key.pem; remove the folder, and it is made anew"),
+        (lose_authority, "is not empty and has no ca.pem with ca-key.pem"),
+        (lose_key, "has no key.pem; remove the folder, and it is created again"),
         (mix, "is of another authority"),
     ],
 )

@@ -104,7 +104,7 @@ def test_a_robot_whose_agent_is_stopped_stands_still_and_the_mission_goes_on(tmp
         os.kill(stopped, SIGCONT)
         ended = run.ended()
     assert ended.status in OVER
-    assert "late: ticks in which it stood still" in ended.out
+    assert "late: ticks in which the robot stopped" in ended.out
     told = json.loads((out / "summary.json").read_text())
     with (out / "ticks.csv").open(newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["robot"] == "a" and row["state"] == ""]
@@ -138,6 +138,6 @@ def test_a_world_says_why_there_is_no_farewell_of_a_robot(tmp_path: Path) -> Non
         "tandem world: no FinalReport of a: behind, at tick 0 of 9; a lower --rate leaves"
     )
     assert gone == "tandem world: no FinalReport of b: gone; the last Command was of tick 0"
-    assert "deadlines missed, of 9: a 8, b 8; a lower --rate, such as --rate 10, leaves" in ended.out
+    assert "deadlines missed, of 9: a 8, b 8; a lower --rate, such as --rate 10, gives" in ended.out
     robots = json.loads((out / "summary.json").read_text())["robots"]
-    assert robots["a"]["no_farewell"] == "its last Command in time was of tick 0 of 9"
+    assert robots["a"]["no_farewell"] == "its last Command that arrived in time is of tick 0 of 9"

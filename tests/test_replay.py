@@ -223,8 +223,8 @@ def test_where_it_tears_is_told(recording: Path) -> None:
     assert as_recorded.startswith("paper-1: as recorded, to the bit, in 49 ticks ")
     assert rest > 0
     assert tears == [
-        "no tick, b: it has left no journal",
-        f"tick {last.tick}, a: its journal breaks off here, expected MissionEnd and Farewell",
+        "no tick, b: its journal is missing",
+        f"tick {last.tick}, a: its journal breaks off here, expected MissionEnd and FinalReport",
         f"agent-a.journal ends with {rest} bytes of a torn write",
     ]
 
@@ -242,4 +242,4 @@ def test_a_frame_of_a_wrong_length_is_no_tear(recording: Path) -> None:
 def test_what_is_no_record_is_refused(tmp_path: Path) -> None:
     ended = tandem("replay", tmp_path)
     assert (ended.status, ended.out) == (2, "")
-    assert ended.err == f"tandem replay: {tmp_path} holds no record: there is no world.journal\n"
+    assert ended.err == f"tandem replay: {tmp_path} contains no recording: there is no world.journal\n"

@@ -114,7 +114,7 @@ def test_a_robot_that_comes_back_later_is_waited_for_even_after_the_last_tick(
     undisturbed: Path, tmp_path: Path
 ) -> None:
     ended = tandem("run", "paper-1", "-q", "--out", tmp_path / "out", "--kill", "a@48:command+0.5s")
-    said = "tandem run: agent a was killed at tick 48, and is started again in 0.5 s\n"
+    said = "tandem run: agent a was killed at tick 48, and is restarted in 0.5 s\n"
     assert ended[:2] == (0, LOCALISED), ended
     assert ended.err.startswith(said)
     same(tmp_path / "out", undisturbed)
@@ -197,14 +197,14 @@ def test_a_kill_is_read_as_it_is_written() -> None:
     ],
 )
 def test_a_mistyped_kill_is_none(text: str) -> None:
-    with pytest.raises(BadKill, match="is no kill"):
+    with pytest.raises(BadKill, match="is not a kill"):
         parse(text)
 
 
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--kill", "a17"], "--kill: 'a17' is no kill"),
+        (["--kill", "a17"], "--kill: 'a17' is not a kill"),
         (["--kill"], "--kill"),
         (["--kill", "z@17"], "--kill: z@17: there is no 'z'; there are a, b, world"),
         (["--kill", "a@17", "--in-process"], "--kill: --in-process has no processes to kill"),
@@ -313,7 +313,7 @@ def test_torn_tails_are_cut_off_told_and_survived(tick: int, undisturbed: Path, 
     for name, end in ended.items():
         part = "world" if name == "world" else f"agent {name}"
         file = re.escape(f"{out / part.replace(' ', '-')}.journal")
-        said = rf"tandem {part}: {file}: the last \d+ bytes were torn, and are cut off"
+        said = rf"tandem {part}: {file}: the last \d+ bytes are of a torn write and are cut off"
         assert re.search(said, end.err, re.MULTILINE), ended
     assert f", again, at tick {tick}: waiting for a, b" in ended["world"].out
     same(out, undisturbed)

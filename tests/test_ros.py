@@ -159,5 +159,5 @@ def test_a_bridge_that_is_not_there_is_one_line() -> None:
     endpoint = free_endpoint()
     ended = tandem("check-driver", "world.hardware.ros2:Ros2", "--option", f"connect={endpoint}")
     assert ended.status == 2
-    why = f"cannot be made: TimeoutError: no bridge at {endpoint}"
+    why = f"cannot be created: TimeoutError: no bridge at {endpoint}"
     assert ended.err == f"tandem check-driver: world.hardware.ros2:Ros2: {why}\n"

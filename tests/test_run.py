@@ -385,6 +385,6 @@ def test_no_table_is_broken_by_a_terminal_of_80_columns(tmp_path: Path) -> None:
 
 def test_a_footnote_is_there_only_with_its_column() -> None:
     _, text = on_a_terminal("run", "noisy", "--in-process")
-    assert "sigma: of the position" in " ".join(text.split())
+    assert "sigma: claimed, of the position" in " ".join(text.split())
     assert "late:" not in text
     assert "sigma" not in tandem("run", "paper-1", "--in-process").out

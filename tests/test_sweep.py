@@ -739,7 +739,7 @@ def test_a_mistake_in_a_spec_is_one_line_and_status_2(folder: Path) -> None:
 def test_a_spec_that_is_not_there_is_named() -> None:
     ended = tandem("sweep", "nowhere")
     assert ended.status == 2
-    assert ended.err.startswith("tandem sweep: nowhere: neither a file nor a sweep that ships (any-start, ")
+    assert ended.err.startswith("tandem sweep: nowhere: neither a file nor a shipped sweep (any-start, ")
 
 
 @pytest.mark.long

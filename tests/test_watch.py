@@ -376,7 +376,7 @@ def test_run_watch_stays_until_ctrl_c_and_leaves_the_record_that_it_would_have_l
 ) -> None:
     with TandemProcess("run", "paper-1", "--watch", "--out", tmp_path / "record", "-q") as run:
         page = opened(address_of(run))
-        run.until_says("the page stays at")
+        run.until_says("the page remains at")
         expect(page.locator("#status")).to_have_text("localised after 48 ticks")
         page.keyboard.press("Home")
         until_shown(page, 0)
@@ -411,7 +411,7 @@ def test_every_test_that_opens_a_page_skips_where_there_is_no_browser(tmp_path: 
 
 def test_the_page_ends_with_whoever_launched_it(tmp_path: Path) -> None:
     with TandemProcess("run", "paper-1", "--watch", "--out", tmp_path / "record", "-q") as run:
-        run.until_says("the page stays at")
+        run.until_says("the page remains at")
         assert processes_of(tmp_path / "record")
         run.tell(SIGKILL)
         run.ended()

@@ -187,7 +187,7 @@ def test_whose_journal_is_shorter_takes_nothing_from_its_peer(
     assert trajectory.draw(told) == steps.draw(told) == Absent(NO_PLACES)
     mutual = line(drawn(over_time.ranges(told)), "mutual-range")
     assert mutual == line(drawn(over_time.ranges(known)), "mutual-range")
-    assert "; b: the record breaks off after" in told.title
+    assert "; b: the recording breaks off after" in told.title
 
 
 def test_paths_of_two_lengths_are_drawn(folders: tuple[Path, Path]) -> None:
@@ -217,7 +217,7 @@ def test_journals_of_two_runs_are_no_record(command: str, folders: tuple[Path, P
     (tmp_path / "agent-a.journal").write_bytes((tmp_path / "other" / "agent-a.journal").read_bytes())
     ended = tandem(command, tmp_path)
     assert (ended.status, ended.out) == (2, "")
-    assert ended.err.endswith("agent-b.journal: another run's: its briefing is not of a's peer\n")
+    assert ended.err.endswith("agent-b.journal: from another run: its configuration does not match a's\n")
 
 
 def test_a_tick_that_is_left_out_is_no_record(folders: tuple[Path, Path], tmp_path: Path) -> None:
@@ -237,7 +237,7 @@ def test_the_audit_holds_robots_to_their_limits_and_to_what_they_sensed(folders:
     _, alone = folders
     ended = tandem("audit", alone)
     assert ended.status == 0, ended.out
-    assert "a and b, without a world: no violations" in ended.out
+    assert "a and b, hardware mode: no violations" in ended.out
     assert [line.split()[0] for line in ended.out.splitlines()[3:]] == [rule.__name__ for rule in RULES]
 
 

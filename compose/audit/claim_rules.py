@@ -1,4 +1,4 @@
-"""Whether nobody was wrong, or could have been; and whether it ended as the referee says."""
+"""Audit rules for claims: their error, their sigmas, their redundancy, and the outcome of the run."""
 
 from __future__ import annotations
 
@@ -19,45 +19,50 @@ from world.referee import inaccuracy, mistake
 from world.scenario import RobotSpec
 
 PLACES = 3
-"""different relative placements that exact ranges must have been taken from: two leave several solutions"""
+"""The number of relative placements that a claim from exact ranges needs; two leave several solutions."""
 
 
-def claim(case: Evidence) -> Checks:
-    """Whoever claimed to be localised was right, knew it as well as the mission asks for, and had a redundant
-    range; the MissionEnd is the referee's."""
-    for place, placed in enumerate(case.history.scenario.robots):
-        tick, made = _first_claim(case, placed.id)
+def claim(evidence: Evidence) -> Checks:
+    """Check that each claim was right, as accurate as the mission requires, and based on a redundant range.
+
+    The rule also checks `outcome`.
+    """
+    for place, placed in enumerate(evidence.history.scenario.robots):
+        tick, made = _first_claim(evidence, placed.id)
         if made is None:
             continue
-        mission = case.history.scenario.mission
-        why = mistake(made, case.history.ticks[tick].world.truth.poses[place], mission)
+        mission = evidence.history.scenario.mission
+        why = mistake(made, evidence.history.ticks[tick].world.truth.poses[place], mission)
         yield None if why is None else Violation("claim", tick, placed.id, f"it claims a pose that is {why}")
         vague = inaccuracy(made, mission)
         yield None if vague is None else Violation("claim", tick, placed.id, f"it {vague}")
-        past = case.pasts.get(placed.id)
+        past = evidence.pasts.get(placed.id)
         if past is not None and tick < len(past.steps) and past.steps[tick].command is not None:
-            yield _redundant(case, placed, past, tick)
-    yield from outcome(case)
+            yield _redundant(evidence, placed, past, tick)
+    yield from outcome(evidence)
 
 
-def _first_claim(case: Evidence, robot: str) -> tuple[int, Localised | None]:
-    """What it claimed, and when; whatever it says later, it has said that."""
-    for tick, one in enumerate(case.history.ticks):
+def _first_claim(evidence: Evidence, robot: str) -> tuple[int, Localised | None]:
+    """Return the tick and the content of the robot's first claim; (0, None) if it made none."""
+    for tick, one in enumerate(evidence.history.ticks):
         command = one.commands.get(robot)
         if command is not None and isinstance(command.verdict, Localised):
             return tick, command.verdict
     return 0, None
 
 
-def _redundant(case: Evidence, placed: RobotSpec, past: Past, tick: int) -> Violation | None:
-    """It had as many ranges as a claim takes, until the last tick of which it had heard the peer's log."""
-    scenario = case.history.scenario
+def _redundant(evidence: Evidence, placed: RobotSpec, past: Past, tick: int) -> Violation | None:
+    """Return a violation if the claim at `tick` is based on too few mutual ranges.
+
+    Ranges count up to the latest tick for which the robot had received the peer's log.
+    """
+    scenario = evidence.history.scenario
     noise = scenario.mission.noise
-    told = [told.report.through for step in past.steps[: tick + 1] for told in step.heard]
-    through = min(max(told, default=-1), tick)
+    ends = [framed.report.through for step in past.steps[: tick + 1] for framed in step.heard]
+    through = min(max(ends, default=-1), tick)
     mutual = _ranged(past, through)
     if noise.exact:
-        places = _places(case, placed, mutual)
+        places = _places(evidence, placed, mutual)
         return _too_few(tick, placed, "relative placements with a mutual range", places, PLACES)
     least = CHECKED if scenario.planner_name == "assured" else CHECKED_BY_LETTER
     if noise.outliers:
@@ -68,13 +73,11 @@ def _redundant(case: Evidence, placed: RobotSpec, past: Past, tick: int) -> Viol
 def _too_few(tick: int, placed: RobotSpec, what: str, found: int, expected: int) -> Violation | None:
     if found >= expected:
         return None
-    return Violation(
-        "claim", tick, placed.id, f"it claims by {found} {what}, expected {expected} at the least"
-    )
+    return Violation("claim", tick, placed.id, f"it claims with {found} {what}, expected at least {expected}")
 
 
 def _ranged(past: Past, through: int) -> list[int]:
-    """The ticks of its mutual ranges."""
+    """Return the ticks of the mutual ranges up to the tick `through`."""
     return [
         step.observation.tick
         for step in past.steps[: through + 1]
@@ -82,13 +85,13 @@ def _ranged(past: Past, through: int) -> list[int]:
     ]
 
 
-def _places(case: Evidence, placed: RobotSpec, ticks: Sequence[int]) -> int:
-    """From how many different relative placements of the pair the ranges of those ticks were taken."""
-    ids = [robot.id for robot in case.history.scenario.robots]
+def _places(evidence: Evidence, placed: RobotSpec, ticks: Sequence[int]) -> int:
+    """Return the number of different relative placements of the pair at `ticks`."""
+    ids = [robot.id for robot in evidence.history.scenario.robots]
     one, other = ids.index(placed.id), ids.index(placed.peer)
     found: list[tuple[Pose, Pose]] = []
     for tick in ticks:
-        local = case.history.ticks[tick].world.truth.local
+        local = evidence.history.ticks[tick].world.truth.local
         here = local[one], local[other]
         if all(
             any(travelled(*both) > ELSEWHERE for both in zip(here, there, strict=True)) for there in found
@@ -97,20 +100,23 @@ def _places(case: Evidence, placed: RobotSpec, ticks: Sequence[int]) -> int:
     return len(found)
 
 
-def outcome(case: Evidence) -> Checks:
-    """The MissionEnd is what the referee says, by the truth; a run may have failed before he says anything."""
-    end, judgement = case.history.end, case.history.judgement
+def outcome(evidence: Evidence) -> Checks:
+    """Check that the MissionEnd is the referee's judgement of the ground truth.
+
+    A run that failed before the referee had a judgement is accepted.
+    """
+    end, judgement = evidence.history.end, evidence.history.judgement
     if end is None:
         return
     expected = MissionEnd(end.tick, *astuple(judgement)) if judgement is not None else None
     if expected is not None and end != expected:
-        what = f"it ends {_told(end)}, expected {_told(expected)}"
+        what = f"it ends {_ending(end)}, expected {_ending(expected)}"
         yield Violation("claim", end.tick, None, what, between(end, expected))
     elif expected is None and end.outcome != "failed":
-        yield Violation("claim", end.tick, None, f"it ends {_told(end)}, expected it to go on")
+        yield Violation("claim", end.tick, None, f"it ends {_ending(end)}, expected it to continue")
     else:
         yield None
 
 
-def _told(end: MissionEnd) -> str:
+def _ending(end: MissionEnd) -> str:
     return f"{end.outcome} ({end.reason})" if end.reason else end.outcome

@@ -1,4 +1,4 @@
-"""Whether what came to a robot is what was sent to it: by the world's sensors, and by its peer."""
+"""Audit rules for delivery: each robot received the world's Observations and its peer's Reports unchanged."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from collections.abc import Sequence
 from agent.process.agent_journal import Past, Step
 from agent.process.robot import FramedReport
 from compose.audit.evidence import Evidence, Testified
-from compose.audit.findings import Checks, Violation, between, difference, said
+from compose.audit.findings import Checks, Violation, between, difference, quoted
 from protocol.wire import encode
 
 
-def observation(case: Evidence) -> Checks:
-    """Every Observation is, to the bit, what the sensors say where the Commands on record have led everyone."""
-    for robot, past in case.pasts.items():
-        for step in past.steps[: len(case.observations)]:
-            expected = case.observations[step.observation.tick][robot]
+def observation(evidence: Evidence) -> Checks:
+    """Check that the sensor models give each Observation, to the bit, from the journaled Commands."""
+    for robot, past in evidence.pasts.items():
+        for step in past.steps[: len(evidence.observations)]:
+            expected = evidence.observations[step.observation.tick][robot]
             if step.frame == encode(expected):
                 yield None
             else:
@@ -26,20 +26,20 @@ def observation(case: Evidence) -> Checks:
                 )
 
 
-def contact(case: Evidence) -> Checks:
-    """Nothing was sent or heard but in contact, and what was heard is what the Observation listed."""
-    for robot, past in case.pasts.items():
+def contact(evidence: Evidence) -> Checks:
+    """Check that Reports were sent and received only in contact, and that those received are listed."""
+    for robot, past in evidence.pasts.items():
         for step in past.steps:
-            if step.report is not None and step.observation.tick < len(case.observations):
-                yield _sent(case, robot, step)
+            if step.report is not None and step.observation.tick < len(evidence.observations):
+                yield _sent(evidence, robot, step)
             if step.command is not None:
                 yield _listed(robot, step)
-            for told in step.heard:
-                yield _heard(case, robot, step, told)
+            for framed in step.heard:
+                yield _received(evidence, robot, step, framed)
 
 
-def _sent(case: Evidence, robot: str, step: Step) -> Violation | None:
-    if case.contact(robot, step.observation.tick) is not None:
+def _sent(evidence: Evidence, robot: str, step: Step) -> Violation | None:
+    if evidence.contact(robot, step.observation.tick) is not None:
         return None
     return Violation(
         "contact", step.observation.tick, robot, "it sent a report, expected none: out of contact"
@@ -48,58 +48,58 @@ def _sent(case: Evidence, robot: str, step: Step) -> Violation | None:
 
 def _listed(robot: str, step: Step) -> Violation | None:
     listed = [tick for contact in step.observation.contacts for tick in contact.heard or ()]
-    heard = [told.report.tick for told in step.heard]
-    if len(heard) + len(step.missed) == len(listed) and _in_order(heard, listed):
+    received = [framed.report.tick for framed in step.heard]
+    if len(received) + len(step.missed) == len(listed) and _is_subsequence(received, listed):
         return None
-    without = f" and went without {len(step.missed)}" if step.missed else ""
-    what = f"it heard the reports of ticks {said(heard)}{without}, expected {said(listed)}"
+    missed = f" and missed {len(step.missed)}" if step.missed else ""
+    what = f"it received the reports of ticks {quoted(received)}{missed}, expected {quoted(listed)}"
     return Violation("contact", step.observation.tick, robot, what)
 
 
-def _in_order(some: Sequence[int], of: Sequence[int]) -> bool:
-    """Whether `some` is what is left of `of` without a few."""
+def _is_subsequence(some: Sequence[int], of: Sequence[int]) -> bool:
+    """Return whether `some` is `of` without some of its elements, in the same order."""
     rest = iter(of)
     return all(one in rest for one in some)
 
 
-def _heard(case: Evidence, robot: str, step: Step, told: FramedReport) -> Violation | None:
-    now, then = step.observation.tick, told.report.tick
-    if max(now, then) >= len(case.observations):
-        return None  # where they were, nobody knows
+def _received(evidence: Evidence, robot: str, step: Step, framed: FramedReport) -> Violation | None:
+    now, then = step.observation.tick, framed.report.tick
+    if max(now, then) >= len(evidence.observations):
+        return None  # the ground truth of these ticks is not in the recording
     for tick in (now, then):
-        if case.contact(robot, tick) is None:
-            what = f"it heard the report of tick {then}, expected none: out of contact at tick {tick}"
+        if evidence.contact(robot, tick) is None:
+            what = f"it received the report of tick {then}, expected none: out of contact at tick {tick}"
             return Violation("contact", now, robot, what)
     return None
 
 
-def report(case: Testified) -> Checks:
-    """Every report that was heard is, to the byte, what the peer has on record as sent."""
-    for robot, past in case.pasts.items():
-        peer = case.pasts.get(past.config.peer)
+def report(evidence: Testified) -> Checks:
+    """Check that each received Report is, to the byte, the one in the peer's journal."""
+    for robot, past in evidence.pasts.items():
+        peer = evidence.pasts.get(past.config.peer)
         if peer is None:
             continue
         for step in past.steps:
-            for told in step.heard:
-                if told.report.tick < _on_record(peer):
-                    yield _as_sent(robot, step, told, peer)
+            for framed in step.heard:
+                if framed.report.tick < _complete_until(peer):
+                    yield _as_sent(robot, step, framed, peer)
 
 
-def _on_record(peer: Past) -> float:
-    """Of the ticks before this, the peer's journal holds every report that it sent."""
+def _complete_until(peer: Past) -> float:
+    """Return the tick before which the peer's journal contains every Report that it sent."""
     if peer.final_report is not None:
         return math.inf
     cut = peer.steps and peer.steps[-1].command is None and peer.steps[-1].report is None
     return len(peer.steps) - 1 if cut else len(peer.steps)
 
 
-def _as_sent(robot: str, step: Step, told: FramedReport, peer: Past) -> Violation | None:
+def _as_sent(robot: str, step: Step, framed: FramedReport, peer: Past) -> Violation | None:
     tick, steps = step.observation.tick, peer.steps
-    sent = steps[told.report.tick].report if told.report.tick < len(steps) else None
+    sent = steps[framed.report.tick].report if framed.report.tick < len(steps) else None
     if sent is None:
-        what = f"it heard a report of tick {told.report.tick}, which {peer.config.robot} never sent"
+        what = f"it received a report of tick {framed.report.tick}, which {peer.config.robot} never sent"
         return Violation("report", tick, robot, what)
-    if told.frame == sent.frame:
+    if framed.frame == sent.frame:
         return None
-    what = f"in the report of tick {told.report.tick}, {difference(told.report, sent.report)}"
-    return Violation("report", tick, robot, what, between(told.report, sent.report))
+    what = f"in the report of tick {framed.report.tick}, {difference(framed.report, sent.report)}"
+    return Violation("report", tick, robot, what, between(framed.report, sent.report))

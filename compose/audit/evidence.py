@@ -1,4 +1,4 @@
-"""What is judged: a run, as its journals tell it, beside what the world's sensors must have said in it."""
+"""The evidence of an audit: the content of a run's journals, and the Observations recomputed from it."""
 
 from __future__ import annotations
 
@@ -17,81 +17,85 @@ from world.world_journal import History, history
 
 
 class AgentLog(msgspec.Struct, frozen=True):
-    """A robot's journal, as far as it can be followed."""
+    """The content of an agent's journal, up to the first frame that is out of order."""
 
     past: Past | None
-    """none where not even a briefing is on record"""
+    """Content of the journal; None if it does not even contain a RobotConfig."""
     disorder: str | None = None
-    """what stands where it cannot; what comes after it is not read"""
+    """Description of the first frame that is out of order; frames after it are not read."""
     disorder_tick: int | None = None
+    """Tick of that frame, if it has one."""
     missing: bool = False
-    """there is no such journal"""
+    """Absence of the journal."""
 
 
 class Testified(Protocol):
-    """What robots' journals tell, whoever else tells something."""
+    """The evidence in the agents' journals, with or without a world's journal."""
 
     @property
     def pasts(self) -> dict[str, Past]:
-        """Of the robots that tell one."""
+        """The content of each agent's journal, by robot; robots without a RobotConfig are omitted."""
 
 
 class Evidence(msgspec.Struct, frozen=True):
-    """A run, before the judge."""
+    """The evidence of a run with a world's journal."""
 
     history: History
     observations: tuple[dict[str, Observation], ...]
-    """what every robot senses, tick by tick, where the Commands on record have led it"""
+    """Observations of each tick, by robot, recomputed from the journaled Commands."""
     testimonies: dict[str, AgentLog]
-    """of every robot of the scenario"""
+    """Journal of each robot of the scenario."""
 
     @property
     def pasts(self) -> dict[str, Past]:
-        """Of the robots that tell one."""
+        """The content of each agent's journal, by robot; robots without a RobotConfig are omitted."""
         return {robot: one.past for robot, one in self.testimonies.items() if one.past is not None}
 
     @property
     def forced(self) -> bool:
-        """Whether the world did not wait for every answer: in real time, or with its patience lost."""
+        """Whether the world may have continued without an answer: in real time, or after a timeout."""
         failed = self.history.end is not None and self.history.end.outcome == "failed"
         return failed or any(past.config.tick_s is not None for past in self.pasts.values())
 
     def contact(self, robot: str, tick: int) -> Contact | None:
-        """The contact that `robot` truly had at that tick; none, too, where that is not on record."""
+        """Return the recomputed contact of `robot` at `tick`; None if there is none, or no ground truth."""
         if not 0 <= tick < len(self.observations):
             return None
         return next(iter(self.observations[tick][robot].contacts), None)
 
     def command(self, robot: str, tick: int) -> Command | None:
-        """What the world had of `robot` at that tick."""
+        """Return the Command of `robot` at `tick` in the world's journal; None if there is none."""
         return self.history.ticks[tick].commands.get(robot)
 
 
 def case_of(journals: Mapping[str, Iterable[bytes]], folder: object) -> Evidence:
-    """The frames of the journals in `folder`, by name, as a case.
+    """Return the evidence in the frames of `journals`, by file name; `folder` appears in error messages.
 
     Raises CorruptJournal, whose text names the journal.
     """
-    told = history(journals[WORLD_JOURNAL], f"{folder}/{WORLD_JOURNAL}")
+    run = history(journals[WORLD_JOURNAL], f"{folder}/{WORLD_JOURNAL}")
     testimonies = {}
-    for robot in told.scenario.robots:
+    for robot in run.scenario.robots:
         name = agent_journal(robot.id)
         frames = list(journals.get(name, ()))
-        testimony = testimony_of(frames, f"{folder}/{name}") if name in journals else _NONE
-        if testimony.past is not None and testimony.past.config.robot != robot.id:
-            raise CorruptJournal(f"{folder}/{name} is the journal of {testimony.past.config.robot}")
-        testimonies[robot.id] = testimony
+        agent_log = testimony_of(frames, f"{folder}/{name}") if name in journals else _MISSING
+        if agent_log.past is not None and agent_log.past.config.robot != robot.id:
+            raise CorruptJournal(f"{folder}/{name} is the journal of {agent_log.past.config.robot}")
+        testimonies[robot.id] = agent_log
     sensed = tuple(
-        [{observation.robot: observation for observation in observations(world)} for world in told.worlds]
+        [{observation.robot: observation for observation in observations(world)} for world in run.worlds]
     )
-    return Evidence(told, sensed, testimonies)
+    return Evidence(run, sensed, testimonies)
 
 
-_NONE = AgentLog(None, missing=True)
+_MISSING = AgentLog(None, missing=True)
 
 
 def testimony_of(frames: list[bytes], source: object) -> AgentLog:
-    """What `frames` tell, as far as that can be followed. Raises CorruptJournal."""
+    """Return the content of an agent's journal, up to the first frame that is out of order.
+
+    Raises CorruptJournal, whose text begins with `source`.
+    """
     if is_blank(frames):
         return AgentLog(None)
     try:
@@ -101,6 +105,9 @@ def testimony_of(frames: list[bytes], source: object) -> AgentLog:
 
 
 def other_versions(pasts: Mapping[str, Past]) -> str | None:
-    """In what the first robot's versions differ from those here, of the robots whose do."""
-    told = [otherwise(past.environment, of_robot()) for past in pasts.values()]
-    return next((one for one in told if one is not None), None)
+    """Return how the versions of the first robot that has others differ from those of this process.
+
+    The result is None if no robot has other versions.
+    """
+    differences = [otherwise(past.environment, of_robot()) for past in pasts.values()]
+    return next((one for one in differences if one is not None), None)

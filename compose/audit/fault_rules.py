@@ -1,19 +1,19 @@
-"""What befell the reports on their way: whether it is what the fault plan says, and how much it was."""
+"""An audit rule that recomputes the effect of the fault plan on Reports, and statistics of each link."""
 
 from __future__ import annotations
 
 from agent.process.agent_journal import Past
 from compose.audit.evidence import Evidence
-from compose.audit.findings import Checks, LinkStatistics, Violation, said
+from compose.audit.findings import Checks, LinkStatistics, Violation, quoted
 
 
-def faults(case: Evidence) -> Checks:
-    """What each Observation lists as heard, and as damaged, is what the fault plan does to the reports sent."""
-    if not case.history.scenario.faults:
+def faults(evidence: Evidence) -> Checks:
+    """Check that each Observation lists the received and damaged Reports that follow from the fault plan."""
+    if not evidence.history.scenario.faults:
         return
-    for robot, past in case.pasts.items():
-        for step in past.steps[: len(case.observations)]:
-            expected = case.contact(robot, step.observation.tick)
+    for robot, past in evidence.pasts.items():
+        for step in past.steps[: len(evidence.observations)]:
+            expected = evidence.contact(robot, step.observation.tick)
             if expected is None:
                 continue
             for found in step.observation.contacts:
@@ -21,30 +21,30 @@ def faults(case: Evidence) -> Checks:
                 if listed == planned:
                     yield None
                 else:
-                    what = f"heard and damaged are {said(listed)}, expected {said(planned)}"
+                    what = f"heard and damaged are {quoted(listed)}, expected {quoted(planned)}"
                     yield Violation("faults", step.observation.tick, robot, what)
 
 
-def befallen(case: Evidence) -> tuple[LinkStatistics, ...]:
-    """Of every link of the scenario's pairs whose receiver is on record; nothing without a fault plan."""
-    if not case.history.scenario.faults:
+def befallen(evidence: Evidence) -> tuple[LinkStatistics, ...]:
+    """Return the statistics of each link whose receiver has a journal; none without a fault plan."""
+    if not evidence.history.scenario.faults:
         return ()
-    return tuple([_befallen(past) for past in case.pasts.values()])
+    return tuple([_statistics(past) for past in evidence.pasts.values()])
 
 
-def _befallen(past: Past) -> LinkStatistics:
-    """Of the link to this robot."""
+def _statistics(past: Past) -> LinkStatistics:
+    """Return the statistics of the link to the robot whose journal is `past`."""
     contacts = [
         (step.observation.tick, contact) for step in past.steps for contact in step.observation.contacts
     ]
-    heard = [(now, tick) for now, contact in contacts for tick in contact.heard or ()]
+    received = [(now, tick) for now, contact in contacts for tick in contact.heard or ()]
     damaged = [tick for _, contact in contacts for tick in contact.damaged]
-    ticks = [tick for _, tick in heard]
+    ticks = [tick for _, tick in received]
     return LinkStatistics(
         link=f"{past.config.peer}->{past.config.robot}",
         sent=len(contacts),
-        heard=len(heard),
-        late=sum([tick < now for now, tick in heard]),
+        heard=len(received),
+        late=sum([tick < now for now, tick in received]),
         twice=len(ticks) - len(set(ticks)),
         damaged=len(damaged),
         lost=len({now for now, _ in contacts} - {*ticks, *damaged}),

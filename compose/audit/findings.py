@@ -1,4 +1,4 @@
-"""What an audit finds: of each rule how many checks were made, and what was found otherwise than expected."""
+"""The findings of an audit: the number of checks of each rule, and the violations."""
 
 from __future__ import annotations
 
@@ -8,54 +8,54 @@ from typing import Any, TypeVar
 import msgspec
 
 ROUNDING = 1e-6
-"""of a value, or of 1 where it is less: how far apart two computations may come by rounding alone"""
+"""The difference that rounding alone can cause, relative to the value or to 1, whichever is larger."""
 RECOMPUTED = ("observation", "decision", "config")
-"""rules that hold the recording against what is computed here"""
+"""The rules that compare the recording with values computed by this process."""
 MAX_VALUE = 60
-"""characters of a value that is quoted"""
+"""The maximum length in characters of a quoted value."""
 
 
 class Difference(msgspec.Struct, frozen=True):
-    """A value on record that is not what follows from the rest of the record, to the bit."""
+    """A recorded value that differs from the one computed from the rest of the recording."""
 
     kind: str
-    """of message"""
+    """Class name of the message."""
     field: str
-    """where in the message it stands, such as `contacts[0].range`"""
+    """Path of the value in the message, such as `contacts[0].range`."""
     found: str
     expected: str
     by_rounding: bool
-    """no value in the two messages differs by more than ROUNDING"""
+    """Whether all values of the two messages agree within ROUNDING."""
 
 
 class Violation(msgspec.Struct, frozen=True):
-    """Something that a sound run cannot have on record."""
+    """A contradiction in the recording, which a correct run cannot produce."""
 
     rule: str
     tick: int | None
-    """none of what is of no tick, such as a briefing"""
+    """Tick of the violation; None if it has none, such as one in a RobotConfig."""
     robot: str | None
-    """none of what only the world has on record"""
+    """Id of the robot; None if only the world's journal is concerned."""
     what: str
-    """was found, and what was expected"""
+    """Text that says what was found and what was expected."""
     difference: Difference | None = None
-    """where two messages were held against each other: the first in which they differ"""
+    """First difference, if the violation is one between two messages."""
     breaks_off: bool = False
-    """there is no more of the journal, and what there is may be sound"""
+    """Whether the violation is only that a journal ends early; its content may be correct."""
 
     @property
     def line(self) -> str:
-        """All of it."""
+        """The violation as one line of text."""
         where = f"tick {self.tick}" if self.tick is not None else "no tick"
         return f"{where}, {self.robot or 'the world'}, {self.rule}: {self.what}"
 
 
 Checks = Iterator[Violation | None]
-"""what a rule yields: of every check that it makes the violation, or None"""
+"""The iterator that a rule returns: for each check a violation, or None if it passed."""
 
 
 class Count(msgspec.Struct, frozen=True):
-    """How often a rule was held against the record, and how often it did not hold."""
+    """The number of checks of one rule, and how many of them failed."""
 
     rule: str
     checks: int
@@ -63,37 +63,41 @@ class Count(msgspec.Struct, frozen=True):
 
 
 class LinkStatistics(msgspec.Struct, frozen=True):
-    """A link, and what became of the reports on it, as Observations have it; a copy counts for itself."""
+    """The statistics of the Reports on one link, from the receiver's Observations; each copy counts."""
 
     link: str
+    """Link, as sender->receiver."""
     sent: int
-    """in contact"""
+    """Number of ticks in contact, in each of which one Report is sent."""
     heard: int
+    """Number of received Reports."""
     late: int
-    """of these: not in the tick in which they were sent"""
+    """Number of Reports received in a later tick than the one in which they were sent."""
     twice: int
-    """of these: heard before"""
+    """Number of Reports that had been received before."""
     damaged: int
+    """Number of Reports that arrived damaged."""
     lost: int
-    """that nobody heard, not even damaged"""
+    """Number of Reports of which no copy arrived, not even a damaged one."""
 
 
 class Findings(msgspec.Struct, frozen=True):
-    """Of a whole record."""
+    """The findings of the audit of one recording."""
 
     scenario: str
+    """Name of the scenario; in hardware mode, the names of the robots."""
     ticks: int
-    """that are on record"""
+    """Number of ticks in the recording."""
     counts: tuple[Count, ...]
-    """a rule each"""
+    """Counts of each rule."""
     violations: tuple[Violation, ...]
-    """the earliest first"""
+    """Violations, by tick."""
     links: tuple[LinkStatistics, ...] = ()
-    """of each link, under a fault plan"""
+    """Statistics of each link; empty without a fault plan."""
     rounding: tuple[Violation, ...] = ()
-    """what differs by rounding alone, in a recording that was made with other versions: no violations"""
+    """Differences by rounding alone in a recording made with other versions; they are not violations."""
     versions: str | None = None
-    """in what they are others than here"""
+    """Description of how those versions differ from the ones of this process; None if they do not."""
 
 
 T = TypeVar("T")
@@ -101,15 +105,15 @@ T = TypeVar("T")
 
 def findings_of(
     rules: Sequence[Callable[[T], Checks]],
-    case: T,
+    evidence: T,
     versions: str | None,
     *,
     scenario: str,
     ticks: int,
     links: tuple[LinkStatistics, ...] = (),
 ) -> Findings:
-    """Return what each of `rules`, counted by its name, finds in `case`; `versions` says which differ."""
-    checks = {rule.__name__: list(rule(case)) for rule in rules}
+    """Return the findings of `rules` in `evidence`; `versions` describes other versions, if it has any."""
+    checks = {rule.__name__: list(rule(evidence)) for rule in rules}
     found = [one for some in checks.values() for one in some if one is not None]
     found.sort(key=lambda one: -1 if one.tick is None else one.tick)
     rounding: list[Violation] = []
@@ -127,23 +131,23 @@ def _by_rounding(one: Violation) -> bool:
 
 
 def difference(found: msgspec.Struct, expected: msgspec.Struct) -> str:
-    """In which fields two messages of a kind differ, to the bit; the first of them in full."""
+    """Return the names of the fields in which two messages differ to the bit, and the values of the first."""
     fields = [
         name
         for name in found.__struct_fields__
         if _bits(getattr(found, name)) != _bits(getattr(expected, name))
     ]
     if not fields:
-        return "the frame is another, of the same content"
+        return "the frame differs, its content is the same"
     first = fields[0]
     more = f" (and {', '.join(fields[1:])})" if fields[1:] else ""
-    return f"{first} is {said(getattr(found, first))}, expected {said(getattr(expected, first))}{more}"
+    return f"{first} is {quoted(getattr(found, first))}, expected {quoted(getattr(expected, first))}{more}"
 
 
 def between(found: msgspec.Struct, expected: msgspec.Struct) -> Difference:
-    """The first value in which they differ, however deep it stands."""
+    """Return the first value, at any depth, in which the two messages differ."""
     field, one, other = _first("", found, expected)
-    return Difference(type(found).__name__, field, said(one), said(other), _close(found, expected))
+    return Difference(type(found).__name__, field, quoted(one), quoted(other), _close(found, expected))
 
 
 def _close(one: Any, other: Any) -> bool:
@@ -176,8 +180,8 @@ def _first(path: str, found: Any, expected: Any) -> tuple[str, Any, Any]:
     return path.removeprefix("."), found, expected
 
 
-def said(value: Any) -> str:
-    """A value, as short as it can be quoted."""
+def quoted(value: Any) -> str:
+    """Return `value` as JSON, cut to MAX_VALUE characters."""
     text = msgspec.json.encode(value).decode()
     return text if len(text) <= MAX_VALUE else f"{text[: MAX_VALUE - 3]}..."
 

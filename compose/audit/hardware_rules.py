@@ -1,7 +1,7 @@
-"""A record without a world: what robots with drivers of their own have left, judged by what it tells itself.
+"""The audit of a recording of hardware mode, which contains agents' journals only, and no ground truth.
 
-Nobody knows where they were; but what each decided must follow from what came in, and what it heard must be
-what its peer sent, where that is on record, too.
+The rules check that each robot's decisions follow from its inputs. If both journals of a pair are there, they
+also check that each robot received what its peer sent.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ from protocol.journal.journal_file import CorruptJournal
 
 
 class Alone(msgspec.Struct, frozen=True):
-    """The robots' journals, and nothing else."""
+    """The evidence of a run in hardware mode: the agents' journals."""
 
     testimonies: dict[str, AgentLog]
 
     @property
     def pasts(self) -> dict[str, Past]:
-        """Of the robots that tell one."""
+        """The content of each agent's journal, by robot; robots without a RobotConfig are omitted."""
         return {robot: one.past for robot, one in self.testimonies.items() if one.past is not None}
 
 
-def order(alone: Alone) -> Checks:
-    """Every journal is whole and in its order."""
-    for robot, testimony in alone.testimonies.items():
-        yield broken_off(robot, testimony)
-        if testimony.past is None:
+def order(evidence: Alone) -> Checks:
+    """Check that each journal is complete and in order."""
+    for robot, agent_log in evidence.testimonies.items():
+        yield broken_off(robot, agent_log)
+        if agent_log.past is None:
             continue
-        for step in testimony.past.steps:
-            yield whole(robot, testimony.past, step, excused=True)
+        for step in agent_log.past.steps:
+            yield whole(robot, agent_log.past, step, excused=True)
 
 
 RULES: tuple[Callable[[Alone], Checks], ...] = (order, config, report, decision, limits, log)
-"""each by its name; where one violation follows from another, it comes later"""
+"""The rules of the audit of hardware mode; a rule whose violations follow from another's comes after it."""
 
 
 def judge_alone(
@@ -51,23 +51,23 @@ def judge_alone(
     folder: object,
     rules: Sequence[Callable[[Alone], Checks]] = RULES,
 ) -> Findings:
-    """What there is to find in the frames of `journals`, by name; `folder` is where errors say they are.
+    """Return the findings of `rules` in the frames of `journals`, by file name; errors name `folder`.
 
     Raises CorruptJournal, whose text names the journal.
     """
     testimonies: dict[str, AgentLog] = {}
     for name, frames in journals.items():
-        testimony = testimony_of(list(frames), f"{folder}/{name}")
+        agent_log = testimony_of(list(frames), f"{folder}/{name}")
         robot = name.removeprefix("agent-").removesuffix(".journal")
-        if testimony.past is not None and testimony.past.config.robot != robot:
-            raise CorruptJournal(f"{folder}/{name} is the journal of {testimony.past.config.robot}")
-        testimonies[robot] = testimony
-    alone = Alone(testimonies)
-    agree({robot: past.config for robot, past in alone.pasts.items()}, folder)
+        if agent_log.past is not None and agent_log.past.config.robot != robot:
+            raise CorruptJournal(f"{folder}/{name} is the journal of {agent_log.past.config.robot}")
+        testimonies[robot] = agent_log
+    evidence = Alone(testimonies)
+    agree({robot: past.config for robot, past in evidence.pasts.items()}, folder)
     return findings_of(
         rules,
-        alone,
-        other_versions(alone.pasts),
-        scenario=f"{' and '.join(testimonies)}, without a world",
-        ticks=max([len(past.steps) for past in alone.pasts.values()], default=0),
+        evidence,
+        other_versions(evidence.pasts),
+        scenario=f"{' and '.join(testimonies)}, hardware mode",
+        ticks=max([len(past.steps) for past in evidence.pasts.values()], default=0),
     )

@@ -1,4 +1,4 @@
-"""Whether the journals are whole, in order and agree with each other, and everyone was briefed alike."""
+"""Audit rules for the journals: complete, in order, consistent with each other and with the scenario."""
 
 from __future__ import annotations
 
@@ -8,123 +8,130 @@ from compose.audit.findings import Checks, Violation, between, difference
 from protocol.wire import encode
 
 
-def order(case: Evidence) -> Checks:
-    """Every journal is whole and in its order; what is in two of them is the same in both.
+def order(evidence: Evidence) -> Checks:
+    """Check that each journal is complete and in order, and that journals agree on messages they share.
 
-    Of a journal that breaks off, or is out of order somewhere, only that is said: what there is counts.
+    A journal that ends early, or has a frame out of order, is one violation. Its earlier content is checked.
     """
-    yield _of_the_world(case)
-    for robot, testimony in case.testimonies.items():
-        yield _of_the_robot(case, robot, testimony)
-        past = testimony.past
+    yield _world_journal(evidence)
+    for robot, agent_log in evidence.testimonies.items():
+        yield _agent_journal(evidence, robot, agent_log)
+        past = agent_log.past
         if past is None:
             continue
         for step in past.steps:
-            yield whole(robot, past, step, excused=case.forced)
-            yield _same_drive(case, robot, past, step)
-        if past.end is not None and case.history.end is not None:
-            yield _same_end(case, robot, past)
-            yield _same_farewell(case, robot, past)
+            yield whole(robot, past, step, excused=evidence.forced)
+            yield _same_command(evidence, robot, past, step)
+        if past.end is not None and evidence.history.end is not None:
+            yield _same_end(evidence, robot, past)
+            yield _same_final_report(evidence, robot, past)
 
 
-def _of_the_world(case: Evidence) -> Violation | None:
-    told = case.history
-    if told.disorder is not None:
-        return Violation("order", told.disorder.tick, None, told.disorder.what)
-    if told.end is None:
-        last = told.ticks[-1].world.truth.tick if told.ticks else None
-        what = "its journal breaks off here, expected an MissionEnd"
+def _world_journal(evidence: Evidence) -> Violation | None:
+    run = evidence.history
+    if run.disorder is not None:
+        return Violation("order", run.disorder.tick, None, run.disorder.what)
+    if run.end is None:
+        last = run.ticks[-1].world.truth.tick if run.ticks else None
+        what = "its journal breaks off here, expected a MissionEnd"
         return Violation("order", last, None, what, breaks_off=True)
     return None
 
 
-def _of_the_robot(case: Evidence, robot: str, testimony: AgentLog) -> Violation | None:
-    past, end = testimony.past, case.history.end
-    if testimony.missing:
-        return Violation("order", None, robot, "it has left no journal", breaks_off=True)
-    off = broken_off(robot, testimony)
+def _agent_journal(evidence: Evidence, robot: str, agent_log: AgentLog) -> Violation | None:
+    past, end = agent_log.past, evidence.history.end
+    if agent_log.missing:
+        return Violation("order", None, robot, "its journal is missing", breaks_off=True)
+    off = broken_off(robot, agent_log)
     if past is None or off is not None:
         return off
-    if end is not None and len(past.steps) != end.tick + 1 and not case.forced:
+    if end is not None and len(past.steps) != end.tick + 1 and not evidence.forced:
         return Violation(
-            "order", end.tick, robot, f"it went through {len(past.steps)} ticks, expected {end.tick + 1}"
+            "order", end.tick, robot, f"its journal has {len(past.steps)} ticks, expected {end.tick + 1}"
         )
     return None
 
 
-def broken_off(robot: str, testimony: AgentLog) -> Violation | None:
-    """Where its journal is out of order, or breaks off."""
-    past = testimony.past
-    if testimony.disorder is not None:
-        return Violation("order", testimony.disorder_tick, robot, testimony.disorder)
+def broken_off(robot: str, agent_log: AgentLog) -> Violation | None:
+    """Return a violation if the agent's journal has a frame out of order, or ends early."""
+    past = agent_log.past
+    if agent_log.disorder is not None:
+        return Violation("order", agent_log.disorder_tick, robot, agent_log.disorder)
     if past is None or past.final_report is None:
         last = past.steps[-1].observation.tick if past is not None and past.steps else None
-        what = "its journal breaks off here, expected MissionEnd and Farewell"
+        what = "its journal breaks off here, expected MissionEnd and FinalReport"
         return Violation("order", last, robot, what, breaks_off=True)
     return None
 
 
 def whole(robot: str, past: Past, step: Step, *, excused: bool) -> Violation | None:
-    """Every Observation was answered, but for the last: that may have come too late, or been the last of all."""
+    """Return a violation if the robot did not answer the Observation of `step`.
+
+    The last Observation needs no answer if the journal ends there, or if `excused`: it may be late.
+    """
     tick, last = step.observation.tick, step is past.steps[-1]
     if last and (past.end is None or (excused and step.command is None)):
         return None
     if step.command is None:
-        return Violation("order", tick, robot, "no Command follows its Sense")
+        return Violation("order", tick, robot, "no Command follows its Observation")
     if step.estimate is None:
-        return Violation("order", tick, robot, "no Estimate follows its Drive")
+        return Violation("order", tick, robot, "no Estimate follows its Command")
     if step.missed and past.config.tick_s is None:
-        return Violation("order", tick, robot, "it went without a report, expected it to wait: no real time")
+        return Violation(
+            "order", tick, robot, "it continued without a report, expected it to wait in lockstep"
+        )
     return None
 
 
-def _same_drive(case: Evidence, robot: str, past: Past, step: Step) -> Violation | None:
-    """The world had the Command that the robot gave."""
+def _same_command(evidence: Evidence, robot: str, past: Past, step: Step) -> Violation | None:
+    """Return a violation if the world's journal does not contain the robot's Command."""
     tick = step.observation.tick
-    if tick >= len(case.history.ticks):
+    if tick >= len(evidence.history.ticks):
         return None
-    had, gave = case.command(robot, tick), step.command
-    if had is None and past.config.tick_s is None:
-        return Violation("order", tick, robot, "the world went without its Command, expected it to wait")
-    if had is None or (gave is None and past.end is None):
+    received, sent = evidence.command(robot, tick), step.command
+    if received is None and past.config.tick_s is None:
+        return Violation("order", tick, robot, "the world continued without its Command, expected it to wait")
+    if received is None or (sent is None and past.end is None):
         return None
-    if gave is None:
-        return Violation("order", tick, robot, "the world has a Command of it, expected none: it gave none")
-    if encode(had) == encode(gave):
+    if sent is None:
+        return Violation("order", tick, robot, "the world has a Command from it, expected none: it sent none")
+    if encode(received) == encode(sent):
         return None
-    what = f"the world's Command of it: {difference(had, gave)}"
-    return Violation("order", tick, robot, what, between(had, gave))
+    what = f"the world's Command from it: {difference(received, sent)}"
+    return Violation("order", tick, robot, what, between(received, sent))
 
 
-def _same_end(case: Evidence, robot: str, past: Past) -> Violation | None:
-    """The robot was told how it ended, as the world put it down."""
+def _same_end(evidence: Evidence, robot: str, past: Past) -> Violation | None:
+    """Return a violation if the robot received another MissionEnd than the one in the world's journal."""
     assert past.end is not None
-    assert case.history.end is not None
-    if encode(past.end) == encode(case.history.end):
+    assert evidence.history.end is not None
+    if encode(past.end) == encode(evidence.history.end):
         return None
-    what = f"the MissionEnd that it was told: {difference(past.end, case.history.end)}"
-    return Violation("order", past.end.tick, robot, what, between(past.end, case.history.end))
+    what = f"the MissionEnd that it received: {difference(past.end, evidence.history.end)}"
+    return Violation("order", past.end.tick, robot, what, between(past.end, evidence.history.end))
 
 
-def _same_farewell(case: Evidence, robot: str, past: Past) -> Violation | None:
-    """The world has heard the robot's last word."""
+def _same_final_report(evidence: Evidence, robot: str, past: Past) -> Violation | None:
+    """Return a violation if the world's journal does not contain the robot's FinalReport."""
     assert past.end is not None
-    said, heard = past.final_report, case.history.final_reports.get(robot)
-    if said is None:
+    sent, received = past.final_report, evidence.history.final_reports.get(robot)
+    if sent is None:
         return None
-    if heard is None:
-        return Violation("order", past.end.tick, robot, "the world has no FinalReport of it", breaks_off=True)
-    if encode(heard) == encode(said):
+    if received is None:
+        return Violation(
+            "order", past.end.tick, robot, "the world has no FinalReport from it", breaks_off=True
+        )
+    if encode(received) == encode(sent):
         return None
-    what = f"the world's FinalReport of it: {difference(heard, said)}"
-    return Violation("order", past.end.tick, robot, what, between(heard, said))
+    what = f"the world's FinalReport from it: {difference(received, sent)}"
+    return Violation("order", past.end.tick, robot, what, between(received, sent))
 
 
-def config(case: Evidence) -> Checks:
-    """Every robot was told what the scenario says, and all of them the same duration of a tick."""
-    tick_s = next((past.config.tick_s for past in case.pasts.values()), None)
-    for robot, past in case.pasts.items():
-        expected = case.history.scenario.config(robot, tick_s)
+def config(evidence: Evidence) -> Checks:
+    """Check that each RobotConfig follows from the scenario, with the same tick duration for all robots."""
+    tick_s = next((past.config.tick_s for past in evidence.pasts.values()), None)
+    for robot, past in evidence.pasts.items():
+        expected = evidence.history.scenario.config(robot, tick_s)
         if encode(past.config) == encode(expected):
             yield None
         else:

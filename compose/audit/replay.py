@@ -1,8 +1,8 @@
-"""A run once more, on what its journals say came in; and whether everything follows as it is on record.
+"""The replay of a recording: the run is computed again from the journaled inputs, and compared to the bit.
 
-The world is moved by the Commands on record, and senses anew; every robot's planner is run on the Observations and
-Reports that came to its process. This is the judge's own doing: of his rules those that recompute something.
-Where there was no world, the robots' journals are held against themselves.
+The world moves by the journaled Commands and computes new Observations. Each robot's planner runs on the
+Observations and Reports that its process received. A replay applies those audit rules that recompute
+something. In hardware mode, only the agents' journals are replayed.
 """
 
 from __future__ import annotations
@@ -32,43 +32,43 @@ RULES: tuple[Callable[[Evidence], Checks], ...] = (
     order,
     outcome,
 )
-"""in the order of a tick: what differs first has caused what differs later"""
+"""The rules of a replay, in the order of a tick: the first difference is the cause of later ones."""
 ALONE: tuple[Callable[[Alone], Checks], ...] = (report, decision, order_alone)
-"""the same without a world"""
+"""The rules of a replay in hardware mode."""
 
 
 class Replay(msgspec.Struct, frozen=True):
-    """What came of it."""
+    """The result of a replay."""
 
     scenario: str
     ticks: int
     checks: int
-    """messages that were held against what follows"""
+    """Number of compared messages."""
     differences: tuple[Violation, ...]
-    """the first of them first"""
+    """Differences, by tick."""
     tears: tuple[Violation, ...]
-    """where journals break off"""
+    """Journals that end early."""
     rounding: int = 0
-    """messages that differ by rounding alone, in a recording that was made with other versions"""
+    """Number of messages that differ by rounding alone, in a recording made with other versions."""
     versions: str | None = None
-    """in what they are others than here"""
+    """Description of how those versions differ from the ones of this process; None if they do not."""
 
 
 def replay(folder: Path) -> tuple[Replay, dict[str, int]]:
-    """Of the record in `folder`; and of each of its journals how many bytes of a torn write it ends with.
+    """Replay the recording in `folder`; return the result, and the torn bytes at the end of each journal.
 
-    Raises OSError if there is none, journal.CorruptJournal if a frame in it cannot be understood, or stands
-    in the journal of another robot.
+    Raises OSError if there is no recording, CorruptJournal if a frame cannot be decoded or is in the journal
+    of another robot.
     """
     found = books(folder)
-    told = replayed({name: book.frames for name, book in found.items()}, folder)
-    return told, {name: book.torn for name, book in found.items()}
+    result = replayed({name: book.frames for name, book in found.items()}, folder)
+    return result, {name: book.torn for name, book in found.items()}
 
 
-def replayed(journals: Mapping[str, Iterable[bytes]], folder: object = "the record") -> Replay:
-    """Of the frames of `journals`, by name; `folder` is where errors say they are.
+def replayed(journals: Mapping[str, Iterable[bytes]], folder: object = "the recording") -> Replay:
+    """Replay the frames of `journals`, by file name, and return the result; errors name `folder`.
 
-    Raises journal.CorruptJournal like `replay`.
+    Raises CorruptJournal like `replay`.
     """
     findings = judged(journals, folder, RULES, ALONE)
     return Replay(

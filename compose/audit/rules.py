@@ -1,4 +1,4 @@
-"""The audit of a record: every rule held against it."""
+"""The audit of a recording by all rules."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ RULES: tuple[Callable[[Evidence], Checks], ...] = (
     log,
     claim,
 )
-"""each by its name; where one violation follows from another, it comes later"""
+"""The rules of the audit; a rule whose violations follow from another's comes after it."""
 
 
 def audit(folder: Path) -> Findings:
-    """What there is to find in the record in `folder`; without a world, in what its robots have left.
+    """Audit the recording in `folder`, with or without a world's journal, and return the findings.
 
-    Raises OSError if there is none, journal.CorruptJournal if a frame in it cannot be understood, or stands
-    in the journal of another robot, or of another run than its peer's.
+    Raises OSError if there is no recording. Raises CorruptJournal if a frame cannot be decoded, if it is in
+    the journal of another robot, or if two peers' journals are of different runs.
     """
     return judged({name: book.frames for name, book in books(folder).items()}, folder)
 
@@ -49,9 +49,9 @@ def judged(
     rules: Sequence[Callable[[Evidence], Checks]] = RULES,
     without: Sequence[Callable[[Alone], Checks]] = hardware_rules.RULES,
 ) -> Findings:
-    """What there is to find by `rules`, or `without` a world, in the frames of `journals`, by name.
+    """Return the findings in the frames of `journals`, by file name; errors name `folder`.
 
-    `folder` is where errors say they are. Raises journal.CorruptJournal like `audit`.
+    The rules are `rules`, or `without` if there is no world's journal. Raises CorruptJournal like `audit`.
     """
     if WORLD_JOURNAL in journals:
         return judge(journals, folder, rules)
@@ -60,20 +60,20 @@ def judged(
 
 def judge(
     journals: Mapping[str, Iterable[bytes]],
-    folder: object = "the record",
+    folder: object = "the recording",
     rules: Sequence[Callable[[Evidence], Checks]] = RULES,
 ) -> Findings:
-    """What there is to find in the frames of `journals`, by name; `folder` is where errors say they are.
+    """Return the findings of `rules` in the frames of `journals`, one of which is the world's.
 
-    Raises journal.CorruptJournal like `audit`.
+    Errors name `folder`. Raises CorruptJournal like `audit`.
     """
-    case = case_of(journals, folder)
-    told = case.history
+    evidence = case_of(journals, folder)
+    run = evidence.history
     return findings_of(
         rules,
-        case,
-        otherwise(told.environment, of_world()) or other_versions(case.pasts),
-        scenario=told.scenario.name,
-        ticks=len(told.ticks),
-        links=befallen(case),
+        evidence,
+        otherwise(run.environment, of_world()) or other_versions(evidence.pasts),
+        scenario=run.scenario.name,
+        ticks=len(run.ticks),
+        links=befallen(evidence),
     )

@@ -1,4 +1,4 @@
-"""Audit rules for the part of a scenario that follows from the rest of it: the audit recomputes it."""
+"""Audit rules that recompute the parts of a scenario that follow from the rest of it."""
 
 from __future__ import annotations
 
@@ -20,36 +20,37 @@ from protocol.orbits import Rendezvous, rendezvous
 from world.scenario import RobotSpec
 
 
-def scenario(case: Evidence) -> Checks:
+def scenario(evidence: Evidence) -> Checks:
     """Check that `tandem run` accepts the scenario, and that its orbits follow from the rest of it."""
-    told = case.history.scenario
-    for why in (noise_infeasibility(told.mission), safety_infeasibility(told.mission)):
+    found = evidence.history.scenario
+    for why in (noise_infeasibility(found.mission), safety_infeasibility(found.mission)):
         yield _violation(None, why and f"mission.{why}")
-    place = {robot.id: place for place, robot in enumerate(told.robots)}
-    for robot in told.robots:
-        peer = told.robots[place[robot.peer]]
+    place = {robot.id: place for place, robot in enumerate(found.robots)}
+    for robot in found.robots:
+        peer = found.robots[place[robot.peer]]
         for why in (
             _off_role(robot, first=place[robot.id] < place[robot.peer]),
-            _off_range(robot, told.mission),
-            _off_lie(robot),
-            _off_plan(robot.rendezvous, told.mission, told.planner_name, robot.anchor, peer.anchor),
+            _off_range(robot, found.mission),
+            _off_attack(robot),
+            _off_plan(robot.rendezvous, found.mission, found.planner_name, robot.anchor, peer.anchor),
         ):
             yield _violation(robot.id, why)
 
 
-def config(case: Testified) -> Checks:
-    """Check that the orbits in each robot's briefing follow from the mission and the anchors in it.
+def config(evidence: Testified) -> Checks:
+    """Check that the orbits in each RobotConfig follow from the mission and the anchors in it.
 
-    This is for hardware mode. With a world, `journals.config` compares the briefing with the scenario.
+    This is for hardware mode. Otherwise, `journal_rules.config` compares the RobotConfig with the scenario.
     """
-    for robot, past in case.pasts.items():
-        told = past.config
-        why = _off_plan(told.rendezvous, told.mission, told.planner_name, told.anchor, told.peer_anchor)
+    for robot, past in evidence.pasts.items():
+        found = past.config
+        why = _off_plan(found.rendezvous, found.mission, found.planner_name, found.anchor, found.peer_anchor)
         yield Violation("config", None, robot, why) if why is not None else None
 
 
 def _off_role(robot: RobotSpec, *, first: bool) -> str | None:
-    return None if (robot.role == "a") == first else f"role is {robot.role}: the first of a pair is a"
+    expected = "a" if first else "b"
+    return None if robot.role == expected else f"role is {robot.role}, expected {expected}"
 
 
 def _off_range(robot: RobotSpec, mission: Mission) -> str | None:
@@ -58,18 +59,18 @@ def _off_range(robot: RobotSpec, mission: Mission) -> str | None:
     return f"it starts {rho0:.12g} m from its anchor, outside R = {reach:.12g} m" if rho0 > reach else None
 
 
-def _off_lie(robot: RobotSpec) -> str | None:
+def _off_attack(robot: RobotSpec) -> str | None:
     early = robot.attack is not None and robot.attack.kind in OF_THE_START and robot.attack.part != "all"
-    return "its lie is of the start, and not of all" if early else None
+    return "its attack changes the start, and its part is not all" if early else None
 
 
 def _off_plan(
     found: Rendezvous, mission: Mission, planner_name: PlannerName, anchor: Anchor, peer: Anchor
 ) -> str | None:
-    """Return why `found` is not the plan for these anchors; None if it is."""
+    """Return why `found` are not the orbits for these anchors; None if they are."""
     distance = math.dist((anchor.x, anchor.y), (peer.x, peer.y))
     if distance < NEAREST_ANCHORS:
-        return f"its anchor is {distance:.3g} m from its peer's, expected {NEAREST_ANCHORS:g} m at the least"
+        return f"its anchor is {distance:.3g} m from its peer's, expected at least {NEAREST_ANCHORS:g} m"
     if (why := infeasibility(mission, distance)) is not None:
         return f"mission: {why}"
     expected = rendezvous(mission, distance, planner_name)

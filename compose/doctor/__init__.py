@@ -1,1 +1,1 @@
-"""Checks of a machine, its keys and its network, and a list of running missions."""
+"""Checks of a machine, its keys and its network, and the list of running missions."""

@@ -1,11 +1,13 @@
-"""Access rules, tried for real: what must not pass a router, and whether it does.
+"""Tests of a router's access rules: forbidden messages are sent, and must not pass.
 
-Two sessions with one's own keys, for a router is not asked about what stays within one. What is put is put
-under a run of no mission, by a name drawn for it, and is no frame that anybody could take for one: no world,
-robot or page acts on it, even if it passes. In a mission that runs, the doctor only listens, and only for
-what it must not hear: where rules hold, the router tells nobody that it does; where they do not, the world
-says its truth for that moment, which costs a little time and changes nothing. Nothing is ever put under a
-mission's keys, no sign of life is shown, and no question is answered.
+The test needs two sessions with the same keys, because messages within one session do not pass the router. It
+publishes under the random name of a run that does not exist, and its payload is not a frame. No world,
+robot or page acts on it, even if it passes.
+
+In a running mission, the test only subscribes, and only to keys that it must not read. If the rules are
+enforced, the router does not announce the subscription. If they are not, the world publishes its ground truth
+while the test lasts, which costs a little time and changes nothing. The test never publishes under keys of a
+mission, declares no liveliness token and answers no query.
 """
 
 from __future__ import annotations
@@ -25,150 +27,173 @@ from protocol.network.endpoints import Endpoints
 from protocol.wire import MalformedFrame, decode
 
 ASK_S = 2.0
-"""how long to wait for one answer"""
+"""Time in s to wait for one answer."""
 LOOK_AGAIN_S = 0.01
+"""The polling interval in s."""
 MATCHED_S = 0.5
-"""how long a world may take to learn that somebody listens to its truth"""
+"""Time in s that a world has to learn of a subscriber to its ground truth."""
 TICKS = 3
-"""that go by after that before it counts that nothing was heard: a truth is said after the tick's Senses"""
+"""The number of ticks without a forbidden message after which the test passes. The ground truth of a tick is
+published after its Observations."""
 RING = 16
-"""samples that wait on a key, so that others' wildcards do not displace what is looked for"""
+"""The size of the buffer of a key in samples, so that samples under wildcards do not displace all others."""
 NO_FRAME = b"?"
-RENEW = "the router must enforce the rules: start it by its zenoh.json5 as `tandem keys` left it"
+"""A payload that no process accepts."""
+RENEW = "the router must enforce the rules: start it with the zenoh.json5 that `tandem keys` wrote"
+"""The advice for a rule that is not enforced."""
 
 
 class SessionPair(NamedTuple):
-    """Two sessions at one router, by the same keys."""
+    """Two sessions at one router with the same keys."""
 
-    speaker: zenoh.Session
-    hearer: zenoh.Session
+    publisher: zenoh.Session
+    subscriber: zenoh.Session
 
-    def passed(self, what: Mapping[str, str]) -> dict[str, zenoh.Sample]:
-        """Of these keys, by their names: those under which what is put by one comes to the other."""
-        ears: dict[str, Any] = {name: self.hearer.declare_subscriber(key) for name, key in what.items()}
+    def passed(self, tested: Mapping[str, str]) -> dict[str, zenoh.Sample]:
+        """Publish under each key of `tested`; return the samples that reached the other session, by name."""
+        subscribers: dict[str, Any] = {
+            name: self.subscriber.declare_subscriber(key) for name, key in tested.items()
+        }
         self._settle()
-        for key in what.values():
-            self.speaker.put(key, NO_FRAME)
+        for key in tested.values():
+            self.publisher.put(key, NO_FRAME)
         self._settle()
-        came = {name: sample for name, ear in ears.items() if (sample := _under(what[name], ear)) is not None}
-        for ear in ears.values():
-            ear.undeclare()
-        return came
+        received = {
+            name: sample
+            for name, one in subscribers.items()
+            if (sample := _under(tested[name], one)) is not None
+        }
+        for one in subscribers.values():
+            one.undeclare()
+        return received
 
     def _settle(self) -> None:
-        """What either has said has passed the router: a question and its answer have, on the same links."""
-        for one in (self.hearer, self.speaker, self.hearer):
+        """Wait until earlier messages of both sessions have passed the router, with queries on its links."""
+        for one in (self.subscriber, self.publisher, self.subscriber):
             session.alive(one, keys.world_alive("*"), ASK_S)
 
 
 def probe_run() -> str:
-    """A name that no mission has."""
+    """Return the name of a run that does not exist."""
     return f"doctor-{random.SystemRandom().getrandbits(64):016x}"
 
 
 def tried(pair: SessionPair, endpoints: Endpoints, wait: float) -> Iterator[Finding]:
-    """What `tandem keys` gave these endpoints the right to do passes, and nothing else."""
-    who = endpoints.participant
-    if who is None:
-        yield untried("rules: there are none to try without --keys")
-    elif who in access_control.CARRIERS:
-        yield untried(f"rules: the {who} may say and hear anything; try them by the keys of a robot")
+    """Check that the router lets pass what these keys allow, and nothing else.
+
+    `wait` is the time in s to observe each running mission.
+    """
+    participant = endpoints.participant
+    if participant is None:
+        yield untried("rules: there are none to test without --keys")
+    elif participant in access_control.CARRIERS:
+        yield untried(
+            f"rules: the {participant} may publish and read anything; test them with a robot's keys"
+        )
     else:
-        me = who.removeprefix(access_control.agent("")) if who != access_control.VIEWER else None
-        other = _another(endpoints, me)
-        yield from _forged(pair, who, me, other)
-        if me is not None:
-            for run in _runs(pair.hearer):
-                yield from _overheard(pair, run, me, wait)
+        robot = (
+            participant.removeprefix(access_control.agent(""))
+            if participant != access_control.VIEWER
+            else None
+        )
+        other = _another(endpoints, robot)
+        yield from _publishing(pair, participant, robot, other)
+        if robot is not None:
+            for run in _runs(pair.subscriber):
+                yield from _reading(pair, run, robot, wait)
 
 
-def _another(endpoints: Endpoints, me: str | None) -> str:
-    """A robot that these keys are not of."""
+def _another(endpoints: Endpoints, robot: str | None) -> str:
+    """Return a robot other than `robot`, if possible one that the rules name."""
     subjects = endpoints.setting("access_control/subjects") or ()
     robots = [name for one in subjects for name in one.get("cert_common_names") or () if "agent-" in name]
-    others = [name.removeprefix("agent-") for name in robots if name != access_control.agent(me or "")]
+    others = [name.removeprefix("agent-") for name in robots if name != access_control.agent(robot or "")]
     return others[0] if others else "somebody-else"
 
 
-def _others(run: str, me: str, other: str) -> Iterator[tuple[str, str]]:
-    """A key of each kind under which `me` puts nothing, such as robot/b/command, and the whole of it."""
+def _forbidden(run: str, robot: str, other: str) -> Iterator[tuple[str, str]]:
+    """Yield a key of each kind under which `robot` must not publish, shortened and in full.
+
+    A shortened key is robot/b/command, for example.
+    """
     for key, rule in keys.RULES.items():
         if rule.way == "put":
-            named = {"run": run, "robot": other if rule.by == "robot" else me, "peer": me}
-            yield _short(whole := key(*(named[name] for name in signature(key).parameters))), whole
+            named = {"run": run, "robot": other if rule.by == "robot" else robot, "peer": robot}
+            yield _short(full := key(*(named[name] for name in signature(key).parameters))), full
 
 
 def _short(key: str) -> str:
     return key.split("/", 2)[2]
 
 
-def _forged(pair: SessionPair, who: str, me: str | None, other: str) -> Iterator[Finding]:
-    said = dict(_others(probe_run(), me or other, other))
-    if passed := sorted(pair.passed(said)):
-        yield fix(f"rules: {who} can put {', '.join(passed)}; {RENEW}")
+def _publishing(pair: SessionPair, participant: str, robot: str | None, other: str) -> Iterator[Finding]:
+    """Check that forbidden messages do not pass, and that the robot's own Reports do."""
+    tested = dict(_forbidden(probe_run(), robot or other, other))
+    if passed := sorted(pair.passed(tested)):
+        yield fix(f"rules: {participant} can publish {', '.join(passed)}; {RENEW}")
     else:
-        yield ok(f"rules: what {who} puts as {', '.join(sorted(said))} does not pass")
-    if me is not None:
-        if pair.passed({"Report": keys.report(probe_run(), me, me)}):
-            yield ok(f"rules: what {who} puts as Reports of {me} passes")
+        yield ok(f"rules: {participant} cannot publish {', '.join(sorted(tested))}")
+    if robot is not None:
+        if pair.passed({"Report": keys.report(probe_run(), robot, robot)}):
+            yield ok(f"rules: {participant} can publish Reports of {robot}")
         else:
-            yield fix(f"rules: what {who} puts as Reports of {me} does not pass; {RENEW}, with {me} in it")
+            yield fix(f"rules: {participant} cannot publish Reports of {robot}; {RENEW}, with {robot} in it")
 
 
 def _runs(link: zenoh.Session) -> list[str]:
     return [key.run for key in session.alive(link, keys.world_alive("*"), ASK_S)]
 
 
-def _overheard(pair: SessionPair, run: str, me: str, wait: float) -> Iterator[Finding]:
-    """What must not be heard of a mission that runs, while what may be is."""
-    peer = _peer(pair.hearer, run, me)
+def _reading(pair: SessionPair, run: str, robot: str, wait: float) -> Iterator[Finding]:
+    """Check that `robot` cannot read forbidden keys of a running mission while it can read its own."""
+    peer = _peer(pair.subscriber, run, robot)
     if peer is None:
         yield untried(
-            f"rules: reading the truth of {run}: {me} has no part in it; try by a robot's keys that has"
+            f"rules: reading the truth of {run}: {robot} is not in it; test with the keys of a robot that is"
         )
         return
     forbidden = {
         _short(key): key for key in (keys.truth(run), keys.command(run, peer), keys.observation(run, peer))
     }
     latest: Any = zenoh.handlers.RingChannel(RING)
-    ears: dict[str, Any] = {
-        name: pair.hearer.declare_subscriber(key, latest) for name, key in forbidden.items()
+    subscribers: dict[str, Any] = {
+        name: pair.subscriber.declare_subscriber(key, latest) for name, key in forbidden.items()
     }
-    own: Any = pair.hearer.declare_subscriber(keys.observation(run, me), latest)
-    came: set[str] = set()
+    own: Any = pair.subscriber.declare_subscriber(keys.observation(run, robot), latest)
+    received: set[str] = set()
     ticks: set[int] = set()
     now = time.monotonic()
     matched, until = now + MATCHED_S, now + MATCHED_S + wait
-    while len(ticks) < TICKS and len(came) < len(ears) and now < until:
+    while len(ticks) < TICKS and len(received) < len(subscribers) and now < until:
         time.sleep(LOOK_AGAIN_S)
         now = time.monotonic()
-        if (sample := _under(keys.observation(run, me), own)) is not None and now >= matched:
+        if (sample := _under(keys.observation(run, robot), own)) is not None and now >= matched:
             ticks |= _ticks(sample.payload.to_bytes())
-        came |= {name for name, ear in ears.items() if _under(forbidden[name], ear) is not None}
-    for one in (own, *ears.values()):
+        received |= {name for name, one in subscribers.items() if _under(forbidden[name], one) is not None}
+    for one in (own, *subscribers.values()):
         one.undeclare()
-    what = ", ".join(sorted(forbidden))
-    if came:
-        yield fix(f"rules: {access_control.agent(me)} can read {', '.join(sorted(came))} in {run}; {RENEW}")
+    names = ", ".join(sorted(forbidden))
+    participant = access_control.agent(robot)
+    if received:
+        yield fix(f"rules: {participant} can read {', '.join(sorted(received))} in {run}; {RENEW}")
     elif len(ticks) >= TICKS:
-        yield ok(f"rules: {access_control.agent(me)} hears nothing of {what} in {run}")
+        yield ok(f"rules: {participant} cannot read {names} in {run}")
     else:
-        yield untried(
-            f"rules: reading {what}: {run} did not move within {wait:g} s; try while it does (--connect-timeout)"
-        )
+        yield untried(f"rules: reading {names}: {run} had no ticks within {wait:g} s; raise --timeout")
 
 
-def _peer(link: zenoh.Session, run: str, me: str) -> str | None:
-    answer = session.ask(link, keys.config(run, me), ASK_S)
+def _peer(link: zenoh.Session, run: str, robot: str) -> str | None:
+    """Return the peer of `robot`, from its configuration; None if the world does not answer with one."""
+    answer = session.ask(link, keys.config(run, robot), ASK_S)
     try:
         return decode(answer, RobotConfig).peer if isinstance(answer, bytes) else None
     except MalformedFrame:
         return None
 
 
-def _under(key: str, ear: Any) -> zenoh.Sample | None:
-    """Return the next sample that came under `key` itself; what came under a wildcard tells nothing of it."""
-    samples: Iterator[zenoh.Sample] = iter(ear.try_recv, None)
+def _under(key: str, subscriber: Any) -> zenoh.Sample | None:
+    """Return the next sample under `key` itself; samples under wildcards say nothing about its rule."""
+    samples: Iterator[zenoh.Sample] = iter(subscriber.try_recv, None)
     return next((sample for sample in samples if str(sample.key_expr) == key), None)
 
 

@@ -1,7 +1,7 @@
-"""Certificates: who they say they are, who signed them, how long they hold, and who can read their keys.
+"""Checks of certificates: their name, their authority, their validity, and the permissions of their keys.
 
-Each is shown to an end of a TLS handshake in memory, and judged by OpenSSL there, but for the dates, which
-are to be told. Nobody else sees it.
+OpenSSL verifies each certificate in a TLS handshake in memory, without the network. The dates are checked
+separately, so that a finding can state them.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from protocol.network import access_control
 from protocol.network.endpoints import Endpoints, is_encrypted, place
 
 SOON_DAYS = 30
-"""a certificate that ends sooner is to be renewed"""
+"""The number of days before its expiry from which a certificate must be renewed."""
 DAY_S = 86_400.0
 NO_CHECK_TIME = 0x200000
-"""OpenSSL's X509_V_FLAG_NO_CHECK_TIME, for which the module ssl has no name"""
+"""OpenSSL's X509_V_FLAG_NO_CHECK_TIME, which the module ssl does not define."""
 UNASKED = ""
-"""the password of a key that has one, instead of a question on the terminal; Zenoh knows none either"""
+"""The password for encrypted keys. Zenoh supports none; without this value, OpenSSL asks on the terminal."""
 FLIGHTS = 4
-"""a handshake in memory is over after as many, either way"""
+"""The number of exchanges after which a handshake in memory has succeeded or failed."""
 
 
 class CertificateSet(NamedTuple):
@@ -37,78 +37,78 @@ class CertificateSet(NamedTuple):
     key: Path
     authority: Path
     connects: bool
-    """it is for connecting with; else for listening"""
+    """Whether it is used for connecting; otherwise it is used for listening."""
 
 
 def papers(endpoints: Endpoints, now: float | None = None) -> Iterator[Finding]:
-    """Of all certificates that the configuration names; `now` is the time, in s since 1970."""
-    told = set()
+    """Check all certificates in the configuration; `now` is the time in s since 1970."""
+    yielded = set()
     for side in ("connect", "listen"):
         certificate, key, authority = (
             endpoints.file(f"transport/link/tls/{name}")
             for name in (f"{side}_certificate", f"{side}_private_key", "root_ca_certificate")
         )
         if certificate is not None and key is not None and authority is not None:
-            paper = CertificateSet(certificate, key, authority, side == "connect")
-            for finding in _findings(paper, endpoints, time.time() if now is None else now):
-                if finding not in told:
-                    told.add(finding)
+            files = CertificateSet(certificate, key, authority, side == "connect")
+            for finding in _findings(files, endpoints, time.time() if now is None else now):
+                if finding not in yielded:
+                    yielded.add(finding)
                     yield finding
 
 
-def _findings(paper: CertificateSet, endpoints: Endpoints, now: float) -> Iterator[Finding]:
-    at = paper.certificate
-    if paper.key.stat().st_mode & 0o077:
-        yield fix(f"key: others than its owner can read {paper.key}; chmod 600 {paper.key}")
+def _findings(files: CertificateSet, endpoints: Endpoints, now: float) -> Iterator[Finding]:
+    at = files.certificate
+    if files.key.stat().st_mode & 0o077:
+        yield fix(f"key: other users can read {files.key}; chmod 600 {files.key}")
     else:
-        yield ok(f"key: only its owner reads {paper.key}")
+        yield ok(f"key: only its owner can read {files.key}")
     try:
         signed = True
-        shown = _shown(paper, paper.authority)
+        shown = _shown(files, files.authority)
     except ssl.SSLCertVerificationError as error:
         yield fix(
-            f"certificate: {at} is refused by {paper.authority}: {error.verify_message}; "
-            "take both from one folder that `tandem keys` made"
+            f"certificate: {at} is not accepted by {files.authority}: {error.verify_message}; "
+            "take both from one folder that `tandem keys` created"
         )
         signed = False
         try:
-            shown = _shown(paper, at)
+            shown = _shown(files, at)
         except ssl.SSLError:
             return
     except ssl.SSLError as error:
-        yield fix(f"certificate: {at}: {_unusable(paper, error)}; copy the folder once more")
+        yield fix(f"certificate: {at}: {_unusable(files, error)}; copy the folder again")
         return
-    name = dict(pair for part in shown["subject"] for pair in part).get("commonName", "nobody")
+    name = dict(pair for part in shown["subject"] for pair in part).get("commonName", "no name")
     if signed:
-        yield ok(f"certificate: {paper.authority.name} signs {at}, which is of {name}")
+        yield ok(f"certificate: {at} is signed by {files.authority.name} and is of {name}")
     yield _dated(f"certificate: {at}", shown, now)
-    for authority in _context(ssl.PROTOCOL_TLS_CLIENT, paper.authority).get_ca_certs():
-        finding = _dated(f"authority: {paper.authority}", authority, now)
+    for authority in _context(ssl.PROTOCOL_TLS_CLIENT, files.authority).get_ca_certs():
+        finding = _dated(f"authority: {files.authority}", authority, now)
         if finding.mark != ok("").mark:
             yield finding
-    yield from _named(paper, name, endpoints)
-    if not paper.connects:
+    yield from _named(files, name, endpoints)
+    if not files.connects:
         yield from _known(at, shown, endpoints)
 
 
-def _unusable(paper: CertificateSet, error: ssl.SSLError) -> str:
+def _unusable(files: CertificateSet, error: ssl.SSLError) -> str:
     if error.reason == "KEY_VALUES_MISMATCH":
-        return f"{paper.key} is not its key"
-    return f"with {paper.key.name} and {paper.authority.name} it cannot be read: {error.reason or error}"
+        return f"{files.key} is not its key"
+    return f"with {files.key.name} and {files.authority.name} it cannot be read: {error.reason or error}"
 
 
-def _named(paper: CertificateSet, name: str, endpoints: Endpoints) -> Iterator[Finding]:
-    """Whether the certificate, the configuration and the folder are of the same participant."""
+def _named(files: CertificateSet, name: str, endpoints: Endpoints) -> Iterator[Finding]:
+    """Check that the certificate, the configuration and the folder are of the same participant."""
     if endpoints.participant is None:
         return
-    folder = paper.certificate.parent
+    folder = files.certificate.parent
     if name != endpoints.participant:
         yield fix(
-            f"names: {paper.certificate} is of {name}, and {folder / KEYED} of {endpoints.participant}; "
-            f"copy the folder of {endpoints.participant} once more"
+            f"names: {files.certificate} is of {name}, and {folder / KEYED} of {endpoints.participant}; "
+            f"copy the folder of {endpoints.participant} again"
         )
     elif _is_participant(folder.name) and folder.name != name:
-        yield fix(f"names: the folder {folder} holds the keys of {name}; copy the one of {folder.name}")
+        yield fix(f"names: the folder {folder} contains the keys of {name}; copy the folder of {folder.name}")
     else:
         yield ok(f"names: certificate and configuration are of {name}")
 
@@ -121,7 +121,7 @@ def _is_participant(folder: str) -> bool:
 
 
 def _known(at: Path, shown: Mapping[str, Any], endpoints: Endpoints) -> Iterator[Finding]:
-    """Whether who connects to where this one listens finds that name in the certificate."""
+    """Check that the certificate names each host at which this participant listens."""
     names = {_host(value) for _, value in shown.get("subjectAltName", ())}
     for endpoint in endpoints.listen:
         where = place(endpoint)
@@ -131,8 +131,8 @@ def _known(at: Path, shown: Mapping[str, Any], endpoints: Endpoints) -> Iterator
             yield ok(f"names: {at} names {where[0]}")
         else:
             yield fix(
-                f"names: {at} does not name {where[0]}, so nobody will believe it there; remove the folder, "
-                f"and make it anew by `tandem keys` with --host {where[0]}"
+                f"names: {at} does not name {where[0]}, so clients will refuse it there; remove the folder, "
+                f"and create it again with `tandem keys --host {where[0]}`"
             )
 
 
@@ -146,11 +146,11 @@ def _host(text: str) -> str:
 def _dated(what: str, shown: Mapping[str, Any], now: float) -> Finding:
     begins, ends = (ssl.cert_time_to_seconds(shown[name]) for name in ("notBefore", "notAfter"))
     days = (ends - now) / DAY_S
-    renew = "remove its folder, and make it anew by `tandem keys`"
+    renew = "remove its folder, and create it again with `tandem keys`"
     if now < begins:
         return fix(f"{what} is not valid before {_date(begins)}; set this host's clock, or wait")
     if now >= ends:
-        return fix(f"{what} has expired on {_date(ends)}; {renew}")
+        return fix(f"{what} expired on {_date(ends)}; {renew}")
     if days < SOON_DAYS:
         return fix(f"{what} expires on {_date(ends)}, in {days:.0f} days; {renew}")
     return ok(f"{what} is valid until {_date(ends)}")
@@ -160,14 +160,17 @@ def _date(when: float) -> str:
     return time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(when))
 
 
-def _shown(paper: CertificateSet, trusted: Path) -> Mapping[str, Any]:
-    """What an end of a handshake sees of who shows this certificate. Raises ssl.SSLError."""
+def _shown(files: CertificateSet, trusted: Path) -> Mapping[str, Any]:
+    """Return the certificate as its peer receives it in a handshake, verified against `trusted`.
+
+    Raises ssl.SSLError.
+    """
     client = _context(ssl.PROTOCOL_TLS_CLIENT, trusted)
     server = _context(ssl.PROTOCOL_TLS_SERVER, trusted)
-    server.load_cert_chain(paper.certificate, paper.key, UNASKED)
-    if paper.connects:
+    server.load_cert_chain(files.certificate, files.key, UNASKED)
+    if files.connects:
         client.verify_mode = ssl.CERT_NONE
-        client.load_cert_chain(paper.certificate, paper.key, UNASKED)
+        client.load_cert_chain(files.certificate, files.key, UNASKED)
         server.verify_mode = ssl.CERT_REQUIRED
     there, back = ssl.MemoryBIO(), ssl.MemoryBIO()
     ends = (client.wrap_bio(back, there), server.wrap_bio(there, back, server_side=True))
@@ -175,7 +178,7 @@ def _shown(paper: CertificateSet, trusted: Path) -> Mapping[str, Any]:
         for end in ends:
             with suppress(ssl.SSLWantReadError):
                 end.do_handshake()
-    return ends[1 if paper.connects else 0].getpeercert() or {}
+    return ends[1 if files.connects else 0].getpeercert() or {}
 
 
 def _context(protocol: int, trusted: Path) -> ssl.SSLContext:

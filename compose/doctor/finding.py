@@ -1,4 +1,4 @@
-"""What a check has found."""
+"""The result of a check."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ from typing import NamedTuple
 
 
 class Finding(NamedTuple):
-    """A line of what is so, of what to do, or of what could not be told."""
+    """One line: a check that passed, a problem with its solution, or a check that could not be made."""
 
     mark: str
+    """OK, FIX or UNTRIED."""
     text: str
 
     def __str__(self) -> str:
@@ -21,15 +22,15 @@ UNTRIED = "--"
 
 
 def ok(text: str) -> Finding:
-    """All is well with it."""
+    """Return a finding that a check passed."""
     return Finding(OK, text)
 
 
 def fix(text: str) -> Finding:
-    """It is not; says what, and what to do."""
+    """Return a finding of a problem; `text` says what is wrong and what to do."""
     return Finding(FIX, text)
 
 
 def untried(text: str) -> Finding:
-    """It was not tried; says why."""
+    """Return a finding that a check was not made; `text` says why."""
     return Finding(UNTRIED, text)

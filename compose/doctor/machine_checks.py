@@ -1,4 +1,4 @@
-"""What a mission needs of this machine: what is installed, and the ports to listen on."""
+"""Checks of this machine: the installed packages, and the ports to listen on."""
 
 from __future__ import annotations
 
@@ -15,48 +15,53 @@ from protocol.network.endpoints import Endpoints, place
 from protocol.wire import VERSION
 
 PORT = {
-    errno.EADDRINUSE: "taken; end the process that has it (`ss -ltnp` lists them), or choose another port",
-    errno.EADDRNOTAVAIL: "no address of this machine; `ip address` lists those, and 0.0.0.0 is all of them",
-    errno.EACCES: "not for everybody; choose a port from 1024 on",
+    errno.EADDRINUSE: "in use; end the process that uses it (`ss -ltnp` lists them), or choose another port",
+    errno.EADDRNOTAVAIL: "not an address of this host; `ip address` lists them, and 0.0.0.0 is all of them",
+    errno.EACCES: "reserved for privileged users; choose a port from 1024 on",
 }
-"""what there is to be done about a port"""
+"""The problem with a port and its solution, by the error of bind(2)."""
 
 
 def versions() -> Iterator[Finding]:
-    """What is installed is what Tandem asks for."""
+    """Check that the installed packages have the versions that Tandem requires."""
     own = extras.version()
     if own is None:
         yield fix(f"{PACKAGE} is not installed; `uv sync`, or `pip install` it")
         return
     found = list(extras.libraries())
-    well = [f"{one.name} {one.version}" for one in found if one.fits]
-    said = [f"python {platform.python_version()}", f"{PACKAGE} {own}", *well, f"protocol version {VERSION}"]
-    yield ok(f"versions: {', '.join(said)}")
+    fitting = [f"{one.name} {one.version}" for one in found if one.fits]
+    installed = [
+        f"python {platform.python_version()}",
+        f"{PACKAGE} {own}",
+        *fitting,
+        f"protocol version {VERSION}",
+    ]
+    yield ok(f"versions: {', '.join(installed)}")
     for one in found:
         if not one.fits:
             what = f"{one.name} {one.version}" if one.version is not None else f"{one.name} is missing"
-            yield fix(f"versions: {what}; {PACKAGE} {own} needs {one.bounds}: install it anew")
+            yield fix(f"versions: {what}; {PACKAGE} {own} needs {one.bounds}: install it again")
 
 
 def ports(endpoints: Endpoints) -> Iterator[Finding]:
-    """Each place to listen can be had, and nobody is let in by mistake."""
+    """Check that each port to listen on is free, and not open to other machines without keys."""
     for endpoint in endpoints.listen:
-        complaint = _taken(endpoint)
-        yield fix(f"port: {endpoint}: {complaint}") if complaint else ok(f"port: {endpoint} is free")
+        problem = _problem(endpoint)
+        yield fix(f"port: {endpoint}: {problem}") if problem else ok(f"port: {endpoint} is free")
     if (warning := beyond(endpoints)) is not None:
-        yield fix(f"port: {warning}; make keys by `tandem keys`, or listen at 127.0.0.1")
+        yield fix(f"port: {warning}; create keys with `tandem keys`, or listen at 127.0.0.1")
 
 
-def _taken(endpoint: str) -> str | None:
-    """What keeps a process from listening there; none if it can."""
+def _problem(endpoint: str) -> str | None:
+    """Return why a process cannot listen at `endpoint`, and what to do; None if it can."""
     where = place(endpoint)
     if where is None:
-        return "no place with a port"
+        return "not an address with a port"
     kind = socket.SOCK_DGRAM if endpoint.startswith("quic/") else socket.SOCK_STREAM
     try:
         for family, type_, number, _, address in socket.getaddrinfo(*where, type=kind):
             with socket.socket(family, type_, number) as probe:
-                if kind == socket.SOCK_STREAM:  # as Zenoh does: the remains of old links do not matter
+                if kind == socket.SOCK_STREAM:  # as Zenoh does, so that links in TIME_WAIT do not matter
                     probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 probe.bind(address)
     except socket.gaierror:

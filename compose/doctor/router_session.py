@@ -1,4 +1,4 @@
-"""A session for a command that looks at a network once."""
+"""A client session for commands that inspect a network."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ import zenoh
 from protocol.network import diagnosis, session
 from protocol.network.endpoints import Endpoints
 
-PATIENCE_S = 3.0
-"""how long to try, beside the attempt that is being made then"""
+TIMEOUT_S = 3.0
+"""Time in s after which no new attempt to connect is made."""
 
 
 class Unreached(OSError):
-    """No router is reached at these endpoints; its text says what to check."""
+    """No router was reached at these endpoints; the text says what to check."""
 
 
 @contextmanager
 def linked(endpoints: Endpoints) -> Iterator[zenoh.Session]:
-    """A client's session. Raises Unreached."""
-    give_up = time.monotonic() + PATIENCE_S
+    """Yield a client session. Raises Unreached."""
+    give_up = time.monotonic() + TIMEOUT_S
 
     def unanswered() -> None:
         if time.monotonic() >= give_up:

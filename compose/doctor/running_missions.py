@@ -1,8 +1,8 @@
-"""What missions there are on a network, from a moment's listening.
+"""The missions that run on a network, found by listening for a short time.
 
-Nobody does anything for a listener that they would not do anyway: signs of life are asked for once, and what
-is listened to are Observations and Commands, which are said whoever listens. Truth and estimates, which are said only
-while somebody listens, are left alone; so are the robots. Listening ends as soon as each has said something.
+The search causes no additional work for a mission. It asks for liveliness tokens once, and subscribes to
+Observations and Commands, which are published in any case. It does not subscribe to the ground truth and the
+estimates, which are published only for subscribers. It ends as soon as each process has sent a message.
 """
 
 from __future__ import annotations
@@ -20,60 +20,64 @@ from protocol.network.keys import Key
 from protocol.wire import MalformedFrame, decode, version_of
 
 ASK_S = 2.0
-"""how long to wait for one answer"""
+"""Time in s to wait for one answer."""
 FIND_S = 0.5
-"""how long to look for a mission where none is to be seen: routers may have been linked just now"""
+"""Time in s to look for a mission if there is none: routers may just have connected to each other."""
 LOOK_AGAIN_S = 0.02
+"""The polling interval in s."""
 AHEAD = 4
-"""ticks by which a Command may be ahead of the latest Observation that was heard, which may come by another way"""
+"""The number of ticks by which a Command may be ahead of the latest received Observation."""
 
 
 class Participant(msgspec.Struct, frozen=True):
-    """A robot of a mission, as it was heard last."""
+    """The latest known state of a robot of a mission."""
 
     robot: str
     there: bool
-    """whether it shows that it is alive"""
+    """Whether its agent has a liveliness token."""
     tick: int | None = None
-    """of its latest Command; none if it said none in the time"""
+    """Tick of its latest Command; None if none was received."""
     phase: Phase | None = None
     state: str | None = None
 
 
 class RunningMission(msgspec.Struct, frozen=True):
-    """A run, as it was heard last."""
+    """The latest known state of a run."""
 
     run: str
     world: bool
-    """whether its world shows that it is alive"""
+    """Whether its world has a liveliness token."""
     tick: int | None
-    """of the latest Observation or MissionEnd; none if none was said in the time"""
+    """Tick of the latest Observation or MissionEnd; None if none was received."""
     outcome: Outcome | None
-    """once it is over"""
+    """Outcome; None while the mission runs."""
     versions: tuple[int, ...]
-    """of the wire protocol, that were heard"""
+    """Versions of the wire protocol in the received frames."""
     robots: tuple[Participant, ...]
-    """all that the world or a peer has named, there or not"""
+    """All robots that the world or a peer named, alive or not."""
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Who ought to be there."""
+        """The processes of the run that have no liveliness token."""
         world = () if self.world else ("its world",)
         return (*world, *(one.robot for one in self.robots if not one.there))
 
 
 def look(link: zenoh.Session, wait: float) -> tuple[RunningMission, ...]:
-    """The missions that `link` sees; listens for `wait` s at the most. For viewers, and worlds."""
-    there = _there(link)
-    if not there:
+    """Return the missions that `link` sees, after listening for at most `wait` s.
+
+    The session needs the access rights of a viewer or a world.
+    """
+    alive = _alive(link)
+    if not alive:
         return ()
-    ear = _Ear(link, there)
-    ear.listen(wait)
-    return tuple(_mission(link, ear, run, robots) for run, robots in there.items())
+    latest = _LatestFrames(link, alive)
+    latest.listen(wait)
+    return tuple(_mission(link, latest, run, robots) for run, robots in alive.items())
 
 
-def _there(link: zenoh.Session) -> dict[str, frozenset[str]]:
-    """The signs of life by run: of the robots by their names, of the world by ""."""
+def _alive(link: zenoh.Session) -> dict[str, frozenset[str]]:
+    """Return the liveliness tokens by run: the names of the robots, and "" for the world."""
     until = time.monotonic() + FIND_S
     while True:
         worlds = session.alive(link, keys.world_alive("*"), ASK_S)
@@ -87,42 +91,45 @@ def _there(link: zenoh.Session) -> dict[str, frozenset[str]]:
     return {run: frozenset(found[run]) for run in sorted(found)}
 
 
-class _Ear:
-    """The latest frame of each key, and how many there were. What comes under no such key is not heard."""
+class _LatestFrames:
+    """The latest frame of each key, and the number of frames. Samples under other keys are ignored."""
 
-    def __init__(self, link: zenoh.Session, there: dict[str, frozenset[str]]) -> None:
+    def __init__(self, link: zenoh.Session, alive: dict[str, frozenset[str]]) -> None:
         self._link = link
-        self._there = there
+        self._alive = alive
         self.latest: dict[Key, bytes] = {}
         self._count = Counter[Key]()
         self._over = False
 
     def listen(self, wait: float) -> None:
-        """Until everybody who is there has said something; `wait` s at the most."""
+        """Listen until each process that is alive has sent a message, at most `wait` s."""
         declared: list[Any] = [
             self._link.declare_subscriber(key(run, "*"), self._hand_over)
-            for run in self._there
+            for run in self._alive
             for key in (keys.observation, keys.command)
         ]
         until = time.monotonic() + wait
-        while not all(map(self._is_heard, self._there)) and time.monotonic() < until:
+        while not all(map(self._is_complete, self._alive)) and time.monotonic() < until:
             time.sleep(LOOK_AGAIN_S)
         self._over = True
         for one in declared:
             one.undeclare()
 
     def _hand_over(self, sample: zenoh.Sample) -> None:
-        if self._over:  # what comes while one key after the other is given up would be of many ticks
+        if self._over:  # frames received between the undeclarations would be of several ticks
             return
         key = keys.parse(str(sample.key_expr))
         if key is not None:
             self.latest[key] = sample.payload.to_bytes()
             self._count[key] += 1
 
-    def _is_heard(self, run: str) -> bool:
-        """The world speaks to all its robots in turn: who is spoken to twice was so after all the others."""
-        robots = self._there[run] - {""}
-        if "" not in self._there[run]:
+    def _is_complete(self, run: str) -> bool:
+        """Return whether all robots of `run` have sent a Command, and its world Observations to all of them.
+
+        The world sends to its robots in turn: once one has received two, all have received one.
+        """
+        robots = self._alive[run] - {""}
+        if "" not in self._alive[run]:
             return True
         again = any(
             self._count[Key(keys.observation, run, one)] > 1 for one in self.named(run, keys.observation)
@@ -130,74 +137,81 @@ class _Ear:
         return again and robots <= self.named(run, keys.command)
 
     def named(self, run: str, kind: Any) -> set[str]:
-        """The robots under whose key of this kind something came."""
+        """Return the robots for whose key of this kind a frame was received."""
         return {one.robot for one in tuple(self.latest) if (one.kind, one.run) == (kind, run)}
 
-    def said(self, key: Key, messages: Any) -> Any:
-        """The latest message under `key`, if it is one of `messages` and of the robot that the key names."""
-        message = _said(self.latest.get(key), messages)
+    def message(self, key: Key, messages: Any) -> Any:
+        """Return the latest message under `key`, if it is one of `messages` and of the robot in the key."""
+        message = _decoded(self.latest.get(key), messages)
         return message if getattr(message, "robot", key.robot) == key.robot else None
 
 
-def _mission(link: zenoh.Session, ear: _Ear, run: str, there: frozenset[str]) -> RunningMission:
+def _mission(link: zenoh.Session, latest: _LatestFrames, run: str, alive: frozenset[str]) -> RunningMission:
     frames = [
-        ear.latest[Key(kind, run, robot)]
+        latest.latest[Key(kind, run, robot)]
         for kind in (keys.observation, keys.command)
-        for robot in ear.named(run, kind)
+        for robot in latest.named(run, kind)
     ]
-    answers = _briefings(link, run, ear.named(run, keys.observation) | there - {""}) if "" in there else {}
+    answers = _configs(link, run, latest.named(run, keys.observation) | alive - {""}) if "" in alive else {}
     frames += answers.values()
-    briefed = [one for frame in answers.values() if (one := _said(frame, RobotConfig)) is not None]
-    named = there - {""} | ear.named(run, keys.observation) | ear.named(run, keys.command)
-    named |= {one.peer for one in briefed}
-    said = [
-        ear.said(Key(keys.observation, run, robot), Observation | MissionEnd | FinalReport) for robot in named
+    configs = [one for frame in answers.values() if (one := _decoded(frame, RobotConfig)) is not None]
+    named = alive - {""} | latest.named(run, keys.observation) | latest.named(run, keys.command)
+    named |= {one.peer for one in configs}
+    messages = [
+        latest.message(Key(keys.observation, run, robot), Observation | MissionEnd | FinalReport)
+        for robot in named
     ]
-    ends = [one for one in said if isinstance(one, MissionEnd)]
-    tick = max((one.tick for one in said if isinstance(one, Observation | MissionEnd)), default=None)
+    ends = [one for one in messages if isinstance(one, MissionEnd)]
+    tick = max((one.tick for one in messages if isinstance(one, Observation | MissionEnd)), default=None)
     return RunningMission(
         run,
-        "" in there,
+        "" in alive,
         tick,
         ends[0].outcome if ends else None,
         tuple(sorted({version for frame in frames if (version := version_of(frame)) is not None})),
         tuple(
             _participant(
-                robot, robot in there, tick, ear.said(Key(keys.command, run, robot), Command | FinalReport)
+                robot,
+                robot in alive,
+                tick,
+                latest.message(Key(keys.command, run, robot), Command | FinalReport),
             )
             for robot in sorted(named)
         ),
     )
 
 
-def _briefings(link: zenoh.Session, run: str, robots: set[str]) -> dict[str, bytes]:
-    """One of each pair, which names the other: where drivers stand in the world's place, nobody else does."""
+def _configs(link: zenoh.Session, run: str, robots: set[str]) -> dict[str, bytes]:
+    """Return the frame of one RobotConfig of each pair, by robot.
+
+    The RobotConfig names the peer. In hardware mode, no other message does.
+    """
     found: dict[str, bytes] = {}
     paired: set[str] = set()
     until = time.monotonic() + ASK_S
     for robot in sorted(robots):
         if robot not in paired and time.monotonic() < until:
             answer = session.ask(
-                link, keys.config(run, robot), ASK_S, lambda frame: _said(frame, RobotConfig) is not None
+                link, keys.config(run, robot), ASK_S, lambda frame: _decoded(frame, RobotConfig) is not None
             )
             if isinstance(answer, bytes):
                 found[robot] = answer
-                config = _said(answer, RobotConfig)
+                config = _decoded(answer, RobotConfig)
                 paired |= {config.peer} if config is not None else set()
     return found
 
 
 def _participant(
-    robot: str, there: bool, latest: int | None, command: Command | FinalReport | None
+    robot: str, alive: bool, latest: int | None, command: Command | FinalReport | None
 ) -> Participant:
-    """As `command` tells it, unless that is of a tick to come: the world is in tick `latest`."""
+    """Return the state of a robot; a `command` too far ahead of tick `latest` is ignored."""
     if not isinstance(command, Command) or (latest is not None and command.tick > latest + AHEAD):
-        return Participant(robot, there)
-    return Participant(robot, there, command.tick, command.phase, command.state)
+        return Participant(robot, alive)
+    return Participant(robot, alive, command.tick, command.phase, command.state)
 
 
-def _said(frame: bytes | None, kind: Any) -> Any:
-    """The message in a frame; none if there is none, or none that is understood here."""
+def _decoded(frame: bytes | None, kind: Any) -> Any:
+    """Return the message in a frame; None if there is no frame, or it cannot be decoded."""
     try:
         return decode(frame, kind) if frame is not None else None
     except MalformedFrame:

@@ -1,1 +1,1 @@
-"""Recordings of hardware mode and the driver conformance check."""
+"""Recordings of hardware mode, and the conformance check of drivers."""

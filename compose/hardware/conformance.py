@@ -1,7 +1,7 @@
-"""Whether a driver keeps the contract of world/hardware/driver.py, by what it did in an exercise.
+"""Checks that a driver conforms to the contract of world/hardware/driver.py, from an exercise.
 
-None of the checks knows where the robot truly was: odometry is held against what was asked, and ranges to the
-anchor against the path that the odometry tells of.
+The checks have no ground truth. They compare the odometry with the commands, and the ranges to the anchor
+with the path from the odometry. The docstring of a check is its line in the output of `tandem check-driver`.
 """
 
 from __future__ import annotations
@@ -15,74 +15,77 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares  # type: ignore[import-untyped]
 
-from compose.hardware.exercise import ExerciseRun, Try
+from compose.hardware.exercise import FIRST_HALF, SECOND_HALF, STOPPED, ExerciseRun, Try
 from protocol.mission import Mission
 from protocol.motion import ORIGIN, REST, Controls, Pose, step
 from world.hardware.driver import SENSING
 
 PROMPT = 0.05
-"""of a manoeuvre: how long `command` may take to return"""
+"""The part of a manoeuvre that `drive` may take to return."""
 LIKE = 0.25
-"""of what was asked for: by how much what is measured may differ, where the wheels take time to turn"""
+"""The relative difference allowed between measured and commanded speeds, because wheels accelerate."""
 STILL = 0.02
-"""of a manoeuvre at full speed: less is standing"""
+"""The part of the maximum speeds below which a robot is at rest."""
 EXACT = 1e-6
-"""m: ranges of sensors without noise agree with the path so far"""
+"""The tolerance in m with which ranges without noise must agree with the path."""
 SIGMAS = 6.0
+"""The number of standard deviations by which ranges with noise may differ from the path."""
 
 
 class Found(NamedTuple):
-    """What a check came to."""
+    """The result of a check."""
 
     check: str
+    """Requirement that was checked."""
     wrong: str | None
+    """Description of the error; None if there is none."""
 
 
 Check = Callable[[Mission, Sequence[Try]], str | None]
 
 
 def prompt(_: Mission, tries: Sequence[Try]) -> str | None:
-    """sense and drive come back in time to decide"""
+    """sense and drive return in time"""
     sensing, driving = median(one.sensing_s for one in tries), median(one.driving_s for one in tries)
     if sensing > SENSING:
-        return f"sense takes {sensing:.2g} of a manoeuvre, expected {SENSING:g} at the most"
+        return f"sense takes {sensing:.2g} of a manoeuvre, expected at most {SENSING:g}"
     if driving > PROMPT:
-        return f"drive takes {driving:.2g} of a manoeuvre, expected {PROMPT:g} at the most: it must not wait"
+        return f"drive takes {driving:.2g} of a manoeuvre, expected at most {PROMPT:g}: it must not wait"
     return None
 
 
 def stands(mission: Mission, tries: Sequence[Try]) -> str | None:
-    """who is told nothing stands still"""
+    """without a command, the robot is at rest"""
     for tick, one in enumerate(tries):
         if one.asked == REST and tick > 0 and not _still(one.reading.executed, mission):
-            return f"tick {tick}, {one.what}: it drove {_said(one.reading.executed)}, expected rest"
+            return f"tick {tick}, {one.what}: it drove {_text(one.reading.executed)}, expected rest"
     return None
 
 
 def drives(mission: Mission, tries: Sequence[Try]) -> str | None:
-    """a manoeuvre is what was asked for, in m/s and rad/s, and told in its own tick"""
+    """manoeuvres are as commanded, in m/s and rad/s, and measured in their own tick"""
     wrong: list[str] = []
     for tick, one in enumerate(tries):
-        if one.asked == REST or one.share < 1.0 or one.what == "the rest of it":
+        if one.asked == REST or one.share < 1.0 or one.what == SECOND_HALF:
             continue
         done, before = one.reading.executed, tries[tick - 1].asked
         if _like(done, one.asked, mission):
             continue
         if before not in (one.asked, REST) and _like(done, before, mission):
-            return f"tick {tick}, {one.what}: it tells what was driven in tick {tick - 1}"
+            return f"tick {tick}, {one.what}: it reports what was driven in tick {tick - 1}"
         hint = ""
         if one.asked.omega and abs(done.omega / one.asked.omega - math.degrees(1.0)) < 10.0:
             hint = ": degrees?"
         elif _still(done, mission):
             hint = ": it has not moved"
-        wrong.append(f"tick {tick}, {one.what}: it drove {_said(done)}, asked was {_said(one.asked)}{hint}")
+        wrong.append(f"tick {tick}, {one.what}: it drove {_text(done)}, expected {_text(one.asked)}{hint}")
     return wrong[0] if wrong else None
 
 
 def lasts(_: Mission, tries: Sequence[Try]) -> str | None:
-    """in half the time it drives half of it, and the other half then"""
+    """half of a manoeuvre takes half of its time"""
     for tick, one in enumerate(tries):
-        if one.what in ("half of a straight", "the rest of it"):
+        if one.what in (FIRST_HALF, SECOND_HALF):
             part = one.reading.executed.v / one.asked.v
             if abs(part - one.share) > LIKE:
                 return (
@@ -93,20 +96,20 @@ def lasts(_: Mission, tries: Sequence[Try]) -> str | None:
 
 
 def stops(_: Mission, tries: Sequence[Try]) -> str | None:
-    """stop ends a manoeuvre, and odometry tells what was driven, not what was asked for"""
+    """stop ends a manoeuvre, and odometry measures what was driven, not what was commanded"""
     for tick, one in enumerate(tries):
-        if one.what == "stopped half-way":
+        if one.what == STOPPED:
             part = one.reading.executed.v / one.asked.v
             if abs(part - one.share) > LIKE:
                 return (
-                    f"tick {tick}: it tells {part:.2f} of a manoeuvre that was stopped after {one.share:.2f} "
-                    "of its time"
+                    f"tick {tick}: it reports {part:.2f} of a manoeuvre that was stopped after "
+                    f"{one.share:.2f} of its time"
                 )
     return None
 
 
 def fresh(mission: Mission, tries: Sequence[Try]) -> str | None:
-    """a range is of its own tick"""
+    """each range is measured in its own tick"""
     for tick in range(1, len(tries)):
         before, now = tries[tick - 1].reading, tries[tick].reading
         if now.anchor_range is None or abs(now.executed.v) < 0.2 * mission.first_straight / mission.period:
@@ -117,24 +120,24 @@ def fresh(mission: Mission, tries: Sequence[Try]) -> str | None:
 
 
 def ranges(mission: Mission, tries: Sequence[Try]) -> str | None:
-    """ranges to the anchor are in metres, and of the path that the odometry tells of"""
+    """ranges to the anchor are in metres, and agree with the path from the odometry"""
     path, tolerance = _path(tries, mission)
     ranged = [(pose, one.reading.anchor_range) for pose, one in zip(path, tries, strict=True)]
     some = [(pose, rho) for pose, rho in ranged if rho is not None]
     if len(some) < 6:
-        return f"{len(some)} ranges to the anchor, expected 6 or more: begin near it"
+        return f"{len(some)} ranges to the anchor, expected at least 6: start near the anchor"
     anchor, scale = _fit(some, scaled=False)
     worst = _worst(some, anchor, scale, mission)
     if worst <= tolerance:
         return None
     anchor, scale = _fit(some, scaled=True)
     if _worst(some, anchor, scale, mission) <= tolerance:
-        return f"ranges are {scale:.4g} times as long as the path that the odometry tells of"
-    return f"no place of the anchor explains them: {worst:.3g} m off, expected {tolerance:.3g} m at the most"
+        return f"ranges are {scale:.4g} times as long as on the path from the odometry"
+    return f"no anchor position agrees with them: {worst:.3g} m off, expected at most {tolerance:.3g} m"
 
 
 def reach(mission: Mission, tries: Sequence[Try]) -> str | None:
-    """beyond R there is no range, and within R there is one, but for drop-outs"""
+    """there is a range within R, except for drop-outs, and none beyond R"""
     path, tolerance = _path(tries, mission)
     most = mission.sensing_range + tolerance
     for tick, one in enumerate(tries):
@@ -147,14 +150,14 @@ def reach(mission: Mission, tries: Sequence[Try]) -> str | None:
         if one.reading.anchor_range is not None
     ]
     if len(some) < 6:
-        return "too few ranges to tell"
+        return "there are too few ranges for this check"
     anchor, _ = _fit(some, scaled=True)
     for tick, (pose, one) in enumerate(zip(path, tries, strict=True)):
         rho = math.dist((pose.x, pose.y), anchor)
-        silent, within = one.reading.anchor_range is None, rho < mission.sensing_range - tolerance
-        if silent and within and not mission.noise.drop_outs:
+        absent, within = one.reading.anchor_range is None, rho < mission.sensing_range - tolerance
+        if absent and within and not mission.noise.drop_outs:
             return f"tick {tick}: no range, {rho:.6g} m from the anchor, and the mission has no drop-outs"
-        if not silent and rho > most:
+        if not absent and rho > most:
             return (
                 f"tick {tick}: a range, {rho:.6g} m from the anchor, beyond R = {mission.sensing_range:g} m"
             )
@@ -165,16 +168,16 @@ CHECKS: tuple[Check, ...] = (prompt, stands, drives, lasts, stops, fresh, ranges
 
 
 def judged(trial: ExerciseRun) -> list[Found]:
-    """What each check came to."""
+    """Return the result of each check of an exercise."""
     return [Found(str(check.__doc__), check(trial.config.mission, trial.tries)) for check in CHECKS]
 
 
-def _said(controls: Controls) -> str:
+def _text(controls: Controls) -> str:
     return f"({controls.v:.4g} m/s, {controls.omega:.4g} rad/s)"
 
 
 def _slack(mission: Mission) -> tuple[float, float]:
-    """m/s and rad/s: what noise may make of rest."""
+    """Return the speeds in m/s and rad/s up to which a robot is at rest, odometry noise included."""
     v, omega = mission.noise.standstill_bound
     return STILL * mission.max_speed + v, STILL * mission.max_turn_rate + omega
 
@@ -193,20 +196,23 @@ def _like(done: Controls, asked: Controls, mission: Mission) -> bool:
 
 
 def _path(tries: Sequence[Try], mission: Mission) -> tuple[list[Pose], float]:
-    """Dead reckoning, one pose a tick; and how far off a range may be from it, in m."""
-    path, along, across, far = [ORIGIN], 0.0, 0.0, 0.0
+    """Return the dead-reckoned pose of each tick, and the tolerance in m of ranges from these poses."""
+    path, along, across, farthest = [ORIGIN], 0.0, 0.0, 0.0
     for one in tries[1:]:
-        done = one.reading.executed
-        path.append(step(path[-1], done.v, done.omega, mission.period))
-        v, omega = mission.noise.odometry.variances(done.v, done.omega)
+        driven = one.reading.executed
+        path.append(step(path[-1], driven.v, driven.omega, mission.period))
+        v, omega = mission.noise.odometry.variances(driven.v, driven.omega)
         along, across = along + v, across + omega
-        far = max(far, math.hypot(path[-1].x, path[-1].y))
-    drift = mission.period * math.sqrt(along + across * far * far)
-    return path, EXACT + SIGMAS * math.hypot(mission.noise.anchor_sigma, drift)
+        farthest = max(farthest, math.hypot(path[-1].x, path[-1].y))
+    sigma = mission.period * math.sqrt(along + across * farthest * farthest)
+    return path, EXACT + SIGMAS * math.hypot(mission.noise.anchor_sigma, sigma)
 
 
 def _fit(some: Sequence[tuple[Pose, float]], *, scaled: bool) -> tuple[tuple[float, float], float]:
-    """Where, in the frame of the odometry, the anchor explains the ranges best; and how many m each m is."""
+    """Return the anchor position in the odometry frame that fits best, and the scale of the ranges.
+
+    The scale is 1 unless `scaled`.
+    """
     xy = np.array([(pose.x, pose.y) for pose, _ in some])
     rho = np.array([rho for _, rho in some])
     span = float(np.max(rho)) or 1.0
@@ -227,6 +233,6 @@ def _fit(some: Sequence[tuple[Pose, float]], *, scaled: bool) -> tuple[tuple[flo
 def _worst(
     some: Sequence[tuple[Pose, float]], anchor: tuple[float, float], scale: float, mission: Mission
 ) -> float:
-    """m: the largest residual; of those that outliers leave."""
+    """Return the largest residual in m, after dropping three times the expected number of outliers."""
     off = sorted([abs(scale * math.dist((pose.x, pose.y), anchor) - rho) for pose, rho in some])
     return off[max(0, len(off) - 1 - math.ceil(3.0 * mission.noise.outliers * len(off)))]

@@ -22,21 +22,24 @@ from world.hardware.driver import Driver
 from world.hardware.driver_journal import DriverPast, ProcessStart, boot, driver_journal, driver_past
 
 RELEASE_S = 10.0
-"""s that the agent of a killed launcher has to end, which unlocks its journal"""
+"""Time in s that the agent of a killed launcher has to end, which unlocks its journal."""
 LOOK_AGAIN_S = 0.02
+"""The polling interval in s."""
 
 
 class DriverRecord(msgspec.Struct, frozen=True):
-    """The content of both journals; that of the driver is open for writing."""
+    """The content of both journals; the driver's journal is open for writing."""
 
     journal: Journal
+    """Journal of the driver."""
     past: DriverPast
+    """Content of the driver's journal when it was opened."""
     known: int
-    """the latest tick in the agent's journal; -1 if there is none"""
+    """Latest tick in the agent's journal; -1 if there is none."""
     again: bool
-    """whether the journals existed before"""
+    """Whether the journals existed before."""
     start: ProcessStart
-    """the start of this process"""
+    """Start of this process."""
 
     def take_up(self, driver: Driver, name: str, field: Field) -> None:
         """Resume the mission with `driver`, called `name` in errors. Raises UserError if it cannot."""
@@ -60,7 +63,7 @@ def recorded(folder: Path, config: RobotConfig, inbox: Inbox, *, fsync: bool) ->
     agents = folder / agent_journal(config.robot)
     if not path.exists():
         if _frames(agents, inbox):
-            raise CannotRecord(f"{agents} is there already, and {path.name} is not; choose another folder")
+            raise CannotRecord(f"{agents} exists, and {path.name} does not; choose another folder")
         with Journal(path, fsync=fsync) as journal:
             journal.write(encode(config))
             yield DriverRecord(journal, DriverPast(), -1, again=False, start=start)
@@ -70,8 +73,8 @@ def recorded(folder: Path, config: RobotConfig, inbox: Inbox, *, fsync: bool) ->
         past = driver_past(old.frames, config, path)
         if past.may_lack:
             raise CorruptJournal(
-                f"{path} was written without --fsync, and this computer has been started again since: "
-                "what the robot has told its peer may be missing in it"
+                f"{path} was written without --fsync, and this computer has restarted since: "
+                "Reports that the robot sent to its peer may be missing in it"
             )
         known = _known(_frames(agents, inbox), past, agents)
         old.write(*(old.frames or [encode(config)]))
@@ -113,11 +116,11 @@ def _known(frames: list[bytes], past: DriverPast, path: Path) -> int:
             known += 1
             if known > past.tick:
                 raise CorruptJournal(
-                    f"{path} goes on after tick {past.tick}, where the driver's journal ends; "
-                    "only with --fsync both survive a power cut"
+                    f"{path} continues after tick {past.tick}, where the driver's journal ends; "
+                    "only with --fsync do both survive a power cut"
                 )
             if frame != past.ticks[known].frame:
                 raise CorruptJournal(
-                    f"{path}: at tick {known} another Observation than the driver's journal has"
+                    f"{path}: the Observation of tick {known} differs from the one in the driver's journal"
                 )
     return known

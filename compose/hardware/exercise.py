@@ -1,6 +1,6 @@
-"""An exercise that a driver is led through, so that what it did can be judged, by `conformance`.
+"""The exercise of a driver, whose measurements `conformance` checks.
 
-The robot needs room: it drives straight away from about its anchor until it is out of its range for sure.
+The robot needs space: it starts near its anchor and drives straight away from it until it is out of range.
 """
 
 from __future__ import annotations
@@ -15,27 +15,33 @@ from protocol.wire import MalformedFrame, decode, encode
 from world.hardware.driver import Driver, Reading
 
 SETTLED = 0.1
-"""of a manoeuvre: how long after it the robot is looked at"""
+"""The part of a manoeuvre to wait after its end before sensing."""
+FIRST_HALF, SECOND_HALF = "first half of a straight", "second half of a straight"
+STOPPED = "stopped half-way"
 
 
 class Try(NamedTuple):
     """A tick of the exercise."""
 
     what: str
+    """Name of the tick in messages."""
     asked: Controls
+    """Commanded speeds in m/s and rad/s."""
     share: float
-    """of the manoeuvre that was over when the robot was looked at, or stopped; 1 at the most"""
+    """Part of the manoeuvre that was over at the sensing or the stop, at most 1."""
     reading: Reading
     driving_s: float
+    """Time that `drive` took, in parts of a manoeuvre."""
     sensing_s: float
+    """Time that `sense` took, in parts of a manoeuvre."""
 
 
 class Broken(Exception):
-    """The exercise could not go on; its text says why."""
+    """The exercise failed; the text says why."""
 
 
 class ExerciseRun:
-    """An exercise, as it is gone through."""
+    """One run of the exercise."""
 
     def __init__(self, driver: Driver, config: RobotConfig, manoeuvre_s: float) -> None:
         self.config = config
@@ -43,50 +49,50 @@ class ExerciseRun:
         self._driver = driver
         self._manoeuvre_s = manoeuvre_s
         self._began = 0.0
-        """the latest manoeuvre"""
+        """Monotonic time in s of the start of the latest manoeuvre."""
 
     def go_through(self) -> None:
-        """All of it. Raises Broken. The robot stands afterwards."""
+        """Run the whole exercise, after which the robot is at rest. Raises Broken."""
         mission = self.config.mission
         v = 0.5 * mission.first_straight / mission.period
         omega = min(mission.max_turn_rate, 1.0 / mission.period)
         try:
-            self._observation("stands at first", REST, 1.0)
+            self._observation("at rest at the start", REST, 1.0)
             for what, asked in (
-                ("stands, as nobody says anything", REST),
+                ("at rest, without a command", REST),
                 ("straight", Controls(v, 0.0)),
                 ("turn", Controls(0.0, omega)),
                 ("arc", Controls(0.6 * v, 0.8 * omega)),
                 ("backwards", Controls(-v, 0.0)),
-                ("stands, as no drive comes", REST),
+                ("at rest, without another command", REST),
                 ("turn back", Controls(0.0, -0.7 * omega)),
                 ("straight", Controls(0.9 * v, 0.0)),
             ):
                 self._try(what, asked)
             self._command(asked := Controls(v, 0.0))
             self._wait(0.5)
-            self._observation("half of a straight", asked, self._share())
+            self._observation(FIRST_HALF, asked, self._share())
             before = self.tries[-1].share
             self._wait(1.0)
-            self._observation("the rest of it", asked, 1.0 - before)
+            self._observation(SECOND_HALF, asked, 1.0 - before)
             self._command(asked := Controls(-v, 0.0))
             self._wait(0.5)
             share = self._share()
             self._driver.stop()
             self._wait(1.0)
-            self._observation("stopped half-way", asked, share)
-            self._try("stands after the stop", REST)
+            self._observation(STOPPED, asked, share)
+            self._try("at rest after the stop", REST)
             for _ in range(math.ceil(2.0 * mission.sensing_range / (v * mission.period)) + 2):
-                self._try("away", Controls(v, 0.0))
+                self._try("away from the anchor", Controls(v, 0.0))
         except Broken:
             raise
-        except Exception as error:  # it is the user's own, and may raise anything
+        except Exception as error:  # the user's code may raise anything
             raise Broken(f"{type(error).__name__}: {error}") from error
         finally:
             self._driver.stop()
 
     def _try(self, what: str, asked: Controls) -> None:
-        """A whole manoeuvre; none at all if it is to rest."""
+        """Drive a whole manoeuvre, or wait as long without a command if `asked` is rest, and sense."""
         if asked == REST:
             self._began, took = time.monotonic(), 0.0
         else:
@@ -111,7 +117,7 @@ class ExerciseRun:
         reading = self._driver.sense(tick)
         took = time.monotonic() - began
         if not isinstance(reading, Reading):
-            raise Broken(f"sense({tick}) gives {type(reading).__name__}, expected a Reading")
+            raise Broken(f"sense({tick}) returns {type(reading).__name__}, expected a Reading")
         try:
             decode(
                 encode(Observation(tick, self.config.robot, reading.executed, reading.anchor_range)),
@@ -121,5 +127,5 @@ class ExerciseRun:
                 decode(encode(Observation(tick, self.config.robot, None, reading.mutual_range)), Observation)
         except (MalformedFrame, TypeError) as error:
             raise Broken(f"sense({tick}): {error}") from None
-        share_s = self._manoeuvre_s
-        self.tries.append(Try(what, asked, share, reading, driving_s / share_s, took / share_s))
+        manoeuvre_s = self._manoeuvre_s
+        self.tries.append(Try(what, asked, share, reading, driving_s / manoeuvre_s, took / manoeuvre_s))

@@ -1,1 +1,1 @@
-"""Starting missions: in one process, or as processes with their viewers and signals."""
+"""The start of missions, in one process or as several, with viewers and signals."""

@@ -1,4 +1,4 @@
-"""A driver by its name, MODULE:CLASS, as the user says it on the command line."""
+"""Loading of drivers by their name on the command line, MODULE:CLASS."""
 
 from __future__ import annotations
 
@@ -16,70 +16,80 @@ from world.hardware.driver_journal import DriverPast
 from world.scenario import Scenario
 
 METHODS = ("sense", "drive", "stop", "close")
+"""The methods that a driver must have."""
 
 Maker = Callable[..., Driver]
+"""The constructor of a driver."""
 
 
 def driver_class(name: str) -> Maker:
-    """The class that `name` says; modules are looked for in the directory at hand, too. Raises UserError."""
+    """Return the class named `name`; modules are searched in the working directory too. Raises UserError."""
     module, _, cls = name.partition(":")
     if not module or not cls.isidentifier():
-        raise UserError(f"'{name}' is no driver; one looks like MODULE:CLASS")
+        raise UserError(f"'{name}' is not a driver; expected MODULE:CLASS")
     if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # last: there may be a folder called world
+        sys.path.append(os.getcwd())  # last, because it may contain a folder named world
     try:
         found = getattr(import_module(module), cls)
     except ModuleNotFoundError as error:
         raise UserError(f"{name}: there is no module '{error.name}'") from None
     except AttributeError:
         raise UserError(f"{name}: there is no '{cls}' in {module}") from None
-    except Exception as error:  # noqa: BLE001  # it is the user's own, and may raise anything
+    except Exception as error:  # noqa: BLE001  # the user's code may raise anything
         raise UserError(f"{name}: {module} cannot be imported: {type(error).__name__}: {error}") from None
     missing = [method for method in METHODS if not callable(getattr(found, method, None))]
     if not callable(found) or missing:
-        raise UserError(f"{name}: is no driver: it has no {', '.join(missing) or 'constructor'}")
+        raise UserError(f"{name}: is not a driver: it has no {', '.join(missing) or 'constructor'}")
     maker: Maker = found
     return maker
 
 
 def made(
-    maker: Maker, name: str, config: RobotConfig, manoeuvre_s: float, given: Mapping[str, str]
+    maker: Maker, name: str, config: RobotConfig, manoeuvre_s: float, options: Mapping[str, str]
 ) -> Driver:
-    """The driver itself. Raises UserError, by whatever it raised."""
+    """Return the driver that `maker` creates. Raises UserError for whatever it raises.
+
+    `manoeuvre_s` is the wall time of a manoeuvre in s.
+    """
     try:
-        return maker(config, manoeuvre_s, **given)
+        return maker(config, manoeuvre_s, **options)
     except Exception as error:  # noqa: BLE001  # as above
-        raise UserError(f"{name}: cannot be made: {type(error).__name__}: {error}") from None
+        raise UserError(f"{name}: cannot be created: {type(error).__name__}: {error}") from None
 
 
 def again(driver: Driver, name: str, past: DriverPast) -> None:
-    """Stop the robot, and have its driver go on where `past` ends. Raises UserError."""
+    """Stop the robot, and resume its driver at the end of `past`. Raises UserError."""
     resume = getattr(driver, "resume", None)
     if not callable(resume):
-        raise UserError(f"--out: holds a record, and {name} has no resume() for it; choose another folder")
+        raise UserError(
+            f"--out: contains a recording, and {name} has no resume() method; choose another folder"
+        )
     try:
         driver.stop()
         resume(past.tick, past.mark)
     except Exception as error:  # noqa: BLE001  # as above
-        raise UserError(f"{name}: cannot go on: {type(error).__name__}: {error}") from None
+        raise UserError(f"{name}: cannot resume: {type(error).__name__}: {error}") from None
 
 
 def options_of(words: list[str]) -> dict[str, str]:
-    """What NAME=VALUE, as often as it was said, gives a driver. Raises UserError."""
-    given = {}
+    """Return the driver's options from a list of NAME=VALUE. Raises UserError."""
+    options = {}
     for word in words:
         name, equals, value = word.partition("=")
         if not equals or not name.isidentifier():
-            raise UserError(f"--option: '{word}' is no option; one looks like NAME=VALUE")
-        given[name] = value
-    return given
+            raise UserError(f"--option: '{word}' is not an option; expected NAME=VALUE")
+        options[name] = value
+    return options
 
 
 def mission(source: str, robot: str) -> Scenario:
-    """The mission in that file, in which `robot` takes part. Raises UserError."""
+    """Return the scenario named `source`, or in that file, after checking that `robot` is in it.
+
+    Raises UserError.
+    """
     scenario = setting(source).scenario
     if scenario.faults:
-        raise UserError(f"{source}: fault: without a world, the radio is as it is")
+        raise UserError(f"{source}: fault: not available in hardware mode, which uses the real radio")
     if robot not in (ids := [placed.id for placed in scenario.robots]):
         near = did_you_mean(robot, ids)
         raise UserError(f"{source}: there is no robot '{robot}'; there are {', '.join(ids)}{near}")
@@ -87,5 +97,5 @@ def mission(source: str, robot: str) -> Scenario:
 
 
 def briefed(scenario: Scenario, robot: str, manoeuvre_s: float) -> RobotConfig:
-    """What `robot` is told; a tick lasts a manoeuvre and what thinking takes."""
+    """Return the configuration of `robot`; a tick lasts a manoeuvre and the part THINKING of one at rest."""
     return scenario.config(robot, (1.0 + THINKING) * manoeuvre_s)

@@ -27,10 +27,11 @@ from protocol.output import one_line
 NOT_FORKED = 71
 """The exit status reported for a process that could not be forked (EX_OSERR)."""
 LINGER_S = 5.0
-"""s that processes have to end by themselves after their launcher has ended; then they are killed"""
+"""Time in s that processes have to end after their launcher has ended; then they are killed."""
 LOOK_AGAIN_S = 0.01
+"""The polling interval in s."""
 PR_SET_PDEATHSIG = 1
-"""<sys/prctl.h>"""
+"""The option of prctl(2) for a signal on the end of the parent, from <sys/prctl.h>."""
 
 
 class _RequestLoop:
@@ -84,7 +85,7 @@ class _RequestLoop:
             pid = os.fork()
         except OSError as error:
             os.write(streams[2], f"cannot start a process: {error.strerror}\n".encode())
-            self._tell(Ended(start.number, NOT_FORKED))
+            self._report(Ended(start.number, NOT_FORKED))
         else:
             if not pid:
                 self._launcher.detach()  # its descriptor becomes the child's standard input
@@ -107,11 +108,11 @@ class _RequestLoop:
         with suppress(ChildProcessError):
             while (found := os.waitpid(-1, os.WNOHANG))[0]:
                 pid, status = found
-                self._tell(Ended(self._numbers.pop(pid), os.waitstatus_to_exitcode(status)))
+                self._report(Ended(self._numbers.pop(pid), os.waitstatus_to_exitcode(status)))
 
-    def _tell(self, news: Ended) -> None:
+    def _report(self, end: Ended) -> None:
         with suppress(OSError):  # the launcher has ended
-            self._launcher.sendall(news.frame())
+            self._launcher.sendall(end.frame())
 
 
 def _become(start: ForkRequest, streams: list[int], parent: int) -> None:

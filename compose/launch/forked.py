@@ -35,11 +35,11 @@ class ForkRequest(msgspec.Struct, frozen=True, tag=True):
     """A request to fork a process."""
 
     number: int
-    """chosen by the launcher, which identifies the process by it"""
+    """Number by which the launcher identifies the process."""
     main: str
-    """the function that the process calls, as module:function"""
+    """Function that the process calls, as module:function."""
     title: str
-    """its name in `ps`, before the arguments"""
+    """Name of the process in `ps`, before the arguments."""
     arguments: tuple[str, ...]
 
 
@@ -51,13 +51,15 @@ class Signal(msgspec.Struct, frozen=True, tag=True):
 
 
 KILL_S = 5.0
-"""s that a killed process has to end; after that its fork server is considered hung, and is killed"""
+"""Time in s that a killed process has to end; then its fork server is considered hung, and is killed."""
 TAKE_S = 60.0
-"""s to retry sending descriptors while too many are in flight: the fork server may still be importing"""
+"""Time in s for retries while too many descriptors are in flight: the fork server may still import."""
 LOOK_S = 1.0
-"""interval at which processes are looked at of which the fork server says nothing"""
+"""The interval in s at which processes are checked while the fork server reports nothing."""
 TRY_AGAIN_S = 0.01
+"""The interval in s between these retries."""
 ENDED_BYTES = 8
+"""The size of a report that a process has ended."""
 
 
 class Ended(NamedTuple):
@@ -65,7 +67,7 @@ class Ended(NamedTuple):
 
     number: int
     status: int
-    """exit status; negative is the signal that killed it"""
+    """Exit status; negative is the signal that killed it."""
 
     def frame(self) -> bytes:
         """Return the report as ENDED_BYTES bytes."""
@@ -85,9 +87,9 @@ class Process:
     ) -> None:
         self._stdin = stdin
         self.stdout = stdout
-        """descriptor from which its standard output is read; None if it goes nowhere"""
+        """Descriptor from which its standard output is read; None if it is discarded."""
         self._streams = [stream for stream in (stdin, stdout) if stream is not None]
-        """the launcher's descriptors, closed once the process has ended"""
+        """Descriptors of the launcher, closed once the process has ended."""
         self._server = server
         self._number = number
         self._on_end = on_end
@@ -139,10 +141,10 @@ class Process:
 
     def hand(self, data: bytes) -> None:
         """Write `data` to the standard input of the process, unless it has ended."""
-        left = memoryview(data)
+        rest = memoryview(data)
         with suppress(BrokenPipeError):
-            while left:
-                left = left[os.write(self._stdin, left) :]
+            while rest:
+                rest = rest[os.write(self._stdin, rest) :]
 
     def ended(self, status: int) -> None:
         """Store the exit status; called by the server when the process has ended."""
@@ -172,7 +174,7 @@ class ForkServer:
         self._running: dict[int, Process] = {}
         self._lock = threading.Lock()
         self.gone = False
-        """whether the server has ended, and all its processes with it"""
+        """Whether the server, and with it all its processes, has ended."""
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
 
@@ -211,9 +213,9 @@ class ForkServer:
         """Wait for the server to end, and return how it did, in a line."""
         status = self._process.wait()
         self._errors.seek(0)
-        said = self._errors.read().decode(errors="replace").strip().splitlines()
+        errors = self._errors.read().decode(errors="replace").strip().splitlines()
         how = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
-        return f"the fork server {how}{f': {said[-1]}' if said else ''}"
+        return f"the fork server {how}{f': {errors[-1]}' if errors else ''}"
 
     def kill(self) -> None:
         """Kill the server and all its processes."""
@@ -266,7 +268,7 @@ class ForkServer:
     def _received(self) -> bytes:
         """Return the next bytes from the server; none once it has ended.
 
-        A server that is suspended would not tell of ended processes: it is continued, then killed.
+        A suspended server would not report ended processes. It is continued, then killed.
         """
         overdue: float | None = None
         news = select.poll()
@@ -283,10 +285,10 @@ class ForkServer:
         return self._socket.recv(4096)
 
     def _end_all(self) -> None:
-        """No process outlasts the server."""
+        """Mark all processes as ended, because none outlasts the server."""
         with self._lock:
-            left, self._running = self._running, {}
-        for process in left.values():
+            ended, self._running = self._running, {}
+        for process in ended.values():
             process.ended(-signal.SIGKILL)
 
 

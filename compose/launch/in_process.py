@@ -1,4 +1,4 @@
-"""A whole mission in one process, without a network: the same planner, radio and world."""
+"""A complete mission in one process, without a network, with the same planner, radio and world."""
 
 from __future__ import annotations
 
@@ -16,48 +16,48 @@ from world.simulation import Course
 
 
 def play(scenario: Scenario, out: Path | None = None) -> Recording:
-    """The run of `scenario`. Journals go to `out`, byte for byte those of the run as processes.
+    """Run `scenario`, and write its journals to `out`. They are identical to those of a run as processes.
 
-    Raises journal.CannotRecord if `out` holds a record, or cannot be written.
+    Raises CannotRecord if `out` contains a recording, or cannot be written.
     """
     if out is None:
         return played(scenario, {})
-    with ExitStack() as open_ones:
+    with ExitStack() as stack:
         return played(
-            scenario, {name: open_ones.enter_context(Journal(out / name)) for name in journals(scenario)}
+            scenario, {name: stack.enter_context(Journal(out / name)) for name in journals(scenario)}
         )
 
 
 def journals(scenario: Scenario) -> list[str]:
-    """What its journals are called."""
+    """Return the file names of the journals of a run of `scenario`."""
     return [*[agent_journal(robot.id) for robot in scenario.robots], WORLD_JOURNAL]
 
 
 def played(scenario: Scenario, sinks: Mapping[str, Sink]) -> Recording:
-    """The run of `scenario`, whose journals go to `sinks`, by name: all of them, or none."""
+    """Run `scenario`, and write its journals to `sinks`, by file name; without sinks, write none."""
     ids = [robot.id for robot in scenario.robots]
     course = Course(scenario, sinks.get(WORLD_JOURNAL))
     robots = {robot: Robot(scenario.config(robot), sinks.get(agent_journal(robot))) for robot in ids}
     moments: list[TickRecord] = []
     end: MissionEnd | None = None
-    told: dict[tuple[str, int], FramedReport] = {}
+    sent: dict[tuple[str, int], FramedReport] = {}
     while end is None:
         observations = course.observations()
         for observation in observations:
             report = robots[observation.robot].observation(observation)
             if report is not None:
-                told[observation.robot, observation.tick] = report
+                sent[observation.robot, observation.tick] = report
         commands: dict[str, Command] = {}
         for observation in observations:
-            heard = [
-                told[contact.peer, tick] for contact in observation.contacts for tick in contact.heard or ()
+            received = [
+                sent[contact.peer, tick] for contact in observation.contacts for tick in contact.heard or ()
             ]
-            commands[observation.robot] = robots[observation.robot].decide(heard)
+            commands[observation.robot] = robots[observation.robot].decide(received)
             if robots[observation.robot].journaled:
                 robots[observation.robot].estimate()
-        if told:
-            for robot in ids:  # nobody hears it any more
-                told.pop((robot, course.tick - LATEST), None)
+        if sent:
+            for robot in ids:  # it can no longer be received
+                sent.pop((robot, course.tick - LATEST), None)
         moments.append(TickRecord(course.world.truth, commands))
         end = course.command(commands)
     final_reports: dict[str, FinalReport] = {robot: robots[robot].final_report(end) for robot in ids}

@@ -22,17 +22,17 @@ from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from world.scenario import Scenario
 
 FOLLOW_S = 2.0
-"""s that the agents have to end after the world has ended"""
+"""Time in s that the agents have to end after the world has ended."""
 STOP_S = 3.0
-"""s that a process has to end after SIGTERM; then it is killed"""
+"""Time in s that a process has to end after SIGTERM; then it is killed."""
 JOIN_S = 60.0
-"""s that an agent looks for its world, before JOIN_EACH_S is added"""
+"""The connection timeout of an agent in s, before JOIN_EACH_S is added."""
 JOIN_EACH_S = 0.5
-"""s added for each robot of the run, because all start at once"""
+"""Time in s added for each robot of the run, because all start at once."""
 CHILD_FILES, SPARE_FILES = 2, 12
-"""descriptors that the launcher needs for each process of a run, and for starting one"""
+"""The number of descriptors that the launcher needs for each process of a run, and for starting one."""
 LISTENING_PORTS = range(20_000, 32_000)
-"""Below the ephemeral ports: one of those could go to an outgoing connection before it is used."""
+"""The ports for `free_endpoint`. They are below the ephemeral ports, which outgoing connections may take."""
 
 
 class ChildFailed(RuntimeError):
@@ -63,7 +63,7 @@ class MissionProcess:
     def __init__(self, name: str, arguments: list[str], inbox: Inbox, kills: Sequence[Kill]) -> None:
         self.name = name
         self.kills = list(kills)
-        """the scheduled kills that have not happened yet"""
+        """Scheduled kills that have not happened yet."""
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # closed by `forget`
         self._server = fork_server()
         self._process = self._server.start(
@@ -97,7 +97,7 @@ class MissionProcess:
         how = (
             f"was killed by signal {-self.status}" if self.status < 0 else f"ended with status {self.status}"
         )
-        return f"{how}: {'; '.join(said.splitlines())}" if (said := self.said()) else how
+        return f"{how}: {'; '.join(errors.splitlines())}" if (errors := self.said()) else how
 
     def hand(self, frame: bytes) -> None:
         """Send `frame`, preceded by its length, to the standard input of the process."""
@@ -137,8 +137,8 @@ def play(
 ) -> list[Kill]:
     """Run `scenario`, write its journals to `out`, and return the kills that did not happen.
 
-    `rate` is the speed relative to real time, None for lockstep; `timeout` is a timeout in s. A process is
-    killed at its points in `kills`, and started again.
+    `rate` is the speed relative to real time, None for lockstep; `timeout` is in s. A process is killed at
+    its points in `kills`, and restarted.
 
     Without `agents_journal`, only the world writes a journal. The outcome follows from that one alone, and
     with many robots the other files take a noticeable part of the run time.
@@ -175,8 +175,8 @@ def _arguments(
     journal = ["--out", str(out)]
     real_time = ["--rate", str(rate)] if rate is not None else []
 
-    def keyed(who: str) -> list[str]:
-        return ["--keys", str(keys / who)] if keys is not None else []
+    def keyed(participant: str) -> list[str]:
+        return ["--keys", str(keys / participant)] if keys is not None else []
 
     wait = ["--connect-timeout", str(JOIN_S + JOIN_EACH_S * len(scenario.robots))]
     world = ["world", scenario.name, "--listen", endpoint, *keyed("world"), *shared, *journal, *real_time]
@@ -203,7 +203,7 @@ class _Run:
         self.names = list(arguments)
         self.children: dict[str, MissionProcess] = {}
         self._due: dict[str, float] = {}
-        """monotonic time in s at which a killed process is restarted, by its name"""
+        """Monotonic time in s at which a killed process is restarted, by name."""
 
     def start(self, name: str, kills: Sequence[Kill]) -> None:
         """Start or restart the process `name`, which will be killed at `kills`."""
@@ -223,7 +223,7 @@ class _Run:
             if arrival.topic == "ended":
                 child = self.children[arrival.key]
                 if child.status != ENDED:
-                    self._bury(child)
+                    self._schedule_restart(child)
                     continue
                 running.discard(child.name)
                 if child.name == WORLD:
@@ -238,7 +238,7 @@ class _Run:
             return min(self._due.values()) - time.monotonic()
         return None if world_runs else FOLLOW_S
 
-    def _bury(self, child: MissionProcess) -> None:
+    def _schedule_restart(self, child: MissionProcess) -> None:
         """Schedule the restart of a killed child.
 
         Raises ChildFailed if the child did not end by one of its kills, or by a kill without a restart.
@@ -251,15 +251,15 @@ class _Run:
         child.kills.remove(kill)
         child.end(0.0)
         when = f" in {kill.after:g} s" if kill.after else ""
-        self._inbox.say(f"{child.name} was killed at tick {kill.tick}, and is started again{when}")
+        self._inbox.say(f"{child.name} was killed at tick {kill.tick}, and is restarted{when}")
         self._due[child.name] = time.monotonic() + kill.after
 
     def stop(self) -> None:
         """End all processes, and print what those that ended well wrote to standard error."""
         _stop(self.children.values())
         for child in self.children.values():
-            if child.status == ENDED and (said := child.said()):
-                say(*said.splitlines(), error=True)
+            if child.status == ENDED and (errors := child.said()):
+                say(*errors.splitlines(), error=True)
             child.forget()
 
 

@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM, a closed terminal and the end of a launcher, as something that arrives like the rest."""
+"""Ctrl-C, SIGTERM, a closed terminal and the end of a launcher, delivered as items of an Inbox."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def stop_with_launcher(inbox: Inbox) -> None:
 
 
 def stop_by_signal(inbox: Inbox) -> None:
-    """From now on, put "stop" into `inbox` when the process is told to stop.
+    """Put "stop" into `inbox` on SIGINT, SIGTERM and SIGHUP, from now until the process ends.
 
-    Until now such a signal has ended the process at once and silently. There is no way back: what has
-    come to its end is said and written before the process ends, whatever arrives meanwhile.
+    Before this call, such a signal ends the process at once and without output. The handlers are never
+    removed, so that a signal cannot interrupt the output and the files at the end of a run.
     """
 
     def hand_over(number: int, _frame: object) -> None:

@@ -1,6 +1,6 @@
-"""What shows a mission beside it: a process that reads the growing journals, and its launcher's part.
+"""Viewers of a mission: processes that read the growing journals, and their launcher's side.
 
-It says on standard output where it is to be found, once it is; and it ends with its standard input.
+A viewer writes its address to standard output when it is ready. It ends when its standard input is closed.
 """
 
 from __future__ import annotations
@@ -19,33 +19,34 @@ from protocol.network.inbox import Inbox, Interrupted
 from protocol.output import say
 
 OVER = b"."
-"""what it is told when the mission is over"""
+"""The message to a viewer that the mission has ended."""
 READY_S = 30.0
-"""how long it may take until it is there"""
+"""Time in s that a viewer has to be ready."""
 
 
 class Beside:
-    """A process that shows a mission."""
+    """A running viewer process."""
 
     def __init__(self, what: str, process: subprocess.Popen[bytes], address: str) -> None:
+        """`what` is the name of the viewer in messages."""
         self.address = address
         self._what = what
         self._process = process
 
     def announce(self) -> None:
-        """Say where it is."""
+        """Print the address."""
         say(f"{self._what} at {self.address}")
 
     def conclude(self) -> None:
-        """The mission is over; it stays."""
+        """Tell the viewer that the mission has ended, and print that it keeps running."""
         assert self._process.stdin is not None
         with suppress(BrokenPipeError):
             self._process.stdin.write(OVER)
             self._process.stdin.flush()
-        say(f"{self._what} stays at {self.address} until Ctrl-C")
+        say(f"{self._what} remains at {self.address} until Ctrl-C")
 
     def put_end(self, inbox: Inbox) -> None:
-        """Put "ended" with its address into `inbox` once the process is gone."""
+        """Put "ended" with the address into `inbox` once the process has ended."""
 
         def wait() -> None:
             self._process.wait()
@@ -55,24 +56,27 @@ class Beside:
 
 
 def stay(shows: Sequence[Beside], inbox: Inbox) -> None:
-    """The mission is over: wait for Ctrl-C, or for the end of all of `shows`.
+    """Wait, after the mission, for Ctrl-C or for the end of all viewers in `shows`.
 
-    A process of the mission may end after it, and is none of them.
+    Processes of the mission that end later are ignored.
     """
     for show in shows:
         show.conclude()
         show.put_end(inbox)
-    left = {show.address for show in shows}
+    running = {show.address for show in shows}
     with suppress(Interrupted):
-        while left:
+        while running:
             arrival = inbox.next(None)
             if arrival.topic == "ended":
-                left.discard(arrival.key)
+                running.discard(arrival.key)
 
 
 @contextmanager
 def beside(what: str, module: str, *arguments: str) -> Iterator[Beside]:
-    """`python -m module arguments`, for as long as it takes. Raises UserError, by its own words."""
+    """Run the viewer `python -m module arguments` in this context.
+
+    Raises UserError, with the last line of its standard error, if it is not ready within READY_S.
+    """
     with tempfile.TemporaryFile() as errors:
         process = subprocess.Popen(
             [sys.executable, "-P", "-m", module, *arguments],
@@ -87,11 +91,11 @@ def beside(what: str, module: str, *arguments: str) -> Iterator[Beside]:
                 process.kill()
                 process.wait()
                 errors.seek(0)
-                said = errors.read().decode(errors="replace").strip().splitlines()
+                output = errors.read().decode(errors="replace").strip().splitlines()
                 raise UserError(
-                    said[-1].removeprefix("tandem watch: ")
-                    if said
-                    else f"{what}: not there within {READY_S:g} s"
+                    output[-1].removeprefix("tandem watch: ")
+                    if output
+                    else f"{what}: not ready within {READY_S:g} s"
                 )
             yield Beside(what, process, address)
         finally:
@@ -99,29 +103,29 @@ def beside(what: str, module: str, *arguments: str) -> Iterator[Beside]:
 
 
 def page(folder: Path, port: int) -> tuple[str, ...]:
-    """What `beside` is to be told for the page on the record that is about to be written into `folder`."""
+    """Return the arguments of `beside` for the page of the recording in `folder`."""
     return ("the page", "compose.cli", "watch", str(folder), "--launched", "--port", str(port))
 
 
 def viewers(folder: Path, port: int, origins: Sequence[str], robots: Sequence[str]) -> tuple[str, ...]:
-    """Return what `beside` is told to serve a run of `robots` to Foxglove, and to web pages of `origins`."""
+    """Return the arguments of `beside` to serve a run to Foxglove, and to web pages of `origins`."""
     words = (str(port), ",".join(origins), str(folder), *robots)
-    return ("what Foxglove's viewers show", "compose.view.foxglove.live_server", *words)
+    return ("the Foxglove server", "compose.view.foxglove.live_server", *words)
 
 
 def _address(process: subprocess.Popen[bytes]) -> str | None:
-    """What it says once it is there; none if it does not within READY_S."""
-    said: list[bytes] = []
+    """Return the address that the viewer writes when it is ready; None if it is not ready within READY_S."""
+    lines: list[bytes] = []
     out = process.stdout
     assert out is not None
-    reader = threading.Thread(target=lambda: said.append(out.readline()), daemon=True)
+    reader = threading.Thread(target=lambda: lines.append(out.readline()), daemon=True)
     reader.start()
     reader.join(READY_S)
-    return said[0].decode().strip() or None if said else None
+    return lines[0].decode().strip() or None if lines else None
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """It ends with its standard input; else it is killed."""
+    """Close the streams of the viewer, which ends it; kill it if it has not ended after STOP_S."""
     for pipe in (process.stdin, process.stdout):
         if pipe is not None:
             with suppress(OSError):

@@ -1,7 +1,7 @@
-"""The bare barrier: what a tick costs over Zenoh with no mission in it. `tandem bench` measures against it.
+"""The Zenoh baseline of `tandem bench`: the duration of a tick's message exchange without a mission.
 
-The same processes, topology and quality of service as a mission, and messages of the same size: one
-puts a frame to each robot and waits for a frame of each. Nothing is encoded, checked or kept.
+The processes, topology, quality of service and sizes of messages are those of a mission. The world sends a
+frame to each robot and waits for a frame from each. Nothing is encoded, checked or stored.
 """
 
 from __future__ import annotations
@@ -18,19 +18,21 @@ from protocol.network import keys, session
 from protocol.network.endpoints import at
 from protocol.network.inbox import Inbox
 
-PATIENCE_S = 30.0
+TIMEOUT_S = 30.0
+"""Time in s without an answer before giving up."""
 RUN = "barrier"
+"""The run name in the keys."""
 
 
 def drop(frames: SimpleQueue[bytes], sample: zenoh.Sample) -> None:
-    """What both ends do with what arrives."""
+    """Put the payload of a received sample into `frames`."""
     frames.put(sample.payload.to_bytes())
 
 
 def world(link: zenoh.Session, robots: Sequence[str], size: int, ticks: int) -> float:
-    """Seconds that `ticks` rounds take, once everybody is there; frames of `size` bytes.
+    """Wait for all robots, and return the time in s that `ticks` rounds with frames of `size` bytes take.
 
-    Raises queue.Empty after PATIENCE_S without an answer.
+    Raises queue.Empty after TIMEOUT_S without an answer.
     """
     frames: SimpleQueue[bytes] = SimpleQueue()
     there = Inbox("barrier")
@@ -38,21 +40,21 @@ def world(link: zenoh.Session, robots: Sequence[str], size: int, ticks: int) -> 
     publishers = [session.publisher(link, keys.observation(RUN, robot)) for robot in robots]
     session.watch_liveliness(link, keys.robot_alive(RUN, "*"), there)
     for _ in robots:
-        there.next(PATIENCE_S)
+        there.next(TIMEOUT_S)
     frame = bytes(size)
     began = time.perf_counter()
     for _ in range(ticks):
         for publisher in publishers:
             publisher.put(frame)
         for _ in publishers:
-            frames.get(timeout=PATIENCE_S)
+            frames.get(timeout=TIMEOUT_S)
     return time.perf_counter() - began
 
 
 def robot(endpoint: str, name: str, size: int, ticks: int) -> None:
-    """Answer `ticks` frames with one of `size` bytes each."""
+    """Answer each of `ticks` frames with one of `size` bytes."""
     frames: SimpleQueue[bytes] = SimpleQueue()
-    give_up = time.monotonic() + PATIENCE_S
+    give_up = time.monotonic() + TIMEOUT_S
 
     def unanswered() -> None:
         if time.monotonic() > give_up:
@@ -64,7 +66,7 @@ def robot(endpoint: str, name: str, size: int, ticks: int) -> None:
         _token = session.show_alive(link, keys.robot_alive(RUN, name))
         frame = bytes(size)
         for _ in range(ticks):
-            frames.get(timeout=PATIENCE_S)
+            frames.get(timeout=TIMEOUT_S)
             publisher.put(frame)
 
 

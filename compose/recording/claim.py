@@ -1,4 +1,4 @@
-"""A robot's claim to know its pose, held against where it was when it claimed."""
+"""A robot's claim to be localised, compared with its true pose."""
 
 from __future__ import annotations
 
@@ -10,44 +10,47 @@ from protocol.rounding import TOLERANCE
 from world.referee import errors
 
 DEGREES_OF_FREEDOM = 3
-"""of a pose: what its NEES is in the mean, where covariances are true"""
+"""The degrees of freedom of a pose, which is the mean NEES if the covariances are true."""
 
 
 class Claim(msgspec.Struct, frozen=True):
-    """The first that a robot made, and how far off it was."""
+    """The first claim of a robot, with its errors."""
 
     tick: int
+    """Tick of the claim."""
     pose: Pose
+    """Claimed pose in m and rad."""
     covariance: Covariance | None
-    """none where sensors are exact"""
+    """Claimed covariance; None if sensors are exact."""
     position_error: float
-    """m"""
+    """Distance in m from the true position."""
     heading_error: float
-    """rad"""
+    """Absolute difference in rad from the true heading."""
     nees: float | None
-    """the normalised estimation error squared; none where there is no covariance"""
+    """Normalised estimation error squared; None without a covariance."""
 
 
-def claim(tick: int, said: Localised, truth: Pose) -> Claim:
-    """What was `said` at `tick` by a robot that was at `truth`."""
-    position, heading = errors(said.pose, truth)
-    squared = nees(said.pose, truth, said.covariance) if said.covariance is not None else None
-    return Claim(tick, said.pose, said.covariance, position, heading, squared)
+def claim(tick: int, verdict: Localised, truth: Pose) -> Claim:
+    """Return the claim that `verdict` makes at `tick`, with its errors from the true pose `truth`."""
+    position, heading = errors(verdict.pose, truth)
+    squared = nees(verdict.pose, truth, verdict.covariance) if verdict.covariance is not None else None
+    return Claim(tick, verdict.pose, verdict.covariance, position, heading, squared)
 
 
 def matrix(covariance: Covariance) -> list[list[float]]:
-    """All of it: 3 x 3, of x, y and heading."""
+    """Return the 3 x 3 matrix of x, y (m) and heading (rad)."""
     c = covariance
     return [[c.xx, c.xy, c.xh], [c.xy, c.yy, c.yh], [c.xh, c.yh, c.hh]]
 
 
 def nees(estimate: Pose, truth: Pose, covariance: Covariance) -> float:
-    """e^T P^-1 e, with e = (x, y, wrapped heading) of the error (Bar-Shalom, Li and Kirubarajan 2001, 5.4).
+    """Return the NEES e^T P^-1 e, where e is the error (x, y, wrapped heading) and P the covariance.
 
-    An eigenvalue of P below the square of 1e-6 (m, rad) counts as that: no claim is held to be surer than
-    what sensors that are exact are held to, and a P that is singular still tells what the error is worth.
+    See Bar-Shalom, Li and Kirubarajan 2001, section 5.4. Eigenvalues of P below TOLERANCE^2 are raised to it:
+    TOLERANCE is the accuracy required with exact sensors, no claim counts as more certain than that, and a
+    singular P has a NEES too.
     """
-    import numpy as np  # noqa: PLC0415  # where sensors are exact, nothing is loaded for it
+    import numpy as np  # noqa: PLC0415  # loaded only if there is a covariance
 
     error = np.array([estimate.x - truth.x, estimate.y - truth.y, wrap(estimate.heading - truth.heading)])
     variances, axes = np.linalg.eigh(np.array(matrix(covariance)))

@@ -1,7 +1,8 @@
 """The Cramér-Rao bound of a pair's poses, for the trajectories that it drove.
 
-The fit that the robots make of their ranges, taken at the truth: true controls, true distances, no step. What
-is left then is the inverse of the Fisher information, odometry integrated out.
+The bound is the covariance of the robots' own least-squares fit, evaluated at the ground truth: with true
+controls, true distances and no iteration. It is the inverse of the Fisher information, with the odometry
+noise marginalised out.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ from world.truth import asked
 
 
 def position_bounds(recording: Recording, pair: tuple[int, int], tick: int) -> tuple[float, float] | None:
-    """m: the root of the trace of the bound on each one's position at `tick`.
+    """Return the square root in m of the trace of the bound on each robot's position at `tick`.
 
-    None where sensors are exact, or ranges may be outliers: there the bound is not that of a Gaussian.
+    The result is None if sensors are exact, or if ranges can be outliers, whose noise is not Gaussian.
     """
     scenario = recording.scenario
     noise = scenario.mission.noise
@@ -39,8 +40,8 @@ def position_bounds(recording: Recording, pair: tuple[int, int], tick: int) -> t
         for k, (place, anchor) in enumerate(zip(pair, anchors, strict=True)):
             if ranges[place] is not None:
                 own[k].append((truth.tick, _apart(truth.poses[place], Pose(anchor.x, anchor.y, 0.0))))
-        (met,) = mutual_ranges(truth, scenario, [pair])
-        if met is not None and met.range is not None:
+        (contact,) = mutual_ranges(truth, scenario, [pair])
+        if contact is not None and contact.range is not None:
             mutual.append((truth.tick, _apart(truth.poses[pair[0]], truth.poses[pair[1]])))
     tracks, guess = [], []
     for place, anchor in zip(pair, anchors, strict=True):
@@ -61,12 +62,12 @@ def _apart(one: Pose, other: Pose) -> float:
 
 
 def _driven(recording: Recording, place: int, tick: int) -> Track:
-    """What a robot executed until `tick`."""
+    """Return the track of the controls that a robot executed until `tick`."""
     scenario = recording.scenario
     robot = scenario.robots[place].id
-    done: Sequence[Controls] = [
+    driven: Sequence[Controls] = [
         executed(asked(moment.commands.get(robot), scenario.mission), scenario, robot, moment.truth.tick)
         for moment in recording.moments[:tick]
     ]
-    v, omega = np.array([one.v for one in done]), np.array([one.omega for one in done])
+    v, omega = np.array([one.v for one in driven]), np.array([one.omega for one in driven])
     return track(v, omega, scenario.mission.period)

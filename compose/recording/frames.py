@@ -1,4 +1,4 @@
-"""Every frame of a record, each with when it was journaled."""
+"""The frames of a recording, each with the tick in which it was journaled."""
 
 from __future__ import annotations
 
@@ -25,50 +25,52 @@ from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, body, decode
 from world.scenario import Scenario
 
 OfWorld = Environment | Scenario | Command | DeadlineMissed | MissionEnd | FinalReport
-"""what stands in a world's journal"""
+"""The kinds of messages in the world's journal."""
 KINDS = Scenario | OfRobot
-"""what stands in a journal"""
+"""The kinds of messages in any journal."""
 
 
 class Journaled(msgspec.Struct, frozen=True):
-    """One frame."""
+    """A frame of a journal."""
 
     journal: str
-    """the name of its file"""
+    """File name of the journal."""
     place: int
-    """how many frames stand before it there"""
+    """Number of frames before it in the journal."""
     tick: int
-    """in which it was journaled; a Report that was heard late is of an earlier one"""
+    """Tick in which it was journaled; a Report that was received late is of an earlier tick."""
     message: Any
-    """one of KINDS"""
+    """Decoded message, one of KINDS."""
     frame: bytes
+    """Encoded message."""
 
     @property
     def kind(self) -> str:
-        """Such as "observation"."""
+        """The name of the kind of message on the wire, such as "observation"."""
         return kind_of(type(self.message))
 
     @property
     def body(self) -> bytes:
-        """The frame without its head: msgpack. What is left out follows: the version, and the CRC of this."""
+        """The frame without its head, as msgpack. The head is the version and the CRC of the body."""
         return body(self.frame)
 
 
 def kind_of(kind: type[msgspec.Struct]) -> str:
-    """What messages of that kind are called on the wire."""
+    """Return the name of that kind of message on the wire."""
     return str(kind.__struct_config__.tag)
 
 
 class Telling:
-    """A journal's frames, as they are read. Raises CorruptJournal where one cannot be understood."""
+    """A decoder of the frames of one journal, which may be read in parts."""
 
     def __init__(self, name: str) -> None:
+        """`name` is the file name of the journal."""
         self._name = name
         self._place = 0
         self._tick = 0
 
     def of(self, frames: Iterable[bytes]) -> Iterator[Journaled]:
-        """Those that come next."""
+        """Yield the next frames of the journal. Raises CorruptJournal if one cannot be decoded."""
         for frame in frames:
             try:
                 message: Message = decode(frame, KINDS, MAX_FRAME_BYTES)
@@ -88,6 +90,9 @@ class Telling:
 
 
 def in_time(books: Mapping[str, JournalFile]) -> Iterator[Journaled]:
-    """Those of all journals, tick by tick; within one, journal by journal. Raises CorruptJournal."""
+    """Yield the frames of all journals by tick, and within a tick in the order of `books`.
+
+    Raises CorruptJournal if a frame cannot be decoded.
+    """
     each = [Telling(name).of(book.frames) for name, book in books.items()]
     return merge(*each, key=lambda one: one.tick)

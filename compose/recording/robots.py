@@ -1,6 +1,6 @@
-"""The robots of a record without a world: who has left a journal, and how it ended by what they say.
+"""The robots of a recording of hardware mode: their journals, their pairs and the outcome that they recorded.
 
-Nobody knows the truth of it. What each measured and decided is on record; where it was, only as it claims.
+Such a recording has no ground truth. It contains what each robot measured and decided.
 """
 
 from __future__ import annotations
@@ -22,52 +22,52 @@ if TYPE_CHECKING:
 
 
 def alone(folder: Path) -> bool:
-    """Whether there are robots' journals in `folder`, and no world's."""
+    """Return whether `folder` contains agents' journals and no world's journal."""
     names = [path.name for path in journals_in(folder)]
     return bool(names) and WORLD_JOURNAL not in names
 
 
 def pasts(folder: Path) -> dict[str, Past]:
-    """What each robot has left in `folder`; nothing of one that was never briefed.
+    """Return the content of each agent's journal in `folder`, by robot.
 
-    Raises OSError if a journal cannot be read, CorruptJournal if one is damaged before its end, or of another
-    run than its peer's.
+    Journals without a RobotConfig are omitted. Raises OSError if a journal cannot be read, CorruptJournal if
+    one is damaged before its end or is of another run than its peer's.
     """
-    told = {robot: past_of(folder, robot) for robot in map(robot_of, journals_in(folder))}
-    found = {robot: past for robot, past in told.items() if past is not None}
+    contents = {robot: past_of(folder, robot) for robot in map(robot_of, journals_in(folder))}
+    found = {robot: past for robot, past in contents.items() if past is not None}
     agree({robot: past.config for robot, past in found.items()}, folder)
     return found
 
 
 def casts(folder: Path) -> list[tuple[str, ...]]:
-    """The pairs of which one has left a journal in `folder`, a first; and who was never briefed, alone.
+    """Return the pairs of which at least one robot has a journal in `folder`, role a first.
 
-    Raises OSError if one cannot be read, CorruptJournal if one is of another run than its peer's.
+    A robot whose journal has no RobotConfig is in a tuple of its own. Raises OSError if a journal cannot be
+    read, CorruptJournal if one is of another run than its peer's.
     """
     robots = [robot_of(path) for path in journals_in(folder)]
-    told = {
+    configs = {
         robot: config
         for robot in robots
-        if (config := _briefing(folder / agent_journal(robot))) is not None and config.robot == robot
+        if (config := _config(folder / agent_journal(robot))) is not None and config.robot == robot
     }
-    agree(told, folder)
-    pairs = [(one.robot, one.peer) if one.role == "a" else (one.peer, one.robot) for one in told.values()]
+    agree(configs, folder)
+    pairs = [(one.robot, one.peer) if one.role == "a" else (one.peer, one.robot) for one in configs.values()]
     paired = {robot for pair in pairs for robot in pair}
     return [*dict.fromkeys(pairs), *[(robot,) for robot in robots if robot not in paired]]
 
 
-def agree(told: Mapping[str, RobotConfig], folder: object) -> None:
-    """Peers were briefed for one mission. Raises CorruptJournal if any two were not, or they are no pair."""
-    for robot, one in told.items():
-        other = told.get(one.peer)
+def agree(configs: Mapping[str, RobotConfig], folder: object) -> None:
+    """Raise CorruptJournal if the configurations of two peers are not of the same pair and mission."""
+    for robot, one in configs.items():
+        other = configs.get(one.peer)
         if other is not None and _shared(one, robot) != _shared(other, robot):
-            raise CorruptJournal(
-                f"{folder}/{agent_journal(one.peer)}: another run's: its briefing is not of {robot}'s peer"
-            )
+            path = f"{folder}/{agent_journal(one.peer)}"
+            raise CorruptJournal(f"{path}: from another run: its configuration does not match {robot}'s")
 
 
 def _shared(config: RobotConfig, robot: str) -> tuple[object, ...]:
-    """What both of a pair are told, seen from `robot`."""
+    """Return the part of a configuration that both robots of a pair share, in the view of `robot`."""
     own = config.robot == robot
     return (
         config.robot if own else config.peer,
@@ -81,8 +81,8 @@ def _shared(config: RobotConfig, robot: str) -> tuple[object, ...]:
     )
 
 
-def _briefing(path: Path) -> RobotConfig | None:
-    """None where it does not begin with one."""
+def _config(path: Path) -> RobotConfig | None:
+    """Return the RobotConfig at the beginning of an agent's journal; None if there is none."""
     try:
         frames = journal_file.Tail(path).news()
         head = frames[named_in(frames) is not None :]
@@ -91,13 +91,13 @@ def _briefing(path: Path) -> RobotConfig | None:
         return None
 
 
-def outcome(told: Mapping[str, Past]) -> str:
-    """How it ended, by what each says; once, where they agree."""
+def outcome(pasts: Mapping[str, Past]) -> str:
+    """Return the outcome that each robot recorded, in one line; if all agree, once."""
     ends = {
         robot: ended(past.end.outcome, past.end.tick, past.end.reason)
         if past.end is not None
         else broken_off(len(past.steps) - 1)
-        for robot, past in told.items()
+        for robot, past in pasts.items()
     }
     if len(set(ends.values())) == 1:
         return next(iter(ends.values()))

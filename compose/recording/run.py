@@ -1,4 +1,4 @@
-"""The record of a run: what its journals hold."""
+"""The recording of a run: its folder, its journals and their content."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ WORLD_JOURNAL = "world.journal"
 
 
 def agent_journal(robot: str) -> str:
-    """The name of the file that `robot` keeps its record in."""
+    """Return the file name of the journal of the agent of `robot`."""
     return f"agent-{robot}.journal"
 
 
 def robot_of(path: Path) -> str:
-    """Whose record an agent's journal is, by its name."""
+    """Return the robot of an agent's journal, from its file name."""
     return path.stem.removeprefix("agent-")
 
 
 def journals_in(folder: Path) -> list[Path]:
-    """Those of a record that are there, the world's first."""
+    """Return the paths of the journals in `folder`, the world's first."""
     world = folder / WORLD_JOURNAL
     return [*([world] if world.exists() else []), *sorted(folder.glob(agent_journal("*")))]
 
 
 @contextmanager
 def folder_for(out: Path | None) -> Iterator[Path]:
-    """Where a record goes: `out`, or a folder that is gone afterwards. Raises UserError."""
+    """Yield the folder of a recording: `out`, created if necessary, or a temporary one. Raises UserError."""
     if out is None:
         with tempfile.TemporaryDirectory(prefix="tandem-") as folder:
             yield Path(folder)
@@ -53,7 +53,7 @@ def folder_for(out: Path | None) -> Iterator[Path]:
 
 
 def make(out: Path) -> None:
-    """See to it that `out` is a folder that can be written. Raises UserError."""
+    """Create the folder `out` and check that it is writable. Raises UserError if it is not."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=out):
@@ -63,40 +63,45 @@ def make(out: Path) -> None:
 
 
 def cannot_write(out: Path, error: OSError) -> str:
-    """What to tell the user of `error`."""
+    """Return the message for the user that `out` cannot be written."""
     return f"--out: {out} cannot be written: {error.strerror or error}"
 
 
 class TickRecord(msgspec.Struct, frozen=True):
-    """One tick: where everyone was, and what everyone then set out to do."""
+    """One tick of a run."""
 
     truth: Truth
+    """Ground truth at the tick."""
     commands: dict[str, Command]
+    """Commands of the tick, by robot; a Command that was late is missing."""
 
 
 class Recording(msgspec.Struct, frozen=True):
-    """A run, whole."""
+    """The content of the world's journal of a run."""
 
     scenario: Scenario
     moments: tuple[TickRecord, ...]
+    """Ticks, from tick 0."""
     end: MissionEnd | None
-    """none if the record breaks off"""
+    """End of the mission; None if the recording breaks off."""
     final_reports: dict[str, FinalReport]
+    """FinalReports, by robot."""
 
 
 class JournalFile(msgspec.Struct, frozen=True):
-    """A journal, as it is found."""
+    """A journal on disk."""
 
     frames: list[bytes]
+    """Complete frames."""
     torn: int
-    """bytes of a torn write behind them"""
+    """Number of bytes of a torn write at the end."""
 
 
 def books(folder: Path) -> dict[str, JournalFile]:
-    """Every journal of the record in `folder`, by its name; the world's is the first, if there is one.
+    """Return the journals of the recording in `folder`, by file name; the world's is first.
 
-    Raises OSError if there is none at all or one cannot be read, journal.CorruptJournal where something
-    stands that is no frame.
+    Raises OSError if there is no journal or one cannot be read, CorruptJournal if one contains anything other
+    than frames.
     """
     names = sorted([path.name for path in folder.glob(agent_journal("*"))])
     if not names or (folder / WORLD_JOURNAL).exists():
@@ -105,55 +110,58 @@ def books(folder: Path) -> dict[str, JournalFile]:
 
 
 def read(folder: Path) -> Recording:
-    """The record of the run in `folder`: its world's journal, folded.
+    """Return the run recorded in `folder`, from the world's journal.
 
-    Raises OSError if there is none, journal.CorruptJournal if it is damaged before its end.
+    Raises OSError if there is no such journal, CorruptJournal if it is damaged before its end.
     """
     path = folder / WORLD_JOURNAL
-    told = history(journal_file.read(path), path)
-    if told.disorder is not None:
-        raise journal_file.CorruptJournal(f"{path}: {told.disorder.what}")
-    moments = tuple([TickRecord(tick.world.truth, tick.commands) for tick in told.ticks])
-    return Recording(told.scenario, moments, told.end, told.final_reports)
+    run = history(journal_file.read(path), path)
+    if run.disorder is not None:
+        raise journal_file.CorruptJournal(f"{path}: {run.disorder.what}")
+    moments = tuple([TickRecord(tick.world.truth, tick.commands) for tick in run.ticks])
+    return Recording(run.scenario, moments, run.end, run.final_reports)
 
 
 def estimates(folder: Path, robot: str) -> tuple[Estimate, ...]:
-    """What `robot` held possible, tick by tick: of its own journal in the record in `folder`.
+    """Return the Estimate of each tick in the journal of `robot` in `folder`.
 
-    Raises OSError if there is none, journal.CorruptJournal if it is damaged before its end, or another's.
+    Raises OSError if there is no such journal, CorruptJournal if it is damaged before its end, or is the
+    journal of another robot or of another run.
     """
-    told = past_of(folder, robot)
-    return told.estimates if told is not None else ()
+    past = past_of(folder, robot)
+    return past.estimates if past is not None else ()
 
 
 def past_of(folder: Path, robot: str) -> Past | None:
-    """What `robot` journaled in the record in `folder`; None if it was killed before it was briefed.
+    """Return the content of the journal of `robot` in `folder`; None if it has no RobotConfig.
 
-    Raises like `estimates`.
+    Raises OSError and CorruptJournal like `estimates`.
     """
-    from agent.process.agent_journal import past  # noqa: PLC0415  # whoever launches, and reads how it went, needs no planner
+    from agent.process.agent_journal import past as past_in  # noqa: PLC0415  # the launcher needs no planner
 
     path = folder / agent_journal(robot)
     frames = list(journal_file.read(path))
     if is_blank(frames):
         return None
-    told = past(frames, path)
-    if told.config.robot != robot:
-        raise journal_file.CorruptJournal(f"{path} is the journal of {told.config.robot}")
+    past = past_in(frames, path)
+    if past.config.robot != robot:
+        raise journal_file.CorruptJournal(f"{path} is the journal of {past.config.robot}")
     world = folder / WORLD_JOURNAL
     head = list(islice(journal_file.read(world), 2)) if world.exists() else []
-    if not is_blank(head) and not opened(head, world)[0].is_of(told.config):
-        raise journal_file.CorruptJournal(f"{path}: another run's: its briefing is not this world's")
-    return told
+    if not is_blank(head) and not opened(head, world)[0].is_of(past.config):
+        raise journal_file.CorruptJournal(
+            f"{path}: from another run: its configuration does not match the world's"
+        )
+    return past
 
 
 @contextmanager
 def legible(folder: Path) -> Iterator[None]:
-    """Whatever keeps the record in `folder` from being read is a line for the user. Raises UserError."""
+    """Raise UserError, with one line, for every error that prevents reading the recording in `folder`."""
     try:
         yield
     except FileNotFoundError:
-        raise UserError(f"{folder} holds no record: there is no {WORLD_JOURNAL}") from None
+        raise UserError(f"{folder} contains no recording: there is no {WORLD_JOURNAL}") from None
     except OSError as error:
         raise UserError(f"{folder} cannot be read: {error.strerror or error}") from None
     except journal_file.CorruptJournal as error:

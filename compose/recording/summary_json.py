@@ -1,4 +1,4 @@
-"""`summary.json`: how a run ended, and how each robot found out where it is."""
+"""`summary.json`: the outcome of a run, its parameters, and the claim and counts of each robot."""
 
 from __future__ import annotations
 
@@ -27,14 +27,17 @@ SUMMARY = "summary.json"
 
 
 def summary(recording: Recording, mode: Mode, wall_s: float | None) -> dict[str, Any]:
-    """What `summary.json` says; what does not apply is None."""
+    """Return the content of `summary.json`; values that do not apply are None.
+
+    `wall_s` is the wall time of the run in s.
+    """
     scenario, moments = recording.scenario, recording.moments
     return {
         "scenario": scenario.name,
         "seed": scenario.seed,
         "mode": mode,
         "outcome": recording.end.outcome if recording.end is not None else "failed",
-        "reason": recording.end.reason if recording.end is not None else "the record breaks off",
+        "reason": recording.end.reason if recording.end is not None else "the recording breaks off",
         "ticks": moments[-1].truth.tick if moments else 0,
         "wall_s": wall_s,
         "first_contact_tick": first_contact(recording),
@@ -58,7 +61,7 @@ def summary(recording: Recording, mode: Mode, wall_s: float | None) -> dict[str,
 
 
 def first_contact(recording: Recording) -> int | None:
-    """The first tick at which two peers were in range of each other."""
+    """Return the first tick at which two peers were in range of each other; None if there is none."""
     pairs = recording.scenario.pairs()
     for moment in recording.moments:
         if any(mutual is not None for mutual in mutual_ranges(moment.truth, recording.scenario, pairs)):
@@ -67,7 +70,7 @@ def first_contact(recording: Recording) -> int | None:
 
 
 def first_claim(recording: Recording, place: int) -> Claim | None:
-    """The first claim to know its pose of the robot at that place in the scenario."""
+    """Return the first claim of the robot at `place` in the scenario; None if it made none."""
     robot = recording.scenario.robots[place].id
     for moment in recording.moments:
         command = moment.commands.get(robot)
@@ -92,27 +95,27 @@ def _robot_summary(recording: Recording, place: int) -> dict[str, Any]:
         "position_sigma_m": covariance.position_sigma if covariance is not None else None,
         "heading_sigma_rad": covariance.heading_sigma if covariance is not None else None,
         "nees": claimed.nees if claimed is not None else None,
-        **{field: getattr(final_report, field, None) for field in _SAID},
-        "no_farewell": None if final_report is not None else _why_none(recording, robot),
+        **{field: getattr(final_report, field, None) for field in _COUNTS},
+        "no_farewell": None if final_report is not None else _missing_final_report(recording, robot),
         "deadlines_missed": sum([robot not in moment.commands for moment in recording.moments[:-1]]),
     }
 
 
-def _why_none(recording: Recording, robot: str) -> str:
-    """Why there is no FinalReport of `robot`, as far as the world's journal tells."""
+def _missing_final_report(recording: Recording, robot: str) -> str:
+    """Return why the world's journal has no FinalReport of `robot`."""
     if recording.end is None:
-        return "the record breaks off"
+        return "the recording breaks off"
     latest = max(
         [moment.truth.tick for moment in recording.moments if robot in moment.commands], default=None
     )
     if latest is None:
-        return "no Command of it came in time"
+        return "none of its Commands arrived in time"
     if latest < recording.end.tick:
-        return f"its last Command in time was of tick {latest} of {recording.end.tick}"
+        return f"its last Command that arrived in time is of tick {latest} of {recording.end.tick}"
     return "it did not answer the MissionEnd"
 
 
-_SAID = [field for field in FinalReport.__struct_fields__ if field != "robot"]
+_COUNTS = [field for field in FinalReport.__struct_fields__ if field != "robot"]
 
 
 def _listed(pose: Pose) -> list[float]:
@@ -121,7 +124,7 @@ def _listed(pose: Pose) -> list[float]:
 
 @cache
 def versions() -> dict[str, str | None]:
-    """Of everything that a run's figures may depend on."""
+    """Return the versions of all packages on which the results of a run can depend."""
     found: dict[str, str | None] = {"python": platform.python_version()}
     for package in ("tandem-ranging", "eclipse-zenoh", "numpy", "scipy", "msgspec", "msgpack"):
         found[package] = version(package)
@@ -135,15 +138,15 @@ def leave(recording: Recording, summary: Mapping[str, Any], folder: Path) -> Non
 
 
 def outcome_line(summary: Mapping[str, Any]) -> str:
-    """The outcome, in one line."""
+    """Return the outcome in one line."""
     return ended(summary["outcome"], summary["ticks"], summary["reason"])
 
 
 def broken_off(ticks: int) -> str:
-    """That it did not end, in one line."""
-    return f"the record breaks off after {max(0, ticks)} ticks"
+    """Return the outcome of a run without an end, in one line."""
+    return f"the recording breaks off after {max(0, ticks)} ticks"
 
 
 def ended(outcome: Outcome, ticks: int, reason: str | None) -> str:
-    """How a run ended, in one line."""
+    """Return the outcome of a run that ended, in one line."""
     return f"{outcome} after {ticks} ticks{f' ({one_line(reason)})' if reason else ''}"

@@ -1,4 +1,4 @@
-"""`ticks.csv`: a row per tick and robot."""
+"""`ticks.csv`: one row per tick and robot."""
 
 from __future__ import annotations
 
@@ -21,33 +21,39 @@ if TYPE_CHECKING:
 
 
 class TickRow(msgspec.Struct, frozen=True):
-    """One robot in one tick, as `ticks.csv` has it; what is none is an empty field there."""
+    """One row of `ticks.csv`: one robot in one tick. None is an empty field of the file."""
 
     tick: int
     robot: str
     x: float | None
-    """true; none where there was no world to know it"""
+    """True x in m; None in hardware mode."""
     y: float | None
+    """True y in m; None in hardware mode."""
     heading: float | None
-    """in (-pi, pi]"""
+    """True heading in rad, in (-pi, pi]; None in hardware mode."""
     v: float | None
-    """driven until the next tick, without a world as measured; none in the last"""
+    """Speed in m/s executed until the next tick, measured in hardware mode; None in the last tick."""
     omega: float | None
+    """Turn rate in rad/s, like `v`."""
     anchor_range: float | None
+    """Measured range to the anchor in m."""
     mutual_range: float | None
+    """Measured range to the peer in m."""
     phase: int | None
+    """Phase of the Command; None if the Command was late."""
     state: str | None
+    """Planner state of the Command; None if the Command was late."""
 
     @property
     def pose(self) -> Pose | None:
-        """The true one, where it is known."""
+        """The true pose; None in hardware mode."""
         if self.x is None or self.y is None or self.heading is None:
             return None
         return Pose(self.x, self.y, self.heading)
 
 
 def rows(recording: Recording) -> Iterator[TickRow]:
-    """One per tick and robot, tick 0 included."""
+    """Yield one row per tick and robot, from tick 0."""
     scenario = recording.scenario
     last = recording.moments[-1].truth.tick if recording.moments else 0
     for moment in recording.moments:
@@ -58,8 +64,8 @@ def rows(recording: Recording) -> Iterator[TickRow]:
             command = moment.commands.get(robot.id)
             v = omega = None
             if tick != last:
-                done = executed(asked(command, scenario.mission), scenario, robot.id, tick)
-                v, omega = done.v, done.omega
+                driven = executed(asked(command, scenario.mission), scenario, robot.id, tick)
+                v, omega = driven.v, driven.omega
             yield TickRow(
                 *(tick, robot.id, pose.x, pose.y, wrap(pose.heading), v, omega),
                 *(anchor[i], mutual.get(robot.id)),
@@ -67,10 +73,10 @@ def rows(recording: Recording) -> Iterator[TickRow]:
             )
 
 
-def rows_of(told: Mapping[str, Past]) -> Iterator[TickRow]:
-    """The same of robots without a world: speeds as measured, and nothing of their true poses."""
-    for tick in range(max([len(past.steps) for past in told.values()], default=0)):
-        for robot, past in told.items():
+def rows_of(pasts: Mapping[str, Past]) -> Iterator[TickRow]:
+    """Yield one row per tick and robot of hardware mode, with measured speeds and without true poses."""
+    for tick in range(max([len(past.steps) for past in pasts.values()], default=0)):
+        for robot, past in pasts.items():
             if tick >= len(past.steps):
                 continue
             observation, command = past.steps[tick].observation, past.steps[tick].command
@@ -92,21 +98,21 @@ def rows_of(told: Mapping[str, Past]) -> Iterator[TickRow]:
 
 
 def ticks_csv(recording: Recording) -> str:
-    """One row per tick and robot."""
+    """Return the text of `ticks.csv`."""
     return table(rows(recording))
 
 
 def table(rows: Iterable[TickRow]) -> str:
-    """`rows` as `ticks.csv` has them: floats in their shortest exact form."""
+    """Return `rows` in the format of `ticks.csv`, with floats in their shortest exact form."""
     out = io.StringIO()
-    written = csv.writer(out, lineterminator="\n")
-    written.writerow(TickRow.__struct_fields__)
-    written.writerows([["" if one is None else one for one in astuple(row)] for row in rows])
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(TickRow.__struct_fields__)
+    writer.writerows([["" if one is None else one for one in astuple(row)] for row in rows])
     return out.getvalue()
 
 
 def _mutual(scenario: Scenario, truth: Truth) -> dict[str, float]:
-    """Everyone's range to its peer, if there is one."""
+    """Return the measured range in m to the peer, for each robot that has one."""
     pairs = scenario.pairs()
     return {
         scenario.robots[i].id: mutual.range

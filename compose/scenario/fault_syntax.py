@@ -1,4 +1,4 @@
-"""A fault plan as a user writes it: `[[fault]]` in a file, or `--fault "a->b: loss=0.3, delay=0..3"`."""
+"""The syntax of fault plans: `[[fault]]` in a scenario file, `--fault "a->b: loss=0.3, delay=0..3"`."""
 
 from __future__ import annotations
 
@@ -15,23 +15,24 @@ from world.faults import MAX_DELAY, MAX_FAULTS, Delay, Fault, LinkSelector
 _LINK = re.compile(r"\s*(?P<one>[A-Za-z0-9_-]+)\s*(?P<way><->|->)\s*(?P<other>[A-Za-z0-9_-]+)\s*")
 _NUMBER = re.compile(r"-?[0-9]*\.?[0-9]+(?:[eE]-?[0-9]+)?")
 EVERYWHERE = "*"
+"""The text of a link that selects all links."""
 
 
 class BadFault(ValueError):
-    """A fault that cannot be; the text names the field and what is wrong."""
+    """An invalid fault; the text names the field and what is wrong."""
 
 
 class FaultTable(Fault, frozen=True, array_like=False, forbid_unknown_fields=True):
-    """[[fault]]: a `Fault` whose link and delay are written as people write them."""
+    """A `[[fault]]` table: a `Fault` with its link and its delay in the syntax of scenario files."""
 
     link: str = EVERYWHERE  # type: ignore[assignment]
-    """a->b, a<->b, or * for all"""
+    """Link a->b, both directions a<->b, or * for all links."""
     delay: Delay | Annotated[list[Delay], Meta(min_length=2, max_length=2)] = 0  # type: ignore[assignment]
-    """or between two, both included"""
+    """Delay in ticks, or the bounds between which it is drawn, both included."""
 
 
 def fault(table: FaultTable, pairs: Iterable[tuple[str, str]]) -> Fault:
-    """The fault that `table` describes, among robots that come in these `pairs`. Raises BadFault."""
+    """Return the fault that `table` describes, where `pairs` are the pairs of robots. Raises BadFault."""
     least, most = table.delay if isinstance(table.delay, list) else (table.delay, table.delay)
     for name, window in (
         ("delay", (least, most)),
@@ -39,24 +40,28 @@ def fault(table: FaultTable, pairs: Iterable[tuple[str, str]]) -> Fault:
         ("contact_ticks", table.contact_ticks),
     ):
         if window is not None and window[0] > window[1]:
-            raise BadFault(f"{name}: from {window[0]} to {window[1]} is backwards")
+            raise BadFault(f"{name}: the lower bound {window[0]} is above the upper bound {window[1]}")
     if table.burst_start > 0.0 and table.burst_end == 0.0:
-        raise BadFault("burst_end: a burst that never ends is a partition")
+        raise BadFault("burst_end: must be above 0; for a burst that never ends, set partition")
     return Fault(**asdict(table) | {"link": _link(table.link, list(pairs)), "delay": (least, most)})
 
 
 def added(plan: Sequence[Fault], table: FaultTable, pairs: Sequence[tuple[str, str]]) -> tuple[Fault, ...]:
-    """`plan` with the fault that `table` describes; `pairs` both ways. Raises BadFault."""
+    """Return `plan` with the fault that `table` describes appended.
+
+    `pairs` holds each pair of robots in both orders. Raises BadFault.
+    """
     plan = (*plan, fault(table, pairs))
     for sender, receiver in pairs:
         if plan[-1].on(sender, receiver):
-            on_it = [one for one in plan if one.on(sender, receiver)]
-            if len(on_it) > MAX_FAULTS:
+            on_link = [one for one in plan if one.on(sender, receiver)]
+            if len(on_link) > MAX_FAULTS:
                 raise BadFault(f"link: more than {MAX_FAULTS} faults from '{sender}' to '{receiver}'")
-            late = sum([one.delay[1] for one in on_it])
-            if late > MAX_DELAY:
+            delay = sum([one.delay[1] for one in on_link])
+            if delay > MAX_DELAY:
                 raise BadFault(
-                    f"delay: from '{sender}' to '{receiver}' up to {late} ticks in all, more than {MAX_DELAY}"
+                    f"delay: up to {delay} ticks in total from '{sender}' to '{receiver}', "
+                    f"more than {MAX_DELAY}"
                 )
     return plan
 
@@ -66,23 +71,26 @@ def _link(text: str, pairs: Sequence[tuple[str, str]]) -> LinkSelector | None:
         return None
     match = _LINK.fullmatch(text)
     if match is None:
-        raise BadFault(f"link: '{text}' is none; one looks like a->b, a<->b or *")
+        raise BadFault(f"link: '{text}' is not a link; expected a->b, a<->b or *")
     one, other = match["one"], match["other"]
     if (one, other) not in pairs and (other, one) not in pairs:
-        raise BadFault(f"link: '{one}' and '{other}' are no pair of the scenario")
+        raise BadFault(f"link: '{one}' and '{other}' are not a pair of the scenario")
     return LinkSelector(one, other, both=match["way"] == "<->")
 
 
 def table_of(text: str) -> dict[str, Any]:
-    """The table that `text` stands for: `LINK: NAME=VALUE, ...`, without LINK for all. Raises BadFault."""
+    """Return the fault table of `text`, which is `LINK: NAME=VALUE, ...`; without LINK, all links.
+
+    Raises BadFault.
+    """
     link, colon, rest = text.rpartition(":")
     table: dict[str, Any] = {"link": link.strip()} if colon else {}
     for part in rest.split(","):
         name, equals, value = (piece.strip() for piece in part.partition("="))
         if not name:
-            raise BadFault(f"'{text}' says nothing; one looks like a->b: loss=0.3, delay=0..3")
+            raise BadFault(f"'{text}' has an empty entry; expected the form a->b: loss=0.3, delay=0..3")
         if name in table:
-            raise BadFault(f"{name}: said twice")
+            raise BadFault(f"{name}: given twice")
         table[name] = _value(name, value) if equals else True
     try:
         msgspec.convert(table, FaultTable)
@@ -92,7 +100,7 @@ def table_of(text: str) -> dict[str, Any]:
 
 
 def _named(error: str) -> str:
-    """msgspec's error, with the field in front."""
+    """Return msgspec's error with the field in front."""
     what, _, where = error.partition(" - at `$")
     unknown = re.fullmatch(r"Object contains unknown field `(.*)`", what, re.DOTALL)
     if unknown is not None:

@@ -1,4 +1,4 @@
-"""`--kill` and `[[kill]]`: processes that kill themselves where they are told to, to be started again."""
+"""Scheduled kills, from `--kill` and `[[kill]]`: a process kills itself, and the launcher restarts it."""
 
 from __future__ import annotations
 
@@ -15,14 +15,20 @@ from msgspec import Meta
 from protocol.spelling import did_you_mean
 
 Point = Literal["observation", "report", "journal", "command"]
-"""How far a tick has come. An agent's: its Observation is there, and nothing on record; its Report is sent; its
-Command is on record, and not sent; it is sent. The world's: no Observation is sent; all are; all Commands are on
-record, and nobody has moved; all Commands are there, and not on record."""
+"""A point of a tick at which a process can be killed.
+
+| point | in an agent | in the world |
+|---|---|---|
+| observation | the Observation has arrived and is not journaled | no Observation has been sent |
+| report | the Report has been sent | all Observations have been sent |
+| journal | the Command is journaled and not sent | all Commands are journaled, no robot has moved |
+| command | the Command has been sent | all Commands have arrived and are not journaled |
+"""
 
 POINTS: tuple[Point, ...] = get_args(Point)
 WORLD = "world"
 DRAWN = "?"
-"""whoever, or wherever in the tick, the seed says"""
+"""The value of `who` or `point` that is drawn from the seed."""
 _Tick = Annotated[int, Meta(ge=0, le=999_999_999)]
 _FORM = re.compile(
     r"(?P<who>[A-Za-z0-9_-]{1,32})@(?P<tick>[0-9]{1,9})(?::(?P<point>observation|report|journal|command))?"
@@ -31,50 +37,53 @@ _FORM = re.compile(
 
 
 class BadKill(ValueError):
-    """A text that says no kill; says what one looks like."""
+    """An invalid kill; the text says what is wrong or what a kill looks like."""
 
 
 class Kill(msgspec.Struct, frozen=True):
-    """One process, killed once."""
+    """One kill of one process."""
 
     who: str
-    """a robot, or WORLD"""
+    """The id of a robot, or WORLD."""
     tick: int
     point: Point
     after: float | None
-    """s until it is started again; none is never"""
+    """Time in s until the process is restarted; None if it is not restarted."""
     text: str
-    """as it was written"""
+    """The kill as the user wrote it."""
 
     @property
     def process(self) -> str:
-        """What the launcher calls it."""
+        """The launcher's name for the process."""
         return WORLD if self.who == WORLD else f"agent {self.who}"
 
     @property
     def last_words(self) -> str:
-        """What the process says when it takes it."""
+        """The line that the process writes to standard error just before it kills itself."""
         return f"--kill {self.text}: taken"
 
 
 class KillTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """[[kill]]: what `--kill` says, or that it is to be drawn from the seed."""
+    """A `[[kill]]` table: the fields of `--kill`, each of which can be drawn from the seed."""
 
     who: str | list[str] = DRAWN
-    """a robot, or WORLD; or several, all of them in the one tick"""
+    """The id of a robot, WORLD or DRAWN; or a list of them, which are killed in the same tick."""
     tick: _Tick | Annotated[list[_Tick], Meta(min_length=2, max_length=2)] = 0
-    """or drawn between two, both included"""
+    """The tick, or the bounds between which it is drawn, both included."""
     point: Literal["observation", "report", "journal", "command", "?"] = "observation"
-    """of each that is killed, where it is drawn"""
+    """The point of the tick; if DRAWN, it is drawn separately for each process."""
     after: Annotated[float, Meta(ge=0.0, le=999_999.0)] | Literal["never"] = 0.0
-    """s until each is started again"""
+    """Time in s until each process is restarted."""
 
     def kills(self, draw: random.Random, anyone: Sequence[str]) -> list[Kill]:
-        """Those that `draw` makes of it, among `anyone`. Raises BadKill, whose text begins with the field."""
+        """Return the kills of this table, with open fields drawn from `draw` and processes from `anyone`.
+
+        Raises BadKill, whose text begins with the field.
+        """
         named = self.who if isinstance(self.who, list) else [self.who]
         least, most = self.tick if isinstance(self.tick, list) else (self.tick, self.tick)
         if least > most:
-            raise BadKill(f"tick: from {least} to {most} is backwards")
+            raise BadKill(f"tick: the lower bound {least} is above the upper bound {most}")
         tick = draw.randint(least, most)
         after = f"+{self.after:.6f}s" if self.after != "never" else "+never"
         found = []
@@ -89,7 +98,11 @@ class KillTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def drawn(tables: Sequence[KillTable], seed: int, robots: Sequence[str]) -> tuple[Kill, ...]:
-    """What the tables of a scenario come to. Raises BadKill, whose text begins with the field."""
+    """Return the kills of all `[[kill]]` tables of a scenario.
+
+    Each table has its own random stream, keyed by `seed` and the place of the table. Raises BadKill, whose
+    text begins with the field.
+    """
     kills: list[Kill] = []
     for i, table in enumerate(tables):
         try:
@@ -100,12 +113,15 @@ def drawn(tables: Sequence[KillTable], seed: int, robots: Sequence[str]) -> tupl
 
 
 def parse(text: str) -> Kill:
-    """`a@17`, `b@20:report`, `world@30:journal+5s`, `a@17+never`. Raises BadKill."""
+    """Return the kill that `text` describes.
+
+    Examples are `a@17`, `b@20:report`, `world@30:journal+5s` and `a@17+never`. Raises BadKill.
+    """
     match = _FORM.fullmatch(text)
     if match is None:
         raise BadKill(
-            f"'{text}' is no kill; one is a@17, b@20:report, world@30:journal+5s or a@17:command+never, "
-            "and the points of a tick are observation, report, journal, command"
+            f"'{text}' is not a kill; expected a@17, b@20:report, world@30:journal+5s or a@17:command+never; "
+            "the points of a tick are observation, report, journal and command"
         )
     after = None if match["never"] else float(match["after"] or 0.0)
     point = cast(Point, match["point"] or "observation")
@@ -113,7 +129,10 @@ def parse(text: str) -> Kill:
 
 
 def taker(kills: Sequence[Kill]) -> Callable[[str, int], None] | None:
-    """What the process that is to take `kills` calls wherever it comes to a point; none if there are none."""
+    """Return a callback that kills this process at its scheduled points; None if there are no `kills`.
+
+    The process calls it with the point and the tick at every point of every tick.
+    """
     if not kills:
         return None
     fatal: dict[tuple[str, int], Kill] = {(kill.point, kill.tick): kill for kill in kills}
@@ -127,9 +146,9 @@ def taker(kills: Sequence[Kill]) -> Callable[[str, int], None] | None:
     return on_kill_point
 
 
-def taken(kills: Sequence[Kill], said: str) -> Kill | None:
-    """Which of `kills` a process took that has been killed, and has said so at the end."""
+def taken(kills: Sequence[Kill], errors: str) -> Kill | None:
+    """Return the kill that ended a process, from the end of its standard error `errors`; None if none did."""
     for kill in kills:
-        if said.endswith(kill.last_words):
+        if errors.endswith(kill.last_words):
             return kill
     return None

@@ -1,4 +1,4 @@
-"""A TOML file -> a validated scenario, or one line that names the file and the field."""
+"""Scenario files: TOML is read and validated; invalid input is one line with the file and the field."""
 
 from __future__ import annotations
 
@@ -42,17 +42,17 @@ from world.scenario import RobotSpec, Scenario
 
 MAX_TICKS = 10**9
 MAX_ROBOTS = 200
-"""so many that the truth about all of them fits a frame"""
+"""The largest number of robots, so that a GroundTruth message of all of them fits a frame."""
 Place = Annotated[float, Meta(ge=-1e6, le=1e6)]
-"""m: nobody gets so far from there that `units.Coordinate` would not hold it"""
+"""A coordinate in m. No robot can drive so far from it that it leaves the range of `units.Coordinate`."""
 EXCHANGES = 20
-"""reports for which a mission may have to wait as long as they hardly ever take"""
+"""The number of reports for each of which `max_ticks` allows the full `delivery_time_bound`."""
 NEAREST_ANCHORS = TOLERANCE
-"""m: two that are nearer are in one place, as exactly as poses are claimed"""
+"""The minimum distance in m of two anchors: nearer ones coincide at the accuracy of exact claims."""
 TICK_S = (5e-4, 3600.0)
-"""s of wall time that a tick in real time may last"""
+"""The bounds in s of the wall time of a tick in real time."""
 WITHIN = 1.0 - 1e-9
-"""of R: how far out a start is drawn at the most, so that rounding does not carry it outside"""
+"""The part of R within which starts are drawn, so that rounding cannot move one outside."""
 
 
 CHOICES: dict[str, tuple[str, ...]] = {
@@ -61,42 +61,42 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "part": get_args(Part),
     "point": (*POINTS, DRAWN),
 }
-"""of the fields that take one of a few words"""
+"""The permitted values of each field that takes one of a few words."""
 
 
 class BadScenario(UserError):
-    """The user's scenario cannot be played; the text names the file, the field and what is wrong."""
+    """An invalid scenario; the text names the file, the field and what is wrong."""
 
 
 class Unworkable(BadScenario):
-    """The scenario is sound, but no mission could be played in its setting; the text says why."""
+    """A valid scenario whose mission cannot succeed or cannot be run; the text says why."""
 
 
 class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A table of the file: a field that it does not know is a typo."""
+    """A table of the file. Unknown fields are errors, because they are typing mistakes."""
 
 
 class PlannerTable(_Table, frozen=True):
-    """[planner]"""
+    """The `[planner]` table."""
 
     name: PlannerName = "assured"
 
 
 class RobotTable(_Table, frozen=True):
-    """[[robot]]"""
+    """A `[[robot]]` table."""
 
     id: RobotId
     anchor: tuple[Place, Place]
     start: tuple[Place, Place, Annotated[float, Meta(ge=-1e6, le=1e6)]] | None = None
-    """x, y in m, heading in rad; drawn from the seed inside the sensing range where it is left out"""
+    """Start pose x, y in m and heading in rad; None: drawn from the seed, within range of the anchor."""
     peer: RobotId | None = None
-    """needed only with more than two robots"""
+    """Id of the peer; required with more than two robots."""
     attack: Attack | None = None
-    """what it tells its peer instead of the truth"""
+    """False data injection: the falsification of the reports that this robot sends to its peer."""
 
 
 class ScenarioFile(_Table, frozen=True):
-    """What a scenario file may say."""
+    """The content of a scenario file."""
 
     name: Annotated[str, Meta(pattern=NAME, max_length=48)]
     mission: Mission
@@ -105,20 +105,20 @@ class ScenarioFile(_Table, frozen=True):
     max_ticks: Annotated[int, Meta(ge=1, le=MAX_TICKS)] | None = None
     planner: PlannerTable = PlannerTable()
     fault: list[FaultTable] = []
-    """of the radio, one befalling a report after the other"""
+    """Faults of the radio, applied to each report one after the other."""
     kill: list[KillTable] = []
-    """of processes: the world knows nothing of it, and no record tells"""
+    """Kills of processes. They are not part of the Scenario and do not appear in the recording."""
 
 
 class ScenarioTemplate(msgspec.Struct, frozen=True):
-    """A scenario file found good, and the scenario that it makes; another draw from it is cheap."""
+    """A validated scenario file with its scenario, from which scenarios of other seeds are drawn cheaply."""
 
     file: ScenarioFile
     scenario: Scenario
-    """with the seed of the file"""
+    """Scenario with the seed of the file."""
 
     def seeded(self, seed: int | None) -> Scenario:
-        """The same, with what the file leaves open drawn from `seed`, if there is one."""
+        """Return the scenario with open starts drawn from `seed`; None stands for the seed of the file."""
         if seed is None:
             return self.scenario
         reach = self.file.mission.sensing_range
@@ -134,33 +134,36 @@ class ScenarioTemplate(msgspec.Struct, frozen=True):
         )
 
     def kills(self, seed: int) -> tuple[Kill, ...]:
-        """Who is killed, and when; what the file leaves open is drawn from `seed`. Raises BadKill."""
+        """Return the kills of the file, with open fields drawn from `seed`. Raises BadKill."""
         return drawn(self.file.kill, seed, [robot.id for robot in self.file.robot])
 
 
 def shipped(package: str = "scenario") -> dict[str, Path]:
-    """The scenarios that come with Tandem, by name; or the sweeps, for the package `sweep`."""
+    """Return the shipped scenario files by name; for the package `sweep`, the shipped sweep files."""
     path = Path(str(resources.files("compose") / package / "shipped"))
     return {file.stem: file for file in sorted(path.glob("*.toml"))}
 
 
 SHIPPED = {"scenario": ("scenario", "run"), "sweep": ("sweep", "sweep")}
-"""of each folder: what a file in it is, and the command that plays it"""
+"""The kind of file in each package, and the command that runs it."""
 
 
 def unknown(source: str, folder: str) -> str:
-    """Return why there is nothing called `source` to be read, where a file of `folder` was expected."""
+    """Return an error message: `source` is neither a file nor a shipped file of the package `folder`."""
     names = {one: shipped(one) for one in SHIPPED}
     for other, (kind, command) in SHIPPED.items():
         if other != folder and source in names[other]:
-            return f"{source} is a {kind}: `tandem {command} {source}` plays it"
+            return f"{source} is a {kind}; run it with `tandem {command} {source}`"
     near = did_you_mean(source, [name for found in names.values() for name in found])
     ships = ", ".join(names[folder])
-    return f"{source}: neither a file nor a {SHIPPED[folder][0]} that ships ({ships}){near}"
+    return f"{source}: neither a file nor a shipped {SHIPPED[folder][0]} ({ships}){near}"
 
 
 def run_name(scenario: Scenario, out: Path | None = None) -> str:
-    """A name for a run of it that no other run has; the same again for one that goes on in `out`."""
+    """Return a unique name for a run of `scenario`.
+
+    With `out`, the name follows from the host and that folder, so that a resumed run has its name again.
+    """
     mark = secrets.token_hex(3)
     if out is not None:
         mark = hashlib.blake2s(f"{platform.node()}:{out.resolve()}".encode(), digest_size=3).hexdigest()
@@ -168,7 +171,7 @@ def run_name(scenario: Scenario, out: Path | None = None) -> str:
 
 
 def check_rate(scenario: Scenario, rate: float | None) -> None:
-    """Raises UserError where `rate` makes a tick last no sensible time."""
+    """Raise UserError if a tick at `rate` would last less or more than TICK_S permits."""
     shortest, longest = TICK_S
     if rate is not None and not shortest <= scenario.mission.period / rate <= longest:
         period = scenario.mission.period
@@ -179,15 +182,15 @@ def check_rate(scenario: Scenario, rate: float | None) -> None:
 
 
 def load(source: str, *, seed: int | None = None, faults: Sequence[str] = ()) -> Scenario:
-    """The scenario of that name, or in the file at that path; `seed` overrides its own.
+    """Return the shipped scenario named `source`, or the one in the file at that path.
 
-    `faults` are added to its own. Raises UserError: NotToml or BadScenario.
+    `seed` replaces the seed of the file; `faults` are added to its faults. Raises NotToml and BadScenario.
     """
     return setting(source, faults).seeded(seed)
 
 
 def setting(source: str, faults: Sequence[str] = ()) -> ScenarioTemplate:
-    """That of the scenario of that name, or in the file at that path, with `faults`.
+    """Return the template of the shipped scenario named `source`, or of the file at that path, with `faults`.
 
     Raises NotToml and BadScenario.
     """
@@ -202,7 +205,7 @@ def setting(source: str, faults: Sequence[str] = ()) -> ScenarioTemplate:
 
 
 def parse(text: str, source: str, *, seed: int | None = None, faults: Sequence[str] = ()) -> Scenario:
-    """The scenario in `text`, with `faults`.
+    """Return the scenario in `text`, with `faults` added to its own.
 
     Raises NotToml and BadScenario, whose texts begin with `source`.
     """
@@ -210,9 +213,9 @@ def parse(text: str, source: str, *, seed: int | None = None, faults: Sequence[s
 
 
 def validate(table: Mapping[str, Any], source: str, faults: Sequence[str] = ()) -> ScenarioTemplate:
-    """The setting that the table of a scenario file describes, with `faults`.
+    """Return the template of the scenario file whose content is `table`, with `faults` added to its own.
 
-    Raises BadScenario and Unworkable.
+    Raises BadScenario and Unworkable, whose texts begin with `source`.
     """
     try:
         file = msgspec.convert(table, ScenarioFile)
@@ -226,7 +229,8 @@ def validate(table: Mapping[str, Any], source: str, faults: Sequence[str] = ()) 
     return found
 
 
-def _validated(file: ScenarioFile, source: str, told: Sequence[str]) -> Scenario:
+def _validated(file: ScenarioFile, source: str, options: Sequence[str]) -> Scenario:
+    """Return the scenario of `file`, with the faults of the `--fault` options added to its own."""
     _check_noise(file.mission, source)
     peers = _peers(file.robot, source)
     place = {robot.id: i for i, robot in enumerate(file.robot)}
@@ -246,22 +250,22 @@ def _validated(file: ScenarioFile, source: str, told: Sequence[str]) -> Scenario
             )
         if robot.attack is not None and robot.attack.kind in OF_THE_START and robot.attack.part != "all":
             raise BadScenario(
-                f"{source}: robot[{i}].attack.part: a lie of the {robot.attack.kind} is of the beginning, "
-                "and so of all"
+                f"{source}: robot[{i}].attack.part: an attack of kind {robot.attack.kind} changes "
+                "the start, so part must be 'all'"
             )
         placed.append(
             RobotSpec(robot.id, peer, role, Anchor(*robot.anchor), start, plans[robot.id], robot.attack)
         )
-    faults = _faults(file, told, list(peers.items()), source)
+    faults = _faults(file, options, list(peers.items()), source)
     budget = max(tick_budget(file.mission, plan) for plan in plans.values())
-    held_up = EXCHANGES * delivery_time_bound(faults) if faults else 0
-    if file.max_ticks is None and budget + held_up > MAX_TICKS:
-        what = "mission: to meet" if budget > MAX_TICKS else "fault: what befalls the reports"
-        raise Unworkable(f"{source}: {what} could take {budget + held_up} ticks, more than {MAX_TICKS}")
+    delay = EXCHANGES * delivery_time_bound(faults) if faults else 0
+    if file.max_ticks is None and budget + delay > MAX_TICKS:
+        cause = "mission: the rendezvous" if budget > MAX_TICKS else "fault: the delivery of reports"
+        raise Unworkable(f"{source}: {cause} could take {budget + delay} ticks, more than {MAX_TICKS}")
     scenario = Scenario(
         name=file.name,
         seed=file.seed,
-        max_ticks=file.max_ticks if file.max_ticks is not None else budget + held_up,
+        max_ticks=file.max_ticks if file.max_ticks is not None else budget + delay,
         mission=file.mission,
         planner_name=file.planner.name,
         robots=tuple(placed),
@@ -271,21 +275,24 @@ def _validated(file: ScenarioFile, source: str, told: Sequence[str]) -> Scenario
         for one in scenario.robots:
             decode(encode(scenario.config(one.id)), RobotConfig)
     except MalformedFrame as error:
-        raise Unworkable(f"{source}: mission: no robot could be told of it: {error}") from None
+        raise Unworkable(f"{source}: mission: a robot's configuration cannot be encoded: {error}") from None
     return scenario
 
 
 def _faults(
-    file: ScenarioFile, told: Sequence[str], pairs: Sequence[tuple[str, str]], source: str
+    file: ScenarioFile, options: Sequence[str], pairs: Sequence[tuple[str, str]], source: str
 ) -> tuple[Fault, ...]:
-    """The plan: those of the file, then those of the command line; `pairs` both ways."""
+    """Return the fault plan: the faults of the file, then those of the `--fault` options.
+
+    `pairs` holds each pair of robots in both orders.
+    """
     plan: tuple[Fault, ...] = ()
     for i, table in enumerate(file.fault):
         try:
             plan = added(plan, table, pairs)
         except BadFault as error:
             raise BadScenario(f"{source}: fault[{i}].{error}") from None
-    for text in told:
+    for text in options:
         try:
             plan = added(plan, msgspec.convert(table_of(text), FaultTable), pairs)
         except BadFault as error:
@@ -294,12 +301,12 @@ def _faults(
 
 
 def _check_noise(mission: Mission, source: str) -> None:
-    """Raises BadScenario, and Unworkable where there is so much of it that no robot could be sure."""
+    """Raise BadScenario if the noise is invalid, Unworkable if robots cannot localise or drive safely."""
     least, most = mission.noise.outlier_bias
     if least > most:
         raise BadScenario(
-            f"{source}: mission.noise.outlier_bias: the least, {least:.6g} m, is more than the most, "
-            f"{most:.6g} m"
+            f"{source}: mission.noise.outlier_bias: the lower bound {least:.6g} m is above the upper "
+            f"bound {most:.6g} m"
         )
     why = noise_infeasibility(mission) or safety_infeasibility(mission)
     if why is not None:
@@ -307,12 +314,12 @@ def _check_noise(mission: Mission, source: str) -> None:
 
 
 def _plan(file: ScenarioFile, first: int, second: int, source: str) -> Rendezvous:
-    """How the two are to meet."""
+    """Return the rendezvous orbits of the pair of robots at the places `first` and `second` in the file."""
     distance = math.dist(file.robot[first].anchor, file.robot[second].anchor)
     if distance < NEAREST_ANCHORS:
         raise BadScenario(
-            f"{source}: robot[{second}].anchor: less than {NEAREST_ANCHORS:g} m from that of its peer "
-            f"'{file.robot[first].id}'"
+            f"{source}: robot[{second}].anchor: less than {NEAREST_ANCHORS:g} m from the anchor of "
+            f"its peer '{file.robot[first].id}'"
         )
     why = infeasibility(file.mission, distance)
     if why is not None:
@@ -321,10 +328,10 @@ def _plan(file: ScenarioFile, first: int, second: int, source: str) -> Rendezvou
 
 
 def _peers(robots: list[RobotTable], source: str) -> dict[str, str]:
-    """Everyone's peer. Two robots are each other's; more of them have to say it."""
+    """Return the peer of each robot. With two robots, each is the peer of the other by default."""
     for name, count in Counter(robot.id for robot in robots).items():
         if count > 1:
-            raise BadScenario(f"{source}: robot.id: {count} robots are called '{name}'")
+            raise BadScenario(f"{source}: robot.id: {count} robots have the id '{name}'")
     ids = [robot.id for robot in robots]
     if len(robots) == 2 and all(robot.peer is None for robot in robots):
         return {ids[0]: ids[1], ids[1]: ids[0]}
@@ -332,7 +339,7 @@ def _peers(robots: list[RobotTable], source: str) -> dict[str, str]:
     for i, robot in enumerate(robots):
         if robot.peer is None:
             raise BadScenario(
-                f"{source}: robot[{i}].peer: '{robot.id}' needs one: of {len(ids)} robots, two are a pair"
+                f"{source}: robot[{i}].peer: '{robot.id}' needs a peer, because there are {len(ids)} robots"
             )
         if robot.peer not in ids:
             near = did_you_mean(robot.peer, ids)
@@ -342,16 +349,20 @@ def _peers(robots: list[RobotTable], source: str) -> dict[str, str]:
         if peers[robot.id] == robot.id or peers[peers[robot.id]] != robot.id:
             raise BadScenario(
                 f"{source}: robot[{i}].peer: '{robot.id}' names '{robot.peer}', whose peer is "
-                f"'{peers[peers[robot.id]]}'; robots come in pairs"
+                f"'{peers[peers[robot.id]]}'; robots must form pairs"
             )
     return peers
 
 
 def _start(robot: RobotTable, sensing_range: float, seed: int) -> Pose:
-    """Where the robot is released: as the file says, or uniform in its anchor's range, any heading."""
+    """Return the start pose in the file, or one drawn uniformly from the disc of its anchor's range.
+
+    A drawn heading is uniform in [0, 2 pi).
+    """
     if robot.start is not None:
         x, y, heading = robot.start
-        return Pose(x, y, heading if abs(heading) <= TAU else wrap(heading))  # many turns would cost digits
+        # many turns are removed here, because trigonometric functions of large angles lose digits
+        return Pose(x, y, heading if abs(heading) <= TAU else wrap(heading))
     draw = random.Random(f"{seed}/start/{robot.id}").random
     radius = WITHIN * sensing_range * math.sqrt(draw())
     bearing, heading = TAU * draw(), TAU * draw()

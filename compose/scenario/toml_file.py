@@ -1,4 +1,4 @@
-"""A TOML file that a user has written: its text, its table, and what is wrong in it, the field in front."""
+"""Reading of TOML files written by users, and error messages that begin with the field."""
 
 from __future__ import annotations
 
@@ -14,11 +14,14 @@ from protocol import files
 
 
 class NotToml(UserError):
-    """The text names the file, and where it is not TOML."""
+    """A file that is not TOML; the text names the file and the place of the error."""
 
 
 def read_text(path: Path) -> str:
-    """What the file says. Raises FileNotFoundError, and ValueError, whose text says why it cannot be read."""
+    """Return the text of the file.
+
+    Raises FileNotFoundError, and ValueError whose text says why the file cannot be read.
+    """
     try:
         return files.read_text(path)
     except FileNotFoundError:
@@ -30,17 +33,20 @@ def read_text(path: Path) -> str:
 
 
 def table_in(text: str, source: str) -> dict[str, Any]:
-    """The TOML in `text`, whatever it says. Raises NotToml, whose text begins with `source`."""
+    """Return the table of the TOML in `text`, without validation.
+
+    Raises NotToml, whose text begins with `source`.
+    """
     try:
         return msgspec.toml.decode(text, type=dict[str, Any])
-    except (ValueError, RecursionError) as error:  # of msgspec, or of the TOML library beneath it
+    except (ValueError, RecursionError) as error:  # from msgspec or from its TOML parser
         raise NotToml(f"{source}: not TOML: {error}") from None
 
 
 def field_first(error: str, choices: Mapping[str, Sequence[str]]) -> str:
-    """msgspec's "Expected `float`, got `str` - at `$.mission.period`", with the field in front.
+    """Return msgspec's `error` with the field in front: "mission.period: expected 'float', got 'str'".
 
-    `choices` are of the fields that take one of a few words.
+    `choices` are the permitted values of each field that takes one of a few words.
     """
     match = re.fullmatch(r"(?P<what>.*?)(?: - at `\$\.?(?P<where>.*)`)?", error, re.DOTALL)
     assert match is not None
@@ -53,5 +59,5 @@ def field_first(error: str, choices: Mapping[str, Sequence[str]]) -> str:
             f"there is no {what.removeprefix('invalid enum value ')}; there are {', '.join(choices[field])}"
         )
     if "matching regex" in what:
-        what = "no name: letters, digits, - and _, a letter or digit first"
+        what = "invalid name: use letters, digits, - and _, and begin with a letter or digit"
     return f"{match['where']}: {what}" if match["where"] else what

@@ -1,8 +1,8 @@
-"""Certificates for everybody who takes part in missions, and the Zenoh configurations that go with them.
+"""Certificates for all participants of missions, and their Zenoh configurations.
 
-A folder for each: its certificate and key, the authority's certificate, and a configuration that names these,
-asks everybody else for theirs, and lets pass what protocol/network/access_control.py allows. The
-configuration serves Tandem (--keys) as well as a Zenoh router of any other make.
+Each participant has a folder with its certificate and key, the authority's certificate, and a configuration.
+The configuration names these files, requires certificates of all other participants, and enforces the rules
+of protocol/network/access_control.py. Both Tandem (`--keys`) and the official Zenoh router can use it.
 """
 
 from __future__ import annotations
@@ -33,63 +33,64 @@ from protocol import files
 from protocol.network import access_control
 
 AUTHORITY_DAYS = 36_500
-"""as long as certificates may last"""
+"""The validity of the authority's certificate in days."""
 SKEW = timedelta(days=1)
-"""by how much a robot's clock may be behind"""
+"""The time by which a participant's clock may be behind."""
 SECRET = 0o600
-"""only the owner reads such a file, from the first byte on"""
+"""The mode with which a secret file is created: only its owner can read it."""
 GITIGNORE = ".gitignore"
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
-"""names that everybody who may be a router has"""
+"""The host names in every certificate."""
 
 
 class BadKeys(ValueError):
-    """What is in the folder is none of ours, or cannot be written; says what."""
+    """A folder that `make` did not create, or that is damaged; the text says what is wrong."""
 
 
 class Authority(NamedTuple):
-    """Who signs."""
+    """The certificate authority, with its private key."""
 
     certificate: x509.Certificate
     key: ec.EllipticCurvePrivateKey
 
 
 def make(folder: Path, robots: Sequence[str], hosts: Sequence[str], days: int) -> tuple[list[str], list[str]]:
-    """Who has got a certificate, and who had one, which is kept; `folder` has then a folder for each.
+    """Create the missing participants' folders in `folder`; return the created names and the existing ones.
 
-    The robots are `robots`, and those that have a folder. Routers and the world are known by `hosts`, too.
-    Raises BadKeys or OSError.
+    The participants are the router, the world, the viewer, and the agents of `robots` and of robots that have
+    a folder. Certificates are valid for `days`; those of the router and the world also name `hosts`. Existing
+    certificates are not changed; all configurations are written again. Raises BadKeys or OSError.
     """
     folder.mkdir(parents=True, exist_ok=True)
     authority = _authority(folder)
     if not (folder / GITIGNORE).exists():
-        files.write(folder / GITIGNORE, "# Keys do not belong into a repository.\n*\n")
+        files.write(folder / GITIGNORE, "# Keys do not belong in a repository.\n*\n")
     known = {path.parent.name.removeprefix("agent-") for path in folder.glob(f"agent-*/{KEYED}")}
-    everyone = sorted(known | set(robots))
-    made, kept = [], []
+    agents = sorted(known | set(robots))
+    created, existing = [], []
     for name in (
         access_control.ROUTER,
         access_control.WORLD,
         access_control.VIEWER,
-        *(access_control.agent(robot) for robot in everyone),
+        *(access_control.agent(robot) for robot in agents),
     ):
         own = folder / name
         if own.exists():
             for file in ("cert.pem", "key.pem", "ca.pem"):
                 if not (own / file).is_file():
-                    raise BadKeys(f"{own} has no {file}; remove the folder, and it is made anew")
+                    raise BadKeys(f"{own} has no {file}; remove the folder, and it is created again")
             if files.read_bytes(own / "ca.pem") != files.read_bytes(folder / "ca.pem"):
                 raise BadKeys(f"{own} is of another authority than {folder / 'ca.pem'}")
-            kept.append(name)
+            existing.append(name)
         else:
             _participant(own, name, authority, hosts, days)
-            made.append(name)
-        files.write(own / KEYED, configuration(name, everyone))
-    return made, kept
+            created.append(name)
+        files.write(own / KEYED, configuration(name, agents))
+    return created, existing
 
 
 def configuration(name: str, robots: Sequence[str]) -> str:
-    """The Zenoh configuration of a participant, whose files lie beside it."""
+    """Return the Zenoh configuration of a participant, which is in the same folder as its files."""
     settings = {
         "metadata": {"participant": name},
         "transport": {
@@ -108,11 +109,11 @@ def configuration(name: str, robots: Sequence[str]) -> str:
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "access_control": access_control.access_control(robots),
     }
-    return f"// Made by `tandem keys`, and made anew each time.\n{json.dumps(settings, indent=1)}\n"
+    return f"// Written by `tandem keys`, and overwritten each time.\n{json.dumps(settings, indent=1)}\n"
 
 
 def _authority(folder: Path) -> Authority:
-    """That of the folder, made if it has none."""
+    """Return the authority of `folder`; create it if the folder is empty. Raises BadKeys."""
     certificate, key = folder / "ca.pem", folder / "ca-key.pem"
     if certificate.exists() and key.exists():
         try:
@@ -124,7 +125,7 @@ def _authority(folder: Path) -> Authority:
             raise BadKeys(f"{key} is not the key of {certificate}")
         return Authority(found, private)
     if any(path.name != GITIGNORE and path.suffix != files.DRAFT for path in folder.iterdir()):
-        raise BadKeys(f"{folder} is not empty, and holds no ca.pem with ca-key.pem; choose another folder")
+        raise BadKeys(f"{folder} is not empty and has no ca.pem with ca-key.pem; choose another folder")
     private = ec.generate_private_key(ec.SECP256R1())
     name = _name(f"Tandem {x509.random_serial_number() % 16**8:08x}")
     now = datetime.now(UTC)
@@ -141,14 +142,14 @@ def _authority(folder: Path) -> Authority:
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(private.public_key()), critical=False)
         .sign(private, hashes.SHA256())
     )
-    with files.draft(key, SECRET) as one, files.draft(certificate) as other:  # neither, if one has no room
+    with files.draft(key, SECRET) as one, files.draft(certificate) as other:  # both files or none
         one.write_bytes(_pem(private))
         other.write_bytes(signed.public_bytes(Encoding.PEM))
     return Authority(signed, private)
 
 
 def _participant(own: Path, name: str, authority: Authority, hosts: Sequence[str], days: int) -> None:
-    """A folder with all that one machine needs; it is there as a whole, or not at all."""
+    """Create the folder `own` with the key and certificates of a participant, completely or not at all."""
     private = ec.generate_private_key(ec.SECP256R1())
     names = (*LOOPBACK, *hosts) if name in access_control.CARRIERS else LOOPBACK
     issued = issue(authority, name, private.public_key(), names, timedelta(days=days))
@@ -170,7 +171,7 @@ def issue(
     hosts: Sequence[str],
     lasts: timedelta,
 ) -> x509.Certificate:
-    """A certificate of `name`, to connect with, and to listen with at `hosts`; it `lasts` from now on."""
+    """Return a certificate of `name` for connecting and for listening at `hosts`, valid for `lasts`."""
     now = datetime.now(UTC)
     key_id = x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key())
     uses = [ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH]
@@ -194,7 +195,7 @@ def issue(
 
 
 def is_host(text: str) -> bool:
-    """Whether a certificate can bear it: an address, or a name of letters, digits, - and dots."""
+    """Return whether `text` is an IP address, or a host name of letters, digits, - and dots."""
     try:
         ipaddress.ip_address(text)
     except ValueError:

@@ -1,1 +1,1 @@
-"""What commands print: progress, outcome, tables."""
+"""The terminal output of commands: progress, outcome and tables."""

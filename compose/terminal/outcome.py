@@ -1,4 +1,4 @@
-"""What is told of a run: while it runs, at its end, or where it breaks off."""
+"""The terminal output of a run, and the files derived from it at its end."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from world.scenario import Scenario
 
 @contextmanager
 def shown_live(options: argparse.Namespace, scenario: Scenario, folder: Path) -> Iterator[None]:
-    """Show the run while it runs, where somebody can see it."""
+    """Show the progress of the run recorded in `folder`, if standard output is a terminal."""
     if options.quiet or not sys.stdout.isatty():
         yield
         return
-    from compose.terminal import progress  # noqa: PLC0415  # where nothing is shown, nothing is loaded to show it
+    from compose.terminal import progress  # noqa: PLC0415  # loaded only if it is used
 
     with progress.live(scenario, folder):
         yield
@@ -33,14 +33,14 @@ def shown_live(options: argparse.Namespace, scenario: Scenario, folder: Path) ->
 
 @contextmanager
 def counting(what: str, steps: int) -> Iterator[Callable[[], None]]:
-    """A bar of so many steps, if any, where somebody can see it; what is called after each of them."""
+    """Show a progress bar if standard output is a terminal; yield a callback that advances it a step."""
     if not steps or not sys.stdout.isatty():
         yield lambda: None
         return
     from rich.console import Console  # noqa: PLC0415  # as above
     from rich.progress import Progress, TimeElapsedColumn  # noqa: PLC0415
 
-    console = Console(soft_wrap=True)  # what is printed meanwhile is not broken into lines
+    console = Console(soft_wrap=True)  # other output is not wrapped
     with Progress(
         *Progress.get_default_columns(), TimeElapsedColumn(), console=console, transient=True
     ) as bar:
@@ -50,44 +50,45 @@ def counting(what: str, steps: int) -> Iterator[Callable[[], None]]:
 
 def conclude(
     options: argparse.Namespace,
-    played: run.Recording,
+    recording: run.Recording,
     folder: Path | None,
     mode: Mode,
     began: float,
 ) -> int:
-    """Say how it went, and leave the views of the record in `folder`, if it is to stay; the status.
+    """Print the outcome, write `summary.json` and `ticks.csv` if `--out` is given, return the exit status.
 
-    Raises UserError if there is no room for them.
+    `began` is the value of time.perf_counter at the start, in s. Raises UserError if the files cannot be
+    written.
     """
-    told = summary(played, mode, round(time.perf_counter() - began, 6))
+    result = summary(recording, mode, round(time.perf_counter() - began, 6))
     if options.quiet:
-        say(outcome_line(told))
+        say(outcome_line(result))
     else:
         from compose.terminal import progress  # noqa: PLC0415  # as above
 
-        progress.result(told, getattr(options, "rate", None))
+        progress.result(result, getattr(options, "rate", None))
     if folder is not None and options.out is not None:
         sys.stdout.flush()
         try:
-            leave(played, told, folder)
+            leave(recording, result, folder)
         except OSError as error:
             raise UserError(run.cannot_write(folder, error)) from None
-    return status_of(told["outcome"])
+    return status_of(result["outcome"])
 
 
 def break_off(options: argparse.Namespace, folder: Path, reason: str, began: float) -> None:
-    """Leave the views of a record that has no end, if it is to stay; as far as there is a record."""
+    """Write the derived files of a recording that breaks off, if `--out` is given and it is readable."""
     if options.out is None:
         return
     with suppress(OSError, ValueError):
-        played = run.read(folder)
-        told = summary(played, "processes", round(time.perf_counter() - began, 6))
-        leave(played, told | {"reason": reason}, folder)
+        recording = run.read(folder)
+        result = summary(recording, "processes", round(time.perf_counter() - began, 6))
+        leave(recording, result | {"reason": reason}, folder)
 
 
 def going_on(old: Retrace, inbox: Inbox) -> Journal:
-    """The journal of `old`, to be written on; says so if its end was torn. Raises CannotRecord."""
+    """Return the journal of `old`, open for appending; report a torn end. Raises CannotRecord."""
     journal, cut = old.go_on()
     if cut:
-        inbox.say(f"{old.path}: the last {cut} bytes were torn, and are cut off")
+        inbox.say(f"{old.path}: the last {cut} bytes are of a torn write and are cut off")
     return journal

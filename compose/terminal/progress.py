@@ -1,4 +1,4 @@
-"""What a run shows on a terminal: each robot's phase, state and tick while it runs; a table at its end."""
+"""The live table of a run, with each robot's phase and state, and the table at its end."""
 
 from __future__ import annotations
 
@@ -19,32 +19,32 @@ from protocol.output import one_line, say
 from protocol.wire import MAX_FRAME_BYTES, decode
 from world.scenario import Scenario
 
-IS_AT, THINKS, ERROR, SIGMA = "is at x, y, heading", "thinks it is at", "error m", "sigma m"
+TRUTH, ESTIMATE, ERROR, SIGMA = "true x, y, heading", "estimate", "error m", "sigma m"
 RANGES, REPORTS, LATE = "ranges", "reports", "late"
 NOTES = (
-    (SIGMA, "sigma: of the position, as claimed"),
-    (LATE, "late: ticks in which it stood still, as its drive had not come in time"),
-    (ERROR, "m and rad"),
+    (SIGMA, "sigma: claimed, of the position"),
+    (LATE, "late: ticks in which the robot stopped because its command was late"),
+    (ERROR, "poses in m and rad"),
     (RANGES, "ranges to the anchor + to the peer"),
-    (REPORTS, "reports sent / heard"),
+    (REPORTS, "reports sent / received"),
 )
-"""each with the column that it is a footnote to"""
+"""The footnotes, each with its column."""
 CHOICES = (
-    (IS_AT, THINKS, ERROR, SIGMA, RANGES, REPORTS, LATE),
-    (THINKS, ERROR, SIGMA, RANGES, REPORTS, LATE),
+    (TRUTH, ESTIMATE, ERROR, SIGMA, RANGES, REPORTS, LATE),
+    (ESTIMATE, ERROR, SIGMA, RANGES, REPORTS, LATE),
     (ERROR, SIGMA, RANGES, REPORTS, LATE),
     (ERROR, SIGMA, LATE),
 )
-"""of the columns: the first that fits; sigma and late only where there is something to show"""
+"""Sets of columns, of which the first that fits is shown; empty columns SIGMA and LATE are omitted."""
 LISTED = 4
-"""robots that are listed with all their figures where a table of all columns does not fit"""
+"""The largest number of robots that are shown as a list if the table of all columns does not fit."""
 NAMED = 10
-"""robots that a sentence names at the most"""
+"""The largest number of robots named in a sentence."""
 
 
 @contextmanager
 def live(scenario: Scenario, folder: Path) -> Iterator[None]:
-    """Show the run whose record grows in `folder`, ten times a second."""
+    """Show the progress of the run recorded in `folder`, ten times a second."""
     journal = Tail(folder / WORLD_JOURNAL)
     commands: dict[str, Command] = {}
 
@@ -67,7 +67,7 @@ def live(scenario: Scenario, folder: Path) -> Iterator[None]:
         for robot in ids:
             command = commands.get(robot)
             if command is None:
-                rows.add_row(robot, "", "awaited", "", "")
+                rows.add_row(robot, "", "waiting for it", "", "")
             else:
                 rows.add_row(
                     robot,
@@ -89,13 +89,16 @@ def live(scenario: Scenario, folder: Path) -> Iterator[None]:
 
 
 def result(summary: Mapping[str, Any], rate: float | None = None) -> None:
-    """The table at the end of a run that went at `rate`, and what became of deadlines and FinalReports."""
+    """Print the table at the end of a run at `rate`, and the number of missed deadlines.
+
+    `summary` is the content of `summary.json`; `rate` is the speed relative to real time, None for lockstep.
+    """
     robots: Mapping[str, Any] = summary["robots"]
     exact = all(robot["covariance"] is None for robot in robots.values())
     late = {name: missed for name, robot in robots.items() if (missed := robot["deadlines_missed"])}
-    left_out = {*([SIGMA] if exact else []), *([] if late else [LATE])}
+    omitted = {*([SIGMA] if exact else []), *([] if late else [LATE])}
     for choice in CHOICES:
-        columns = [column for column in choice if column not in left_out]
+        columns = [column for column in choice if column not in omitted]
         cells = {name: _cells(robot, columns) for name, robot in robots.items()}
         rows = [(name, *of_robot.values()) for name, of_robot in cells.items()]
         made = tables.table(["robot"], columns, rows)
@@ -117,26 +120,26 @@ def result(summary: Mapping[str, Any], rate: float | None = None) -> None:
 
 
 def _missed(late: Mapping[str, int], ticks: int, rate: float | None) -> str:
-    """That deadlines were missed, by whom, and what to do about it."""
+    """Return the sentence on missed deadlines: the number of each robot, and the advice."""
     worst = sorted(late.items(), key=lambda one: -one[1])
     names = ", ".join([f"{name} {missed}" for name, missed in worst[:NAMED]])
     more = f" and {len(worst) - NAMED} more robots" if len(worst) > NAMED else ""
     slower = f", such as --rate {rate / 2:g}," if rate is not None else ""
-    return f"deadlines missed, of {ticks}: {names}{more}; a lower --rate{slower} leaves more time for each"
+    return f"deadlines missed, of {ticks}: {names}{more}; a lower --rate{slower} gives each robot more time"
 
 
 def _cells(robot: Mapping[str, Any], columns: Sequence[str]) -> dict[str, str]:
-    """What stands in its line, by column."""
-    all_of_it = {
-        IS_AT: _pose(robot["truth"]),
-        THINKS: _pose(robot["estimate"]),
+    """Return the cells of the robot's row, by column."""
+    cells = {
+        TRUTH: _pose(robot["truth"]),
+        ESTIMATE: _pose(robot["estimate"]),
         ERROR: _number(robot["position_error_m"], ".1e"),
         SIGMA: _number(robot["position_sigma_m"], ".1e"),
         RANGES: f"{_number(robot['anchor_ranges'])} + {_number(robot['mutual_ranges'])}",
         REPORTS: f"{_number(robot['reports_sent'])} / {_number(robot['reports_heard'])}",
         LATE: _number(robot["deadlines_missed"]),
     }
-    return {column: all_of_it[column] for column in columns}
+    return {column: cells[column] for column in columns}
 
 
 def _pose(pose: list[float] | None) -> str:

@@ -8,9 +8,9 @@ import textwrap
 from collections.abc import Iterable
 
 UNLIMITED = 1000
-"""the width in columns of an output that is not a terminal"""
+"""The width in columns of an output that is not a terminal."""
 LEAST = 20
-"""the minimum number of columns beside an indent"""
+"""The minimum number of columns beside an indent."""
 
 
 def room() -> int:
@@ -19,7 +19,7 @@ def room() -> int:
 
 
 def notes(wanted: Iterable[tuple[str, str]], columns: Iterable[str]) -> list[str]:
-    """Return the lines of the footnotes; `wanted` are pairs of a column and its note, `columns` are shown."""
+    """Return the lines of the footnotes of `columns`; `wanted` holds pairs of a column and its footnote."""
     shown = {*columns}
     return wrapped("; ".join([note for column, note in wanted if column in shown]))
 
