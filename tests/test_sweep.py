@@ -301,7 +301,7 @@ def test_a_sweep_that_is_killed_twice_goes_on_where_it_was(folder: Path) -> None
     (out / "parts" / "00000-99999999.parquet").write_bytes(b"torn")
     ended = sweep(folder, "lengthy.toml", "killed")
     assert ended.status == 1
-    assert ended.err.count("cannot be read: its trials are played again\n") == 1
+    assert ended.err.count("cannot be read: its trials will run again\n") == 1
     assert done > 1
     assert parts(out) == 0
     played(folder, "lengthy.toml", "straight")
@@ -391,14 +391,14 @@ def test_a_folder_of_another_sweep_is_refused(folder: Path) -> None:
     before = rows(folder / "out")
     (folder / "other.toml").write_text(RANDOM.replace("period = 1.0", "period = 0.5"))
     for was, new, says in (
-        ("seed = 5", "seed = 6", "seed is 5 there and 6 here"),
-        ("[10.0, 8]", "[10.0, 9]", "axis[0].values[1][0] is 8 there and 9 here"),
-        ("base.toml", "other.toml", "scenario.mission.period is 1 there and 0.5 here"),
+        ("seed = 5", "seed = 6", "seed is 5 in the folder and 6 in this sweep"),
+        ("[10.0, 8]", "[10.0, 9]", "axis[0].values[1][0] is 8 in the folder and 9 in this sweep"),
+        ("base.toml", "other.toml", "scenario.mission.period is 1 in the folder and 0.5 in this sweep"),
     ):
         (folder / "both.toml").write_text(BOTH.replace(was, new))
         with pytest.raises(UserError) as refused:
             played(folder, "both.toml", "out")
-        assert str(refused.value).endswith(f"out holds another sweep: {says}; choose another folder")
+        assert str(refused.value).endswith(f"out contains another sweep: {says}; choose another folder")
     assert rows(folder / "out") == before
 
 
@@ -444,7 +444,7 @@ def test_the_command_that_the_table_prints_plays_the_trial_again(folder: Path) -
     command = shlex.split(next(line for line in ended.out.splitlines() if line.startswith("  tandem run ")))
     assert command[0] == "tandem"
     tandem(*command[1:], cwd=folder)
-    summary = json.loads((folder / "record" / "summary.json").read_text())
+    summary = json.loads((folder / "recording" / "summary.json").read_text())
     cell = int(Path(command[2]).stem)
     row = next(row for row in rows(folder / "out") if (row["cell"], row["seed"]) == (cell, summary["seed"]))
     for name in ("outcome", "reason", "ticks", "first_contact_tick", "t_max_s"):
@@ -471,7 +471,7 @@ def test_of_more_cells_than_fit_a_screen_those_in_which_all_is_well_are_counted(
     lines = ended.out.splitlines()
     listed = [line.split()[0] for line in lines if line[1:2].isdigit()]
     assert listed == poor
-    assert f"all is well in {202 - len(poor)} cells, not listed: out/summary.csv" in lines
+    assert f"{202 - len(poor)} cells without a problem are not listed; see out/summary.csv" in lines
     assert 0 < len(poor) < 202
 
 
@@ -497,7 +497,7 @@ def test_a_trial_that_breaks_a_rule_fails_the_sweep_and_is_named(
     assert said[-1] == f"audited: 16 of 16 trials, 12 clean; trial 2 of cell 0: {first}"
     report.show(results, folder / "out", quiet=False)
     said = capsys.readouterr().out.splitlines()
-    assert any(line.startswith("to look at first: trial 2 of cell 0, ") and first in line for line in said)
+    assert any(line.startswith("look at trial 2 of cell 0 first: ") and first in line for line in said)
     heading = next(line for line in said if line.startswith(" cell")).split()
     line = next(line for line in said if line.startswith(" 0 ")).split()
     assert line[heading.index("clean")] == "3"
@@ -520,12 +520,12 @@ def test_a_setting_in_which_nobody_can_meet_is_a_refused_cell(folder: Path) -> N
     (folder / "slow.toml").write_text(start + "[[1.0, 1.0], [1e-6, 1e-3]]")
     ended = sweep(folder, "slow.toml", "out")
     assert ended.status in (0, 1)
-    assert "cell 1 cannot be played: mission: a tick moves a robot by " in ended.out
+    assert "cell 1 cannot run: mission: a tick moves a robot by " in ended.out
     summary = summary_rows(folder / "out")
     assert [row["trials"] for row in summary] == ["2", "0"]
     assert [bool(row["refused"]) for row in summary] == [False, True]
     (folder / "slow.toml").write_text(start + "[[1e-6, 1e-3]]")
-    with pytest.raises(UserError, match="no cell can be played; cell 0: mission: a tick moves a robot by"):
+    with pytest.raises(UserError, match="no cell can run; cell 0: mission: a tick moves a robot by"):
         played(folder, "slow.toml", "none")
     assert not (folder / "none").exists()
 
@@ -579,7 +579,7 @@ def test_a_base_scenario_whose_table_is_none_is_one_line(noise: str, folder: Pat
         played(folder, "bad.toml", "out")
     assert str(refused.value) == (
         f"{folder / 'bad.toml'}: axis[0].field: 'mission.noise.odometry.v': "
-        f"{where} of the base scenario is no table"
+        f"{where} of the base scenario is not a table"
     )
 
 
@@ -684,31 +684,31 @@ JOINT = 'name = "both"\nfields = ["mission.period", "mission.max_speed"]\nvalues
             "mission.noise.outlier_bias[0]",
             "axis[0].field: 'mission.noise.outlier_bias[0]': the base scenario has no mission.noise.out",
         ),
-        ("robot.b.anchor[0]", "robot..anchor", "axis[0].field: 'robot..anchor': no path"),
+        ("robot.b.anchor[0]", "robot..anchor", "axis[0].field: 'robot..anchor': not a path"),
         (
             "robot.b.anchor[0]",
             "mission.period.x",
             "axis[0].field: 'mission.period.x': mission.period is a single",
         ),
-        ("robot.b.anchor[0]", "seed", "axis[0].field: 'seed': every trial has a seed of its own"),
-        ("robot.b.anchor[0]", "planner", "axis[1]: 'planner.name' is set by axis[0] ('planner') already"),
-        ("robot.b.anchor[0]", "planner.name", "axis[1]: another axis is called 'planner.name'"),
+        ("robot.b.anchor[0]", "seed", "axis[0].field: 'seed': every trial has its own seed"),
+        ("robot.b.anchor[0]", "planner", "axis[1]: 'planner.name' is already set by axis[0] ('planner')"),
+        ("robot.b.anchor[0]", "planner.name", "axis[1]: another axis has the name 'planner.name'"),
         ("[10.0, 8]", "[]", "axis[0].values: "),
-        ("[10.0, 8]", "[8, 8.0]", "axis[0].values[1]: the same as values[0]"),
-        ("[10.0, 8]", "[8, 1979-05-27]", "axis[0].values[1]: not a number"),
-        ("[10.0, 8]", "[8, nan]", "axis[0].values[1]: not a number"),
+        ("[10.0, 8]", "[8, 8.0]", "axis[0].values[1]: equal to values[0]"),
+        ("[10.0, 8]", "[8, 1979-05-27]", "axis[0].values[1]: must be a number"),
+        ("[10.0, 8]", "[8, nan]", "axis[0].values[1]: must be a number"),
         (
             "[10.0, 8]",
             '[8, "x"]',
             "cell 2 (robot.b.anchor[0] = x; planner.name = paper): robot[1].anchor[0]: ",
         ),
         ("[10.0, 8]", "[8, 0]", "cell 2 (robot.b.anchor[0] = 0; planner.name = paper): robot[1].anchor: "),
-        ('field = "robot.b.anchor[0]"', "", "axis[0]: names one 'field', or a 'name'"),
+        ('field = "robot.b.anchor[0]"', "", "axis[0]: needs either 'field', or 'name'"),
         (AXIS, AXIS + '\nlabels = ["x", "y"]', "axis[0].name: missing"),
-        (AXIS, AXIS + '\nname = "D"\nlabels = ["x", "x"]', "axis[0].labels: not 2 different ones"),
-        (AXIS, AXIS + '\nname = "rate"\nlabels = ["x", "y"]', "axis: 2 columns would be called 'rate'"),
+        (AXIS, AXIS + '\nname = "D"\nlabels = ["x", "x"]', "axis[0].labels: must be 2 different labels"),
+        (AXIS, AXIS + '\nname = "rate"\nlabels = ["x", "y"]', "axis: 2 columns would have the name 'rate'"),
         (AXIS, JOINT.replace('name = "both"', ""), "axis[0].name: missing"),
-        (AXIS, JOINT.replace("[0.5, 1.0]", "[0.5]"), "axis[0].values[1]: not a list of 2 values"),
+        (AXIS, JOINT.replace("[0.5, 1.0]", "[0.5]"), "axis[0].values[1]: must be a list of 2 values"),
         (
             AXIS,
             JOINT.replace("mission.period", "mission.perod"),
