@@ -197,7 +197,7 @@ def test_what_is_drawn_is_within_its_interval_and_starts_are_within_range() -> N
             "draw[0].over: 'robot.a.anchor[0]' is 0",
         ),
         ('field = "mission.period"\nuniform = [-1e308, 1e308]', "draw[0]: -1e+308 to 1e+308 is not"),
-        ('field = "mission.period"\nlog_uniform = [1e-308, 1e308]', "draw[0]: the interval 1e-308 to 1e+308 is too"),
+        ('field = "mission.period"\nlog_uniform = [1e-308, 1e308]', "draw[0]: the interval 1e-308 to"),
         ('field = "mission.period"\nuniform = [2, 1]', "draw[0]: 2 to 1 is not an interval"),
         ('field = "mission.period"\nlog_uniform = [0, 1]', "draw[0]: 0 to 1 is not an interval above 0"),
         (
