@@ -279,7 +279,7 @@ def test_trials_that_raise_die_or_hang_are_rows_and_the_others_go_on(folder: Pat
     assert (summary["trials"], summary["failed"]) == ("8", "3")
     again = sweep(folder, "astray.toml", "out")
     assert again.status == 3
-    assert "trial 1 of cell 0, failed (ValueError: two\\nlines)" in again.out
+    assert "trial 1 of cell 0 first: failed (ValueError: two\\nlines)" in again.out
     sweep(folder, "astray.toml", "out", "--retry")
     assert rows(folder / "out") == expected
 
