@@ -45,7 +45,7 @@ def test_what_becomes_known_of_a_tick_later_is_on_the_time_line_and_in_the_log(
         growing = {name: stack.enter_context(Journal(tmp_path / name)) for name in whole}
 
         def grow(robots: int, commands: int) -> None:
-            """Write the robots' journals up to tick `robots`, and the world's up to the Commands of `commands`."""
+            """Write the journals of robots up to tick `robots`, and Commands up to tick `commands`."""
             goals = {name: frames_to(paper_1 / name, robots) for name in whole if name != WORLD_JOURNAL}
             goals[WORLD_JOURNAL] = frames_to(paper_1 / WORLD_JOURNAL, commands, Command)
             for name, goal in goals.items():

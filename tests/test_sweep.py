@@ -1,4 +1,4 @@
-"""A sweep's rows depend on what was asked, and not on who plays them or what goes wrong meanwhile."""
+"""The rows of a sweep depend only on its sweep file, not on its workers or on failures."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from tests.commands import PAPER_1, Ended, TandemProcess, tandem, temporary_in, 
 
 HOUSE = Path(__file__).parents[1]
 RANDOM = PAPER_1.replace("start", "# start")
-"""its starts are drawn"""
+"""A scenario with random starts."""
 BOTH = """
 name = "both"
 scenario = "base.toml"
@@ -54,15 +54,15 @@ values = ["paper", "assured"]
 paired = true
 """
 LENGTHY = BOTH.replace("[10.0, 8]", "[60.0]").replace("trials = 12", "trials = 40")
-"""some seconds of it"""
+"""A sweep that takes several seconds."""
 ASTRAY = 'name = "astray"\nscenario = "base.toml"\ntrials = 8\n'
 HASTY = ASTRAY + "trial_timeout = 1.5\n"
-"""for trials that hang for certain: others may take longer on a busy machine"""
+"""A sweep only for trials that hang; others may take longer than its timeout on a busy machine."""
 
 
 @pytest.fixture(autouse=True)
 def nothing_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Every temporary folder is in tmp_path, so the processes of a test are known by their arguments."""
+    """Put all temporary folders into tmp_path, and check that no processes or files remain."""
     folder = temporary_in(tmp_path, monkeypatch)
     yield
     until(lambda: not trial_processes(tmp_path), "no process for trials is left")
@@ -88,7 +88,7 @@ def said_by(pid: int) -> list[str]:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """With base.toml, both.toml, lengthy.toml, astray.toml and hasty.toml."""
+    """Return a folder with base.toml, both.toml, lengthy.toml, astray.toml and hasty.toml."""
     (tmp_path / "base.toml").write_text(RANDOM)
     for name, text in (("both", BOTH), ("lengthy", LENGTHY), ("astray", ASTRAY), ("hasty", HASTY)):
         (tmp_path / f"{name}.toml").write_text(text)
@@ -96,7 +96,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def rows(out: Path) -> list[dict[str, Any]]:
-    """All of them, but for their wall times."""
+    """Return all rows without their wall times."""
     return [
         {name: value for name, value in row.items() if name != "wall_s"}
         for row in pq.read_table(out / "trials.parquet").to_pylist()
@@ -122,7 +122,7 @@ def played(
     audit: bool = True,
     done: Callable[[int], None] = lambda _: None,
 ) -> execution.Results:
-    """The sweep, as the command plays it, but for figures and what is said."""
+    """Run the sweep as the command does, without figures and output."""
     silent = execution.Progress(say=print, begin=lambda *_: None, done=done)
     sweep = spec.load(str(folder / source), trials=trials)
     return execution.sweep(
@@ -135,7 +135,7 @@ def played(
 
 
 def sweep_up(folder: Path) -> None:
-    """Remove what a command that was killed could not."""
+    """Remove the files that a killed command could not."""
     for left in (folder / "tmp").glob("tandem-dask-*"):
         shutil.rmtree(left)
 
@@ -144,7 +144,7 @@ def parts(out: Path) -> int:
     return len(list(out.glob("parts/*.parquet")))
 
 
-# --- who plays it is all the same ---------------------------------------------------------------------
+# --- workers -----------------------------------------------------------------------------------------
 
 
 def test_rows_are_the_same_on_one_worker_and_on_two(folder: Path) -> None:
@@ -168,7 +168,7 @@ def test_rows_are_the_same_as_processes_over_zenoh(folder: Path) -> None:
 
 
 def dask(stack: ExitStack, module: str, *arguments: str | Path, cwd: Path) -> subprocess.Popen[bytes]:
-    """A part of a cluster that somebody started by hand."""
+    """Start a process of a Dask cluster."""
     process = subprocess.Popen(
         [sys.executable, "-P", "-W", "ignore", "-m", f"distributed.cli.{module}", *map(str, arguments)],
         stdout=subprocess.DEVNULL,
@@ -244,7 +244,7 @@ def test_a_seed_follows_from_the_sweep_the_cell_and_the_trial(folder: Path) -> N
     assert all(0 <= trial_seed(5, "{}", k) < 2**63 for k in range(100))
 
 
-# --- what goes wrong ----------------------------------------------------------------------------------
+# --- failures -----------------------------------------------------------------------------------------
 
 
 def misbehaving(function: str, source: str, folder: Path) -> subprocess.Popen[str]:
@@ -372,7 +372,7 @@ def test_a_folder_may_be_called_anything_and_a_label_stands_as_it_is_written(fol
     assert (folder / name / "figures" / "success-way.png").exists()
 
 
-# --- a sweep's folder ------------------------------------------------------------------------------
+# --- results folder ------------------------------------------------------------------------------
 
 
 @pytest.mark.long
@@ -475,7 +475,7 @@ def test_of_more_cells_than_fit_a_screen_those_in_which_all_is_well_are_counted(
     assert 0 < len(poor) < 202
 
 
-# --- every trial is judged ------------------------------------------------------------------------------
+# --- audits -------------------------------------------------------------------------------------------
 
 
 def test_a_trial_that_breaks_a_rule_fails_the_sweep_and_is_named(
@@ -638,7 +638,7 @@ def test_the_sweep_of_noise_plays_the_same_starts_in_every_cell() -> None:
     )
 
 
-# --- a mistake in the spec ----------------------------------------------------------------------------
+# --- invalid sweep files ----------------------------------------------------------------------------
 
 AXIS = 'field = "robot.b.anchor[0]"\nvalues = [10.0, 8]'
 JOINT = 'name = "both"\nfields = ["mission.period", "mission.max_speed"]\nvalues = [[1.0, 1.0], [0.5, 1.0]]'
