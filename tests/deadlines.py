@@ -37,7 +37,7 @@ def main() -> int:
         for stopped in (0.0, STOPPED_S):
             with tempfile.TemporaryDirectory(prefix="tandem-") as folder:
                 began = time.monotonic()
-                recording = played(Path(folder), rate, stopped)
+                recording = run_mission(Path(folder), rate, stopped)
                 wall = time.monotonic() - began
             ticks = recording.moments[-1].truth.tick
             missed = {robot: late(recording, robot) for robot in "ab"}
@@ -50,7 +50,7 @@ def main() -> int:
     return 0 if well else 1
 
 
-def played(folder: Path, rate: int, stopped: float) -> Recording:
+def run_mission(folder: Path, rate: int, stopped: float) -> Recording:
     """Return the recording of LASTS_S s at `rate`, with the agent of a stopped for `stopped` s."""
     scenario, out = folder / "mission.toml", folder / "out"
     scenario.write_text(f"max_ticks = {rate * LASTS_S}\n" + ENDLESS.replace("max_ticks", "# max_ticks"))

@@ -56,7 +56,7 @@ class Case(NamedTuple):
 
     @property
     def by(self) -> str:
-        """What else its name says."""
+        """The part of the name of the case that describes its connection."""
         if self.secured:
             return ", through a router, secured"
         return ", through a router" if self.routed and self.what.startswith("link") else ""

@@ -29,7 +29,7 @@ from compose.recording.run import WORLD_JOURNAL, agent_journal
 from compose.view.export.folder import export
 from protocol.journal import journal_file
 from tests.commands import LONG, TandemProcess, journals, process_of, processes_of, tandem, until
-from tests.same_plans import played, said, scenario
+from tests.same_plans import described, run_both_ways, scenario
 
 PAPER = ("paper-1", "paper-2")
 KILL_BYTES = 20_000
@@ -58,8 +58,8 @@ def main(count: int, kills: int) -> int:
 def _both_ways(name: str | int, folder: Path) -> tuple[str, bool]:
     if isinstance(name, int):
         text = scenario(random.Random(name))
-        outcomes, found = played(text, folder)
-        what = f"{outcomes[0]}; {said(text)}"
+        outcomes, found = run_both_ways(text, folder)
+        what = f"{outcomes[0]}; {described(text)}"
     else:
         for out, mode in (("processes", []), ("one-process", ["--in-process"])):
             tandem("run", name, "-q", "--out", folder / out, *mode)

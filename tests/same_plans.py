@@ -30,12 +30,13 @@ def main(count: int) -> int:
         text = scenario(random.Random(number))
         parse(text, f"plan {number}")
         with tempfile.TemporaryDirectory(prefix="tandem-same-") as folder:
-            outcomes, found = played(text, Path(folder))
+            outcomes, found = run_both_ways(text, Path(folder))
         same = found[0] == found[1] != {} and outcomes[0] == outcomes[1]
         different += not same
         amount = f"{len(found[0])} journals, {sum(map(len, found[0].values()))} bytes"
         print(
-            f"{number:3} {'same' if same else 'DIFFERENT'}: {outcomes[0]}; {amount}; {said(text)}", flush=True
+            f"{number:3} {'same' if same else 'DIFFERENT'}: {outcomes[0]}; {amount}; {described(text)}",
+            flush=True,
         )
         if not same:
             for name in sorted(found[0].keys() | found[1].keys()):
@@ -45,7 +46,7 @@ def main(count: int) -> int:
     return 1 if different else 0
 
 
-def played(text: str, folder: Path) -> tuple[list[str], list[dict[str, bytes]]]:
+def run_both_ways(text: str, folder: Path) -> tuple[list[str], list[dict[str, bytes]]]:
     """Run a plan as processes, then in one process; return the outcomes and the journals."""
     (folder / "plan.toml").write_text(text)
     outcomes, found = [], []
@@ -94,7 +95,7 @@ def fault(draw: random.Random, pairs: int) -> str:
     return "\n".join(lines) + "\n"
 
 
-def said(text: str) -> str:
+def described(text: str) -> str:
     """Return a plan as one line of text."""
     planner_name = "paper" if '"paper"' in text else "assured"
     noise = "noisy" if "mission.noise" in text else "exact"

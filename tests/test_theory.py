@@ -395,7 +395,7 @@ def counted(draw: Callable[..., Setting], *, same: bool, draws: int = DRAWS) -> 
     ids=["2+1 anywhere", "1+1+1 anywhere", "2+1 of the pair", "1+1+1 of the pair"],
 )
 def test_both_bounds_are_reached(draw: Callable[..., Setting], same: bool, numbers: set[int]) -> None:
-    """Of 100 000 draws each, at least 99.6 % of the scans were complete, and none had a seventh solution:
+    """At least 99.6 % of the scans of 100 000 draws each were complete, and none had a seventh solution:
 
     2+1, anywhere:     2 in 34.0 %, 4 in 66.0 %
     1+1+1, anywhere:   2 in 48.9 %, 4 in 46.3 %, 6 in 4.8 %
