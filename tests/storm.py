@@ -541,5 +541,5 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("frames", type=int)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--distance", type=float, default=1000.0, help="of the anchors, in m")
+    parser.add_argument("--distance", type=float, default=1000.0, help="distance of the anchors, m")
     sys.exit(main(parser.parse_args()))
