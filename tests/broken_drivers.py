@@ -1,4 +1,4 @@
-"""Drivers that break the contract, each in one way."""
+"""Drivers that violate the driver contract, each in one way."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class SkipsEverySecondTick(Rover):
 
 
 class DrivesWithoutEnd(Rover):
-    """Holds the last drive until another comes."""
+    """A driver that continues the last command until it receives another."""
 
     def _settle(self) -> None:
         super()._settle()
@@ -107,7 +107,7 @@ class DrivesForTwiceAsLong(Rover):
 
 
 class DrivesInHalfTheTime(Rover):
-    """All of it, twice as fast."""
+    """A driver that executes a whole manoeuvre in half the time."""
 
     def __init__(self, config: RobotConfig, manoeuvre_s: float) -> None:
         super().__init__(config, manoeuvre_s)
@@ -138,13 +138,13 @@ class NoDriver:
 
 
 class CannotResume(Rover):
-    """One that has no memory of what its wheels did."""
+    """A driver that does not store what its wheels did."""
 
     resume = None  # type: ignore[assignment]
 
 
 class LosesAReading(Rover):
-    """One whose process is killed once, when it has taken the reading of a tick."""
+    """A driver whose process is killed once, after it has taken the reading of a tick."""
 
     TICK = 8
 

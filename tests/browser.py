@@ -1,7 +1,7 @@
-"""A browser to look at the page with: Debian's, `apt-get install chromium`.
+"""Helpers that test the page in Debian's browser: `apt-get install chromium`.
 
-A test that asks for the fixture `opened` (tests/conftest.py) skips where there is none. With
-TANDEM_SHOTS=DIR, `shot` leaves a picture of what a test saw there.
+A test that uses the fixture `opened` (tests/conftest.py) is skipped if no browser is installed. If
+TANDEM_SHOTS names a folder, `shot` writes screenshots to it.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from tests.commands import BOUND_S, TandemProcess
 
 BOUND_MS = 1000 * BOUND_S
 SERVER_GONE = "ERR_(CONNECTION_(REFUSED|RESET|CLOSED)|EMPTY_RESPONSE|INCOMPLETE_CHUNKED_ENCODING)"
-"""What a browser says after a test has stopped the server.
+"""The errors that a browser logs after a test has stopped the server.
 
-Which of these it says depends on whether it was connecting, waiting for an answer, or reading one.
+The error depends on whether the browser was connecting, waiting for an answer, or reading one.
 """
 SCRUB = "(scrub, tick) => { scrub.value = tick; scrub.dispatchEvent(new Event('input')); }"
 Open = Callable[..., Page]
@@ -32,7 +32,7 @@ expect.set_options(timeout=BOUND_MS)
 
 @contextmanager
 def chromium() -> Iterator[Browser]:
-    """The browser; the test skips where there is none."""
+    """Yield a browser; skip the test if none is installed."""
     found = shutil.which("chromium") or shutil.which("chromium-browser")
     if found is None:
         pytest.skip("there is no chromium: apt-get install chromium")
@@ -44,7 +44,10 @@ def chromium() -> Iterator[Browser]:
 
 @contextmanager
 def pages(browser: Browser) -> Iterator[Open]:
-    """Opens pages; in the end none must have complained, or asked anybody but the server."""
+    """Yield a function that opens pages.
+
+    At the end, fail if a page has logged an error, or has sent a request to any other host than the server.
+    """
     complaints: list[str] = []
     hosts: set[str] = set()
     opened: list[Page] = []
@@ -54,7 +57,7 @@ def pages(browser: Browser) -> Iterator[Open]:
             viewport={"width": width, "height": height}, color_scheme="dark" if dark else "light"
         )
         opened.append(page)
-        page.on("console", lambda said: complaints.append(said.text) if said.type == "error" else None)
+        page.on("console", lambda entry: complaints.append(entry.text) if entry.type == "error" else None)
         page.on("pageerror", lambda error: complaints.append(str(error)))
         page.on("request", lambda request: hosts.add(re.sub(r"^(\w+://[^/:]+).*", r"\1", request.url)))
         page.set_default_timeout(BOUND_MS)
@@ -64,20 +67,20 @@ def pages(browser: Browser) -> Iterator[Open]:
     yield opens
     for page in opened:
         page.close()
-    unexpected = [said for said in complaints if not re.search(SERVER_GONE, said)]
+    unexpected = [text for text in complaints if not re.search(SERVER_GONE, text)]
     assert not unexpected, unexpected
     assert hosts <= {"http://127.0.0.1"}
 
 
 @contextmanager
 def watching(*arguments: str | Path) -> Iterator[tuple[TandemProcess, str]]:
-    """`tandem watch`, and the address of its page."""
+    """Yield a process of `tandem watch`, and the address of its page."""
     with TandemProcess("watch", *arguments) as command:
         yield command, address_of(command)
 
 
 def address_of(command: TandemProcess) -> str:
-    """Where its page is, once it has said so."""
+    """Return the address of the page of `command`, when it has printed it."""
     command.until_says("http://127.0.0.1:")
     found = re.search(r"http://\S+", command.out)
     assert found is not None
@@ -90,13 +93,13 @@ def until_shown(page: Page, tick: int) -> None:
 
 
 def shot(page: Page, name: str) -> None:
-    """Leave a picture of the page, if there is a folder for it."""
+    """Write a screenshot of the page if TANDEM_SHOTS is set."""
     if folder := os.environ.get("TANDEM_SHOTS"):
         page.screenshot(path=Path(folder) / f"{name}.png")
 
 
 def picture(page: Page) -> str:
-    """The plane, pixel by pixel, once all that was asked for is drawn."""
+    """Return the canvas as a data URL, after all pending drawing."""
     page.evaluate("() => new Promise(drawn => requestAnimationFrame(() => requestAnimationFrame(drawn)))")
     return str(page.evaluate("document.getElementById('canvas').toDataURL()"))
 
@@ -117,7 +120,7 @@ INKS = """() => {
 
 
 def inks(page: Page) -> dict[str, int]:
-    """How many pixels of the plane are of each of its colours, once all that was asked for is drawn."""
+    """Return the number of pixels of each named colour in the canvas, after all pending drawing."""
     picture(page)
     found: dict[str, int] = page.evaluate(INKS)
     return found

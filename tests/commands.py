@@ -25,8 +25,9 @@ from protocol.journal import journal_file
 from tests import warm
 
 BOUND_S = 60.0
-"""s: longer than any wait that succeeds takes, even on a busy machine"""
+"""The time in s after which a wait fails; longer than any successful wait, even on a busy machine."""
 LOOK_AGAIN_S = 0.002
+"""The time in s between two checks of a condition."""
 
 SECTION_IV = """
 [mission]
@@ -68,9 +69,9 @@ LONG_TICKS = 1874
 ASSURED = "max_ticks = 1_000_000\n" + PAPER_1.replace('"paper"', '"assured"').replace(
     "10.0, 0.0", "60.0, 0.0"
 ).replace("11.3", "61.3")
-"""A scenario of the variant that tolerates missed deadlines, however many a busy machine causes."""
+"""A scenario of the planner that tolerates any number of missed deadlines, as on a busy machine."""
 REAL_TIME = ASSURED.replace("1_000_000", "600")
-"""The same for `--rate 20`: it is over after half a minute, with any outcome."""
+"""The same scenario for `--rate 20`. It ends after half a minute, with any outcome."""
 OVER = (0, 1)
 """The exit statuses of a mission that has ended; in real time, either is possible."""
 ENDLESS = (
@@ -78,6 +79,7 @@ ENDLESS = (
 )
 """A scenario so long that it does not end during a test."""
 LONG_JOURNAL_BYTES = 180_000
+"""The size in bytes that the world's journal of LONG exceeds during the run."""
 
 
 def several_pairs(pairs: int) -> str:
@@ -94,9 +96,11 @@ class Ended(NamedTuple):
     """The result of a command that has ended."""
 
     status: int
-    """exit status; negative is the signal that killed it"""
+    """exit status; if negative, the number of the signal that killed the process"""
     out: str
+    """standard output"""
     err: str
+    """standard error"""
 
 
 class TandemProcess:
@@ -109,7 +113,7 @@ class TandemProcess:
         terminal: int | None = None,
         through: Sequence[str] = (),
     ) -> None:
-        """Start the command; `terminal` receives its standard output, `through` is a command that execs it.
+        """Start the command. `terminal` receives its standard output; `through` is a command that execs it.
 
         `run` gets `--no-export` unless the arguments say otherwise, because an export takes longer.
         """
@@ -138,32 +142,32 @@ class TandemProcess:
 
     @property
     def running(self) -> bool:
-        """Whether the process has not ended yet."""
+        """True while the process has not ended."""
         return self._process.poll() is None
 
     def until(self, condition: Callable[[], object], what: str) -> None:
         """Wait until `condition` holds, which must be before the command ends."""
 
-        met = False
+        holds = False
 
-        def come() -> bool:
-            nonlocal met
-            met = bool(condition())
-            return met or not self.running
+        def check() -> bool:
+            nonlocal holds
+            holds = bool(condition())
+            return holds or not self.running
 
-        until(come, f"{what}\n{self.err}")
-        assert met or condition(), f"ended before {what}: {self.out}{self.err}"
+        until(check, f"{what}\n{self.err}")
+        assert holds or condition(), f"ended before {what}: {self.out}{self.err}"
 
     def until_says(self, words: str) -> None:
         """Wait until the command has printed `words` on either stream."""
-        self.until(lambda: words in self.out + self.err, f"it says '{words}'")
+        self.until(lambda: words in self.out + self.err, f"it prints '{words}'")
 
     def until_written(self, path: Path, amount: int) -> None:
         """Wait until the file at `path` has at least `amount` bytes."""
-        self.until(lambda: size(path) >= amount, f"{path.name} holds {amount} bytes")
+        self.until(lambda: size(path) >= amount, f"{path.name} has {amount} bytes")
 
     def until_answered(self, robot: str, recording: Path) -> None:
-        """Wait until `robot` has answered tick 0: its Observation, Command and Estimate are in the recording."""
+        """Wait until `robot` has answered tick 0: its Observation, Command and Estimate are recorded."""
         path = recording / f"agent-{robot}.journal"
         self.until(
             lambda: path.exists() and len(list(journal_file.read(path))) >= 5, f"{robot} answers tick 0"
@@ -185,7 +189,7 @@ class TandemProcess:
         return False
 
     def catches(self, number: Signals) -> bool:
-        """Return whether the process has a handler for that signal by now."""
+        """Return true if the process has installed a handler for the signal."""
         return bool(_signals_caught(self.pid) >> (number - 1) & 1)
 
     def __enter__(self) -> TandemProcess:
@@ -237,7 +241,7 @@ def on_a_terminal(*arguments: str | Path) -> tuple[int, str]:
 
 @contextmanager
 def world(scenario: str | Path, *arguments: str | Path) -> Iterator[tuple[TandemProcess, str]]:
-    """Yield a world that waits for its robots, and its endpoint."""
+    """Yield a simulator process that waits for its robots, and its endpoint."""
     endpoint = free_endpoint()
     with TandemProcess("world", scenario, "--listen", endpoint, *arguments) as command:
         command.until_says("waiting for")
@@ -272,13 +276,13 @@ def processes_of(mark: str | Path) -> dict[int, list[str]]:
 def process_of(mark: str | Path, *words: str) -> int:
     """Return the id of the one process whose command line contains `mark`, and `words` in a row."""
     wanted = " ".join(words)
-    found = [pid for pid, said in processes_of(mark).items() if f" {wanted} " in f" {' '.join(said)} "]
+    found = [pid for pid, line in processes_of(mark).items() if f" {wanted} " in f" {' '.join(line)} "]
     assert len(found) == 1, f"{wanted}: {found}"
     return found[0]
 
 
 def temporary_in(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return a new folder in `folder` for all temporary files, so that a test sees what is left of them."""
+    """Return a new folder in `folder` for all temporary files, so that a test can check which remain."""
     found = folder / "tmp"
     found.mkdir()
     monkeypatch.setenv("TMPDIR", str(found))

@@ -16,7 +16,7 @@ from tests.browser import Open, chromium, pages, watching
 from tests.commands import tandem
 
 if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
-    # Thousands of short processes must not compile the same modules again, each for itself.
+    # Thousands of short processes would otherwise compile the same modules again.
     compiled = Path(__file__).parents[1] / ".pytest_cache" / "compiled"
     sys.pycache_prefix = os.environ["PYTHONPYCACHEPREFIX"] = str(compiled)
     sys.dont_write_bytecode = False
@@ -25,14 +25,14 @@ settings.register_profile("tandem", derandomize=True, deadline=None, database=No
 settings.load_profile("tandem")
 
 
-def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:  # noqa: ARG001  # the hook's own name
-    """Two for each core: a test that starts processes waits for a good part of its time."""
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:  # noqa: ARG001  # the hook requires the name
+    """Return two workers per core: tests that start processes spend much of their time waiting."""
     return 2 * (os.cpu_count() or 1)
 
 
 @pytest.fixture(scope="module")
 def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Those of a mission of a and b; nobody changes anything in it."""
+    """Return a folder with the keys of a mission of a and b, which tests must not change."""
     folder = tmp_path_factory.mktemp("keys") / "keys"
     assert tandem("keys", folder, "--robots", "a,b").status == 0
     return folder
@@ -40,28 +40,28 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def mine(keys: Path, tmp_path: Path) -> Path:
-    """Those of a, to be spoilt."""
+    """Return a copy of the keys of a, which the test may change."""
     shutil.copytree(keys / "agent-a", tmp_path / "mine")
     return tmp_path / "mine"
 
 
-@pytest.fixture(scope="module")  # no longer: playwright's event loop would be in the way of others
+@pytest.fixture(scope="module")  # a longer scope would leave playwright's event loop running in other modules
 def browser() -> Iterator[Browser]:
-    """The test skips where there is none."""
+    """Yield a browser; skip the test if none is installed."""
     with chromium() as found:
         yield found
 
 
 @pytest.fixture
 def opened(browser: Browser) -> Iterator[Open]:
-    """Opens pages; in the end none must have complained, or asked anybody but the server."""
+    """Yield a function that opens pages; the test fails on page errors and requests to other hosts."""
     with pages(browser) as opens:
         yield opens
 
 
 @pytest.fixture(scope="module")
 def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The record of paper-1; nobody changes anything in it."""
+    """Return the recording of paper-1, which tests must not change."""
     folder = tmp_path_factory.mktemp("recorded") / "paper-1"
     folder.mkdir()
     in_process.play(load("paper-1"), folder)
@@ -70,6 +70,6 @@ def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def address(paper_1: Path) -> Iterator[str]:
-    """That of the page on the record of paper-1."""
+    """Yield the address of the page on the recording of paper-1."""
     with watching(paper_1) as (_, found):
         yield found

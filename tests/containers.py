@@ -1,10 +1,11 @@
-"""A measurement: a mission in containers, by the compose file; one of them is killed, and comes back.
+"""A measurement: a mission in containers of the compose file, one of which is killed and restarted.
 
     uv run python -m tests.containers [--base FILE]
 
-No test: it needs root, podman, and without `--base` mmdebstrap (Debian's packages), and says so where it
-has not. No registry is asked: the base is made of Debian's packages, and the rest comes from PyPI. All that
-podman keeps is in a folder of this run's own, and nothing is left.
+This is a measurement, because it needs root, podman, and mmdebstrap unless `--base` is given (all packages of
+Debian). If one is missing, it prints so and is skipped. It uses no image registry: the base image is made of
+Debian packages, and the rest comes from PyPI. All images and containers are in a temporary folder that is
+removed at the end.
 """
 
 from __future__ import annotations
@@ -32,18 +33,18 @@ from tests.podman import DEPLOY, HOUSE, Podman, Unable
 
 BASE, LEAN, LAB = (f"localhost/tandem-check{part}" for part in ("-base", "", "-lab"))
 EPOCH = "1700000000"
-"""s; the date of every file in an image"""
+"""The date of every file in an image, in s since 1970."""
 RATE = 4.0
-"""times real time: a mission takes some 7 s"""
+"""The factor of real time; a mission takes about 7 s."""
 MIDDLE = 8
-"""the tick from which on somebody is killed"""
+"""The first tick at which a container is killed."""
 PORT = 7447
 LINKS = 3
-"""of the router in the middle of a mission: both agents, and the world"""
+"""The number of links of the router during a mission: both agents and the world."""
 ESTABLISHED = "01"
-"""in Linux's tables of connections"""
+"""The state of an established connection in /proc/net/tcp."""
 AWAY_S = 1.0
-"""how long who is killed stays away, at the least"""
+"""The least time in s between the kill and the restart of a container."""
 ROUTER = """
 import signal, zenoh
 config = zenoh.Config()
@@ -59,11 +60,11 @@ for path, value in {
 with zenoh.open(config):
     signal.pause()
 """
-"""for the router's official image, which only a registry has: Zenoh's library, told the same"""
+"""A program that replaces the router's official image, which only a registry has: the same configuration."""
 
 
 class Mission:
-    """The compose file, up."""
+    """A mission that runs in the containers of the compose file."""
 
     def __init__(self, podman: Podman, port: int, what: str) -> None:
         self._podman = podman
@@ -72,7 +73,7 @@ class Mission:
         self._options: tuple[str, ...] = ()
 
     def compose(self, *arguments: str) -> None:
-        """podman-compose, of this mission."""
+        """Run podman-compose for this mission."""
         self._podman.compose(
             *("-p", self._project, *self._options, *arguments),
             TANDEM_IMAGE=LEAN,
@@ -82,18 +83,18 @@ class Mission:
         )
 
     def routed(self, folder: Path) -> None:
-        """With a router beside the world, which is there first."""
+        """Use a router, which starts before the world."""
         stand_in = folder / "stand-in.json"
         service = {"image": LEAN, "entrypoint": ["python3", "-c", ROUTER], "command": []}
         stand_in.write_text(json.dumps({"services": {"zenoh": service}}))
         self._options = ("-f", str(stand_in), "--profile", "router")
 
     def container(self, service: str) -> str:
-        """Its name."""
+        """Return the name of the container of a service."""
         return f"{self._project}_{service}_1"
 
     def tick(self) -> int:
-        """How far the page has seen the mission come; -1 if it has seen none."""
+        """Return the latest tick that the page has received; -1 if none."""
         try:
             with urlopen(f"http://127.0.0.1:{self._port}/api/news", timeout=5.0) as news:
                 shows = json.loads(news.readline().removeprefix(b"data: "))["list"]["shows"]
@@ -102,7 +103,7 @@ class Mission:
         return max((show["last"] for show in shows), default=-1)
 
     def ended(self, service: str) -> int | None:
-        """Its exit status; none if it runs."""
+        """Return the exit status of a service; None while it runs."""
         state = self._podman(
             "inspect", "--format", "{{.State.Running}} {{.State.ExitCode}}", self.container(service)
         )
@@ -110,7 +111,7 @@ class Mission:
         return None if running == "true" else int(status)
 
     def healthy(self, service: str) -> bool:
-        """Whether its health check passes."""
+        """Return true if the health check of a service passes."""
         try:
             self._podman("healthcheck", "run", self.container(service))
         except subprocess.CalledProcessError:
@@ -118,25 +119,25 @@ class Mission:
         return True
 
     def links(self, service: str) -> int:
-        """How many there are to a router in it, or from one to the world."""
+        """Return the number of connections of a service on the router's port."""
         tables = self._podman("exec", self.container(service), "cat", "/proc/net/tcp", "/proc/net/tcp6")
         rows = [line.split() for line in tables.splitlines() if ":" in line.split()[0]]
         port = f":{PORT:04X}"
         return sum(row[3] == ESTABLISHED and (row[1].endswith(port) or row[2].endswith(port)) for row in rows)
 
     def logs(self, service: str) -> str:
-        """What it said."""
+        """Return the log of a service."""
         return self._podman("logs", self.container(service))
 
     def recording(self, folder: Path) -> Path:
-        """All journals, in one folder."""
+        """Copy all journals to `folder`, and return it."""
         for name in ("world", "agent-a", "agent-b"):
             self._podman("cp", f"{self.container(name)}:/journal/{name}.journal", folder)
         return folder
 
 
 def base(podman: Podman, given: Path | None, folder: Path) -> str:
-    """Import the base image; how it was had. Raises Unable."""
+    """Import the base image, and return how it was made. Raises Unable."""
     file, how = given, f"of {given}"
     if file is None:
         if shutil.which("mmdebstrap") is None:
@@ -154,7 +155,7 @@ def base(podman: Podman, given: Path | None, folder: Path) -> str:
 
 
 def build(podman: Podman, folder: Path) -> None:
-    """Both images. A line each. Raises CalledProcessError."""
+    """Build both images, and print a line for each. Raises CalledProcessError."""
     python = podman("run", "--rm", "--network=none", BASE, "python3", "-V").split()[1].rpartition(".")[0]
     project = tomllib.loads((HOUSE / "pyproject.toml").read_text())
     wanted = project["build-system"]["requires"] + project["project"]["dependencies"]
@@ -178,7 +179,7 @@ def build(podman: Podman, folder: Path) -> None:
         layers, took = once(), time.monotonic() - began
         size = int(podman("inspect", "--format", "{{.Size}}", image)) / 1e6
         own = size - int(podman("inspect", "--format", "{{.Size}}", BASE)) / 1e6
-        again = "" if extras else f"; built again it is the same: {'yes' if once() == layers else 'NO'}"
+        again = "" if extras else f"; identical when built again: {'yes' if once() == layers else 'NO'}"
         sizes = f"{size:.0f} MB, {own:.0f} without its base"
         print(f"image {extras or 'lean'}: {sizes}; built in {took:.0f} s{again}", flush=True)
     began = time.monotonic()
@@ -187,7 +188,10 @@ def build(podman: Podman, folder: Path) -> None:
 
 
 def play(podman: Podman, killed: str, folder: Path) -> bool:
-    """A mission in which `killed` is killed in the middle, and comes back. Whether all is well; says so."""
+    """Run a mission in which the service `killed` is killed and restarted.
+
+    Print the result, and return true if it is as expected.
+    """
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]
     mission = Mission(podman, port, killed)
@@ -208,7 +212,7 @@ def play(podman: Podman, killed: str, folder: Path) -> bool:
             sick += [] if mission.links("zenoh") == LINKS else ["links of the router"]
         mission.compose("kill", killed)
         at, since = mission.tick(), time.monotonic()
-        until(lambda: time.monotonic() >= since + AWAY_S, "it was away")
+        until(lambda: time.monotonic() >= since + AWAY_S, "the container is away")
         mission.compose(*up, killed)
         until(lambda: all(mission.ended(one) is not None for one in services), "all have ended", 120.0)
         statuses = {one: mission.ended(one) for one in services}
@@ -234,7 +238,10 @@ def play(podman: Podman, killed: str, folder: Path) -> bool:
 
 
 def on_a_robot(podman: Podman, folder: Path) -> bool:
-    """The image alone, as an agent with keys; the world and the peer are processes. Whether all is well."""
+    """Run the image as an agent with keys; the world and the peer are processes.
+
+    Print the result, and return true if it is as expected.
+    """
     keys, journal, endpoint = folder / "keys", folder / "robot", free_endpoint("tls")
     assert tandem("keys", keys, "--robots", "a,b").status == 0
     journal.mkdir()
@@ -245,19 +252,19 @@ def on_a_robot(podman: Podman, folder: Path) -> bool:
         world = stack.enter_context(TandemProcess("world", "random", *with_keys))
         peer = ("--connect", endpoint, "--keys", keys / "agent-b", "-q")
         stack.enter_context(TandemProcess("agent", "b", *peer))
-        said = podman(
+        log = podman(
             *("run", "--rm", "--network=host", "--read-only", "--cap-drop=all"),
             *("-v", f"{keys}/agent-a:/keys:ro", "-v", f"{journal}:/journal"),
             *(LEAN, "agent", "a", "--connect", endpoint, "--keys", "/keys", "--out", "/journal", "--fsync"),
         )
         ended = world.ended()
-    print(f"the image as a robot's agent, over TLS: {said.splitlines()[-1]}", flush=True)
+    print(f"the image as a robot's agent, over TLS: {log.splitlines()[-1]}", flush=True)
     return ended.status == 0
 
 
 @contextmanager
 def containers() -> Iterator[tuple[Podman, Path]]:
-    """Raises Unable."""
+    """Yield podman and a temporary folder. Raises Unable if containers cannot run."""
     if os.geteuid() != 0:
         raise Unable("not root")
     for command in ("podman", "uv"):
@@ -272,8 +279,8 @@ def _checked(command: list[str]) -> None:
 
 
 def main(given: Path | None) -> int:
-    """Build, and play every case, a line for each; 0 if all is as it should be."""
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(130))  # clean up, then too
+    """Build the images, run every case, and return 0 if all results are as expected."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(130))  # SIGTERM must clean up, too
     try:
         with containers() as (podman, folder):
             print(f"base: {base(podman, given, folder)}", flush=True)

@@ -1,6 +1,6 @@
-"""What `mcap doctor` looks at in a file, held against the records as the stock reader parses them.
+"""The checks of `mcap doctor`, applied to the records that the official reader parses.
 
-That doctor is a Go program, which is not to be had everywhere; these are its checks, by its source.
+`mcap doctor` is a Go program that is not available everywhere. These checks follow its source.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from mcap.well_known import Profile
 
 
 def complaints(path: Path) -> list[str]:
-    """Errors and warnings alike; raises what the reader raises where a CRC or a record is damaged."""
+    """Return the errors and warnings on the file. Raises the reader's error if a CRC or record is damaged."""
     data = path.read_bytes()
     records = list(StreamReader(io.BytesIO(data), emit_chunks=True, validate_crcs=True).records)
     end = next(i for i, record in enumerate(records) if isinstance(record, DataEnd))
@@ -47,7 +47,7 @@ def complaints(path: Path) -> list[str]:
 
 
 class _Examined:
-    """What has been seen of the data section."""
+    """The records of the data section that have been examined."""
 
     def __init__(self, found: list[str]) -> None:
         self.found = found
@@ -78,12 +78,12 @@ class _Examined:
         if record.id == 0 or not record.encoding or not record.name or not record.data:
             self.found.append(f"schema {record.id} is empty")
         if record.id in self.schemas:
-            self.found.append(f"schema {record.id} stands twice in the data section")
+            self.found.append(f"schema {record.id} occurs twice in the data section")
         self.schemas[record.id] = record
 
     def _channel(self, record: Channel) -> None:
         if record.id in self.channels:
-            self.found.append(f"channel {record.id} stands twice in the data section")
+            self.found.append(f"channel {record.id} occurs twice in the data section")
         if record.schema_id not in self.schemas:
             self.found.append(f"channel {record.id} has no schema")
         self.channels[record.id] = record
@@ -97,7 +97,7 @@ class _Examined:
         self.counts[record.channel_id] = self.counts.get(record.channel_id, 0) + 1
 
     def summary(self, records: list[McapRecord]) -> None:
-        """Whether it tells of what there is, all of it, once."""
+        """Check that the summary section describes the data section completely, and each item once."""
         if {one.id: one for one in records if isinstance(one, Schema)} != self.schemas:
             self.found.append("the summary has other schemas")
         if {one.id: one for one in records if isinstance(one, Channel)} != self.channels:
@@ -106,11 +106,11 @@ class _Examined:
         if [(one.message_start_time, one.message_end_time) for one in indexes] != self.chunks:
             self.found.append("the chunk indexes are not those of the chunks")
         statistics = [one for one in records if isinstance(one, Statistics)]
-        told = [
+        claimed = [
             (one.message_count, one.channel_count, one.schema_count, one.chunk_count)
             + (one.message_start_time, one.message_end_time, one.channel_message_counts)
             for one in statistics
         ]
         there = (len(self.times), len(self.channels), len(self.schemas), len(self.chunks))
-        if told != [(*there, min(self.times), max(self.times), self.counts)]:
-            self.found.append(f"the statistics say {told}, there are {there}")
+        if claimed != [(*there, min(self.times), max(self.times), self.counts)]:
+            self.found.append(f"the statistics are {claimed}, the records are {there}")

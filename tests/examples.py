@@ -1,4 +1,4 @@
-"""One of each message, with nothing left out that it may hold."""
+"""Example messages of every kind, with all of their optional fields set."""
 
 from __future__ import annotations
 

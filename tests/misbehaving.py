@@ -1,4 +1,4 @@
-"""Trials that go wrong, and a sweep of them: `python -m tests.misbehaving FUNCTION SPEC OUT`."""
+"""Trials that fail, and a sweep that runs them: `python -m tests.misbehaving FUNCTION SPEC OUT`."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from protocol.network.inbox import Inbox
 from protocol.wire import encode
 
 HANGS = "hangs"
-"""a file that a trial leaves which hangs, and no other"""
+"""The name of the file that a trial writes before it hangs."""
 
 
 class Owned(worker_pool.WorkerProcess):
-    """Is given up only where a trial hangs, however long another takes."""
+    """A process for trials whose timeout applies only to trials that hang, however slow the machine is."""
 
     def answer(self, timeout: float) -> bytes:
-        """The next frame. Raises Hung where it hangs, and Died."""
+        """Return the next frame. Raises Hung if the trial hangs, and Died if the process ends."""
         while True:
             try:
                 return super().answer(timeout)
@@ -37,7 +37,7 @@ class Owned(worker_pool.WorkerProcess):
 
 
 def astray(one: trial.Trial) -> trial.TrialRow:
-    """The second trial raises, the fourth ends its process, the sixth never ends; others are as they are."""
+    """Run a trial; the second raises an error, the fourth ends its process, and the sixth never ends."""
     match one.number:
         case 1:
             raise ValueError("two\nlines")
@@ -50,7 +50,7 @@ def astray(one: trial.Trial) -> trial.TrialRow:
 
 
 def boastful(one: trial.Trial) -> trial.TrialRow:
-    """In the third trial of a cell robots say that they know where they are before they do."""
+    """Run a trial; in the third of a cell, estimates report too early that robots are localised."""
     if one.number != 2:
         return trial.play(one)
     with patch.object(in_process, "Robot", Boaster):
@@ -58,10 +58,10 @@ def boastful(one: trial.Trial) -> trial.TrialRow:
 
 
 class Boaster(Robot):
-    """A robot whose estimates do not follow from what it knows."""
+    """A robot whose estimates do not follow from its state."""
 
     def estimate(self) -> bytes:
-        """Says that it is localised."""
+        """Return and journal an estimate that reports the robot as localised."""
         frame = encode(replace(planner.estimate(self.mind), localised=True))
         assert self._journal is not None
         self._journal.write(frame)
@@ -69,14 +69,14 @@ class Boaster(Robot):
 
 
 def endless(one: trial.Trial) -> trial.TrialRow:
-    """None ends; each says that it has begun."""
+    """Run a trial that writes the file `playing` and never ends."""
     Path(tempfile.gettempdir(), "playing").touch()
     threading.Event().wait()
     return trial.play(one)
 
 
 def main(function: str, source: str, out: str) -> None:
-    """Play the sweep so on two workers, as `tandem sweep` does."""
+    """Run the sweep with `function` on two workers, as `tandem sweep` does."""
     inbox = Inbox("misbehaving")
     stop_by_signal(inbox)
     means = execution.ExecutionOptions(workers=2, play=f"tests.misbehaving:{function}")

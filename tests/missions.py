@@ -1,4 +1,4 @@
-"""A mission whose robot a is released where a test wants it, its anchor at the origin."""
+"""Missions in which robot a has a given start, and its anchor is at the origin."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def mission_of(
     speed: float = 1.0,
     turn_rate: float = math.pi,
 ) -> Recording:
-    """Played in this process; the peer starts half a metre from its own anchor."""
+    """Run such a mission in this process. The peer starts half a metre from its own anchor."""
     text = f"""
         name = "mission"
         planner = {{name = "{planner_name}"}}

@@ -1,9 +1,10 @@
-"""A measurement: a world and two agents on hosts of their own; links go down, a router is killed.
+"""A measurement: a world and two agents on separate hosts, while links go down or a router is killed.
 
     uv run python -m tests.namespaces
 
-No test: it needs root and `ip` (Debian's iproute2), and says so where it has not. Each host is a network
-namespace; one more, the switch, holds a bridge. Nothing outside of them is touched, and nothing is left.
+This is a measurement, because it needs root and `ip` (Debian's iproute2); without them it is skipped. Each
+host is a network namespace; one more, the switch, contains a bridge. Nothing else is changed, and all are
+removed at the end.
 """
 
 from __future__ import annotations
@@ -35,27 +36,27 @@ PORT = 7447
 DOWN_S = (0.5, 3.0, 20.0)
 RATE = "10"
 MIDDLE = {False: 20_000, True: 1_500}
-"""bytes of the world's journal when it happens, in lockstep and in real time"""
+"""The size in bytes of the world's journal at the interruption, in lockstep and in real time."""
 ASSURED = PAPER_1.replace('"paper"', '"assured"').replace("10.0, 0.0", "20.0, 0.0").replace("11.3", "21.3")
-"""for real time, in which the missions of `paper` bear no robot that stands still"""
+"""The scenario for real time, in which the `paper` planner fails if a robot misses a deadline."""
 
 
 class Case(NamedTuple):
-    """What happens in the middle of a run."""
+    """An interruption in the middle of a run."""
 
     what: str
     real_time: bool
     routed: bool
-    """the agents reach the world through a router"""
+    """true if the agents reach the world through a router"""
     happens: Callable[[Network, Run], None]
-    """returns when all is well again"""
+    """function that causes the interruption, and returns when it is over"""
 
     secured: bool = False
-    """over TLS, with access rules; the world and the agents are clients of a router that enforces them"""
+    """true to use TLS; the world and the agents are clients of a router that enforces access rules"""
 
     @property
     def by(self) -> str:
-        """What else its name says."""
+        """The part of the name of the case that describes its connection."""
         if self.secured:
             return ", through a router, secured"
         return ", through a router" if self.routed and self.what.startswith("link") else ""
@@ -89,12 +90,12 @@ class Network:
         _ip("-n", self._switch, "link", "set", "dev", host, state)
 
     def on(self, host: str) -> list[str]:
-        """The command that becomes one on `host`."""
+        """Return a command prefix that runs a command on `host`."""
         return ["ip", "netns", "exec", self._prefix + host]
 
 
 class Run:
-    """A mission under way."""
+    """A running mission."""
 
     def __init__(self, case: Case, network: Network, folder: Path, stack: ExitStack) -> None:
         self.out = folder / "out"
@@ -115,7 +116,7 @@ class Run:
             self.start_router()
         reach = ["--connect", router] if case.secured else ["--listen", clock]
         self.parts = {"world": self._part("world", "world", str(self.scenario), *reach, *rate)}
-        self.parts["world"].until_written(self.out / "world.journal", 1)  # which it does when it listens
+        self.parts["world"].until_written(self.out / "world.journal", 1)  # when it listens
         if case.routed and not case.secured:
             self.start_router()
         for robot in ("a", "b"):
@@ -132,17 +133,17 @@ class Run:
         )
 
     def start_router(self) -> None:
-        """The router between the world and the agents."""
+        """Start the router between the world and the agents."""
         arguments = [sys.executable, "-m", "tests.namespaces", *self._route]
         self.router = subprocess.Popen([*self._network.on("router"), *arguments])
         self._stack.callback(_end, self.router)
 
     def written(self) -> int:
-        """How much the world has on record."""
+        """Return the size of the world's journal in bytes."""
         return size(self.out / "world.journal")
 
     def answered(self) -> int:
-        """The latest tick in which both answered."""
+        """Return the latest tick in which both robots have answered; -1 if none."""
         kinds = Environment | Scenario | Command | DeadlineMissed | MissionEnd | FinalReport
         both: dict[int, int] = {}
         for frame in journal_file.read(self.out / "world.journal"):
@@ -153,12 +154,12 @@ class Run:
 
     @property
     def running(self) -> bool:
-        """Whether the world is."""
+        """True while the world runs."""
         return self.parts["world"].running
 
 
 def down(seconds: float) -> Callable[[Network, Run], None]:
-    """The link of a goes down for so long."""
+    """Return an interruption in which the link of a is down for `seconds`."""
 
     def happens(network: Network, _run: Run) -> None:
         network.link("a", "down")
@@ -171,7 +172,7 @@ def down(seconds: float) -> Callable[[Network, Run], None]:
 
 
 def killed(seconds: float) -> Callable[[Network, Run], None]:
-    """The router is killed, and started again after so long."""
+    """Return an interruption in which the router is killed, and restarted after `seconds`."""
 
     def happens(_network: Network, run: Run) -> None:
         run.router.kill()
@@ -206,7 +207,11 @@ CASES += [
 
 
 def play(case: Case, network: Network, expected: dict[str, bytes]) -> tuple[dict[str, Ended], float, str]:
-    """How everyone ended, the time until both robots answered again, and whether the bytes are the same."""
+    """Run a case.
+
+    Return how each process ended, the time in s until both robots answered again, and whether the recording
+    has the expected bytes.
+    """
     with tempfile.TemporaryDirectory(prefix="tandem-hosts-") as folder, ExitStack() as stack:
         run = Run(case, network, Path(folder), stack)
         run.parts["world"].until_written(run.out / "world.journal", MIDDLE[case.real_time])
@@ -223,7 +228,7 @@ def play(case: Case, network: Network, expected: dict[str, bytes]) -> tuple[dict
 
 
 def local() -> dict[str, bytes]:
-    """The record of the mission in lockstep, played in one process."""
+    """Return the recording of the lockstep mission, run in one process."""
     with tempfile.TemporaryDirectory(prefix="tandem-hosts-") as folder:
         scenario, out = Path(folder) / "scenario.toml", Path(folder) / "out"
         scenario.write_text(LONG)
@@ -232,7 +237,7 @@ def local() -> dict[str, bytes]:
 
 
 def route(listen: str, connect: list[str], keys: Path | None) -> None:
-    """Be the router, until killed."""
+    """Run the router until it is killed."""
     endpoints = Endpoints(tuple(connect), (listen,))
     if keys is not None:
         endpoints = configured(keys / KEYED, connect, [listen])
@@ -242,7 +247,7 @@ def route(listen: str, connect: list[str], keys: Path | None) -> None:
 
 @contextmanager
 def hosts() -> Iterator[Network]:
-    """Raises Unable."""
+    """Yield the network. Raises Unable if network namespaces cannot be used."""
     if os.geteuid() != 0:
         raise Unable("not root")
     if shutil.which("ip") is None:
@@ -256,7 +261,7 @@ def hosts() -> Iterator[Network]:
 
 
 class Unable(Exception):
-    """There can be no namespaces here; says why."""
+    """Network namespaces cannot be used here. The text gives the reason."""
 
 
 def _ip(*arguments: str) -> None:
@@ -269,16 +274,16 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def main(wanted: str) -> int:
-    """Play the cases that have `wanted` in their names, a line for each; 0 if all are as they should be."""
+    """Run the cases whose names contain `wanted`; return 0 if all results are as expected."""
     wrong = 0
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(130))  # clean up, then too
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(130))  # SIGTERM must clean up, too
     try:
         with hosts() as network:
             expected = local()
             print(f"{'case':54} {'outcome':32} {'resumed after s':>16} {'same bytes':>11}", flush=True)
             for case in CASES:
-                time_kept = f"--rate {RATE}" if case.real_time else "lockstep"
-                name = f"{case.what}, {time_kept}{case.by}"
+                timing = f"--rate {RATE}" if case.real_time else "lockstep"
+                name = f"{case.what}, {timing}{case.by}"
                 if wanted not in name:
                     continue
                 ended, resumed, same = play(case, network, expected)
@@ -294,7 +299,7 @@ def main(wanted: str) -> int:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
-    parser.add_argument("wanted", nargs="?", default="", help="only cases whose names have this")
+    parser.add_argument("wanted", nargs="?", default="", help="run only cases whose names contain this text")
     parser.add_argument("--router", nargs="+", metavar="LISTEN CONNECT", help=argparse.SUPPRESS)
     parser.add_argument("--keys", type=Path, help=argparse.SUPPRESS)
     arguments = parser.parse_args()

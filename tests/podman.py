@@ -1,4 +1,4 @@
-"""Podman, for a measurement: with storage and networks of its own, and a runtime that works here."""
+"""Podman for measurements, with its own storage and networks, and a container runtime that works here."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ RUNTIMES: tuple[dict[str, str], ...] = (
     {"runtime": "crun", "cgroup_manager": "cgroupfs"},
     {"runtime": "runc", "cgroup_manager": "cgroupfs"},
 )
-"""tried in this order: podman's own choice, and what runs without systemd, or with old cgroups"""
+"""The runtimes to try, in order: podman's default, then some for systems without systemd or new cgroups."""
 
 
 class Unable(Exception):
-    """There can be no containers here; says why."""
+    """Containers cannot run here. The text gives the reason."""
 
 
 class Podman:
-    """Podman, with storage and networks of this run's own."""
+    """The command podman, with separate storage and networks that are removed at the end."""
 
     def __init__(self, folder: Path, stack: ExitStack) -> None:
         self._folder = folder
@@ -37,7 +37,7 @@ class Podman:
         stack.callback(self._leave)
 
     def load(self, base: Path, image: str) -> None:
-        """Import the image, and find out how a container starts. Raises Unable."""
+        """Import the base image, and select a runtime that starts containers. Raises Unable without one."""
         for engine in RUNTIMES:
             self._configure(engine)
             self("import", base, image)
@@ -52,22 +52,22 @@ class Podman:
         raise Unable("podman starts no container here")
 
     def _configure(self, engine: dict[str, str]) -> None:
-        said = "".join(f'{name} = "{value}"\n' for name, value in engine.items())
+        settings = "".join(f'{name} = "{value}"\n' for name, value in engine.items())
         (self._folder / "networks").mkdir(exist_ok=True)
         (self._folder / "containers.conf").write_text(
             '[containers]\ndefault_ulimits = ["nofile=1024:1024", "nproc=1024:1024"]\n'
             f'[network]\nnetwork_backend = "netavark"\nnetwork_config_dir = "{self._folder}/networks"\n'
-            f'[engine]\ntmp_dir = "{self._folder}/tmp"\n{said}'
+            f'[engine]\ntmp_dir = "{self._folder}/tmp"\n{settings}'
         )
 
     def __call__(self, *arguments: str | Path, check: bool = True) -> str:
-        """What the command prints. Raises CalledProcessError."""
+        """Run podman, and return its standard output. Raises CalledProcessError."""
         return self._run(["podman", *map(str, arguments)], check)
 
-    def compose(self, *arguments: str, **said: str) -> None:
-        """podman-compose, of our file. Raises CalledProcessError."""
+    def compose(self, *arguments: str, **environment: str) -> None:
+        """Run podman-compose with the project's compose file. Raises CalledProcessError."""
         command = [sys.executable, "-m", "podman_compose", "-f", str(DEPLOY / "compose.yaml"), *arguments]
-        self._run(command, check=True, environment=said)
+        self._run(command, check=True, environment=environment)
 
     def _run(self, command: list[str], check: bool, environment: dict[str, str] | None = None) -> str:
         done = subprocess.run(

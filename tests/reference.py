@@ -1,4 +1,4 @@
-"""The values of an independent implementation: Section IV at every tick, eq. (7), phase 1."""
+"""Reference values of an independent implementation: the simulations of Section IV, eq. (7), and phase 1."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Pair = tuple[float, float]
 
 
 class Simulation(msgspec.Struct, frozen=True):
-    """One of Section IV's, at every tick."""
+    """A simulation of Section IV, with its values at every tick."""
 
     sa: Triple
     sb: Triple
@@ -26,16 +26,16 @@ class Simulation(msgspec.Struct, frozen=True):
     k_second: int
     k_last: int
     candidates: list[tuple[float, Pair]]
-    """every solution of eq. (7)"""
+    """all solutions of eq. (7)"""
     J: float
     w2: float
     d_i: list[float]
-    """of the candidates that silence has left"""
+    """distances d_i of eq. (8) for the solutions that are consistent with no detection, in m"""
     chosen: tuple[float, Pair]
 
 
 class Solution(msgspec.Struct, frozen=True):
-    """A placement of <a(M1)> in <b(M2)>."""
+    """A placement of the frame <a(M1)> in <b(M2)>."""
 
     phi: float
     T: Pair
@@ -55,7 +55,7 @@ class Equation7(msgspec.Struct, frozen=True):
 
 
 class Phase1(msgspec.Struct, frozen=True):
-    """A robot alone with its anchor, which is at the origin."""
+    """Phase 1 of a robot whose anchor is at the origin."""
 
     start: Triple
     rho0: float
@@ -69,7 +69,7 @@ class Phase1(msgspec.Struct, frozen=True):
 
 
 class Reference(msgspec.Struct, frozen=True):
-    """The whole file."""
+    """The contents of `data/reference_values.json`."""
 
     sims: list[Simulation]
     eq7: list[Equation7]

@@ -1,7 +1,7 @@
-"""A robot base as zenoh-bridge-ros2dds shows one: Twists in, Odometry and Ranges out, in CDR by pycdr2.
+"""A simulated robot base as zenoh-bridge-ros2dds exposes it: Twists in, Odometry and Ranges out, in CDR.
 
-Nothing of it is the driver's: its messages are declared here from ROS 2's own definitions (common_interfaces
-of humble). Annotations are looked at while the program runs, so they are no strings.
+It shares no code with the driver: the messages are declared here with pycdr2, from the definitions of ROS 2
+Humble (common_interfaces). pycdr2 evaluates annotations at run time, so they must not be strings.
 """
 
 import math
@@ -22,7 +22,7 @@ from protocol.network.endpoints import listening
 
 Covariance: Any = array[float64, 36]  # type: ignore[misc]
 PERIOD_S = 0.01
-"""of odometry and ranges"""
+"""The period in s of odometry and ranges."""
 WATCHDOG_S = 0.5
 """The time in s after the last Twist at which the base stops: the default of ros2_control's diff drive.
 
@@ -121,13 +121,13 @@ def twist(payload: bytes) -> tuple[float, float]:
 
 
 class Base:
-    """It moves as it is told, measures where it is, and stands when nobody tells it anything."""
+    """A base that executes Twists, publishes measurements, and stops when it receives no more Twists."""
 
     def __init__(self, link: zenoh.Session, anchor: tuple[float, float], reach: float) -> None:
         self.pose = Pose(0.3, -0.4, 3.0)
         self._anchor = anchor
         self._reach = reach
-        self._told = (0.0, 0.0)
+        self._command = (0.0, 0.0)
         self._at = 0.0
         self._over = threading.Event()
         self._odom = session.publisher(link, "bot/odom")
@@ -136,13 +136,13 @@ class Base:
         link.declare_subscriber("bot/cmd_vel", self._on_twist)
 
     def _on_twist(self, sample: zenoh.Sample) -> None:
-        self._told, self._at = twist(sample.payload.to_bytes()), time.monotonic()
+        self._command, self._at = twist(sample.payload.to_bytes()), time.monotonic()
 
     def run(self) -> None:
         before = time.monotonic()
         while not self._over.wait(PERIOD_S):
             now = time.monotonic()
-            v, omega = self._told if now - self._at < WATCHDOG_S else (0.0, 0.0)
+            v, omega = self._command if now - self._at < WATCHDOG_S else (0.0, 0.0)
             self.pose, before = step(self.pose, v, omega, now - before), now
             rho = math.dist((self.pose.x, self.pose.y), self._anchor)
             self._odom.put(odometry(self.pose))
@@ -155,7 +155,7 @@ class Base:
 
 @contextmanager
 def base(endpoint: str, anchor: tuple[float, float], reach: float) -> Iterator[Base]:
-    """One that is there, behind its bridge at `endpoint`."""
+    """Yield a running base behind a bridge at `endpoint`."""
     with session.open_router(listening(endpoint)) as link:
         found = Base(link, anchor, reach)
         thread = threading.Thread(target=found.run)

@@ -1,4 +1,4 @@
-"""A Zenoh router by a configuration alone, with Zenoh's own defaults: `python -m tests.router CONFIG`."""
+"""A Zenoh router with a configuration file and Zenoh's defaults: `python -m tests.router CONFIG`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import zenoh
 
 if __name__ == "__main__":
     file = Path(sys.argv[1])
-    os.chdir(file.parent)  # where Zenoh looks for the files that a configuration names
+    os.chdir(file.parent)  # Zenoh resolves file names in a configuration against the working directory
     zenoh.init_log_from_env_or("off")
     with zenoh.open(zenoh.Config.from_file(file)):
         print("routing", flush=True)

@@ -1,8 +1,9 @@
-"""A measurement: random fault plans, played as processes and in one process; are all journals the same bytes?
+"""A measurement: do random fault plans give the same journals as processes and in one process?
 
     uv run python -m tests.same_plans 20
 
-A line for each plan, and a verdict; exit status 0 if all are the same. The number of a plan is its seed.
+It prints a line per plan and a verdict. The exit status is 0 if all journals are the same. The number of a
+plan is its seed.
 """
 
 from __future__ import annotations
@@ -19,33 +20,34 @@ from tests.surveys import ODOMETRY, SIGMA, WHEELS
 
 EXACT, RANGES, ALL_NOISE = "", SIGMA, f"{SIGMA}\noutliers = 0.05\n{WHEELS}\n{ODOMETRY}"
 MAX_TICKS = 300
-"""a plan that lets next to nothing through ends undecided, which is to be the same both ways, too"""
+"""The length of a mission. A plan that delivers almost no report ends undecided, which is fine, too."""
 
 
 def main(count: int) -> int:
-    """Play `count` of them; 0 if every journal is the same both ways."""
+    """Run `count` plans; return 0 if every journal is the same in both cases."""
     different = 0
     for number in range(1, count + 1):
         text = scenario(random.Random(number))
         parse(text, f"plan {number}")
         with tempfile.TemporaryDirectory(prefix="tandem-same-") as folder:
-            outcomes, found = played(text, Path(folder))
+            outcomes, found = run_both_ways(text, Path(folder))
         same = found[0] == found[1] != {} and outcomes[0] == outcomes[1]
         different += not same
-        told = f"{len(found[0])} journals, {sum(map(len, found[0].values()))} bytes"
+        amount = f"{len(found[0])} journals, {sum(map(len, found[0].values()))} bytes"
         print(
-            f"{number:3} {'same' if same else 'DIFFERENT'}: {outcomes[0]}; {told}; {said(text)}", flush=True
+            f"{number:3} {'same' if same else 'DIFFERENT'}: {outcomes[0]}; {amount}; {described(text)}",
+            flush=True,
         )
         if not same:
             for name in sorted(found[0].keys() | found[1].keys()):
                 if found[0].get(name) != found[1].get(name):
                     print(f"    {name} differs; as processes {outcomes[0]}, in one process {outcomes[1]}")
-    print(f"{count - different} of {count} plans: the same bytes both ways")
+    print(f"{count - different} of {count} plans give the same bytes in both cases")
     return 1 if different else 0
 
 
-def played(text: str, folder: Path) -> tuple[list[str], list[dict[str, bytes]]]:
-    """As processes, then in one: how it ended, and the journals."""
+def run_both_ways(text: str, folder: Path) -> tuple[list[str], list[dict[str, bytes]]]:
+    """Run a plan as processes, then in one process; return the outcomes and the journals."""
     (folder / "plan.toml").write_text(text)
     outcomes, found = [], []
     for out, mode in (("processes", []), ("one-process", ["--in-process"])):
@@ -56,7 +58,7 @@ def played(text: str, folder: Path) -> tuple[list[str], list[dict[str, bytes]]]:
 
 
 def scenario(draw: random.Random) -> str:
-    """A scenario with a plan of one to four faults; a third of them under noise, a fifth with two pairs."""
+    """Return a scenario with one to four faults; a third have noise, and a fifth of the others two pairs."""
     noise = draw.choice((EXACT, EXACT, EXACT, EXACT, RANGES, ALL_NOISE))
     planner_name = draw.choice(("assured", "assured", "assured", "paper"))
     pairs = 2 if draw.random() < 0.2 and not noise else 1
@@ -74,12 +76,12 @@ def scenario(draw: random.Random) -> str:
 
 
 def fault(draw: random.Random, pairs: int) -> str:
-    """The table of one."""
+    """Return the table of a random fault."""
     links = ["*", "a->b", "b->a", "a<->b", *(["c->d", "c<->d"] if pairs == 2 else [])]
     lines = [f'link = "{draw.choice(links)}"']
     least, most = sorted((draw.randrange(11), draw.randrange(11)))
     begin, ticks = draw.randrange(10), draw.randrange(30)
-    may_say = (
+    options = (
         f"loss = {draw.uniform(0.0, 0.9):.3f}",
         f"burst_start = {draw.uniform(0.0, 0.5):.3f}\nburst_end = {draw.uniform(0.05, 1.0):.3f}",
         f"delay = [{least}, {most}]",
@@ -89,12 +91,12 @@ def fault(draw: random.Random, pairs: int) -> str:
         f"reports_per_tick = {draw.uniform(0.1, 2.0):.3f}",
         f"partition = true\ncontact_ticks = [{begin}, {begin + ticks}]",
     )
-    lines += [line for line in may_say if draw.random() < 0.4]
+    lines += [line for line in options if draw.random() < 0.4]
     return "\n".join(lines) + "\n"
 
 
-def said(text: str) -> str:
-    """The plan, in a line."""
+def described(text: str) -> str:
+    """Return a plan as one line of text."""
     planner_name = "paper" if '"paper"' in text else "assured"
     noise = "noisy" if "mission.noise" in text else "exact"
     pairs = text.count("[[robot]]") // 2

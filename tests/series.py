@@ -9,6 +9,6 @@ import pytest
 
 
 def series(cases: Iterable[Any], short: int = 1) -> list[Any]:
-    """Return `cases` for `parametrize` or a fixture's `params`, all but the first `short` marked long."""
+    """Return `cases` for `parametrize` or `params` of a fixture, all but the first `short` marked as long."""
     listed = list(cases)
     return listed[:short] + [pytest.param(case, marks=pytest.mark.long) for case in listed[short:]]

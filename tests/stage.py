@@ -1,4 +1,7 @@
-"""A stage for a `Field`: time passes only while it waits, and the test answers what it says."""
+"""A simulated environment for the bridge of hardware mode.
+
+Time passes only while the bridge waits, and the test answers the frames that it sends.
+"""
 
 from __future__ import annotations
 
@@ -13,17 +16,17 @@ from protocol.network.inbox import NOTHING, Arrival, Inbox, Topic
 from world.hardware import bridge, termination
 
 TRANSPORT_S = 1e-4
-"""how long whatever is said is on its way"""
+"""The simulated transport time of a frame, in s."""
 
 
 class Stage(Inbox):
-    """The clock, the network and the inbox of a `Field`, in one thread: nothing depends on the machine."""
+    """The clock, network and inbox of a bridge, in one thread and independent of the speed of the machine."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         super().__init__("field")
         self.now = 0.0
         self.put_frames: list[tuple[str, bytes]] = []
-        """what the field has said: key and frame"""
+        """keys and frames that the bridge has sent"""
         self.answer: Callable[[str, bytes], None] = lambda _key, _frame: None
         self._coming: list[tuple[float, int, Arrival]] = []
         for module in (bridge, termination):
@@ -32,7 +35,7 @@ class Stage(Inbox):
             bridge,
             "session",
             SimpleNamespace(
-                publisher=lambda _link, key: SimpleNamespace(put=lambda frame: self._said(key, frame)),
+                publisher=lambda _link, key: SimpleNamespace(put=lambda frame: self._on_put(key, frame)),
                 subscribe=lambda *_: None,
                 watch_liveliness=lambda *_: None,
                 answer=lambda *_: None,
@@ -41,16 +44,16 @@ class Stage(Inbox):
         )
 
     def monotonic(self) -> float:
-        """The time on stage."""
+        """Return the simulated time in s."""
         return self.now
 
     def alive(self, *robots: str) -> None:
-        """These robots' agents are there."""
+        """Report the agents of these robots as alive."""
         for robot in robots:
             self.comes("alive", keys.robot_alive("r", robot))
 
     def comes(self, topic: Topic, key: str, frame: bytes = b"", after: float = TRANSPORT_S) -> None:
-        """That arrives `after` so many seconds from now."""
+        """Schedule an arrival `after` seconds from now."""
         heapq.heappush(
             self._coming,
             (
@@ -61,7 +64,7 @@ class Stage(Inbox):
         )
 
     def next(self, timeout: float | None) -> Arrival:
-        """The next arrival, once it is time for it; NOTHING after `timeout` seconds without."""
+        """Return the next arrival at its time; NOTHING if there is none within `timeout` seconds."""
         assert timeout is not None
         until = self.now + max(timeout, 0.0)
         if self._coming and self._coming[0][0] <= until:
@@ -71,6 +74,6 @@ class Stage(Inbox):
         self.now = until
         return NOTHING
 
-    def _said(self, key: str, frame: bytes) -> None:
+    def _on_put(self, key: str, frame: bytes) -> None:
         self.put_frames.append((key, frame))
         self.answer(key, frame)

@@ -1,4 +1,4 @@
-"""A mission by the bare planner and world, tick by tick."""
+"""A mission that runs the planner and the world directly, tick by tick."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from world.tick import World, advance, observations, release
 
 
 class Step(NamedTuple):
-    """One tick: what went into each of its halves, and what came out."""
+    """One tick: the inputs and outputs of `observe` and `decide` of each robot."""
 
     world: World
     sensed: list[Observation]
@@ -24,7 +24,7 @@ class Step(NamedTuple):
 
 
 def steps(name: str) -> Iterator[Step]:
-    """The ticks of the scenario `name`, which ends localised."""
+    """Yield the ticks of the scenario `name`, and check that it ends localised."""
     world = release(load(name))
     states = {robot.id: RobotState(world.scenario.config(robot.id)) for robot in world.scenario.robots}
     while True:

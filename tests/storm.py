@@ -1,9 +1,10 @@
 """Mutated frames on every key of a running mission: `python -m tests.storm 1000000`.
 
-No test: it takes long (`tests/test_bad_frames.py` plays a short one). A stranger's session puts so many
-frames, drawn from a seed, evenly over the ticks of a mission of two pairs. Robots c and d are played here, by
-the record of the same mission in one process: they answer a tick once its frames are put, so the mission
-lasts as long as the storm, and no more than two ticks' frames wait anywhere.
+This is a measurement, because it takes long; `tests/test_bad_frames.py` runs a short one. An unrelated Zenoh
+session puts the given number of frames, drawn from a seed and spread evenly over the ticks of a mission of
+two pairs. This process replaces the agents of robots c and d: it replays their frames from the recording of
+the same mission in one process. They answer a tick after its frames have been put, so the mission lasts as
+long as the storm, and at most the frames of two ticks are queued anywhere.
 """
 
 from __future__ import annotations
@@ -52,20 +53,27 @@ from world.scenario import Scenario
 
 RUN = "storm"
 CALM_TICKS = 12
-"""at the end, so that the last frame is in before the MissionEnd"""
+"""The number of ticks at the end without frames; the last frame arrives before the MissionEnd."""
 LINK_BYTES = 47_000
-"""a little less than what breaks a low-latency link"""
-PLAYED, PUPPETS = ("a", "b"), ("c", "d")
+"""The size of a huge frame, slightly below the one that breaks a low-latency link."""
+AGENTS, PUPPETS = ("a", "b"), ("c", "d")
+"""The robots with agents, and the robots that this process replaces."""
 MOMENTS = 5
-"""when memory is looked at, from the first frame to the last"""
+"""The number of memory measurements, from the first frame to the last."""
 
 Fate = Literal["refused", "passed over", "either", "unheard"]
-"""what must become of a frame: counted as refused; none of this tick's, and left aside; one or the other,
-by what has come before; or nobody listens"""
+"""The expected treatment of a frame.
+
+`refused`: it is counted as refused. `passed over`: it belongs to another tick and is ignored. `either`: one
+of these, depending on earlier frames. `unheard`: no process subscribes to its key.
+"""
 
 
 def scenario(distance: float) -> str:
-    """Two pairs. Those of the first meet late; then a hears b, late and twice, and b does not hear a."""
+    """Return a scenario of two pairs whose first pair has faults in both directions.
+
+    The first pair meets late. Then a receives the reports of b late and duplicated, and b receives none of a.
+    """
     return f"""
 name = "storm"
 seed = 3
@@ -103,12 +111,12 @@ class Shot(NamedTuple):
     kind: str
     key: str
     frame: bytes | None
-    """none is a deletion"""
+    """content; None for a deletion"""
     fate: Fate
 
 
 class Genuine:
-    """Every frame of a mission, by key and tick, as it was played undisturbed in one process."""
+    """Every frame of a mission in one process without a storm, by key and tick."""
 
     def __init__(self, played: Scenario, folder: Path) -> None:
         recording = in_process.play(played, folder)
@@ -147,7 +155,7 @@ class Genuine:
 
 
 class Storm:
-    """Draws frames, each for the tick in which it is put."""
+    """A generator of frames, each drawn for the tick in which it is put."""
 
     def __init__(self, genuine: Genuine, seed: int) -> None:
         self._draw = random.Random(seed)
@@ -155,17 +163,17 @@ class Storm:
         self._last = genuine.ticks
         self.acted_on = [
             key
-            for one, other in (PLAYED, PLAYED[::-1])
+            for one, other in (AGENTS, AGENTS[::-1])
             for key in (keys.observation(RUN, one), keys.command(RUN, one), keys.report(RUN, one, other))
         ]
-        """keys by which somebody of a, b and the world acts on frames"""
+        """keys on whose frames a, b or the world acts"""
         self.watched = [
             keys.truth(RUN),
             keys.config(RUN, "a"),
             keys.world_alive(RUN),
-            *[key for one in PLAYED for key in (keys.estimate(RUN, one), keys.robot_alive(RUN, one))],
+            *[key for one in AGENTS for key in (keys.estimate(RUN, one), keys.robot_alive(RUN, one))],
         ]
-        """others of the mission, and nothing put on them changes anything"""
+        """other keys of the mission, whose frames have no effect"""
         self.ghost = keys.command(RUN, "ghost")
         self.wild = [
             *(
@@ -178,12 +186,12 @@ class Storm:
             *(f"tandem/{RUN}/robot/a/*", f"tandem/{RUN}/r$*/a/observation", "*/*/*/*/*", "**/to/*"),
             *(f"{keys.command(RUN, 'a')}/**", f"tandem/{RUN}/robot/*/**/b"),
         ]
-        """wildcards, each of which covers keys by which somebody acts on frames"""
+        """wildcards that match keys in `acted_on`"""
         self.odd = [
             *("tandem", "command", f"tandem/{RUN}", f"tandem/{RUN}/robot", f"tandem/{RUN}/robot/a"),
             *(f"{key}/more" for key in self.acted_on),
         ]
-        """keys of too few chunks, and of too many: nobody listens"""
+        """keys with too few or too many chunks, to which no process subscribes"""
         kinds: dict[Callable[[str, int], Shot], int] = {
             self.truncated: 15,
             self.flipped: 15,
@@ -201,7 +209,7 @@ class Storm:
         self._kinds, self._weights = list(kinds), list(kinds.values())
 
     def shot(self, tick: int) -> Shot:
-        """The next, while `tick` is played."""
+        """Return the next frame to put during `tick`."""
         [kind] = self._draw.choices(self._kinds, self._weights)
         if self._draw.random() < 0.1:
             shot = kind(self._draw.choice(self.acted_on), tick)
@@ -229,7 +237,7 @@ class Storm:
         return Shot("huge", key, self._draw.randbytes(1) * size, "refused")
 
     def replayed(self, key: str, tick: int) -> Shot:
-        """As it was, of the right sender."""
+        """Return an unchanged old frame of the correct sender."""
         topic = _topic(key)
         old = [past for past in self._genuine[key] if past <= tick - 2] if topic == "report" else []
         if tick < 2 or (topic == "report" and not old):
@@ -239,7 +247,7 @@ class Storm:
         return Shot(f"{topic} replayed", key, self._genuine[key][past], fate)
 
     def old(self, key: str, tick: int) -> Shot:
-        """Well-formed, of a tick that is over, and not what was said then."""
+        """Return a valid frame of a past tick that differs from the one sent then."""
         if tick < 2:
             return self.truncated(key, tick)
         past = self._draw.randrange(max(0, tick - 80), tick - 1)
@@ -253,7 +261,7 @@ class Storm:
         return Shot(f"{type(message).__name__} of a tick to come", key, encode(message), "refused")
 
     def posing(self, key: str, tick: int) -> Shot:
-        """By the key of one robot, from another; or for it."""
+        """Return a frame on the key of one robot that names another robot."""
         robot = _robot(key)
         message = replace(self._forged(key, tick, end=False), robot="c" if robot == "a" else "a")
         if _topic(key) == "command" and self._draw.random() < 0.3:
@@ -261,7 +269,7 @@ class Storm:
         return Shot("from another", key, encode(message), "refused")
 
     def again(self, key: str, tick: int) -> Shot:
-        """What its robot has just been told, or tells, as it is."""
+        """Return the genuine frame of this tick, unchanged."""
         frame = self._genuine[key].get(tick)
         if frame is None:
             return self.flipped(key, tick)
@@ -280,13 +288,13 @@ class Storm:
         return self._of(self._draw.choice(list(self._genuine)), tick)
 
     def _of(self, key: str, tick: int) -> bytes:
-        """A genuine frame that `key` carries, of about `tick` if there is one."""
-        told = self._genuine[key]
+        """Return a genuine frame of `key`, of a tick shortly before `tick` if there is one."""
+        genuine = self._genuine[key]
         near = max(0, tick - self._draw.randrange(100))
-        return told[near] if near in told else self._draw.choice(list(told.values()))
+        return genuine[near] if near in genuine else self._draw.choice(list(genuine.values()))
 
     def _forged(self, key: str, tick: int, *, end: bool = True) -> Any:
-        """Of `tick`, and nothing that is ever said."""
+        """Return a message of `tick` that no process of the mission ever sends."""
         robot, some = _robot(key), self._draw.uniform(0.01, 3.0)
         match _topic(key):
             case "observation" if end and self._draw.random() < 0.3:
@@ -310,77 +318,82 @@ def _topic(key: str) -> str:
 
 
 class Tally:
-    """What was put, and what became of it."""
+    """The counts of frames put, and the results of the storm."""
 
     def __init__(self) -> None:
         self.fates: Counter[tuple[str, Fate]] = Counter()
-        """by who gets it, and what must become of it"""
+        """number of frames by recipient and expected treatment"""
         self.kinds: Counter[tuple[str, str]] = Counter()
-        """by kind, and what it was put on"""
+        """number of frames by kind and topic of the key"""
         self.memory: dict[str, list[float]] = {}
-        """MB of each process, at MOMENTS"""
+        """resident memory of each process in MB, MOMENTS values"""
         self.seconds = 0.0
+        """duration of the storm"""
         self.statuses: list[int] = []
         self.refused: dict[str, int] = {}
-        """by process"""
+        """number of frames that each process has refused"""
         self.late = 0
-        """Drives that the world has left aside"""
+        """number of Commands of past ticks that the world has ignored"""
         self.outcome = ""
         self.same = False
-        """whether `ticks.csv` is that of the undisturbed mission"""
-        self.said = ""
+        """true if `ticks.csv` equals that of the mission without a storm"""
+        self.errors = ""
+        """standard error of all processes"""
 
     @property
     def frames(self) -> int:
-        """In all."""
+        """The number of frames put."""
         return self.kinds.total()
 
     def note(self, shot: Shot) -> None:
-        """It was put."""
+        """Count a frame that has been put."""
         for process in recipients(shot.key):
             self.fates[process, shot.fate] += 1
         concrete = shot.fate != "unheard" and keys.parse(shot.key) is not None
         self.kinds[shot.kind, _topic(shot.key) if concrete else "others"] += 1
 
     def accounted(self, process: str) -> bool:
-        """Whether it has refused what it must, and nothing that it must not."""
+        """Return true if the process has refused all frames that it must, and no others than `either`."""
         must = self.fates[process, "refused"]
         return must <= self.refused[process] <= must + self.fates[process, "either"]
 
 
-LISTENED = (
+SUBSCRIBED = (
     ("world", keys.command(RUN, "*")),
     *[
         (one, key)
-        for one, other in (PLAYED, PLAYED[::-1])
+        for one, other in (AGENTS, AGENTS[::-1])
         for key in (keys.observation(RUN, one), keys.report(RUN, other, one))
     ],
 )
-"""who listens to what, of the processes that act on it"""
+"""The processes that act on frames, with the keys to which they subscribe."""
 
 
 @cache
 def recipients(key: str) -> Sequence[str]:
-    """The processes that get what is put on `key`; one gets a wildcard once for each key that it covers."""
+    """Return the processes that receive a frame put on `key`, once per matching subscription."""
     put = zenoh.KeyExpr(key)
-    return [process for process, heard in LISTENED if put.intersects(zenoh.KeyExpr(heard))]
+    return [process for process, subscribed in SUBSCRIBED if put.intersects(zenoh.KeyExpr(subscribed))]
 
 
 def rage(
     frames: int, seed: int, distance: float, folder: Path, advance: Callable[[], None] = lambda: None
 ) -> Tally:
-    """A storm of so many frames, on a mission whose anchors are `distance` apart; `advance` hears of each."""
-    file, out, alone = folder / "storm.toml", folder / "out", folder / "alone"
-    alone.mkdir()
+    """Run a storm of `frames` frames on a mission whose anchors are `distance` m apart.
+
+    `advance` is called after each frame.
+    """
+    file, out, calm = folder / "storm.toml", folder / "out", folder / "calm"
+    calm.mkdir()
     file.write_text(scenario(distance))
-    genuine = Genuine(load(str(file)), alone)
+    genuine = Genuine(load(str(file)), calm)
     tally, storm = Tally(), Storm(genuine, seed)
     with world(file, "--run", RUN, "--out", out) as (clock, endpoint), ExitStack() as others:
         agents = {
             robot: others.enter_context(
                 TandemProcess("agent", robot, "--connect", endpoint, "--out", out, "-q")
             )
-            for robot in PLAYED
+            for robot in AGENTS
         }
         for robot, agent in agents.items():
             agent.until_answered(robot, out)
@@ -406,20 +419,20 @@ def rage(
                 tally.seconds = time.monotonic() - began
                 _look(processes, tally)
         tally.statuses = [process.ended().status for process in processes.values()]
-        tally.said = "".join(process.err for process in processes.values())
+        tally.errors = "".join(process.err for process in processes.values())
         totals = re.search(r"refused (\d+) frames in all(?:, and discarded (\d+))?", clock.err)
     result = json.loads((out / "summary.json").read_text())
     tally.outcome = result["outcome"]
-    tally.refused = {robot: result["robots"][robot]["frames_refused"] for robot in PLAYED}
+    tally.refused = {robot: result["robots"][robot]["frames_refused"] for robot in AGENTS}
     tally.refused["world"], tally.late = (
         (int(number or 0) for number in totals.groups()) if totals else (0, 0)
     )
-    tally.same = (out / "ticks.csv").read_bytes() == (alone / "ticks.csv").read_bytes()
+    tally.same = (out / "ticks.csv").read_bytes() == (calm / "ticks.csv").read_bytes()
     return tally
 
 
 def stranger_at(endpoint: str) -> zenoh.Session:
-    """A session with nothing of our configuration: ours cannot even send what is oversized."""
+    """Open a session with Zenoh's own configuration; Tandem's cannot send oversized frames."""
     config = zenoh.Config()
     config.insert_json5("mode", json.dumps("client"))
     config.insert_json5("connect/endpoints", json.dumps([endpoint]))
@@ -428,39 +441,39 @@ def stranger_at(endpoint: str) -> zenoh.Session:
 
 
 def _publishers(link: zenoh.Session, storm: Storm) -> dict[str, zenoh.Publisher]:
-    """One for each key, once everybody listens: a put before that would be lost."""
-    heeded = [*storm.acted_on, storm.ghost, *storm.wild]
-    found = {key: session.publisher(link, key) for key in (*heeded, *storm.watched, *storm.odd)}
-    heard: dict[str, bool] = {}
-    for key in heeded:
-        session.on_matching(found[key], partial(heard.__setitem__, key))
-    until(lambda: all(heard.get(key) for key in heeded), "everyone listens")
+    """Return a publisher for each key, after all processes have subscribed. Earlier frames would be lost."""
+    subscribed = [*storm.acted_on, storm.ghost, *storm.wild]
+    found = {key: session.publisher(link, key) for key in (*subscribed, *storm.watched, *storm.odd)}
+    matched: dict[str, bool] = {}
+    for key in subscribed:
+        session.on_matching(found[key], partial(matched.__setitem__, key))
+    until(lambda: all(matched.get(key) for key in subscribed), "all processes subscribe")
     return found
 
 
 @contextmanager
 def _ticks(endpoint: str, genuine: Genuine) -> Iterator[Iterator[int]]:
-    """The ticks of the mission. The puppets answer each when the next is asked for."""
+    """Yield an iterator over the ticks of the mission. PUPPETS answer a tick when the next is requested."""
 
-    def nobody() -> None:
+    def on_no_world() -> None:
         raise AssertionError("no world")
 
     inbox = Inbox("storm")
-    with session.open_client(at(endpoint), nobody) as link:
+    with session.open_client(at(endpoint), on_no_world) as link:
         commands = {robot: session.publisher(link, keys.command(RUN, robot)) for robot in PUPPETS}
         for robot in PUPPETS:
             session.subscribe(link, keys.observation(RUN, robot), inbox, "observation")
         tokens = [session.show_alive(link, keys.robot_alive(RUN, robot)) for robot in PUPPETS]
-        yield _played(inbox, commands, genuine)
+        yield _puppet_ticks(inbox, commands, genuine)
         del tokens
 
 
-def _played(inbox: Inbox, commands: dict[str, zenoh.Publisher], genuine: Genuine) -> Iterator[int]:
+def _puppet_ticks(inbox: Inbox, commands: dict[str, zenoh.Publisher], genuine: Genuine) -> Iterator[int]:
     latest = -1
-    parted: set[str] = set()
-    while len(parted) < len(PUPPETS):
+    ended: set[str] = set()
+    while len(ended) < len(PUPPETS):
         arrival = inbox.next(BOUND_S)
-        assert arrival.topic == "observation", "the world is silent"
+        assert arrival.topic == "observation", "the world sends nothing"
         robot = arrival.source.robot
         message: Observation | MissionEnd | FinalReport = decode(
             arrival.frame, Observation | MissionEnd | FinalReport
@@ -474,7 +487,7 @@ def _played(inbox: Inbox, commands: dict[str, zenoh.Publisher], genuine: Genuine
             case MissionEnd():
                 commands[robot].put(genuine.final_reports[robot])
             case FinalReport():
-                parted.add(robot)
+                ended.add(robot)
 
 
 def _look(processes: dict[str, TandemProcess], tally: Tally) -> None:
@@ -486,13 +499,13 @@ def _look(processes: dict[str, TandemProcess], tally: Tally) -> None:
 
 
 def tables(tally: Tally) -> Sequence[Table]:
-    """What was put, and what became of it."""
+    """Return tables of the frames put, their treatment, and memory."""
     topics = ("observation", "command", "report", "others")
-    put = Table("kind", *topics, title="frames put, by what they were put on")
+    put = Table("kind", *topics, title="frames put, by topic of the key")
     for kind in sorted({kind for kind, _ in tally.kinds}):
         put.add_row(kind, *[f"{count:,}" if (count := tally.kinds[kind, topic]) else "" for topic in topics])
     fates: tuple[Fate, ...] = ("refused", "either", "passed over")
-    became = Table("process", *fates, "refused by it", title="what must become of them, and what did")
+    became = Table("process", *fates, "refused by it", title="expected treatment")
     memory = Table(
         "process", *[f"{100 * i // (MOMENTS - 1)} %" for i in range(MOMENTS)], title="resident memory, MB"
     )
@@ -504,7 +517,7 @@ def tables(tally: Tally) -> Sequence[Table]:
 
 
 def main(arguments: argparse.Namespace) -> int:
-    """Let it storm, and print what became of it."""
+    """Run a storm, print the results, and return 0 if they are as expected."""
     console = Console()
     with tempfile.TemporaryDirectory(prefix="storm-") as folder, Progress(console=console) as progress:
         bar = progress.add_task("storm", total=arguments.frames)
@@ -515,12 +528,12 @@ def main(arguments: argparse.Namespace) -> int:
         console.print(table)
     console.print(
         f"{tally.frames:,} frames in {tally.seconds:.0f} s, {tally.frames / tally.seconds:,.0f} a second; "
-        f"{tally.outcome}, {'the same' if tally.same else 'ANOTHER'} ticks.csv; "
-        f"the world left aside {tally.late:,} Commands of ticks past; statuses {tally.statuses}"
+        f"{tally.outcome}, {'the same' if tally.same else 'A DIFFERENT'} ticks.csv; "
+        f"the world ignored {tally.late:,} Commands of past ticks; statuses {tally.statuses}"
     )
     good = tally.outcome == "localised" and tally.same and all(map(tally.accounted, tally.memory))
     if not good:
-        console.print(tally.said)
+        console.print(tally.errors)
     return 0 if good else 1
 
 
@@ -528,5 +541,5 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("frames", type=int)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--distance", type=float, default=1000.0, help="m; the mission's ticks grow with it")
+    parser.add_argument("--distance", type=float, default=1000.0, help="distance of the anchors, m")
     sys.exit(main(parser.parse_args()))

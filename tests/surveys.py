@@ -1,4 +1,4 @@
-"""Missions under noise, with Section IV's parameters, whose starts are drawn."""
+"""Missions with noise and random starts, at the parameters of Section IV."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def scenario_of(
     accuracy: float = 0.1,
     max_ticks: int | None = None,
 ) -> Scenario:
-    """The anchors are 10 m apart."""
+    """Return a scenario with the given noise table; the anchors are 10 m apart."""
     text = f"""
         name = "survey"
         {f"max_ticks = {max_ticks}" if max_ticks is not None else ""}
@@ -52,16 +52,16 @@ def scenario_of(
 
 @cache
 def survey(noise: str, seed: int, planner_name: str = "assured", accuracy: float = 0.1) -> Recording:
-    """The mission of `scenario_of`, played in this process."""
+    """Return the recording of the mission of `scenario_of`, run in this process."""
     return play(scenario_of(noise, seed, planner_name=planner_name, accuracy=accuracy))
 
 
 def assert_localised(recording: Recording) -> None:
-    """As well as was asked for, in the same tick, and nobody farther off than the claim allows for."""
-    said = summary(recording, "in-process", None)
-    assert said["outcome"] == "localised", (recording.scenario.seed, said["reason"])
-    robots = said["robots"]
-    assert robots["a"]["localised_tick"] == robots["b"]["localised_tick"] == said["ticks"]
+    """Check that both robots localise in the same tick, to mission.accuracy and within the claimed sigmas."""
+    result = summary(recording, "in-process", None)
+    assert result["outcome"] == "localised", (recording.scenario.seed, result["reason"])
+    robots = result["robots"]
+    assert robots["a"]["localised_tick"] == robots["b"]["localised_tick"] == result["ticks"]
     accuracy = recording.scenario.mission.accuracy
     for robot in robots.values():
         off, sigma = robot["position_error_m"], robot["position_sigma_m"]
@@ -71,9 +71,9 @@ def assert_localised(recording: Recording) -> None:
 
 
 ROUNDING = 1e-6
-"""m and rad: what the referee allows for"""
+"""The tolerance of the referee, in m and rad."""
 
 
 def states(recording: Recording, robot: str) -> list[str]:
-    """What the robot did, tick by tick."""
+    """Return the state of the robot at every tick."""
     return [moment.commands[robot].state for moment in recording.moments]

@@ -248,7 +248,7 @@ def test_a_storm_of_mutated_frames_on_every_key_disturbs_nothing(tmp_path: Path)
         assert tally.accounted(process), (process, tally.fates, tally.refused)
         assert sizes[-1] - sizes[2] < SETTLED_MB
     assert tally.late >= tally.fates["world", "passed over"]
-    assert "Traceback" not in tally.said
+    assert "Traceback" not in tally.errors
 
 
 # --- well-formed frames, with this test as the world and the peer ---------------------------------------

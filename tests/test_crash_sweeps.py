@@ -101,7 +101,7 @@ def test_a_trial_that_leaves_another_record_has_failed_and_says_where(
     monkeypatch.setattr(in_process, "played", otherwise)
     found = play(Trial(0, 0, load("paper-1"), processes=False, kills=()))
     assert (found.outcome, found.ticks, found.same_record) == ("failed", 48, False)
-    assert found.reason == f"another record than in one process: {name}"
+    assert found.reason == f"the recording differs from the run in one process: {name}"
 
 
 def test_a_process_that_is_never_started_again_ends_its_trial() -> None:

@@ -82,7 +82,7 @@ def test_the_pictures_show_what_became_of_each_lie(results: execution.Results, t
     assert {f"{name}.{kind}" for name in ("attacks", "roc") for kind in ("svg", "pdf", "png")} <= {
         path.name for path in tmp_path.iterdir()
     }
-    place = attack_figures.axis_of_lies(results)
+    place = attack_figures.attack_axis(results)
     assert place == 0
     exact, noisy = attack_figures.outcomes(results, place).axes
     for panel in (exact, noisy):
@@ -102,6 +102,6 @@ def test_a_sweep_without_lies_has_no_such_pictures(tmp_path: Path) -> None:
     results = execution.sweep(
         sweep, tmp_path / "out", execution.ExecutionOptions(workers=1), Inbox("test"), progress
     )
-    assert attack_figures.axis_of_lies(results) is None
+    assert attack_figures.attack_axis(results) is None
     axis_figures.draw(results, tmp_path / "figures")
     assert not (tmp_path / "figures" / "roc.svg").exists()

@@ -1,4 +1,4 @@
-"""How soon the two meet, at whatever phases they begin to orbit; and what their orbits keep to."""
+"""The time until two orbiting robots meet, for all starting phases, and the limits of their orbits."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from protocol.motion import TAU
 from protocol.orbits import WAITING_PLACE, Orbit, half_passage, rendezvous
 
 Setting = tuple[float, float, float, float, float]
-"""D, R, T_s, v_max, omega_max"""
+"""A setting: D, R, T_s, v_max, omega_max."""
 
 SECTION_IV: Setting = (10.0, 3.0, 1.0, 1.0, math.pi)
 SETTINGS: tuple[Setting, ...] = (
@@ -32,16 +32,19 @@ ALWAYS_IN_RANGE: tuple[Setting, ...] = tuple(
 )
 
 FINE = (8192, 128)
-"""phases of a and of b: a's are the finer since a moves; b's hold those nearest to M1 and farthest from it"""
+"""The number of sampled phases of a and b. Those of a are finer because a moves.
+
+The phases of b include the nearest to M1 and the farthest from it.
+"""
 COARSE = (120, 120)
 ROUNDING = 1e-9
-"""s, m and rad: more than sums of this size lose"""
+"""The tolerance in s, m and rad, above the rounding error of sums of this size."""
 
 Array = NDArray[np.float64]
 
 
 def drawn(least: float, most: float) -> st.SearchStrategy[Setting]:
-    """Settings of all kinds, with R / D from `least` to `most`."""
+    """Return a strategy for settings with R / D from `least` to `most`."""
     ranges = st.floats(least, most), st.floats(0.05, 1.0), st.floats(0.3, 5.0), st.floats(0.2, math.pi)
     return st.tuples(st.floats(1.0, 40.0), *ranges).map(lambda of: (of[0], of[0] * of[1], *of[2:]))
 
@@ -51,22 +54,23 @@ def mission_of(setting: Setting) -> Mission:
 
 
 def pairs(phases: tuple[int, int]) -> tuple[Array, Array]:
-    """Every pair of starting phases of a and b."""
+    """Return all pairs of starting phases of a and b."""
     alpha, beta = np.meshgrid(*(np.arange(n) * (TAU / n) for n in phases))
     return alpha.ravel(), beta.ravel()
 
 
 def apart(distance: float, a: Orbit, alpha: Array, b: Orbit, beta: Array) -> Array:
-    """m: between robots at the phases alpha and beta of their orbits; M1 is at (0, 0) and M2 at (D, 0)."""
+    """Return the distance in m of robots at the phases alpha and beta; M1 is at (0, 0) and M2 at (D, 0)."""
     x = distance + b.radius * np.cos(beta) - a.radius * np.cos(alpha)
     y = b.radius * np.sin(beta) - a.radius * np.sin(alpha)
     return np.hypot(x, y)
 
 
 def meeting(setting: Setting, a: Orbit, b: Orbit, phases: tuple[int, int]) -> Array:
-    """The ticks until both are first in range, from every pair of phases: sampled, as the robots do.
+    """Return the ticks until the robots are first in range, for every pair of starting phases.
 
-    Ticks before which they cannot close the gap between them need no look. Fails where one pair passes by.
+    Distances are sampled once per tick, as by the robots. Ticks in which the robots cannot have closed the
+    gap are skipped. Fails if a pair of phases never leads to a meeting.
     """
     distance, reach, period, _, _ = setting
     alpha, beta = pairs(phases)
@@ -81,7 +85,7 @@ def meeting(setting: Setting, a: Orbit, b: Orbit, phases: tuple[int, int]) -> Ar
     return ticks
 
 
-# --- how long it takes --------------------------------------------------------------------------------
+# --- time to meet -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("setting", SETTINGS)
@@ -101,7 +105,7 @@ def test_the_bound_holds_in_every_setting(setting: Setting) -> None:
 
 
 def papers(setting: Setting) -> tuple[Orbit, Orbit]:
-    """Eq. (6), inside (D + R) / 2 by the margin that sampled orbits need so as to meet at all."""
+    """Return the orbits of eq. (6), smaller than (D + R) / 2 by the margin that sampled orbits need."""
     distance, reach, period, speed, turn_rate = setting
     share = math.acos(distance / (distance + reach)) / math.pi
     radius = 0.5 * (distance + reach) - (speed * period * (1.0 - share)) ** 2 / (16.0 * reach)
@@ -110,7 +114,7 @@ def papers(setting: Setting) -> tuple[Orbit, Orbit]:
 
 
 def compared(setting: Setting) -> tuple[float, float]:
-    """How long it takes, over how long on the paper's orbits: in the mean, and at worst."""
+    """Return the ratio of the time to meet to that on the paper's orbits: mean and maximum."""
     plan = rendezvous(mission_of(setting), setting[0], "assured")
     ours = meeting(setting, plan.a, plan.b, COARSE)
     theirs = meeting(setting, *papers(setting), COARSE)
@@ -129,7 +133,7 @@ def test_they_meet_sooner_than_on_the_papers_orbits(setting: Setting) -> None:
     assert mean <= 0.75
 
 
-# --- where they are always in range -------------------------------------------------------------------
+# --- orbits always in range ---------------------------------------------------------------------------
 
 
 @given(drawn(1.1, 1.5))
@@ -146,7 +150,7 @@ def test_where_they_are_in_range_wherever_they_wait_both_wait(setting: Setting) 
     assert np.max(apart(distance, plan.a, pairs(COARSE)[0], plan.b, pairs(COARSE)[1])) <= reach
 
 
-# --- what the orbits keep to --------------------------------------------------------------------------
+# --- limits of orbits ---------------------------------------------------------------------------------
 
 
 @given(drawn(0.1, 1.5))

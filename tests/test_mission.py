@@ -1,4 +1,4 @@
-"""What follows from the mission's parameters: the plan, the turn rates, the bounds; and who keeps to them."""
+"""The plan, turn rates and bounds that follow from the mission parameters, and missions that respect them."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_the_tick_budget_leaves_room_beyond_the_bound(
 
 
 def gain(turn: float) -> float:
-    """The cost of eq. (4) over v_1 T_s, at omega_1 T_s = turn."""
+    """Return the cost of eq. (4) divided by v_1 T_s, at omega_1 T_s = turn."""
     return math.sin(turn / 2) ** 2 / turn
 
 
@@ -87,7 +87,7 @@ def test_the_turn_rate_of_the_third_point_is_the_optimum_within_omega_max(missio
 
 @st.composite
 def second_points(draw: st.DrawFn) -> tuple[Mission, list[Pose]]:
-    """A mission, and where +alpha and -alpha put a robot that has its second range, in the anchor's frame."""
+    """Draw a mission and the poses at the second range for +alpha and -alpha, in the anchor's frame."""
     mission = draw(missions)
     alpha = draw(st.floats(0.0, math.pi))
     rho0 = draw(st.floats(0.0, 1.0)) * mission.sensing_range
@@ -137,7 +137,7 @@ def test_where_there_is_room_the_third_point_is_the_best_of_eq_4(
 
 
 def test_a_branch_on_the_circle_of_range_is_put_inside_it_by_the_margin() -> None:
-    """Eq. (5) to the letter puts it exactly on R, and rounding would say whether it is measured."""
+    """Eq. (5) puts it exactly on R, where rounding would decide if a range is measured."""
     place = step(Pose(1.8337195113037719, 0.0, 0.31233737057044775), 1.0, 0.0, 1.0)
     mirrored = Pose(place.x, -place.y, -place.heading)
     controls = third_point([place, mirrored], SECTION_IV, "paper")
@@ -148,7 +148,7 @@ def test_a_branch_on_the_circle_of_range_is_put_inside_it_by_the_margin() -> Non
 
 
 def test_branches_that_mirror_across_the_heading_are_told_apart_straight_ahead() -> None:
-    """So they may lie after a circle: one in front of the anchor, one behind, and no turn helps."""
+    """After a circle, one branch can be in front of the anchor and one behind; no turn distinguishes them."""
     places = [Pose(0.5, 1.0, math.pi / 2), Pose(0.5, -1.0, math.pi / 2)]
     controls = third_point(places, SECTION_IV, "paper")
     assert controls is not None
@@ -170,11 +170,11 @@ def test_a_range_is_taken_up_to_r_and_at_r() -> None:
     assert mutual_ranges(at(Pose(0.0, 0.0, 0.0), Pose(0.0, beyond, 0.0)), scenario, [(0, 1)]) == [None]
 
 
-# --- missions whose parameters bite -------------------------------------------------------------------
+# --- missions at the limits of parameters -------------------------------------------------------------------
 
 
 def turns(recording: Recording, state: str) -> list[float]:
-    """The turns that a makes on the spot, before it meets b."""
+    """Return the turns of a on the spot before it meets b."""
     commands = [moment.commands["a"] for moment in recording.moments if moment.commands["a"].phase < 3]
     assert all(command.v == 0.0 for command in commands if command.state == state)
     return [command.omega for command in commands if command.state == state]
@@ -244,7 +244,7 @@ def _places(moment: TickRecord) -> list[tuple[float, float]]:
 
 
 def test_a_single_candidate_is_checked_before_it_is_claimed() -> None:
-    """Two mutual ranges and D leave no redundancy: with one placement left, b still makes a manoeuvre."""
+    """Two mutual ranges and D have no redundancy, so b makes a manoeuvre even with one placement left."""
     second = next(step for step in steps("paper-1") if step.commands["b"].state == "last-manoeuvre")
     state, heard = second.observed["b"], second.heard["b"]
     possible = planner.decide(state, heard).belief.placements
@@ -261,7 +261,7 @@ def test_a_single_candidate_is_checked_before_it_is_claimed() -> None:
 
 @st.composite
 def last_points(draw: st.DrawFn) -> tuple[Pose, Pose, list[Placement]]:
-    """b in <b(M2)>, a in <a(M1)>, and placements that put a within b's range."""
+    """Draw the pose of b in <b(M2)>, that of a in <a(M1)>, and placements with a within range of b."""
     b = Pose(6.5 * math.cos(1.0), 6.5 * math.sin(1.0), draw(angles))
     a = Pose(6.5, 0.0, 0.0)
     found = []
@@ -275,14 +275,14 @@ def last_points(draw: st.DrawFn) -> tuple[Pose, Pose, list[Placement]]:
 
 
 def predicted(b: Pose, a: Pose, found: list[Placement], v: float, omega: float) -> list[float]:
-    """m: d_i of eq. (8)."""
+    """Return the distances d_i of eq. (8), in m."""
     end = step(b, v, omega, SECTION_IV.period)
     places = [compose(Pose(p.x, p.y, p.phi), a) for p in found]
     return [math.hypot(place.x - end.x, place.y - end.y) for place in places]
 
 
 def least(distances: list[float]) -> float:
-    """J of eq. (8), on squares."""
+    """Return J of eq. (8), on squared distances, in m^2."""
     return min(abs(one**2 - other**2) for one, other in combinations(distances, 2))
 
 
@@ -310,7 +310,7 @@ def test_the_letters_last_manoeuvre_maximises_eq_8_at_full_speed(
 def test_the_assured_last_manoeuvre_keeps_as_many_candidates_in_range_as_it_can(
     case: tuple[Pose, Pose, list[Placement]],
 ) -> None:
-    """And of those that keep as many, it is the one that eq. (8) likes best."""
+    """Among manoeuvres with as many candidates in range, it is the optimum of eq. (8)."""
     b, a, found = case
     rim = SECTION_IV.sensing_range - 1e-6
     plan = last_manoeuvre("b", a, b, found, SECTION_IV, "assured")
@@ -341,7 +341,7 @@ def test_a_single_candidate_is_checked_from_where_its_range_changes_most() -> No
 
 
 def test_where_in_the_plane_the_anchors_stand_costs_no_digit() -> None:
-    """Far out, coordinates have fewer of them; what is sensed and driven is the same to the bit."""
+    """Far from the origin, coordinates have fewer digits, but measurements and commands are identical."""
 
     def driven(shift: float) -> list[tuple[float, float, str]]:
         text = f"""

@@ -1,4 +1,4 @@
-"""The world's noise: what is drawn, from what, and what it does to ranges, wheels and odometry."""
+"""The noise of the simulator: its random streams, and its effect on ranges, actuation and odometry."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ from world.truth import Truth
 
 Floats = NDArray[np.float64]
 N = 20_000
-"""draws, where a statistic is looked at"""
+"""The number of draws in a statistical test."""
 Z = 4.5
-"""standard errors that a statistic may be off: of the seeds, one in 150 000 would be farther"""
+"""The tolerance of a statistic in standard errors, exceeded by one in 150 000 seeds."""
 RHO_A, RHO_B, APART = 1.5, 2.0, 2.5
-"""m: the robots of `near` from their anchors, and from each other"""
+"""The distances in m of the robots of `near` from their anchors, and from each other."""
 
 
 def near(noise: str = "", *, seed: int = 1, max_ticks: int = 500) -> Scenario:
-    """A scenario in which everything is in range from the start."""
+    """Return a scenario in which all ranges are within R from the start."""
     text = f"""
         name = "near"
         seed = {seed}
@@ -66,18 +66,18 @@ def near(noise: str = "", *, seed: int = 1, max_ticks: int = 500) -> Scenario:
 
 
 def at_tick(scenario: Scenario, tick: int) -> Truth:
-    """Everyone still where it was released."""
+    """Return the truth at `tick` with all robots at their starts."""
     return replace(release(scenario).truth, tick=tick)
 
 
 def to_anchors(scenario: Scenario, ticks: int = N) -> list[list[float | None]]:
-    """Every robot's ranges to its anchor, tick after tick."""
+    """Return the anchor ranges of every robot, tick by tick."""
     told = [anchor_ranges(at_tick(scenario, tick), scenario) for tick in range(ticks)]
     return [list(ranges) for ranges in zip(*told, strict=True)]
 
 
 def mutual(scenario: Scenario, ticks: int = N) -> list[float | None]:
-    """The range between the robots, tick after tick; they are in contact throughout."""
+    """Return the mutual ranges, tick by tick; the robots are always in contact."""
     told = []
     for tick in range(ticks):
         (found,) = mutual_ranges(at_tick(scenario, tick), scenario, scenario.pairs())
@@ -87,7 +87,7 @@ def mutual(scenario: Scenario, ticks: int = N) -> list[float | None]:
 
 
 def all_ranges(scenario: Scenario, ticks: int = N) -> list[list[float | None]]:
-    """Those of a and of b to their anchors, and those between them."""
+    """Return the anchor ranges of a, those of b, and the mutual ranges."""
     return [*to_anchors(scenario, ticks), mutual(scenario, ticks)]
 
 
@@ -108,7 +108,7 @@ def has_share(hits: int, of: int, share: float) -> bool:
 
 
 def is_gaussian(values: Floats, sigma: float) -> bool:
-    """Of mean 0 and that standard deviation, with as many within one, two and three sigmas as there are."""
+    """Return true if `values` are consistent with a Gaussian of mean 0 and standard deviation `sigma`."""
     shares = ((1.0, 0.682689), (2.0, 0.954500), (3.0, 0.997300))
     within = [has_share(int((np.abs(values) <= k * sigma).sum()), len(values), share) for k, share in shares]
     spread = abs(values.std() / sigma - 1.0) <= Z / math.sqrt(2.0 * len(values))
@@ -123,7 +123,7 @@ def is_white(values: Floats) -> bool:
     return all(are_uncorrelated(values[lag:], values[:-lag]) for lag in (1, 2, 3))
 
 
-# --- what is drawn ------------------------------------------------------------------------------------
+# --- random streams ------------------------------------------------------------------------------------
 
 
 def test_without_noise_nothing_is_drawn_and_every_tick_is_the_same_to_the_bit(
@@ -151,7 +151,7 @@ def test_without_noise_nothing_is_drawn_and_every_tick_is_the_same_to_the_bit(
 
 
 def frames(folder: Path, robot: str) -> list[bytes]:
-    """What a robot sensed, heard and said: not its RobotConfig, which names the noise, nor what precedes it."""
+    """Return the journal of a robot after its RobotConfig, which contains the noise parameters."""
     return list(journal_file.read(folder / f"agent-{robot}.journal"))[2:]
 
 
@@ -310,7 +310,7 @@ def test_a_range_that_is_dropped_leaves_the_contact() -> None:
 
 
 def test_reports_are_heard_where_the_range_was_dropped(tmp_path: Path) -> None:
-    """Of a seed that drops every range between the robots, as long as the mission lasts."""
+    """The seed drops every mutual range of the mission."""
     dropping = next(
         seed for seed in range(1000) if mutual(near("drop_outs = 0.5", seed=seed), 4) == [None] * 4
     )
@@ -346,7 +346,7 @@ def test_a_range_is_never_negative() -> None:
     assert 30 < (told > 0.0).sum() < 70
 
 
-# --- wheels and odometry ------------------------------------------------------------------------------
+# --- actuation and odometry ------------------------------------------------------------------------------
 
 DRIFT = "{v = 0.02, omega = 0.05}"
 
@@ -438,7 +438,7 @@ def test_the_fastest_robot_with_the_worst_wheels_can_be_told_what_it_did() -> No
     assert fastest > 3e6
 
 
-# --- what is claimed ----------------------------------------------------------------------------------
+# --- claims -------------------------------------------------------------------------------------------
 
 
 def claims(tick: int, robot: str, pose: Pose, covariance: Covariance | None = None) -> Command:
@@ -452,7 +452,7 @@ def moved_on(world: World, commands: dict[str, Command]) -> World:
 
 
 def test_a_claim_is_held_against_where_the_robot_was_when_it_claimed() -> None:
-    """Wheels with a floor move it on while it waits for its peer's verdict."""
+    """Actuation noise with a floor moves it on while it waits for the verdict of its peer."""
     at_first = release(near("actuation = {v_floor = 0.1}"))
     a, b = at_first.truth.poses
     later = moved_on(at_first, {"a": claims(0, "a", a), "b": sent(0.0, 0.0, "b")})
@@ -483,7 +483,7 @@ def test_a_claim_is_wrong_beyond_five_of_its_sigmas_and_the_reason_says_of_which
         assert outcome is None or (onward.reason or "").endswith("rad off, with sigmas 0.05 m and 0.02 rad")
 
 
-# --- the record ---------------------------------------------------------------------------------------
+# --- the recording ---------------------------------------------------------------------------------------
 
 NOISES = {
     "wheels": "actuation = {v = 0.01, omega = 0.02}",
@@ -495,7 +495,7 @@ by_noise = pytest.mark.parametrize("noise", NOISES.values(), ids=NOISES)
 
 
 def noisy(noise: str, folder: Path) -> Path:
-    """A scenario file whose starts are drawn."""
+    """Write a scenario file with random starts, and return its path."""
     file = folder / "noisy.toml"
     file.write_text(
         f'name = "noisy"\n{SECTION_IV}[mission.noise]\n{noise}\n'
@@ -523,7 +523,7 @@ def test_processes_leave_the_same_bytes_as_one_process(noise: str, seed: str, tm
 
 
 def driven(scenario: Scenario, folder: Path, ticks: int) -> tuple[list[Truth], list[list[Observation]]]:
-    """The truth and the senses of robots that drive without a mind, with the world's journal in `folder`."""
+    """Return the truth and observations of robots with fixed commands; the world's journal is in `folder`."""
     with closing(journal_file.Journal(folder / WORLD_JOURNAL)) as kept:
         course = Course(scenario, kept)
         truths, told = [], []
@@ -552,7 +552,7 @@ def test_the_record_of_a_mission_is_read_as_it_was_played(noise: str, seed: int,
 
 @by_noise
 def test_ticks_gives_what_was_driven_and_measured(noise: str, tmp_path: Path) -> None:
-    """The true v and omega, and the ranges with their noise: those that the robots were told."""
+    """It contains the true v and omega, and the ranges with noise that the robots received."""
     scenario = near(noise)
     _, told = driven(scenario, tmp_path, 60)
     rows = list(csv.DictReader(ticks_csv(read(tmp_path)).splitlines()))
@@ -574,7 +574,7 @@ def shortest(value: float | None) -> str:
 
 
 def test_ticks_gives_what_a_robot_did_of_which_no_drive_came() -> None:
-    """In real time a robot whose Command came too late is told to rest; a floor moves it all the same."""
+    """In real time, a robot with a late Command is stopped, but a noise floor still moves it."""
     scenario = near("actuation = {v_floor = 0.1}", max_ticks=1)
     world = release(scenario)
     onward = moved_on(world, {})

@@ -1,4 +1,4 @@
-"""What a distribution holds: the sources, and no key or recording that lies in the tree beside them."""
+"""The contents of a distribution: the sources, and no keys or recordings that are in the tree."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FOREIGN = (
 
 @pytest.fixture(scope="module")
 def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What is in the repository, and what a user has left in it."""
+    """Return a copy of the repository with additional files of a user."""
     folder = tmp_path_factory.mktemp("tree")
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=False)
     if listed.returncode:
@@ -34,7 +34,7 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in filter(None, listed.stdout.split("\0")):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(ROOT / name, folder / name)
-    (folder / ".gitignore").unlink()  # the list of what is packed is enough
+    (folder / ".gitignore").unlink()  # the list of packed files must suffice
     for name in FOREIGN:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(SECRET)
@@ -42,7 +42,7 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def built(tree: Path, kind: str, out: Path) -> Path:
-    """The file that `uv build` leaves."""
+    """Return the file that `uv build` writes."""
     uv = shutil.which("uv")
     if uv is None:
         pytest.skip("uv is not installed")
@@ -60,7 +60,7 @@ def built(tree: Path, kind: str, out: Path) -> Path:
 
 
 def tracked(tree: Path, *folders: str) -> set[str]:
-    """What belongs to the project in these folders."""
+    """Return the files of the project in these folders."""
     files = [path for folder in folders for path in (tree / folder).rglob("*") if path.is_file()]
     names = {str(PurePath(path).relative_to(tree)) for path in files}
     return {name for name in names if name not in FOREIGN}

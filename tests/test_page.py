@@ -1,6 +1,6 @@
-"""The page in a browser, where it once told what was not so.
+"""Regression tests of the page in a browser.
 
-Tests that ask for `opened` need a browser, and skip where there is none (tests/browser.py).
+Tests that use `opened` are skipped if no browser is installed (tests/browser.py).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from world.referee import errors
 
 
 def frames_to(path: Path, tick: int, first: type[Observation | Command] = Observation) -> int:
-    """How many frames stand in a journal before those of `tick`, of which `first` is the first."""
+    """Return the number of frames in a journal before `tick`, whose first frame is a `first`."""
     for place, frame in enumerate(journal_file.read(path)):
         with suppress(MalformedFrame):
             if decode(frame, first, MAX_FRAME_BYTES).tick == tick:
@@ -45,7 +45,7 @@ def test_what_becomes_known_of_a_tick_later_is_on_the_time_line_and_in_the_log(
         growing = {name: stack.enter_context(Journal(tmp_path / name)) for name in whole}
 
         def grow(robots: int, commands: int) -> None:
-            """The robots have journaled what comes before that tick, the world all Commands before that."""
+            """Write the journals of robots up to tick `robots`, and Commands up to tick `commands`."""
             goals = {name: frames_to(paper_1 / name, robots) for name in whole if name != WORLD_JOURNAL}
             goals[WORLD_JOURNAL] = frames_to(paper_1 / WORLD_JOURNAL, commands, Command)
             for name, goal in goals.items():
@@ -63,7 +63,7 @@ def test_what_becomes_known_of_a_tick_later_is_on_the_time_line_and_in_the_log(
         assert marks(page) == 0
         grow(47, 47)
         expect(page.locator("#log")).to_contain_text("a and b are in range of each other: 2.95 m")
-        assert marks(page) > 20  # of the contact
+        assert marks(page) > 20  # the mark of the contact
         grow(48, 48)
         expect(page.locator("#log")).to_contain_text("b has 4 possible placements of the pair")
         expect(page.locator("#log")).to_contain_text("a and b are in range of each other: 2.95 m")
@@ -79,7 +79,7 @@ MARKS = """() => {
 
 
 def marks(page: Page) -> int:
-    """How many pixels of the time line belong to marks, and to its hand, but where that is at tick 0."""
+    """Return the number of pixels of marks and of the hand in the time line, except around tick 0."""
     picture(page)
     return int(page.evaluate(MARKS))
 
@@ -124,7 +124,7 @@ def test_a_killed_robot_keeps_its_phase_and_is_shown_as_down_until_it_is_back(
                 expect(page.locator(".card[data-robot=b] .doing")).not_to_contain_text("down")
 
 
-# --- what is shown ----------------------------------------------------------------------------------
+# --- contents ---------------------------------------------------------------------------------------
 
 CENTRE = """() => {
   const canvas = document.getElementById('canvas'), style = getComputedStyle(document.documentElement);
@@ -173,13 +173,13 @@ HELD = """async ([now, next, share]) => {
 def test_a_hypothesis_that_goes_on_moves_to_where_it_is_next_and_others_as_driven(
     opened: Open, address: str
 ) -> None:
-    """The order is by probability, and differs from tick to tick."""
+    """Hypotheses are ordered by probability, and the order changes from tick to tick."""
     page = opened(address)
     now = {"world": [[0, 0, 0], [5, 5, 0]], "probability": [0.7, 0.3], "covariance": [4, 0, 0, 4, 0, 0]}
     next_ = {"world": [[6.1, 5, 0], [1, 0.1, 0]], "probability": [0.9, 0.1], "covariance": [2, 0, 0, 2, 0, 0]}
     found = page.evaluate(HELD, [now, next_ | {"executed": [1, 0]}, 0.5])
     assert found["poses"] == [[0.5, pytest.approx(0.05), 0], [pytest.approx(5.55), 5, 0]]
-    assert found["covariance"] == now["covariance"]  # its hypothesis is not the first any more
+    assert found["covariance"] == now["covariance"]  # its hypothesis is no longer the first
     kept = {"world": [[1.1, 0, 0]], "covariance": [2, 0, 0, 2, 0, 0], "executed": [1, 0]}
     found = page.evaluate(HELD, [now, kept, 0.5])
     assert found["poses"] == [[pytest.approx(0.55), 0, 0], [5.5, 5, 0]]  # the other is ruled out then
@@ -239,12 +239,12 @@ def test_an_error_is_told_of_a_pose_that_leads_and_else_as_a_range(
 
 
 DRAWN = "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
-"""waits until what was asked for so far has been drawn"""
+"""A script that waits until all pending drawing is done."""
 TIMELESS = """() => {
     const real = window.requestAnimationFrame.bind(window);
     window.requestAnimationFrame = (draw) => real(() => draw(1));
 }"""
-"""for a page that draws, and for which no time passes while it plays"""
+"""A script that stops time for a page that still draws."""
 
 
 @pytest.mark.parametrize(
@@ -281,7 +281,7 @@ def state(page: Page) -> list[object]:
 
 
 def test_space_plays_though_the_closed_help_still_has_the_focus(opened: Open, address: str) -> None:
-    """For a moment after it closes, which a slow machine makes longer, a key goes to its button."""
+    """For a moment after it closes, longer on a slow machine, keys still go to its button."""
     page = opened(f"{address}#tick=20")
     until_shown(page, 20)
     page.locator("#keys button").first.dispatch_event("keydown", {"key": " ", "bubbles": True})

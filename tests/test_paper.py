@@ -1,4 +1,4 @@
-"""Section IV and the reference values: what the paper says happens, happens, at every tick."""
+"""The simulations of Section IV and the reference values, compared at every tick."""
 
 from __future__ import annotations
 
@@ -114,16 +114,16 @@ def test_a_robot_senses_the_references_ranges_and_what_it_drove(
 
 
 class Row(NamedTuple):
-    """What the notes on the paper say of one robot's phases 1 and 2."""
+    """The expected values of phases 1 and 2 of one robot, from the notes on the paper."""
 
     scenario: str
     robot: str
     branch: str
     alpha: float
     located: int
-    """the tick in which phase 1 is done"""
+    """tick in which phase 1 ends"""
     anchor_ranges: int
-    """by then"""
+    """number of anchor ranges until then"""
     mu: float
     orbits: int
 
@@ -297,7 +297,7 @@ def test_eq_7_has_all_the_references_placements_and_no_more(case: Equation7) -> 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_eq_7_has_the_references_four_placements_at_each_encounter(name: str) -> None:
-    """Both frames as the paper has them: centred in the own anchor, the x-axis through p_0."""
+    """Both frames are those of the paper: centred at the own anchor, with the x-axis through p_0."""
     reference = SIMULATIONS[name]
     a1, a2 = (_from_anchor(reference, "a", tick) for tick in (reference.k_meet, reference.k_second))
     b = _from_anchor(reference, "b", reference.k_meet)

@@ -1,4 +1,4 @@
-"""`tandem ps`: what it tells of missions that run, wait, or are over; and that it disturbs none."""
+"""`tandem ps`: its list of missions that run, wait or have ended, which it does not disturb."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from tests.test_topologies import Router, routing
 
 
 def listed(endpoint: str, *flags: str | Path) -> list[str]:
-    """The lines of a listing, which goes well."""
+    """Return the lines of a successful listing."""
     ended = tandem("ps", "--connect", endpoint, *flags)
     assert (ended.status, ended.err) == (0, "")
     return ended.out.splitlines()
 
 
 def told(endpoint: str, *flags: str | Path) -> list[dict[str, Any]]:
-    """The same, as a program reads it."""
+    """Return a successful listing as JSON."""
     found: list[dict[str, Any]] = json.loads("\n".join(listed(endpoint, "--json", *flags)))["missions"]
     return found
 
@@ -134,24 +134,24 @@ def test_a_viewer_lists_over_tls_what_there_is(tmp_path: Path) -> None:
     assert ended.err.endswith("is the folder of agent-a, not of viewer\n")
 
 
-# --- worlds that a test plays ---------------------------------------------------------------------------
+# --- simulated worlds -----------------------------------------------------------------------------------
 
 
 class Played:
-    """A world of robot a, and its agent, both of this process."""
+    """A simulated world and agent of robot a, both in this process."""
 
     def __init__(self, link: zenoh.Session) -> None:
         self.link = link
         self.frames: dict[str, bytes] = {}
-        """by key, said over and over"""
+        """frames by key, which are sent repeatedly"""
         self.tokens: list[zenoh.LivelinessToken] = []
         self.wanted = threading.Event()
-        """somebody listens to the truth, or to an estimate"""
+        """set when a subscriber for the truth or an estimate exists"""
 
 
 @contextmanager
 def played(start: Callable[[Played], None]) -> Iterator[tuple[Played, str]]:
-    """A mission as a stranger's program may play it, and where."""
+    """Yield a mission run by an unrelated program, and its endpoint."""
     endpoint = free_endpoint()
     with session.open_router(listening(endpoint)) as link:
         mission, over = Played(link), threading.Event()
@@ -196,7 +196,7 @@ def over(mission: Played) -> None:
 
 
 def driven(mission: Played) -> None:
-    """As where a driver stands in the world's place for a: of b only the briefing tells."""
+    """Run the mission as in hardware mode for a: only the RobotConfig names b."""
     running(mission)
     session.answer(mission.link, keys.config("r", "a"), lambda _: load("paper-1").config("a"))
 

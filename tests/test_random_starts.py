@@ -1,4 +1,4 @@
-"""What random starts do at Section IV's parameters, by the thousand, in one process."""
+"""Thousands of random starts at the parameters of Section IV, in one process."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from world.scenario import Scenario
 
 STARTS = 5000
 SHARES = 10
-"""tests, so that several processes divide the work"""
+"""The number of tests among which the starts are divided, for parallel execution."""
 
 
 def started(seed: int, planner_name: str) -> Scenario:
@@ -49,6 +49,6 @@ def test_the_letter_localises_most_random_starts_and_guesses_at_none(number: int
         recording = in_process.play(started(seed, "paper"))
         assert recording.end is not None
         outcomes[recording.end.outcome] += 1
-    # 93 to 95 % of all 5000; a tenth of them spreads three standard deviations, 3.2 %, about 94 %
+    # 93 to 95 % of all 5000 localise; three standard deviations of a tenth of them are 3.2 %
     assert set(outcomes) <= {"localised", "undecided"}
     assert 0.905 <= outcomes["localised"] / outcomes.total() <= 0.975

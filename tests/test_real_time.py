@@ -1,4 +1,4 @@
-"""`--rate`: the world does not wait, and whoever is late stands still."""
+"""`--rate`: the world does not wait, and a robot whose Command is late stops for that tick."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from world.scenario import Scenario
 
 
 def missed(path: Path, robot: str) -> int:
-    """In how many ticks the world went without `robot`'s Command."""
+    """Return the number of ticks without a Command of `robot`."""
     kinds = Environment | Scenario | Command | DeadlineMissed | MissionEnd | FinalReport
     messages = [decode(frame, kinds, MAX_FRAME_BYTES) for frame in journal_file.read(path)]
     return sum(isinstance(message, DeadlineMissed) and message.robot == robot for message in messages)
@@ -54,7 +54,7 @@ def test_a_rate_that_cannot_be_kept_can_still_be_stopped(tmp_path: Path) -> None
 
 @contextmanager
 def robots_at(endpoint: str, answers: Callable[[Observation], bool]) -> Iterator[ExitStack]:
-    """Robots a and b of run r, which rest in the ticks that `answers` picks; b leaves when it is closed."""
+    """Yield robots a and b of run r, which answer ticks that `answers` selects; closing the stack ends b."""
     with session.open_client(at(endpoint), lambda: None) as a, ExitStack() as leaves:
         b = leaves.enter_context(session.open_client(at(endpoint), lambda: None))
         commands = {one: session.publisher(a, keys.command("r", one)) for one in "ab"}
@@ -115,7 +115,7 @@ def test_a_robot_whose_agent_is_stopped_stands_still_and_the_mission_goes_on(tmp
 
 
 def test_a_world_says_why_there_is_no_farewell_of_a_robot(tmp_path: Path) -> None:
-    """Both answer the first tick only; then b leaves."""
+    """Both answer only the first tick; then b ends."""
     out = tmp_path / "out"
     (tmp_path / "short.toml").write_text("max_ticks = 9\n" + ASSURED.partition("\n")[2])
     second = threading.Event()

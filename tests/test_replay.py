@@ -1,4 +1,4 @@
-"""A record is played once more: what is on it follows to the bit, and one bit that does not is shown."""
+"""The replay of a recording: identical to the bit, and every bit that differs is reported."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from tests.test_audit import kept
 from world.scenario import Scenario
 
 HEAD = 5
-"""bytes of a frame before its body"""
+"""The number of bytes of a frame before its body."""
 TRIES = 100
 A, B = agent_journal("a"), agent_journal("b")
 UNUSED = {"name", "seed", "max_ticks"}
-"""of a scenario whose starts are given and whose sensors are exact: nothing on record follows from them"""
+"""The fields without effect on a recording if starts are given and sensors are exact."""
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def test_what_was_played_as_processes_is_replayed_to_the_bit(tmp_path: Path) -> 
 
 
 def flips(recording: dict[str, list[bytes]], tries: int) -> Iterator[tuple[str, int, bytes]]:
-    """Frames with one bit of their message's values flipped and a good CRC, each with where it stands."""
+    """Yield frames with one flipped bit in their message and a valid CRC, each with its journal and index."""
     draw = random.Random(6)
     places = [(name, i) for name, frames in recording.items() for i in range(len(frames))]
     while tries:
@@ -83,12 +83,12 @@ def flips(recording: dict[str, list[bytes]], tries: int) -> Iterator[tuple[str, 
 
 
 def _matters(frame: bytes, flipped: bytes) -> bool:
-    """Whether `flipped` says something else, from which something follows, or of which there is a copy."""
+    """Return true if `flipped` differs in content that affects the replay or is also in another journal."""
     before = decode(frame, KINDS, MAX_FRAME_BYTES)
     try:
         after = decode(flipped, KINDS, MAX_FRAME_BYTES)
     except MalformedFrame:
-        return False  # it says nothing at all: no journal with it can be read
+        return False  # it cannot be decoded: no journal with it can be read
     if isinstance(before, Scenario) and isinstance(after, Scenario):
         unused = {name: getattr(before, name) for name in UNUSED}
         return encode(replace(after, **unused)) != encode(before)
@@ -106,7 +106,7 @@ def test_one_flipped_bit_in_any_value_that_matters_is_found(name: str) -> None:
 
 
 def planted(folder: Path, name: str, kind: type, tick: int, **fields: Any) -> tuple[Any, Any]:
-    """Change a message in the journal of that name; the message before and after."""
+    """Change a message in a journal, and return the message before and after."""
     frames = list(journal_file.read(folder / name))
     told = [decode(frame, KINDS, MAX_FRAME_BYTES) for frame in frames]
     (place,) = (i for i, one in enumerate(told) if isinstance(one, kind) and getattr(one, "tick", 0) == tick)
@@ -161,7 +161,7 @@ def test_a_record_whose_drives_the_world_has_otherwise_is_found_there(recording:
 
 
 def changed(recording: dict[str, list[bytes]], name: str, was: Any, **fields: Any) -> dict[str, list[bytes]]:
-    """`recording` with that message of a journal otherwise."""
+    """Return `recording` with changed fields in one message of a journal."""
     frames = [encode(replace(was, **fields)) if one == encode(was) else one for one in recording[name]]
     assert frames != recording[name]
     return recording | {name: frames}
@@ -194,11 +194,11 @@ def test_an_end_that_does_not_follow_is_found_though_all_say_the_same(
     assert [(one.rule, one.tick) for one in replayed(recording).differences] == [("claim", end.tick)]
 
 
-# --- what breaks off ------------------------------------------------------------------------------------
+# --- truncation -----------------------------------------------------------------------------------------
 
 
 def cut(path: Path, size: int) -> int:
-    """Leave so many bytes of a journal; how many of them are no whole frame."""
+    """Truncate a journal to `size` bytes, and return how many of them are an incomplete frame."""
     path.write_bytes(path.read_bytes()[:size])
     return size - len(journal_file.packed(journal_file.read(path)))
 
@@ -207,7 +207,7 @@ def cut(path: Path, size: int) -> int:
 def test_a_record_that_is_torn_anywhere_is_replayed_to_the_tear(
     name: str, paper_1: dict[str, list[bytes]]
 ) -> None:
-    for count in range(2, len(paper_1[name]), 3):  # after the versions and the scenario, or a briefing
+    for count in range(2, len(paper_1[name]), 3):  # after the versions and the scenario, or a RobotConfig
         again = replayed(paper_1 | {name: paper_1[name][:count]})
         assert again.differences == ()
         assert again.tears

@@ -1,4 +1,4 @@
-"""Whoever is killed, wherever in a tick, is started again and goes on: the run ends with the same bytes."""
+"""Processes that are killed at any point of a tick are restarted, and the recording has the same bytes."""
 
 from __future__ import annotations
 
@@ -61,12 +61,12 @@ PARTS = ("agent-a", "agent-b", "world")
 LOCALISED = "localised after 48 ticks\n"
 REPEAT_S = 0.25
 AT_ONCE_S = 10.0
-"""less than the 30 s of its patience"""
+"""A time in s that is less than the timeout of 30 s."""
 
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The record of the paper's first mission: in range of each other from tick 46 to its end, 48."""
+    """Return the recording of the paper's first simulation, with contact from tick 46 to the end at 48."""
     out = tmp_path_factory.mktemp("undisturbed") / "out"
     assert tandem("run", "paper-1", "--in-process", "-q", "--out", out).status == 0
     return out
@@ -81,7 +81,7 @@ def options(kills: str) -> list[str]:
     return [word for kill in kills.split() for word in ("--kill", kill)]
 
 
-# --- killed, and started again ------------------------------------------------------------------------
+# --- killed and restarted ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -166,7 +166,7 @@ def test_in_real_time_whoever_is_away_stands_still_and_is_told_what_it_missed(tm
         assert [step.observation.tick for step in lived.steps] == list(range(len(lived.steps)))
 
 
-# --- what is typed ------------------------------------------------------------------------------------
+# --- options ------------------------------------------------------------------------------------------
 
 
 def test_a_kill_is_read_as_it_is_written() -> None:
@@ -223,11 +223,11 @@ def refused(ended: Ended, *words: str) -> None:
         assert word in ended.err
 
 
-# --- a record that breaks off -------------------------------------------------------------------------
+# --- incomplete recordings ----------------------------------------------------------------------------
 
 
 def cuts(data: bytes) -> list[int]:
-    """Places to tear a journal at: all over it, and closer in its last ticks."""
+    """Return sizes to which a journal is truncated: all over it, and denser in its last ticks."""
     return [*range(0, len(data), 211), *range(len(data) - 1200, len(data) + 1, 7), len(data)]
 
 
@@ -292,7 +292,7 @@ def shells(out: Path, endpoint: str, folder: ExitStack) -> dict[str, TandemProce
 
 
 def at_tick(frames: list[bytes], tick: int) -> int:
-    """How many bytes of a journal stand before the first frame that names `tick`, its head left out."""
+    """Return the number of bytes of a journal before the first frame of `tick`, without the file header."""
     for place, frame in enumerate(frames):
         if place and msgpack.unpackb(frame[5:])[1] == tick:
             return len(journal_file.packed(frames[:place]))
@@ -403,7 +403,7 @@ def test_an_agent_says_farewell_until_a_world_has_it_on_record(tmp_path: Path) -
             assert agent.ended(AT_ONCE_S).status == 1
 
 
-# --- what is said again -------------------------------------------------------------------------------
+# --- repeated messages --------------------------------------------------------------------------------
 
 
 def test_a_repeated_sense_makes_an_agent_say_all_its_latest_reports_again(tmp_path: Path) -> None:
@@ -455,7 +455,7 @@ def next_of(queue: SimpleQueue[int]) -> int:
 
 @pytest.fixture
 def recording(undisturbed: Path, tmp_path: Path) -> Path:
-    """One to be spoilt: a copy of the undisturbed run's, without its end."""
+    """Return a copy of the undisturbed recording without its end, which the test may change."""
     for name in PARTS:
         frames = list(journal_file.read(undisturbed / f"{name}.journal"))
         (tmp_path / f"{name}.journal").write_bytes(journal_file.packed(frames[:60]))
@@ -533,7 +533,7 @@ def test_an_agents_record_of_another_briefing_is_refused(recording: Path, tmp_pa
 def test_an_agents_record_in_which_it_sensed_otherwise_is_no_use(recording: Path, paper_2: str) -> None:
     path = recording / "agent-a.journal"
     path.write_bytes(journal_file.packed(list(journal_file.read(path))[:4]))
-    with TandemProcess("agent", "b", "--connect", paper_2):  # whose briefings are those of paper-1
+    with TandemProcess("agent", "b", "--connect", paper_2):  # its RobotConfigs are those of paper-1
         ended = tandem("agent", "a", "--connect", paper_2, "--out", recording)
     said = "the recording is of another run: the Observation of a at tick 0 differs"
     assert (ended.status, ended.err) == (3, f"tandem agent a: {said}\n")

@@ -1,4 +1,4 @@
-"""The driver of a robot that speaks ROS 2: its bytes, its arithmetic, and the contract."""
+"""The ROS 2 driver: its encoding, its arithmetic, and the driver contract."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from tests.commands import tandem
 from world.hardware import ros2
 
 LITTLE_ENDIAN = b"\x00\x01\x00\x00"
-"""CDR's encapsulation header (OMG DDSI-RTPS 10.5): CDR_LE, no options"""
+"""The encapsulation header of CDR (OMG DDSI-RTPS 10.5): CDR_LE without options."""
 
 TWIST = LITTLE_ENDIAN + struct.pack("<6d", 1.5, 0.0, 0.0, 0.0, 0.0, -0.25)
-"""by hand: six doubles, each at a multiple of 8 from the header on (OMG CORBA 15.3.1)"""
+"""A Twist encoded by hand: six doubles, aligned to 8 bytes after the header (OMG CORBA 15.3.1)."""
 
 STAMP = struct.pack("<iI", 7, 8)
 RANGE = (
     LITTLE_ENDIAN
     + STAMP
-    + struct.pack("<I4s", 4, b"uwb\0")  # a string: its length with the zero, then its bytes
+    + struct.pack("<I4s", 4, b"uwb\0")  # a string: its length including the zero byte, then its bytes
     + struct.pack("<B3x4f", 0, 0.5, 0.25, 100.0, 2.5)  # a byte, then padding to a multiple of 4
 )
-"""by hand: sensor_msgs/Range of 2.5 m"""
+"""A sensor_msgs/Range of 2.5 m, encoded by hand."""
 
 ODOMETRY = (
     LITTLE_ENDIAN
@@ -42,7 +42,7 @@ ODOMETRY = (
     + struct.pack("<6d", *[0.0] * 6)
     + struct.pack("<36d", *[0.0] * 36)
 )
-"""by hand: nav_msgs/Odometry at (3, -4), heading 0.8"""
+"""A nav_msgs/Odometry at (3, -4) with heading 0.8, encoded by hand."""
 
 
 def test_a_twist_is_the_bytes_of_the_specification_and_of_another_library() -> None:
@@ -132,7 +132,7 @@ anchor = [10.0, 0.0]
 
 @pytest.mark.long
 def test_a_base_behind_a_bridge_keeps_the_contract(tmp_path: Path) -> None:
-    """With another library's bytes, a watchdog of its own, and headings that wrap."""
+    """The base uses another CDR library, has its own watchdog, and its headings wrap."""
     (tmp_path / "ros.toml").write_text(SCENARIO)
     endpoint = free_endpoint()
     with ros_base.base(endpoint, (1.0, 0.5), 3.0) as base:

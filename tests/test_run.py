@@ -1,4 +1,4 @@
-"""`tandem run`: the whole mission as processes over Zenoh, and what it leaves behind."""
+"""`tandem run`: a whole mission as processes over Zenoh, and its files."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def distance(one: dict[str, str], other: dict[str, str]) -> float:
 
 @pytest.fixture(scope="module", params=["paper-1", "paper-2"])
 def played(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
-    """A paper's mission, played as processes, and where its record is."""
+    """Return the name of a simulation of the paper, run as processes, and its recording."""
     out = tmp_path_factory.mktemp(request.param) / "out"
     ended = tandem("run", request.param, "--out", out)
     assert ended.status == 0, ended
@@ -56,7 +56,7 @@ def played(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     return request.param, out
 
 
-# --- what it leaves ---------------------------------------------------------------------------------
+# --- files ------------------------------------------------------------------------------------------
 
 
 def test_the_papers_missions_localise_at_their_tick_and_leave_the_whole_record(
@@ -243,7 +243,7 @@ def test_the_seed_draws_the_starts(tmp_path: Path) -> None:
     assert (one["x"], one["y"], one["heading"]) != (other["x"], other["y"], other["heading"])
 
 
-# --- what it says -----------------------------------------------------------------------------------
+# --- output -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("mode", [[], ["--in-process"]], ids=["processes", "in-process"])
@@ -261,7 +261,7 @@ def test_the_table_at_the_end_says_how_each_robot_fared() -> None:
     assert "localised after 48 ticks" in ended.out
     rows = {words[0]: words[1:] for line in ended.out.splitlines() if (words := line.strip(" │┃").split())}
     for robot, x, y, heading in (("a", "3.65", "-5.47", "+0.44"), ("b", "3.74", "-3.08", "+3.06")):
-        for figure in (x, y, heading):  # where it is, and where it thinks it is
+        for figure in (x, y, heading):  # the true and the estimated pose
             assert sum(figure in word for word in rows[robot]) == 2, ended.out
 
 
@@ -335,7 +335,7 @@ def test_whatever_is_listed_is_a_whole_sentence_and_stands_in_one_column() -> No
         assert all(line[width] == " " != line[width + 1] and line.endswith(".") for line in lines), lines
 
 
-# --- company ----------------------------------------------------------------------------------------
+# --- several runs ----------------------------------------------------------------------------------------
 
 
 def test_runs_side_by_side_do_not_disturb_each_other(played: tuple[str, Path], tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Two robots that range each other come no nearer than the safety distance, whatever may be true."""
+"""Two robots that range each other keep the safety distance under every remaining hypothesis."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from world.scenario import Scenario
 
 SAFE = 1.0
 NEAR = 75
-"""the seed of a random mission in which b's last manoeuvre leads it to 0.75 m from a, if it may"""
+"""The seed of a random mission in which b's last manoeuvre ends 0.75 m from a without a safety distance."""
 
 
 def safe(seed: int, distance: float = SAFE, **noise: float) -> Scenario:

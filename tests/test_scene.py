@@ -1,4 +1,4 @@
-"""What there is to see of a run, whoever tells of it: whole records, and torn and incomplete ones."""
+"""The scene of a run from every source: complete, torn and incomplete recordings."""
 
 from __future__ import annotations
 
@@ -188,7 +188,7 @@ def test_whose_process_is_gone_is_down_in_every_tick_until_it_is_back(paper_1: P
     present(b=False)
     present(b=True)
     known.take(journals.known.final_reports["a"], 0)
-    present(a=False)  # it has done its part
+    present(a=False)  # its part of the mission has ended
     shown = scenes(stage, known)
     assert [one.player("a").down for one in shown] == [False, True, False, False]
     assert shown[1].player("a").mode_name == "a is down: its process is gone"

@@ -1,4 +1,4 @@
-"""What noise makes of a path and of its ranges, and what a fit makes of both: held against brute force."""
+"""Noisy paths and ranges, and the least-squares fit to both, compared with numerical differentiation."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from protocol.noise import Noise, VelocityNoise
 Array = NDArray[np.float64]
 
 SMALL = 1e-5
-"""by what a variable is moved, to see a derivative"""
+"""The step of a numerical derivative."""
 
 speeds = st.floats(-2.0, 2.0)
 turns = st.one_of(st.floats(-4.0, 4.0), st.sampled_from((0.0, 1e-4, -1e-4)))
@@ -45,18 +45,18 @@ few = settings(max_examples=20)
 
 
 def derivative(of: Callable[[Array], Array], at: Array) -> Array:
-    """By central differences; (rows, unknowns)."""
+    """Return the derivative by central differences, of shape (rows, unknowns)."""
     sides = [(of(at + one) - of(at - one)) / (2.0 * SMALL) for one in SMALL * np.eye(len(at))]
     return np.stack(sides, -1)
 
 
 def near(expected: Array) -> object:
-    """To as many digits as differences give."""
+    """Return an approximate comparison with the accuracy of numerical differences."""
     return pytest.approx(expected, rel=1e-6, abs=1e-7 * max(1.0, float(np.max(np.abs(expected)))))
 
 
 def variances(drift: VelocityNoise, measured: Track) -> Array:
-    """Of the noise in v at each tick, then of that in omega."""
+    """Return the variances of the noise in v at each tick, then of that in omega."""
     ticks = zip(measured.v.tolist(), measured.omega.tolist(), strict=True)
     return np.array([drift.variances(v, omega) for v, omega in ticks]).T.ravel()
 
@@ -81,17 +81,17 @@ def test_a_track_is_where_the_steps_lead(driven: list[tuple[float, float]], peri
 
 
 class Looks(NamedTuple):
-    """Rows along a path, and the derivatives of what they look at."""
+    """Rows along a path, and the derivatives of their observations."""
 
     path: Track
     rows: Projection
     by_noise: Array
-    """in v at each tick, then in omega; (rows, 2 k)"""
+    """derivatives by the noise in v at each tick, then in omega; shape (rows, 2 k)"""
 
 
 @st.composite
 def looks(draw: st.DrawFn) -> Looks:
-    """At positions, in any direction and as if through any glass; or at headings."""
+    """Draw rows that observe positions in any direction with any scale, or headings."""
     path = track_of(draw(manoeuvres), draw(periods))
     k = len(path.v)
     kinds = st.tuples(st.integers(0, k), lengths, lengths, st.booleans())
@@ -150,25 +150,25 @@ def test_noise_has_the_size_of_what_was_measured_and_the_course_of_what_was_driv
 
 
 class Told(NamedTuple):
-    """What two robots have measured, and what is true."""
+    """The measurements of two robots, and their true values."""
 
     measured: tuple[Track, Track]
     ranges: Ranges
     noise: Noise
     apart: tuple[float, float]
-    """m: M2 - M1"""
+    """M2 - M1, in m"""
     guess: Array
-    """the true one"""
+    """true value of the fitted parameters"""
     poses: Array
-    """the true last poses, relative to M1"""
+    """true last poses, relative to M1"""
 
 
 K = 10
-"""ticks that both drive"""
+"""The number of ticks that both robots drive."""
 
 
 def told(seed: int, noise: Noise) -> Told:
-    """Both drive about their anchors at random, and are ranged in each tick."""
+    """Return data of two robots that drive randomly about their anchors, with all ranges in every tick."""
     draw = np.random.default_rng(seed)
     apart = draw.uniform(-4.0, 4.0, 2)
     measured, guess, tracks = [], [], []
@@ -202,7 +202,7 @@ def told(seed: int, noise: Noise) -> Told:
 
 
 def placed(start: Pose) -> tuple[float, float]:
-    """Where the anchor lies in the frame of a robot's odometry that begins at `start`, relative to it."""
+    """Return the position of the anchor in the odometry frame of a robot that starts at `start`."""
     c, s = math.cos(start.heading), math.sin(start.heading)
     return -c * start.x - s * start.y, s * start.x - c * start.y
 
@@ -212,8 +212,7 @@ def distances(told: Told, guess: Array) -> Array:
 
 
 def clear(told: Told) -> bool:
-    """Whether nobody is so near to what it is ranged from that a distance has no derivative, and the ranges
-    tell where both are."""
+    """Return true if all distances are differentiable, and the ranges determine both poses."""
     predicted = predict(told.guess, told.measured, told.ranges, told.apart)
     return (
         float(np.min(predicted.distance)) > 0.1
@@ -244,7 +243,7 @@ def test_a_range_changes_with_the_guess_as_predicted(seed: int) -> None:
 @some
 @given(seeds)
 def test_a_range_looks_at_a_robot_along_its_direction(seed: int) -> None:
-    """Moved in the frame of its odometry, the robot's range changes by as much."""
+    """A displacement in the frame of its odometry changes the range of a robot by the same amount."""
     one = told(seed, EXACT)
     assume(clear(one))
     predicted = predict(one.guess, one.measured, one.ranges, one.apart)
@@ -277,7 +276,7 @@ def fitted(told: Told, guess: Array) -> Fit:
 
 
 def nudged(told: Told, seed: int, by: float) -> Array:
-    """m and rad"""
+    """Return the true parameters with random offsets of scale `by`, in m and rad."""
     guess: Array = told.guess + by * np.random.default_rng(seed).uniform(-1.0, 1.0, 6)
     return guess
 
@@ -308,8 +307,10 @@ def test_one_robot_finds_its_anchor_and_leaves_the_heading_alone(seed: int) -> N
 
 
 def information_of(told: Told, found: Fit) -> tuple[Array, Array, Array]:
-    """The Fisher information of the guess and of all noise, by differences; the gradient of the log-posterior
-    by them; and the derivatives of the last poses. What has no variance is no unknown."""
+    """Return the Fisher information, the gradient of the log-posterior, and derivatives of the last poses.
+
+    All are numerical differences by the parameters and the noise. Noise without variance is not an unknown.
+    """
     variance = np.concatenate([variances(told.noise.odometry, path) for path in told.measured])
     free = variance > 0.0
     errors = [np.concatenate(error) for error in found.errors] or [np.zeros(2 * K)] * 2
@@ -336,7 +337,7 @@ def information_of(told: Told, found: Fit) -> tuple[Array, Array, Array]:
 
 
 def end_of(path: Track, guess: Array) -> Array:
-    """The last pose, relative to the anchor."""
+    """Return the last pose, relative to the anchor."""
     mx, my, turn = guess.tolist()
     x, y, heading = float(path.x[-1]), float(path.y[-1]), float(path.heading[-1])
     end = compose(Pose(0.0, 0.0, turn), Pose(x - mx, y - my, heading))
@@ -386,7 +387,7 @@ def test_without_drift_the_covariance_is_the_inverse_of_the_ranges_information(s
 
 
 def test_a_fit_that_begins_where_one_ended_ends_there_too() -> None:
-    """Straight at its anchor nothing bends, and the guess is right at once; the path is corrected even so."""
+    """On a path straight to the anchor the guess is right at once, but the path is still corrected."""
     measured, driven = (track(np.full(8, v), np.zeros(8), 1.0) for v in (1.0, 1.01))
     told = [(tick, 20.0 - x) for tick, x in enumerate(driven.x.tolist())]
     noise = Noise(0.01, odometry=VelocityNoise(v=0.05))
@@ -429,7 +430,7 @@ def test_a_variance_that_rounding_has_made_negative_is_no_knowledge() -> None:
 
 
 def test_exact_ranges_and_strides_of_a_kilometre_leave_a_covariance_that_can_be_inverted() -> None:
-    """The drift of wheels is 10^7 times what ranges are known to, twice from the same place."""
+    """The odometry noise is 10^7 times the accuracy of the ranges, two of which are from the same place."""
     path = track(np.array([1e3, -1e3, 1e3, 0.0, 0.0]), np.array([0.3, -0.2, 0.4, 0.0, 0.0]), 1.0)
     anchor = np.array((400.0, 300.0, 0.0))
     rho = np.hypot(path.x - anchor[0], path.y - anchor[1])

@@ -1,4 +1,4 @@
-"""Whoever is stopped and continued costs the others time, and nothing else; or the run ends, and says who."""
+"""A stopped process delays the others until it continues, or the run ends and names it."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ from world.scenario import Scenario
 
 NAMES = ("agent a", "agent b", "world")
 PATIENCE_S = 6.0
-"""longer than Zenoh's lease"""
+"""The timeout in s, longer than the lease of Zenoh."""
 LOCALISED = f"localised after {LONG_TICKS} ticks\n"
 
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The scenario LONG, and its record in `out` beside it."""
+    """Return the scenario file LONG; its recording is in `out` in the same folder."""
     path = tmp_path_factory.mktemp("undisturbed") / "long.toml"
     path.write_text(LONG)
     assert tandem("run", path, "--in-process", "-q", "--out", path.parent / "out").status == 0
@@ -60,7 +60,7 @@ def journal_bytes(out: Path) -> list[bytes]:
 
 
 def states(pid: int) -> set[str]:
-    """Of all its threads: T is stopped."""
+    """Return the states of all threads of a process; T means stopped."""
     return {
         (task / "stat").read_text().rpartition(")")[2].split()[0]
         for task in Path(f"/proc/{pid}/task").iterdir()
@@ -74,7 +74,7 @@ def stop(pid: int) -> None:
 
 @pytest.fixture
 def assured(tmp_path: Path) -> Path:
-    """A scenario of the variant that is sure, for whom standing still is no harm."""
+    """Return a scenario of the `assured` planner, which tolerates stops."""
     path = tmp_path / "assured.toml"
     path.write_text(REAL_TIME)
     return path
@@ -82,7 +82,7 @@ def assured(tmp_path: Path) -> Path:
 
 @contextmanager
 def watched(out: Path, name: str) -> Iterator[Inbox]:
-    """What a bystander hears of the process: that it is alive, and that its link is given up."""
+    """Yield an inbox with the liveliness of the process `name` as another session observes it."""
     words = next(words for words in processes_of(out).values() if "world" in words)
     option = {word: words[place + 1] for place, word in enumerate(words) if word in ("--listen", "--run")}
     run = option["--run"]
@@ -182,7 +182,7 @@ def test_in_real_time_who_is_stopped_stands_still_from_the_next_period_on(
         pid = process_of(out, "agent", "a")
         with watched(out, "agent a") as bystander:
             stop(pid)
-            answered = ticks(out) + 1  # whose Observation may have come before
+            answered = ticks(out) + 1  # its Observation may have come before the stop
             until(lambda: given_up(bystander), "its link is given up")
             until(lambda: ticks(out) > answered + 20, "twenty ticks are over")
             continued = ticks(out)
@@ -221,5 +221,5 @@ def played(out: Path) -> list[Environment | Scenario | Command | DeadlineMissed 
 
 
 def ticks(out: Path) -> int:
-    """The latest tick that is on record."""
+    """Return the latest tick in the recording."""
     return max(message.tick for message in played(out) if isinstance(message, Command | DeadlineMissed))

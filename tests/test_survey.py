@@ -1,4 +1,4 @@
-"""What `assured` does under noise: it measures until it knows, claims what is true, and says what is left."""
+"""The `assured` planner under noise: it measures until it is certain, and its claims are consistent."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ SEEDS = range(4, 7)
 
 
 def first_ranges(scenario: Scenario, robot: int, ticks: int) -> list[float | None]:
-    """What it measures to its anchor in the first ticks, standing where it was released."""
+    """Return the anchor ranges of a robot that stays at its start, in the first ticks."""
     truth = release(scenario).truth
     return [anchor_ranges(replace(truth, tick=tick), scenario)[robot] for tick in range(ticks)]
 
@@ -53,14 +53,14 @@ def without(noise: Noise, scenario: Scenario) -> Scenario:
 
 
 def biases(scenario: Scenario, robot: int, ticks: int) -> list[float]:
-    """m: by how much its first ranges are too long."""
+    """Return the errors of the first ranges of a robot, in m."""
     measured = first_ranges(scenario, robot, ticks)
     true = first_ranges(without(Noise(), scenario), robot, ticks)
     return [(one or 0.0) - (other or 0.0) for one, other in zip(measured, true, strict=True)]
 
 
 def in_contact(recording: Recording) -> list[bool]:
-    """Whether the two were in range of each other, tick by tick."""
+    """Return, tick by tick, whether the robots were in contact."""
     pairs = recording.scenario.pairs()
     return [mutual_ranges(moment.truth, recording.scenario, pairs) != [None] for moment in recording.moments]
 
@@ -69,7 +69,7 @@ def apart(one: Pose, other: Pose) -> float:
     return math.hypot(one.x - other.x, one.y - other.y)
 
 
-# --- what is claimed ----------------------------------------------------------------------------------
+# --- claims -------------------------------------------------------------------------------------------
 
 
 @by_noise
@@ -94,7 +94,7 @@ def test_both_localise_in_other_settings(scenario: Callable[[int], Scenario]) ->
 
 @pytest.mark.long
 def test_who_asks_for_more_waits_longer_and_gets_it() -> None:
-    """In the mean: what a robot asks for changes where it drives, too."""
+    """This holds in the mean, because the required accuracy also changes the path."""
     waited = {0.1: 0, 0.04: 0}
     for seed in range(4, 9):
         for accuracy in waited:
@@ -127,7 +127,7 @@ def test_a_mission_that_is_cut_short_is_undecided_and_says_what_was_left() -> No
     assert all((count == 1) == (probability == 1.0) for count, probability in many)
 
 
-# --- where they drive ---------------------------------------------------------------------------------
+# --- paths ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("noise", [SIGMA, NOISES["odometry"]], ids=["ranges", "odometry"])
@@ -143,7 +143,7 @@ def test_the_robots_keep_apart_and_b_stays_in_range_of_its_anchor(noise: str) ->
 
 
 def test_a_lost_contact_is_found_again() -> None:
-    """Tick by tick: after one without contact there is another with it, and the mission ends well."""
+    """After a tick without contact there is one with contact, and the mission ends localised."""
     lost = 0
     for seed in (*SEEDS, 3, 20):
         recording = survey(NOISES["drop-outs"], seed)
@@ -160,7 +160,7 @@ def test_a_lost_contact_is_found_again() -> None:
 
 
 def test_who_hears_nothing_where_its_anchor_should_be_goes_back() -> None:
-    """Seed 4 of the drop-outs, as a scan of some found."""
+    """A scan of seeds found seed 4 for the drop-outs."""
     recording = survey(NOISES["drop-outs"], 4)
     homing = [robot for robot in ("a", "b") if "homing" in states(recording, robot)]
     assert homing
@@ -179,7 +179,7 @@ MANY = f"{SIGMA}\noutliers = 0.2"
 
 
 def first_too_long(count: int) -> list[int]:
-    """Seeds of MANY one of whose robots has outliers for the ranges of its first two ticks."""
+    """Return seeds of MANY in which both first ranges of a robot are outliers."""
     found = (
         seed
         for seed in range(4000)
@@ -193,15 +193,15 @@ def test_who_begins_with_outliers_localises_all_the_same() -> None:
         assert_localised(survey(MANY, seed))
 
 
-# --- the same again -----------------------------------------------------------------------------------
+# --- repetition ---------------------------------------------------------------------------------------
 
 
 SHORT = 6
-"""a seed"""
+"""The seed of a short mission."""
 
 
 def ticks(scenario: Scenario) -> Iterator[tuple[World, dict[str, RobotState], dict[str, RobotState]]]:
-    """The world, the minds before and those that have observed; each step checked against a copy's."""
+    """Yield the world and the states before and after `observe`, each step compared with that of a copy."""
     world = release(scenario)
     states = {robot.id: RobotState(scenario.config(robot.id)) for robot in scenario.robots}
     while isinstance(world, World):
@@ -247,10 +247,10 @@ def test_the_same_mind_takes_the_same_step_and_is_left_as_it_was() -> None:
 
 
 def test_both_hold_the_same_of_each_other_while_they_hear_each_other() -> None:
-    """From the same logs, by the same arithmetic: a claim of one is never waited for by the other."""
+    """Both use the same logs and arithmetic, so neither waits for a claim of the other."""
     held = 0
-    for _, states, _ in ticks(scenario_of(SIGMA, 4)):
-        a, b = states["a"], states["b"]
+    for _, current, _ in ticks(scenario_of(SIGMA, 4)):
+        a, b = current["a"], current["b"]
         if a.belief.pair and b.belief.pair:
             assert a.belief.pair == b.belief.pair
             assert a.belief.blocking_reason == b.belief.blocking_reason
@@ -269,7 +269,7 @@ def test_a_robot_whose_peer_gives_up_under_noise_gives_up_too() -> None:
 
 
 def first_impossible(count: int) -> list[int]:
-    """Seeds of MANY whose first range, of either robot, is longer than any within R can be."""
+    """Return seeds of MANY in which the first range of a robot is longer than any within R can be."""
     found = (
         seed
         for seed in range(4000)
@@ -287,11 +287,11 @@ def test_drop_outs_that_add_up_do_not_keep_a_robot_in_phase_1() -> None:
     assert_localised(survey(f"{SIGMA}\noutliers = 0.05\ndrop_outs = 0.1\n{WHEELS}\n{ODOMETRY}", 9))
 
 
-# --- what is doubted on the way -----------------------------------------------------------------------
+# --- consistency on the way ---------------------------------------------------------------------------
 
 
 def test_a_robot_that_turns_out_to_head_off_its_radius_turns_onto_it_again() -> None:
-    """Set off as if it were aligned, a robot finds by its next range which way it heads."""
+    """A robot that starts as if it were aligned finds its heading from its next range."""
     world = release(scenario_of(SIGMA, SHORT))
     states = {robot.id: RobotState(world.scenario.config(robot.id)) for robot in world.scenario.robots}
     misled = False
@@ -313,7 +313,7 @@ def test_a_robot_that_turns_out_to_head_off_its_radius_turns_onto_it_again() -> 
 
 
 def test_a_robot_that_left_its_peers_range_does_not_go_there_again() -> None:
-    """Both planned to stay in range, by a belief that an outlier misled; going back is not enough."""
+    """An outlier misled both robots' plans to stay in range, and driving back is not enough."""
     recording = play(scenario_of("outliers = 0.05", 4253053381025039869, accuracy=0.03))
     assert "retreating" in states(recording, "a")
     assert_localised(recording)

@@ -1,4 +1,4 @@
-"""Where robots drive under noise: in range, apart, within what wheels can do, and where ranges tell most."""
+"""The paths of robots under noise: in range, separated, feasible, and with the most informative ranges."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SIGMA = 0.1
 MISSION = Mission(3.0, 1.0, 1.0, math.pi, noise=Noise(SIGMA, SIGMA))
 REACH = MISSION.sensing_range
 SETTLED = np.eye(2) * 0.05**2
-"""m^2: of an anchor that is known as well as phase 1 asks for"""
+"""The covariance in m^2 of an anchor that is known as well as phase 1 requires."""
 BOTH_SETTLED = np.diag([0.05**2, 0.05**2, 0.02**2] * 2)
 
 angles = st.floats(-math.pi, math.pi)
@@ -38,7 +38,7 @@ missions = st.builds(
 
 
 def after(pose: Pose, command: Controls, mission: Mission = MISSION) -> Pose:
-    """Where a manoeuvre leads that is driven for as long as manoeuvres last."""
+    """Return the pose after a manoeuvre of the usual duration."""
     for _ in range(stride(mission)):
         pose = step(pose, command.v, command.omega, mission.period)
     return pose
@@ -74,7 +74,7 @@ def test_a_manoeuvre_leads_where_the_motion_model_says(mission: Mission, way: in
         assert (ways.along[way, k], ways.across[way, k]) == pytest.approx((pose.x, pose.y), abs=1e-9)
 
 
-# --- alone --------------------------------------------------------------------------------------------
+# --- one robot --------------------------------------------------------------------------------------------
 
 
 @given(st.floats(0.3, 1.0), angles, angles, st.floats(0.4, 3.0))
@@ -97,7 +97,7 @@ def test_alone_a_robot_stays_in_range_of_its_anchor(part: float, bearing: float,
 
 @given(st.floats(-1.5, 1.5), st.floats(0.4, 1.8))
 def test_of_mirror_images_a_robot_drives_where_their_ranges_differ(along: float, aside: float) -> None:
-    """Ahead and behind the two are alike, and standing tells nothing either."""
+    """Ahead, behind and at rest, both mirror images predict the same ranges."""
     one, other = Pose(along, aside, 0.0), Pose(along, -aside, 0.0)
     tight = np.eye(2) * 1e-6
     command = plan_alone([held(one, 0.5, tight), held(other, 0.5, tight)], MISSION)
@@ -108,7 +108,7 @@ def test_of_mirror_images_a_robot_drives_where_their_ranges_differ(along: float,
     assert math.hypot(*gaps) > 4.0 * SIGMA
 
 
-# --- together -----------------------------------------------------------------------------------------
+# --- two robots -----------------------------------------------------------------------------------------
 
 M2 = (10.0, 0.0)
 
@@ -151,7 +151,7 @@ def test_from_beside_the_circle_pursuit_leads_back_to_it(
     assert math.hypot(local.x, local.y) == pytest.approx(radius, abs=1e-3)
 
 
-# --- home ---------------------------------------------------------------------------------------------
+# --- return to the anchor -----------------------------------------------------------------------------
 
 
 @given(missions, st.booleans(), st.floats(-30.0, 30.0), st.floats(-30.0, 30.0), angles)
@@ -173,7 +173,7 @@ def test_from_anywhere_a_robot_finds_home(
     assert math.hypot(pose.x - 1.0, pose.y + 2.0) <= arrival_tolerances(mission)[0]
 
 
-# --- the way round ------------------------------------------------------------------------------------
+# --- detours ------------------------------------------------------------------------------------------
 
 
 def test_exact_sensors_need_no_clearance_and_the_plan_is_as_it_was() -> None:

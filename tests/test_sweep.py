@@ -1,4 +1,4 @@
-"""A sweep's rows depend on what was asked, and not on who plays them or what goes wrong meanwhile."""
+"""The rows of a sweep depend only on its sweep file, not on its workers or on failures."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from tests.commands import PAPER_1, Ended, TandemProcess, tandem, temporary_in, 
 
 HOUSE = Path(__file__).parents[1]
 RANDOM = PAPER_1.replace("start", "# start")
-"""its starts are drawn"""
+"""A scenario with random starts."""
 BOTH = """
 name = "both"
 scenario = "base.toml"
@@ -54,15 +54,15 @@ values = ["paper", "assured"]
 paired = true
 """
 LENGTHY = BOTH.replace("[10.0, 8]", "[60.0]").replace("trials = 12", "trials = 40")
-"""some seconds of it"""
+"""A sweep that takes several seconds."""
 ASTRAY = 'name = "astray"\nscenario = "base.toml"\ntrials = 8\n'
 HASTY = ASTRAY + "trial_timeout = 1.5\n"
-"""for trials that hang for certain: others may take longer on a busy machine"""
+"""A sweep only for trials that hang; others may take longer than its timeout on a busy machine."""
 
 
 @pytest.fixture(autouse=True)
 def nothing_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Every temporary folder is in tmp_path, so the processes of a test are known by their arguments."""
+    """Put all temporary folders into tmp_path, and check that no processes or files remain."""
     folder = temporary_in(tmp_path, monkeypatch)
     yield
     until(lambda: not trial_processes(tmp_path), "no process for trials is left")
@@ -88,7 +88,7 @@ def said_by(pid: int) -> list[str]:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """With base.toml, both.toml, lengthy.toml, astray.toml and hasty.toml."""
+    """Return a folder with base.toml, both.toml, lengthy.toml, astray.toml and hasty.toml."""
     (tmp_path / "base.toml").write_text(RANDOM)
     for name, text in (("both", BOTH), ("lengthy", LENGTHY), ("astray", ASTRAY), ("hasty", HASTY)):
         (tmp_path / f"{name}.toml").write_text(text)
@@ -96,7 +96,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def rows(out: Path) -> list[dict[str, Any]]:
-    """All of them, but for their wall times."""
+    """Return all rows without their wall times."""
     return [
         {name: value for name, value in row.items() if name != "wall_s"}
         for row in pq.read_table(out / "trials.parquet").to_pylist()
@@ -122,7 +122,7 @@ def played(
     audit: bool = True,
     done: Callable[[int], None] = lambda _: None,
 ) -> execution.Results:
-    """The sweep, as the command plays it, but for figures and what is said."""
+    """Run the sweep as the command does, without figures and output."""
     silent = execution.Progress(say=print, begin=lambda *_: None, done=done)
     sweep = spec.load(str(folder / source), trials=trials)
     return execution.sweep(
@@ -135,7 +135,7 @@ def played(
 
 
 def sweep_up(folder: Path) -> None:
-    """Remove what a command that was killed could not."""
+    """Remove the files that a killed command could not."""
     for left in (folder / "tmp").glob("tandem-dask-*"):
         shutil.rmtree(left)
 
@@ -144,7 +144,7 @@ def parts(out: Path) -> int:
     return len(list(out.glob("parts/*.parquet")))
 
 
-# --- who plays it is all the same ---------------------------------------------------------------------
+# --- workers -----------------------------------------------------------------------------------------
 
 
 def test_rows_are_the_same_on_one_worker_and_on_two(folder: Path) -> None:
@@ -168,7 +168,7 @@ def test_rows_are_the_same_as_processes_over_zenoh(folder: Path) -> None:
 
 
 def dask(stack: ExitStack, module: str, *arguments: str | Path, cwd: Path) -> subprocess.Popen[bytes]:
-    """A part of a cluster that somebody started by hand."""
+    """Start a process of a Dask cluster."""
     process = subprocess.Popen(
         [sys.executable, "-P", "-W", "ignore", "-m", f"distributed.cli.{module}", *map(str, arguments)],
         stdout=subprocess.DEVNULL,
@@ -244,7 +244,7 @@ def test_a_seed_follows_from_the_sweep_the_cell_and_the_trial(folder: Path) -> N
     assert all(0 <= trial_seed(5, "{}", k) < 2**63 for k in range(100))
 
 
-# --- what goes wrong ----------------------------------------------------------------------------------
+# --- failures -----------------------------------------------------------------------------------------
 
 
 def misbehaving(function: str, source: str, folder: Path) -> subprocess.Popen[str]:
@@ -279,7 +279,7 @@ def test_trials_that_raise_die_or_hang_are_rows_and_the_others_go_on(folder: Pat
     assert (summary["trials"], summary["failed"]) == ("8", "3")
     again = sweep(folder, "astray.toml", "out")
     assert again.status == 3
-    assert "trial 1 of cell 0, failed (ValueError: two\\nlines)" in again.out
+    assert "trial 1 of cell 0 first: failed (ValueError: two\\nlines)" in again.out
     sweep(folder, "astray.toml", "out", "--retry")
     assert rows(folder / "out") == expected
 
@@ -301,7 +301,7 @@ def test_a_sweep_that_is_killed_twice_goes_on_where_it_was(folder: Path) -> None
     (out / "parts" / "00000-99999999.parquet").write_bytes(b"torn")
     ended = sweep(folder, "lengthy.toml", "killed")
     assert ended.status == 1
-    assert ended.err.count("cannot be read: its trials are played again\n") == 1
+    assert ended.err.count("cannot be read: its trials will run again\n") == 1
     assert done > 1
     assert parts(out) == 0
     played(folder, "lengthy.toml", "straight")
@@ -372,7 +372,7 @@ def test_a_folder_may_be_called_anything_and_a_label_stands_as_it_is_written(fol
     assert (folder / name / "figures" / "success-way.png").exists()
 
 
-# --- a sweep's folder ------------------------------------------------------------------------------
+# --- results folder ------------------------------------------------------------------------------
 
 
 @pytest.mark.long
@@ -391,14 +391,14 @@ def test_a_folder_of_another_sweep_is_refused(folder: Path) -> None:
     before = rows(folder / "out")
     (folder / "other.toml").write_text(RANDOM.replace("period = 1.0", "period = 0.5"))
     for was, new, says in (
-        ("seed = 5", "seed = 6", "seed is 5 there and 6 here"),
-        ("[10.0, 8]", "[10.0, 9]", "axis[0].values[1][0] is 8 there and 9 here"),
-        ("base.toml", "other.toml", "scenario.mission.period is 1 there and 0.5 here"),
+        ("seed = 5", "seed = 6", "seed is 5 in the folder and 6 in this sweep"),
+        ("[10.0, 8]", "[10.0, 9]", "axis[0].values[1][0] is 8 in the folder and 9 in this sweep"),
+        ("base.toml", "other.toml", "scenario.mission.period is 1 in the folder and 0.5 in this sweep"),
     ):
         (folder / "both.toml").write_text(BOTH.replace(was, new))
         with pytest.raises(UserError) as refused:
             played(folder, "both.toml", "out")
-        assert str(refused.value).endswith(f"out holds another sweep: {says}; choose another folder")
+        assert str(refused.value).endswith(f"out contains another sweep: {says}; choose another folder")
     assert rows(folder / "out") == before
 
 
@@ -444,7 +444,7 @@ def test_the_command_that_the_table_prints_plays_the_trial_again(folder: Path) -
     command = shlex.split(next(line for line in ended.out.splitlines() if line.startswith("  tandem run ")))
     assert command[0] == "tandem"
     tandem(*command[1:], cwd=folder)
-    summary = json.loads((folder / "record" / "summary.json").read_text())
+    summary = json.loads((folder / "recording" / "summary.json").read_text())
     cell = int(Path(command[2]).stem)
     row = next(row for row in rows(folder / "out") if (row["cell"], row["seed"]) == (cell, summary["seed"]))
     for name in ("outcome", "reason", "ticks", "first_contact_tick", "t_max_s"):
@@ -471,11 +471,11 @@ def test_of_more_cells_than_fit_a_screen_those_in_which_all_is_well_are_counted(
     lines = ended.out.splitlines()
     listed = [line.split()[0] for line in lines if line[1:2].isdigit()]
     assert listed == poor
-    assert f"all is well in {202 - len(poor)} cells, not listed: out/summary.csv" in lines
+    assert f"{202 - len(poor)} cells without a problem are not listed; see out/summary.csv" in lines
     assert 0 < len(poor) < 202
 
 
-# --- every trial is judged ------------------------------------------------------------------------------
+# --- audits -------------------------------------------------------------------------------------------
 
 
 def test_a_trial_that_breaks_a_rule_fails_the_sweep_and_is_named(
@@ -497,7 +497,7 @@ def test_a_trial_that_breaks_a_rule_fails_the_sweep_and_is_named(
     assert said[-1] == f"audited: 16 of 16 trials, 12 clean; trial 2 of cell 0: {first}"
     report.show(results, folder / "out", quiet=False)
     said = capsys.readouterr().out.splitlines()
-    assert any(line.startswith("to look at first: trial 2 of cell 0, ") and first in line for line in said)
+    assert any(line.startswith("look at trial 2 of cell 0 first: ") and first in line for line in said)
     heading = next(line for line in said if line.startswith(" cell")).split()
     line = next(line for line in said if line.startswith(" 0 ")).split()
     assert line[heading.index("clean")] == "3"
@@ -520,12 +520,12 @@ def test_a_setting_in_which_nobody_can_meet_is_a_refused_cell(folder: Path) -> N
     (folder / "slow.toml").write_text(start + "[[1.0, 1.0], [1e-6, 1e-3]]")
     ended = sweep(folder, "slow.toml", "out")
     assert ended.status in (0, 1)
-    assert "cell 1 cannot be played: mission: a tick moves a robot by " in ended.out
+    assert "cell 1 cannot run: mission: a tick moves a robot by " in ended.out
     summary = summary_rows(folder / "out")
     assert [row["trials"] for row in summary] == ["2", "0"]
     assert [bool(row["refused"]) for row in summary] == [False, True]
     (folder / "slow.toml").write_text(start + "[[1e-6, 1e-3]]")
-    with pytest.raises(UserError, match="no cell can be played; cell 0: mission: a tick moves a robot by"):
+    with pytest.raises(UserError, match="no cell can run; cell 0: mission: a tick moves a robot by"):
         played(folder, "slow.toml", "none")
     assert not (folder / "none").exists()
 
@@ -579,7 +579,7 @@ def test_a_base_scenario_whose_table_is_none_is_one_line(noise: str, folder: Pat
         played(folder, "bad.toml", "out")
     assert str(refused.value) == (
         f"{folder / 'bad.toml'}: axis[0].field: 'mission.noise.odometry.v': "
-        f"{where} of the base scenario is no table"
+        f"{where} of the base scenario is not a table"
     )
 
 
@@ -638,7 +638,7 @@ def test_the_sweep_of_noise_plays_the_same_starts_in_every_cell() -> None:
     )
 
 
-# --- a mistake in the spec ----------------------------------------------------------------------------
+# --- invalid sweep files ----------------------------------------------------------------------------
 
 AXIS = 'field = "robot.b.anchor[0]"\nvalues = [10.0, 8]'
 JOINT = 'name = "both"\nfields = ["mission.period", "mission.max_speed"]\nvalues = [[1.0, 1.0], [0.5, 1.0]]'
@@ -684,31 +684,31 @@ JOINT = 'name = "both"\nfields = ["mission.period", "mission.max_speed"]\nvalues
             "mission.noise.outlier_bias[0]",
             "axis[0].field: 'mission.noise.outlier_bias[0]': the base scenario has no mission.noise.out",
         ),
-        ("robot.b.anchor[0]", "robot..anchor", "axis[0].field: 'robot..anchor': no path"),
+        ("robot.b.anchor[0]", "robot..anchor", "axis[0].field: 'robot..anchor': not a path"),
         (
             "robot.b.anchor[0]",
             "mission.period.x",
             "axis[0].field: 'mission.period.x': mission.period is a single",
         ),
-        ("robot.b.anchor[0]", "seed", "axis[0].field: 'seed': every trial has a seed of its own"),
-        ("robot.b.anchor[0]", "planner", "axis[1]: 'planner.name' is set by axis[0] ('planner') already"),
-        ("robot.b.anchor[0]", "planner.name", "axis[1]: another axis is called 'planner.name'"),
+        ("robot.b.anchor[0]", "seed", "axis[0].field: 'seed': every trial has its own seed"),
+        ("robot.b.anchor[0]", "planner", "axis[1]: 'planner.name' is already set by axis[0] ('planner')"),
+        ("robot.b.anchor[0]", "planner.name", "axis[1]: another axis has the name 'planner.name'"),
         ("[10.0, 8]", "[]", "axis[0].values: "),
-        ("[10.0, 8]", "[8, 8.0]", "axis[0].values[1]: the same as values[0]"),
-        ("[10.0, 8]", "[8, 1979-05-27]", "axis[0].values[1]: not a number"),
-        ("[10.0, 8]", "[8, nan]", "axis[0].values[1]: not a number"),
+        ("[10.0, 8]", "[8, 8.0]", "axis[0].values[1]: equal to values[0]"),
+        ("[10.0, 8]", "[8, 1979-05-27]", "axis[0].values[1]: must be a number"),
+        ("[10.0, 8]", "[8, nan]", "axis[0].values[1]: must be a number"),
         (
             "[10.0, 8]",
             '[8, "x"]',
             "cell 2 (robot.b.anchor[0] = x; planner.name = paper): robot[1].anchor[0]: ",
         ),
         ("[10.0, 8]", "[8, 0]", "cell 2 (robot.b.anchor[0] = 0; planner.name = paper): robot[1].anchor: "),
-        ('field = "robot.b.anchor[0]"', "", "axis[0]: names one 'field', or a 'name'"),
+        ('field = "robot.b.anchor[0]"', "", "axis[0]: needs either 'field', or 'name'"),
         (AXIS, AXIS + '\nlabels = ["x", "y"]', "axis[0].name: missing"),
-        (AXIS, AXIS + '\nname = "D"\nlabels = ["x", "x"]', "axis[0].labels: not 2 different ones"),
-        (AXIS, AXIS + '\nname = "rate"\nlabels = ["x", "y"]', "axis: 2 columns would be called 'rate'"),
+        (AXIS, AXIS + '\nname = "D"\nlabels = ["x", "x"]', "axis[0].labels: must be 2 different labels"),
+        (AXIS, AXIS + '\nname = "rate"\nlabels = ["x", "y"]', "axis: 2 columns would have the name 'rate'"),
         (AXIS, JOINT.replace('name = "both"', ""), "axis[0].name: missing"),
-        (AXIS, JOINT.replace("[0.5, 1.0]", "[0.5]"), "axis[0].values[1]: not a list of 2 values"),
+        (AXIS, JOINT.replace("[0.5, 1.0]", "[0.5]"), "axis[0].values[1]: must be a list of 2 values"),
         (
             AXIS,
             JOINT.replace("mission.period", "mission.perod"),

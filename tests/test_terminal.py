@@ -1,4 +1,4 @@
-"""Text that robots say reaches a terminal escaped, whichever command prints it."""
+"""Text from robots is escaped by every command that prints it on a terminal."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def final_report(robot: str) -> FinalReport:
 
 
 def play_hostile(endpoint: str, pause: Callable[[], object] = lambda: None) -> None:
-    """Robot b, which says such things, and gives up in tick 3; calls `pause` in tick 2."""
+    """Run robot b, which sends hostile text and gives up in tick 3; call `pause` in tick 2."""
     heard, paused = Inbox("test"), False
     with session.open_client(at(endpoint), lambda: None) as link:
         command = session.publisher(link, keys.command(RUN, "b"))
@@ -165,7 +165,7 @@ def test_a_live_table_and_an_outcome_on_a_terminal_show_what_a_robot_says_escape
 
 
 def test_nothing_prints_but_by_the_one_way() -> None:
-    """Ruff's rule T201, which says where it is allowed."""
+    """Ruff's rule T201 enforces it, except in the files that pyproject.toml lists."""
     command = [
         sys.executable,
         "-m",

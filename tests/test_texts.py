@@ -1,4 +1,4 @@
-"""Text of any length is within its bound in a message, and a journal holds nothing that cannot be read."""
+"""Texts of any length are cut to their bound in a message, and every journal can be read."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ LONG_TEXTS = {
 
 
 def structs_in(value: object) -> Iterator[msgspec.Struct]:
-    """`value` and every struct in it."""
+    """Yield `value` and every struct in it."""
     if isinstance(value, msgspec.Struct):
         yield value
         for name in value.__struct_fields__:
@@ -64,7 +64,7 @@ def structs_in(value: object) -> Iterator[msgspec.Struct]:
 
 
 def text_fields() -> set[tuple[type[msgspec.Struct], str]]:
-    """Every field of a message, and of what is in one, that holds a text of any length."""
+    """Return every field of a message, and of structs in one, for a text of any length."""
     found: set[tuple[type[msgspec.Struct], str]] = set()
     seen: set[type] = set()
 
@@ -132,13 +132,13 @@ def test_a_text_at_its_bound_is_kept_whole(kind: type[msgspec.Struct], field: st
     "message", EXAMPLES, ids=[f"{i}-{type(message).__name__}" for i, message in enumerate(EXAMPLES)]
 )
 def test_a_decoder_takes_text_up_to_its_bound_in_characters_and_refuses_more(message: Message) -> None:
-    """Whoever sends it; the bound is that of the field: of a text, of a word, of a robot."""
+    """The bound is that of the field: a text, a word or a robot id."""
     tree = plain(message)
     for path, value in parts(tree):
         if isinstance(value, str):
             bounds = [bound for bound in (16, 31, 32, 64, MAX_TEXT) if _taken(message, path, "a" * bound)]
             if not bounds:
-                continue  # one of a few words
+                continue  # one of a few literals
             bound = max(bounds)
             assert bound in (32, 64, MAX_TEXT)
             assert not _taken(message, path, "a" * (bound + 1))
@@ -189,7 +189,7 @@ def test_an_agent_that_gives_up_at_length_leaves_a_journal_that_is_read(tmp_path
 
 
 def test_a_verdict_of_as_many_words_as_there_may_be_ends_a_run_whose_record_is_read(tmp_path: Path) -> None:
-    """Both robots are played here, and give up at once."""
+    """The test replaces both robots, which give up at once."""
     scenario, out = tmp_path / "paper.toml", tmp_path / "out"
     scenario.write_text(PAPER_1)
     gives_up = Undecided("\U0001f600" * MAX_TEXT)
@@ -224,4 +224,4 @@ def test_a_verdict_of_as_many_words_as_there_may_be_ends_a_run_whose_record_is_r
     assert history(read(out / "world.journal"), out).end is not None
     replayed, audited = tandem("replay", out), tandem("audit", out)
     assert (replayed.status, audited.status) == (0, 1), replayed.err + audited.err
-    assert re.search(r"^claim +1 +0$", audited.out, re.MULTILINE), audited.out  # what is missing are journals
+    assert re.search(r"^claim +1 +0$", audited.out, re.MULTILINE), audited.out  # only journals are missing

@@ -1,9 +1,9 @@
-"""What the paper states about indistinguishability (Sections II.A and III.C), counted by brute force.
+"""The paper's statements on indistinguishability (Sections II.A and III.C), checked by brute force.
 
-A robot drives through points that it knows in a frame of its own: p_k, as complex numbers. It does not
-know how that frame lies in the plane: turned by phi, shifted by T. Two initial states are
-indistinguishable if they put every point at the measured range from its anchor (Definition 1). So one
-counts pairs (phi, T). Nothing here uses the closed forms of `agent`, except to compare them.
+A robot drives through points p_k (complex numbers) that it knows in its own frame. The rotation phi and the
+shift T of that frame in the plane are unknown. Two initial states are indistinguishable if they put every
+point at the measured range from its anchor (Definition 1), so the tests count pairs (phi, T). They use the
+closed forms of `agent` only for comparison.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ Reals = NDArray[np.float64]
 Three = tuple[complex, complex, complex]
 PERIOD = 1.0
 COARSE, FINER, FINEST = 256, 32, 3
-"""cells that a scan begins with, parts a doubtful one is cut into, and how many times"""
+"""The initial cells of a scan, the parts into which an undecided cell is cut, and the number of cuts."""
 ROUND = COARSE * FINER**FINEST
 STEP = TAU / ROUND
-"""rad: of the finest cells; edges are counted in these, so that neighbours share them to the bit"""
+"""The width of the finest cells, in rad. Edges are multiples of it, so neighbours share them to the bit."""
 BISECTIONS = 45
 FITS = 1e-7
-"""m^2 and m: what rounding leaves of an equation that holds"""
+"""The largest residual of a satisfied equation, in m^2 or m."""
 DRAWS = 500
-"""of each seeded count"""
+"""The number of draws of each seeded count."""
 
 angles = st.floats(-math.pi, math.pi)
 coordinates = st.floats(-5.0, 5.0)
@@ -45,26 +45,26 @@ forwards = st.builds(Controls, st.floats(0.3, 1.0), st.floats(-3.0, 3.0))
 straights = st.builds(
     Controls, st.floats(0.3, 1.0) | st.floats(-1.0, -0.3), st.sampled_from([0.0, TAU / PERIOD])
 )
-"""On a line: straight on, straight back, or a full circle, which ends where it began."""
+"""Manoeuvres on a line: forward, backward, or a full circle, which ends at its start."""
 
 
 # --- brute force --------------------------------------------------------------------------------------
 
 
 class Scan(NamedTuple):
-    """Where a trigonometric polynomial of phi is zero."""
+    """The zeros of a trigonometric polynomial of phi."""
 
     zeros: list[float]
     is_complete: bool
-    """whether no second zero can hide beside another (none is nearly double)"""
+    """true if there are no nearly double zeros, so that none is missed"""
 
 
 def scan(f: Callable[[Reals], Reals], degree: int) -> Scan:
-    """All sign changes of `f` around the circle, bisected.
+    """Return all sign changes of `f` around the circle, by bisection.
 
-    By Bernstein's inequality |f''| <= degree^2 max|f|. If a cell of width h held two zeros, f would be
-    stationary between them, and at both ends of the cell no more than degree^2 h^2 max|f|. So a cell with
-    an end above that holds one zero if the sign changes, else none; the others are cut into finer ones.
+    By Bernstein's inequality, |f''| <= degree^2 max|f|. If a cell of width h had two zeros, f would be
+    stationary between them, and at most degree^2 h^2 max|f| at both ends of the cell. A cell with a larger
+    value at one end therefore has one zero if the sign changes, else none. Other cells are cut.
     """
     cells = np.arange(COARSE) * FINER**FINEST
     size = np.abs(f(STEP * cells)).max()
@@ -87,7 +87,7 @@ def scan(f: Callable[[Reals], Reals], degree: int) -> Scan:
 
 
 class Setting(NamedTuple):
-    """Three ranges: from the points p_k of a robot to the anchors m_k, which may be the same."""
+    """Three ranges from the points p_k of a robot to the anchors m_k, of which two may be the same."""
 
     p: Three
     m: Three
@@ -95,15 +95,15 @@ class Setting(NamedTuple):
 
     @classmethod
     def of(cls, p: Three, m: Three, phi: float, shift: complex) -> Setting:
-        """What is measured where the robot's frame is turned by `phi`, then shifted."""
+        """Return the ranges of a robot whose frame is rotated by `phi`, then shifted."""
         q = cmath.rect(1.0, phi) * np.array(p) + shift
         first, second, third = (float(rho) for rho in np.abs(q - np.array(m)))
         return cls(p, m, (first, second, third))
 
     def system(self, phi: Reals) -> tuple[NDArray[np.complex128], Reals]:
-        """Numerator and determinant of the first point as seen from its anchor, t = numerator/determinant.
+        """Return numerator and determinant of t, the first point relative to its anchor (their quotient).
 
-        As Section III.C says: subtract the first equation |t| = rho_0 from the others,
+        By Section III.C, subtract the first equation |t| = rho_0 from the others,
         |t - u_k| = rho_k with u_k = (m_k - m_0) - e^{i phi} (p_k - p_0). That leaves two linear equations
         u_k . t = w_k, by Cramer's rule.
         """
@@ -114,7 +114,7 @@ class Setting(NamedTuple):
         return 1j * (w2 * u1 - w1 * u2), (u1.conj() * u2).imag
 
     def residual(self, phi: Reals) -> Reals:
-        """What is left of the first equation, |t|^2 = rho_0^2, times the determinant squared.
+        """Return the residual of the first equation, |t|^2 = rho_0^2, times the determinant squared.
 
         Each solution (phi, T) is a zero; a phi that leaves two T is a double one, as numerator and
         determinant both vanish there.
@@ -123,12 +123,12 @@ class Setting(NamedTuple):
         return np.asarray(np.abs(numerator) ** 2 - (self.rho[0] * determinant) ** 2)
 
     def harmonics(self) -> Reals:
-        """Of the residual, scaled: the amplitudes of e^{i n phi}, n = 0 ... 8."""
+        """Return the amplitudes of e^{i n phi}, n = 0 ... 8, of the scaled residual."""
         spectrum = np.abs(np.fft.rfft(self.residual(np.linspace(0.0, TAU, 16, endpoint=False))))
         return np.asarray(spectrum / spectrum.max())
 
     def solve(self) -> tuple[list[tuple[float, complex]], bool]:
-        """Every (phi, T), and whether that is all."""
+        """Return all solutions (phi, T) found, and true if they are complete."""
         zeros, is_complete = scan(self.residual, 3)
         if not is_complete:
             return [], False
@@ -141,7 +141,7 @@ class Setting(NamedTuple):
 
 
 def command(start: Pose, controls: Sequence[Controls]) -> list[Pose]:
-    """Q: the start, and where each manoeuvre ends."""
+    """Return Q: the start, and the pose after each manoeuvre."""
     poses = [start]
     for control in controls:
         poses.append(step(poses[-1], control.v, control.omega, PERIOD))
@@ -155,7 +155,7 @@ def place(pose: Pose) -> complex:
 def headings_that_fit(
     rho0: float, odometry: Sequence[complex], rho: Sequence[float]
 ) -> tuple[list[float], bool]:
-    """One anchor: with q_0 rotated to (rho_0, 0), as one may, these are left; and whether that is all."""
+    """Return the headings that fit one anchor with q_0 at (rho_0, 0), and true if they are complete."""
 
     def misses(k: int) -> Callable[[Reals], Reals]:
         return lambda phi: np.asarray(np.abs(rho0 + np.exp(1j * phi) * odometry[k]) ** 2 - rho[k] ** 2)
@@ -168,7 +168,7 @@ def headings_that_fit(
 
 
 def off_the_line(odometry: Sequence[complex]) -> float:
-    """m: how far the farthest point lies from the line through the first two."""
+    """Return the largest distance in m of a point from the line through the first two."""
     chord = odometry[1] - odometry[0]
     return max(abs(((point - odometry[0]) / chord).imag) * abs(chord) for point in odometry)
 
@@ -216,9 +216,9 @@ def test_three_points_or_more_that_are_not_collinear_leave_rotations_only(
 def test_two_points_or_collinear_ones_leave_the_mirror_image_too_and_nothing_else(
     rho0: float, heading: float, controls: list[Controls]
 ) -> None:
-    """Proposition 1 (2); the two are the branches +-alpha of eq. (2).
+    """Proposition 1 (2); the two solutions are the branches +-alpha of eq. (2).
 
-    The points are mirrored, by a turn about q_0: what the robot drove between them is turned.
+    A rotation about q_0 mirrors the points: the path of the robot between them is rotated.
     """
     poses = command(ORIGIN, controls)
     odometry = [place(pose) for pose in poses]
@@ -244,8 +244,11 @@ def test_two_points_or_collinear_ones_leave_the_mirror_image_too_and_nothing_els
 def test_a_third_range_tells_the_branches_apart_unless_omega_1_makes_full_turns(
     half_turns: int, classes: int
 ) -> None:
-    """Below eq. (3) the paper excludes omega_1 = j pi. But it is omega_1 T_s = 2 j pi that leaves q_2 on the
-    line of q_0 and q_1; half a turn tells the branches apart, and Section IV allows it (omega_max = pi)."""
+    """Below eq. (3) the paper excludes omega_1 = j pi. Only omega_1 T_s = 2 j pi keeps q_2 on the line.
+
+    The line is that of q_0 and q_1. Half a turn distinguishes the branches, and Section IV allows it
+    (omega_max = pi).
+    """
     controls = [Controls(1.0, 0.0), Controls(1.0, half_turns * math.pi / PERIOD)]
     odometry = [place(pose) for pose in command(ORIGIN, controls)]
     rho = [abs(place(pose)) for pose in command(Pose(2.0, 0.0, 1.2), controls)]
@@ -254,7 +257,7 @@ def test_a_third_range_tells_the_branches_apart_unless_omega_1_makes_full_turns(
     assert len(found) == classes
 
 
-# --- more anchors -------------------------------------------------------------------------------------
+# --- several anchors -------------------------------------------------------------------------------------
 
 
 @settings(max_examples=300)
@@ -281,7 +284,7 @@ def test_3_plus_1_leaves_two_trajectories(
 def test_2_plus_1_leaves_two_trajectories_for_each_distance_of_q_2_from_m_1(
     odometry: tuple[complex, complex], distance: float, start: complex, heading: float
 ) -> None:
-    """Section II.A.2: two ranges yield two distances (the branches of eq. (2)); one may not reach."""
+    """Section II.A.2: two ranges give two distances (branches of eq. (2)), of which one can be infeasible."""
     ways = (0j, *odometry)
     q2 = start + cmath.rect(1.0, heading) * ways[2]
     assume(min(abs(start), abs(odometry[0]), abs(q2)) > 0.3)
@@ -302,7 +305,7 @@ def test_2_plus_1_leaves_two_trajectories_for_each_distance_of_q_2_from_m_1(
 def test_eq_7_has_exactly_the_placements_that_brute_force_finds(
     distance: float, p1b: complex, ways: tuple[complex, complex], phi: float, psi: float
 ) -> None:
-    """M_2 and p_1^b are anchors: D is M_1's range to the one, rho_1m and rho_2m are a's to the other."""
+    """M_2 and p_1^b act as anchors: D is the range of M_1 to M_2; rho_1m and rho_2m are of a to p_1^b."""
     p1a, p2a = ways
     truth = cmath.rect(distance, psi)
     setting = Setting.of((0j, p1a, p2a), (0j, p1b, p1b), phi, truth)
@@ -324,17 +327,20 @@ def test_eq_7_has_exactly_the_placements_that_brute_force_finds(
         )
 
 
-# --- how many: 2+1 against 1+1+1 ----------------------------------------------------------------------
+# --- counts: 2+1 against 1+1+1 -----------------------------------------------------------------------
 
 
 def anywhere(rng: np.random.Generator, *, same: bool) -> Setting:
-    """A robot at three points, each ranged from one of three anchors; or of two, if two are the `same`."""
+    """Draw a robot at three points, each ranged from one of three anchors, or of two if `same`."""
     p0, p1, p2, m0, m1, m2, shift = (complex(x, y) for x, y in rng.normal(size=(7, 2)))
     return Setting.of((p0, p1, p2), (m0, m1, m1 if same else m2), rng.uniform(0.0, TAU), shift)
 
 
 def meeting(rng: np.random.Generator, *, same: bool) -> Setting:
-    """Section IV's orbits, met within R: a drives 1 m, b too or (`same`) stands; D and two mutual ranges."""
+    """Draw an encounter within R on Section IV's orbits, with D and two mutual ranges.
+
+    Robot a drives 1 m between the ranges; b also does, or stops if `same`.
+    """
     anchors, sensing = 10.0, 3.0
     orbit = 0.5 * (anchors + sensing)
     while True:
@@ -372,7 +378,7 @@ def test_2_plus_1_leaves_four_at_most_and_1_plus_1_plus_1_not_eight_but_six(
 
 
 def counted(draw: Callable[..., Setting], *, same: bool, draws: int = DRAWS) -> Counter[int]:
-    """How many draws have how many solutions, where the scan is sure of it."""
+    """Return the number of draws by their number of solutions, for complete scans."""
     rng = np.random.default_rng(1)
     scans = [scan(draw(rng, same=same).residual, 3) for _ in range(draws)]
     return Counter(len(one.zeros) for one in scans if one.is_complete)
@@ -389,16 +395,16 @@ def counted(draw: Callable[..., Setting], *, same: bool, draws: int = DRAWS) -> 
     ids=["2+1 anywhere", "1+1+1 anywhere", "2+1 of the pair", "1+1+1 of the pair"],
 )
 def test_both_bounds_are_reached(draw: Callable[..., Setting], same: bool, numbers: set[int]) -> None:
-    """Of 100 000 draws each, the scan was sure of 99.6 % or more, and never saw a seventh solution:
+    """At least 99.6 % of the scans of 100 000 draws each were complete, and none had a seventh solution:
 
     2+1, anywhere:     2 in 34.0 %, 4 in 66.0 %
     1+1+1, anywhere:   2 in 48.9 %, 4 in 46.3 %, 6 in 4.8 %
     2+1, the pair:     4 in all
     1+1+1, the pair:   2 in 27.0 %, 4 in 60.6 %, 6 in 12.4 %
 
-    The pair's 2+1 has all four since M_1, seen from p_1^b, is at most R nearer or farther than the orbit's
-    radius (D+R)/2, on either branch: between (D-R)/2 and (D+3R)/2, where Section III.C finds two
-    intersections. Only silence leaves fewer.
+    The 2+1 of the pair always has four, because M_1, seen from p_1^b, is at most R nearer or farther than the
+    orbit's radius (D+R)/2, on either branch: between (D-R)/2 and (D+3R)/2, where Section III.C finds two
+    intersections. Only ticks without a detection leave fewer.
     """
     counts = counted(draw, same=same)
     assert set(counts) == numbers
@@ -426,7 +432,7 @@ def test_the_bounds_hold_in_general_position_only(
     m: Three,
     family: Callable[[float], tuple[float, complex]],
 ) -> None:
-    """The paper does not say so: there are settings that leave a whole circle of trajectories."""
+    """The paper does not mention settings in which a whole circle of trajectories is indistinguishable."""
     truth = Setting.of(p, m, *family(0.0))
     for beta in (0.5, 1.0, 2.0, 4.0):
         assert Setting.of(p, m, *family(beta)).rho == pytest.approx(truth.rho, abs=1e-12)

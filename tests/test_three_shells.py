@@ -1,4 +1,4 @@
-"""`tandem world` and `tandem agent`, each started on its own: any order, any number of pairs, no mix-ups."""
+"""`tandem world` and `tandem agent`, started separately in any order, with any number of pairs."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def unanswered() -> None:
 
 @pytest.fixture(scope="module")
 def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The record of the paper's first mission."""
+    """Return the recording of the first simulation of the paper."""
     out = tmp_path_factory.mktemp("paper-1") / "out"
     assert tandem("run", "paper-1", "--in-process", "-q", "--out", out).status == 0
     return out
@@ -45,7 +45,7 @@ def test_any_order_of_starting_gives_the_same_record(
         started: dict[str, TandemProcess] = {}
         for name in order:
             if name == "world":
-                for agent in started.values():  # which it says after 5 s
+                for agent in started.values():  # it prints this after 5 s
                     agent.until_says(f"no world at {endpoint} yet")
                 part = ("world", "paper-1", "--listen", endpoint)
             else:
@@ -120,7 +120,7 @@ def test_an_agent_finds_no_world_where_its_run_is_not_alive() -> None:
 
 @pytest.fixture(scope="module")
 def waiting(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """The endpoint of a world, run "mine", that has a and waits for b."""
+    """Yield the endpoint of a world of run "mine" that has robot a and waits for b."""
     out = tmp_path_factory.mktemp("waiting") / "out"
     with (
         world("paper-1", "--run", "mine", "--timeout", "100") as (_, endpoint),

@@ -1,4 +1,4 @@
-"""A mission is the same through any routers: one, two, one a robot; somebody else's, or its own."""
+"""A mission is the same through one router, two, one per robot, an external one, or its own."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ROUTER = [sys.executable, "-m", "tests.router"]
 
 
 class Router(NamedTuple):
-    """Where it listens, to whom it is linked, and by whose keys."""
+    """The configuration of a router: its endpoints, its links, and its keys."""
 
     listen: str
     connect: tuple[str, ...] = ()
@@ -32,7 +32,7 @@ class Router(NamedTuple):
 
 @contextmanager
 def routing(router: Router, folder: Path) -> Iterator[subprocess.Popen[str]]:
-    """A router's process, once it routes."""
+    """Yield the process of a router that is ready."""
     settings: dict[str, Any] = {"mode": "router"}
     if router.keys is not None:
         text = (router.keys / KEYED).read_text().partition("\n")[2]  # without the comment it is JSON
@@ -60,7 +60,7 @@ def routing(router: Router, folder: Path) -> Iterator[subprocess.Popen[str]]:
 def parts(
     scenario: Path, out: Path, flags: Mapping[str, Sequence[str | Path]], stack: ExitStack
 ) -> dict[str, TandemProcess]:
-    """The world and the agents, each with flags of its own."""
+    """Yield the processes of the world and the agents, each with its own flags."""
     what: dict[str, list[str | Path]]
     what = {"world": ["world", scenario], "a": ["agent", "a"], "b": ["agent", "b"]}
     return {
@@ -70,7 +70,7 @@ def parts(
 
 
 def record_of(text: str, folder: Path) -> dict[str, bytes]:
-    """The record of a mission in one process; its file is scenario.toml."""
+    """Return the recording of a mission in one process; write its file scenario.toml."""
     (folder / "scenario.toml").write_text(text)
     assert (
         tandem("run", folder / "scenario.toml", "--in-process", "-q", "--out", folder / "local").status == 0
@@ -79,7 +79,7 @@ def record_of(text: str, folder: Path) -> dict[str, bytes]:
 
 
 def same(mission: dict[str, TandemProcess], out: Path, expected: dict[str, bytes]) -> None:
-    """All localise, and leave that record."""
+    """Check that all processes succeed, and that the recording is the expected one."""
     ended = {name: part.ended() for name, part in mission.items()}
     assert {name: end.status for name, end in ended.items()} == dict.fromkeys(mission, 0), ended
     assert journals(out) | {"ticks.csv": (out / "ticks.csv").read_bytes()} == expected

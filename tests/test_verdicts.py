@@ -1,4 +1,4 @@
-"""A verdict is given once, and a robot that gives up does not keep its peer waiting."""
+"""A verdict is sent once, and a robot that gives up does not delay its peer."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_a_wrong_claim_cannot_be_taken_back() -> None:
 def test_the_letter_gives_up_where_the_third_mutual_range_settles_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """b drove its last manoeuvre; a, which the paper has stand, stands. No placement is known well here."""
+    """b has driven its last manoeuvre, and a stops, as in the paper. No placement is well determined here."""
     monkeypatch.setattr(precision, "pinned_down", lambda *_: False)
     text = f'{shipped()["random"].read_text()}\n[planner]\nname = "paper"\n'
     recording = play(parse(text, "random", seed=441))
@@ -70,16 +70,16 @@ def test_the_letter_gives_up_where_the_third_mutual_range_settles_nothing(
     assert states[-3:] == [("straight", "standing"), ("waiting", "last-manoeuvre"), ("waiting", "undecided")]
 
 
-# --- how well a robot must know what it claims ----------------------------------------------------------
+# --- the accuracy of claims -----------------------------------------------------------------------------
 
 
 def covariance(position: float, heading: float) -> Covariance:
-    """That of a position and a heading of these sigmas, in m and rad."""
+    """Return the covariance for these sigmas of position and heading, in m and rad."""
     return Covariance(position**2 / 2.0, 0.0, 0.0, position**2 / 2.0, 0.0, heading**2)
 
 
 def judged(text: str, a: Covariance | None, *, off: float = 0.0) -> Judgement | World:
-    """Both claim where they are at once; a's claim is `off` by so many metres, and has this covariance."""
+    """Return the judgement on immediate claims of both; that of a is `off` by metres, with covariance `a`."""
     world = release(parse(text, "noisy", seed=1))
     there, other = world.truth.poses
     claim = Localised(replace(there, x=there.x + off), a)
@@ -110,7 +110,7 @@ def test_a_robot_that_knows_its_pose_less_well_than_was_asked_is_not_localised(
 
 
 def test_no_sigma_excuses_a_claim_that_is_farther_off_than_the_accuracy_allows() -> None:
-    """Five times the accuracy, 0.1 m; where sensors are exact, a micrometre."""
+    """The limit is five times the accuracy of 0.1 m, or 1e-6 m with exact sensors."""
     huge = covariance(4.5e7, 3.0)
     for text, far, near in ((NOISY, 0.501, 0.499), (EXACT, 2e-6, 1e-7)):
         wrong, vague = judged(text, huge, off=far), judged(text, huge, off=near)
@@ -136,7 +136,7 @@ def test_without_a_world_a_claim_less_accurate_than_was_asked_does_not_end_local
 def honest_claims(
     planner_name: str, sigmas: Sequence[float], seeds: Sequence[int], outliers: float = 0.0
 ) -> int:
-    """How many claims honest robots make under such noise, each as accurate as was asked for."""
+    """Return the number of claims of honest robots under this noise, and check their accuracy."""
     claims = 0
     for sigma in sigmas:
         for seed in seeds:

@@ -1,6 +1,6 @@
-"""The page on which a run is watched: what it shows, in a real browser, and whom it asks.
+"""The page that shows a run: its contents in a real browser, and its requests.
 
-Tests that ask for `opened` need a browser, and skip where there is none (tests/browser.py).
+Tests that use `opened` are skipped if no browser is installed (tests/browser.py).
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ from tests.commands import (
 )
 
 FAST_TICKS = 1000
-"""about a second of a mission that nobody slows"""
+"""The number of ticks of about a second at full speed."""
 WITH_TIMEOUT = ("--timeout", "600")
-"""a mission that waits while browsers start"""
+"""The options of a mission that waits while browsers start."""
 
 
-# --- a record ---------------------------------------------------------------------------------------
+# --- a recording ---------------------------------------------------------------------------------------
 
 
 def test_a_record_scrubbed_to_tick_46_shows_the_first_contact(opened: Open, address: str) -> None:
@@ -82,8 +82,8 @@ def test_the_plane_is_drawn_in_the_colours_of_what_happens(opened: Open, address
         until_shown(page, tick)
         seen[tick] = inks(page)
     assert seen[0]["range"] > 3 * seen[20]["range"]  # both are in range of their anchors; neither is
-    assert seen[45]["link"] == 0 < seen[46]["link"]  # they meet
-    assert seen[47]["ghost"] > 3 * seen[46]["ghost"] > 300  # one place each is possible, then four
+    assert seen[45]["link"] == 0 < seen[46]["link"]  # phase 3 begins
+    assert seen[47]["ghost"] > 3 * seen[46]["ghost"] > 300  # one placement each is possible, then four
     assert seen[0]["phase-2"] == 0 < seen[20]["phase-2"]  # trails
     assert seen[20]["phase-1"] > 100
     assert seen[45]["phase-3"] == 0 < seen[46]["phase-3"] < seen[48]["phase-3"]
@@ -93,10 +93,10 @@ def test_the_plane_is_drawn_in_the_colours_of_what_happens(opened: Open, address
     until_shown(page, 46)
     alone = inks(page)
     assert alone["ring"] < 0.6 * seen[46]["ring"]  # its own anchor's range
-    assert alone["link"] > 100  # the ring on which a is
+    assert alone["link"] > 100  # the circle of range on which a is
     page.locator("#scrub").evaluate(SCRUB, 47)
     until_shown(page, 47)
-    assert inks(page)["phase-3"] < 50 < seen[47]["phase-3"]  # where it truly is, nothing is drawn
+    assert inks(page)["phase-3"] < 50 < seen[47]["phase-3"]  # nothing is drawn at its true position
 
 
 @pytest.mark.long
@@ -110,7 +110,7 @@ def test_what_becomes_of_reports_is_drawn_on_their_way(opened: Open, tmp_path: P
             page = opened(f"{where}#tick=46")
             until_shown(page, 46)
             seen[fault] = inks(page)["fault"]
-    assert seen["loss=0"] == 0 < 1.7 * seen["loss=1"] < seen["corrupt=1"]  # dashed; whole, and crossed out
+    assert seen["loss=0"] == 0 < 1.7 * seen["loss=1"] < seen["corrupt=1"]  # dashed; solid and crossed out
 
 
 @pytest.mark.long
@@ -204,7 +204,7 @@ def test_robots_without_a_world_are_shown_by_what_they_know(
 
 
 def as_a_driver_tells(message: Message) -> Message:
-    """Without a world nobody lists what is heard."""
+    """Return a message as in hardware mode, where no simulator lists the received reports."""
     if not isinstance(message, Observation):
         return message
     return replace(message, contacts=tuple([replace(one, heard=None) for one in message.contacts]))
@@ -345,7 +345,7 @@ def test_a_mission_is_followed_to_its_end_from_its_journals_and_from_the_network
                 expect(page.locator("#log .now").last).to_have_text(re.compile("The mission ends: localised"))
             shot(files, "live-journals")
             shot(heard, "live-network")
-            for page in (files, heard):  # whatever was skipped is there afterwards
+            for page in (files, heard):  # skipped frames are present afterwards
                 for tick in (0, 5, 46):
                     page.locator("#scrub").evaluate(SCRUB, tick)
                     until_shown(page, tick)
@@ -355,7 +355,7 @@ def test_a_mission_is_followed_to_its_end_from_its_journals_and_from_the_network
 
 @pytest.mark.long
 def test_a_page_keeps_up_with_a_mission_as_fast_as_it_goes(opened: Open, tmp_path: Path) -> None:
-    """By leaving out frames: thousands of ticks are past, and it is never far behind for long."""
+    """It skips frames: after thousands of ticks, it has never been far behind for long."""
     scenario, out = tmp_path / "endless.toml", tmp_path / "out"
     scenario.write_text(ENDLESS)
     with TandemProcess("run", scenario, "--watch", "--out", out, "-q") as run:

@@ -1,4 +1,4 @@
-"""A frame is understood whole, or refused with the one error there is."""
+"""A frame is decoded completely, or refused with MalformedFrame."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from world.scenario import Scenario
 
 ANY: Any = reduce(or_, sorted(Message.__subclasses__(), key=lambda kind: kind.__name__))
 HEAD = 5
-"""bytes before the body: the version and the CRC-32"""
+"""The number of bytes before the body: the version and the CRC-32."""
 
 by_message = pytest.mark.parametrize(
     "message", EXAMPLES, ids=[f"{i}-{type(message).__name__}" for i, message in enumerate(EXAMPLES)]
@@ -42,7 +42,7 @@ by_message = pytest.mark.parametrize(
 
 
 def framed(body: bytes, version: int = VERSION) -> bytes:
-    """`body` as if it were a message's."""
+    """Return a frame with `body` in place of a message."""
     return struct.pack(">BI", version, zlib.crc32(body)) + body
 
 
@@ -52,7 +52,7 @@ def packed(value: object) -> bytes:
 
 
 def plain(message: Message) -> Any:
-    """The message as any msgpack library reads it."""
+    """Return the message as any msgpack library decodes it."""
     return msgpack.unpackb(encode(message)[HEAD:])
 
 
@@ -61,7 +61,7 @@ def refuses(frame: bytes, kind: Any = ANY) -> None:
         decode(frame, kind)
 
 
-# --- what we send ------------------------------------------------------------------------------------
+# --- encoding ----------------------------------------------------------------------------------------
 
 
 def test_there_is_an_example_of_every_message() -> None:
@@ -90,7 +90,7 @@ def test_any_msgpack_library_reads_what_we_send(message: Message) -> None:
     assert decode(framed(packed(plain(message))), ANY) == message
 
 
-# --- what is refused ---------------------------------------------------------------------------------
+# --- refusals ----------------------------------------------------------------------------------------
 
 
 @by_message
@@ -98,7 +98,7 @@ def test_a_truncated_frame_is_refused(message: Message) -> None:
     frame = encode(message)
     for length in range(len(frame)):
         refuses(frame[:length])
-        if length > HEAD:  # the CRC fits, and the message breaks off
+        if length > HEAD:  # the CRC is valid, and the message is truncated
             refuses(framed(frame[HEAD:length]))
 
 
@@ -149,7 +149,7 @@ Path = tuple[object, ...]
 
 
 def parts(value: Any, path: Path = ()) -> Iterator[tuple[Path, Any]]:
-    """Every value in a msgpack tree with the way to it, the tag at the top aside."""
+    """Yield every value in a msgpack tree with its path, except for the tag at the top."""
     yield path, value
     if isinstance(value, list):
         for i, item in enumerate(value):
@@ -161,7 +161,7 @@ def parts(value: Any, path: Path = ()) -> Iterator[tuple[Path, Any]]:
 
 
 def changed(value: Any, path: Path, new: object) -> Any:
-    """A copy of the tree with `new` at `path`."""
+    """Return a copy of the tree with `new` at `path`."""
     if not path:
         return new
     step, *rest = path
@@ -202,7 +202,7 @@ def test_a_value_of_the_wrong_type_is_refused(message: Message) -> None:
 
 
 def _understood(frame: bytes) -> object:
-    """The message, or None where it is refused; nothing else is ever raised."""
+    """Return the message; None if it is refused. Other errors are failures."""
     try:
         return decode(frame, ANY)
     except MalformedFrame:
@@ -298,7 +298,7 @@ def test_a_message_with_anything_anywhere_is_a_message_or_refused(
 
 
 def test_a_mission_without_one_of_its_parameters_is_refused() -> None:
-    """But for what it may leave out: how sure to be, and noise."""
+    """The accuracy and the noise are optional."""
     tree = plain(EXAMPLES[0])
     path, mission = next((path, value) for path, value in parts(tree) if isinstance(value, dict))
     assert tuple(mission) == Mission.__struct_fields__

@@ -1,4 +1,4 @@
-"""A record of robots alone: what their own journals tell is shown, and nothing of what only a world knows."""
+"""Recordings in hardware mode: viewers show the robots' journals, and nothing that requires the truth."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ MEASURED = ("tick", "robot", "anchor_range", "mutual_range", "phase", "state")
 
 @pytest.fixture(scope="module", params=["paper-1", "noisy"])
 def folders(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A record, and what the robots have of it."""
+    """Return a recording, and a folder with only the robots' journals of it."""
     whole, alone = tmp_path_factory.mktemp("whole"), tmp_path_factory.mktemp("alone")
     play(load(request.param), whole)
     for robot in "ab":
@@ -71,7 +71,7 @@ def test_an_export_has_what_was_measured_and_believed_and_no_truth(folders: tupl
         driven = past.steps[after].observation.executed if after < len(past.steps) else None
         assert told["v"] == (
             "" if driven is None else repr(driven.v)
-        )  # where the world knows what was driven
+        )  # with a simulator, the executed motion is known
         assert told["omega"] == ("" if driven is None else repr(driven.omega))
     rows, truly = (pq.read_table(folder / "ticks.parquet").to_pylist() for folder in (alone, whole))
     for name in ("world", "local", "probability", "estimate_x", "cov_xx", "verdict", "time_s"):
@@ -196,7 +196,7 @@ def test_paths_of_two_lengths_are_drawn(folders: tuple[Path, Path]) -> None:
     shorter = replace(told, b=replace(told.b, path=told.b.path[: told.contacts[0][0]]))
     figure = drawn(trajectory.draw(shorter))
     assert line(figure, "path-b") == [(p.x, p.y) for p in shorter.b.path]
-    assert isinstance(steps.draw(shorter), Absent)  # there is no tick in which both places are known
+    assert isinstance(steps.draw(shorter), Absent)  # there is no tick with known poses of both
     drawn(over_time.ranges(shorter))
 
 

@@ -1,6 +1,7 @@
-"""A clock that only sleeping moves, for an exercise and the drivers that it is tried on.
+"""A virtual clock for check-driver exercises, which only advances when the code sleeps.
 
-`tandem check-driver tests.virtual_time:Rover` is an exercise in it: what it finds does not depend on the machine.
+The results of `tandem check-driver tests.virtual_time:Rover` therefore do not depend on the speed of the
+machine.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from tests import broken_drivers
 
 
 class Clock:
-    """In the place of the module `time`."""
+    """A replacement for the module `time`."""
 
     def __init__(self) -> None:
         self.now = 1000.0
@@ -28,11 +29,11 @@ class Clock:
 
 
 MODULES: tuple[ModuleType, ...] = (exercise, rover, broken_drivers)
-"""that tell the time in an exercise"""
+"""The modules that read the time in an exercise."""
 
 
 class Rover(RealRover):
-    """The example, in a process where time is virtual from now on."""
+    """The example driver. Time is virtual in its process from its construction on."""
 
     def __init__(self, config: RobotConfig, manoeuvre_s: float) -> None:
         clock = Clock()

@@ -1,4 +1,4 @@
-"""Commands forked from a process that has imported everything, for tests that only wait for the result.
+"""Commands forked from a process with all modules imported, for tests that only wait for the result.
 
 A forked command behaves like one that is started by itself. `tests/commands.py` starts commands both ways.
 """
@@ -30,7 +30,7 @@ class Request(msgspec.Struct, frozen=True):
     """A command line, its working directory and its environment."""
 
     words: list[bytes]
-    """bytes, as the system passes them: they need not be valid text"""
+    """arguments as bytes, because they need not be valid text"""
     folder: str
     environment: dict[bytes, bytes]
 
@@ -46,7 +46,7 @@ def warm_up() -> None:
 
 
 def run(words: list[str], folder: Path | None, out: IO[bytes], err: IO[bytes], within: float) -> int:
-    """Run `tandem WORDS` in `folder`, and return its exit status; negative is the signal that killed it.
+    """Run `tandem WORDS` in `folder`, and return its exit status, negative if a signal killed it.
 
     Raises AssertionError if it runs for longer than `within` seconds.
     """
@@ -67,7 +67,7 @@ def run_command() -> None:
     """Run the command whose file sys.argv names, in this forked process."""
     with open(sys.argv[1], "rb") as file:
         command = msgspec.msgpack.decode(file.read(), type=Request)
-    os.dup(0)  # that stays open: a fork server takes a process that closes it for one that has ended
+    os.dup(0)  # keep it open: the fork server treats a process that closes it as ended
     for path, stream, flags in ((sys.argv[2], 1, os.O_WRONLY), (os.devnull, 0, os.O_RDONLY)):
         opened = os.open(path, flags)
         os.dup2(opened, stream)

@@ -1,4 +1,4 @@
-"""Pictures of a sweep over lies: which are found out, and at what price in false alarms."""
+"""The figures of a sweep over attacks: how many are detected, and how many honest missions are rejected."""
 
 from __future__ import annotations
 
@@ -13,19 +13,20 @@ from compose.sweep.execution import Results
 from compose.sweep.spec import Axis
 
 FIELD = ".attack"
-"""how the path of the field ends that is varied"""
+"""The end of the path of the field that such a sweep varies."""
 
 HONEST = "honest"
-"""the label of the truth, against which lies are held"""
+"""The label of missions without an attack, with which the others are compared."""
 
 OUTCOMES = (("inconsistent", "#0b3c6f", ""), ("undecided", "#c9c9c9", ""), ("localised", "#9fc8a9", ".."))
-"""outcome, colour, hatch; what is left is wrong"""
+"""The outcome, colour and hatch of each part of a bar. The remaining part is `wrong`."""
 
 WRONG = "#d9541e"
+"""The colour of `wrong`."""
 
 
-def axis_of_lies(results: Results) -> int | None:
-    """Which axis is of lies, with the truth among its values; none if there is none."""
+def attack_axis(results: Results) -> int | None:
+    """Return the index of the axis of attacks that includes HONEST; None if there is none."""
     for place, axis in enumerate(results.sweep.axes):
         if axis.fields[0].endswith(FIELD) and axis.labels is not None and HONEST in axis.labels:
             return place
@@ -33,7 +34,7 @@ def axis_of_lies(results: Results) -> int | None:
 
 
 def outcomes(results: Results, place: int) -> Figure:
-    """What became of the missions under each lie: found out, believed without harm, or believed and wrong."""
+    """Return a bar chart of the outcomes under each attack, a panel per combination of the other axes."""
     axis = results.sweep.axes[place]
     groups = _settings(results, place)
     labels = [axis.label(i) for i in range(len(axis.values))]
@@ -56,17 +57,17 @@ def outcomes(results: Results, place: int) -> Figure:
 
 
 def roc(results: Results, place: int) -> Figure | None:
-    """Receiver operating characteristic: lies told apart from the truth by the least p-value of a mission.
+    """Return the receiver operating characteristic of detecting attacks by the least p-value of a mission.
 
-    A line for each kind and part of a lie, all its sizes pooled. No picture where sensors are exact: there a
-    p-value is 0 or 1.
+    There is one line per kind and part of an attack; its sizes are pooled. Return None if all sensors are
+    exact, because p-values are then 0 or 1.
     """
     axis = results.sweep.axes[place]
-    truth = _honest(axis)
+    baseline = _honest(axis)
     noisy = [
         (name, cells)
         for name, cells in _settings(results, place)
-        if len(honest := _least(results.of(cells[truth]))) and np.ptp(honest) > 0.0
+        if len(honest := _least(results.of(cells[baseline]))) and np.ptp(honest) > 0.0
     ]
     if not noisy:
         return None
@@ -74,27 +75,27 @@ def roc(results: Results, place: int) -> Figure | None:
     panels = figure.subplots(1, len(noisy), sharey=True, squeeze=False)[0]
     kinds = list(dict.fromkeys([_kind(axis.label(i)) for i in range(len(axis.values))]))
     for panel, (name, cells) in zip(panels, noisy, strict=True):
-        honest = np.sort(_least(results.of(cells[truth])))
+        honest = np.sort(_least(results.of(cells[baseline])))
         false = np.arange(1, len(honest) + 1) / len(honest)
         for k, kind in enumerate([one for one in kinds if one != HONEST]):
             sizes = [cell for i, cell in enumerate(cells) if _kind(axis.label(i)) == kind]
-            lies = np.sort(np.concatenate([_least(results.of(cell)) for cell in sizes]))
-            found = np.searchsorted(lies, honest, side="right") / max(1, len(lies))
+            attacked = np.sort(np.concatenate([_least(results.of(cell)) for cell in sizes]))
+            found = np.searchsorted(attacked, honest, side="right") / max(1, len(attacked))
             colour, line = f"C{k // 4}", ("-", "--", "-.", ":")[k % 4]
             panel.step(false, found, where="post", color=colour, ls=line, lw=1.2, label=kind)
         panel.set_xscale("log")
         panel.xaxis.set_major_formatter("{x:g}")
         panel.set_title(name)
-        panel.set_xlabel("honest missions held to be lies")
+        panel.set_xlabel("honest missions rejected (false positive rate)")
         panel.set_ylim(0.0, 1.02)
-    panels[0].set_ylabel("lies found out")
+    panels[0].set_ylabel("attacks detected (true positive rate)")
     handles, named = panels[0].get_legend_handles_labels()
     figure.legend(handles, named, loc="outside right center", frameon=False)
     return figure
 
 
 def _settings(results: Results, place: int) -> list[tuple[str, list[int]]]:
-    """The other axes' choices: what to call each, and the cell of each lie in it."""
+    """Return the combinations of the other axes: a name, and the cell of each attack."""
     return [
         (", ".join([f"{name} {label}" for name, label in named]), cells)
         for named, cells in results.settings(place)
@@ -102,23 +103,28 @@ def _settings(results: Results, place: int) -> list[tuple[str, list[int]]]:
 
 
 def _honest(axis: Axis) -> int:
+    """Return the index of the value HONEST."""
     assert axis.labels is not None
     return list(axis.labels).index(HONEST)
 
 
 def _kind(label: str) -> str:
-    """The label without its size."""
+    """Return the label of an attack without its size."""
     words: Sequence[str] = label.split()
     size = next((i for i, word in enumerate(words) if word[0].isdigit()), len(words))
     return " ".join(words[:size])
 
 
 def _share(table: pa.Table, outcome: str) -> float:
+    """Return the fraction of trials with this outcome; 0 without trials."""
     return float(np.mean(np.array(table["outcome"].to_pylist()) == outcome)) if len(table) else 0.0
 
 
 def _least(table: pa.Table) -> NDArray[np.float64]:
-    """The least p-value in each mission; 0 where an alarm needed none, 1 where nothing was in doubt."""
+    """Return the least p-value of each mission, shape (trials,).
+
+    Without a p-value it is 0 if the outcome is `inconsistent`, else 1.
+    """
     names = [name for name in table.column_names if name.endswith("_p_value")]
     columns = [table[name].to_pylist() for name in names]
     rows = zip(table["outcome"].to_pylist(), *columns, strict=True)

@@ -1,4 +1,7 @@
-"""Pictures of a sweep: success and ticks against each axis, and when robots met, against T_max."""
+"""The figures of a sweep: success rate and ticks over each axis, and the time until robots meet.
+
+Sweeps over attacks or kills have additional figures.
+"""
 
 from __future__ import annotations
 
@@ -29,20 +32,20 @@ STYLES = (
     ("#8e5ea2", (0, (5, 1)), "v"),
     ("#c9a227", (0, (3, 1, 1, 1)), "P"),
 )
-"""colour, line, marker: of different lightness, and told apart without colour too"""
+"""The colour, line and marker of each line of a figure, distinguishable without colour."""
 LOGARITHMIC = 20.0
-"""an axis whose largest value is so many times its smallest"""
+"""The ratio of the largest to the smallest value from which on an axis is logarithmic."""
 FITTING = 60
-"""characters that stand side by side below an axis"""
+"""The total length in characters up to which the labels below an axis are horizontal."""
 BESIDE = 96
-"""characters of a legend that stand side by side"""
+"""The length in characters of the widest row of a legend."""
 _NUMBER = re.compile(r"[0-9]+(?:\.[0-9]+)?").fullmatch
-APART = 0.45
-"""of the room that a name has, for what stands beside each other there"""
+SPREAD = 0.45
+"""The fraction of the space of a label over which the points of several lines are spread."""
 
 
 def draw(results: Results, folder: Path) -> None:
-    """Draw them anew, each as SVG, PDF and PNG, into `folder`."""
+    """Draw all figures of the sweep into `folder`, each as SVG, PDF and PNG."""
     folder.mkdir(exist_ok=True)
     with look():
         for place, axis in enumerate(results.sweep.axes):
@@ -51,16 +54,16 @@ def draw(results: Results, folder: Path) -> None:
                 save(_success(results, place), folder / f"success-{name}")
                 save(ticks_against(results, place), folder / f"ticks-{name}")
         save(_meeting(results), folder / "meeting")
-        if (of_lies := attack_figures.axis_of_lies(results)) is not None:
-            save(attack_figures.outcomes(results, of_lies), folder / "attacks")
-            if (roc := attack_figures.roc(results, of_lies)) is not None:
+        if (attacks := attack_figures.attack_axis(results)) is not None:
+            save(attack_figures.outcomes(results, attacks), folder / "attacks")
+            if (roc := attack_figures.roc(results, attacks)) is not None:
                 save(roc, folder / "roc")
-        if (of_ticks := crash_figures.axis_of_ticks(results)) is not None:
-            save(crash_figures.costs(results, of_ticks), folder / "crash")
+        if (kill_ticks := crash_figures.kill_tick_axis(results)) is not None:
+            save(crash_figures.costs(results, kill_ticks), folder / "crash")
 
 
 def _success(results: Results, place: int) -> Figure:
-    """The rate of localised trials, with Wilson's interval."""
+    """Return the figure of the success rate over an axis, with 95 % Wilson intervals."""
     figure, axes, at = _against(results.sweep.axes[place])
     lines = list(_lines(results, place))
     for i, (label, tables) in enumerate(lines):
@@ -89,15 +92,17 @@ def _success(results: Results, place: int) -> Figure:
 
 
 def _rates(figures: Sequence[CellSummary]) -> tuple[Any, Any, Any]:
+    """Return the rates and the bounds of their intervals, each of shape (points,)."""
     rows = [(one.rate or 0.0, one.rate_low or 0.0, one.rate_high or 0.0) for one in figures]
     rates, low, high = np.array(rows).reshape(-1, 3).T
     return rates, np.minimum(low, rates), np.maximum(high, rates)
 
 
 def ticks_against(results: Results, place: int) -> Figure:
-    """Median and maximum of the ticks that trials took which localised; 10 to 90 %, or up to 95 %.
+    """Return the figure of the ticks until localised over an axis: median, maximum and spread.
 
-    Between numbers that is a band, above names a line.
+    The spread is a band from the 10th to the 90th percentile over a numeric axis, and a line up to the 95th
+    percentile over an axis of names.
     """
     axis = results.sweep.axes[place]
     joined = _numbers(axis) is not None
@@ -142,7 +147,10 @@ def ticks_against(results: Results, place: int) -> Figure:
 
 
 def _meeting(results: Results) -> Figure:
-    """How many have met by when: in seconds since release; and of T_max since both orbit."""
+    """Return the figure of the share of trials in which phase 3 has begun, over time.
+
+    One panel shows the time in s since the start, the other the time since both orbit, divided by T_max.
+    """
     figure = Figure(figsize=(7.2, 3.4), layout="constrained")
     since_release, in_orbit = figure.subplots(1, 2, sharey=True)
     groups = _groups(results)
@@ -152,17 +160,17 @@ def _meeting(results: Results) -> Figure:
     ]
     for k, axes in enumerate((since_release, in_orbit)):
         known = [values[k][~np.isnan(values[k])] for values in times]
-        end = max([1.0, *[met.max() for met in known if len(met)]])
-        for (label, table), met, (colour, style, _) in zip(groups, known, STYLES, strict=False):
-            share = np.arange(len(met) + 1) / max(1, len(table))
-            x, y = np.concatenate([[0.0], np.sort(met), [end]]), np.append(share, share[-1])
+        end = max([1.0, *[group_times.max() for group_times in known if len(group_times)]])
+        for (label, table), group_times, (colour, style, _) in zip(groups, known, STYLES, strict=False):
+            share = np.arange(len(group_times) + 1) / max(1, len(table))
+            x, y = np.concatenate([[0.0], np.sort(group_times), [end]]), np.append(share, share[-1])
             axes.step(x, y, where="post", color=colour, ls=style, lw=1.3, label=label)
     in_orbit.axvline(1.0, color="0.2", lw=1.0)
     in_orbit.annotate(
         "$T_{max}$", (1.0, 0.02), parse_math=True, xytext=(-3, 0), textcoords="offset points", ha="right"
     )
-    in_orbit.set_xlabel("from both in orbit to meeting, over $T_{max}$", parse_math=True)
-    since_release.set_xlabel("from release to meeting [s]")
+    in_orbit.set_xlabel("from both in orbit to phase 3, over $T_{max}$", parse_math=True)
+    since_release.set_xlabel("from start to phase 3 [s]")
     since_release.set_ylabel("share of all trials")
     since_release.set_ylim(0.0, 1.02)
     if len(groups) > 1:
@@ -171,24 +179,27 @@ def _meeting(results: Results) -> Figure:
 
 
 def _groups(results: Results) -> list[tuple[str, pa.Table]]:
-    """Each cell on its own while there are few; else those told apart."""
+    """Return the trials of each line of the meeting figure, with its label.
+
+    There is one line per cell if there are at most as many cells as styles, else one per distinguished group.
+    """
     axes = results.sweep.axes
-    played = [cell for cell in results.cells if results.figures[cell.index].trials]
-    if len(played) <= len(STYLES):
+    run_cells = [cell for cell in results.cells if results.figures[cell.index].trials]
+    if len(run_cells) <= len(STYLES):
         return [
             (
                 ", ".join([_named(axis, i) for axis, i in zip(axes, cell.place, strict=True)]),
                 results.of(cell.index),
             )
-            for cell in played
+            for cell in run_cells
         ]
-    groups = [(label, results.of(*chosen)) for label, chosen in _apart(results, None)]
+    groups = [(label, results.of(*chosen)) for label, chosen in _distinguished_cells(results, None)]
     return [(label, table) for label, table in groups if len(table)]
 
 
 def _lines(results: Results, place: int) -> Iterator[tuple[str, list[pa.Table]]]:
-    """The trials at each value of an axis, a line for whatever is told apart."""
-    for label, chosen in _apart(results, place):
+    """Yield the lines of a figure over the axis `place`: a label, and the trials at each value."""
+    for label, chosen in _distinguished_cells(results, place):
         yield (
             label,
             [
@@ -198,35 +209,41 @@ def _lines(results: Results, place: int) -> Iterator[tuple[str, list[pa.Table]]]
         )
 
 
-def _apart(results: Results, place: int | None) -> Iterator[tuple[str, set[int]]]:
-    """The cells of each choice of values of the axes told apart, and what to call it; the others pooled."""
-    axes, apart = results.sweep.axes, _told_apart(results, place)
-    for choice in product(*[range(len(axes[i].values)) for i in apart]):
-        label = ", ".join([_named(axes[i], value) for i, value in zip(apart, choice, strict=True)])
+def _distinguished_cells(results: Results, place: int | None) -> Iterator[tuple[str, set[int]]]:
+    """Yield a label and the cells of each combination of values of the distinguished axes.
+
+    The cells of the remaining axes are pooled.
+    """
+    axes, distinguished = results.sweep.axes, _distinguished(results, place)
+    for choice in product(*[range(len(axes[i].values)) for i in distinguished]):
+        label = ", ".join([_named(axes[i], value) for i, value in zip(distinguished, choice, strict=True)])
         yield (
             label,
-            {cell.index for cell in results.cells if tuple([cell.place[i] for i in apart]) == choice},
+            {cell.index for cell in results.cells if tuple([cell.place[i] for i in distinguished]) == choice},
         )
 
 
-def _told_apart(results: Results, place: int | None) -> tuple[int, ...]:
-    """The other axes with few values, paired ones first, while there is a style for each choice of them."""
+def _distinguished(results: Results, place: int | None) -> tuple[int, ...]:
+    """Return the indices of the axes that get separate lines in a figure over the axis `place`.
+
+    Paired axes come first. An axis is added if there is still a style for every combination.
+    """
     axes = results.sweep.axes
     others = [i for i, axis in enumerate(axes) if i != place and len(axis.values) > 1]
-    apart: list[int] = []
+    distinguished: list[int] = []
     for i in sorted(others, key=lambda i: (not axes[i].paired, i)):
-        if math.prod([len(axes[k].values) for k in (*apart, i)]) <= len(STYLES):
-            apart.append(i)
-    return tuple(apart)
+        if math.prod([len(axes[k].values) for k in (*distinguished, i)]) <= len(STYLES):
+            distinguished.append(i)
+    return tuple(distinguished)
 
 
 def _named(axis: Axis, i: int) -> str:
-    """A value of the axis, where it stands alone."""
+    """Return the name of a value for a legend; a number gets the name of its axis, such as `seed = 3`."""
     return axis.label(i) if _numbers(axis) is None else f"{axis.name.rpartition('.')[2]} = {axis.label(i)}"
 
 
 def _against(axis: Axis) -> tuple[Figure, Axes, list[float]]:
-    """A picture with the values of an axis along it, and where they lie."""
+    """Return a figure with the values of `axis` along the horizontal axis, and their positions."""
     numbers = _numbers(axis)
     labels = [axis.label(i) for i in range(len(axis.values))]
     crowded = numbers is None and sum(map(len, labels)) > FITTING
@@ -246,7 +263,7 @@ def _against(axis: Axis) -> tuple[Figure, Axes, list[float]]:
 
 
 def _numbers(axis: Axis) -> list[float] | None:
-    """The values of the axis, or what they are called, if they are numbers."""
+    """Return the values or labels of the axis as numbers; None if they are not numbers."""
     if axis.labels is not None:
         return [float(label) for label in axis.labels] if all(map(_NUMBER, axis.labels)) else None
     if len(axis.fields) > 1:
@@ -258,17 +275,17 @@ def _numbers(axis: Axis) -> list[float] | None:
 
 
 def _joined(axis: Axis, style: Any) -> Any:
-    """Between numbers there is something; between names there is not."""
+    """Return the line style between points: `style` on a numeric axis, none on an axis of names."""
     return style if _numbers(axis) is not None else ""
 
 
 def _aside(axis: Axis, i: int, lines: int) -> float:
-    """How far beside a name the point of one of several lines stands."""
-    return 0.0 if _numbers(axis) is not None else APART / lines * (i - 0.5 * (lines - 1))
+    """Return the horizontal offset of the points of line `i`; 0 on a numeric axis."""
+    return 0.0 if _numbers(axis) is not None else SPREAD / lines * (i - 0.5 * (lines - 1))
 
 
 def _legend(figure: Figure, axes: Axes) -> None:
-    """Above, where it hides nothing; none where there is nothing to tell apart."""
+    """Add a legend above the axes, unless there are no labels."""
     handles, labels = axes.get_legend_handles_labels()
     if any(labels):
         longest = max(map(len, labels))

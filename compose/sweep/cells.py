@@ -1,4 +1,4 @@
-"""The cells of a sweep, and the seed of every trial in them."""
+"""The cells of a sweep, and the seeds and scenarios of their trials."""
 
 from __future__ import annotations
 
@@ -15,32 +15,33 @@ from compose.sweep.spec import Sweep
 
 
 class Cell(msgspec.Struct, frozen=True):
-    """One choice of a value on each axis."""
+    """One combination of values, one from each axis."""
 
     index: int
+    """index of the cell within the sweep"""
     place: tuple[int, ...]
-    """of its value on each axis"""
+    """index of its value on each axis"""
     fields: dict[str, Any]
-    """each varied field's value, by its path"""
+    """values of the varied fields, by their paths"""
     key: str
-    """what the seeds of its trials depend on: its fields, but for those of paired axes"""
+    """canonical JSON text of the fields of unpaired axes, on which the seeds of its trials depend"""
     table: dict[str, Any]
-    """of the scenario's file"""
+    """parsed table of its scenario file"""
 
     @property
     def file_name(self) -> str:
-        """Of its scenario."""
+        """The name of its scenario file."""
         return f"{self.index:03d}.toml"
 
 
 class RefusedCell(msgspec.Struct, frozen=True):
-    """A cell in whose setting no mission can be played."""
+    """A cell whose scenario is infeasible."""
 
     reason: str
 
 
 def cells(sweep: Sweep) -> Iterator[Cell]:
-    """All of them, in order: the last axis varies fastest."""
+    """Yield the cells of `sweep` in order; the last axis varies fastest."""
     for index, place in enumerate(product(*[range(len(axis.values)) for axis in sweep.axes])):
         table = sweep.base
         fields: dict[str, Any] = {}
@@ -55,13 +56,16 @@ def cells(sweep: Sweep) -> Iterator[Cell]:
 
 
 def label(sweep: Sweep, cell: Cell) -> str:
-    """The cell's values, in words."""
-    said = [f"{axis.name} = {axis.label(i)}" for axis, i in zip(sweep.axes, cell.place, strict=True)]
-    return "; ".join(said) or "the only one"
+    """Return the names and values of the axes at this cell, for people to read."""
+    values = [f"{axis.name} = {axis.label(i)}" for axis, i in zip(sweep.axes, cell.place, strict=True)]
+    return "; ".join(values) or "the only cell"
 
 
 def setting_of(sweep: Sweep, cell: Cell) -> ScenarioTemplate | RefusedCell:
-    """The cell's scenario, validated. Raises BadScenario where the user is mistaken in one of its fields."""
+    """Return the validated scenario of the cell, or RefusedCell if it is infeasible.
+
+    Raises BadScenario if a field is invalid.
+    """
     source = f"{sweep.source}: cell {cell.index} ({label(sweep, cell)})"
     try:
         return validate(cell.table, source)
@@ -70,12 +74,15 @@ def setting_of(sweep: Sweep, cell: Cell) -> ScenarioTemplate | RefusedCell:
 
 
 def trial_table(sweep: Sweep, cell: Cell, trial: int) -> dict[str, Any]:
-    """Return the table of a trial's scenario file, complete but for starts that follow from its seed."""
+    """Return the table of a trial's scenario file, with its seed and draws.
+
+    Starts that the scenario leaves open are not in it; they follow from the seed.
+    """
     seed = trial_seed(sweep.seed, cell.key, trial)
     return {**sweep.draws.table(cell.table, seed), "seed": seed}
 
 
 def trial_seed(sweep_seed: int, key: str, trial: int) -> int:
-    """The seed of a trial's scenario: of 63 bits, whoever plays it and whatever else is played."""
+    """Return the 63-bit seed of a trial's scenario. It depends on the arguments only."""
     digest = hashlib.sha256(f"{sweep_seed}/{key}/{trial}".encode()).digest()
     return int.from_bytes(digest[:8], "big") >> 1

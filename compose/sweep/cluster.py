@@ -31,22 +31,26 @@ from protocol.output import one_line
 T = TypeVar("T")
 
 AHEAD = 2
-"""chunks submitted per worker thread: one that runs, and one that waits"""
+"""The number of chunks submitted per worker thread: one that runs, and one that waits."""
 SCHEMES = ("tcp", "tls", "ws", "wss")
 """The schemes that the address of a scheduler may have."""
 CONNECT_S = 5.0
+"""The time in s within which a scheduler must answer."""
 RESULT_S = 60.0
-"""how long a result may take to come from a worker that has it, on a machine that is busy, too"""
+"""The time in s within which a worker must deliver a result that it has; generous for busy machines."""
 LOOK_S = 1.0
-"""s between two counts of the worker threads"""
+"""The time in s between two counts of the worker threads."""
 RETRIES = 2
-"""retries of a chunk whose worker could not start a process for trials"""
+"""The number of retries of a chunk whose worker could not start a process for trials."""
 LOOPBACK = "127.0.0.1:0"
 
 
 @contextmanager
 def connect(workers: int, scheduler: str | None) -> Iterator[Client]:
-    """Yield a client of `workers` threads in this process, or of a `scheduler`. Raises UserError."""
+    """Yield a Dask client of `workers` threads in this process, or of the scheduler at an address.
+
+    Raises UserError if the scheduler cannot be reached.
+    """
     dask.config.set({"distributed.comm.timeouts.connect": CONNECT_S, "distributed.admin.tick.limit": "1h"})
     for name in ["distributed", *logging.root.manager.loggerDict]:
         if name.partition(".")[0] == "distributed":
@@ -82,7 +86,7 @@ def connect(workers: int, scheduler: str | None) -> Iterator[Client]:
 
 @contextmanager
 def _system_errors() -> Iterator[None]:
-    """Raise what the system refused as the OSError that it is: Dask makes a RuntimeError of it."""
+    """Raise an OSError as itself: Dask wraps it in a RuntimeError."""
     try:
         yield
     except RuntimeError as error:
@@ -95,10 +99,10 @@ def _system_errors() -> Iterator[None]:
 
 
 async def _look_for(address: str) -> None:
-    """Raise an error unless a scheduler answers within CONNECT_S: a Client would wait for it for ever."""
+    """Raise an error unless a scheduler answers within CONNECT_S. A Client would wait for ever."""
     scheme, location = parse_address(address)
     if scheme not in SCHEMES:
-        raise ValueError(f"'{scheme}' is none of {', '.join(SCHEMES)}")
+        raise ValueError(f"the scheme '{scheme}' is none of {', '.join(SCHEMES)}")
     parse_host_port(location)
     try:
         async with asyncio.timeout(CONNECT_S):
@@ -108,7 +112,7 @@ async def _look_for(address: str) -> None:
     except TimeoutError:
         raise TimeoutError(f"no answer within {CONNECT_S:g} s") from None
     if known.get("type") != "Scheduler":
-        raise ValueError(f"a {known.get('type', 'stranger')} answers there, and no scheduler")
+        raise ValueError(f"the process at this address is a {known.get('type', 'stranger')}, not a scheduler")
 
 
 def play(
@@ -124,35 +128,35 @@ def play(
     lost. In any case, all chunks are cancelled and their processes ended.
     """
     sweep = secrets.token_hex(8)
-    flying: dict[str, tuple[Future[Any], Chunk, Work]] = {}
+    submitted: dict[str, tuple[Future[Any], Chunk, Work]] = {}
     try:
         threads, looked = _threads(client), time.monotonic()
         if not threads:
             inbox.say("the scheduler has no workers yet")
         chunks = chunks_of(work, orders, lambda: max(threads, 1))
         while True:
-            while len(flying) < AHEAD * max(threads, 1) and (following := next(chunks, None)) is not None:
+            while len(submitted) < AHEAD * max(threads, 1) and (following := next(chunks, None)) is not None:
                 chunk, source = following
                 future = client.submit(
                     worker_pool.run, sweep, msgspec.msgpack.encode(chunk), pure=False, retries=RETRIES
                 )
-                flying[str(future.key)] = future, chunk, source
+                submitted[str(future.key)] = future, chunk, source
                 future.add_done_callback(lambda ended: inbox.put("ended", str(ended.key)))
-            if not flying:
+            if not submitted:
                 return
             arrival = inbox.next(LOOK_S)
-            if arrival.key in flying:
-                future, chunk, source = flying.pop(arrival.key)
+            if arrival.key in submitted:
+                future, chunk, source = submitted.pop(arrival.key)
                 rows = _rows(future, chunk)
                 took_s = sum([orders.timeout if row.wall_s is None else row.wall_s for row in rows])
                 source.took(len(rows), took_s)
                 done(rows)
             if time.monotonic() - looked > LOOK_S:
                 if client.status not in ("running", "connecting"):
-                    raise EngineFailed("the scheduler is lost")
+                    raise EngineFailed("the connection to the scheduler is lost")
                 threads, looked = _threads(client), time.monotonic()
     finally:
-        _leave(client, sweep, [future for future, _, _ in flying.values()])
+        _leave(client, sweep, [future for future, _, _ in submitted.values()])
 
 
 def _rows(future: Future[Any], chunk: Chunk) -> list[TrialRow]:
@@ -167,14 +171,13 @@ def _rows(future: Future[Any], chunk: Chunk) -> list[TrialRow]:
     except TimeoutError:  # the worker with the result is lost
         error = None
     if error is None:
-        raise EngineFailed("the scheduler is lost")
-    said = one_line(f"lost: {type(error).__name__}: {error}")[:MAX_ERROR]
-    if not isinstance(
-        error, KilledWorker | worker_pool.Died | worker_pool.Hung
-    ):  # every chunk would fail like this one
-        raise EngineFailed(f"a worker cannot play trials: {said}")
+        raise EngineFailed("the connection to the scheduler is lost")
+    error_text = one_line(f"lost: {type(error).__name__}: {error}")[:MAX_ERROR]
+    if not isinstance(error, KilledWorker | worker_pool.Died | worker_pool.Hung):
+        # every chunk would fail like this one
+        raise EngineFailed(f"a worker cannot run trials: {error_text}")
     return [
-        lost(chunk.cell, trial, seed, said, None)
+        lost(chunk.cell, trial, seed, error_text, None)
         for trial, seed in zip(chunk.trials, chunk.seeds, strict=True)
     ]
 
@@ -201,11 +204,11 @@ def _within(seconds: float, ask: Callable[[], T]) -> T | None:
     return None
 
 
-def _leave(client: Client, sweep: str, flying: Sequence[Future[Any]]) -> None:
-    """Cancel the futures `flying`, and end all processes of the sweep."""
+def _leave(client: Client, sweep: str, submitted: Sequence[Future[Any]]) -> None:
+    """Cancel the futures `submitted`, and end all processes of the sweep."""
 
     def dismiss() -> None:
-        client.cancel(flying, force=True)
+        client.cancel(submitted, force=True)
         client.run(worker_pool.dismiss, sweep)
 
     _within(CONNECT_S, dismiss)  # if the scheduler is lost, its workers' processes end by themselves

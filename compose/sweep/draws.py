@@ -23,26 +23,30 @@ Heading = Literal["any", "radial", "tangential", "collinear"]
 Start = tuple[float, float, float]
 
 NEAR = (1e-12, 1e-6)
-"""m: the interval of the distance between anchor and start for `near-anchor`; log-uniform"""
+"""The interval in m of the distance between anchor and start for `near-anchor`, log-uniform."""
 OFF = (1e-16, 1e-3)
-"""rad, or fraction of R: the interval of the deviation from a special heading or from the rim.
+"""The interval of the deviation from a special heading, in rad, or from the rim, as a fraction of R.
 
 Half of the draws have no deviation; in the other half it is log-uniform.
 """
 
 
 class DrawTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """[[draw]]: a `field` drawn from one of two distributions, times and divided by other fields' values."""
+    """The table [[draw]]: a `field` drawn from one of two distributions, scaled by other fields."""
 
     field: str
     uniform: Interval | None = None
+    """bounds of a uniform distribution"""
     log_uniform: Interval | None = None
+    """bounds of a log-uniform distribution; a draw has either this or `uniform`"""
     times: list[str] = []
+    """fields by whose values the draw is multiplied"""
     over: list[str] = []
+    """fields by whose values the draw is divided"""
 
 
 class StartsTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """[starts]: the kinds of place and heading that each robot draws from, with equal probability."""
+    """The table [starts]: kinds of place and heading, from which each robot draws with equal probability."""
 
     places: Annotated[tuple[Place, ...], Meta(min_length=1)] = ("inside",)
     headings: Annotated[tuple[Heading, ...], Meta(min_length=1)] = ("any",)
@@ -53,10 +57,14 @@ class Draw(msgspec.Struct, frozen=True):
 
     field: str
     way: Steps
+    """parsed path of the field"""
     interval: Interval
     logarithmic: bool
+    """true for a log-uniform, false for a uniform distribution"""
     times: tuple[Steps, ...] = ()
+    """parsed paths of the fields by whose values the draw is multiplied"""
     over: tuple[Steps, ...] = ()
+    """parsed paths of the fields by whose values the draw is divided"""
 
 
 class Draws(msgspec.Struct, frozen=True):
@@ -92,11 +100,13 @@ def _stream(seed: int, name: str) -> Callable[[], float]:
 
 
 def _between(draw: Callable[[], float], interval: Interval, *, logarithmic: bool = True) -> float:
+    """Draw a number from `interval`, log-uniform or uniform."""
     low, high = interval
     return low * (high / low) ** draw() if logarithmic else low + (high - low) * draw()
 
 
 def _one_of(draw: Callable[[], float], kinds: Sequence[T]) -> T:
+    """Draw one of `kinds` with equal probability."""
     return kinds[int(draw() * len(kinds))]
 
 
@@ -129,7 +139,7 @@ def _start(
 ) -> Start:
     """Return a start (x, y in m, heading in rad) at most `reach` m from `anchor`.
 
-    `other` is the peer's anchor. `first` is the peer's start if it is drawn already, else None.
+    `other` is the peer's anchor. `first` is the peer's start, or None if it is not drawn yet.
     """
     line = math.atan2(other[1] - anchor[1], other[0] - anchor[0])
     place, heading_kind = _one_of(draw, kinds.places), _one_of(draw, kinds.headings)

@@ -1,4 +1,4 @@
-"""A sweep, from its spec to its results: what is left of it is played, and what there is gathered."""
+"""The execution of a sweep: run the trials without a row, then collect the results."""
 
 from __future__ import annotations
 
@@ -22,55 +22,62 @@ from protocol import files
 from protocol.network.inbox import Inbox, Interrupted
 
 SUMMARY = "summary.csv"
+"""The name of the table of cells in the results folder."""
 
 
 class ExecutionOptions(msgspec.Struct, frozen=True):
-    """Where and how trials are played; nothing in their rows depends on it but the wall time."""
+    """Options of execution. In the rows of trials, only the wall time depends on them."""
 
     workers: int = os.cpu_count() or 1
-    """threads, each with a process for trials, where there is no scheduler"""
+    """number of worker threads without a scheduler; each has one process for trials"""
     scheduler: str | None = None
-    """the address of Dask's"""
+    """address of a Dask scheduler; None to run on this machine"""
     processes: bool = False
-    """trials as processes over Zenoh"""
+    """true to run trials as processes over Zenoh"""
     audit: bool = True
-    """judge every trial's journals"""
+    """true to audit the journals of every trial"""
     play: str = PLAY
+    """function that runs a trial, as module:function"""
     retry: bool = False
-    """play again what was lost before"""
+    """true to run trials again that were lost earlier"""
 
 
 class Progress(msgspec.Struct, frozen=True):
-    """Who is told how the sweep goes on."""
+    """The callbacks that show the progress of a sweep."""
 
     say: Callable[[str], None]
+    """callback for a line of text"""
     begin: Callable[[int, int], None]
-    """so many trials are done, of so many"""
+    """callback at the start, with the number of completed trials and of all trials"""
     done: Callable[[int], None]
-    """so many more are"""
+    """callback after a chunk, with the number of trials that it completed"""
 
 
 class Results(msgspec.Struct, frozen=True):
-    """What there is of a sweep."""
+    """The results of a sweep, which may be incomplete."""
 
     sweep: Sweep
     cells: tuple[Cell, ...]
     table: pa.Table
+    """one row per trial"""
     figures: dict[int, CellSummary]
-    """of each cell"""
+    """statistics of each cell, by its index"""
     stopped: str | None
-    """why there is no more yet"""
+    """reason why the sweep is incomplete; None if it is complete"""
     interrupted: bool
-    """because somebody said so"""
+    """true if a signal stopped the sweep"""
     trials: int
-    """in all cells that are not refused"""
+    """number of trials of all cells that are not refused"""
 
     def of(self, *cells: int) -> pa.Table:
-        """The trials of these cells."""
+        """Return the rows of the trials of these cells."""
         return self.table.filter(pa.array(np.isin(self.table["cell"].to_numpy(), cells)))
 
     def settings(self, place: int) -> list[tuple[list[tuple[str, str]], list[int]]]:
-        """Each choice of values of all axes but that at `place`: names and labels; its cells, along that."""
+        """Return all combinations of values of the axes other than the one at index `place`.
+
+        Each is a list of (name of axis, label of value), and its cells in the order of the axis at `place`.
+        """
         others = [(i, axis) for i, axis in enumerate(self.sweep.axes) if i != place]
         found: dict[tuple[int, ...], list[int]] = {}
         for cell in self.cells:
@@ -82,9 +89,10 @@ class Results(msgspec.Struct, frozen=True):
 
 
 def sweep(sweep: Sweep, out: Path, means: ExecutionOptions, inbox: Inbox, progress: Progress) -> Results:
-    """Play what has no row in `out` yet, and gather what there is then, however it ended.
+    """Run the trials without a row in the folder `out`, and return the results.
 
-    Raises UserError: of the spec, a cell that is not a scenario, `out` or the scheduler.
+    The results are collected even if the sweep is stopped. Raises UserError if the sweep, the scenario of a
+    cell, `out` or the scheduler is unusable.
     """
     with opened(out, sweep) as folder:
         check_columns(sweep, folder.schema)
@@ -102,25 +110,28 @@ def sweep(sweep: Sweep, out: Path, means: ExecutionOptions, inbox: Inbox, progre
             except BrokenPipeError:
                 raise
             except OSError as error:
-                stopped = f"cannot go on: {files.said(error)}"
+                stopped = f"cannot continue: {files.said(error)}"
         return _gathered(folder, stopped, interrupted)
 
 
 def check_columns(sweep: Sweep, schema: pa.Schema) -> None:
-    """Raises BadSpec where two columns of a table would be called the same."""
+    """Raise BadSpec if two columns of a table would have the same name."""
     for names in (schema.names, header(sweep)):
         for name, count in Counter(names).items():
             if count > 1:
-                raise BadSpec(f"{sweep.source}: axis: {count} columns would be called '{name}'")
+                raise BadSpec(f"{sweep.source}: axis: {count} columns would have the name '{name}'")
 
 
 def _left(folder: Folder, progress: Progress) -> list[Work]:
-    """What has to be played; only the settings of those cells are worked out."""
+    """Return the trials that still have to run. Only the scenarios of their cells are validated.
+
+    Raises BadSpec if all cells are refused.
+    """
     sweep, refused = folder.sweep, dict(folder.refused)
     done = folder.done()
-    beyond = sum([trial >= sweep.trials for trials in done.values() for trial in trials])
-    if beyond:
-        progress.say(f"{folder.path} holds {beyond} trials beyond {sweep.trials} a cell; they are kept")
+    surplus = sum([trial >= sweep.trials for trials in done.values() for trial in trials])
+    if surplus:
+        progress.say(f"{folder.path} holds {surplus} trials beyond the {sweep.trials} per cell; kept")
     work = []
     count = 0
     for cell in folder.cells.values():
@@ -138,10 +149,10 @@ def _left(folder: Folder, progress: Progress) -> list[Work]:
             work.append(Work(cell.index, cell.key, setting, left, cell.table))
     if len(refused) == len(folder.cells):
         first, reason = next(iter(refused.items()))
-        raise BadSpec(f"{sweep.source}: no cell can be played; cell {first}: {reason}")
+        raise BadSpec(f"{sweep.source}: no cell can run; cell {first}: {reason}")
     folder.ask(refused)
     for part in folder.ignored:
-        progress.say(f"{part} cannot be read: its trials are played again")
+        progress.say(f"{part} cannot be read: its trials will run again")
     progress.begin(count - sum([len(one.trials) for one in work]), count)
     return work
 
@@ -149,22 +160,27 @@ def _left(folder: Folder, progress: Progress) -> list[Work]:
 def _play(
     folder: Folder, work: list[Work], means: ExecutionOptions, inbox: Inbox, progress: Progress
 ) -> None:
+    """Run `work`, and store its rows in `folder` as chunks complete.
+
+    Raises Interrupted on a signal, EngineFailed if the scheduler is lost, and UserError if it is unreachable.
+    """
     sweep = folder.sweep
     orders = TrialOptions(
         sweep.seed, means.processes, sweep.trial_timeout, means.play, means.audit, sweep.draws
     )
 
-    def keep(rows: list[TrialRow]) -> None:
+    def store(rows: list[TrialRow]) -> None:
         folder.add(rows)
         progress.done(len(rows))
 
-    from compose.sweep import cluster  # noqa: PLC0415  # Dask takes a second
+    from compose.sweep import cluster  # noqa: PLC0415  # importing Dask takes a second
 
     with cluster.connect(means.workers, means.scheduler) as client:
-        cluster.play(client, work, orders, inbox, keep)
+        cluster.play(client, work, orders, inbox, store)
 
 
 def _gathered(folder: Folder, stopped: str | None, interrupted: bool) -> Results:
+    """Write the tables of trials and cells, and return the results. A failure to write sets `stopped`."""
     table = folder.table()
     cells = tuple(folder.cells.values())
     figures = _figures(table, cells, folder.refused)
@@ -178,6 +194,7 @@ def _gathered(folder: Folder, stopped: str | None, interrupted: bool) -> Results
 
 
 def _figures(table: pa.Table, cells: tuple[Cell, ...], refused: Mapping[int, str]) -> dict[int, CellSummary]:
+    """Return the statistics of each cell; `table` is sorted by cell."""
     ends = table["cell"].to_numpy().searchsorted([cell.index for cell in cells], side="right")
     begins = [0, *ends[:-1]]
     return {

@@ -1,4 +1,4 @@
-"""A dotted path into a scenario file: `mission.period`, `robot.a.start`, `robot[1].anchor[0]`."""
+"""Dotted paths to fields of a scenario file: `mission.period`, `robot.a.start`, `robot[1].anchor[0]`."""
 
 from __future__ import annotations
 
@@ -14,18 +14,21 @@ from msgspec import inspect
 from compose.scenario.scenario_file import ScenarioFile
 
 Steps = tuple[str | int, ...]
-"""keys of tables and places in lists, from the top of the file"""
+"""A parsed path: table keys and list indices, from the top of the file."""
 _STEP = re.compile(r"(?P<dot>\.?)(?:(?P<key>[A-Za-z0-9_-]+)|\[(?P<place>[0-9]{1,4})\])")
 DRAWN = "seed"
-"""the one field that is every trial's own"""
+"""The field that a sweep cannot vary, because every trial has its own seed."""
 
 
 class NoSuchField(ValueError):
-    """A path leads nowhere; the text says where it ends."""
+    """A path does not lead to a field. The text names the first step that does not exist."""
 
 
 def steps(path: str, base: Mapping[str, Any]) -> Steps:
-    """The way to the field `path` of the scenario `base`, which may leave it out. Raises NoSuchField."""
+    """Return the parsed `path`, checked against the scenario schema and the table `base`.
+
+    The field may be missing in `base` if the schema has it. Raises NoSuchField.
+    """
     kind: inspect.Type = inspect.type_info(ScenarioFile)
     value: Any = base
     walked: list[str | int] = []
@@ -35,7 +38,7 @@ def steps(path: str, base: Mapping[str, Any]) -> Steps:
             case inspect.StructType(fields=fields):
                 kinds = {field.encode_name: field.type for field in fields}
                 if value is not None and not isinstance(value, Mapping):
-                    raise NoSuchField(f"{so_far} of the base scenario is no table")
+                    raise NoSuchField(f"{so_far} of the base scenario is not a table")
                 if step not in kinds:
                     raise NoSuchField(f"{so_far or 'a scenario'} has no field '{step}'")
                 kind = kinds[str(step)]
@@ -54,12 +57,12 @@ def steps(path: str, base: Mapping[str, Any]) -> Steps:
                 raise NoSuchField(f"{so_far} is a single value")
         walked.append(step)
     if walked == [DRAWN]:
-        raise NoSuchField("every trial has a seed of its own")
+        raise NoSuchField("every trial has its own seed")
     return tuple(walked)
 
 
 def with_value(table: Mapping[str, Any], way: Steps, value: Any) -> dict[str, Any]:
-    """A copy of `table` in which the field at `way` is `value`."""
+    """Return a copy of `table` in which the field at `way` is `value`."""
     changed = copy.deepcopy(dict(table))
     inner: Any = changed
     for step, then in pairwise((*way, None)):
@@ -75,7 +78,7 @@ def with_value(table: Mapping[str, Any], way: Steps, value: Any) -> dict[str, An
 
 
 def value_at(table: Mapping[str, Any], way: Steps) -> Any:
-    """Return the value of the field at `way`. Raises KeyError or IndexError where `table` leaves it out."""
+    """Return the value of the field at `way`. Raises KeyError or IndexError if it is missing."""
     value: Any = table
     for step in way:
         value = value[step]
@@ -83,12 +86,13 @@ def value_at(table: Mapping[str, Any], way: Steps) -> Any:
 
 
 def _split(path: str) -> list[str | int]:
+    """Return the steps of a path. Raises NoSuchField if its syntax is wrong."""
     found: list[str | int] = []
     at = 0
     while at < len(path):
         match = _STEP.match(path, at)
         if match is None or bool(match["dot"]) != (at > 0 and match["key"] is not None):
-            raise NoSuchField("no path: such as mission.period, robot.a.start or robot[1].anchor[0]")
+            raise NoSuchField("not a path such as mission.period, robot.a.start or robot[1].anchor[0]")
         found.append(match["key"] or int(match["place"]))
         at = match.end()
     if not found:
@@ -97,11 +101,12 @@ def _split(path: str) -> list[str | int]:
 
 
 def _written(walked: Sequence[str | int]) -> str:
+    """Return steps as the text of a path."""
     return "".join([f"[{step}]" if isinstance(step, int) else f".{step}" for step in walked]).lstrip(".")
 
 
 def _bare(kind: inspect.Type) -> inspect.Type:
-    """What a field holds that may be left out."""
+    """Return the type of a field without constraints and without None."""
     if isinstance(kind, inspect.Metadata):
         return _bare(kind.type)
     if isinstance(kind, inspect.UnionType):
@@ -111,13 +116,19 @@ def _bare(kind: inspect.Type) -> inspect.Type:
 
 
 def _may_be_empty(kind: inspect.Type) -> bool:
-    """Whether it is a table of which every field may be left out, as of a fault; then so may the table."""
+    """Return true if the type is a table without required fields, such as a fault.
+
+    A list can be extended by an empty table of such a type.
+    """
     bare = _bare(kind)
     return isinstance(bare, inspect.StructType) and not any(field.required for field in bare.fields)
 
 
 def _place(step: str | int, listed: Sequence[Any], so_far: str, *, spare: bool) -> int:
-    """Where in a list: as the path says, with `spare` beyond its end, too; or of the table with that id."""
+    """Return the index of `step` in the list `listed`: the index itself, or that of the table with that id.
+
+    An index beyond the end is valid only if `spare`. Raises NoSuchField.
+    """
     if isinstance(step, int):
         if step >= len(listed) and not spare:
             raise NoSuchField(f"the base scenario has no {so_far}[{step}]")
@@ -129,7 +140,7 @@ def _place(step: str | int, listed: Sequence[Any], so_far: str, *, spare: bool) 
 
 
 def jsonable(value: Any) -> bool:
-    """Whether the value is made of what both TOML and JSON know; NaN is not."""
+    """Return true if both TOML and JSON can represent the value. They cannot represent NaN and infinity."""
     match value:
         case bool() | int() | str():
             return True
@@ -144,11 +155,12 @@ def jsonable(value: Any) -> bool:
 
 
 def canonical(value: Any) -> str:
-    """The value as JSON text that is the same however it was written: 1 and 1.0 are one number."""
+    """Return the value as canonical JSON text; 1 and 1.0 give the same text."""
     return msgspec.json.encode(_whole(value), order="deterministic").decode()
 
 
 def _whole(value: Any) -> Any:
+    """Return `value` with every integral float replaced by an integer."""
     match value:
         case float() if value.is_integer():
             return int(value)

@@ -1,6 +1,6 @@
-"""What is left to do in a sweep, and how it is cut into chunks.
+"""The trials that a sweep still has to run, and their division into chunks.
 
-What a chunk holds, and who plays which, follows from how long trials take; what a trial is does not.
+The sizes of chunks, and the workers that run them, depend on how long trials take; trials themselves do not.
 """
 
 from __future__ import annotations
@@ -17,45 +17,50 @@ from compose.sweep.draws import Draws
 from compose.sweep.worker import Chunk
 
 CHUNK_S = 1.0
-"""what a chunk should last: long beside handing it out, short beside losing it"""
+"""The wall time in s that a chunk should take: long compared to its overhead, short enough to lose."""
 MAX_CHUNK = 1000
-"""trials"""
+"""The largest number of trials in a chunk."""
 FIRST_CHUNK = 8
-"""trials, while nobody knows how long one takes; as processes one, which takes most of a second"""
+"""The number of trials in a chunk while their duration is unknown.
 
-
+It is 1 for trials as processes, each of which takes most of a second.
+"""
 FADES = 0.8
-"""weight of what was known of the time that trials take, beside that of a chunk that has just ended"""
+"""The factor by which earlier durations of trials lose weight with each chunk that completes."""
 
 
 class EngineFailed(Exception):
-    """The sweep cannot go on; the text says why."""
+    """The sweep cannot continue. The text gives the reason."""
 
 
 class Work(msgspec.Struct):
-    """What is left to do in a cell."""
+    """The trials that a cell still has to run, and how long its trials have taken."""
 
     cell: int
     key: str
-    """of its seeds"""
+    """key of the cell, from which the seeds of its trials are derived"""
     setting: ScenarioTemplate
     trials: list[int]
+    """indices of the trials to run"""
     table: dict[str, Any]
-    """of its scenario's file"""
+    """parsed table of the cell's scenario file"""
     given: int = 0
-    """how many have been handed out"""
+    """number of trials that have been put into chunks"""
     played: float = 0.0
-    """trials that have ended; the older, the less they count"""
+    """number of completed trials, weighted by FADES"""
     played_s: float = 0.0
-    """s of wall time that those took"""
+    """wall time in s of the completed trials, weighted in the same way"""
 
     def took(self, trials: int, wall_s: float) -> None:
-        """Count `trials` that took `wall_s` in all: what comes next will take about as long."""
+        """Update the mean duration of trials with a chunk of `trials` that took `wall_s` s in total."""
         self.played = FADES * self.played + trials
         self.played_s = FADES * self.played_s + wall_s
 
     def size(self, threads: int, first: int) -> int:
-        """How many trials to hand out at once, so that near the end all threads have some."""
+        """Return the size of the next chunk for `threads` worker threads, in trials.
+
+        It is `first` until a chunk has completed. It decreases towards the end to give all threads work.
+        """
         share = math.ceil((len(self.trials) - self.given) / (2 * threads))
         if not self.played:
             return min(first, share)
@@ -64,21 +69,29 @@ class Work(msgspec.Struct):
 
 
 class TrialOptions(msgspec.Struct, frozen=True):
-    """What holds for every trial of a sweep."""
+    """The options that all trials of a sweep have in common."""
 
     seed: int
+    """seed of the sweep"""
     processes: bool
+    """true to run trials as processes over Zenoh"""
     timeout: float
-    """s"""
+    """wall time in s that a trial may take"""
     play: str
+    """function that runs a trial, as module:function"""
     audit: bool
+    """true to audit the journals of every trial"""
     draws: Draws = Draws()
+    """values drawn for each trial"""
 
 
 def chunks_of(
     work: Sequence[Work], orders: TrialOptions, threads: Callable[[], int]
 ) -> Iterator[tuple[Chunk, Work]]:
-    """All of it, each chunk as large as fits when it is asked for."""
+    """Yield all trials of `work` as chunks, each with its source.
+
+    The size of a chunk is decided when it is requested, from the durations known by then.
+    """
     for source in work:
         while source.given < len(source.trials):
             slow = orders.processes or source.setting.file.kill

@@ -1,4 +1,4 @@
-"""What a sweep shows on a terminal: how far it is, and in the end a table with a row a cell."""
+"""The terminal output of a sweep: a progress bar, and at the end a table with one row per cell."""
 
 from __future__ import annotations
 
@@ -19,17 +19,19 @@ from compose.terminal import tables, text_width
 from protocol.output import say
 
 RATE_OVER_S = 10.0
-"""what the rate is averaged over"""
+"""The time in s over which the rate of trials is averaged."""
 OUTCOMES = ("localised", "undecided", "inconsistent", "wrong", "failed")
+"""The columns that count outcomes."""
 NOTES = (
     ("rate_low", "rate: 95 % interval (Wilson)"),
     ("p50", "p50, p95, max: ticks of trials that localised"),
-    ("error p50", "error: m, of the worse robot"),
+    ("error p50", "error: position error in m of the worse robot"),
     ("within", "within: claims within 3 x accuracy"),
-    ("nees low", "nees: in the mean, and the 99 % band of true covariances"),
+    ("nees low", "nees: mean, and the 99 % band for consistent covariances"),
 )
-"""each with the column that it is a footnote to"""
+"""The footnotes of the table, each with the column whose presence requires it."""
 WIDEST = (*OUTCOMES, "clean", "rate", "rate_low", "rate_high", "p50", "p95", "max", "error p50", "error max")
+"""The columns of the widest table, except for `trials`."""
 CHOICES = (
     ("trials", *WIDEST),
     ("trials", *WIDEST[:-2]),
@@ -37,24 +39,24 @@ CHOICES = (
     ("trials", "rate", "p50", "max"),
     ("trials", "rate"),
 )
-"""of the columns; the first that fits"""
+"""The possible choices of columns. The first that fits the terminal is used."""
 OF_NOISE = ("within", "nees", "nees low", "nees high")
-"""more of them, where covariances are claimed"""
+"""The additional columns of sweeps in which robots claim covariances."""
 MOST_ROWS = 100
-"""cells that are listed whether or not all was well"""
+"""The largest number of cells for which the table lists all cells, also those without a problem."""
 
 
 class _Rate(bars.ProgressColumn):
-    """Trials a second."""
+    """The progress column with the number of trials per second."""
 
     def render(self, task: bars.Task) -> Text:
-        """As rich asks for it."""
+        """Return the rate as text; Rich calls this method."""
         return Text(f"{task.speed:.3g}/s" if task.speed else "")
 
 
 @contextmanager
 def progress(name: str, say: Callable[[str], None], visible: bool) -> Iterator[Progress]:
-    """A bar with the rate and the time left, where somebody can see it."""
+    """Yield the progress callbacks. If `visible`, they show a bar with the rate and the remaining time."""
     bar = bars.Progress(
         bars.TextColumn("{task.description}"),
         bars.BarColumn(),
@@ -75,7 +77,7 @@ def progress(name: str, say: Callable[[str], None], visible: bool) -> Iterator[P
 
 
 def show(results: Results, out: Path, *, quiet: bool) -> None:
-    """The table, and how to see one of its trials; or only the counts."""
+    """Print the results: with `quiet` only the counts, otherwise also the table and the trial to look at."""
     total = {name: sum([getattr(one, name) for one in results.figures.values()]) for name in OUTCOMES}
     total["refused"] = sum([one.refused_trials for one in results.figures.values()])
     counts = ", ".join([f"{count} {name}" for name, count in total.items() if count])
@@ -89,10 +91,10 @@ def show(results: Results, out: Path, *, quiet: bool) -> None:
         lines, columns = _lines(results)
         say("", *lines, "", *text_width.notes(NOTES, columns))
     if shown < len(results.cells):
-        say(f"all is well in {len(results.cells) - shown} cells, not listed: {out / SUMMARY}")
+        say(f"{len(results.cells) - shown} cells without a problem are not listed; see {out / SUMMARY}")
     for index, figures in results.figures.items():
         if figures.refused is not None:
-            say(f"cell {index} cannot be played: {figures.refused}")
+            say(f"cell {index} cannot run: {figures.refused}")
     for reason, count in refusals(results.table):
         say(f"refused: {count}: {reason}")
     note = noted(results.table)
@@ -100,27 +102,27 @@ def show(results: Results, out: Path, *, quiet: bool) -> None:
         why = f" ({note.why})" if note.why else ""
         how = f"{note.outcome} after {note.ticks} ticks" if note.ticks is not None else note.outcome
         file = shlex.quote(str(out / CELLS / f"{note.cell:03d}.toml"))
-        say(f"to look at first: trial {note.trial} of cell {note.cell}, {how}{why}; any trial again:")
+        say(f"look at trial {note.trial} of cell {note.cell} first: {how}{why}; to run it again:")
         if results.sweep.draws:
             source = shlex.quote(results.sweep.source)
             say(f"  tandem sweep {source} --print-trial {note.cell}:{note.trial} > trial.toml")
             file = "trial.toml"
-        say(f"  tandem run {file} --seed {note.seed} --out record")
+        say(f"  tandem run {file} --seed {note.seed} --out recording")
     say(f"results: {out}")
 
 
 def _audited(results: Results) -> str:
-    """How many trials were judged, and the first violation."""
+    """Return the line with the number of audited trials, and the first violation."""
     figures = results.figures.values()
     audited, clean = sum([one.audited for one in figures]), sum([one.clean for one in figures])
     note = noted(results.table) if clean < audited else None
     first = f"; trial {note.trial} of cell {note.cell}: {note.why}" if note is not None else ""
-    played = sum([one.trials for one in figures])
-    return f"audited: {audited} of {played} trials, {clean} clean{first}"
+    total = sum([one.trials for one in figures])
+    return f"audited: {audited} of {total} trials, {clean} clean{first}"
 
 
 def _lines(results: Results) -> tuple[list[str], Sequence[str]]:
-    """The table, as wide as there is room, and its columns."""
+    """Return the lines of the widest table that fits the terminal, and its columns."""
     columns: Sequence[str] = ()
     for columns in _choices(results):
         lines = tables.lines(_table(results, columns))
@@ -130,25 +132,26 @@ def _lines(results: Results) -> tuple[list[str], Sequence[str]]:
 
 
 def _shown(results: Results) -> list[Cell]:
-    """All of them; of more than fit a screen or two, those in which something was not well."""
+    """Return the cells to list: all, or those with a problem if there are more than MOST_ROWS cells."""
     if len(results.cells) <= MOST_ROWS:
         return list(results.cells)
     return [cell for cell in results.cells if not _well(results.figures[cell.index])]
 
 
 def _well(figures: CellSummary) -> bool:
-    """All were played and localised, and nothing was found in those that were judged."""
+    """Return true if all trials of a cell have localised and no audit found a violation."""
     return (
         figures.refused is None and figures.trials == figures.localised and figures.audited == figures.clean
     )
 
 
 def _noisy(results: Results) -> bool:
+    """Return true if robots claimed covariances in any cell."""
     return any(one.nees_mean is not None for one in results.figures.values())
 
 
 def _choices(results: Results) -> tuple[tuple[str, ...], ...]:
-    """Of the columns, the widest first."""
+    """Return the possible choices of columns, the widest first."""
     if not _noisy(results):
         return CHOICES
     return tuple((*columns, *OF_NOISE) for columns in CHOICES) + CHOICES[-1:]
@@ -158,8 +161,8 @@ def _table(results: Results, columns: Sequence[str]) -> Table:
     axes = [axis.name.rpartition(".")[2] for axis in results.sweep.axes]
     rows = []
     for cell in _shown(results):
-        said = _figures(results.figures[cell.index])
-        rows.append([*_axes(results, cell), *[said[column] for column in columns]])
+        texts = _figures(results.figures[cell.index])
+        rows.append([*_axes(results, cell), *[texts[column] for column in columns]])
     return tables.table(["cell", *axes], columns, rows)
 
 

@@ -1,7 +1,8 @@
-"""The folder of a sweep: what was asked, the rows of what has been played, and what follows from them.
+"""The results folder of a sweep: its manifest, the scenarios of its cells, and the rows of its trials.
 
-A row is on disk from the moment its chunk is done: in a part of its own until the parts are gathered into
-`trials.parquet`. Both change by renaming, so whenever it ends, what is there is whole.
+The rows of a chunk are written to a file of their own, a part, as soon as the chunk completes. At the end,
+the parts are merged into `trials.parquet`. All files are replaced by renaming, so the folder is consistent
+whenever the process ends.
 """
 
 from __future__ import annotations
@@ -27,23 +28,27 @@ from compose.sweep.trial import TrialRow
 from protocol import files
 
 TRIALS = "trials.parquet"
+"""The name of the merged table of trials."""
 SWEEP = "sweep.json"
+"""The name of the manifest."""
 PARTS = "parts"
+"""The name of the folder of parts."""
 CELLS = "cells"
+"""The name of the folder of the cells' scenario files."""
 MAX_DIFFERENCE = 60
-"""characters, of a value that differs"""
+"""The largest length of a differing value in an error, in characters."""
 
 
 class Manifest(msgspec.Struct, frozen=True):
-    """`sweep.json`: what a folder's rows are of."""
+    """The contents of `sweep.json`: the sweep to which the rows of the folder belong."""
 
     sweep: Sweep
     refused: dict[int, str]
-    """cells in whose setting no mission can be played, and why"""
+    """reasons why cells are infeasible, by the index of the cell"""
 
 
 class Folder:
-    """A sweep's folder, which no other run writes meanwhile."""
+    """The results folder of a sweep, locked against other sweeps."""
 
     def __init__(self, path: Path, sweep: Sweep) -> None:
         self.path = path
@@ -51,12 +56,13 @@ class Folder:
         self.cells: dict[int, Cell] = {cell.index: cell for cell in cells(sweep)}
         self.schema = schema_of(sweep, list(self.cells.values()))
         self.ignored: list[Path] = []
-        """parts that cannot be read"""
+        """paths of parts that cannot be read"""
         self.refused: dict[int, str] = {}
+        """reasons why cells are infeasible, by the index of the cell"""
         self._parts = path / PARTS
 
     def done(self) -> dict[int, set[int]]:
-        """The trials of each cell that have a row."""
+        """Return the indices of the trials with a row, by the index of the cell."""
         found: dict[int, set[int]] = {index: set() for index in self.cells}
         for table in self._tables(["cell", "trial"]):
             for cell, trial in zip(table["cell"].to_pylist(), table["trial"].to_pylist(), strict=True):
@@ -64,15 +70,15 @@ class Folder:
         return found
 
     def forget_lost(self) -> None:
-        """The trials that were lost, to an error or with their process, have no row any more."""
+        """Delete the rows of lost trials, so that the trials run again."""
         table = self.table()
         self.gather(table.filter(table["error"].is_null()))
 
     def ask(self, refused: Mapping[int, str]) -> None:
-        """Put down what is about to be played, and each cell's scenario."""
+        """Write the manifest with the refused cells, and the scenario file of each cell."""
         self.refused = dict(refused)
-        asked = msgspec.json.encode(Manifest(self.sweep, self.refused))
-        files.write(self.path / SWEEP, msgspec.json.format(asked, indent=2) + b"\n")
+        manifest = msgspec.json.encode(Manifest(self.sweep, self.refused))
+        files.write(self.path / SWEEP, msgspec.json.format(manifest, indent=2) + b"\n")
         (self.path / CELLS).mkdir(exist_ok=True)
         self._parts.mkdir(exist_ok=True)
         for cell in self.cells.values():
@@ -81,17 +87,17 @@ class Folder:
             files.write(self.path / CELLS / cell.file_name, text.encode())
 
     def add(self, rows: Sequence[TrialRow]) -> None:
-        """Keep the rows of a chunk."""
+        """Write the rows of a chunk to a part."""
         if rows:
             name = f"{rows[0].cell:05d}-{rows[0].trial:08d}.parquet"
             files.write(self._parts / name, encoded(of_rows(rows, self.sweep, self.cells, self.schema)))
 
     def table(self) -> pa.Table:
-        """All rows, in order."""
+        """Return all rows, sorted by cell and trial. Raises UserError if `trials.parquet` cannot be read."""
         return gathered([self.schema.empty_table(), *self._tables(self.schema.names)])
 
     def gather(self, table: pa.Table) -> None:
-        """From now on `trials.parquet` holds these rows, and there are no parts."""
+        """Replace `trials.parquet` by `table`, and delete the parts."""
         files.write(self.path / TRIALS, encoded(table))
         for part in self._parts.glob("*"):
             part.unlink()
@@ -99,7 +105,10 @@ class Folder:
             self._parts.rmdir()
 
     def _tables(self, columns: list[str]) -> Iterator[pa.Table]:
-        """What has been gathered, then each part. Raises UserError if the former cannot be read."""
+        """Yield the columns of `trials.parquet`, then those of each part.
+
+        Raises UserError if `trials.parquet` cannot be read. Parts that cannot be read are added to `ignored`.
+        """
         gathered = self.path / TRIALS
         if gathered.exists():
             try:
@@ -116,9 +125,10 @@ class Folder:
 
 @contextmanager
 def opened(path: Path, sweep: Sweep) -> Iterator[Folder]:
-    """The folder at `path`, new or with what has been played of the same sweep.
+    """Yield the results folder at `path`, new or with rows of the same sweep, under an exclusive lock.
 
-    Raises UserError where it cannot be written, is in use, or is of another sweep.
+    Raises UserError if it cannot be written, is in use, or belongs to another sweep. A new folder that is
+    still empty at the end is removed.
     """
     new = not path.exists()
     make(path)
@@ -134,28 +144,34 @@ def opened(path: Path, sweep: Sweep) -> Iterator[Folder]:
     finally:
         os.close(lock)
         if new:
-            with suppress(OSError):  # it holds something
+            with suppress(OSError):  # the folder is not empty
                 path.rmdir()
 
 
 def _refused_before(path: Path, sweep: Sweep) -> dict[int, str]:
-    """The cells that an earlier run found unworkable. Raises UserError if it was of another sweep."""
+    """Return the refused cells of an earlier run of `sweep` in this folder; empty if there was none.
+
+    Raises UserError if the folder belongs to another sweep.
+    """
     try:
-        asked = msgspec.json.decode(files.read_bytes(path / SWEEP), type=Manifest)
+        manifest = msgspec.json.decode(files.read_bytes(path / SWEEP), type=Manifest)
     except FileNotFoundError:
         if (path / TRIALS).exists() or (path / PARTS).exists():
-            raise UserError(f"--out: {path} holds the rows of an unknown sweep") from None
+            raise UserError(f"--out: {path} contains rows of an unknown sweep") from None
         return {}
     except ValueError as error:
         raise UserError(f"--out: {path / SWEEP} cannot be read: {error}") from None
-    difference = _difference(_identity(asked.sweep), _identity(sweep))
+    difference = _difference(_identity(manifest.sweep), _identity(sweep))
     if difference is not None:
-        raise UserError(f"--out: {path} holds another sweep: {difference}; choose another folder")
-    return asked.refused
+        raise UserError(f"--out: {path} contains another sweep: {difference}; choose another folder")
+    return manifest.refused
 
 
 def _identity(sweep: Sweep) -> dict[str, Any]:
-    """What two sweeps must share to share a folder. Trials can be added, and time-outs changed."""
+    """Return the properties that must be equal for two runs to use one folder.
+
+    The number of trials and the timeout may differ.
+    """
     return {
         "name": sweep.name,
         "seed": sweep.seed,
@@ -166,17 +182,21 @@ def _identity(sweep: Sweep) -> dict[str, Any]:
 
 
 def _difference(there: Any, here: Any, where: str = "") -> str | None:
-    """The first field in which the two differ, and how."""
+    """Return a description of the first field in which the two values differ; None if they are equal.
+
+    `where` is the path of the values.
+    """
     if isinstance(there, Mapping) and isinstance(here, Mapping):
         pairs = [(f"{where}.{key}".lstrip("."), there.get(key), here.get(key)) for key in {**there, **here}]
     elif isinstance(there, list | tuple) and isinstance(here, list | tuple) and len(there) == len(here):
         pairs = [(f"{where}[{i}]", *both) for i, both in enumerate(zip(there, here, strict=True))]
     else:
         same = canonical(there) == canonical(here)
-        return None if same else f"{where} is {_cut(there)} there and {_cut(here)} here"
+        return None if same else f"{where} is {_cut(there)} in the folder and {_cut(here)} in this sweep"
     return next((found for name, one, other in pairs if (found := _difference(one, other, name))), None)
 
 
 def _cut(value: Any) -> str:
-    said = "left out" if value is None else canonical(value)
-    return said if len(said) <= MAX_DIFFERENCE else f"{said[: MAX_DIFFERENCE - 3]}..."
+    """Return the value as text of at most MAX_DIFFERENCE characters."""
+    text = "not set" if value is None else canonical(value)
+    return text if len(text) <= MAX_DIFFERENCE else f"{text[: MAX_DIFFERENCE - 3]}..."

@@ -1,4 +1,7 @@
-"""A sweep's TOML file -> a validated sweep, or one line that names the file and the field."""
+"""The sweep file: its TOML schema, and its validation.
+
+Invalid input raises BadSpec, whose text is one line with the file and the field.
+"""
 
 from __future__ import annotations
 
@@ -19,97 +22,104 @@ from compose.sweep.field_paths import NoSuchField, Steps, canonical, jsonable, s
 from protocol.units import NAME
 
 MAX_TRIALS = 10**7
-"""per cell"""
+"""The largest number of trials per cell."""
 MAX_CELLS = 10_000
+"""The largest number of cells of a sweep."""
 TRIAL_TIMEOUT_S = 60.0
+"""The default wall time in s after which a trial counts as hung."""
 Label = Annotated[str, Meta(min_length=1, max_length=60)]
 
 
 class BadSpec(UserError):
-    """The user's sweep cannot be run; the text names the file, the field and what is wrong."""
+    """An error in a sweep file. Its text names the file, the field and the problem."""
 
 
 class AxisTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """[[axis]]: one `field` and its values; or `name` and `fields`, which vary together."""
+    """The table [[axis]]: one `field` and its values, or a `name` and several `fields` that vary together."""
 
     values: Annotated[list[Any], Meta(min_length=1)]
     field: str | None = None
     fields: Annotated[list[str], Meta(min_length=1)] | None = None
     name: Annotated[str, Meta(pattern=NAME, max_length=48)] | None = None
     labels: list[Label] | None = None
-    """what to call each value in tables and figures"""
+    """names of the values in tables and figures"""
     paired: bool = False
-    """left out of the trials' seeds: all its values face the same draws"""
+    """true if trials have the same seeds, hence the same random draws, at all values of this axis"""
 
 
 class SpecFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a sweep's file may say."""
+    """The schema of a sweep file."""
 
     name: Annotated[str, Meta(pattern=NAME, max_length=48)]
     scenario: str
-    """a name that ships, or a file, relative to this one"""
+    """name of a shipped scenario, or path of a scenario file relative to the sweep file's folder"""
     trials: Annotated[int, Meta(ge=1, le=MAX_TRIALS)]
-    """per cell"""
+    """number of trials per cell"""
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
     trial_timeout: Annotated[float, Meta(gt=0.0, le=1e6)] = TRIAL_TIMEOUT_S
-    """s of wall time, after which a trial counts as hung"""
+    """wall time in s after which a trial counts as hung"""
     axis: list[AxisTable] = []
     draw: list[DrawTable] = []
-    """fields that every trial draws anew, in this order"""
+    """fields whose values are drawn for each trial, in this order"""
     starts: StartsTable | None = None
-    """kinds of start that every trial draws from"""
+    """kinds of start from which each trial draws; None to use the starts of the scenario"""
 
 
 class Axis(msgspec.Struct, frozen=True):
-    """Fields of the scenario that vary together, and their values."""
+    """One axis of a sweep: scenario fields that vary together, and their values."""
 
     name: str
-    """the field, if it is only one"""
+    """name of the axis; by default, the path of its only field"""
     fields: tuple[str, ...]
+    """paths of the fields, as in the sweep file"""
     ways: tuple[Steps, ...]
-    """to each of the fields"""
+    """parsed paths of the fields"""
     values: tuple[tuple[Any, ...], ...]
-    """of each of the fields, a tuple for each value of the axis"""
+    """values of the axis, each a tuple with one element per field"""
     labels: tuple[str, ...] | None
+    """names of the values; None to derive them from the values"""
     paired: bool
+    """true if the seeds of trials do not depend on this axis"""
 
     def label(self, place: int) -> str:
-        """What to call a value of it."""
+        """Return the name of the value at index `place`."""
         if self.labels is not None:
             return self.labels[place]
-        said = [value if isinstance(value, str) else canonical(value) for value in self.values[place]]
-        if len(said) == 1:
-            return said[0]
-        return ", ".join(f"{field}={value}" for field, value in zip(self.fields, said, strict=True))
+        texts = [value if isinstance(value, str) else canonical(value) for value in self.values[place]]
+        if len(texts) == 1:
+            return texts[0]
+        return ", ".join(f"{field}={value}" for field, value in zip(self.fields, texts, strict=True))
 
 
 class Sweep(msgspec.Struct, frozen=True):
-    """A sweep, complete: what each trial is follows from it."""
+    """A validated sweep. It determines every trial completely."""
 
     source: str
-    """the spec, as the user calls it"""
+    """name or path of the sweep file, as the user gave it"""
     name: str
     base: dict[str, Any]
-    """the table of the scenario's file"""
+    """parsed table of the scenario file, before any axis or draw is applied"""
     axes: tuple[Axis, ...]
     trials: int
-    """per cell"""
+    """number of trials per cell"""
     seed: int
+    """seed of the sweep, from which the seeds of its trials are derived"""
     trial_timeout: float
-    """s"""
+    """wall time in s after which a trial counts as hung"""
     draws: Draws = Draws()
-    """what each trial draws beside the starts that the scenario leaves open"""
+    """values drawn for each trial, in addition to starts that the scenario leaves open"""
 
 
 def shipped() -> dict[str, Path]:
-    """The sweeps that come with Tandem, by name."""
+    """Return the paths of the shipped sweep files, by name."""
     return scenario_file.shipped("sweep")
 
 
 def load(source: str, *, trials: int | None = None, seed: int | None = None) -> Sweep:
-    """The sweep of that name, or in the file at that path; `trials` and `seed` override its own.
+    """Return the sweep that `source` names: a shipped sweep, or a file at that path.
 
-    Raises BadSpec, and NotToml where it is not TOML.
+    `trials` and `seed` override the values of the sweep file. Raises BadSpec if the sweep is unknown or
+    invalid, and NotToml if the file is not TOML.
     """
     path = shipped().get(source, Path(source))
     try:
@@ -138,21 +148,22 @@ def load(source: str, *, trials: int | None = None, seed: int | None = None) -> 
 
 
 def _base(spec: SpecFile, path: Path, source: str) -> dict[str, Any]:
-    """The table of the scenario that `spec` varies."""
+    """Return the table of the base scenario of `spec`. Raises BadSpec if it cannot be read."""
     file = scenario_file.shipped().get(spec.scenario, path.parent / spec.scenario)
     try:
         return table_in(read_text(file), spec.scenario)
     except FileNotFoundError:
         names = ", ".join(scenario_file.shipped())
         raise BadSpec(
-            f"{source}: scenario: '{spec.scenario}' is neither a file beside it nor a scenario that ships "
-            f"({names})"
+            f"{source}: scenario: '{spec.scenario}' is neither a file in the folder of the sweep file nor a "
+            f"shipped scenario ({names})"
         ) from None
     except (ValueError, NotToml) as error:
         raise BadSpec(f"{source}: scenario: {error}") from None
 
 
 def _axis(table: AxisTable, where: str, base: dict[str, Any]) -> Axis:
+    """Return the validated axis; `where` is its prefix in error messages. Raises BadSpec."""
     fields = _fields(table, where)
     ways = []
     for i, field in enumerate(fields):
@@ -166,9 +177,9 @@ def _axis(table: AxisTable, where: str, base: dict[str, Any]) -> Axis:
     for i, value in enumerate(table.values):
         values.append(_value(value, f"{where}.values[{i}]", table.fields))
         if (first := seen.setdefault(canonical(value), i)) != i:
-            raise BadSpec(f"{where}.values[{i}]: the same as values[{first}]")
+            raise BadSpec(f"{where}.values[{i}]: equal to values[{first}]")
     if table.labels is not None and not len(table.labels) == len(set(table.labels)) == len(values):
-        raise BadSpec(f"{where}.labels: not {len(values)} different ones, one for each of the values")
+        raise BadSpec(f"{where}.labels: must be {len(values)} different labels, one for each value")
     return Axis(
         name=table.name if table.name is not None else fields[0],
         fields=tuple(fields),
@@ -180,31 +191,32 @@ def _axis(table: AxisTable, where: str, base: dict[str, Any]) -> Axis:
 
 
 def _fields(table: AxisTable, where: str) -> list[str]:
-    """What the axis varies. Raises BadSpec where that, or what to call it, is not said."""
+    """Return the field paths of the axis. Raises BadSpec if fields or name are missing or ambiguous."""
     if (table.field is None) == (table.fields is None):
-        raise BadSpec(f"{where}: names one 'field', or a 'name' and the 'fields' that vary together")
+        raise BadSpec(f"{where}: needs either 'field', or 'name' and 'fields'")
     fields = table.fields if table.fields is not None else [str(table.field)]
     if table.name is None and table.fields is not None:
-        raise BadSpec(f"{where}.name: missing: what to call {', '.join(fields)} together")
+        raise BadSpec(f"{where}.name: missing: an axis with 'fields' needs a name")
     if table.name is None and table.labels is not None:
-        raise BadSpec(f"{where}.name: missing: the labels are a column of their own")
+        raise BadSpec(f"{where}.name: missing: an axis with 'labels' needs a name for their column")
     if table.name in fields:
-        raise BadSpec(f"{where}.name: '{table.name}' is one of its fields")
+        raise BadSpec(f"{where}.name: '{table.name}' is also one of the fields of this axis")
     return fields
 
 
 def _value(value: Any, where: str, fields: Sequence[str] | None) -> tuple[Any, ...]:
+    """Return one value of an axis as a tuple with one element per field. Raises BadSpec."""
     if not jsonable(value):
-        raise BadSpec(f"{where}: not a number, a text, true or false, or a list or table of these")
+        raise BadSpec(f"{where}: must be a number, a string, true or false, or a list or table of these")
     if fields is None:
         return (value,)
     if not isinstance(value, list) or len(value) != len(fields):
-        raise BadSpec(f"{where}: not a list of {len(fields)} values, one for each of the fields")
+        raise BadSpec(f"{where}: must be a list of {len(fields)} values, one for each field")
     return tuple(value)
 
 
 def _draws(spec: SpecFile, axes: Sequence[Axis], base: dict[str, Any], source: str) -> tuple[Draw, ...]:
-    """Return the fields that every trial draws. Raises BadSpec."""
+    """Return the validated draws of `spec`, in order. Raises BadSpec."""
     known: dict[Steps, tuple[Any, ...]] = {
         way: tuple(value[i] for value in axis.values) for axis in axes for i, way in enumerate(axis.ways)
     }
@@ -212,15 +224,15 @@ def _draws(spec: SpecFile, axes: Sequence[Axis], base: dict[str, Any], source: s
     for i, table in enumerate(spec.draw):
         where = f"{source}: draw[{i}]"
         if (table.uniform is None) == (table.log_uniform is None):
-            raise BadSpec(f"{where}: has one of 'uniform' and 'log_uniform'")
+            raise BadSpec(f"{where}: needs exactly one of 'uniform' and 'log_uniform'")
         interval = table.uniform or table.log_uniform
         assert interval is not None
         low, high = interval
         if not low < high or not math.isfinite(high - low) or (table.log_uniform is not None and low <= 0.0):
             above = " above 0" if table.log_uniform is not None else ""
-            raise BadSpec(f"{where}: from {low:g} to {high:g} is no interval{above}")
+            raise BadSpec(f"{where}: {low:g} to {high:g} is not an interval{above}")
         if table.log_uniform is not None and not math.isfinite(high / low):
-            raise BadSpec(f"{where}: from {low:g} to {high:g} is too wide")
+            raise BadSpec(f"{where}: the interval {low:g} to {high:g} is too wide")
         (way,) = _numbers([table.field], f"{where}.field", base)
         _check_takes_float(table.field, way, low, base, f"{where}.field")
         draws.append(
@@ -238,16 +250,16 @@ def _draws(spec: SpecFile, axes: Sequence[Axis], base: dict[str, Any], source: s
 
 
 def _check_takes_float(field: str, way: Steps, value: float, base: dict[str, Any], where: str) -> None:
-    """Raises BadSpec where the field at `way` is not a float; other bounds are each trial's."""
+    """Raise BadSpec if the field at `way` is not a float. Its bounds are checked for each trial."""
     try:
         msgspec.convert(with_value(base, way, value + 0.5), scenario_file.ScenarioFile)
     except msgspec.ValidationError as error:
         if "got `float`" in str(error):
-            raise BadSpec(f"{where}: '{field}' is not a floating-point number, and cannot be drawn") from None
+            raise BadSpec(f"{where}: '{field}' is not a floating-point field and cannot be drawn") from None
 
 
 def _numbers(fields: Sequence[str], where: str, base: dict[str, Any]) -> tuple[Steps, ...]:
-    """Return the ways to `fields`. Raises BadSpec where there is no such field."""
+    """Return the parsed paths of `fields`. Raises BadSpec if a field does not exist."""
     found = []
     for field in fields:
         try:
@@ -265,29 +277,31 @@ def _known(
     *,
     zero: bool = True,
 ) -> tuple[Steps, ...]:
-    """Return the ways to `fields`, whose values are known when they are needed. Raises BadSpec.
+    """Return the parsed paths of `fields`, whose values scale a draw. Raises BadSpec.
 
-    `varied` are the values of the fields that axes set, none of those that are drawn; `zero`: one may be 0.
+    Each value must be a number that is known before the draw. `varied` contains the possible values of fields
+    that axes set, and an empty tuple for each field that is drawn earlier. A value may be 0 only if `zero` is
+    true.
     """
     ways = _numbers(fields, where, base)
     for field, way in zip(fields, ways, strict=True):
         try:
             values = varied[way] if way in varied else (value_at(base, way),)
         except (KeyError, IndexError):
-            raise BadSpec(f"{where}: '{field}' is neither in the scenario nor drawn before") from None
+            raise BadSpec(f"{where}: '{field}' is neither set by the scenario nor drawn earlier") from None
         if any(isinstance(value, bool) or not isinstance(value, int | float) for value in values):
             raise BadSpec(f"{where}: '{field}' is not a number")
         if 0 in values and not zero:
-            raise BadSpec(f"{where}: '{field}' is 0, by which nothing can be divided")
+            raise BadSpec(f"{where}: '{field}' is 0 and cannot be a divisor")
     return ways
 
 
 def _check_together(axes: Sequence[Axis], draws: Draws, source: str) -> None:
-    """Raises BadSpec where two axes, or draws, get into each other's way."""
+    """Raise BadSpec if axes share a name, if axes or draws overlap, or if there are too many cells."""
     names: set[str] = set()
     for i, axis in enumerate(axes):
         if axis.name in names:
-            raise BadSpec(f"{source}: axis[{i}]: another axis is called '{axis.name}'")
+            raise BadSpec(f"{source}: axis[{i}]: another axis has the name '{axis.name}'")
         names.add(axis.name)
     placed = [
         (f"axis[{i}]", field, way)
@@ -298,7 +312,7 @@ def _check_together(axes: Sequence[Axis], draws: Draws, source: str) -> None:
     for (one, field, way), (other, another, further) in combinations(placed, 2):
         shorter = min(len(way), len(further))
         if way[:shorter] == further[:shorter]:
-            raise BadSpec(f"{source}: {other}: '{another}' is set by {one} ('{field}') already")
+            raise BadSpec(f"{source}: {other}: '{another}' is already set by {one} ('{field}')")
     count = math.prod(len(axis.values) for axis in axes)
     if count > MAX_CELLS:
-        raise BadSpec(f"{source}: axis: {count} cells, more than {MAX_CELLS}")
+        raise BadSpec(f"{source}: axis: {count} cells exceed the limit of {MAX_CELLS}")

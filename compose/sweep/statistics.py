@@ -1,4 +1,4 @@
-"""A row a cell: how many of its trials ended how, how long they took, and how exact they were."""
+"""The statistics of each cell: outcomes, durations and accuracy of its trials, and `summary.csv`."""
 
 from __future__ import annotations
 
@@ -27,75 +27,79 @@ from protocol.messages import Outcome
 _NUMBER = re.compile(r"[-+]?\d[\d.]*(e[-+]?\d+)?")
 Floats = NDArray[np.float64]
 CONFIDENCE = 0.95
-"""of an interval"""
+"""The confidence level of the interval of a success rate."""
 NEES_CONFIDENCE = 0.99
-"""of the band of a mean NEES"""
+"""The probability with which a mean NEES lies in its band if the covariances are consistent."""
 WORSE = ("wrong", "inconsistent", "failed", "undecided")
-"""outcomes that call for a look, the worst first"""
+"""The outcomes that need a look, the worst first."""
 
 
 class CellSummary(msgspec.Struct, frozen=True):
-    """A row of `summary.csv`, after its axes; what does not apply is None."""
+    """A row of `summary.csv`, without the columns of the axes. A value that does not apply is None."""
 
     trials: int
+    """number of trials that were not refused; the counts of the outcomes sum to it"""
     localised: int
     undecided: int
     inconsistent: int
     wrong: int
     failed: int
-    """lost to an error, or to a process that was"""
+    """number of trials that failed or were lost"""
     rate: float | None
-    """localised, of all trials"""
+    """fraction of the trials that localised"""
     rate_low: float | None
     rate_high: float | None
-    """Wilson's interval"""
+    """bounds of the 95 % Wilson interval of the rate"""
     ticks_p10: float | None
-    """until all was known; of trials that localised"""
+    """percentiles of the number of ticks of trials that localised"""
     ticks_p50: float | None
     ticks_p90: float | None
     ticks_p95: float | None
     ticks_max: float | None
     meeting_tick_p50: float | None
-    """when phase 3 began; of trials in which it did"""
+    """median tick at which phase 3 began, of trials in which it began"""
     meeting_tick_max: float | None
     t_max_s: float | None
+    """largest T_max of a trial, in s"""
     t_max_ratio_max: float | None
-    """the longest that both orbited until phase 3 began, over T_max"""
+    """largest ratio of the time from both in orbit to phase 3 to T_max"""
     error_p50_m: float | None
-    """of the worse robot of each trial in which one claimed"""
+    """median over trials with a claim of the largest position error of a robot"""
     error_max_m: float | None
     error_max_rad: float | None
     claims: int
-    """of a pose, by all robots"""
+    """number of claims by all robots"""
     within_3_accuracy: float | None
-    """of these, off by no more than 3 times mission.accuracy"""
+    """fraction of the claims with a position error of at most 3 times mission.accuracy"""
     nees_mean: float | None
-    """over trials that were not wrong, each with the mean of its robots' claims: 3 is expected where
-    covariances are true"""
+    """mean over trials that were not wrong of the mean NEES of their robots' claims; 3 is expected if
+    the claimed covariances are consistent"""
     nees_low: float | None
-    """between which bounds that lies in 99 % of sweeps then"""
+    """lower bound of the band that contains nees_mean in 99 % of sweeps if covariances are consistent"""
     nees_high: float | None
+    """upper bound of that band"""
     rmse_over_bound: float | None
-    """root mean square of the position errors of all robots, over that of their Cramér-Rao bounds"""
+    """root mean square of the position errors of all robots, divided by that of their Cramér-Rao bounds"""
     reports_p50: float | None
-    """sent, by all"""
+    """median number of reports that all robots of a trial sent"""
     audited: int
-    """trials"""
+    """number of audited trials"""
     clean: int
-    """of these, without a violation"""
+    """number of audited trials without a violation"""
     violations: int
-    """in all"""
+    """number of violations in all trials"""
     reports_lost: int
-    """of all trials"""
+    """number of reports lost in all trials"""
     reports_refused: int
+    """number of reports rejected in all trials"""
     refused_trials: int
-    """trials in whose drawn setting no mission can be played; no other figure counts them"""
+    """number of trials whose scenario is infeasible with the drawn values; no other figure counts them"""
     refused: str | None
-    """why no mission can be played in this setting"""
+    """reason why the scenario of this cell is infeasible"""
 
 
 class NotableTrial(msgspec.Struct, frozen=True):
-    """A trial that deserves a look: one that breaks a rule; else the worst outcome; else the longest."""
+    """The trial to look at first: one with a violation, else the worst outcome, else the longest."""
 
     cell: int
     trial: int
@@ -106,9 +110,12 @@ class NotableTrial(msgspec.Struct, frozen=True):
 
 
 def counted(table: pa.Table, refused: str | None = None) -> CellSummary:
-    """The figures of these trials."""
+    """Return the statistics of the trials in `table`.
+
+    `refused` is the reason why the scenario of the cell is infeasible, or None.
+    """
     everything = len(table)
-    table = _played(table)
+    table = _not_refused(table)
     outcomes = table["outcome"].to_pylist()
     counts = {outcome: outcomes.count(outcome) for outcome in get_args(Outcome)}
     k, n = counts["localised"], len(outcomes)
@@ -155,7 +162,10 @@ def counted(table: pa.Table, refused: str | None = None) -> CellSummary:
 
 
 def _rmse_over_bound(table: pa.Table) -> float | None:
-    """Of all robots that have a bound."""
+    """Return the RMS position error over the RMS Cramér-Rao bound, of all robots with a bound.
+
+    None if no robot has one.
+    """
     names = [name.removesuffix("_bound_m") for name in table.schema.names if name.endswith("_bound_m")]
     if not names or not len(table):
         return None
@@ -168,7 +178,7 @@ def _rmse_over_bound(table: pa.Table) -> float | None:
 
 
 def wilson(k: int, n: int) -> tuple[float | None, float | None]:
-    """Between which rates the true one lies, given k of n."""
+    """Return the Wilson interval of the rate of `k` successes in `n` trials; (None, None) if n is 0."""
     if not n:
         return None, None
     z = NormalDist().inv_cdf(0.5 + 0.5 * CONFIDENCE)
@@ -178,35 +188,39 @@ def wilson(k: int, n: int) -> tuple[float | None, float | None]:
 
 
 def nees_band(trials: int) -> tuple[float | None, float | None]:
-    """Between which bounds the mean of so many trials' NEES lies, where covariances are true.
+    """Return the bounds of the mean NEES of `trials` trials if the claimed covariances are consistent.
 
-    One robot's sum to a chi-square of 3 degrees of freedom a trial. A trial's mean over its robots varies as
-    much where their errors go together, and less where they do not; so a mean outside is none by chance.
+    The NEES of one robot, summed over the trials, has a chi-square distribution with 3 degrees of freedom per
+    trial. The mean over the robots of a trial has the same variance if their errors are fully correlated, and
+    a smaller one otherwise. The probability of a mean outside the band is therefore at most 1 %.
     """
     if not trials:
         return None, None
     tail = 0.5 * (1.0 - NEES_CONFIDENCE)
-    half = 0.5 * DEGREES_OF_FREEDOM * trials  # chi-square of 2 a is twice a gamma of a
+    half = 0.5 * DEGREES_OF_FREEDOM * trials  # chi-square with 2 a degrees of freedom = 2 gamma(a)
     low, high = 2.0 * gammaincinv(half, tail) / trials, 2.0 * gammainccinv(half, tail) / trials
     return float(low), float(high)
 
 
 def column(table: pa.Table, name: str) -> Floats:
-    """A column of numbers; NaN where there is none."""
+    """Return a numeric column as floats, shape (rows,), with NaN for missing values."""
     return np.asarray(table[name].cast(pa.float64()).to_numpy(), float)
 
 
 def orbited_over_t_max(table: pa.Table) -> Floats:
-    """How long both orbited until phase 3 began, over T_max: 0 if they met before, NaN if never."""
+    """Return, per trial, the time from both in orbit to phase 3 divided by T_max.
+
+    It is 0 if phase 3 begins before both orbit, and NaN if it never begins.
+    """
     meeting, orbiting = column(table, "meeting_tick"), column(table, "orbiting_tick")
     orbited = meeting - np.where(np.isnan(orbiting), meeting, orbiting)
     t_max = column(table, "t_max_s")
-    at_once = np.where(orbited > 0.0, math.inf, orbited)  # where T_max is 0
+    at_once = np.where(orbited > 0.0, math.inf, orbited)  # used if T_max is 0
     return np.divide(orbited * column(table, "period_s"), t_max, out=at_once, where=t_max > 0.0)
 
 
 def summary_csv(sweep: Sweep, cells: Sequence[Cell], figures: Mapping[int, CellSummary]) -> str:
-    """A row a cell."""
+    """Return the text of `summary.csv`, with one row per cell."""
     out = io.StringIO()
     rows = csv.writer(out, lineterminator="\n")
     rows.writerow(header(sweep))
@@ -220,7 +234,7 @@ def summary_csv(sweep: Sweep, cells: Sequence[Cell], figures: Mapping[int, CellS
 
 
 def header(sweep: Sweep) -> list[str]:
-    """Of `summary.csv`."""
+    """Return the column names of `summary.csv`."""
     axes = [
         name
         for axis in sweep.axes
@@ -229,7 +243,7 @@ def header(sweep: Sweep) -> list[str]:
     return ["cell", *axes, *CellSummary.__struct_fields__]
 
 
-def _played(table: pa.Table) -> pa.Table:
+def _not_refused(table: pa.Table) -> pa.Table:
     """Return the trials that were not refused."""
     return table.filter(
         pa.array([outcome != "refused" for outcome in table["outcome"].to_pylist()], pa.bool_())
@@ -237,7 +251,10 @@ def _played(table: pa.Table) -> pa.Table:
 
 
 def refusals(table: pa.Table) -> list[tuple[str, int]]:
-    """Return why trials were refused, and how many; of reasons that differ in numbers only, the first."""
+    """Return the reasons for refused trials with their counts, the most frequent first.
+
+    Reasons that differ only in numbers are counted together under the first of them.
+    """
     first: dict[str, str] = {}
     counts: Counter[str] = Counter()
     for outcome, reason in zip(table["outcome"].to_pylist(), table["reason"].to_pylist(), strict=True):
@@ -250,8 +267,8 @@ def refusals(table: pa.Table) -> list[tuple[str, int]]:
 
 
 def noted(table: pa.Table) -> NotableTrial | None:
-    """The trial to look at first, if any was played."""
-    table = _played(table)
+    """Return the trial to look at first; None if none has run."""
+    table = _not_refused(table)
     if not len(table):
         return None
     outcomes = table["outcome"].to_pylist()
@@ -277,5 +294,5 @@ def _known(values: Floats) -> Floats:
 
 
 def _percentile(values: Floats, percent: float) -> float | None:
-    """Between the two nearest, in proportion; None of none."""
+    """Return the percentile of `values` with linear interpolation; None if there are none."""
     return float(np.percentile(values, percent)) if len(values) else None

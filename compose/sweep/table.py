@@ -1,4 +1,4 @@
-"""Rows as a table: a column for each axis, then each field of a row, then those of each robot."""
+"""The table of trials: columns for the axes and draws, the fields of a TrialRow, and those of each robot."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _OF_ALL = [field for field in TrialRow.__struct_fields__ if field not in ("cell"
 
 
 def schema_of(sweep: Sweep, cells: Sequence[Cell]) -> pa.Schema:
-    """Its columns; they follow from the sweep."""
+    """Return the schema of the table of trials, which the sweep and its cells determine."""
     fields = [pa.field("cell", _KINDS["cell"])]
     for axis in sweep.axes:
         if axis.labels is not None:
@@ -55,7 +55,7 @@ def schema_of(sweep: Sweep, cells: Sequence[Cell]) -> pa.Schema:
 
 
 def _robots(cells: Sequence[Cell]) -> list[str]:
-    """Everyone who is in a cell. A scenario may be badly wrong still; it will be refused."""
+    """Return the ids of all robots in any cell. Malformed scenarios are skipped; they are rejected later."""
     ids: dict[str, None] = {}
     for cell in cells:
         robots = cell.table.get("robot")
@@ -66,7 +66,7 @@ def _robots(cells: Sequence[Cell]) -> list[str]:
 
 
 def _kind(values: Sequence[Any]) -> pa.DataType:
-    """The column that holds them; JSON text where no other does."""
+    """Return the column type for the values of an axis; a string for JSON text if no other type fits."""
     if all(isinstance(value, bool) for value in values):
         return pa.bool_()
     if any(isinstance(value, bool) for value in values):
@@ -78,21 +78,22 @@ def _kind(values: Sequence[Any]) -> pa.DataType:
     return pa.string()
 
 
-def _held(value: Any, kind: pa.DataType) -> Any:
+def _cast(value: Any, kind: pa.DataType) -> Any:
+    """Return `value` as an element of a column of type `kind`."""
     if kind == pa.string() and not isinstance(value, str):
         return canonical(value)
     return float(value) if kind == pa.float64() else value
 
 
 def of_rows(rows: Sequence[TrialRow], sweep: Sweep, cells: Mapping[int, Cell], schema: pa.Schema) -> pa.Table:
-    """The table of `rows`; what the axes say belongs to the cell."""
+    """Return `rows` as a table of `schema`. The columns of the axes come from the cells."""
     columns: dict[str, list[Any]] = {"cell": [row.cell for row in rows]}
     for where, axis in enumerate(sweep.axes):
         if axis.labels is not None:
             columns[axis.name] = [axis.labels[cells[row.cell].place[where]] for row in rows]
         for field in axis.fields:
             kind = schema.field(field).type
-            columns[field] = [_held(cells[row.cell].fields[field], kind) for row in rows]
+            columns[field] = [_cast(cells[row.cell].fields[field], kind) for row in rows]
     for draw in sweep.draws.fields:
         columns[draw.field] = [row.drawn.get(draw.field) for row in rows]
     columns["trial"] = [row.trial for row in rows]
@@ -106,7 +107,7 @@ def of_rows(rows: Sequence[TrialRow], sweep: Sweep, cells: Mapping[int, Cell], s
 
 
 def gathered(tables: Sequence[pa.Table]) -> pa.Table:
-    """All their rows, in order, each trial once."""
+    """Return the rows of all tables, sorted by cell and trial, each trial once."""
     table = pa.concat_tables(tables).sort_by([("cell", "ascending"), ("trial", "ascending")])
     cell, trial = table["cell"].to_numpy(), table["trial"].to_numpy()
     first = np.ones(len(table), bool)
@@ -115,15 +116,19 @@ def gathered(tables: Sequence[pa.Table]) -> pa.Table:
 
 
 def read(path: Path, schema: pa.Schema, columns: list[str]) -> pa.Table:
-    """Those columns of a file of the schema. Raises OSError or ValueError if it is none."""
-    with open_file(path) as opened, pq.ParquetFile(opened) as file:  # a path with a colon it takes for a URI
+    """Return `columns` of the Parquet file at `path`.
+
+    Raises OSError if it cannot be read, and ValueError if it is not Parquet or does not have `schema`.
+    """
+    # pyarrow would read a path with a colon as a URI
+    with open_file(path) as opened, pq.ParquetFile(opened) as file:
         if not file.schema_arrow.equals(schema):
-            raise ValueError("its columns are others")
+            raise ValueError("its columns are not those of this sweep")
         return file.read(columns)
 
 
 def encoded(table: pa.Table) -> bytes:
-    """What a file of it holds."""
+    """Return the table as the bytes of a Parquet file."""
     file = pa.BufferOutputStream()
     pq.write_table(table, file)
     return bytes(file.getvalue().to_pybytes())

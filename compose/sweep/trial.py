@@ -1,4 +1,4 @@
-"""One trial, played, and the row that it leaves."""
+"""One trial: its input, its run, and its row of results."""
 
 from __future__ import annotations
 
@@ -20,53 +20,59 @@ from protocol.motion import Covariance
 from world.scenario import Scenario
 
 TrialOutcome = Literal["localised", "undecided", "inconsistent", "wrong", "failed", "refused"]
-"""a mission's, or `refused`: no mission can be played in the setting that the trial has drawn"""
+"""The outcome of a mission, or `refused`: the scenario with the drawn values is infeasible."""
 N = TypeVar("N", int, float)
 WITHIN = 3.0
-"""times mission.accuracy"""
+"""The factor of mission.accuracy within which a position error counts in `claims_within`."""
 ROUNDING = 1e-6
-"""ticks by which a quotient may miss a whole number"""
+"""The rounding error in ticks up to which T_max / T_s counts as a whole number."""
 
 
 class Trial(msgspec.Struct, frozen=True):
-    """What is to be played."""
+    """One trial to run."""
 
     cell: int
     number: int
-    """within the cell"""
+    """index of the trial within its cell"""
     scenario: Scenario
     processes: bool
-    """over Zenoh, instead of in this process"""
+    """true to run the mission as processes over Zenoh, false to run it in this process"""
     audit: bool = False
-    """whether its journals are judged, as soon as it is over"""
+    """true to audit its journals after the run"""
     kills: tuple[Kill, ...] | None = None
-    """of its processes; none where it is no trial of kills, and no processes are needed for them"""
+    """kills of its processes; None if the scenario has no kills, so that it can run in one process"""
 
 
 class RobotRow(msgspec.Struct, frozen=True, array_like=True):
-    """What a row says of one robot; what does not apply is None."""
+    """The columns of a row for one robot. A value that does not apply is None."""
 
     branch: str | None = None
+    """branch of phase 1 that the robot took"""
     alpha: float | None = None
-    """rad"""
+    """signed angle alpha of eq. (2), in rad"""
     candidates: int | None = None
+    """number of solutions of eq. (7)"""
     candidates_left: int | None = None
+    """number of these that are consistent with the ticks without a detection"""
     position_error_m: float | None = None
+    """position error of the first claim"""
     heading_error_rad: float | None = None
+    """heading error of the first claim"""
     hypotheses: int | None = None
-    """left, about the poses of both"""
+    """number of hypotheses about the poses of the pair at the end"""
     probability: float | None = None
-    """of the likeliest of them"""
+    """probability of the most probable hypothesis"""
     p_value: float | None = None
-    """the least with which the ranges spoke against what its peer told"""
+    """least p-value of the consistency tests of the ranges against the peer's reports"""
     position_sigma_m: float | None = None
-    """as claimed: the root of the trace of the position's part of the covariance"""
+    """square root of the trace of the claimed position covariance"""
     nees: float | None = None
-    """of the claim"""
+    """normalised estimation error squared of the claim"""
     bound_m: float | None = None
-    """the Cramér-Rao bound on the position, root of the trace, of the trajectories driven until the claim"""
+    """Cramér-Rao bound on the position (square root of the trace), for the trajectories up to the last claim
+    of the pair"""
     cov_xx: float | None = None
-    """as claimed, in m^2, m rad and rad^2; h is the heading"""
+    """claimed covariance of (x, y, heading h), in m^2, m rad and rad^2"""
     cov_xy: float | None = None
     cov_xh: float | None = None
     cov_yy: float | None = None
@@ -75,105 +81,122 @@ class RobotRow(msgspec.Struct, frozen=True, array_like=True):
 
 
 class TrialRow(msgspec.Struct, frozen=True, array_like=True):
-    """A trial that was played, or was lost; what does not apply is None."""
+    """The row of a trial that has run, was lost or was refused. A value that does not apply is None."""
 
     cell: int
     trial: int
     seed: int
-    """of the scenario"""
+    """seed of the scenario"""
     outcome: TrialOutcome
     reason: str | None = None
-    """why the outcome is no better"""
+    """reason for an outcome other than `localised`"""
     error: str | None = None
-    """why there is none"""
+    """error because of which the trial has no result"""
     ticks: int | None = None
+    """number of ticks until the mission ended"""
     first_contact_tick: int | None = None
-    """two peers in range of each other"""
+    """first tick at which two peers are within sensing range of each other"""
     orbiting_tick: int | None = None
-    """both of a pair orbit; of several pairs the last; none if they meet before"""
+    """first tick at which both robots of a pair orbit, the last of several pairs; None if a pair
+    reaches phase 3 earlier"""
     meeting_tick: int | None = None
-    """phase 3 begins; of several pairs the last"""
+    """tick at which phase 3 begins, the last of several pairs"""
     period_s: float | None = None
-    """T_s: what a tick lasts"""
+    """T_s, the duration of a tick in s"""
     t_max_s: float | None = None
+    """T_max in s, the bound on the time in orbit until two robots meet; the largest of all robots"""
     t_max_ticks: int | None = None
+    """T_max in ticks, rounded up"""
     candidates: int | None = None
-    """the most of any robot, before silence"""
+    """largest number of solutions of eq. (7) of any robot"""
     candidates_left: int | None = None
-    """and after"""
+    """largest number of these that are consistent with the ticks without a detection"""
     position_error_m: float | None = None
-    """of the robot that is farthest off"""
+    """largest position error of any robot's first claim"""
     heading_error_rad: float | None = None
+    """largest heading error of any robot's first claim"""
     hypotheses: int | None = None
-    """left: the most of any robot"""
+    """largest number of hypotheses of any robot at the end"""
     nearest_m: float | None = None
-    """two peers, from their first mutual range on; where there is a safety distance"""
+    """least distance in m of two peers, from their first mutual range on; None without a safety distance"""
     claims: int | None = None
-    """robots that claimed to be localised"""
+    """number of robots that claimed to be localised"""
     claims_within: int | None = None
-    """of these, how many were off by no more than 3 times mission.accuracy"""
+    """number of claims with a position error of at most 3 times mission.accuracy"""
     nees: float | None = None
-    """the mean of those that claimed a covariance"""
+    """mean NEES of the robots that claimed a covariance"""
     reports_sent: int | None = None
-    """by all"""
+    """number of reports that all robots sent"""
     reports_heard: int | None = None
+    """number of reports that all robots received and used"""
     reports_refused: int | None = None
+    """number of reports that all robots rejected"""
     reports_lost: int | None = None
-    """sent in contact, and never heard"""
+    """number of reports sent in contact and never received"""
     bytes_sent: int | None = None
-    """of reports, by all"""
+    """number of bytes of all reports sent"""
     violations: int | None = None
-    """that the audit found; none if there was none"""
+    """number of violations that the audit found; None if the trial was not audited"""
     first_violation: str | None = None
+    """description of the first violation"""
     kills: int | None = None
-    """that were taken; none where the scenario asks for none"""
+    """number of kills that took place; None if the scenario has no kills"""
     same_record: bool | None = None
-    """whether the record is, to the byte, that of the same in one process without kills"""
+    """true if the recording has the same bytes as that of the same mission in one process without kills"""
     wall_s: float | None = None
+    """wall time in s, with the audit"""
     robots: dict[str, RobotRow] = {}
+    """columns of each robot, by its id"""
     drawn: dict[str, float] = {}
-    """fields that the trial drew, by their paths"""
+    """values drawn for this trial, by the paths of their fields"""
 
 
 def refused(cell: int, trial: int, seed: int, reason: str, drawn: dict[str, float]) -> TrialRow:
-    """Return the row of a trial in whose setting no mission can be played."""
+    """Return the row of a trial whose scenario is infeasible."""
     return TrialRow(cell, trial, seed, "refused", reason, drawn=drawn)
 
 
 def lost(cell: int, trial: int, seed: int, error: str, wall_s: float | None) -> TrialRow:
-    """The row of a trial that was not played to an end."""
+    """Return the row of a trial that did not complete."""
     return TrialRow(
         cell, trial, seed, "failed", error=error, wall_s=None if wall_s is None else round(wall_s, 6)
     )
 
 
 def play(trial: Trial) -> TrialRow:
-    """Play it. What it raises becomes a row with that error."""
+    """Run the trial, and return its row.
+
+    The outcome is `failed` if kills changed the recording. The caller turns exceptions into lost trials.
+    """
     if trial.processes or trial.kills is not None:
         played = as_processes(trial.scenario, audit=trial.audit, kills=trial.kills)
     else:
         played = run_in_process(trial.scenario, audit=trial.audit)
-    found = row(trial, played.recording, played.wall_s, played.belief)
+    found = row(trial, played.recording, played.wall_s, played.findings)
     if played.kills is None:
         return found
-    found = replace(found, kills=played.kills, same_record=not played.otherwise)
-    if not played.otherwise:
+    found = replace(found, kills=played.kills, same_record=not played.differing)
+    if not played.differing:
         return found
-    why = f"another record than in one process: {', '.join(played.otherwise)}"
+    why = f"the recording differs from the run in one process: {', '.join(played.differing)}"
     return replace(found, outcome="failed", reason=why)
 
 
 def row(trial: Trial, recording: Recording, wall_s: float, findings: Findings | None = None) -> TrialRow:
-    """What is kept of a record, and of what its audit found."""
+    """Return the row of a trial, from its recording and its audit findings.
+
+    A recording without a mission end gives the row of a lost trial.
+    """
     scenario, end = recording.scenario, recording.end
     if end is None:
-        return lost(trial.cell, trial.number, scenario.seed, "the record breaks off", wall_s)
+        return lost(trial.cell, trial.number, scenario.seed, "the recording is incomplete", wall_s)
     robots = {robot.id: _robot_row(recording, i) for i, robot in enumerate(scenario.robots)}
     for pair in scenario.pairs():
         robots |= _bounded(robots, recording, pair)
     t_max_s = max(robot.rendezvous.bound for robot in scenario.robots)
-    met = [_meeting(recording, scenario.robots[a].id, scenario.robots[b].id) for a, b in scenario.pairs()]
-    said = recording.final_reports.values()
+    ids = [robot.id for robot in scenario.robots]
+    encounters = [_meeting(recording, ids[a], ids[b]) for a, b in scenario.pairs()]
+    final_reports = recording.final_reports.values()
     errors = [robot.position_error_m for robot in robots.values() if robot.position_error_m is not None]
     nees = [robot.nees for robot in robots.values() if robot.nees is not None]
     return TrialRow(
@@ -184,8 +207,8 @@ def row(trial: Trial, recording: Recording, wall_s: float, findings: Findings | 
         reason=end.reason,
         ticks=end.tick,
         first_contact_tick=first_contact(recording),
-        orbiting_tick=_last([orbiting for orbiting, _ in met]),
-        meeting_tick=_last([meeting for _, meeting in met]),
+        orbiting_tick=_last([orbiting for orbiting, _ in encounters]),
+        meeting_tick=_last([meeting for _, meeting in encounters]),
         period_s=scenario.mission.period,
         t_max_s=t_max_s,
         t_max_ticks=math.ceil(t_max_s / scenario.mission.period - ROUNDING),
@@ -198,11 +221,11 @@ def row(trial: Trial, recording: Recording, wall_s: float, findings: Findings | 
         claims=len(errors),
         claims_within=sum([error <= WITHIN * scenario.mission.accuracy for error in errors]),
         nees=sum(nees) / len(nees) if nees else None,
-        reports_sent=sum([final_report.reports_sent for final_report in said]),
-        reports_heard=sum([final_report.reports_heard for final_report in said]),
-        reports_refused=sum([final_report.reports_refused for final_report in said]),
-        reports_lost=sum([final_report.reports_lost for final_report in said]),
-        bytes_sent=sum([final_report.bytes_sent for final_report in said]),
+        reports_sent=sum([final_report.reports_sent for final_report in final_reports]),
+        reports_heard=sum([final_report.reports_heard for final_report in final_reports]),
+        reports_refused=sum([final_report.reports_refused for final_report in final_reports]),
+        reports_lost=sum([final_report.reports_lost for final_report in final_reports]),
+        bytes_sent=sum([final_report.bytes_sent for final_report in final_reports]),
         violations=len(findings.violations) if findings is not None else None,
         first_violation=findings.violations[0].line if findings is not None and findings.violations else None,
         wall_s=round(wall_s, 6),
@@ -212,11 +235,11 @@ def row(trial: Trial, recording: Recording, wall_s: float, findings: Findings | 
 
 def _robot_row(recording: Recording, place: int) -> RobotRow:
     robot = recording.scenario.robots[place].id
-    return _claimed(_said(recording.final_reports.get(robot)), first_claim(recording, place))
+    return _claimed(_reported(recording.final_reports.get(robot)), first_claim(recording, place))
 
 
-def _said(final_report: FinalReport | None) -> RobotRow:
-    """What the robot says of itself in the end."""
+def _reported(final_report: FinalReport | None) -> RobotRow:
+    """Return the columns that a robot reports in its final report."""
     if final_report is None:
         return RobotRow()
     before, left = final_report.candidates if final_report.candidates is not None else (None, None)
@@ -232,7 +255,7 @@ def _said(final_report: FinalReport | None) -> RobotRow:
 
 
 def _claimed(row: RobotRow, claim: Claim | None) -> RobotRow:
-    """`row`, with what became of the robot's claim."""
+    """Return `row` with the errors and the covariance of the robot's first claim."""
     if claim is None:
         return row
     row = replace(row, position_error_m=claim.position_error, heading_error_rad=claim.heading_error)
@@ -248,12 +271,13 @@ def _claimed(row: RobotRow, claim: Claim | None) -> RobotRow:
 
 
 def _bounded(robots: dict[str, RobotRow], recording: Recording, pair: tuple[int, int]) -> dict[str, RobotRow]:
-    """The rows of a pair that has claimed covariances, with the bounds on them."""
+    """Return the rows of a pair with their Cramér-Rao bounds; none unless both claimed covariances."""
     names = [recording.scenario.robots[place].id for place in pair]
     claims = [first_claim(recording, place) for place in pair]
     if any(robots[name].position_sigma_m is None for name in names):
         return {}
-    from compose.recording.cramer_rao import position_bounds  # noqa: PLC0415  # where sensors are exact, it takes no numpy
+    # imports numpy, which trials with exact sensors do not need
+    from compose.recording.cramer_rao import position_bounds  # noqa: PLC0415
 
     bounds = position_bounds(recording, pair, max([one.tick for one in claims if one is not None]))
     if bounds is None:
@@ -262,7 +286,10 @@ def _bounded(robots: dict[str, RobotRow], recording: Recording, pair: tuple[int,
 
 
 def _meeting(recording: Recording, a: str, b: str) -> tuple[int | None, int | None]:
-    """The tick from which both of a pair orbit, and that at which their phase 3 begins."""
+    """Return the first tick at which both robots of a pair orbit, and the tick at which phase 3 begins.
+
+    The first is None if phase 3 begins earlier, and each is None if it never happens.
+    """
     orbiting = None
     for moment in recording.moments:
         commands = [
@@ -280,10 +307,11 @@ def _meeting(recording: Recording, a: str, b: str) -> tuple[int | None, int | No
 
 
 def _last(ticks: list[int | None]) -> int | None:
-    """The last of several, once all are there."""
+    """Return the largest of `ticks`; None if any is None."""
     known = [tick for tick in ticks if tick is not None]
     return max(known) if len(known) == len(ticks) else None
 
 
 def _most(values: list[N | None]) -> N | None:
+    """Return the largest of the known values; None if there is none."""
     return max([value for value in values if value is not None], default=None)

@@ -1,4 +1,4 @@
-"""A trial's mission, played: in this process, as processes, or as processes some of which are killed."""
+"""The mission of a trial, run in this process, as processes, or as processes with kills."""
 
 from __future__ import annotations
 
@@ -20,49 +20,52 @@ from protocol.journal.journal_file import MemoryJournal, packed
 from protocol.network.inbox import Inbox
 from world.scenario import Scenario
 
-PATIENCE_S = 30.0
-"""how long the processes of a trial wait for each other"""
+TIMEOUT_S = 30.0
+"""The time in s that the processes of a trial wait for each other."""
 
 
 class Played(msgspec.Struct, frozen=True):
-    """A mission to its end."""
+    """A completed mission."""
 
     recording: Recording
-    belief: Findings | None
-    """of its audit, if there was one"""
+    findings: Findings | None
+    """findings of its audit; None if it was not audited"""
     wall_s: float
-    """with its audit"""
+    """wall time in s, with the audit"""
     kills: int | None = None
-    """that were taken, where there were to be any"""
-    otherwise: tuple[str, ...] = ()
-    """the files of its record that are not, to the byte, those of the same in one process"""
+    """number of kills that took place; None if none was requested"""
+    differing: tuple[str, ...] = ()
+    """names of the files of its recording whose bytes differ from those of a run in one process"""
 
 
 def run_in_process(scenario: Scenario, *, audit: bool) -> Played:
-    """Its run in this process; its journals are kept only to be judged."""
+    """Run `scenario` in this process. Journals are written, to memory, only for an audit."""
     began = time.perf_counter()
     if not audit:
         return Played(in_process.play(scenario), None, time.perf_counter() - began)
-    kept = {name: MemoryJournal() for name in in_process.journals(scenario)}
-    recording = in_process.played(scenario, kept)
-    findings = rules.judge({name: journal.frames for name, journal in kept.items()})
+    journals = {name: MemoryJournal() for name in in_process.journals(scenario)}
+    recording = in_process.played(scenario, journals)
+    findings = rules.judge({name: journal.frames for name, journal in journals.items()})
     return Played(recording, findings, time.perf_counter() - began)
 
 
 def as_processes(scenario: Scenario, *, audit: bool, kills: Sequence[Kill] | None = None) -> Played:
-    """Its run as processes. Where there are `kills`, if only none, it is held against that in one process."""
-    from compose.launch import processes  # noqa: PLC0415  # in-process trials do without
+    """Run `scenario` as processes.
+
+    Unless `kills` is None, the recording is compared with that of a run in one process. `kills` may be empty.
+    """
+    from compose.launch import processes  # noqa: PLC0415  # not needed for trials in this process
 
     began = time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="tandem-") as folder:
         out = Path(folder)
-        spared = processes.play(
+        missed = processes.play(
             scenario,
             out,
             Inbox("tandem sweep"),
             run=run_name(scenario),
             rate=None,
-            timeout=PATIENCE_S,
+            timeout=TIMEOUT_S,
             kills=kills or (),
             agents_journal=audit or kills is not None,
         )
@@ -71,11 +74,14 @@ def as_processes(scenario: Scenario, *, audit: bool, kills: Sequence[Kill] | Non
         wall_s = time.perf_counter() - began
         if kills is None:
             return Played(recording, findings, wall_s)
-        return Played(recording, findings, wall_s, len(kills) - len(spared), _otherwise(recording, out))
+        return Played(recording, findings, wall_s, len(kills) - len(missed), _differing(recording, out))
 
 
-def _otherwise(recording: Recording, out: Path) -> tuple[str, ...]:
+def _differing(recording: Recording, out: Path) -> tuple[str, ...]:
+    """Return the names of the files in `out` whose bytes differ from those of a run in one process."""
     undisturbed = {name: MemoryJournal() for name in in_process.journals(recording.scenario)}
     ticks = ticks_csv(in_process.played(recording.scenario, undisturbed))
-    files = [name for name, kept in undisturbed.items() if (out / name).read_bytes() != packed(kept.frames)]
+    files = [
+        name for name, journal in undisturbed.items() if (out / name).read_bytes() != packed(journal.frames)
+    ]
     return (*files, "ticks.csv") if ticks_csv(recording) != ticks else tuple(files)

@@ -1,7 +1,8 @@
 """The process in which trials run, forked from a fork server that has imported this module.
 
-It is asked for chunks on its standard input and answers a row a trial on its standard output, each a frame:
-its length in four bytes, and msgpack. It ends with its standard input, even while a trial never does.
+It reads chunks from its standard input and writes one row per trial to its standard output. Each is a frame:
+its length in four bytes (big endian), then msgpack. The process ends when its standard input is closed, even
+during a trial that hangs.
 """
 
 from __future__ import annotations
@@ -27,60 +28,66 @@ from compose.sweep.draws import Draws
 from protocol.output import one_line
 
 PLAY = "compose.sweep.trial:play"
-"""what plays a trial"""
+"""The default function that runs a trial."""
 READY = b""
-"""the first frame: everything is imported"""
+"""The first frame, sent when all modules are imported."""
 LENGTH_BYTES = 4
 MAX_ERROR = 300
-"""characters"""
+"""The largest length of an error text, in characters."""
 IDLE_S = 300.0
-"""how long to wait for work: whoever ran the sweep may have been killed, and the owner live on"""
+"""The time in s without work after which the process ends.
+
+The command that started the sweep may have been killed while the Dask worker that owns this process lives on.
+"""
 
 
 class Chunk(msgspec.Struct, frozen=True):
-    """Trials of one cell."""
+    """Trials of one cell that a process runs in sequence."""
 
     cell: int
     trials: tuple[int, ...]
+    """indices of the trials within the cell"""
     seeds: tuple[int, ...]
-    """of each trial"""
+    """seed of each trial"""
     setting: ScenarioTemplate
     processes: bool
+    """true to run trials as processes over Zenoh"""
     timeout: float
-    """s of wall time that a trial may last"""
+    """wall time in s that a trial may take"""
     play: str = PLAY
-    """module:function, from a trial to its row"""
+    """function that runs a Trial and returns its TrialRow, as module:function"""
     audit: bool = False
-    """each of them"""
+    """true to audit the journals of every trial"""
     draws: Draws = Draws()
-    """what each of them draws in its scenario's file"""
+    """values drawn for each trial"""
     table: dict[str, Any] = {}
-    """that file, where there are draws"""
+    """parsed table of the cell's scenario file; empty without draws"""
 
     def after(self, done: int) -> Chunk:
-        """What is left of it after so many trials."""
+        """Return the chunk without its first `done` trials."""
         return msgspec.structs.replace(self, trials=self.trials[done:], seeds=self.seeds[done:])
 
 
 def warm_up() -> None:
-    """Get ready to fork such processes: importing this module is all."""
+    """Prepare a fork server for such processes. Importing this module does all of it."""
 
 
 def main() -> None:
-    """Answer until standard input ends."""
+    """Run trials until standard input is closed, or until there has been no work for IDLE_S."""
     folder = sys.argv[1]
-    tempfile.tempdir = folder  # its owner removes it, whatever a trial left there
+    tempfile.tempdir = folder  # removed by the owner, with all files that trials leave in it
     answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what a trial prints is no answer
+    os.dup2(2, 1)  # the output of a trial must not mix with the rows
     chunks: SimpleQueue[Chunk] = SimpleQueue()
     threading.Thread(target=_listen, args=(chunks, folder), daemon=True).start()
     try:
         _play(chunks, answers)
-    finally:  # nobody waits for the answers, or nobody has asked for long
+    finally:  # the reader of the rows is gone, or there was no work for IDLE_S
         shutil.rmtree(folder, ignore_errors=True)
 
 
 def _play(chunks: SimpleQueue[Chunk], answers: BinaryIO) -> None:
+    """Run the trials of `chunks`, and write their rows to `answers`."""
     _answer(answers, READY)
     encoder = msgspec.msgpack.Encoder()
     while True:
@@ -93,11 +100,12 @@ def _play(chunks: SimpleQueue[Chunk], answers: BinaryIO) -> None:
 
 
 def _listen(chunks: SimpleQueue[Chunk], folder: str) -> None:
+    """Read chunks from standard input. End the process when it is closed, and remove `folder`."""
     decoder = msgspec.msgpack.Decoder(Chunk)
     try:
         while (head := sys.stdin.buffer.read(LENGTH_BYTES)) != b"":
             chunks.put(decoder.decode(sys.stdin.buffer.read(int.from_bytes(head, "big"))))
-    finally:  # whoever asked has gone
+    finally:  # the owner has closed standard input, or has ended
         shutil.rmtree(folder, ignore_errors=True)
         os._exit(0)
 
@@ -108,11 +116,12 @@ def _answer(answers: BinaryIO, body: bytes) -> None:
 
 
 def framed(body: bytes) -> bytes:
-    """`body` with its length in front."""
+    """Return `body` as a frame, with its length in front."""
     return len(body).to_bytes(LENGTH_BYTES, "big") + body
 
 
 def _played(chunk: Chunk, number: int, seed: int) -> trial.TrialRow:
+    """Run one trial, and return its row. An exception gives the row of a lost trial."""
     began = time.perf_counter()
     try:
         player = _function(chunk.play)
@@ -128,13 +137,14 @@ def _played(chunk: Chunk, number: int, seed: int) -> trial.TrialRow:
         kills = setting.kills(seed) if setting.file.kill else None
         row = player(trial.Trial(chunk.cell, number, scenario, chunk.processes, chunk.audit, kills))
         return replace(row, drawn=drawn) if drawn else row
-    except BaseException as error:  # noqa: BLE001  # a trial that tries to end the process is lost, too
-        said = one_line(f"{type(error).__name__}: {error}")[:MAX_ERROR]
-        return trial.lost(chunk.cell, number, seed, said, time.perf_counter() - began)
+    except BaseException as error:  # noqa: BLE001  # SystemExit from a trial must not end the process
+        error_text = one_line(f"{type(error).__name__}: {error}")[:MAX_ERROR]
+        return trial.lost(chunk.cell, number, seed, error_text, time.perf_counter() - began)
 
 
 @cache
 def _function(path: str) -> Callable[[trial.Trial], trial.TrialRow]:
+    """Return the function at `path`, as module:function."""
     module, _, name = path.partition(":")
     found: Callable[[trial.Trial], trial.TrialRow] = getattr(import_module(module), name)
     return found

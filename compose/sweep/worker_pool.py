@@ -21,8 +21,9 @@ from compose.sweep.worker import LENGTH_BYTES, MAX_ERROR, READY, Chunk, framed
 from protocol.output import one_line
 
 START_S = 60.0
-"""s that a new process has to import its modules"""
+"""The time in s within which a new process must have imported its modules."""
 READ_BYTES = 1 << 16
+"""The largest number of bytes in one read from a process."""
 
 
 class Died(Exception):
@@ -77,13 +78,14 @@ class WorkerProcess:
         return body
 
     def _how(self) -> str:
-        if not self._process.wait(1.0):  # it has closed its standard output, but still runs
+        """Return how the process ended, with the last line of its standard error."""
+        if not self._process.wait(1.0):  # its standard output is closed, but it still runs
             self.kill()
             return "it closed its standard output"
         status = self._process.status
         size = os.fstat(self._errors.fileno()).st_size
-        said = os.pread(self._errors.fileno(), MAX_ERROR, max(0, size - MAX_ERROR)).decode(errors="replace")
-        last = one_line(said.strip().splitlines()[-1]) if said.strip() else ""
+        errors = os.pread(self._errors.fileno(), MAX_ERROR, max(0, size - MAX_ERROR)).decode(errors="replace")
+        last = one_line(errors.strip().splitlines()[-1]) if errors.strip() else ""
         how = f"killed by {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
         return f"{how}: {last}" if last else how
 
@@ -116,16 +118,16 @@ class _Children:
         with self._lock:
             if sweep in self._over:
                 return None
-            kept = self._resting.pop(key, None)
-            child = self._working[key] = kept or WorkerProcess()
-        if kept is None:
+            reused = self._resting.pop(key, None)
+            child = self._working[key] = reused or WorkerProcess()
+        if reused is None:
             try:
                 ready = child.answer(START_S)
                 assert ready == READY
             except (Died, Hung):
                 self.drop(sweep)
                 raise
-        return child, kept is not None
+        return child, reused is not None
 
     def keep(self, sweep: str) -> None:
         """Store this thread's process for its next chunk; close it if the sweep is over."""
@@ -141,9 +143,9 @@ class _Children:
         """Close this thread's process, and return whether the sweep is still running."""
         with self._lock:
             child = self._working.pop((sweep, threading.get_ident()))
-            goes_on = sweep not in self._over
+            still_running = sweep not in self._over
         child.close()
-        return goes_on
+        return still_running
 
     def dismiss(self, sweep: str) -> None:
         """End all processes of the sweep, and start no more of them."""
@@ -173,7 +175,7 @@ def run(sweep: str, encoded: bytes) -> list[bytes]:
     chunk = msgspec.msgpack.decode(encoded, type=Chunk)
     rows: list[bytes] = []
     while len(rows) < len(chunk.trials) and (taken := _children.take(sweep)) is not None:
-        child, kept = taken
+        child, reused = taken
         asked = len(rows)
         began = time.perf_counter()
         try:
@@ -184,7 +186,7 @@ def run(sweep: str, encoded: bytes) -> list[bytes]:
         except Hung:
             error = f"hung: no answer within {chunk.timeout:g} s"
         except Died as death:
-            if kept and len(rows) == asked:  # a reused process may have ended earlier: try a new one
+            if reused and len(rows) == asked:  # a reused process may have ended earlier: try a new one
                 _children.drop(sweep)
                 continue
             error = f"died: {death}"
