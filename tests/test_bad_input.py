@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from compose.scenario.scenario_file import BadScenario, parse
+from compose.errors import BadScenario
+from compose.scenario.scenario_file import parse
 from tests.commands import PAPER_1, Ended, several_pairs, tandem, world
 
 LISTEN = ("--listen", "tcp/127.0.0.1:7447")
@@ -365,7 +366,7 @@ def test_an_unknown_scenario_is_refused(
         *((["run", "paper-1", "--foxglove", v], "--foxglove: ") for v in ("-1", "65536", "http")),
         (["run", "paper-1", "--export"], "--export: there is no --out DIR"),
         (["run", "paper-1", "--port", "8080"], "--port: of the page, and there is none without --watch"),
-        (["replay", ""], "'' is no folder"),
+        (["replay", ""], "'' is not a path"),
         *((["run", "paper-1", "--rate", v], "--rate: ") for v in ("0", "-1", "nan", "inf", "fast", "1e400")),
         *((["run", "paper-1", "--timeout", v], "--timeout: ") for v in ("0", "-1", "nan", "inf", "x")),
         *((["run", "paper-1", "--seed", v], "--seed: ") for v in ("-1", "1.5", "x", "nan", "²", str(2**63))),

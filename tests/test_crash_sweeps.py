@@ -15,11 +15,12 @@ import pyarrow.parquet as pq
 import pytest
 from msgspec.structs import replace
 
+from compose.errors import BadScenario
 from compose.launch import in_process
 from compose.launch.processes import ChildFailed
 from compose.recording.run import WORLD_JOURNAL, Recording, agent_journal
 from compose.scenario.kills import POINTS, WORLD, KillTable, drawn
-from compose.scenario.scenario_file import BadScenario, load, parse, validate
+from compose.scenario.scenario_file import load, parse, validate
 from compose.scenario.toml_file import table_in
 from compose.sweep import spec
 from compose.sweep.cells import cells

@@ -79,8 +79,8 @@ def test_who_is_there_keeps_the_keys_and_learns_of_who_comes_later(tmp_path: Pat
     before = contents(folder)
     ended = tandem("keys", folder, "--robots", "c")
     assert ended.status == 0
-    assert "made, for 365 days: agent-c\n" in ended.out
-    assert "kept, with their keys and names: router, world, viewer, agent-a, agent-b\n" in ended.out
+    assert "created, valid for 365 days: agent-c\n" in ended.out
+    assert "unchanged: router, world, viewer, agent-a, agent-b\n" in ended.out
     after = contents(folder)
     changed = {name for name in before if after[name] != before[name]}
     assert changed == {f"{name}/{KEYED}" for name in EVERYBODY}
@@ -108,11 +108,14 @@ def test_a_folder_that_is_removed_is_made_anew_by_the_same_authority(tmp_path: P
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--robots", "a,"), "'' is no name"),
+        (("--robots", "a,"), "'' is not a name"),
         (("--robots", "a,b,a"), "names a robot twice"),
-        (("--robots", "../a"), "is no name"),
-        (("--robots", "a" * 33), "more than 32 letters"),
-        (("--robots", "a", "--host", "not a host"), "--host: 'not a host' is neither a name nor an address"),
+        (("--robots", "../a"), "is not a name"),
+        (("--robots", "a" * 33), "more than 32 characters"),
+        (
+            ("--robots", "a", "--host", "not a host"),
+            "--host: 'not a host' is neither a host name nor an IP address",
+        ),
         (("--robots", "a", "--days", "0"), "0 is not from 1 to 36500"),
         ((), "--robots"),
     ],

@@ -20,9 +20,10 @@ from msgspec.structs import replace
 from agent.process.agent_journal import past
 from agent.process.recovery import remember
 from agent.process.robot import Robot
+from compose.errors import BadKill
 from compose.launch.in_process import play
 from compose.launch.processes import free_endpoint
-from compose.scenario.kills import BadKill, parse
+from compose.scenario.kills import parse
 from compose.scenario.scenario_file import load
 from protocol.journal import journal_file
 from protocol.journal.journal_file import CannotRecord, CorruptJournal, Journal

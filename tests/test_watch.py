@@ -473,7 +473,7 @@ def test_ctrl_c_ends_the_page_with_somebody_watching(paper_1: Path) -> None:
         (["--connect", "here"], "--connect: 'here' is no endpoint; one looks like tcp/127.0.0.1:7447"),
         (
             [".", "--port", "65536"],
-            "argument --port: 65536 is not a port, from 0 (one that is free) to 65535",
+            "argument --port: 65536 is not a port, which is 0 (any free port) to 65535",
         ),
     ],
 )
@@ -520,7 +520,7 @@ def test_a_page_on_an_address_of_this_machine_answers_to_it(paper_1: Path) -> No
 def test_an_address_that_cannot_be_had_is_one_line(paper_1: Path) -> None:
     for address, said in {
         "192.0.2.1": "--address: 192.0.2.1 cannot be had: Cannot assign requested address",
-        "robot": "argument --address: 'robot' is no address, such as 127.0.0.1 or 0.0.0.0",
+        "robot": "argument --address: 'robot' is not an IP address such as 127.0.0.1 or 0.0.0.0",
     }.items():
         ended = tandem("watch", str(paper_1), "--address", address)
         assert (ended.status, ended.out, ended.err) == (2, "", f"tandem watch: {said}\n")

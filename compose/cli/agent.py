@@ -1,4 +1,4 @@
-"""`tandem agent`: one robot of a mission whose world is somewhere else."""
+"""`tandem agent`: run the agent of one robot; it connects to a world."""
 
 from __future__ import annotations
 
@@ -10,6 +10,17 @@ from agent.process.link import WorldLinkLost
 from agent.process.node import AgentProcess
 from agent.process.recovery import Memory, remember
 from agent.process.robot import Robot
+from compose.cli.arguments import (
+    add_closing,
+    add_connect_timeout,
+    add_connection,
+    add_fsync,
+    add_launched,
+    add_listen,
+    add_running,
+    kill,
+    name,
+)
 from compose.errors import ENDED, FAILED, STOPPED, UserError, status_of
 from compose.launch.signals import stop_by_signal, stop_with_launcher
 from compose.network import beyond, reach
@@ -30,8 +41,24 @@ LAST_WORD_S = 10.0
 """how long it then waits for what such a world says"""
 
 
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `tandem agent`."""
+    parser.add_argument("id", type=name, metavar="ID", help="id of the robot in the scenario")
+    add_running(parser)
+    parser.add_argument(
+        "--run", type=name, metavar="NAME", help="name of the run [default: the only one that is running]"
+    )
+    add_connect_timeout(parser, "a world")
+    add_connection(parser)
+    add_listen(parser, "endpoint on which this process is a Zenoh router")
+    add_fsync(parser)
+    add_launched(parser)
+    parser.add_argument("--kill", type=kill, action="append", default=[], help=argparse.SUPPRESS)
+    add_closing(parser, "tandem agent a --connect tcp/127.0.0.1:7447 --out recording-a", "docs/network.md")
+
+
 def main(options: argparse.Namespace) -> int:
-    """Play one robot's part."""
+    """Run the agent to the end of its mission, and return the exit status of the outcome."""
     inbox = Inbox(f"tandem agent {options.id}")
     if options.launched:
         stop_with_launcher(inbox)

@@ -1,4 +1,4 @@
-"""`tandem world`: the world of a mission whose robots join from wherever they reach it."""
+"""`tandem world`: run the simulator of a mission; agents connect to it."""
 
 from __future__ import annotations
 
@@ -10,6 +10,17 @@ from pathlib import Path
 
 import zenoh
 
+from compose.cli.arguments import (
+    add_closing,
+    add_connection,
+    add_fsync,
+    add_launched,
+    add_listen,
+    add_running,
+    add_scenario,
+    kill,
+    name,
+)
 from compose.errors import ENDED, FAILED, STOPPED, UserError
 from compose.launch.processes import handed
 from compose.launch.signals import stop_by_signal, stop_with_launcher
@@ -35,8 +46,26 @@ LOOK_AGAIN_S = 0.05
 """how long to wait before trying a router again"""
 
 
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `tandem world`."""
+    add_scenario(parser)
+    add_running(parser)
+    parser.add_argument(
+        "--run",
+        type=name,
+        metavar="NAME",
+        help="name of the run [default: the scenario's and a random suffix]",
+    )
+    add_connection(parser)
+    add_listen(parser, "endpoint on which this process is a Zenoh router")
+    add_fsync(parser)
+    add_launched(parser)
+    parser.add_argument("--kill", type=kill, action="append", default=[], help=argparse.SUPPRESS)
+    add_closing(parser, "tandem world paper-1 --listen tcp/127.0.0.1:7447 --out recording", "docs/network.md")
+
+
 def main(options: argparse.Namespace) -> int:
-    """Play the world's part."""
+    """Run the world to the end of its mission, and return the exit status of the outcome."""
     scenario = _scenario(options)
     check_rate(scenario, options.rate)
     inbox = Inbox("tandem world")

@@ -10,15 +10,12 @@ import msgspec
 from msgspec import Meta
 from msgspec.structs import asdict
 
+from compose.errors import BadFault
 from world.faults import MAX_DELAY, MAX_FAULTS, Delay, Fault, LinkSelector
 
 _LINK = re.compile(r"\s*(?P<one>[A-Za-z0-9_-]+)\s*(?P<way><->|->)\s*(?P<other>[A-Za-z0-9_-]+)\s*")
 _NUMBER = re.compile(r"-?[0-9]*\.?[0-9]+(?:[eE]-?[0-9]+)?")
 EVERYWHERE = "*"
-
-
-class BadFault(ValueError):
-    """A fault that cannot be; the text names the field and what is wrong."""
 
 
 class FaultTable(Fault, frozen=True, array_like=False, forbid_unknown_fields=True):

@@ -9,12 +9,8 @@ from typing import Any
 
 import msgspec
 
-from compose.errors import UserError
+from compose.errors import NotToml
 from protocol import files
-
-
-class NotToml(UserError):
-    """The text names the file, and where it is not TOML."""
 
 
 def read_text(path: Path) -> str:

@@ -28,6 +28,7 @@ from cryptography.hazmat.primitives.serialization import (
 )
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
+from compose.errors import BadKeys
 from compose.network import KEYED
 from protocol import files
 from protocol.network import access_control
@@ -41,10 +42,6 @@ SECRET = 0o600
 GITIGNORE = ".gitignore"
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
 """names that everybody who may be a router has"""
-
-
-class BadKeys(ValueError):
-    """What is in the folder is none of ours, or cannot be written; says what."""
 
 
 class Authority(NamedTuple):
