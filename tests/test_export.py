@@ -621,7 +621,7 @@ def test_a_page_s_origin_is_named_as_a_browser_sends_it() -> None:
             ["--foxglove", "0", "--foxglove-origin", "viewer"],
             "argument --foxglove-origin: 'viewer' is not an origin ",
         ),
-        (["--foxglove-origin", "null"], "--foxglove-origin: of a page that shows what --foxglove serves, "),
+        (["--foxglove-origin", "null"], "--foxglove-origin: it needs --foxglove"),
     ):
         ended = tandem("run", "paper-1", *words)
         assert (ended.status, ended.out) == (2, "")

@@ -407,11 +407,11 @@ def test_a_configuration_may_say_where_to_connect(tmp_path: Path) -> None:
         (("agent", "a", "--keys", "{keys}/agent-a"), "--connect ENDPOINT is needed"),
         (
             ("agent", "a", "--connect", "tls/127.0.0.1:7447"),
-            "takes certificates: --keys DIR, or --config FILE",
+            "needs certificates: --keys DIR, or --config FILE",
         ),
         (
             ("agent", "a", "--connect", "tcp/127.0.0.1:7447", "--keys", "{keys}/agent-a"),
-            "tcp/127.0.0.1:7447 is not encrypted; with --keys it is tls/127.0.0.1:7447",
+            "tcp/127.0.0.1:7447 is not encrypted; with --keys, use tls/127.0.0.1:7447",
         ),
         (
             ("agent", "b", "--connect", "tls/127.0.0.1:7447", "--keys", "{keys}/agent-a"),
@@ -420,14 +420,14 @@ def test_a_configuration_may_say_where_to_connect(tmp_path: Path) -> None:
         (("watch", "--keys", "{keys}/world"), "world is the folder of world, not of viewer"),
         (
             ("world", "paper-1", "--listen", "tls/127.0.0.1:7447", "--keys", "{keys}"),
-            "name one of those in it: agent-a, agent-b, router, viewer, world",
+            "choose one of its folders: agent-a, agent-b, router, viewer, world",
         ),
         (
             ("watch", "--keys", "nowhere"),
-            "nowhere is no participant's folder of keys; `tandem keys` makes such",
+            "nowhere is not a participant's folder of keys; `tandem keys` creates such",
         ),
         (("watch", "--keys", "{keys}/viewer", "--config", "x"), "not allowed with argument"),
-        (("watch", ".", "--keys", "{keys}/viewer"), "--keys: a record needs no network"),
+        (("watch", ".", "--keys", "{keys}/viewer"), "--keys: a recording needs no network"),
     ],
 )
 def test_flags_that_do_not_go_together_are_told(arguments: tuple[str, ...], words: str, keys: Path) -> None:
@@ -439,7 +439,7 @@ def test_flags_that_do_not_go_together_are_told(arguments: tuple[str, ...], word
 
 def test_who_listens_beyond_this_machine_without_keys_is_warned(keys: Path) -> None:
     where = free_endpoint().replace("127.0.0.1", "0.0.0.0")
-    warning = f"listening beyond this machine without --keys, at {where}: whoever reaches it"
+    warning = f"listening without --keys at {where}: every machine that reaches it"
     with TandemProcess("world", "paper-1", "--listen", where) as world:
         world.until_says("waiting for")
         assert world.err.startswith(f"tandem world: {warning}")
