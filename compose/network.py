@@ -56,7 +56,7 @@ def places(options: argparse.Namespace) -> list[Endpoints]:
 
 
 def _check(flag: str, endpoint: str, *, keyed: bool, configured: bool) -> None:
-    """Check that `endpoint` is valid, and encrypted exactly if certificates are given. Raises UserError."""
+    """Check that `endpoint` is valid, and that it fits the flags for certificates. Raises UserError."""
     try:
         check_endpoint(endpoint)
     except BadEndpoint as error:

@@ -526,7 +526,7 @@ def test_the_worlds_record_of_another_scenario_is_refused(recording: Path) -> No
 def test_an_agents_record_of_another_briefing_is_refused(recording: Path, tmp_path: Path) -> None:
     scenario = tmp_path / "farther.toml"
     scenario.write_text(PAPER_1.replace("anchor = [10.0", "anchor = [10.5"))
-    says = f"{recording / 'agent-a.journal'}: another run's: its briefing is not this world's"
+    says = f"{recording / 'agent-a.journal'}: it is of another run: its RobotConfig differs from this world's"
     with world(scenario) as (_, endpoint):
         refuses(recording, "agent", "a", "--connect", endpoint, says=says)
 
