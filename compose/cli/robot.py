@@ -156,7 +156,7 @@ def main(options: argparse.Namespace) -> int:
         say(f"{options.id}: claims {pose.x:.9f} {pose.y:.9f} {wrap(pose.heading):+.9f} (m, m, rad)")
     if not options.quiet:
         advice = f"; a lower --rate, such as {rate / 2:g}, leaves more time" if field.missed else ""
-        missed = f"missed the deadline in {field.missed} of {end.tick + 1} ticks, and stopped for them"
+        missed = f"missed the deadline in {field.missed} of {end.tick + 1} ticks"
         say(f"{options.id}: {missed}{advice}")
     say(f"{options.id}: {ended(end.outcome, end.tick, end.reason)}")
     return status_of(end.outcome)
