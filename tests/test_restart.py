@@ -619,7 +619,7 @@ def test_who_has_ended_waits_for_no_world_that_has_gone_however_patient(
         playing, endpoint = stack.enter_context(world("paper-1"))
         reach = ("--connect", endpoint, "--out", tmp_path, "--timeout", "600")
         agent = stack.enter_context(TandemProcess("agent", "a", *reach))
-        agent.until_says("again, from tick 48 on")
+        agent.until_says("resumed at tick 48")
         playing.tell(SIGKILL)
         ended = agent.ended()
     assert (ended.status, ended.out.splitlines()[-1]) == (0, f"a: {LOCALISED.strip()}")
