@@ -402,9 +402,9 @@ def test_a_configuration_may_say_where_to_connect(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("agent", "a"), "--connect ENDPOINT is needed"),
-        (("world", "paper-1"), "--listen ENDPOINT is needed"),
-        (("agent", "a", "--keys", "{keys}/agent-a"), "--connect ENDPOINT is needed"),
+        (("agent", "a"), "--connect ENDPOINT is required"),
+        (("world", "paper-1"), "--listen ENDPOINT is required"),
+        (("agent", "a", "--keys", "{keys}/agent-a"), "--connect ENDPOINT is required"),
         (
             ("agent", "a", "--connect", "tls/127.0.0.1:7447"),
             "needs certificates: --keys DIR, or --config FILE",
