@@ -1,1 +1,1 @@
-"""Puts processes together: scenarios, launching, records, the command line."""
+"""The programs of Tandem: starting processes, reading and writing files, figures, pages, the command line."""

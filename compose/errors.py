@@ -1,35 +1,83 @@
-"""How a command ends."""
+"""The exit statuses of all commands, and the exceptions that stand for a user's mistake."""
+
+from typing import ClassVar
 
 from protocol.messages import Outcome
 
 LOCALISED = 0
+"""The exit status of a mission in which every robot was localised."""
 ENDED = 0
-"""of a process that `tandem run` launched: its mission came to an MissionEnd, whichever"""
+"""The exit status of a process launched by `tandem run` after any MissionEnd, and of a completed command."""
 NOT_LOCALISED = 1
-"""the mission came to its end, otherwise"""
+"""The exit status of a mission that ended with another outcome than `localised` or `failed`."""
 CLEAN = 0
-"""of an audit: nothing was found"""
+"""The exit status of a check that found nothing wrong."""
 VIOLATED = 1
-"""something was"""
+"""The exit status of an audit, a replay or a driver check that found a violation."""
 AMISS = 1
-"""a check of `tandem doctor` failed"""
+"""The exit status of `tandem doctor` if at least one check failed."""
 USER_ERROR = 2
+"""The exit status of every command that was refused because of a user's mistake."""
 FAILED = 3
-"""the run itself was lost"""
+"""The exit status of a run that failed: a process was lost, or a file could not be read or written."""
 BUG = 70
-"""an error of ours, with its traceback"""
+"""The exit status of a command that ended with an unexpected exception; its traceback is printed."""
 BROKEN_PIPE = 141
-"""whoever read the output has gone"""
+"""The exit status of a command whose output was closed by its reader."""
 STOPPED = 130
-"""by Ctrl-C, or a signal to the same effect"""
+"""The exit status of a command that was stopped by Ctrl-C or an equivalent signal."""
 
 
 class UserError(Exception):
-    """A mistake of the user's; its text is one line that names what and where."""
+    """A user's mistake; its text is one line that names the file or the flag, and what is wrong there."""
+
+    exit_status: ClassVar[int] = USER_ERROR
+    """The exit status of the command that raises it."""
+
+
+# --- scenarios --------------------------------------------------------------------------------------
+
+
+class NotToml(UserError):
+    """A file is not valid TOML; the text names the file and the line."""
+
+
+class BadScenario(UserError):
+    """A scenario is invalid; the text names the file, the field and what is wrong."""
+
+
+class Unworkable(BadScenario):
+    """A scenario is well-formed, but no mission is feasible with its parameters; the text says why."""
+
+
+class BadFault(UserError):
+    """A fault of the radio is invalid; the text names the field and what is wrong."""
+
+
+class BadKill(UserError):
+    """A `--kill` or a `[[kill]]` table is invalid; the text shows the expected form or names the field."""
+
+
+# --- sweeps -----------------------------------------------------------------------------------------
+
+
+class BadSpec(UserError):
+    """A sweep file is invalid; the text names the file, the field and what is wrong."""
+
+
+class NoSuchField(UserError):
+    """A field path of a sweep does not exist in the scenario; the text names the part that is missing."""
+
+
+# --- keys -------------------------------------------------------------------------------------------
+
+
+class BadKeys(UserError):
+    """A folder of keys is incomplete, or was not made by `tandem keys`; the text names the file."""
 
 
 def status_of(outcome: Outcome) -> int:
-    """The exit status of a command whose mission ended so."""
+    """Return the exit status of a command whose mission ended with `outcome`."""
     match outcome:
         case "localised":
             return LOCALISED

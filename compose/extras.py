@@ -1,4 +1,4 @@
-"""The installed packages: what Tandem requires, and the extras that some commands need."""
+"""The installed packages: the dependencies of Tandem, and the extras that some commands need."""
 
 from __future__ import annotations
 
@@ -11,23 +11,25 @@ from typing import NamedTuple
 from compose.errors import UserError
 
 PACKAGE = "tandem-ranging"
+"""The name of the distribution."""
 
 _REQUIREMENT = re.compile(r"(?P<name>[\w.-]+)\s*(?P<bounds>[^;]*)(?P<extra>;.*)?")
 _BOUND = re.compile(r"(?P<way>>=|<)(?P<version>[0-9.]+)")
 
 
 class Library(NamedTuple):
-    """A package that every install has."""
+    """One dependency of Tandem."""
 
     name: str
+    """The name of its distribution."""
     version: str | None
-    """none if it is missing"""
+    """The installed version; None if it is missing."""
     bounds: str
-    """as the package says: ">=" and "<" only"""
+    """The versions that Tandem requires, such as ">=2.2,<3"; only ">=" and "<" occur."""
 
     @property
     def fits(self) -> bool:
-        """Whether it is there, within the bounds."""
+        """Whether it is installed in a version within the bounds."""
         return self.version is not None and all(
             (_numbers(self.version) >= _numbers(bound["version"])) == (bound["way"] == ">=")
             for bound in _BOUND.finditer(self.bounds)
@@ -35,7 +37,7 @@ class Library(NamedTuple):
 
 
 def version(package: str = PACKAGE) -> str | None:
-    """Of a package; none if it is not installed."""
+    """Return the installed version of `package`, or None if it is not installed."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
@@ -43,15 +45,15 @@ def version(package: str = PACKAGE) -> str | None:
 
 
 def libraries() -> Iterator[Library]:
-    """What the base install needs; nothing if Tandem itself is not installed."""
+    """Yield the dependencies without extras; none if Tandem itself is not installed."""
     try:
         required = metadata.requires(PACKAGE) or []
     except metadata.PackageNotFoundError:
         return
     for text in required:
-        said = _REQUIREMENT.fullmatch(text)
-        if said is not None and said["extra"] is None:
-            yield Library(said["name"], version(said["name"]), said["bounds"])
+        requirement = _REQUIREMENT.fullmatch(text)
+        if requirement is not None and requirement["extra"] is None:
+            yield Library(requirement["name"], version(requirement["name"]), requirement["bounds"])
 
 
 def _numbers(text: str) -> tuple[int, ...]:
@@ -59,7 +61,7 @@ def _numbers(text: str) -> tuple[int, ...]:
 
 
 def need(*modules: str, extra: str = "lab") -> None:
-    """See to it that these are installed. Raises UserError."""
+    """Raise UserError, which names `extra`, unless all `modules` are installed."""
     missing = [module for module in modules if find_spec(module) is None]
     if missing:
         raise UserError(f"needs {', '.join(missing)}: install `tandem-ranging[{extra}]`")

@@ -1,4 +1,4 @@
-"""How a command reaches the network, as its flags say: --connect, --listen, --config, --keys."""
+"""The network endpoints that the flags --connect, --listen, --config and --keys describe."""
 
 from __future__ import annotations
 
@@ -19,15 +19,18 @@ from protocol.network.endpoints import (
 )
 
 KEYED = "zenoh.json5"
-"""the configuration in a participant's folder, which `tandem keys` makes"""
-
+"""The name of the Zenoh configuration in a participant's folder, which `tandem keys` writes."""
 
 DEFAULT_ADDRESS = "127.0.0.1:7447"
-"""where viewers look for missions"""
+"""The address at which viewers look for missions without --connect."""
 
 
 def reach(options: argparse.Namespace, who: str | None) -> Endpoints:
-    """The endpoints of `who`: "world", "viewer", a robot's "agent-ID", or anybody's. Raises UserError."""
+    """Return the endpoints that the flags describe.
+
+    `who` is the participant that --keys must belong to: "world", "viewer" or "agent-ID"; any if None.
+    Raises UserError.
+    """
     connect, listen = tuple(options.connect), tuple(getattr(options, "listen", ()))
     file = _keyed(options.keys) if options.keys is not None else options.config
     for flag, endpoints in (("--connect", connect), ("--listen", listen)):
@@ -45,7 +48,7 @@ def reach(options: argparse.Namespace, who: str | None) -> Endpoints:
 
 
 def places(options: argparse.Namespace) -> list[Endpoints]:
-    """Where a viewer looks for missions, each of which may be anywhere else. Raises UserError."""
+    """Return the endpoints at each of which a viewer looks for missions. Raises UserError."""
     found = reach(options, access_control.VIEWER)
     if not found.connect:
         return [replace(found, connect=(f"{'tls' if options.keys else 'tcp'}/{DEFAULT_ADDRESS}",))]
@@ -53,6 +56,7 @@ def places(options: argparse.Namespace) -> list[Endpoints]:
 
 
 def _check(flag: str, endpoint: str, *, keyed: bool, configured: bool) -> None:
+    """Check that `endpoint` is valid, and that it fits the flags for certificates. Raises UserError."""
     try:
         check_endpoint(endpoint)
     except BadEndpoint as error:
@@ -60,34 +64,36 @@ def _check(flag: str, endpoint: str, *, keyed: bool, configured: bool) -> None:
     encrypted = is_encrypted(endpoint)
     if keyed and not encrypted:
         raise UserError(
-            f"{flag}: {endpoint} is not encrypted; with --keys it is tls/{endpoint.partition('/')[2]}"
+            f"{flag}: {endpoint} is not encrypted; with --keys, use tls/{endpoint.partition('/')[2]}"
         )
     if encrypted and not configured:
         raise UserError(
-            f"{flag}: {endpoint} takes certificates: --keys DIR, or --config FILE that names them"
+            f"{flag}: {endpoint} needs certificates: --keys DIR, or --config FILE that names them"
         )
 
 
 def _keyed(folder: Path) -> Path:
-    """The configuration in the folder of one participant. Raises UserError."""
+    """Return the path of the configuration in a participant's folder. Raises UserError."""
     try:
-        there = (folder / KEYED).is_file()
+        exists = (folder / KEYED).is_file()
     except OSError as error:
         raise UserError(f"--keys: {folder}: cannot be read: {error.strerror or error}") from None
-    if not there:
+    if not exists:
         within = sorted(path.parent.name for path in folder.glob(f"*/{KEYED}"))
         why = (
-            f"name one of those in it: {', '.join(within)}" if within else "`tandem keys` makes such folders"
+            f"choose one of its folders: {', '.join(within)}"
+            if within
+            else "`tandem keys` creates such folders"
         )
-        raise UserError(f"--keys: {folder} is no participant's folder of keys; {why}")
+        raise UserError(f"--keys: {folder} is not a participant's folder of keys; {why}")
     return folder / KEYED
 
 
 def beyond(endpoints: Endpoints) -> str | None:
-    """What to know about them, if they let in whoever comes."""
+    """Return a warning if other machines can connect without authentication, or None."""
     if not endpoints.exposed:
         return None
     return (
-        f"listening beyond this machine without --keys, at {' and '.join(endpoints.exposed)}: "
-        "whoever reaches it can read and steer the mission"
+        f"listening without --keys at {' and '.join(endpoints.exposed)}: "
+        "every machine that reaches it can read and control the mission"
     )

@@ -414,9 +414,11 @@ def test_a_journal_of_another_version_is_followed_to_where_it_decides_otherwise(
     ended = tandem("figures", folder, "--only", "plan", "--format", "svg")
     assert ended.status == 3
     assert ended.err == (
-        "tandem figures: of b only up to where its journal can be followed: the recorded decision "
-        "at tick 20 differs: another version wrote the journal\n"
-        "tandem figures: no plan-a-b: the journal of b is missing or cannot be replayed to its end\n"
+        "tandem figures: figures of b end where its journal cannot be replayed: the recorded decision "
+        "at tick 20 differs: another version wrote the journal
+"
+        "tandem figures: no plan-a-b: the journal of b is missing or cannot be replayed to its end
+"
     )
 
 
@@ -495,10 +497,10 @@ def test_of_a_record_that_breaks_off_nothing_is_said_to_be_absent(
     copied(paper_1, tmp_path)
     os.truncate(tmp_path / journal, 1000)
     ended = tandem("figures", tmp_path, "--only", "plan", "--only", "encounter", "--format", "svg")
-    assert f"tandem figures: the record of {torn} breaks off before the mission's end\n" in ended.err
+    assert f"tandem figures: the recording of {torn} ends before the mission does\n" in ended.err
     reasons = re.findall(r"no [\w-]+: (.*)", ended.err)
     assert reasons
-    assert all(reason.endswith(" (as far as the record goes)") for reason in reasons)
+    assert all(reason.endswith(" (in the incomplete recording)") for reason in reasons)
 
 
 @pytest.mark.parametrize("words", [("--only", "plans"), ("--format", "jpg")])

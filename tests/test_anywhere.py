@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from compose.errors import BadSpec, Unworkable
 from compose.launch import in_process
-from compose.scenario.scenario_file import ScenarioTemplate, Unworkable, validate
+from compose.scenario.scenario_file import ScenarioTemplate, validate
 from compose.scenario.toml_file import table_in
 from compose.sweep import spec
 from compose.sweep.cells import cells, trial_seed, trial_table
-from compose.sweep.spec import BadSpec
 from protocol.mission import Mission, infeasibility
 from protocol.rounding import TOLERANCE
 from tests.test_hard_starts import assert_localised

@@ -786,7 +786,7 @@ def test_what_is_no_record_is_refused(tmp_path: Path) -> None:
     refused(tandem("audit", tmp_path / "nowhere"), "nowhere contains no recording: there is no world.journal")
     refused(tandem("audit", empty), "empty contains no recording: there is no world.journal")
     refused(tandem("audit", file), "file cannot be read: Not a directory")
-    refused(tandem("audit", ""), "'' is no folder")
+    refused(tandem("audit", ""), "'' is not a path")
 
 
 @pytest.mark.parametrize("name", [WORLD_JOURNAL, A])

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from compose.scenario.scenario_file import BadScenario, parse
+from compose.errors import BadScenario
+from compose.scenario.scenario_file import parse
 from tests.commands import PAPER_1, Ended, several_pairs, tandem, world
 
 LISTEN = ("--listen", "tcp/127.0.0.1:7447")
@@ -363,9 +364,9 @@ def test_an_unknown_scenario_is_refused(
         (["run", "paper-1", "--in-process", "--rate", "2"], "--rate"),
         (["run", "paper-1", "--in-process", "--foxglove", "8765"], "--foxglove: "),
         *((["run", "paper-1", "--foxglove", v], "--foxglove: ") for v in ("-1", "65536", "http")),
-        (["run", "paper-1", "--export"], "--export: there is no --out DIR"),
-        (["run", "paper-1", "--port", "8080"], "--port: of the page, and there is none without --watch"),
-        (["replay", ""], "'' is no folder"),
+        (["run", "paper-1", "--export"], "--export: it needs --out DIR"),
+        (["run", "paper-1", "--port", "8080"], "--port: it needs --watch"),
+        (["replay", ""], "'' is not a path"),
         *((["run", "paper-1", "--rate", v], "--rate: ") for v in ("0", "-1", "nan", "inf", "fast", "1e400")),
         *((["run", "paper-1", "--timeout", v], "--timeout: ") for v in ("0", "-1", "nan", "inf", "x")),
         *((["run", "paper-1", "--seed", v], "--seed: ") for v in ("-1", "1.5", "x", "nan", "²", str(2**63))),
@@ -443,8 +444,8 @@ def test_an_agents_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("command", "says"),
     [
-        (("run", "paper-2"), " holds a record already"),
-        (("run", "paper-2", "--in-process"), " holds a record already"),
+        (("run", "paper-2"), " already contains a recording"),
+        (("run", "paper-2", "--in-process"), " already contains a recording"),
         (("world", "paper-2", *LISTEN), "/world.journal: damaged at byte 0"),
     ],
     ids=["run", "in-process", "world"],

@@ -60,8 +60,8 @@ def test_a_broken_driver_is_told_what_it_breaks(
             "RangesInFeet",
             "wrong  ranges to the anchor are in metres, and agree with the path from the odometry: ",
         ),
-        ("SensesNonsense", "the exercise can be gone through: after 'arc': sense(5): Expected"),
-        ("LosesItsSensors", "the exercise can be gone through: after 'straight': OSError: no such device"),
+        ("SensesNonsense", "the exercise can be completed: after 'arc': sense(5): Expected"),
+        ("LosesItsSensors", "the exercise can be completed: after 'straight': OSError: no such device"),
     ],
 )
 def test_what_is_wrong_is_a_line_and_a_status(broken: str, said: str) -> None:

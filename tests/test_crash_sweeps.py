@@ -15,11 +15,12 @@ import pyarrow.parquet as pq
 import pytest
 from msgspec.structs import replace
 
+from compose.errors import BadScenario
 from compose.launch import in_process
 from compose.launch.processes import ChildFailed
 from compose.recording.run import WORLD_JOURNAL, Recording, agent_journal
 from compose.scenario.kills import POINTS, WORLD, KillTable, drawn
-from compose.scenario.scenario_file import BadScenario, load, parse, validate
+from compose.scenario.scenario_file import load, parse, validate
 from compose.scenario.toml_file import table_in
 from compose.sweep import spec
 from compose.sweep.cells import cells
@@ -156,7 +157,7 @@ def test_a_run_takes_the_kills_of_its_file_and_those_of_the_command_line(tmp_pat
     assert ended.status == 0, ended
     assert [line for line in ended.err.splitlines() if line.startswith("tandem run")] == [
         "tandem run: world was killed at tick 5, and is restarted",
-        "tandem run: --kill b@900: never came",
+        "tandem run: --kill b@900: not reached",
     ]
 
 
@@ -189,7 +190,7 @@ def test_who_starts_nobody_again_refuses_a_scenario_with_kills(tmp_path: Path) -
     says = "mine.toml: kill: --in-process has no processes to kill"
     refused(tandem("run", "mine.toml", "--in-process", cwd=tmp_path), says)
     world = tandem("world", "mine.toml", "--listen", "tcp/127.0.0.1:7447", cwd=tmp_path)
-    refused(world, "mine.toml: kill: a world starts nobody again; `tandem run` does")
+    refused(world, "mine.toml: kill: `tandem world` does not restart processes; use `tandem run`")
 
 
 # --- shipped sweeps --------------------------------------------------------------------------------

@@ -38,7 +38,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from compose.audit.replay import replay
 from compose.cli import export_bar, run
-from compose.cli.main import parser
+from compose.cli.main import parse
 from compose.launch import in_process
 from compose.launch.processes import free_endpoint
 from compose.recording.run import WORLD_JOURNAL, agent_journal, estimates, read
@@ -404,7 +404,7 @@ def test_a_run_tells_its_outcome_though_it_cannot_export(
     monkeypatch.setattr(run, "stop_by_signal", lambda _: None)  # it would affect the process of the tests
     for quiet, said in ((True, ""), (False, "tandem run: not exported: needs no_such_module")):
         words = ["run", "paper-1", "--in-process", "--out", str(tmp_path / str(quiet)), *["-q"] * quiet]
-        assert run.main(parser().parse_args(words)) == 0
+        assert run.main(parse(words)) == 0
         told = capsys.readouterr()
         assert "localised after 48 ticks" in told.out
         assert told.err.startswith(said)
@@ -619,9 +619,9 @@ def test_a_page_s_origin_is_named_as_a_browser_sends_it() -> None:
     for words, complaint in (
         (
             ["--foxglove", "0", "--foxglove-origin", "viewer"],
-            "argument --foxglove-origin: 'viewer' is no origin; ",
+            "argument --foxglove-origin: 'viewer' is not an origin ",
         ),
-        (["--foxglove-origin", "null"], "--foxglove-origin: of a page that shows what --foxglove serves, "),
+        (["--foxglove-origin", "null"], "--foxglove-origin: it needs --foxglove"),
     ):
         ended = tandem("run", "paper-1", *words)
         assert (ended.status, ended.out) == (2, "")

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from compose.errors import NoSuchField
 from compose.launch import in_process
 from compose.scenario.scenario_file import load
 from compose.sweep import axis_figures, execution, spec
 from compose.sweep.cells import RefusedCell, cells, setting_of
-from compose.sweep.field_paths import NoSuchField, steps, with_value
+from compose.sweep.field_paths import steps, with_value
 from compose.sweep.trial import Trial, row
 from protocol.network.inbox import Inbox
 from world.faults import Fault

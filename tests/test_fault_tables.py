@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from compose.scenario.scenario_file import BadScenario, parse
+from compose.errors import BadScenario
+from compose.scenario.scenario_file import parse
 from tests.commands import PAPER_1, SECTION_IV, journals, several_pairs, tandem
 from tests.test_bad_input import refused, refused_scenario
 from world.faults import Fault, LinkSelector

@@ -84,7 +84,7 @@ def both_have_ended(out: Path, robots: dict[str, TandemProcess]) -> None:
     In real time no more is guaranteed. Robots that received every Command in time are localised, too.
     """
     ends = {name: robot.ended() for name, robot in robots.items()}
-    late = any(f"{name}: stood 0 of" not in ended.out for name, ended in ends.items())
+    late = any(f"{name}: missed the deadline in 0 of" not in ended.out for name, ended in ends.items())
     for name, ended in ends.items():
         assert ended.status in OVER, ended.out + ended.err
         assert f"{name}: localised after" in ended.out or (late and f"{name}: undecided after" in ended.out)
@@ -157,7 +157,7 @@ def test_a_robot_whose_agent_is_killed_stands_still_and_goes_on_from_its_record(
         path = tmp_path / killed / f"agent-{killed}.journal"
         robots[killed].until_written(path, 2500)
         os.kill(process_of(tmp_path / killed, "agent", killed), SIGKILL)
-        robots[killed].until_says("was killed by signal 9, and is started again")
+        robots[killed].until_says("was killed by signal 9 and is restarted")
         both_have_ended(tmp_path, robots)
     stood = [
         step

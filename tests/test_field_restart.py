@@ -99,7 +99,7 @@ def test_a_robot_that_is_killed_goes_on_from_its_record(pair: Pair, killed: str,
     before = len(told(tmp_path, killed).steps)
     pair.again(killed)
     all_is_well(tmp_path, pair)
-    assert f"{killed}: in run field, again, from tick " in pair.robots[killed].out
+    assert f"{killed}: in run field, resumed at tick " in pair.robots[killed].out
     assert len(told(tmp_path, killed).steps) > before
 
 

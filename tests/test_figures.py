@@ -338,13 +338,13 @@ def test_a_robot_without_a_journal_is_named_and_the_others_are_drawn(noisy: Path
     (folder / "agent-a.journal").unlink()
     ended = draw(folder)
     assert ended.status == 3
-    assert ended.err == "tandem figures: no picture of a: agent-a.journal is missing\n"
+    assert ended.err == "tandem figures: no figure of a: agent-a.journal is missing\n"
     assert {path.name for path in (folder / "figures").iterdir()} == {"robot-b.svg"}
     (folder / "agent-a.journal").write_bytes(b"\xc1")
     ended = draw(folder)
     assert ended.status == 3
     assert re.fullmatch(
-        r"tandem figures: no picture of a: [^\n]*agent-a.journal: damaged at byte 0[^\n]*\n", ended.err
+        r"tandem figures: no figure of a: [^\n]*agent-a.journal: damaged at byte 0[^\n]*\n", ended.err
     )
 
 

@@ -79,8 +79,8 @@ def test_who_is_there_keeps_the_keys_and_learns_of_who_comes_later(tmp_path: Pat
     before = contents(folder)
     ended = tandem("keys", folder, "--robots", "c")
     assert ended.status == 0
-    assert "made, for 365 days: agent-c\n" in ended.out
-    assert "kept, with their keys and names: router, world, viewer, agent-a, agent-b\n" in ended.out
+    assert "created, valid for 365 days: agent-c\n" in ended.out
+    assert "unchanged: router, world, viewer, agent-a, agent-b\n" in ended.out
     after = contents(folder)
     changed = {name for name in before if after[name] != before[name]}
     assert changed == {f"{name}/{KEYED}" for name in EVERYBODY}
@@ -108,11 +108,14 @@ def test_a_folder_that_is_removed_is_made_anew_by_the_same_authority(tmp_path: P
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--robots", "a,"), "'' is no name"),
+        (("--robots", "a,"), "'' is not a name"),
         (("--robots", "a,b,a"), "names a robot twice"),
-        (("--robots", "../a"), "is no name"),
-        (("--robots", "a" * 33), "more than 32 letters"),
-        (("--robots", "a", "--host", "not a host"), "--host: 'not a host' is neither a name nor an address"),
+        (("--robots", "../a"), "is not a name"),
+        (("--robots", "a" * 33), "more than 32 characters"),
+        (
+            ("--robots", "a", "--host", "not a host"),
+            "--host: 'not a host' is neither a host name nor an IP address",
+        ),
         (("--robots", "a", "--days", "0"), "0 is not from 1 to 36500"),
         ((), "--robots"),
     ],
@@ -399,16 +402,16 @@ def test_a_configuration_may_say_where_to_connect(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("agent", "a"), "--connect ENDPOINT is needed"),
-        (("world", "paper-1"), "--listen ENDPOINT is needed"),
-        (("agent", "a", "--keys", "{keys}/agent-a"), "--connect ENDPOINT is needed"),
+        (("agent", "a"), "--connect ENDPOINT is required"),
+        (("world", "paper-1"), "--listen ENDPOINT is required"),
+        (("agent", "a", "--keys", "{keys}/agent-a"), "--connect ENDPOINT is required"),
         (
             ("agent", "a", "--connect", "tls/127.0.0.1:7447"),
-            "takes certificates: --keys DIR, or --config FILE",
+            "needs certificates: --keys DIR, or --config FILE",
         ),
         (
             ("agent", "a", "--connect", "tcp/127.0.0.1:7447", "--keys", "{keys}/agent-a"),
-            "tcp/127.0.0.1:7447 is not encrypted; with --keys it is tls/127.0.0.1:7447",
+            "tcp/127.0.0.1:7447 is not encrypted; with --keys, use tls/127.0.0.1:7447",
         ),
         (
             ("agent", "b", "--connect", "tls/127.0.0.1:7447", "--keys", "{keys}/agent-a"),
@@ -417,14 +420,14 @@ def test_a_configuration_may_say_where_to_connect(tmp_path: Path) -> None:
         (("watch", "--keys", "{keys}/world"), "world is the folder of world, not of viewer"),
         (
             ("world", "paper-1", "--listen", "tls/127.0.0.1:7447", "--keys", "{keys}"),
-            "name one of those in it: agent-a, agent-b, router, viewer, world",
+            "choose one of its folders: agent-a, agent-b, router, viewer, world",
         ),
         (
             ("watch", "--keys", "nowhere"),
-            "nowhere is no participant's folder of keys; `tandem keys` makes such",
+            "nowhere is not a participant's folder of keys; `tandem keys` creates such",
         ),
         (("watch", "--keys", "{keys}/viewer", "--config", "x"), "not allowed with argument"),
-        (("watch", ".", "--keys", "{keys}/viewer"), "--keys: a record needs no network"),
+        (("watch", ".", "--keys", "{keys}/viewer"), "--keys: a recording needs no network"),
     ],
 )
 def test_flags_that_do_not_go_together_are_told(arguments: tuple[str, ...], words: str, keys: Path) -> None:
@@ -436,7 +439,7 @@ def test_flags_that_do_not_go_together_are_told(arguments: tuple[str, ...], word
 
 def test_who_listens_beyond_this_machine_without_keys_is_warned(keys: Path) -> None:
     where = free_endpoint().replace("127.0.0.1", "0.0.0.0")
-    warning = f"listening beyond this machine without --keys, at {where}: whoever reaches it"
+    warning = f"listening without --keys at {where}: every machine that reaches it"
     with TandemProcess("world", "paper-1", "--listen", where) as world:
         world.until_says("waiting for")
         assert world.err.startswith(f"tandem world: {warning}")

@@ -12,10 +12,11 @@ from msgspec.structs import replace
 from agent.peer import false_reports, peer_state
 from agent.peer.motion_log import MotionLog
 from agent.planning import planner, plausibility
+from compose.errors import BadScenario
 from compose.launch.in_process import play
 from compose.recording.run import Recording
 from compose.recording.summary_json import summary
-from compose.scenario.scenario_file import BadScenario, parse, shipped
+from compose.scenario.scenario_file import parse, shipped
 from protocol.attack import Attack, Kind, Part
 from protocol.messages import Inconsistent, Ranged, Report, Undecided
 from protocol.motion import ORIGIN, Pose, Segment, follow

@@ -40,15 +40,15 @@ def test_a_mission_is_a_line_and_so_is_each_robot_there_or_not(tmp_path: Path) -
     with world("paper-1", "--run", "mine") as (_, endpoint), ExitStack() as stack:
         assert listed(endpoint) == [
             f"mine at {endpoint}, tick 0, missing: a, b",
-            "  a  not there",
-            "  b  not there",
+            "  a  not connected",
+            "  b  not connected",
         ]
         a = stack.enter_context(TandemProcess("agent", "a", "--connect", endpoint, "--out", tmp_path))
         a.until_answered("a", tmp_path)
         assert listed(endpoint) == [
             f"mine at {endpoint}, tick 0, missing: b",
             "  a  tick 0, phase 1, straight",
-            "  b  not there",
+            "  b  not connected",
         ]
 
 
@@ -99,7 +99,7 @@ def test_robots_whose_world_has_gone_are_listed_and_it_is_missing(tmp_path: Path
         a.until_says("the world has gone")
         assert listed(endpoint) == [
             f"mine at {endpoint}, no tick within 2 s, missing: its world",
-            "  a  there, nothing said within 2 s",
+            "  a  connected, no message within 2 s",
         ]
 
 
@@ -211,12 +211,12 @@ def foreign(mission: Played) -> None:
     [
         (running, ["tick 7", "tick 7, phase 2, orbiting"]),
         (over, ["tick 9, over: undecided", "tick 9, phase 3, undecided"]),
-        (alive, ["no tick within 0.5 s", "there, nothing said within 0.5 s"]),
+        (alive, ["no tick within 0.5 s", "connected, no message within 0.5 s"]),
         (
             foreign,
             [
-                f"no tick within 0.5 s, speaks protocol version {VERSION + 1}, this is {VERSION}",
-                "there, nothing said within 0.5 s",
+                f"no tick within 0.5 s, protocol version {VERSION + 1} instead of {VERSION}",
+                "connected, no message within 0.5 s",
             ],
         ),
     ],
@@ -236,7 +236,7 @@ def test_a_peer_of_whom_nothing_is_heard_is_missing() -> None:
         assert listed(endpoint) == [
             f"r at {endpoint}, tick 7, missing: b",
             "  a  tick 7, phase 2, orbiting",
-            "  b  not there",
+            "  b  not connected",
         ]
 
 

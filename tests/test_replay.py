@@ -131,7 +131,7 @@ def test_the_first_difference_is_shown_with_tick_robot_field_and_both_values(rec
         "paper-1: not as recorded",
         f"tick 12, a, Command v: recorded {after.v!r}, recomputed {before.v!r}",
     ]
-    assert lines[2] == "and 1 more, which `tandem audit` tells"
+    assert lines[2] == "and 1 more, which `tandem audit` lists"
 
 
 def test_a_value_is_shown_however_deep_it_stands(recording: Path) -> None:

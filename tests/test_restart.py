@@ -20,9 +20,10 @@ from msgspec.structs import replace
 from agent.process.agent_journal import past
 from agent.process.recovery import remember
 from agent.process.robot import Robot
+from compose.errors import BadKill
 from compose.launch.in_process import play
 from compose.launch.processes import free_endpoint
-from compose.scenario.kills import BadKill, parse
+from compose.scenario.kills import parse
 from compose.scenario.scenario_file import load
 from protocol.journal import journal_file
 from protocol.journal.journal_file import CannotRecord, CorruptJournal, Journal
@@ -125,9 +126,9 @@ def test_a_point_that_never_comes_is_told(undisturbed: Path, tmp_path: Path) -> 
     ended = tandem("run", "paper-1", "-q", "--out", tmp_path / "out", *kills)
     assert ended[:2] == (0, LOCALISED)
     assert sorted(ended.err.splitlines()) == [
-        "tandem run: --kill a@3:report: never came",
-        "tandem run: --kill b@900: never came",
-        "tandem run: --kill world@49:command+never: never came",
+        "tandem run: --kill a@3:report: not reached",
+        "tandem run: --kill b@900: not reached",
+        "tandem run: --kill world@49:command+never: not reached",
     ]
     same(tmp_path / "out", undisturbed)
 
@@ -315,7 +316,7 @@ def test_torn_tails_are_cut_off_told_and_survived(tick: int, undisturbed: Path, 
         file = re.escape(f"{out / part.replace(' ', '-')}.journal")
         said = rf"tandem {part}: {file}: the last \d+ bytes are of a torn write and are cut off"
         assert re.search(said, end.err, re.MULTILINE), ended
-    assert f", again, at tick {tick}: waiting for a, b" in ended["world"].out
+    assert f", resumed at tick {tick}: waiting for a, b" in ended["world"].out
     same(out, undisturbed)
 
 
@@ -332,7 +333,7 @@ def test_a_world_and_an_agent_that_are_killed_go_on_by_the_same_commands(
         agent.until_answered("a", tmp_path)
         agent.tell(SIGKILL)
         agent = folder.enter_context(TandemProcess(*a))
-        agent.until_says("again, from tick 0 on")
+        agent.until_says("resumed at tick 0")
         first.tell(SIGKILL)
         agent.until_says("the world has gone; waiting 30 s for it")
         second = folder.enter_context(TandemProcess(*clock))
@@ -525,7 +526,7 @@ def test_the_worlds_record_of_another_scenario_is_refused(recording: Path) -> No
 def test_an_agents_record_of_another_briefing_is_refused(recording: Path, tmp_path: Path) -> None:
     scenario = tmp_path / "farther.toml"
     scenario.write_text(PAPER_1.replace("anchor = [10.0", "anchor = [10.5"))
-    says = f"{recording / 'agent-a.journal'}: another run's: its briefing is not this world's"
+    says = f"{recording / 'agent-a.journal'}: it is of another run: its RobotConfig differs from this world's"
     with world(scenario) as (_, endpoint):
         refuses(recording, "agent", "a", "--connect", endpoint, says=says)
 
@@ -581,7 +582,7 @@ def test_a_world_that_has_lost_its_record_is_told_so(recording: Path, paper_1: s
 def test_a_run_is_a_new_one(recording: Path) -> None:
     before = journals(recording)
     ended = tandem("run", "paper-1", "--out", recording)
-    refused(ended, f"--out: {recording} holds a record already; choose another folder")
+    refused(ended, f"--out: {recording} already contains a recording; choose another folder")
     assert journals(recording) == before
 
 
@@ -618,7 +619,7 @@ def test_who_has_ended_waits_for_no_world_that_has_gone_however_patient(
         playing, endpoint = stack.enter_context(world("paper-1"))
         reach = ("--connect", endpoint, "--out", tmp_path, "--timeout", "600")
         agent = stack.enter_context(TandemProcess("agent", "a", *reach))
-        agent.until_says("again, from tick 48 on")
+        agent.until_says("resumed at tick 48")
         playing.tell(SIGKILL)
         ended = agent.ended()
     assert (ended.status, ended.out.splitlines()[-1]) == (0, f"a: {LOCALISED.strip()}")

@@ -470,12 +470,12 @@ def test_ctrl_c_ends_the_page_with_somebody_watching(paper_1: Path) -> None:
         (["."], ". contains no recording, no sweep, and no folders with recordings"),
         (
             [".", "--connect", "tcp/127.0.0.1:7447"],
-            "--connect: a record needs no network; leave out one of the two",
+            "--connect: a recording needs no network; give either DIR or --connect",
         ),
         (["--connect", "here"], "--connect: 'here' is not an endpoint; expected one such as tcp/127.0.0.1:7447"),
         (
             [".", "--port", "65536"],
-            "argument --port: 65536 is not a port, from 0 (one that is free) to 65535",
+            "argument --port: 65536 is not a port, which is 0 (any free port) to 65535",
         ),
     ],
 )
@@ -490,14 +490,14 @@ def test_a_port_that_is_taken_is_one_line(paper_1: Path) -> None:
         for command in (["watch", str(paper_1)], ["run", "paper-1", "--watch"]):
             ended = tandem(*command, "--port", port)
             assert ended.status == 2
-            said = f"tandem {command[0]}: --port: {port} cannot be had: Address already in use\n"
+            said = f"tandem {command[0]}: --port: {port} cannot be used: Address already in use\n"
             assert ended.err == said
 
 
 def test_a_page_on_every_address_is_told_of_and_answers_to_addresses_and_to_no_names(paper_1: Path) -> None:
     with TandemProcess("watch", paper_1, "--address", "0.0.0.0") as command:
         command.until_says("until Ctrl-C")
-        assert "tandem watch: --address: whoever reaches 0.0.0.0 can watch\n" in command.err
+        assert "tandem watch: --address: every machine that reaches 0.0.0.0 can watch\n" in command.err
         address = command.out.split()[0]
         assert address.startswith("http://127.0.0.1:")
         with urlopen(address, timeout=BOUND_S) as answer:
@@ -521,8 +521,8 @@ def test_a_page_on_an_address_of_this_machine_answers_to_it(paper_1: Path) -> No
 
 def test_an_address_that_cannot_be_had_is_one_line(paper_1: Path) -> None:
     for address, said in {
-        "192.0.2.1": "--address: 192.0.2.1 cannot be had: Cannot assign requested address",
-        "robot": "argument --address: 'robot' is no address, such as 127.0.0.1 or 0.0.0.0",
+        "192.0.2.1": "--address: 192.0.2.1 cannot be used: Cannot assign requested address",
+        "robot": "argument --address: 'robot' is not an IP address such as 127.0.0.1 or 0.0.0.0",
     }.items():
         ended = tandem("watch", str(paper_1), "--address", address)
         assert (ended.status, ended.out, ended.err) == (2, "", f"tandem watch: {said}\n")

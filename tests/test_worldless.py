@@ -146,7 +146,7 @@ def test_of_one_robot_there_is_what_it_alone_knows(folders: tuple[Path, Path], t
     ended = tandem("figures", tmp_path, "--only", "ranges", "--only", "trajectory", "--format", "png")
     assert ended.status == 3
     assert ended.err.splitlines() == [
-        "tandem figures: no picture of a: agent-a.journal is missing",
+        "tandem figures: no figure of a: agent-a.journal is missing",
         f"tandem figures: no trajectory-a-b: {NO_PLACES}",
     ]
     assert [path.name for path in (tmp_path / "figures").iterdir()] == ["ranges-a-b.png"]
@@ -165,7 +165,7 @@ def test_a_robot_that_was_never_briefed_is_passed_over(folders: tuple[Path, Path
     assert tandem("export", tmp_path).status == 0
     (tmp_path / "agent-a.journal").write_bytes(b"")
     ended = tandem("figures", tmp_path, "--only", "ranges", "--format", "png")
-    nothing = [f"tandem figures: no picture of {robot}: nothing is on record" for robot in "ab"]
+    nothing = [f"tandem figures: no figure of {robot}: the recording has no data" for robot in "ab"]
     assert ended.err.splitlines() == nothing
     ended = tandem("export", tmp_path)
     assert (ended.status, ended.out) == (2, "")

@@ -12,14 +12,17 @@ robots, so that their agents do not take the link for lost.
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
+from contextlib import ExitStack
 from typing import Any
 
 import zenoh
 
 from protocol.messages import Command, FinalReport, GroundTruth, Message, MissionEnd, Observation
-from protocol.network import keys, session
+from protocol.network import diagnosis, keys, session
+from protocol.network.endpoints import Endpoints
 from protocol.network.inbox import NOTHING, Arrival, Inbox
 from protocol.spelling import did_you_mean
 from protocol.wire import MalformedFrame, decode, encode
@@ -339,3 +342,70 @@ class WorldProcess:
                 elif last is not None and last.tick <= end.tick:
                     self._latest[last.robot] = last.tick
             now = time.monotonic()
+
+
+LOOK_AGAIN_S = 0.05
+"""s to wait before trying to reach a router again."""
+
+
+class NoRouter(TimeoutError):
+    """There is no router that the world, as a client, can connect to; the text says why."""
+
+
+class WorldLinks:
+    """The Zenoh sessions of a world, one after another; a context manager that opens the first."""
+
+    def __init__(self, endpoints: Endpoints, timeout: float, inbox: Inbox, busy_timeout: float) -> None:
+        """Wait at most `timeout` s for a router, and `busy_timeout` s for a port in use to become free."""
+        self.endpoints = endpoints
+        self._timeout = timeout
+        self._inbox = inbox
+        self._busy_timeout = busy_timeout
+        self._open = ExitStack()
+
+    def open(self) -> None:
+        """Close the session, if there is one, and open another.
+
+        Raises CannotListen, NoRouter or Interrupted.
+        """
+        self._open.close()
+        give_up = time.monotonic() + self._timeout
+        self.session: zenoh.Session | None = None
+
+        def unanswered() -> None:
+            if time.monotonic() >= give_up:
+                why = diagnosis.why(self.endpoints)
+                raise NoRouter(f"no router at {self.endpoints}; gave up after {self._timeout:g} s: {why}")
+            self._inbox.next(LOOK_AGAIN_S)
+
+        if self.endpoints.connect:
+            later = threading.Timer(diagnosis.FIRST_WORD_S, self._warn_without_link)
+            later.daemon = True
+            later.start()
+            self._open.callback(later.cancel)
+        opened = session.open_session(self.endpoints, unanswered, self._busy_timeout)
+        self.session = self._open.enter_context(opened)
+
+    def _warn_without_link(self) -> None:
+        """Print that no router is connected: a router runs without its peers, a client waits for one."""
+        if self.session is None or not session.linked(self.session):
+            self._inbox.say(f"no router at {self.endpoints} yet: {diagnosis.why(self.endpoints)}")
+
+    def run(self, process: WorldProcess) -> None:
+        """Run `process` to its MissionEnd, over as many sessions as needed. Raises NoRouter or Interrupted."""
+        while True:
+            assert self.session is not None
+            process.attach(self.session, replaceable=self.endpoints.mode == "client")
+            try:
+                process.play()
+            except RobotsLinkLost:
+                self.open()
+            else:
+                return
+
+    def __enter__(self) -> WorldLinks:
+        self.open()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._open.close()

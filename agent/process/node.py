@@ -15,13 +15,15 @@ from collections.abc import Callable
 
 import zenoh
 
-from agent.process.discovery import ASK_AGAIN_S, NoWorld
-from agent.process.link import AgentLink
+from agent.process.discovery import ASK_AGAIN_S, NoWorld, Search, join
+from agent.process.link import AgentLink, WorldLinkLost
 from agent.process.out_of_step import OutOfStep
 from agent.process.recovery import REPORTS_KEPT, REPORTS_TOLD, Memory
 from agent.process.report_buffer import Post
 from agent.process.robot import FramedReport
-from protocol.messages import MissionEnd, Observation
+from protocol.messages import MissionEnd, Observation, RobotConfig
+from protocol.network import session
+from protocol.network.endpoints import Endpoints
 from protocol.network.inbox import Arrival, Inbox
 from protocol.wire import MalformedFrame, decode, encode
 
@@ -307,3 +309,54 @@ class AgentProcess:
                 )
                 gone = False
         return end
+
+
+def run_agent(
+    robot: str,
+    run: str | None,
+    endpoints: Endpoints,
+    search: Search,
+    *,
+    start: Callable[[str, RobotConfig], AgentProcess],
+    on_first_link: Callable[[], None],
+    on_joined: Callable[[str, RobotConfig], None],
+    on_end: Callable[[], None],
+    end: MissionEnd | None = None,
+) -> MissionEnd:
+    """Join a run as `robot`, and take part in it until its MissionEnd, over as many sessions as are needed.
+
+    A session whose link is lost is replaced by a new one. `run` names the run if several may be alive; `end`
+    is the MissionEnd that the robot's journal contains already. `start` returns the process for the run and
+    the configuration that the world has sent. `on_first_link` is called once a session is open, `on_joined`
+    once the process is attached to it, and `on_end` after the MissionEnd, while the session is still open.
+
+    Raises NoWorld if there is no world and no MissionEnd is known; Unwelcome; CannotListen; Interrupted.
+    """
+    process: AgentProcess | None = None
+    linked = False
+    while True:
+        try:
+            unanswered = search.go_on if process is None else process.unanswered
+            with session.open_session(endpoints, unanswered, session.CLOSE_TIMEOUT_S) as link:
+                if not linked:
+                    on_first_link()
+                    linked = True
+                if process is None:
+                    joined = join(link, run, robot, search)
+                    if joined is None:  # a session that has lost its link finds nothing; a new one may
+                        continue
+                    process = start(*joined)
+                    process.attach(link)
+                    on_joined(*joined)
+                else:
+                    process.attach(link)
+                found = process.play()
+                on_end()
+                return found
+        except WorldLinkLost:
+            continue
+        except NoWorld:
+            end = process.end if process is not None else end
+            if end is None:
+                raise
+            return end

@@ -1,29 +1,188 @@
-"""What one word on the command line may be: from its text to a value, or a line that says why not."""
+"""The arguments that several commands share, and the types that turn one word into a value."""
 
 from __future__ import annotations
 
+import argparse
 import ipaddress
 import re
-from argparse import ArgumentTypeError
+from argparse import ArgumentParser, ArgumentTypeError
 from pathlib import Path
 
-from compose.scenario.kills import BadKill, Kill, parse
+from compose.errors import BadKill
+from compose.scenario.kills import Kill, parse
 from protocol.units import NAME
+
+ENDPOINT_EXAMPLE = "tcp/127.0.0.1:7447"
+
+# --- shared arguments -------------------------------------------------------------------------------
+
+
+def add_closing(parser: ArgumentParser, example: str, page: str) -> None:
+    """End the help of a command with an example and the path of its documentation page in the repository."""
+    parser.epilog = f"example:\n  {example}\n\ndocumentation:\n  {page}"
+
+
+def add_scenario(parser: ArgumentParser) -> None:
+    """Add the scenario, and the flags that change it."""
+    parser.add_argument(
+        "scenario",
+        metavar="SCENARIO",
+        help="name of a scenario that ships with Tandem, or path of a TOML file",
+    )
+    parser.add_argument(
+        "--seed",
+        type=natural,
+        metavar="N",
+        help="seed of all random draws, 0 to 2^63 - 1 [default: the scenario's]",
+    )
+    parser.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="FAULT",
+        help="fault of the radio, such as 'a->b: loss=0.3, delay=0..3' (delay in ticks); may be repeated",
+    )
+    parser.add_argument(
+        "--rate",
+        type=positive,
+        metavar="X",
+        help="run in real time, X times as fast as simulated time [default: lockstep, as fast as possible]",
+    )
+
+
+def add_recording(parser: ArgumentParser) -> None:
+    """Add the folder of a finished recording."""
+    parser.add_argument(
+        "recording", type=folder, metavar="DIR", help="folder of a recording, written with --out DIR"
+    )
+
+
+def add_running(parser: ArgumentParser) -> None:
+    """Add the flags of every command that takes part in a mission."""
+    parser.add_argument(
+        "--out",
+        type=folder,
+        metavar="DIR",
+        help="folder to which the recording is written [default: no recording is kept]",
+    )
+    parser.add_argument(
+        "--timeout",
+        type=positive,
+        default=30.0,
+        metavar="S",
+        help="seconds without an answer before the run fails [default: %(default)g]",
+    )
+    parser.add_argument("-q", "--quiet", action="store_true", help="print only the outcome")
+
+
+def add_connection(parser: ArgumentParser) -> None:
+    """Add the flags that name a router and the credentials for it."""
+    parser.add_argument(
+        "--connect",
+        action="append",
+        default=[],
+        metavar="ENDPOINT",
+        help=f"router to connect to, such as {ENDPOINT_EXAMPLE}; may be repeated",
+    )
+    secured = parser.add_mutually_exclusive_group()
+    secured.add_argument(
+        "--keys",
+        type=folder,
+        metavar="DIR",
+        help="encrypt with the certificates in DIR, one of the folders written by `tandem keys`",
+    )
+    secured.add_argument(
+        "--config", type=folder, metavar="FILE", help="Zenoh configuration file to use instead"
+    )
+
+
+def add_listen(parser: ArgumentParser, purpose: str) -> None:
+    """Add `--listen`; `purpose` begins its help."""
+    parser.add_argument(
+        "--listen",
+        action="append",
+        default=[],
+        metavar="ENDPOINT",
+        help=f"{purpose}, such as {ENDPOINT_EXAMPLE}; may be repeated",
+    )
+
+
+def add_connect_timeout(parser: ArgumentParser, target: str) -> None:
+    """Add `--connect-timeout`, the wait for `target`."""
+    parser.add_argument(
+        "--connect-timeout",
+        type=positive,
+        default=60.0,
+        metavar="S",
+        help=f"seconds to wait for {target} before giving up [default: %(default)g]",
+    )
+
+
+def add_fsync(parser: ArgumentParser) -> None:
+    """Add `--fsync`."""
+    parser.add_argument(
+        "--fsync",
+        action="store_true",
+        help="flush every journal write to disk, so that it survives a power cut",
+    )
+
+
+def add_launched(parser: ArgumentParser) -> None:
+    """Add the hidden flag of processes that another command launches."""
+    parser.add_argument("--launched", action="store_true", help=argparse.SUPPRESS)
+
+
+def add_driver_options(parser: ArgumentParser) -> None:
+    """Add the flags that are passed to a driver."""
+    parser.add_argument(
+        "--option",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="option that is passed to the driver; may be repeated",
+    )
+    parser.add_argument(
+        "--rate",
+        type=positive,
+        metavar="X",
+        help="run X times as fast as real time, with a driver that supports it [default: 1]",
+    )
+
+
+def add_listening_time(parser: ArgumentParser) -> None:
+    """Add `--timeout` of the commands that observe missions for a while."""
+    parser.add_argument(
+        "--timeout",
+        type=positive,
+        default=2.0,
+        metavar="S",
+        help="seconds to listen to running missions [default: %(default)g]",
+    )
+
+
+def add_port(parser: ArgumentParser) -> None:
+    """Add the port of the web page."""
+    parser.add_argument(
+        "--port", type=port, metavar="N", help="TCP port of the web page, 0 to 65535 [default: any free port]"
+    )
+
+
+# --- types ------------------------------------------------------------------------------------------
 
 
 def folder(text: str) -> Path:
-    """A folder, there or not."""
+    """Return the path of a file or folder, which need not exist. Raises ArgumentTypeError."""
     try:
         text.encode()
     except UnicodeEncodeError:
-        raise ArgumentTypeError(f"{text!a} is no folder: it is not UTF-8") from None
+        raise ArgumentTypeError(f"{text!a} is not a path: it is not UTF-8") from None
     if not text:
-        raise ArgumentTypeError("'' is no folder")
+        raise ArgumentTypeError("'' is not a path")
     return Path(text).expanduser()
 
 
 def positive(text: str) -> float:
-    """A number above 0."""
+    """Return a number above 0 and below 1e9. Raises ArgumentTypeError."""
     try:
         value = float(text)
     except ValueError:
@@ -34,20 +193,23 @@ def positive(text: str) -> float:
 
 
 def natural(text: str) -> int:
-    """A whole number that fits 63 bits."""
+    """Return an integer from 0 to 2^63 - 1. Raises ArgumentTypeError."""
     if not re.fullmatch(r"[0-9]{1,19}", text) or int(text) >= 2**63:
         raise ArgumentTypeError(f"'{text}' is not a whole number from 0 to 2^63 - 1")
     return int(text)
 
 
 def cell_and_trial(text: str) -> tuple[int, int]:
-    """A cell, 0 where it is left out, and one of its trials, such as 3:17."""
+    """Return the cell and the trial of a text such as 3:17; the cell is 0 if the text is only the trial.
+
+    Raises ArgumentTypeError.
+    """
     cell, _, trial = text.rpartition(":")
     return natural(cell) if cell else 0, natural(trial)
 
 
 def up_to(most: int, text: str) -> int:
-    """A whole number from 1 to `most`."""
+    """Return an integer from 1 to `most`. Raises ArgumentTypeError."""
     value = natural(text)
     if not 0 < value <= most:
         raise ArgumentTypeError(f"{value} is not from 1 to {most}")
@@ -55,62 +217,62 @@ def up_to(most: int, text: str) -> int:
 
 
 def port(text: str) -> int:
-    """Of TCP; 0 is any that is free."""
+    """Return a TCP port; 0 stands for any free port. Raises ArgumentTypeError."""
     value = natural(text)
     if value >= 1 << 16:
-        raise ArgumentTypeError(f"{value} is not a port, from 0 (one that is free) to 65535")
+        raise ArgumentTypeError(f"{value} is not a port, which is 0 (any free port) to 65535")
     return value
 
 
 def origin(text: str) -> str:
-    """The origin of a web page, as a browser sends it."""
+    """Return the origin of a web page, as a browser sends it. Raises ArgumentTypeError."""
     if text != "null" and not re.fullmatch(r"[a-z][a-z0-9+.-]*://[A-Za-z0-9.\[\]:-]*", text):
-        raise ArgumentTypeError(f"'{text}' is no origin; one looks like https://viewer.example:8080")
+        raise ArgumentTypeError(f"'{text}' is not an origin such as https://viewer.example:8080")
     return text
 
 
 def address(text: str) -> str:
-    """Of IP."""
+    """Return an IP address in its canonical form. Raises ArgumentTypeError."""
     try:
         return str(ipaddress.ip_address(text))
     except ValueError:
-        raise ArgumentTypeError(f"'{text}' is no address, such as 127.0.0.1 or 0.0.0.0") from None
+        raise ArgumentTypeError(f"'{text}' is not an IP address such as 127.0.0.1 or 0.0.0.0") from None
 
 
 def count(text: str) -> int:
-    """Of what there can be a thousand of."""
+    """Return an integer from 1 to 1000. Raises ArgumentTypeError."""
     return up_to(1000, text)
 
 
 def trials(text: str) -> int:
-    """Of a cell."""
+    """Return the trials per cell, an integer from 1 to 10^7. Raises ArgumentTypeError."""
     return up_to(10**7, text)
 
 
 def name(text: str) -> str:
-    """Of a robot or a run."""
+    """Return the name of a robot or a run. Raises ArgumentTypeError."""
     if not re.search(NAME, text):
-        raise ArgumentTypeError(f"'{text}' is no name: letters, digits, - and _ only")
+        raise ArgumentTypeError(f"'{text}' is not a name, which consists of letters, digits, - and _")
     return text
 
 
 def names(text: str) -> tuple[str, ...]:
-    """Of robots, with commas between."""
+    """Return the names of robots from a text in which commas separate them. Raises ArgumentTypeError."""
     found = tuple(name(one) for one in text.split(","))
     if len(set(found)) < len(found):
         raise ArgumentTypeError(f"'{text}' names a robot twice")
     if any(len(one) > 32 for one in found):
-        raise ArgumentTypeError(f"'{text}' has a name of more than 32 letters")
+        raise ArgumentTypeError(f"'{text}' has a name of more than 32 characters")
     return found
 
 
 def days(text: str) -> int:
-    """Up to a hundred years."""
+    """Return a number of days, 1 to 36500. Raises ArgumentTypeError."""
     return up_to(36_500, text)
 
 
 def kill(text: str) -> Kill:
-    """Who is killed, and when."""
+    """Return the kill that `text` describes, such as a@17:report+5s. Raises ArgumentTypeError."""
     try:
         return parse(text)
     except BadKill as error:

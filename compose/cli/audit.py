@@ -1,4 +1,4 @@
-"""`tandem audit`: whether a record keeps the rules."""
+"""`tandem audit`: check a recording against the rules of the world, the planner and the protocol."""
 
 from __future__ import annotations
 
@@ -8,17 +8,24 @@ from msgspec.structs import astuple
 
 from compose.audit.findings import Findings, LinkStatistics
 from compose.audit.rules import audit
+from compose.cli.arguments import add_closing, add_recording
 from compose.errors import CLEAN, VIOLATED
 from compose.recording.run import legible
 from compose.terminal import text_width
 from protocol.output import say
 
 SHOWN = 20
-"""violations that are told in full"""
+"""The number of violations that are printed in full."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `tandem audit`."""
+    add_recording(parser)
+    add_closing(parser, "tandem audit recording", "docs/recordings.md")
 
 
 def main(options: argparse.Namespace) -> int:
-    """Judge the record, and say what there is to find."""
+    """Audit the recording, print the findings, and return VIOLATED if a rule is violated."""
     with legible(options.recording):
         findings = audit(options.recording)
     _show(findings)
@@ -31,7 +38,7 @@ def _show(findings: Findings) -> None:
     for one in findings.counts:
         say(f"{one.rule:10}{one.checks:>8}{one.violations:>12}")
     if findings.links:
-        from compose.terminal import tables  # noqa: PLC0415  # rich takes time to import
+        from compose.terminal import tables  # noqa: PLC0415  # rich is slow to import
 
         rows = [[str(value) for value in astuple(link)] for link in findings.links]
         made = tables.table(["link"], LinkStatistics.__struct_fields__[1:], rows)

@@ -1,7 +1,7 @@
-"""`tandem bench`: speed, each figure against the bare thing in the same run.
+"""`tandem bench`: measure speed, and compare each figure with a baseline measured in the same run.
 
-Absolute times depend on the machine and its mood; the ratios much less. Everything is repeated in turns,
-A B A B, and the medians are compared.
+Absolute times depend on the machine and its load; ratios depend on them much less. All measurements are
+interleaved (A B A B), and their medians are compared.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 from agent.process.robot import Robot
+from compose.cli.arguments import add_closing, count
 from compose.errors import LOCALISED
 from compose.extras import need
 from compose.launch import in_process, processes, zenoh_baseline
@@ -45,21 +46,21 @@ from world.scenario import Scenario
 from world.simulation import Course
 
 MISSION = "far"
-"""thousands of ticks, so that starting is no part of what is timed"""
+"""A scenario of thousands of ticks, so that the start of the processes does not affect the rate."""
 BARRIER_TICKS = 5000
-"""about as many as the mission's"""
+"""The number of ticks of the baseline, about as many as the mission has."""
 MISSIONS = 200
-"""random missions a round, in-process"""
+"""The number of random missions per round, in one process."""
 SEED = 1000
-"""of the first of them"""
+"""The seed of the first of them."""
 NOISY_SIGMA = 0.1
-"""m"""
+"""The standard deviation of all ranges in the noisy missions (m)."""
 NOISY_MISSIONS = 20
-"""random missions with such ranges a round, in-process"""
+"""The number of random missions with such ranges per round, in one process."""
 ROBOTS = 200
-"""in many pairs"""
+"""The number of robots in the scenario of many pairs."""
 STARTED = 20
-"""robots that only start, and end: enough for the CPU of one"""
+"""The number of robots from whose start and end the CPU time of one robot is computed."""
 MANY_MISSION = """
 [mission]
 sensing_range = 3.0
@@ -67,12 +68,25 @@ period = 1.0
 max_speed = 1.0
 max_turn_rate = 3.141592653589793
 """
-"""that of the paper's section IV"""
+"""The mission of section IV of the paper, as TOML."""
 BARE_IMPORTS = "import zenoh, numpy, scipy.optimize, msgspec"
+"""The program whose run time is the baseline of `tandem run`: the imports of Tandem's dependencies."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `tandem bench`."""
+    parser.add_argument(
+        "--rounds",
+        type=count,
+        default=5,
+        metavar="N",
+        help="repetitions of each measurement, 1 to 1000 [default: %(default)s]",
+    )
+    add_closing(parser, "tandem bench --rounds 10", "README.md")
 
 
 def main(options: argparse.Namespace) -> int:
-    """Measure and print."""
+    """Run all measurements, and print one table for each group."""
     need("cryptography", extra="deploy")
     rounds = options.rounds
     parts = (_ticks, _missions, _noisy, _start, _many)
@@ -87,29 +101,29 @@ def main(options: argparse.Namespace) -> int:
 
 
 def _ticks(rounds: int, done: Callable[[], None]) -> Table:
-    """A mission as processes, against the bare barrier."""
-    played = scenario_file.load(MISSION)
-    sizes = _frame_sizes(played)
+    """Measure a mission as processes; the baseline only exchanges frames of the same size over Zenoh."""
+    scenario = scenario_file.load(MISSION)
+    sizes = _frame_sizes(scenario)
     missions: list[float] = []
     bare: list[float] = []
     watched: list[float] = []
     secured: list[float] = []
     barriers: list[float] = []
     for _ in range(rounds):
-        missions.append(_mission_rate(played))
-        bare.append(_mission_rate(played, journals=False))
-        watched.append(_mission_rate(played, watched=True))
-        secured.append(_mission_rate(played, secured=True))
-        barriers.append(_barrier_rate(played, sizes))
+        missions.append(_mission_rate(scenario))
+        bare.append(_mission_rate(scenario, journals=False))
+        watched.append(_mission_rate(scenario, watched=True))
+        secured.append(_mission_rate(scenario, secured=True))
+        barriers.append(_barrier_rate(scenario, sizes))
         done()
     table = _table("Ticks/s as processes, two robots")
     _row(table, f"a mission ({MISSION}), with journals", missions, "ticks/s")
     _row(table, "the same, without journals", bare, "ticks/s")
-    _row(table, "the same, and somebody watches the page", watched, "ticks/s")
+    _row(table, "the same, with a client of the page", watched, "ticks/s")
     _row(table, "the same, over TLS with access control", secured, "ticks/s")
-    _row(table, f"the bare barrier, frames of {sizes[0]} and {sizes[1]} bytes", barriers, "ticks/s")
+    _row(table, f"baseline: frames of {sizes[0]} and {sizes[1]} bytes", barriers, "ticks/s")
     ratios = [mission / one for mission, one in zip(missions, barriers, strict=True)]
-    _row(table, "mission / barrier (at least 0.5)", ratios, "")
+    _row(table, "mission / baseline (at least 0.5)", ratios, "")
     ratios = [mission / without for mission, without in zip(missions, bare, strict=True)]
     _row(table, "with journals / without (at least 0.85)", ratios, "")
     ratios = [with_page / mission for with_page, mission in zip(watched, missions, strict=True)]
@@ -119,12 +133,12 @@ def _ticks(rounds: int, done: Callable[[], None]) -> Table:
     return table
 
 
-def _frame_sizes(played: Scenario) -> tuple[int, int]:
-    """Bytes of a typical Observation, and of a typical Command."""
-    course = Course(played)
+def _frame_sizes(scenario: Scenario) -> tuple[int, int]:
+    """Return the median sizes of an Observation and of a Command (bytes)."""
+    course = Course(scenario)
     observations: list[int] = []
     commands: list[int] = []
-    for moment in in_process.play(played).moments:
+    for moment in in_process.play(scenario).moments:
         observations += [len(encode(observation)) for observation in course.observations()]
         commands += [len(encode(command)) for command in moment.commands.values()]
         course.command(moment.commands)
@@ -133,7 +147,10 @@ def _frame_sizes(played: Scenario) -> tuple[int, int]:
 
 @contextmanager
 def _processes(arguments: Sequence[Sequence[str]], *, until_ended: bool = False) -> Iterator[None]:
-    """Processes, for as long as it takes."""
+    """Run processes of Python, each `python -m` with its arguments, and kill them at the end.
+
+    With `until_ended`, wait at most STOP_S for each to end first.
+    """
     command = [sys.executable, "-P", "-m"]
     children = [subprocess.Popen([*command, *one], stdout=subprocess.DEVNULL) for one in arguments]
     try:
@@ -147,47 +164,51 @@ def _processes(arguments: Sequence[Sequence[str]], *, until_ended: bool = False)
 
 
 def _mission_rate(
-    played: Scenario, *, journals: bool = True, watched: bool = False, secured: bool = False
+    scenario: Scenario, *, journals: bool = True, watched: bool = False, secured: bool = False
 ) -> float:
-    """As processes; `watched`: beside a page, and somebody who looks at it."""
+    """Return the ticks per second of a mission as processes.
+
+    With `watched`, a page is served and a client reads it; with `secured`, all links are encrypted.
+    """
     with ExitStack() as stack:
-        endpoints, keyed = _endpoints(played, secured, stack)
+        endpoints, keyed = _endpoints(scenario, secured, stack)
         folder = stack.enter_context(tempfile.TemporaryDirectory())
-        visitors = []
+        clients = []
         if watched:
             page = stack.enter_context(beside(*page_on(Path(folder), 0)))
-            visitors.append(["compose.view.web.page_client", page.address])
+            clients.append(["compose.view.web.page_client", page.address])
         common = ["--connect", str(endpoints), "--quiet", *(["--out", folder] if journals else [])]
-        robots = [["compose.cli", "agent", robot.id, *keyed(robot.id), *common] for robot in played.robots]
+        robots = [["compose.cli", "agent", robot.id, *keyed(robot.id), *common] for robot in scenario.robots]
         with (
-            _processes(visitors),
+            _processes(clients),
             _processes(robots, until_ended=True),
             session.open_router(endpoints) as link,
             Journal(Path(folder) / run.WORLD_JOURNAL) if journals else nullcontext() as journal,
         ):
-            process = WorldProcess(Course(played, journal), "bench", Inbox("tandem bench"))
+            process = WorldProcess(Course(scenario, journal), "bench", Inbox("tandem bench"))
             process.attach(link)
             end = process.play()
             return end.tick / process.playing_s
 
 
 def _endpoints(
-    played: Scenario, secured: bool, stack: ExitStack
+    scenario: Scenario, secured: bool, stack: ExitStack
 ) -> tuple[Endpoints, Callable[[str], list[str]]]:
-    """Where the world listens, and by which flags a robot reaches it."""
+    """Return the world's endpoints, and a function from a robot's id to the flags with its keys."""
     if not secured:
         return listening(processes.free_endpoint()), lambda _: []
-    from compose.security import certificates  # noqa: PLC0415  # there may be no such library
+    from compose.security import certificates  # noqa: PLC0415  # the library is optional
 
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tandem-keys-")))
-    certificates.make(folder, [robot.id for robot in played.robots], (), 1)
+    certificates.make(folder, [robot.id for robot in scenario.robots], (), 1)
     endpoints = configured(folder / "world" / KEYED, listen=[processes.free_endpoint("tls")])
     return endpoints, lambda robot: ["--keys", str(folder / access_control.agent(robot))]
 
 
-def _barrier_rate(played: Scenario, sizes: tuple[int, int]) -> float:
+def _barrier_rate(scenario: Scenario, sizes: tuple[int, int]) -> float:
+    """Return the ticks per second of the baseline, with frames of `sizes` bytes."""
     endpoint = processes.free_endpoint()
-    ids = [robot.id for robot in played.robots]
+    ids = [robot.id for robot in scenario.robots]
     robots = [
         ["compose.launch.zenoh_baseline", endpoint, one, str(sizes[1]), str(BARRIER_TICKS)] for one in ids
     ]
@@ -199,7 +220,7 @@ def _barrier_rate(played: Scenario, sizes: tuple[int, int]) -> float:
 
 
 def _missions(rounds: int, done: Callable[[], None]) -> Table:
-    """Random missions in-process on one core, and how much of them is the world's."""
+    """Measure random missions in one process on one core, the world's share of them, and their audit."""
     scenarios = [scenario_file.load("random", seed=SEED + i) for i in range(MISSIONS)]
     whole: list[float] = []
     world_part: list[float] = []
@@ -210,7 +231,7 @@ def _missions(rounds: int, done: Callable[[], None]) -> Table:
         for one in scenarios:
             in_process.play(one)
         whole.append(time.perf_counter() - began)
-        world_part.append(sum(_world_alone(in_process.play(one)) for one in scenarios))
+        world_part.append(sum(_world_s(in_process.play(one)) for one in scenarios))
         began = time.perf_counter()
         for one in scenarios:
             run_in_process(one, audit=True)
@@ -218,18 +239,18 @@ def _missions(rounds: int, done: Callable[[], None]) -> Table:
         done()
     table = _table("In-process, one core")
     _row(table, f"{MISSIONS} random missions (at least 300)", [MISSIONS / s for s in whole], "missions/s")
-    _row(table, f"a tick, of {ticks / MISSIONS:.1f} a mission", [1e6 * s / ticks for s in whole], "us")
-    _row(table, "of which the world", [1e6 * s / ticks for s in world_part], "us")
+    _row(table, f"one tick ({ticks / MISSIONS:.1f} per mission)", [1e6 * s / ticks for s in whole], "us")
+    _row(table, "of that, the world", [1e6 * s / ticks for s in world_part], "us")
     _row(table, "the same missions, audited", [MISSIONS / s for s in audited], "missions/s")
-    _row(table, "of those without", [plain / s for plain, s in zip(whole, audited, strict=True)], "")
+    _row(table, "audited / not audited", [plain / s for plain, s in zip(whole, audited, strict=True)], "")
     return table
 
 
-def _world_alone(played: run.Recording) -> float:
-    """Seconds that the same run takes with the robots' answers given."""
+def _world_s(recording: run.Recording) -> float:
+    """Return the time (s) that the world takes to run `recording` again with the recorded Commands."""
     began = time.perf_counter()
-    course = Course(played.scenario)
-    for moment in played.moments:
+    course = Course(recording.scenario)
+    for moment in recording.moments:
         course.observations()
         course.command(moment.commands)
     return time.perf_counter() - began
@@ -239,7 +260,7 @@ def _world_alone(played: run.Recording) -> float:
 
 
 def _noisy(rounds: int, done: Callable[[], None]) -> Table:
-    """Random missions with ranges of NOISY_SIGMA in-process on one core, and where their time goes."""
+    """Measure random missions with range noise of NOISY_SIGMA in one process on one core, by their parts."""
     noise = Noise(anchor_sigma=NOISY_SIGMA, mutual_sigma=NOISY_SIGMA)
     scenarios = [
         _with_noise(scenario_file.load("random", seed=SEED + i), noise) for i in range(NOISY_MISSIONS)
@@ -250,13 +271,16 @@ def _noisy(rounds: int, done: Callable[[], None]) -> Table:
         done()
     table = _table(f"In-process, one core, ranges of sigma {NOISY_SIGMA:g} m")
     scale = 1e3 / NOISY_MISSIONS
-    _row(table, "a mission, both robots (at most 150)", [scale * sum(part) for part in parts], "ms")
-    for k, what in enumerate(("phases 1 and 2, each with its anchor", "phase 3, with the peer", "the world")):
-        _row(table, f"of which {what}", [scale * part[k] for part in parts], "ms")
+    _row(table, "one mission, both robots (at most 150)", [scale * sum(part) for part in parts], "ms")
+    for k, what in enumerate(
+        ("observations (phases 1 and 2)", "decisions in contact (phase 3)", "the world")
+    ):
+        _row(table, f"of that, {what}", [scale * part[k] for part in parts], "ms")
     return table
 
 
 def _with_noise(exact: Scenario, noise: Noise) -> Scenario:
+    """Return `exact` with `noise`, and with the orbits and the tick budget that follow from it."""
     mission = replace(exact.mission, noise=noise)
     first, second = (robot.anchor for robot in exact.robots)
     plan = rendezvous(mission, math.dist((first.x, first.y), (second.x, second.y)), exact.planner_name)
@@ -265,7 +289,7 @@ def _with_noise(exact: Scenario, noise: Noise) -> Scenario:
 
 
 def _parts(scenarios: Sequence[Scenario]) -> tuple[float, float, float]:
-    """s: that the robots take to fold in what they sense, and to decide once in contact; and the world."""
+    """Return the time (s) of the robots' observations, of their decisions, and of the world."""
     sensing = deciding = world = 0.0
     for one in scenarios:
         course = Course(one)
@@ -275,15 +299,15 @@ def _parts(scenarios: Sequence[Scenario]) -> tuple[float, float, float]:
             began = time.perf_counter()
             observations = course.observations()
             sensed = time.perf_counter()
-            told = {
+            own_reports = {
                 observation.robot: robots[observation.robot].observation(observation)
                 for observation in observations
             }
-            heard = time.perf_counter()
+            observed = time.perf_counter()
             commands = {}
             for observation in observations:
                 reports = [
-                    told[contact.peer] for contact in observation.contacts for _ in contact.heard or ()
+                    own_reports[contact.peer] for contact in observation.contacts for _ in contact.heard or ()
                 ]
                 commands[observation.robot] = robots[observation.robot].decide(
                     [one for one in reports if one is not None]
@@ -291,8 +315,8 @@ def _parts(scenarios: Sequence[Scenario]) -> tuple[float, float, float]:
             decided = time.perf_counter()
             end = course.command(commands)
             world += sensed - began + time.perf_counter() - decided
-            sensing += heard - sensed
-            deciding += decided - heard
+            sensing += observed - sensed
+            deciding += decided - observed
     return sensing, deciding, world
 
 
@@ -300,7 +324,7 @@ def _parts(scenarios: Sequence[Scenario]) -> tuple[float, float, float]:
 
 
 def _start(rounds: int, done: Callable[[], None]) -> Table:
-    """The whole of `tandem run paper-1 -q`, against a process that only imports what it stands on."""
+    """Measure `tandem run paper-1 -q`; the baseline is a process that only imports the dependencies."""
     command = [sys.executable, "-P", "-m", "compose.cli", "run", "paper-1", "-q"]
     bare = [sys.executable, "-c", BARE_IMPORTS]
     runs: list[float] = []
@@ -317,6 +341,7 @@ def _start(rounds: int, done: Callable[[], None]) -> Table:
 
 
 def _wall(command: Sequence[str]) -> float:
+    """Return the wall time (s) of a command. Raises CalledProcessError if it fails."""
     began = time.perf_counter()
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     return time.perf_counter() - began
@@ -326,7 +351,7 @@ def _wall(command: Sequence[str]) -> float:
 
 
 def _many(rounds: int, done: Callable[[], None]) -> Table:
-    """The whole of `tandem run` with ROBOTS robots, against one process; and what a robot's start costs."""
+    """Measure `tandem run` with ROBOTS robots, as processes and in one, and the CPU time of one robot."""
     many_processes: list[float] = []
     one: list[float] = []
     starts: list[float] = []
@@ -350,7 +375,7 @@ def _many(rounds: int, done: Callable[[], None]) -> Table:
 
 
 def _pairs(robots: int) -> str:
-    """A scenario of so many robots, each pair on a line of its own."""
+    """Return a scenario file of so many robots, in which each pair has its own line in the plane."""
     tables = [
         f'[[robot]]\nid = "r{i}"\npeer = "r{i ^ 1}"\nanchor = [{10.0 * (i % 2)}, {40.0 * (i // 2)}]\n'
         for i in range(robots)
@@ -359,7 +384,7 @@ def _pairs(robots: int) -> str:
 
 
 def _used(arguments: Sequence[str]) -> tuple[float, float]:
-    """Seconds of wall time and of CPU that the command takes, with all its processes."""
+    """Return the wall time and the CPU time (s) of a `tandem` command with all its processes."""
     began, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
     command = [sys.executable, "-P", "-m", "compose.cli", *arguments]
     subprocess.run(command, check=False, stdout=subprocess.DEVNULL)
@@ -372,6 +397,7 @@ def _used(arguments: Sequence[str]) -> tuple[float, float]:
 
 
 def _table(title: str) -> Table:
+    """Return an empty table with columns for the median, the least and the greatest value, and the unit."""
     table = Table(title=title, title_justify="left")
     table.add_column("")
     for heading in ("median", "from", "to"):
@@ -381,4 +407,5 @@ def _table(title: str) -> Table:
 
 
 def _row(table: Table, what: str, values: Sequence[float], unit: str) -> None:
+    """Add the row `what` to `table`."""
     table.add_row(what, *[f"{value:.4g}" for value in (median(values), min(values), max(values))], unit)

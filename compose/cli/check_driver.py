@@ -1,10 +1,11 @@
-"""`tandem check-driver`: a driver, tried against the contract; the robot moves."""
+"""`tandem check-driver`: check a driver against its contract, docs/driver.md; the robot moves."""
 
 from __future__ import annotations
 
 import argparse
 from contextlib import closing
 
+from compose.cli.arguments import add_closing, add_driver_options, name
 from compose.errors import CLEAN, VIOLATED
 from compose.hardware.conformance import judged
 from compose.hardware.exercise import Broken, ExerciseRun
@@ -14,10 +15,27 @@ from compose.terminal import text_width
 from protocol.output import one_line, say
 
 MARKED = len("wrong  ")
+"""The width of the mark before each check."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `tandem check-driver`."""
+    parser.add_argument("driver", metavar="MODULE:CLASS", help="driver of the robot's wheels and sensors")
+    parser.add_argument(
+        "--mission",
+        default="paper-1",
+        metavar="FILE",
+        help="scenario that gives the robot's limits: a name or a TOML file [default: %(default)s]",
+    )
+    parser.add_argument(
+        "--robot", type=name, default="a", metavar="ID", help="robot of that scenario [default: %(default)s]"
+    )
+    add_driver_options(parser)
+    add_closing(parser, "tandem check-driver docs.rover:Rover --rate 10", "docs/driver.md")
 
 
 def main(options: argparse.Namespace) -> int:
-    """Go through the exercise, and say of each check whether it holds."""
+    """Run the exercise, print the result of each check, and return VIOLATED if one failed."""
     scenario = mission(options.mission, options.robot)
     rate = options.rate or 1.0
     check_rate(scenario, rate)
@@ -30,7 +48,7 @@ def main(options: argparse.Namespace) -> int:
             trial.go_through()
         except Broken as broken:
             where = trial.tries[-1].what if trial.tries else "the start"
-            say(f"wrong  the exercise can be gone through: after '{where}': {broken}")
+            say(f"wrong  the exercise can be completed: after '{where}': {broken}")
             return VIOLATED
     found = judged(trial)
     for one in found:

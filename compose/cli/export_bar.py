@@ -1,4 +1,4 @@
-"""An export as commands make it: with a bar, and no longer than until they are told to stop."""
+"""An export with a progress bar, which a signal stops."""
 
 from __future__ import annotations
 
@@ -13,12 +13,15 @@ if TYPE_CHECKING:
     from compose.view.export.folder import Exported
 
 MODULES = ("foxglove", "pyarrow")
-"""that it needs; whoever calls has made sure of them"""
+"""The optional libraries that an export needs; the caller checks that they are installed."""
 
 
 def exported(folder: Path, out: Path, inbox: Inbox, *, quiet: bool = False) -> Exported:
-    """What `compose.view.export.folder.export` does. Raises UserError; Interrupted when `inbox` says so."""
-    from compose.view.export.folder import FILES, export  # noqa: PLC0415  # slow, and there may be no extra
+    """Export the recording in `folder` to `out`, with a progress bar unless `quiet`.
+
+    Raises UserError if a file cannot be read or written, and Interrupted if `inbox` stops the export.
+    """
+    from compose.view.export.folder import FILES, export  # noqa: PLC0415  # slow to import, and optional
 
     with legible(folder), counting("tandem export", 0 if quiet else len(FILES)) as done:
         return export(folder, out, done=done, check=lambda: inbox.next(0.0))

@@ -1,4 +1,4 @@
-"""`tandem figures`: pictures of a record."""
+"""`tandem figures`: draw the figures of a recording."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from compose.cli.arguments import add_closing, add_recording
 from compose.errors import ENDED, FAILED, UserError
 from compose.extras import need
 from compose.figures import FORMATS, PICTURES
@@ -21,8 +22,30 @@ if TYPE_CHECKING:
     from compose.figures.pair import PairRecord
 
 
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `tandem figures`."""
+    add_recording(parser)
+    parser.add_argument(
+        "--only",
+        action="append",
+        choices=PICTURES,
+        metavar="NAME",
+        help=f"draw only this figure; may be repeated [default: all of {', '.join(PICTURES)}]",
+    )
+    parser.add_argument(
+        "--format",
+        action="append",
+        choices=FORMATS,
+        help=f"write only this format; may be repeated [default: all of {', '.join(FORMATS)}]",
+    )
+    add_closing(parser, "tandem figures recording --only encounter --format svg", "docs/recordings.md")
+
+
 def main(options: argparse.Namespace) -> int:
-    """Draw each pair of the record; FAILED if a robot has left no journal that can be followed to its end."""
+    """Draw each pair of the recording into DIR/figures.
+
+    Return FAILED if the journal of a robot is missing or cannot be replayed to its end.
+    """
     need("matplotlib")
     with legible(options.recording):
         recording = None if alone(options.recording) else read(options.recording)
@@ -43,10 +66,10 @@ def main(options: argparse.Namespace) -> int:
             torn = [name for name, one in accounts.items() if one.past is not None and one.past.end is None]
             torn += ["the world"] if recording is not None and recording.end is None else []
             if torn:
-                _say(f"the record of {' and '.join(torn)} breaks off before the mission's end")
+                _say(f"the recording of {' and '.join(torn)} ends before the mission does")
             pair = _pair(recording, robots, accounts)
             if pair is None:
-                _say(f"no picture of {' and '.join(robots)}: nothing is on record")
+                _say(f"no figure of {' and '.join(robots)}: the recording has no data")
                 status = FAILED
                 continue
             try:
@@ -59,7 +82,7 @@ def main(options: argparse.Namespace) -> int:
 
 
 def _casts(folder: Path, recording: Recording | None) -> list[tuple[str, ...]]:
-    """The robots of each pair, a first; of one that has left a journal, where there was no world."""
+    """Return the robots of each pair, role a first; in hardware mode, only those with a journal."""
     if recording is None:
         return casts(folder)
     robots = recording.scenario.robots
@@ -69,14 +92,14 @@ def _casts(folder: Path, recording: Recording | None) -> list[tuple[str, ...]]:
 def _pair(
     recording: Recording | None, robots: Sequence[str], accounts: Mapping[str, Account]
 ) -> PairRecord | None:
-    """None of those of whom nothing is known."""
+    """Return the data of a pair, or None if there is no journal of either robot."""
     from compose.figures.pair import of_record, of_robots  # noqa: PLC0415
 
     if recording is not None:
         places = {robot.id: place for place, robot in enumerate(recording.scenario.robots)}
         return of_record(recording, (places[robots[0]], places[robots[1]]), accounts)
-    told = {robot: account for robot, account in accounts.items() if account.past is not None}
-    return of_robots(told) if told else None
+    known = {robot: account for robot, account in accounts.items() if account.past is not None}
+    return of_robots(known) if known else None
 
 
 def draw(
@@ -88,10 +111,10 @@ def draw(
     *,
     torn: bool,
 ) -> None:
-    """Print a line for each file that is written, and for each picture that does not apply.
+    """Draw the figures of `kinds`; print a line for each file, and for each figure that does not apply.
 
-    `done` is called after each kind. `torn`: the record breaks off, and what it lacks may have happened.
-    Raises OSError.
+    `done` is called after each kind. `torn` states that the recording is incomplete, so that an event that it
+    lacks may have happened. Raises OSError.
     """
     from compose.figures import catalogue, style  # noqa: PLC0415
     from compose.figures.sheet import Absent  # noqa: PLC0415
@@ -101,7 +124,7 @@ def draw(
         with catalogue.settings(kind):
             for name, figure in catalogue.pictures(pair, kind):
                 if isinstance(figure, Absent):
-                    _say(f"no {name}: {figure.why}{' (as far as the record goes)' if torn else ''}")
+                    _say(f"no {name}: {figure.why}{' (in the incomplete recording)' if torn else ''}")
                     continue
                 for path in style.save(figure, folder / name, formats):
                     say(str(path))
@@ -109,7 +132,7 @@ def draw(
 
 
 def _account(folder: Path, robot: str) -> Account | None:
-    """None, and a line that says why, where its journal cannot be read."""
+    """Return the account of a robot; print why and return None if its journal cannot be read."""
     from compose.figures.account import account  # noqa: PLC0415
 
     try:
@@ -122,9 +145,9 @@ def _account(folder: Path, robot: str) -> Account | None:
         why = str(error)
     else:
         if found.broken is not None:
-            _say(f"of {robot} only up to where its journal can be followed: {found.broken}")
+            _say(f"figures of {robot} end where its journal cannot be replayed: {found.broken}")
         return found
-    _say(f"no picture of {robot}: {why}")
+    _say(f"no figure of {robot}: {why}")
     return None
 
 

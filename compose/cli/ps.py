@@ -1,4 +1,4 @@
-"""`tandem ps`: the missions on a network, and who takes part in them."""
+"""`tandem ps`: list the missions on a network and the robots in them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Iterator
 
 import msgspec
 
+from compose.cli.arguments import add_closing, add_connection, add_listening_time
 from compose.doctor import running_missions
 from compose.doctor.router_session import Unreached, linked
 from compose.doctor.running_missions import Participant, RunningMission
@@ -18,11 +19,19 @@ from protocol.output import one_line, say
 from protocol.wire import VERSION
 
 INDENT = 4
-"""of what is too long for a line"""
+"""The spaces before each continuation of a line that is wider than the terminal."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `tandem ps`."""
+    add_connection(parser)
+    add_listening_time(parser)
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    add_closing(parser, "tandem ps --connect tcp/127.0.0.1:7447 --json", "docs/network.md")
 
 
 def main(options: argparse.Namespace) -> int:
-    """Look once, and tell."""
+    """List the missions at every router once, and return FAILED if a router does not answer."""
     found: list[tuple[str, RunningMission]] = []
     status = ENDED
     for place in places(options):
@@ -37,8 +46,8 @@ def main(options: argparse.Namespace) -> int:
         if not seen and not options.json:
             say(f"no mission at {place}")
     if options.json:
-        told = [{"at": at, **msgspec.to_builtins(one), "missing": one.missing} for at, one in found]
-        say(*json.dumps({"missions": told}, indent=2).replace("\x7f", "\\u007f").splitlines())
+        missions = [{"at": at, **msgspec.to_builtins(one), "missing": one.missing} for at, one in found]
+        say(*json.dumps({"missions": missions}, indent=2).replace("\x7f", "\\u007f").splitlines())
     else:
         for at, mission in found:
             for line in _lines(at, mission, options.timeout):
@@ -46,23 +55,25 @@ def main(options: argparse.Namespace) -> int:
     return status
 
 
-def _lines(at: str, mission: RunningMission, wait: float) -> Iterator[str]:
+def _lines(at: str, mission: RunningMission, timeout: float) -> Iterator[str]:
+    """Yield a line about `mission`, which was listened to for `timeout` seconds, then one per robot."""
     words = [f"{mission.run} at {at}"]
-    words.append(f"tick {mission.tick}" if mission.tick is not None else f"no tick within {wait:g} s")
+    words.append(f"tick {mission.tick}" if mission.tick is not None else f"no tick within {timeout:g} s")
     if mission.outcome is not None:
         words.append(f"over: {mission.outcome}")
     if mission.missing:
         words.append(f"missing: {', '.join(mission.missing)}")
     if others := [str(version) for version in mission.versions if version != VERSION]:
-        words.append(f"speaks protocol version {' and '.join(others)}, this is {VERSION}")
+        words.append(f"protocol version {' and '.join(others)} instead of {VERSION}")
     yield ", ".join(words)
     width = max((len(one.robot) for one in mission.robots), default=0)
     for one in mission.robots:
-        yield f"  {one.robot:{width}}  {_said(one, wait)}"
+        yield f"  {one.robot:{width}}  {_state(one, timeout)}"
 
 
-def _said(one: Participant, wait: float) -> str:
-    there = "" if one.there else "not there any more: "
+def _state(one: Participant, timeout: float) -> str:
+    """Return what is known of a robot that was listened to for `timeout` seconds."""
+    there = "" if one.there else "no longer connected: "
     if one.tick is not None:
         return f"{there}tick {one.tick}, phase {one.phase}, {one.state}"
-    return f"there, nothing said within {wait:g} s" if one.there else "not there"
+    return f"connected, no message within {timeout:g} s" if one.there else "not connected"

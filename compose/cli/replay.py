@@ -1,4 +1,4 @@
-"""`tandem replay`: a recorded run once more, held against the record to the bit."""
+"""`tandem replay`: run a recording again, and compare it with the original to the last bit."""
 
 from __future__ import annotations
 
@@ -6,37 +6,45 @@ import argparse
 
 from compose.audit.findings import Violation
 from compose.audit.replay import replay
+from compose.cli.arguments import add_closing, add_recording
 from compose.errors import CLEAN, VIOLATED
 from compose.recording.run import legible
 from protocol.output import say
 
 
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `tandem replay`."""
+    add_recording(parser)
+    add_closing(parser, "tandem replay recording", "docs/recordings.md")
+
+
 def main(options: argparse.Namespace) -> int:
-    """Play it again, and show the first difference."""
+    """Replay the recording, print the first difference, and return VIOLATED if there is one."""
     with legible(options.recording):
-        played, torn = replay(options.recording)
-    if played.differences:
-        first, *more = played.differences
-        say(f"{played.scenario}: not as recorded")
+        replayed, torn = replay(options.recording)
+    if replayed.differences:
+        first, *more = replayed.differences
+        say(f"{replayed.scenario}: not as recorded")
         say(_difference(first))
         if more:
-            say(f"and {len(more)} more, which `tandem audit` tells")
-        if played.versions is not None:
-            say(f"{played.versions}: that alone can lead to other decisions")
-    elif played.rounding:
+            say(f"and {len(more)} more, which `tandem audit` lists")
+        if replayed.versions is not None:
+            say(f"{replayed.versions}: that alone can lead to other decisions")
+    elif replayed.rounding:
         say(
-            f"{played.scenario}: as recorded but for the last bits, in {played.ticks} ticks: "
-            f"{played.rounding} of {played.checks} checks differ by rounding alone"
+            f"{replayed.scenario}: as recorded but for the last bits, in {replayed.ticks} ticks: "
+            f"{replayed.rounding} of {replayed.checks} checks differ by rounding alone"
         )
-        say(str(played.versions))
+        say(str(replayed.versions))
     else:
-        say(f"{played.scenario}: as recorded, to the bit, in {played.ticks} ticks ({played.checks} checks)")
-    for tear in played.tears:
+        counts = f"{replayed.ticks} ticks ({replayed.checks} checks)"
+        say(f"{replayed.scenario}: as recorded, to the bit, in {counts}")
+    for tear in replayed.tears:
         say(f"{_where(tear)}: {tear.what}")
     for name, size in torn.items():
         if size:
             say(f"{name} ends with {size} bytes of a torn write")
-    return VIOLATED if played.differences else CLEAN
+    return VIOLATED if replayed.differences else CLEAN
 
 
 def _where(found: Violation) -> str:
@@ -45,7 +53,7 @@ def _where(found: Violation) -> str:
 
 
 def _difference(found: Violation) -> str:
-    """Tick, robot, field, recorded and recomputed value; or what else there is to say."""
+    """Return a line with the tick, the robot, and the recorded and the recomputed value where they differ."""
     one = found.difference
     if one is None:
         return f"{_where(found)}: {found.what}"

@@ -1,4 +1,4 @@
-"""`tandem robot`: one robot without a world: its driver here, and its agent, in a process of its own."""
+"""`tandem robot`: one robot in hardware mode: its driver in this process, its agent in another."""
 
 from __future__ import annotations
 
@@ -7,6 +7,16 @@ import time
 from contextlib import closing
 from pathlib import Path
 
+from compose.cli.arguments import (
+    add_closing,
+    add_connect_timeout,
+    add_connection,
+    add_driver_options,
+    add_fsync,
+    add_listen,
+    add_running,
+    name,
+)
 from compose.errors import ENDED, FAILED, STOPPED, UserError, status_of
 from compose.hardware.driver_recording import recorded
 from compose.launch.driver_loader import briefed, driver_class, made, mission, options_of
@@ -26,48 +36,80 @@ from protocol.output import say
 from world.hardware.bridge import Field, NoStart
 
 RELISTEN_S = 5.0
-"""how long the port of a robot that has just been killed may stay busy"""
+"""s to wait for the port of a robot that has just been killed to become free."""
 LEAST_S = 0.1
-"""between two starts of an agent: one that dies at once must not take the machine"""
+"""The least time between two starts of an agent (s): one that ends at once must not load the machine."""
 
 
 class Agent:
-    """The robot's agent, which is started again when it is killed."""
+    """The process of the robot's agent, which is restarted when a signal has killed it."""
 
     def __init__(self, arguments: list[str], inbox: Inbox) -> None:
+        """Start `tandem` with `arguments`; `inbox` prints messages."""
         self._arguments = arguments
         self._inbox = inbox
         self._child = self._start()
 
     def _start(self) -> MissionProcess:
-        self._started, self._told = time.monotonic(), False
+        self._started, self._output_printed = time.monotonic(), False
         return MissionProcess(f"agent {self._arguments[1]}", self._arguments, self._inbox, ())
 
-    def again(self) -> None:
-        """It has ended: by a signal, and it goes on from its journal; or raises ChildFailed."""
+    def restart(self) -> None:
+        """Restart the agent after a signal has killed it; it resumes from its journal.
+
+        Raises ChildFailed if it ended with an error.
+        """
         status = self._child.status
         if status == ENDED:
             return
         if status > 0:
             raise ChildFailed(f"{self._child.name} {self._child.how()}")
-        self._inbox.say(f"{self._child.name} was killed by signal {-status}, and is started again")
+        self._inbox.say(f"{self._child.name} was killed by signal {-status} and is restarted")
         self.end()
         time.sleep(max(0.0, self._started + LEAST_S - time.monotonic()))
         self._child = self._start()
 
     def end(self, within: float = 0.0) -> None:
-        """Leave nobody behind."""
+        """Wait `within` seconds for the agent to end, then stop it, and print its last output."""
         if self._child.running and not within:
             self._child.stop()
         self._child.end(within or STOP_S)
-        if not self._told and self._child.status == ENDED and (said := self._child.said()):
-            say(*said.splitlines(), error=True)
-        self._told = True
+        if not self._output_printed and self._child.status == ENDED and (output := self._child.said()):
+            say(*output.splitlines(), error=True)
+        self._output_printed = True
         self._child.forget()
 
 
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `tandem robot`."""
+    parser.add_argument("id", type=name, metavar="ID", help="id of this robot in the mission")
+    parser.add_argument(
+        "--driver", required=True, metavar="MODULE:CLASS", help="driver of the robot's wheels and sensors"
+    )
+    parser.add_argument(
+        "--mission",
+        required=True,
+        metavar="FILE",
+        help="scenario of the mission: a name or a TOML file; start poses are not used",
+    )
+    add_driver_options(parser)
+    add_running(parser)
+    add_connection(parser)
+    add_listen(parser, "endpoint on which the peer can reach this robot")
+    parser.add_argument(
+        "--run", type=name, metavar="NAME", help="name of the run [default: the scenario's name]"
+    )
+    add_fsync(parser)
+    add_connect_timeout(parser, "the peer")
+    add_closing(
+        parser,
+        "tandem robot a --mission paper-1 --driver docs.rover:Rover --listen tcp/0.0.0.0:7447",
+        "docs/driver.md",
+    )
+
+
 def main(options: argparse.Namespace) -> int:
-    """Play one robot's part, with its own hardware in the world's place, from where a record ends."""
+    """Run one robot's hardware and its agent to the end of the mission; resume a recording in --out."""
     scenario = mission(options.mission, options.id)
     rate = options.rate or 1.0
     check_rate(scenario, rate)
@@ -96,7 +138,7 @@ def main(options: argparse.Namespace) -> int:
                 journal=recording.journal,
             )
             recording.take_up(driver, options.driver, field)
-            end = _play(options, field, reached, folder, inbox)
+            end = _run(options, field, reached, folder, inbox)
     except session.CannotListen as error:
         raise UserError(f"--listen: {error}") from None
     except CannotRecord as error:
@@ -113,17 +155,17 @@ def main(options: argparse.Namespace) -> int:
         pose = field.verdict.pose
         say(f"{options.id}: claims {pose.x:.9f} {pose.y:.9f} {wrap(pose.heading):+.9f} (m, m, rad)")
     if not options.quiet:
-        slower = f"; a lower --rate, such as {rate / 2:g}, leaves more time" if field.missed else ""
-        stood = f"stood {field.missed} of {end.tick + 1} ticks for want of a Command in time"
-        say(f"{options.id}: {stood}{slower}")
+        advice = f"; a lower --rate, such as {rate / 2:g}, leaves more time" if field.missed else ""
+        missed = f"missed the deadline in {field.missed} of {end.tick + 1} ticks"
+        say(f"{options.id}: {missed}{advice}")
     say(f"{options.id}: {ended(end.outcome, end.tick, end.reason)}")
     return status_of(end.outcome)
 
 
-def _play(
+def _run(
     options: argparse.Namespace, field: Field, reached: Endpoints, folder: Path, inbox: Inbox
 ) -> MissionEnd:
-    """The mission, and an agent for it, which leaves with it."""
+    """Run the mission with an agent process of its own, and return its end."""
     keys = (
         ["--keys", str(options.keys.resolve().parent / access_control.agent(options.id))]
         if options.keys
@@ -143,9 +185,9 @@ def _play(
         try:
             field.attach(link)
             if not options.quiet:
-                where = f", again, from tick {field.tick} on" if field.tick >= 0 else ", waiting for its peer"
+                where = f", resumed at tick {field.tick}" if field.tick >= 0 else ", waiting for its peer"
                 say(f"{options.id}: in run {field.run}{where}")
-            end = field.play(options.connect_timeout, agent.again)
+            end = field.play(options.connect_timeout, agent.restart)
             agent.end(STOP_S)
         finally:
             agent.end()

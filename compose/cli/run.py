@@ -1,4 +1,4 @@
-"""`tandem run`: a mission on this machine."""
+"""`tandem run`: run a mission on this machine."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from compose.cli import export_bar
+from compose.cli import arguments, export_bar
 from compose.errors import FAILED, STOPPED, UserError
 from compose.extras import need
 from compose.launch import processes
@@ -26,19 +26,67 @@ from protocol.spelling import did_you_mean
 from world.scenario import Scenario
 
 
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `tandem run`."""
+    arguments.add_scenario(parser)
+    arguments.add_running(parser)
+    parser.add_argument(
+        "--in-process",
+        action="store_true",
+        help="run in one process, without network; decisions are the same",
+    )
+    parser.add_argument(
+        "--secure", action="store_true", help="encrypt all links, with certificates made for this run only"
+    )
+    parser.add_argument(
+        "--export",
+        action=argparse.BooleanOptionalAction,
+        help="also write run.mcap and tables to --out DIR [default: if the extra `lab` is installed]",
+    )
+    parser.add_argument(
+        "--foxglove",
+        type=arguments.port,
+        metavar="PORT",
+        help="serve the live mission to Foxglove on this TCP port",
+    )
+    parser.add_argument(
+        "--foxglove-origin",
+        type=arguments.origin,
+        action="append",
+        default=[],
+        metavar="ORIGIN",
+        help="origin of web pages that may connect to --foxglove, besides Foxglove's own; may be repeated",
+    )
+    parser.add_argument(
+        "--watch", action="store_true", help="serve a web page that shows the mission, live and afterwards"
+    )
+    arguments.add_port(parser)
+    parser.add_argument(
+        "--kill",
+        type=arguments.kill,
+        action="append",
+        default=[],
+        metavar="WHO@TICK",
+        help="kill a process in a tick and restart it, such as a@17, b@20:report or world@30:journal+5s "
+        "(after 5 s; +never: not); the points of a tick are observation, report, journal, command; "
+        "may be repeated",
+    )
+    arguments.add_closing(parser, "tandem run paper-1 --out recording", "docs/scenarios.md")
+
+
 def main(options: argparse.Namespace) -> int:
-    """Play the mission, as processes or in this one."""
+    """Run the mission, as processes or in this one, and return the exit status of its outcome."""
     if not options.in_process:
-        processes.fork_server()  # it imports while the launcher does
+        processes.fork_server()  # it imports modules while this process does
     found = setting(options.scenario, options.fault)
     scenario = found.seeded(options.seed)
     if options.out is not None and any(options.out.glob("*.journal")):
-        raise UserError(f"--out: {options.out} holds a record already; choose another folder")
+        raise UserError(f"--out: {options.out} already contains a recording; choose another folder")
     _check_viewers(options)
     if options.export:
         need(*export_bar.MODULES)
         if options.out is None:
-            raise UserError("--export: there is no --out DIR to leave it in")
+            raise UserError("--export: it needs --out DIR")
     kills = _kills(options, found, scenario)
     if options.secure:
         need("cryptography", extra="deploy")
@@ -48,17 +96,17 @@ def main(options: argparse.Namespace) -> int:
 
 
 def _check_viewers(options: argparse.Namespace) -> None:
-    """Raises UserError."""
+    """Check the flags of viewers. Raises UserError."""
     if options.port is not None and not options.watch:
-        raise UserError("--port: of the page, and there is none without --watch")
+        raise UserError("--port: it needs --watch, which serves the page")
     if options.foxglove is not None:
         need("foxglove")
     elif options.foxglove_origin:
-        raise UserError("--foxglove-origin: of a page that shows what --foxglove serves, and there is none")
+        raise UserError("--foxglove-origin: it needs --foxglove")
 
 
 def _kills(options: argparse.Namespace, found: ScenarioTemplate, scenario: Scenario) -> tuple[Kill, ...]:
-    """Those of the file, then those of the command line. Raises UserError."""
+    """Return the kills of the file, then those of the command line. Raises UserError."""
     ids = [robot.id for robot in scenario.robots]
     for kill in options.kill:
         if kill.who not in (*ids, WORLD):
@@ -70,7 +118,7 @@ def _kills(options: argparse.Namespace, found: ScenarioTemplate, scenario: Scena
 
 
 def _in_process(options: argparse.Namespace, scenario: Scenario, kills: tuple[Kill, ...]) -> int:
-    from compose.launch import in_process  # noqa: PLC0415  # the launcher needs no planner
+    from compose.launch import in_process  # noqa: PLC0415  # processes need no planner here
 
     if options.secure:
         raise UserError("--secure: --in-process has no network")
@@ -78,22 +126,22 @@ def _in_process(options: argparse.Namespace, scenario: Scenario, kills: tuple[Ki
         where = "--kill" if options.kill else f"{options.scenario}: kill"
         raise UserError(f"{where}: --in-process has no processes to kill")
     if options.rate is not None:
-        raise UserError("--rate: --in-process knows no real time")
+        raise UserError("--rate: --in-process cannot run in real time")
     if options.foxglove is not None:
-        raise UserError("--foxglove: what --in-process plays is over before anyone could look")
+        raise UserError("--foxglove: with --in-process, the run is over before a viewer can connect")
     began = time.perf_counter()
     if options.out is None and not options.watch:
         return conclude(options, in_process.play(scenario), None, "in-process", began)
-    with folder_for(options.out) as folder, _shown(options, scenario, folder) as shows:
+    with folder_for(options.out) as folder, _viewers(options, scenario, folder) as viewing:
         began = time.perf_counter()
         try:
-            played = in_process.play(scenario, folder)
+            finished = in_process.play(scenario, folder)
         except CannotRecord as error:
             raise UserError(f"--out: {error}") from None
-        status = conclude(options, played, folder, "in-process", began)
+        status = conclude(options, finished, folder, "in-process", began)
         inbox = Inbox("tandem run")
         stop_by_signal(inbox)
-        return _afterwards(options, folder, shows, inbox, status)
+        return _after_outcome(options, folder, viewing, inbox, status)
 
 
 def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[Kill, ...]) -> int:
@@ -103,7 +151,7 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[
     with (
         folder_for(options.out) as folder,
         _keys(options, scenario) as keys,
-        _shown(options, scenario, folder) as shows,
+        _viewers(options, scenario, folder) as viewing,
     ):
         began = time.perf_counter()
         try:
@@ -117,7 +165,7 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[
                     timeout=options.timeout,
                     kills=kills,
                     keys=keys,
-                    agents_journal=bool(options.out is not None or kills or shows),
+                    agents_journal=bool(options.out is not None or kills or viewing),
                 )
         except processes.ChildFailed as failure:
             inbox.say(f"failed: {failure}")
@@ -128,18 +176,18 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[
             break_off(options, folder, f"stopped by {signal_name}", began)
             return STOPPED
         for kill in spared:
-            inbox.say(f"--kill {kill.text}: never came")
+            inbox.say(f"--kill {kill.text}: not reached")
         status = conclude(options, read(folder), folder, "processes", began)
-        return _afterwards(options, folder, shows, inbox, status)
+        return _after_outcome(options, folder, viewing, inbox, status)
 
 
 @contextmanager
 def _keys(options: argparse.Namespace, scenario: Scenario) -> Iterator[Path | None]:
-    """Keys for this run alone, if it is to be secured."""
+    """Create keys for this run only, and yield their folder; None without --secure."""
     if not options.secure:
         yield None
         return
-    from compose.security import certificates  # noqa: PLC0415  # there may be no such library
+    from compose.security import certificates  # noqa: PLC0415  # the library is optional
 
     with tempfile.TemporaryDirectory(prefix="tandem-keys-") as folder:
         certificates.make(Path(folder), [robot.id for robot in scenario.robots], (), 1)
@@ -147,41 +195,44 @@ def _keys(options: argparse.Namespace, scenario: Scenario) -> Iterator[Path | No
 
 
 @contextmanager
-def _shown(options: argparse.Namespace, scenario: Scenario, folder: Path) -> Iterator[list[Beside]]:
-    """What is to show the mission that is recorded in `folder`: it is there, and where has been said."""
+def _viewers(options: argparse.Namespace, scenario: Scenario, folder: Path) -> Iterator[list[Beside]]:
+    """Start the viewers of the mission recorded in `folder`, print their addresses, and yield them."""
     wanted = [page(folder, options.port or 0)] if options.watch else []
     if options.foxglove is not None:
         ids = [robot.id for robot in scenario.robots]
         wanted.append(viewers(folder, options.foxglove, options.foxglove_origin, ids))
     with ExitStack() as stack:
-        shows = [stack.enter_context(beside(*one)) for one in wanted]
-        for show in shows:
-            show.announce()
-        yield shows
+        started = [stack.enter_context(beside(*one)) for one in wanted]
+        for viewer in started:
+            viewer.announce()
+        yield started
 
 
-def _afterwards(
-    options: argparse.Namespace, folder: Path, shows: Sequence[Beside], inbox: Inbox, status: int
+def _after_outcome(
+    options: argparse.Namespace, folder: Path, viewing: Sequence[Beside], inbox: Inbox, status: int
 ) -> int:
-    """The outcome has been told: export the record, and stay as long as somebody looks; the exit status."""
+    """Export the recording, serve the viewers until they are stopped, and return the exit status.
+
+    It is called once the outcome, of exit status `status`, has been printed.
+    """
     try:
         exported = _export(options, folder, inbox)
     except Interrupted as signal_name:
-        inbox.say(f"stopped by {signal_name} before all was exported")
+        inbox.say(f"stopped by {signal_name} before the export was complete")
         return STOPPED
-    stay(shows, inbox)
+    stay(viewing, inbox)
     return FAILED if options.export and not exported else status
 
 
 def _export(options: argparse.Namespace, folder: Path, inbox: Inbox) -> bool:
-    """Whether the record has been exported. Raises Interrupted."""
+    """Export the recording if the flags allow it, and return whether it was done. Raises Interrupted."""
     if options.out is None or options.export is False:
         return False
     sys.stdout.flush()
     try:
         need(*export_bar.MODULES)
     except UserError as error:
-        if not options.quiet:  # nobody asked for it
+        if not options.quiet:  # the export was not requested
             inbox.say(f"not exported: {error}")
         return False
     try:

@@ -1,4 +1,4 @@
-"""`tandem scenarios`"""
+"""`tandem scenarios`: list the scenarios and sweeps that ship with Tandem."""
 
 from __future__ import annotations
 
@@ -8,10 +8,16 @@ from collections.abc import Mapping
 from itertools import takewhile
 from pathlib import Path
 
+from compose.cli.arguments import add_closing
 from compose.errors import ENDED
 from compose.scenario.scenario_file import shipped
 from compose.terminal import text_width
 from protocol.output import say
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `tandem scenarios`, which takes none."""
+    add_closing(parser, "tandem scenarios", "docs/scenarios.md")
 
 
 def main(_options: argparse.Namespace) -> int:
@@ -30,7 +36,7 @@ def _list(files: Mapping[str, Path]) -> None:
 
 
 def _sentence(text: str) -> str:
-    """The first of the comment that the file begins with, on however many lines it stands."""
+    """Return the first sentence of the comment at the top of a file, which may span several lines."""
     comment = takewhile(lambda line: line.startswith("#"), text.splitlines())
     return re.split(r"(?<=\.) ", " ".join([line.removeprefix("#").strip() for line in comment]), maxsplit=1)[
         0

@@ -1,4 +1,4 @@
-"""`tandem sweep`: a sweep, on this machine or wherever a Dask scheduler has workers."""
+"""`tandem sweep`: run a sweep, on this machine or on the workers of a Dask scheduler."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from compose.cli.arguments import add_closing, cell_and_trial, count, folder, natural, trials
 from compose.errors import FAILED, LOCALISED, NOT_LOCALISED, STOPPED, UserError
 from compose.extras import need
 from compose.launch.signals import stop_by_signal
@@ -20,15 +21,61 @@ if TYPE_CHECKING:
     from compose.sweep.execution import Results
 
 
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `tandem sweep`."""
+    parser.add_argument(
+        "spec", metavar="SPEC", help="name of a sweep that ships with Tandem, or path of a TOML file"
+    )
+    parser.add_argument(
+        "--out",
+        type=folder,
+        metavar="DIR",
+        help="folder for the results; an unfinished sweep in it is resumed [default: sweep-NAME]",
+    )
+    parser.add_argument(
+        "--trials", type=trials, metavar="N", help="trials per cell, 1 to 10^7 [default: the sweep's]"
+    )
+    parser.add_argument(
+        "--seed", type=natural, metavar="S", help="seed of all trials, 0 to 2^63 - 1 [default: the sweep's]"
+    )
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument(
+        "--workers", type=count, metavar="N", help="worker processes, 1 to 1000 [default: one per core]"
+    )
+    where.add_argument(
+        "--scheduler", metavar="ADDRESS", help="address of a running Dask scheduler to use instead"
+    )
+    parser.add_argument(
+        "--processes",
+        action="store_true",
+        help="run each trial as processes over Zenoh [default: in one process]",
+    )
+    parser.add_argument(
+        "--audit",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="audit the journals of every trial, which takes most of the time [default: --audit]",
+    )
+    parser.add_argument("--retry", action="store_true", help="run failed trials of an earlier call again")
+    parser.add_argument(
+        "--print-trial",
+        type=cell_and_trial,
+        metavar="[CELL:]N",
+        help="print the scenario file of a trial and exit [default cell: 0]",
+    )
+    parser.add_argument("-q", "--quiet", action="store_true", help="print only the counts")
+    add_closing(parser, "tandem sweep noise --trials 50 --out results", "docs/sweeps.md")
+
+
 def main(options: argparse.Namespace) -> int:
-    """Play the sweep, or what is left of it."""
+    """Run the trials that have no result yet, and write tables and figures."""
     sweep = spec.load(options.spec, trials=options.trials, seed=options.seed)
     need("distributed", "matplotlib", "pyarrow", "tomli_w")
     if options.print_trial is not None:
         return print_trial(sweep, *options.print_trial)
     inbox = Inbox("tandem sweep")
     stop_by_signal(inbox)
-    from compose.sweep import axis_figures, execution, report  # noqa: PLC0415  # slow, and there may be no extra
+    from compose.sweep import axis_figures, execution, report  # noqa: PLC0415  # slow to import, and optional
 
     out = options.out if options.out is not None else Path(f"sweep-{sweep.name}")
     chosen = {"workers": options.workers} if options.workers is not None else {}
@@ -45,7 +92,7 @@ def main(options: argparse.Namespace) -> int:
     if results.stopped is not None:
         inbox.say(
             f"{results.stopped}: {len(results.table)} of {results.trials} trials are done; "
-            "the same command goes on from there"
+            "the same command resumes the sweep"
         )
         if len(results.table) == results.trials:
             report.show(results, out, quiet=True)
@@ -57,8 +104,8 @@ def main(options: argparse.Namespace) -> int:
 
 
 def print_trial(sweep: Sweep, cell: int, trial: int) -> int:
-    """Print the scenario file of a trial."""
-    import tomli_w  # noqa: PLC0415  # there may be no extra
+    """Print the scenario file of a trial. Raises UserError if there is no such cell."""
+    import tomli_w  # noqa: PLC0415  # the library is optional
 
     found = next((one for one in cells(sweep) if one.index == cell), None)
     if found is None:
@@ -68,10 +115,13 @@ def print_trial(sweep: Sweep, cell: int, trial: int) -> int:
 
 
 def status_of(results: Results) -> int:
-    """As of a mission: localised only where all are; failed where any is, or breaks a rule."""
+    """Return FAILED if a trial failed or violated an audit rule, LOCALISED if all were localised.
+
+    Return NOT_LOCALISED otherwise.
+    """
     counts = [cell.failed + cell.violations for cell in results.figures.values()]
     if any(counts):
         return FAILED
     localised = sum([cell.localised for cell in results.figures.values()])
-    played = sum([cell.trials for cell in results.figures.values()])
-    return LOCALISED if localised == played else NOT_LOCALISED
+    finished = sum([cell.trials for cell in results.figures.values()])
+    return LOCALISED if localised == finished else NOT_LOCALISED

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import compose.cli.agent
-import compose.cli.world  # noqa: F401  # for its import only
-from compose.cli.main import parser
+from compose.cli.main import COMMANDS, command_parser
 from compose.launch import in_process
 from compose.scenario.scenario_file import load
 from protocol import wire
@@ -13,13 +11,17 @@ from protocol.messages import Command, FinalReport, MissionEnd, Observation, Rep
 from world.scenario import Scenario
 
 MISSION = "paper-1"
+FORKED = ("world", "agent")
+"""The commands that forked processes run."""
 RECEIVED = (RobotConfig, Scenario, Observation | MissionEnd, Report, Command, Command | FinalReport)
 """The types that worlds and agents decode."""
 
 
 def missions() -> None:
-    """Prepare worlds and agents: import modules, build the command line and decoders, and run a mission."""
-    parser()
+    """Prepare worlds and agents: import modules, build their parsers and decoders, and run a mission."""
+    for command in COMMANDS:
+        if command.name in FORKED:
+            command_parser(command)
     in_process.play(load(MISSION))
     for kind in RECEIVED:
         wire.prepare(kind)

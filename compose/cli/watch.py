@@ -1,4 +1,4 @@
-"""`tandem watch`: a page on which a run is watched."""
+"""`tandem watch`: serve a web page that shows recordings or live missions."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from compose.cli.arguments import add_closing, add_connection, add_launched, add_port, address, folder
 from compose.errors import ENDED, UserError
 from compose.extras import need
 from compose.launch.viewers import OVER
@@ -19,21 +20,44 @@ if TYPE_CHECKING:
     from compose.view.web.site import Site
 
 NICENESS = 10
-"""the mission's processes come first"""
+"""The niceness of the page's process, so that the processes of the mission get the CPU first."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `tandem watch`."""
+    parser.add_argument(
+        "recording",
+        type=folder,
+        nargs="?",
+        metavar="DIR",
+        help="folder of a recording, of several recordings, or of a sweep [default: live missions]",
+    )
+    add_connection(parser)
+    parser.add_argument(
+        "--address",
+        type=address,
+        default="127.0.0.1",
+        metavar="IP",
+        help="IP address on which the page is served; 0.0.0.0 in a container whose port is published on "
+        "loopback [default: %(default)s]",
+    )
+    add_port(parser)
+    add_launched(parser)
+    add_closing(parser, "tandem watch recording --port 8080", "docs/recordings.md")
 
 
 def main(options: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C."""
     need("starlette", "uvicorn")
-    from compose.view.web import server, site  # noqa: PLC0415  # there may be no extra
+    from compose.view.web import server, site  # noqa: PLC0415  # the libraries are optional
 
     if options.recording is None:
-        from compose.network import places  # noqa: PLC0415  # a record needs no network
+        from compose.network import places  # noqa: PLC0415  # a recording needs no network
 
         shown = site.of_network(places(options))
     elif options.connect or options.config or options.keys:
         flag = "--connect" if options.connect else "--config" if options.config else "--keys"
-        raise UserError(f"{flag}: a record needs no network; leave out one of the two")
+        raise UserError(f"{flag}: a recording needs no network; give either DIR or {flag}")
     else:
         shown = site.of_record(options.recording) if options.launched else site.of_folder(options.recording)
     for note in shown.notes:
@@ -44,9 +68,9 @@ def main(options: argparse.Namespace) -> int:
         what = f"--address: {options.address}"
         if error.errno != errno.EADDRNOTAVAIL:
             what = f"--port: {options.port}"
-        raise UserError(f"{what} cannot be had: {error.strerror}") from None
+        raise UserError(f"{what} cannot be used: {error.strerror}") from None
     if not ipaddress.ip_address(options.address).is_loopback:
-        say(f"tandem watch: --address: whoever reaches {options.address} can watch", error=True)
+        say(f"tandem watch: --address: every machine that reaches {options.address} can watch", error=True)
     if shown.waiting:
         os.nice(NICENESS)
 
@@ -64,8 +88,8 @@ def main(options: argparse.Namespace) -> int:
 
 
 def _follow_launcher(shown: Site, stop: Callable[[], None]) -> None:
-    """The launcher says when the mission is over, and holds standard input open as long as the page stays."""
-    while said := os.read(0, 64):
-        if OVER in said:
+    """Follow the launcher, which writes OVER when the mission is over, and closes the stream at the end."""
+    while received := os.read(0, 64):
+        if OVER in received:
             shown.concluded()
     stop()

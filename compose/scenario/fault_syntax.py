@@ -10,16 +10,13 @@ import msgspec
 from msgspec import Meta
 from msgspec.structs import asdict
 
+from compose.errors import BadFault
 from world.faults import MAX_DELAY, MAX_FAULTS, Delay, Fault, LinkSelector
 
 _LINK = re.compile(r"\s*(?P<one>[A-Za-z0-9_-]+)\s*(?P<way><->|->)\s*(?P<other>[A-Za-z0-9_-]+)\s*")
 _NUMBER = re.compile(r"-?[0-9]*\.?[0-9]+(?:[eE]-?[0-9]+)?")
 EVERYWHERE = "*"
 """The text of a link that selects all links."""
-
-
-class BadFault(ValueError):
-    """An invalid fault; the text names the field and what is wrong."""
 
 
 class FaultTable(Fault, frozen=True, array_like=False, forbid_unknown_fields=True):

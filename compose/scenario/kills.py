@@ -12,6 +12,7 @@ from typing import Annotated, Literal, cast, get_args
 import msgspec
 from msgspec import Meta
 
+from compose.errors import BadKill
 from protocol.spelling import did_you_mean
 
 Point = Literal["observation", "report", "journal", "command"]
@@ -34,10 +35,6 @@ _FORM = re.compile(
     r"(?P<who>[A-Za-z0-9_-]{1,32})@(?P<tick>[0-9]{1,9})(?::(?P<point>observation|report|journal|command))?"
     r"(?:\+(?:(?P<never>never)|(?P<after>[0-9]{1,6}(?:\.[0-9]{1,6})?)s))?"
 )
-
-
-class BadKill(ValueError):
-    """An invalid kill; the text says what is wrong or what a kill looks like."""
 
 
 class Kill(msgspec.Struct, frozen=True):

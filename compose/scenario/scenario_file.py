@@ -16,9 +16,9 @@ from typing import Annotated, Any, get_args
 import msgspec
 from msgspec import Meta
 
-from compose.errors import UserError
-from compose.scenario.fault_syntax import BadFault, FaultTable, added, table_of
-from compose.scenario.kills import DRAWN, POINTS, BadKill, Kill, KillTable, drawn
+from compose.errors import BadFault, BadKill, BadScenario, Unworkable, UserError
+from compose.scenario.fault_syntax import FaultTable, added, table_of
+from compose.scenario.kills import DRAWN, POINTS, Kill, KillTable, drawn
 from compose.scenario.toml_file import field_first, read_text, table_in
 from protocol.attack import OF_THE_START, Attack, Kind, Part
 from protocol.messages import RobotConfig
@@ -62,14 +62,6 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "point": (*POINTS, DRAWN),
 }
 """The permitted values of each field that takes one of a few words."""
-
-
-class BadScenario(UserError):
-    """An invalid scenario; the text names the file, the field and what is wrong."""
-
-
-class Unworkable(BadScenario):
-    """A valid scenario whose mission cannot succeed or cannot be run; the text says why."""
 
 
 class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

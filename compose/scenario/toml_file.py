@@ -9,12 +9,8 @@ from typing import Any
 
 import msgspec
 
-from compose.errors import UserError
+from compose.errors import NotToml
 from protocol import files
-
-
-class NotToml(UserError):
-    """A file that is not TOML; the text names the file and the place of the error."""
 
 
 def read_text(path: Path) -> str:

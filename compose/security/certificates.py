@@ -28,6 +28,7 @@ from cryptography.hazmat.primitives.serialization import (
 )
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
+from compose.errors import BadKeys
 from compose.network import KEYED
 from protocol import files
 from protocol.network import access_control
@@ -41,10 +42,6 @@ SECRET = 0o600
 GITIGNORE = ".gitignore"
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
 """The host names in every certificate."""
-
-
-class BadKeys(ValueError):
-    """A folder that `make` did not create, or that is damaged; the text says what is wrong."""
 
 
 class Authority(NamedTuple):

@@ -9,7 +9,8 @@ from typing import Any
 
 import msgspec
 
-from compose.scenario.scenario_file import ScenarioTemplate, Unworkable, validate
+from compose.errors import Unworkable
+from compose.scenario.scenario_file import ScenarioTemplate, validate
 from compose.sweep.field_paths import canonical, with_value
 from compose.sweep.spec import Sweep
 

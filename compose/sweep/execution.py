@@ -11,10 +11,11 @@ import msgspec
 import numpy as np
 import pyarrow as pa
 
+from compose.errors import BadSpec
 from compose.sweep.cells import Cell, RefusedCell, setting_of
 from compose.sweep.remaining_work import EngineFailed, TrialOptions, Work
 from compose.sweep.results_folder import Folder, opened
-from compose.sweep.spec import BadSpec, Sweep
+from compose.sweep.spec import Sweep
 from compose.sweep.statistics import CellSummary, counted, header, summary_csv
 from compose.sweep.trial import TrialRow
 from compose.sweep.worker import PLAY

@@ -11,6 +11,7 @@ from typing import Any
 import msgspec
 from msgspec import inspect
 
+from compose.errors import NoSuchField
 from compose.scenario.scenario_file import ScenarioFile
 
 Steps = tuple[str | int, ...]
@@ -18,10 +19,6 @@ Steps = tuple[str | int, ...]
 _STEP = re.compile(r"(?P<dot>\.?)(?:(?P<key>[A-Za-z0-9_-]+)|\[(?P<place>[0-9]{1,4})\])")
 DRAWN = "seed"
 """The field that a sweep cannot vary, because every trial has its own seed."""
-
-
-class NoSuchField(ValueError):
-    """A path does not lead to a field. The text names the first step that does not exist."""
 
 
 def steps(path: str, base: Mapping[str, Any]) -> Steps:

@@ -14,11 +14,11 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from compose.errors import UserError
+from compose.errors import BadSpec, NoSuchField, NotToml
 from compose.scenario import scenario_file
-from compose.scenario.toml_file import NotToml, field_first, read_text, table_in
+from compose.scenario.toml_file import field_first, read_text, table_in
 from compose.sweep.draws import Draw, Draws, DrawTable, StartsTable
-from compose.sweep.field_paths import NoSuchField, Steps, canonical, jsonable, steps, value_at, with_value
+from compose.sweep.field_paths import Steps, canonical, jsonable, steps, value_at, with_value
 from protocol.units import NAME
 
 MAX_TRIALS = 10**7
@@ -28,10 +28,6 @@ MAX_CELLS = 10_000
 TRIAL_TIMEOUT_S = 60.0
 """The default wall time in s after which a trial counts as hung."""
 Label = Annotated[str, Meta(min_length=1, max_length=60)]
-
-
-class BadSpec(UserError):
-    """An error in a sweep file. Its text names the file, the field and the problem."""
 
 
 class AxisTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -22,7 +22,8 @@ from typing import Any, BinaryIO
 import msgspec
 from msgspec.structs import replace
 
-from compose.scenario.scenario_file import ScenarioTemplate, Unworkable, validate
+from compose.errors import Unworkable
+from compose.scenario.scenario_file import ScenarioTemplate, validate
 from compose.sweep import trial
 from compose.sweep.draws import Draws
 from protocol.output import one_line

@@ -1,0 +1,60 @@
+"""`tandem --help` lists every command by group, and each command explains its arguments."""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+
+import pytest
+
+from compose.cli.main import COMMANDS, Command, command_parser
+from tests.commands import tandem
+from tests.test_house import HOUSE
+
+
+def test_help_lists_every_command_once_under_its_group() -> None:
+    ended = tandem("--help")
+    assert (ended.status, ended.err) == (0, "")
+    listed: dict[str, list[str]] = {}
+    for line in ended.out.splitlines():
+        if line.endswith(":"):
+            group = listed.setdefault(line[:-1], [])
+        elif line.startswith("  ") and "-" not in line[:4]:
+            group.append(line.split()[0])
+    assert {name: listed[name] for name in ("Run", "Deploy", "Analyse", "Check")} == {
+        "Run": ["run", "replay", "scenarios", "sweep"],
+        "Deploy": ["world", "agent", "robot", "keys"],
+        "Analyse": ["audit", "figures", "export", "watch"],
+        "Check": ["doctor", "ps", "check-driver", "bench"],
+    }
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
+def test_the_help_of_a_command_ends_with_an_example_and_a_page(command: Command) -> None:
+    parser = command_parser(command)
+    *_, example_heading, example, _, heading, page = parser.format_help().splitlines()
+    assert (example_heading, heading) == ("example:", "documentation:")
+    assert (HOUSE / page.strip()).is_file()
+    program, name, *words = example.split()
+    assert (program, name) == ("tandem", command.name)
+    assert parser.parse_all(words).command == command.name
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
+def test_every_flag_is_explained_with_its_default(command: Command) -> None:
+    for action in command_parser(command)._actions:
+        assert action.help, action
+        if isinstance(action.default, int | float | str) and action.default not in (False, argparse.SUPPRESS):
+            assert "[default: " in action.help, action
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
+def test_a_command_imports_only_its_own_module(command: Command) -> None:
+    code = (
+        "import sys\nfrom compose.cli import main\n"
+        f"main.command_parser(next(one for one in main.COMMANDS if one.name == {command.name!r}))\n"
+        "print(*[one.module for one in main.COMMANDS if one.module in sys.modules])"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.split() == [command.module]
