@@ -1,4 +1,4 @@
-"""What the README refers to runs."""
+"""The scripts in docs/ run."""
 
 from __future__ import annotations
 

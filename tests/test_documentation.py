@@ -1,7 +1,7 @@
 """The README and the documentation: their commands run, and their names are those of the code.
 
-Each page is run from top to bottom in a folder of its own. A fenced block of `sh` is run command by command, a
-block of `python` as a script. A comment in the line before a block changes that:
+Each page is run from top to bottom in a folder of its own. A fenced block of `sh` is run command by command,
+a block of `python` as a script. A comment in the line before a block changes that:
 
 - `<!-- file: NAME -->` writes the block to that file;
 - `<!-- exit status: N -->` is the exit status of its commands, which is 0 otherwise;
@@ -90,7 +90,7 @@ def tandem_commands(page: Path) -> list[list[str]]:
 
 
 def mentioned(page: Path) -> list[list[str]]:
-    """Return the arguments of every `tandem` command in the running text of a page, which may be incomplete."""
+    """Return the arguments of every `tandem` command in the running text of a page; some may be missing."""
     text = BLOCK.sub("", page.read_text())
     return [quoted.split() for quoted in re.findall(r"`(?:uv run )?tandem ([a-z-][^`]*)`", text)]
 
@@ -150,7 +150,9 @@ def test_the_long_commands_of_a_page_run(page: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda one: one.stem)
-def test_every_command_of_a_page_exists_with_its_flags(page: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_command_of_a_page_exists_with_its_flags(
+    page: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for words in tandem_commands(page):
         if words == ["--version"]:
             continue

@@ -1,4 +1,4 @@
-"""What a distribution holds: the sources, and no key or recording that lies in the tree beside them."""
+"""A distribution has the sources, and no key or recording that is in the tree beside them."""
 
 from __future__ import annotations
 
@@ -22,11 +22,20 @@ FOREIGN = (
     "tests/agent-a.journal",
     "notes.md",
 )
+PROJECT_FILES = {
+    "CHANGELOG.md",
+    "CITATION.cff",
+    "CONTRIBUTING.md",
+    "LICENSE",
+    "README.md",
+    "mkdocs.yml",
+    "pyproject.toml",
+}
 
 
 @pytest.fixture(scope="module")
 def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What is in the repository, and what a user has left in it."""
+    """Return a folder with the files of the repository, and files that a user has written into it."""
     folder = tmp_path_factory.mktemp("tree")
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=False)
     if listed.returncode:
@@ -34,7 +43,7 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in filter(None, listed.stdout.split("\0")):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(ROOT / name, folder / name)
-    (folder / ".gitignore").unlink()  # the list of what is packed is enough
+    (folder / ".gitignore").unlink()  # the list of packed files must suffice without it
     for name in FOREIGN:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(SECRET)
@@ -42,7 +51,7 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def built(tree: Path, kind: str, out: Path) -> Path:
-    """The file that `uv build` leaves."""
+    """Return the file that `uv build` writes."""
     uv = shutil.which("uv")
     if uv is None:
         pytest.skip("uv is not installed")
@@ -60,21 +69,24 @@ def built(tree: Path, kind: str, out: Path) -> Path:
 
 
 def tracked(tree: Path, *folders: str) -> set[str]:
-    """What belongs to the project in these folders."""
+    """Return the files of the project in these folders."""
     files = [path for folder in folders for path in (tree / folder).rglob("*") if path.is_file()]
     names = {str(PurePath(path).relative_to(tree)) for path in files}
     return {name for name in names if name not in FOREIGN}
 
 
-def test_an_sdist_holds_the_sources_and_nothing_that_lies_beside_them(tree: Path, tmp_path: Path) -> None:
+def test_an_sdist_has_the_sources_and_nothing_else(tree: Path, tmp_path: Path) -> None:
     with tarfile.open(built(tree, "sdist", tmp_path)) as packed:
         names = {name.partition("/")[2] for name in packed.getnames()}
     assert not names & set(FOREIGN)
     wanted = tracked(tree, "agent", "world", "protocol", "compose", "docs", "tests")
-    assert names == wanted | {"LICENSE", "README.md", "pyproject.toml", "PKG-INFO"}
+    assert names == wanted | PROJECT_FILES | {"PKG-INFO"}
 
 
-def test_a_wheel_holds_the_packages_their_data_and_nothing_else(tree: Path, tmp_path: Path) -> None:
+def test_a_wheel_has_the_packages_with_their_data_and_types_and_nothing_else(
+    tree: Path, tmp_path: Path
+) -> None:
     with zipfile.ZipFile(built(tree, "wheel", tmp_path)) as packed:
         names = {name for name in packed.namelist() if ".dist-info/" not in name}
     assert names == tracked(tree, "agent", "world", "protocol", "compose")
+    assert {f"{package}/py.typed" for package in ("agent", "world", "protocol", "compose")} <= names
