@@ -96,7 +96,7 @@ class Rover:
         self._save()
 
     def resume(self, tick: int, mark: tuple[float, ...]) -> None:  # noqa: ARG002  # `state` has it all
-        """Report the motion of a reading that was not recorded again. Raises RuntimeError without a `state`."""
+        """Report the motion of an unrecorded reading again. Raises RuntimeError without a `state`."""
         if not self._found:
             raise RuntimeError("where the body was is not known without --option state=FILE")
         if self._tick > tick:
