@@ -270,7 +270,7 @@ def test_every_generated_table_is_on_a_page_and_explains_each_row() -> None:
     assert used == set(reference.TABLES)
     for name, table in reference.TABLES.items():
         lines = table().splitlines()
-        assert any(line.startswith("| `") or line.startswith("| proto") for line in lines), name
+        assert any(line.startswith(("| `", "| proto")) for line in lines), name
         assert not [line for line in lines if line.endswith("|  |")], f"{name}: a field without a meaning"
 
 
