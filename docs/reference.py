@@ -51,7 +51,7 @@ MEANINGS = {
     "ScenarioFile.mission": "`[mission]`",
     "ScenarioFile.robot": "one `[[robot]]` for each robot",
     "ScenarioFile.seed": "the seed of all random draws, starts included",
-    "ScenarioFile.max_ticks": "the tick after which the run ends undecided; by default computed from the mission",
+    "ScenarioFile.max_ticks": "the last tick of an undecided run; computed from the mission by default",
     "ScenarioFile.planner": "`[planner]`",
     "Mission.noise": "`[mission.noise]`; exact sensors if left out",
     "PlannerTable.name": "the planner of all robots",
