@@ -1,4 +1,4 @@
-"""Draws the pictures of single missions in README and on the pages: `uv run docs/picture.py`."""
+"""Draw the figures of single missions in the documentation again: `uv run docs/picture.py`."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ SHOWN: dict[str, dict[str, str]] = {
     },
     "noisy": {"plan-a-b": "noisy-plan", "robot-a": "noisy-a"},
 }
-"""by scenario: of the pictures that `tandem figures` makes, those that are shown, and their names here"""
+"""By scenario: the titles of the figures of `tandem figures` that pages show, and their file names here."""
 
 
 def main() -> None:
-    """What `tandem run SCENARIO --out DIR` and `tandem figures DIR --format svg` leave in DIR/figures."""
+    """Draw the figures that `tandem run SCENARIO --out DIR` and `tandem figures DIR --format svg` write."""
     for name, shown in SHOWN.items():
         with tempfile.TemporaryDirectory() as folder:
             draw(name, shown, Path(folder))
 
 
 def draw(name: str, shown: Mapping[str, str], folder: Path) -> None:
-    """Play the scenario, and take those pictures of it that are `shown`."""
+    """Run the scenario in `folder`, and copy those of its figures to docs/ that `shown` names."""
     recording = in_process.play(scenario_file.load(name), folder)
     robots = [robot.id for robot in recording.scenario.robots]
     pair = of_record(recording, (0, 1), {robot: account(folder, robot) for robot in robots})

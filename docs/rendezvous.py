@@ -1,9 +1,9 @@
-"""How soon orbits meet: `uv run docs/rendezvous.py [ANGLES] [PLANS]` (1000, 200).
+"""Print how soon two orbiting robots are in range: `uv run docs/rendezvous.py [ANGLES] [PLANS]` (1000, 200).
 
-The mean and the longest time, in ticks, until two robots that drive round their anchors are in range of
-each other, over all pairs of ANGLES starting angles: on the orbits of `assured`; on the paper's, inside
-(D + R) / 2 by the margin that they need to meet at all (a sixth of the angles); and on the soonest of PLANS
-others: any two circles, any constant speeds, either sense, drawn at random and then near the best so far.
+The output is the mean and the longest time, in ticks, over all pairs of ANGLES starting angles, for three
+kinds of orbits: those of `assured`; those of the paper, inside (D + R) / 2 by the margin that they need to
+meet at all (with a sixth of the angles); and the soonest of PLANS others. These are any two circles with any
+constant speeds in either sense, drawn at random and then near the best ones so far.
 """
 
 from __future__ import annotations
@@ -33,27 +33,27 @@ SETTINGS = [
         for omega in (0.2, math.pi)
     ),
 ]
-"""D in m, and R, T_s, v_max, omega_max: those of the sweep `settings`"""
+"""D in m, and the mission with R, T_s, v_max and omega_max: the settings of the sweep `settings`."""
 
 COARSE = 40
-"""starting angles, of a plan that is only drawn"""
-KEPT = 20
-"""of the best plans so far, near which others are drawn"""
+"""The number of starting angles of a drawn plan."""
+BEST = 20
+"""The number of best plans so far near which others are drawn."""
 LONG_TICK = 0.5
-"""s: other plans are drawn only where a tick is so long; where it is shorter, they take their time"""
+"""s: plans are drawn only where a tick is at least this long; with shorter ticks, that takes too long."""
 LIMIT = 20.0
-"""times round an orbit of radius D + R: for so long a meeting is waited for"""
+"""The time after which a simulation stops, in rounds of an orbit of radius D + R at v_max."""
 
 
 class Meeting(NamedTuple):
-    """Ticks until two robots are in range."""
+    """The ticks until two robots are in range, over all pairs of starting angles."""
 
     mean: float
     worst: int
 
 
 def meeting(setting: tuple[float, Mission], a: Orbit, b: Orbit, angles: int) -> Meeting:
-    """By driving from every pair of starting angles, tick by tick."""
+    """Return the ticks until the orbits `a` and `b` meet, by simulation from all pairs of `angles` angles."""
     distance, mission = setting
     starts = (np.arange(angles) + 0.5) * (TAU / angles)
     alpha, beta = (grid.ravel() for grid in np.meshgrid(starts, starts, indexing="ij"))
@@ -73,7 +73,7 @@ def meeting(setting: tuple[float, Mission], a: Orbit, b: Orbit, angles: int) -> 
 
 
 def papers(setting: tuple[float, Mission]) -> tuple[Orbit, Orbit]:
-    """The paper's orbits, inside (D + R) / 2 by m0 = (v T_s (1 - Omega / pi))^2 / (16 R)."""
+    """Return the paper's orbits, inside (D + R) / 2 by m0 = (v T_s (1 - Omega / pi))^2 / (16 R)."""
     distance, mission = setting
     share = half_arc(distance, mission.sensing_range) / math.pi
     margin = (mission.max_speed * mission.period * (1.0 - share)) ** 2 / (16.0 * mission.sensing_range)
@@ -82,19 +82,19 @@ def papers(setting: tuple[float, Mission]) -> tuple[Orbit, Orbit]:
 
 
 def driven(mission: Mission, radius: float, share: float) -> Orbit:
-    """The circle of `radius` (m), at `share` of the speed that is possible there; its sign is the sense."""
+    """Return the circle of `radius` (m) at `share` of the highest speed on it; the sign is the direction."""
     omega = share * min(mission.max_turn_rate, mission.max_speed / max(radius, 1e-9))
     return Orbit(radius, abs(omega) * radius, omega)
 
 
 def soonest(setting: tuple[float, Mission], plans: int) -> Meeting:
-    """The best mean of `plans` pairs of orbits."""
+    """Return the result of that of `plans` drawn pairs of orbits which has the shortest mean time."""
     distance, mission = setting
     size = distance + mission.sensing_range
     draw = np.random.default_rng(1)
     best: list[tuple[Meeting, float, float, float]] = []
     for plan in range(plans):
-        if plan < KEPT or draw.random() < 0.3:
+        if plan < BEST or draw.random() < 0.3:
             radius_a, radius_b, share = draw.uniform([0.0, 0.0, -1.0], [size, size, 1.0])
         else:
             scale = 10.0 ** draw.uniform(-3.0, -0.7)
@@ -102,12 +102,12 @@ def soonest(setting: tuple[float, Mission], plans: int) -> Meeting:
             radius_a, radius_b, share = np.array(near) + scale * draw.normal(size=3) * [size, size, 1.0]
         radius_a, radius_b, share = abs(radius_a), abs(radius_b), float(np.clip(share, -1.0, 1.0))
         met = meeting(setting, driven(mission, radius_a, 1.0), driven(mission, radius_b, share), COARSE)
-        best = sorted([*best, (met, radius_a, radius_b, share)])[:KEPT]
+        best = sorted([*best, (met, radius_a, radius_b, share)])[:BEST]
     return best[0][0]
 
 
 def main(angles: int, plans: int) -> None:
-    """A line each setting."""
+    """Print one line for each setting."""
     print(f"{'D, R, T_s, v_max, omega_max':>30}   assured: bound, mean / worst   paper's orbits   drawn")
     for setting in SETTINGS:
         distance, mission = setting

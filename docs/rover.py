@@ -1,13 +1,13 @@
-"""A robot that is nowhere but in its own process: a driver to copy from, and the ranging between two of them.
+"""A simulated robot as a driver to copy from, and a process that measures the range between two of them.
 
-    uv run docs/rover.py --port 4747 --reach 3                # the beacon: ranges one robot from the other
+    uv run docs/rover.py --port 4747 --reach 3                # the beacon: measures the mutual range
     uv run tandem robot a --mission paper-1 --driver docs.rover:Rover --rate 4 --listen tcp/127.0.0.1:7447 \
         --option start=2.4,-1.2,4.8 --option beacon=127.0.0.1:4747
     uv run tandem robot b --mission paper-1 --driver docs.rover:Rover --rate 4 --connect tcp/127.0.0.1:7447 \
         --option start=11.3,-0.4,3.6 --option beacon=127.0.0.1:4747
 
-There is no world: each robot moves by its own kinematics, and only the beacon, which stands for an
-ultra-wideband exchange between the two, hears from both where they are. Nobody tells the agents.
+There is no simulator process: each robot moves by its own kinematics. Only the beacon, which takes the place
+of an ultra-wideband exchange between the two, receives both positions. The agents receive neither.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from protocol.motion import REST, Controls, Pose, step, wrap
 from world.hardware.driver import Reading
 
 ASK_AGAIN_S = 0.05
-"""a datagram may be lost"""
+"""s: the interval at which a datagram is repeated, because one may be lost."""
 
 
 class Rover:
-    """Wheels, odometry, an anchor's range and the peer's, all without error."""
+    """A driver whose wheels, odometry and ranges are exact (see `world.hardware.driver.Driver`)."""
 
     def __init__(
         self,
@@ -43,11 +43,11 @@ class Rover:
         state: str = "",
         timeout: str = "10",
     ) -> None:
-        """`start` is x,y,heading in <W>, which no agent is told; `beacon` HOST:PORT, or there is no peer.
+        """Place the robot at `start`, "x,y,heading" in <W>, and connect to the `beacon` at "HOST:PORT".
 
-        `state` is a file that stands for the robot's body, which outlasts this process: where it is, and what
-        its wheels are at. `timeout` (s) bounds the wait for the peer to stand in the same tick: this robot
-        has no drop-outs, and rather than call silence what is none, it gives up.
+        No agent receives `start`. `state` is a file with the pose and the wheels' motion, which outlast this
+        process like a robot's body. `timeout` (s) bounds the wait until the peer stands in the same tick.
+        After it the driver raises: this robot has no drop-outs, so it must not report a missing range.
         """
         self._config = config
         self._manoeuvre_s = manoeuvre_s
@@ -57,20 +57,20 @@ class Rover:
             if start
             else Pose(anchor.x + 0.1, anchor.y - 0.2, 0.7)
         )
-        """where it truly was at the last reading"""
+        """The true pose, up to the part of the manoeuvre that `_done` counts."""
         self._controls = REST
         self._began = 0.0
         self._done = 1.0
-        """how much of the manoeuvre is in `pose`"""
+        """The fraction of the current manoeuvre that is in `pose`, from 0 to 1."""
         self._driven = REST
-        """since the last reading"""
+        """The motion since the last reading."""
         self._executed = REST
-        """what that told"""
+        """The motion that the last reading reported."""
         self._tick = 0
         self._give_up_s = float(timeout)
         self._state = Path(state) if state else None
         self._found = self._state is not None and self._state.exists()
-        """whether where the body is has been found, and not made up"""
+        """True if the pose comes from the file `state`."""
         if self._state is not None and self._found:
             self._load(self._state)
         host, _, port = beacon.rpartition(":")
@@ -80,7 +80,7 @@ class Rover:
             self._radio.connect((host, int(port)))
 
     def sense(self, tick: int) -> Reading:
-        """Where it has come to, and what is in range there."""
+        """Return the motion since the last reading, and the ranges at the pose now."""
         self._settle()
         executed, self._driven = self._driven, REST
         self._tick, self._executed = tick, executed
@@ -90,13 +90,13 @@ class Rover:
         return Reading(executed, rho if rho <= reach else None, self._mutual_range(tick))
 
     def drive(self, v: float, omega: float) -> None:
-        """Hold them for a manoeuvre; what was left of the one before is not driven any more."""
+        """Hold `v` and `omega` for a manoeuvre. The rest of the previous manoeuvre is not driven."""
         self._settle()
         self._controls, self._began, self._done = Controls(v, omega), time.monotonic(), 0.0
         self._save()
 
-    def resume(self, tick: int, mark: tuple[float, ...]) -> None:  # noqa: ARG002  # the state tells enough
-        """Take back a reading that nobody has put on record. Raises RuntimeError if there was no `state`."""
+    def resume(self, tick: int, mark: tuple[float, ...]) -> None:  # noqa: ARG002  # `state` has it all
+        """Report the motion of an unrecorded reading again. Raises RuntimeError without a `state`."""
         if not self._found:
             raise RuntimeError("where the body was is not known without --option state=FILE")
         if self._tick > tick:
@@ -105,22 +105,22 @@ class Rover:
             )
 
     def stop(self) -> None:
-        """Stand, and stay in range of whoever ranges it."""
+        """Stop, and stay available for the peer's mutual ranges."""
         self._settle()
         if self._done < 1.0:
             self._controls, self._done = REST, 1.0
         self._save()
-        self._tell(self._tick, parked=True)
+        self._send(self._tick, parked=True)
 
     def close(self) -> None:
-        """Nobody else will say where it was."""
+        """Print the true pose, which no other process knows."""
         if self._radio is not None:
             self._radio.close()
         x, y, heading = self.pose.x, self.pose.y, wrap(self.pose.heading)
         print(f"{self._config.robot}: truly at {x:.9f} {y:.9f} {heading:+.9f}", flush=True)
 
     def _settle(self) -> None:
-        """Move `pose` to where the wheels have come by now, and count what took it there."""
+        """Move `pose` by what the wheels have driven up to now, and add that to `_driven`."""
         share = min(1.0, (time.monotonic() - self._began) / self._manoeuvre_s) - self._done
         self._done += share
         v, omega = self._controls.v * share, self._controls.omega * share
@@ -128,7 +128,7 @@ class Rover:
         self._driven = Controls(self._driven.v + v, self._driven.omega + omega)
 
     def _save(self) -> None:
-        """Put on file where the body is, and what its wheels are at, whole or not at all."""
+        """Write pose and motion to the file `state`, atomically."""
         if self._state is not None:
             wheels = self._controls, self._began, self._done
             body = self.pose, *wheels, self._driven, self._executed, self._tick
@@ -142,61 +142,61 @@ class Rover:
         self.pose, self._controls, self._began, self._done, self._driven, self._executed, self._tick = body
 
     def _mutual_range(self, tick: int) -> float | None:
-        """m; none if the peer, standing in the same tick, is out of range. Raises TimeoutError."""
+        """Return the range (m) to the peer in the same tick; None out of range. Raises TimeoutError."""
         give_up = time.monotonic() + self._give_up_s
         while self._radio is not None and time.monotonic() < give_up:
-            self._tell(tick)
+            self._send(tick)
             try:
-                said = json.loads(self._radio.recv(1024))
+                answer = json.loads(self._radio.recv(1024))
             except TimeoutError:
                 continue
-            except ConnectionRefusedError:  # there is no beacon; to be told so takes no time
+            except ConnectionRefusedError:  # there is no beacon, and the refusal came at once
                 time.sleep(ASK_AGAIN_S)
                 continue
-            if said["tick"] == tick:
-                return said["range"] if said["range"] is None else float(said["range"])
+            if answer["tick"] == tick:
+                return None if answer["range"] is None else float(answer["range"])
         if self._radio is None:
             return None
         raise TimeoutError(f"no answer of the beacon for {self._give_up_s:g} s")
 
-    def _tell(self, tick: int, *, parked: bool = False) -> None:
+    def _send(self, tick: int, *, parked: bool = False) -> None:
         where = {"robot": self._config.robot, "peer": self._config.peer, "tick": tick, "parked": parked}
         if self._radio is not None:
-            with suppress(ConnectionRefusedError):  # what was sent before found no beacon
+            with suppress(ConnectionRefusedError):  # of an earlier datagram: there is no beacon
                 self._radio.send(json.dumps(where | {"x": self.pose.x, "y": self.pose.y}).encode())
 
 
 def main() -> None:
-    """The beacon: answers a robot once its peer stands in the same tick, or is parked."""
+    """Run the beacon: it answers a robot once its peer stands in the same tick, or is parked."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--port", type=int, default=0)
-    parser.add_argument("--reach", type=float, required=True, help="R, in m")
+    parser.add_argument("--reach", type=float, required=True, help="the sensing range R, in m")
     options = parser.parse_args()
-    air = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    air.bind(("127.0.0.1", options.port))
-    print(f"ranging at 127.0.0.1:{air.getsockname()[1]}", flush=True)
-    told: dict[tuple[str, str], tuple[float, float]] = {}
+    radio = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    radio.bind(("127.0.0.1", options.port))
+    print(f"ranging at 127.0.0.1:{radio.getsockname()[1]}", flush=True)
+    positions: dict[tuple[str, str], tuple[float, float]] = {}
     senders: dict[str, tuple[str, int]] = {}
     latest: dict[str, int] = {}
     while True:
-        message, sender = air.recvfrom(1024)
+        message, sender = radio.recvfrom(1024)
         one = json.loads(message)
         robot, peer, tick = one["robot"], one["peer"], one["tick"]
         senders[robot] = sender
-        told.pop((robot, "parked"), None)  # it goes on, or is parked elsewhere
-        for again in range(tick, latest.get(robot, tick)):  # it begins anew
-            told.pop((robot, str(again + 1)), None)
-            told.pop((robot, str(again)), None)
+        positions.pop((robot, "parked"), None)  # it moves again, or is parked elsewhere
+        for again in range(tick, latest.get(robot, tick)):  # it starts from an earlier tick again
+            positions.pop((robot, str(again + 1)), None)
+            positions.pop((robot, str(again)), None)
         latest[robot] = tick
-        place = told.setdefault((robot, "parked" if one["parked"] else str(tick)), (one["x"], one["y"]))
-        other = told.get((peer, str(tick)), told.get((peer, "parked")))
+        place = positions.setdefault((robot, "parked" if one["parked"] else str(tick)), (one["x"], one["y"]))
+        other = positions.get((peer, str(tick)), positions.get((peer, "parked")))
         if other is not None and not one["parked"]:
             rho = math.dist(place, other)
             answer = json.dumps({"tick": tick, "range": rho if rho <= options.reach else None}).encode()
             for name in {robot, peer} & senders.keys():
-                air.sendto(answer, senders[name])
-        elif latest.get(peer, tick) > tick:  # and will not stand in this one any more
-            air.sendto(json.dumps({"tick": tick, "range": None}).encode(), sender)
+                radio.sendto(answer, senders[name])
+        elif latest.get(peer, tick) > tick:  # the peer has left this tick
+            radio.sendto(json.dumps({"tick": tick, "range": None}).encode(), sender)
 
 
 if __name__ == "__main__":

@@ -415,10 +415,8 @@ def test_a_journal_of_another_version_is_followed_to_where_it_decides_otherwise(
     assert ended.status == 3
     assert ended.err == (
         "tandem figures: figures of b end where its journal cannot be replayed: the recorded decision "
-        "at tick 20 differs: another version wrote the journal
-"
-        "tandem figures: no plan-a-b: the journal of b is missing or cannot be replayed to its end
-"
+        "at tick 20 differs: another version wrote the journal\n"
+        "tandem figures: no plan-a-b: the journal of b is missing or cannot be replayed to its end\n"
     )
 
 

@@ -399,7 +399,9 @@ ENDPOINTS = [
 def test_an_endpoint_that_does_not_parse_is_refused(
     command: tuple[str, ...], endpoint: str, tmp_path: Path
 ) -> None:
-    refused(tandem(*command, endpoint, "--out", "out", cwd=tmp_path), f"{command[-1]}: ", "is not an endpoint")
+    refused(
+        tandem(*command, endpoint, "--out", "out", cwd=tmp_path), f"{command[-1]}: ", "is not an endpoint"
+    )
     assert list(tmp_path.iterdir()) == []
 
 

@@ -304,7 +304,8 @@ def test_the_end_says_how_many_deadlines_each_robot_missed_and_suggests_a_lower_
     last = recording.moments[-1].truth.tick
     said = capsys.readouterr().out.splitlines()[-1]
     assert said == (
-        f"deadlines missed, of {last}: a 7, b 1; a lower --rate, such as --rate 20, gives each robot more time"
+        f"deadlines missed, of {last}: a 7, b 1; "
+        "a lower --rate, such as --rate 20, gives each robot more time"
     )
 
 

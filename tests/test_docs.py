@@ -1,4 +1,4 @@
-"""The program `docs/rendezvous.py`, which the README refers to, prints its figures."""
+"""The scripts in docs/ run."""
 
 from __future__ import annotations
 

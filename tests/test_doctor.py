@@ -421,9 +421,7 @@ def test_rules_that_do_not_name_the_robot_are_told(keys: Path, tmp_path: Path) -
     assert tandem("keys", everybody, "--robots", "c").status == 0
     with router_by(keys, enforce, tmp_path) as endpoint:
         ended = tandem("doctor", "--connect", endpoint, "--keys", everybody / "agent-c")
-    only_fix(
-        ended, "rules: agent-c cannot publish Reports of c; the router must enforce the rules"
-    )
+    only_fix(ended, "rules: agent-c cannot publish Reports of c; the router must enforce the rules")
 
 
 def test_what_cannot_be_tried_without_a_mission_that_moves_is_not_said_to_be_well(

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from compose.cli.main import COMMANDS, Command, command_parser
+from compose.cli.main import COMMANDS, CommandEntry, command_parser
 from tests.commands import tandem
 from tests.test_house import HOUSE
 
@@ -31,7 +31,7 @@ def test_help_lists_every_command_once_under_its_group() -> None:
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
-def test_the_help_of_a_command_ends_with_an_example_and_a_page(command: Command) -> None:
+def test_the_help_of_a_command_ends_with_an_example_and_a_page(command: CommandEntry) -> None:
     parser = command_parser(command)
     *_, example_heading, example, _, heading, page = parser.format_help().splitlines()
     assert (example_heading, heading) == ("example:", "documentation:")
@@ -42,7 +42,7 @@ def test_the_help_of_a_command_ends_with_an_example_and_a_page(command: Command)
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
-def test_every_flag_is_explained_with_its_default(command: Command) -> None:
+def test_every_flag_is_explained_with_its_default(command: CommandEntry) -> None:
     for action in command_parser(command)._actions:
         assert action.help, action
         if isinstance(action.default, int | float | str) and action.default not in (False, argparse.SUPPRESS):
@@ -50,7 +50,7 @@ def test_every_flag_is_explained_with_its_default(command: Command) -> None:
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
-def test_a_command_imports_only_its_own_module(command: Command) -> None:
+def test_a_command_imports_only_its_own_module(command: CommandEntry) -> None:
     code = (
         "import sys\nfrom compose.cli import main\n"
         f"main.command_parser(next(one for one in main.COMMANDS if one.name == {command.name!r}))\n"

@@ -1,4 +1,4 @@
-"""The contents of a distribution: the sources, and no keys or recordings that are in the tree."""
+"""A distribution has the sources, and no key or recording that is in the tree beside them."""
 
 from __future__ import annotations
 
@@ -22,11 +22,20 @@ FOREIGN = (
     "tests/agent-a.journal",
     "notes.md",
 )
+PROJECT_FILES = {
+    "CHANGELOG.md",
+    "CITATION.cff",
+    "CONTRIBUTING.md",
+    "LICENSE",
+    "README.md",
+    "mkdocs.yml",
+    "pyproject.toml",
+}
 
 
 @pytest.fixture(scope="module")
 def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a copy of the repository with additional files of a user."""
+    """Return a folder with the files of the repository, and files that a user has written into it."""
     folder = tmp_path_factory.mktemp("tree")
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=False)
     if listed.returncode:
@@ -34,7 +43,7 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in filter(None, listed.stdout.split("\0")):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(ROOT / name, folder / name)
-    (folder / ".gitignore").unlink()  # the list of packed files must suffice
+    (folder / ".gitignore").unlink()  # the list of packed files must suffice without it
     for name in FOREIGN:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(SECRET)
@@ -66,15 +75,18 @@ def tracked(tree: Path, *folders: str) -> set[str]:
     return {name for name in names if name not in FOREIGN}
 
 
-def test_an_sdist_holds_the_sources_and_nothing_that_lies_beside_them(tree: Path, tmp_path: Path) -> None:
+def test_an_sdist_has_the_sources_and_nothing_else(tree: Path, tmp_path: Path) -> None:
     with tarfile.open(built(tree, "sdist", tmp_path)) as packed:
         names = {name.partition("/")[2] for name in packed.getnames()}
     assert not names & set(FOREIGN)
     wanted = tracked(tree, "agent", "world", "protocol", "compose", "docs", "tests")
-    assert names == wanted | {"LICENSE", "README.md", "pyproject.toml", "PKG-INFO"}
+    assert names == wanted | PROJECT_FILES | {"PKG-INFO"}
 
 
-def test_a_wheel_holds_the_packages_their_data_and_nothing_else(tree: Path, tmp_path: Path) -> None:
+def test_a_wheel_has_the_packages_with_their_data_and_types_and_nothing_else(
+    tree: Path, tmp_path: Path
+) -> None:
     with zipfile.ZipFile(built(tree, "wheel", tmp_path)) as packed:
         names = {name for name in packed.namelist() if ".dist-info/" not in name}
     assert names == tracked(tree, "agent", "world", "protocol", "compose")
+    assert {f"{package}/py.typed" for package in ("agent", "world", "protocol", "compose")} <= names

@@ -141,6 +141,6 @@ def test_a_distance_of_which_nobody_would_be_warned_is_refused(tmp_path: Path) -
     ended = tandem("run", file)
     assert ended.status == 2
     assert ended.err == (
-        f"tandem run: {file}: mission.safety_distance: 1.01 m, but robots that approach each other at max_speed "
-        "may be 1 m apart at their first contact (sensing_range - 2 max_speed period)\n"
+        f"tandem run: {file}: mission.safety_distance: 1.01 m, but robots that approach each other at "
+        "max_speed may be 1 m apart at their first contact (sensing_range - 2 max_speed period)\n"
     )

@@ -472,7 +472,10 @@ def test_ctrl_c_ends_the_page_with_somebody_watching(paper_1: Path) -> None:
             [".", "--connect", "tcp/127.0.0.1:7447"],
             "--connect: a recording needs no network; give either DIR or --connect",
         ),
-        (["--connect", "here"], "--connect: 'here' is not an endpoint; expected one such as tcp/127.0.0.1:7447"),
+        (
+            ["--connect", "here"],
+            "--connect: 'here' is not an endpoint; expected one such as tcp/127.0.0.1:7447",
+        ),
         (
             [".", "--port", "65536"],
             "argument --port: 65536 is not a port, which is 0 (any free port) to 65535",

@@ -392,7 +392,7 @@ class WorldLinks:
             self._inbox.say(f"no router at {self.endpoints} yet: {diagnosis.why(self.endpoints)}")
 
     def run(self, process: WorldProcess) -> None:
-        """Run `process` to its MissionEnd, over as many sessions as needed. Raises NoRouter or Interrupted."""
+        """Run `process` to its MissionEnd over as many sessions as needed. Raises NoRouter, Interrupted."""
         while True:
             assert self.session is not None
             process.attach(self.session, replaceable=self.endpoints.mode == "client")

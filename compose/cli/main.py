@@ -28,7 +28,7 @@ CLOSING = """\
 Documentation: README.md and docs/ in the repository."""
 
 
-class Command(NamedTuple):
+class CommandEntry(NamedTuple):
     """One command of `tandem`."""
 
     name: str
@@ -42,46 +42,56 @@ class Command(NamedTuple):
 
 
 COMMANDS = (
-    Command("run", "Run", "Run a mission on this machine.", "compose.cli.run"),
-    Command(
+    CommandEntry("run", "Run", "Run a mission on this machine.", "compose.cli.run"),
+    CommandEntry(
         "replay",
         "Run",
         "Run a recording again and compare it with the original bit by bit.",
         "compose.cli.replay",
     ),
-    Command(
+    CommandEntry(
         "scenarios", "Run", "List the scenarios and sweeps that ship with Tandem.", "compose.cli.scenarios"
     ),
-    Command("sweep", "Run", "Run many trials of a scenario, over ranges of its fields.", "compose.cli.sweep"),
-    Command("world", "Deploy", "Run the simulator of a mission; agents connect to it.", "compose.cli.world"),
-    Command("agent", "Deploy", "Run the agent of one robot; it connects to a world.", "compose.cli.agent"),
-    Command("robot", "Deploy", "Run one robot on its own hardware, with its driver.", "compose.cli.robot"),
-    Command(
+    CommandEntry(
+        "sweep", "Run", "Run many trials of a scenario, over ranges of its fields.", "compose.cli.sweep"
+    ),
+    CommandEntry(
+        "world", "Deploy", "Run the simulator of a mission; agents connect to it.", "compose.cli.world"
+    ),
+    CommandEntry(
+        "agent", "Deploy", "Run the agent of one robot; it connects to a world.", "compose.cli.agent"
+    ),
+    CommandEntry(
+        "robot", "Deploy", "Run one robot on its own hardware, with its driver.", "compose.cli.robot"
+    ),
+    CommandEntry(
         "keys",
         "Deploy",
         "Create certificates and access rules for networks without trust.",
         "compose.cli.keys",
     ),
-    Command("audit", "Analyse", "Check a recording against the rules of the system.", "compose.cli.audit"),
-    Command("figures", "Analyse", "Draw the figures of a recording.", "compose.cli.figures"),
-    Command("export", "Analyse", "Convert a recording to MCAP, CSV and Parquet.", "compose.cli.export"),
-    Command(
+    CommandEntry(
+        "audit", "Analyse", "Check a recording against the rules of the system.", "compose.cli.audit"
+    ),
+    CommandEntry("figures", "Analyse", "Draw the figures of a recording.", "compose.cli.figures"),
+    CommandEntry("export", "Analyse", "Convert a recording to MCAP, CSV and Parquet.", "compose.cli.export"),
+    CommandEntry(
         "watch", "Analyse", "Serve a web page that shows recordings or live missions.", "compose.cli.watch"
     ),
-    Command(
+    CommandEntry(
         "doctor",
         "Check",
         "Check this machine, its keys and its network before a mission.",
         "compose.cli.doctor",
     ),
-    Command("ps", "Check", "List the missions on a network and the robots in them.", "compose.cli.ps"),
-    Command(
+    CommandEntry("ps", "Check", "List the missions on a network and the robots in them.", "compose.cli.ps"),
+    CommandEntry(
         "check-driver",
         "Check",
         "Check a driver against its contract; the robot moves.",
         "compose.cli.check_driver",
     ),
-    Command("bench", "Check", "Measure speed against baselines in the same run.", "compose.cli.bench"),
+    CommandEntry("bench", "Check", "Measure speed against baselines in the same run.", "compose.cli.bench"),
 )
 """All commands, in the order of `tandem --help`."""
 
@@ -166,7 +176,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 @cache  # a process forked from one that has built the parser does not build it again
-def command_parser(command: Command) -> CommandParser:
+def command_parser(command: CommandEntry) -> CommandParser:
     """Import the module of `command`, and return its parser."""
     parser = CommandParser(
         prog=f"tandem {command.name}",
@@ -178,7 +188,7 @@ def command_parser(command: Command) -> CommandParser:
     return parser
 
 
-def _split(arguments: Sequence[str]) -> tuple[Command, Sequence[str]]:
+def _split(arguments: Sequence[str]) -> tuple[CommandEntry, Sequence[str]]:
     """Return the command that `arguments` name, and the words after it.
 
     End the process after `--help` or `--version`, or if there is no such command.

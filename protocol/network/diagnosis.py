@@ -17,9 +17,7 @@ STEP_S = 2.0
 ALERT_S = 0.5
 """The time in s in which a router refuses a certificate after the TLS handshake."""
 
-MUTE = (
-    "something listens there, but links fail; check that it is a Zenoh router, user and password, and tls/"
-)
+MUTE = "something listens there, but links fail; check that it is a Zenoh router, user and password, and tls/"
 ALERTS = {
     "certificate_expired": "this certificate has expired",
     "unknown_ca": "it does not trust the authority of this certificate",

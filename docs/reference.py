@@ -1,0 +1,406 @@
+"""Tables of the reference pages, generated from the code: the hook that mkdocs.yml names.
+
+A page has a line `<!-- generated: NAME -->` for each of TABLES, and the hook writes that table below it.
+`uv run docs/reference.py NAME` prints one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import inspect
+import re
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache, partial
+from itertools import pairwise
+from types import ModuleType
+from typing import Any
+
+import msgspec
+from msgspec import NODEFAULT
+from msgspec import inspect as types
+
+from compose.cli.main import COMMANDS, command_parser
+from compose.recording.ticks_csv import TickRow
+from compose.scenario.fault_syntax import FaultTable
+from compose.scenario.kills import KillTable
+from compose.scenario.scenario_file import PlannerTable, RobotTable, ScenarioFile
+from compose.sweep.draws import DrawTable, StartsTable
+from compose.sweep.spec import AxisTable, SpecFile
+from compose.sweep.trial import RobotRow, TrialRow
+from protocol import messages, wire
+from protocol.attack import Attack
+from protocol.mission import Mission
+from protocol.network import keys
+from protocol.noise import Noise, VelocityNoise
+
+MARKER = re.compile(r"^<!-- generated: (?P<name>[\w-]+) -->$", re.MULTILINE)
+NO_VALUE = "none"
+PARTS = (
+    messages.Contact,
+    messages.Ranged,
+    messages.Localised,
+    messages.Undecided,
+    messages.Inconsistent,
+)
+"""structs that messages contain, and that have no tables on other pages"""
+
+MEANINGS = {
+    "ScenarioFile.name": "the name of the scenario, and the beginning of the names of its runs",
+    "ScenarioFile.mission": "`[mission]`",
+    "ScenarioFile.robot": "one `[[robot]]` for each robot",
+    "ScenarioFile.seed": "the seed of all random draws, starts included",
+    "ScenarioFile.max_ticks": "the last tick of an undecided run; computed from the mission by default",
+    "ScenarioFile.planner": "`[planner]`",
+    "Mission.noise": "`[mission.noise]`; exact sensors if left out",
+    "PlannerTable.name": "the planner of all robots",
+    "RobotTable.id": "the robot's name",
+    "RobotTable.anchor": "x, y of the robot's anchor, in m",
+    "Attack.kind": "the kind of false data",
+    "Attack.part": "the part of the log that is false; `all` for the last three kinds",
+    "SpecFile.name": "the name of the sweep",
+    "SpecFile.seed": "the seed from which the seeds of all trials follow",
+    "SpecFile.axis": "one `[[axis]]` for each axis; a sweep without axes has one cell",
+    "AxisTable.values": "the values; with `fields`, a list of values for each",
+    "AxisTable.field": "the path of the field that varies",
+    "AxisTable.fields": "the paths of the fields that vary together",
+    "AxisTable.name": "the name of an axis with several fields, or with labels",
+    "DrawTable.field": "the path of the field that is drawn",
+    "DrawTable.uniform": "the interval of a uniform draw",
+    "DrawTable.log_uniform": "the interval of a draw whose logarithm is uniform",
+    "DrawTable.times": "the paths of fields that the draw is multiplied by",
+    "DrawTable.over": "the paths of fields that the draw is divided by",
+    "StartsTable.places": "the kinds of start position",
+    "StartsTable.headings": "the kinds of start heading",
+    "TrialRow.cell": "the number of the cell",
+    "TrialRow.trial": "the number of the trial in its cell",
+    "TrialRow.outcome": "the outcome of the mission, or `refused`",
+    "TrialRow.ticks": "the ticks of the mission",
+    "TrialRow.t_max_s": "T_max, the bound on the time that both orbit before the encounter",
+    "TrialRow.t_max_ticks": "the same in ticks",
+    "TrialRow.reports_heard": "reports received by all robots, repeated ones included",
+    "TrialRow.reports_refused": "reports refused by all robots",
+    "TrialRow.first_violation": "the first violation of a rule",
+    "TrialRow.wall_s": "s that the trial took by the clock",
+    "TrialRow.robots": "the columns of the next table, for each robot",
+    "TrialRow.heading_error_rad": "rad, of the robot with the largest heading error",
+    "RobotRow.branch": "how phase 1 ended",
+    "RobotRow.candidates": "solutions of eq. (7), before ticks without a detection are used",
+    "RobotRow.candidates_left": "solutions of eq. (7), after that",
+    "RobotRow.position_error_m": "m, the error of the claimed position",
+    "RobotRow.heading_error_rad": "rad, the error of the claimed heading",
+    "TickRow.y": "true position, m",
+    "TickRow.omega": "rad/s, likewise",
+    "TickRow.anchor_range": "m, as measured; empty out of range, or for a drop-out",
+    "TickRow.mutual_range": "m, as measured; empty likewise",
+    "Environment.tandem": "the version of Tandem",
+    "Environment.c_library": "the C library and its version",
+    "Environment.instruction_set": "the instruction set of the processor",
+    "Environment.linear_algebra": "the linear-algebra library of numpy and its version",
+    "RobotConfig.role": "the paper's a or b",
+    "RobotConfig.peer_anchor": "the peer's anchor",
+    "RobotConfig.mission": "the mission, as in the scenario",
+    "RobotConfig.planner_name": "the planner of the robot",
+    "RobotConfig.rendezvous": "the orbits of both robots, and T_max in s",
+    "Observation.anchor_range": "m, to the robot's own anchor; none out of range, or for a drop-out",
+    "Observation.contacts": "the robots in range",
+    "Report.since": "the tick in which the manoeuvres in `runs` begin",
+    "Report.runs": "the manoeuvres, equal ones in a row as one segment",
+    "Command.v": "m/s",
+    "Command.omega": "rad/s",
+    "Estimate.localised": "whether the robot has claimed a pose",
+    "GroundTruth.poses": "the true pose of each robot",
+    "MissionEnd.outcome": "the outcome of the mission",
+    "MissionEnd.reason": "the reason, if the outcome is not `localised`",
+    "Contact.range": "m, the mutual range; none for a drop-out",
+    "Ranged.range": "m",
+    "Localised.pose": "x, y in m, heading in rad, in the world frame",
+    "Undecided.reason": "the reason, in words",
+    "anchor_ranges": "the number of ranges to the anchor",
+    "mutual_ranges": "the number of ranges to the peer",
+    "branch": "how phase 1 ended",
+    "cov_xy": "likewise",
+    "cov_xh": "likewise",
+    "cov_yy": "likewise",
+    "cov_yh": "likewise",
+    "cov_hh": "likewise",
+    "peer": "the other robot of the pair",
+    "phase": "the phase of the method: 1, 2 or 3",
+    "reports_heard": "reports received, repeated ones included",
+    "reports_sent": "reports sent",
+    "robot": "the robot's name",
+    "state": "the state of the planner",
+    "tick": "the tick k",
+    "verdict": "the robot's verdict, once it has one",
+}
+"""the meaning of fields that have no docstring in the code, by struct and field, or by field"""
+NAMES = {
+    "Mission": "table `[mission]`",
+    "RobotTable": "`[[robot]]`",
+    "PlannerTable": "table `[planner]`",
+    "FaultTable": "`[[fault]]`",
+    "KillTable": "`[[kill]]`",
+    "AxisTable": "`[[axis]]`",
+    "DrawTable": "`[[draw]]`",
+    "StartsTable": "table `[starts]`",
+    "Attack": "table",
+    "Noise": "table",
+    "VelocityNoise": "table",
+}
+"""the types of tables of files, as a user writes them"""
+
+
+@cache
+def _docstrings(module: ModuleType) -> dict[str, dict[str, str]]:
+    """Return the docstring under each field of each class in `module`, by class and field."""
+    found: dict[str, dict[str, str]] = {}
+    try:
+        source = inspect.getsource(module)
+    except (OSError, TypeError):  # a module in C
+        return {}
+    for node in ast.parse(source).body:
+        if isinstance(node, ast.ClassDef):
+            found[node.name] = dict(_pairs(node.body))
+    return found
+
+
+def _pairs(body: Sequence[ast.stmt]) -> Iterable[tuple[str, str]]:
+    """Yield the names of annotated fields that have a string below them, and that string."""
+    for field, below in pairwise(body):
+        match field, below:
+            case (
+                ast.AnnAssign(target=ast.Name(id=name)),
+                ast.Expr(value=ast.Constant(value=str(text))),
+            ):
+                yield name, " ".join(text.split())
+
+
+def _described(struct: type[msgspec.Struct], field: str) -> str:
+    """Return the docstring of a field, of the class that declares it."""
+    for cls in struct.__mro__:
+        module = inspect.getmodule(cls)
+        if module is not None and field in (found := _docstrings(module).get(cls.__name__, {})):
+            return found[field]
+    return MEANINGS.get(f"{struct.__name__}.{field}", MEANINGS.get(field, ""))
+
+
+def _bounds(kind: Any) -> str:
+    low = kind.ge if kind.ge is not None else kind.gt
+    high = kind.le if kind.le is not None else kind.lt
+    if low is None and high is None:
+        return ""
+    if high is None:
+        return f", at least {low:g}"
+    above = "above " if kind.ge is None else ""
+    return f", {above}{_number(low)} to {_number(high)}"
+
+
+def _number(value: float) -> str:
+    """Return a bound; powers of 2 that bound integers are written as powers."""
+    for power in (31, 53, 63):
+        for less in (0, 1):
+            if value == 2**power - less and isinstance(value, int):
+                return f"2^{power}{' - 1' if less else ''}"
+    return f"{value:g}"
+
+
+def _typed(kind: types.Type) -> str:  # noqa: C901, PLR0912  # one line a kind
+    """Return a type as a reader of a file or a frame sees it."""
+    match kind:
+        case types.Metadata():
+            return _typed(kind.type)
+        case types.NoneType():
+            return NO_VALUE
+        case types.BoolType():
+            return "true or false"
+        case types.IntType():
+            return f"integer{_bounds(kind)}"
+        case types.FloatType():
+            return f"number{_bounds(kind)}"
+        case types.StrType(max_length=longest):
+            return f"text of at most {longest} characters" if longest is not None else "text"
+        case types.LiteralType(values=values):
+            return ", ".join(f"`{value}`" for value in values)
+        case types.UnionType(types=several):
+            return " or ".join(dict.fromkeys(_typed(one) for one in several))
+        case types.StructType(cls=cls):
+            return NAMES.get(cls.__name__, cls.__name__)
+        case types.TupleType(item_types=items):
+            return f"[{'; '.join(_typed(one) for one in items)}]"
+        case types.VarTupleType(item_type=item) | types.ListType(item_type=item):
+            return f"list of {_typed(item)}"
+        case types.DictType(value_type=value):
+            return f"table of {_typed(value)}"
+        case _:
+            return "any value"
+
+
+def _cell(text: str) -> str:
+    """Return `text` so that it fits a cell of a table."""
+    return text.replace("|", "\\|").replace("\n", " ").replace("<", "&lt;")
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(map(_cell, line)) + " |" for line in lines)
+
+
+def _default(field: types.Field) -> str:
+    if field.required:
+        return "required"
+    if field.default is NODEFAULT or isinstance(field.default, msgspec.Struct):
+        return ""
+    value = field.default
+    return "left out" if value is None else f"`{msgspec.json.encode(value).decode()}`"
+
+
+def fields_of(struct: type[msgspec.Struct], *, defaults: bool = True) -> str:
+    """Return the table of the fields of `struct`: name, type and bounds, default, meaning."""
+    info = types.type_info(struct)
+    assert isinstance(info, types.StructType)
+    head = ["field", "type", *(["default"] if defaults else []), "meaning"]
+    rows = [
+        [
+            f"`{field.encode_name}`",
+            _typed(field.type),
+            *([_default(field)] if defaults else []),
+            _described(struct, field.name),
+        ]
+        for field in info.fields
+    ]
+    return _table(head, rows)
+
+
+def columns_of(struct: type[msgspec.Struct]) -> str:
+    """Return the table of the columns that a row of `struct` fills: name and meaning."""
+    info = types.type_info(struct)
+    assert isinstance(info, types.StructType)
+    return _table(
+        ["column", "type", "meaning"],
+        [[f"`{field.name}`", _typed(field.type), _described(struct, field.name)] for field in info.fields],
+    )
+
+
+def _first_line(cls: type) -> str:
+    return " ".join((cls.__doc__ or "").split("\n\n")[0].split())
+
+
+def _tag(struct: type[msgspec.Struct]) -> str:
+    info = types.type_info(struct)
+    assert isinstance(info, types.StructType)
+    return str(info.tag)
+
+
+def _chapter(struct: type[msgspec.Struct], *, tagged: bool) -> str:
+    tag = f"Tag `{_tag(struct)}`. " if tagged else ""
+    return f"### {struct.__name__}\n\n{tag}{_first_line(struct)}\n\n{fields_of(struct, defaults=False)}"
+
+
+def wire_messages() -> str:
+    """Return a table for each message, in the order of protocol/messages.py."""
+    found = [
+        one
+        for one in vars(messages).values()
+        if inspect.isclass(one) and issubclass(one, messages.Message) and one is not messages.Message
+    ]
+    return "\n\n".join(_chapter(one, tagged=True) for one in found)
+
+
+def wire_parts() -> str:
+    """Return a table for each struct that messages contain."""
+    tagged = (messages.Localised, messages.Undecided, messages.Inconsistent)
+    return "\n\n".join(_chapter(one, tagged=one in tagged) for one in PARTS)
+
+
+def wire_version() -> str:
+    """Return the version and the limits of frames."""
+    return _table(
+        ["quantity", "value"],
+        [
+            ["protocol version", str(wire.VERSION)],
+            ["largest frame that is sent", f"{wire.MAX_SENT_BYTES} bytes"],
+            ["largest Report", f"{wire.MAX_REPORT_BYTES} bytes"],
+            ["largest frame in a journal", f"{wire.MAX_FRAME_BYTES} bytes"],
+        ],
+    )
+
+
+def wire_keys() -> str:
+    """Return the table of Zenoh keys: their form, and the participants that may send and receive on them."""
+    ways = {"put": "put", "answer": "queryable", "show": "liveliness token"}
+    rows = []
+    for kind, rule in keys.RULES.items():
+        names = {name: name.upper() for name in inspect.signature(kind).parameters}
+        receivers = ", ".join(_participant(one) for one in rule.to)
+        rows.append([f"`{kind(**names)}`", ways[rule.way], _participant(rule.by), receivers])
+    return _table(["key", "operation", "sender", "receivers"], rows)
+
+
+def _participant(name: str) -> str:
+    return {"robot": "robot ROBOT", "peer": "robot PEER", "robots": "all robots"}.get(name, name)
+
+
+def command_line() -> str:
+    """Return a chapter for each command: its help, its usage and its options."""
+    return "\n\n".join([_command(one.name, command_parser(one)) for one in COMMANDS])
+
+
+def _command(name: str, sub: argparse.ArgumentParser) -> str:
+    rows = []
+    for action in sub._actions:
+        if action.help == argparse.SUPPRESS or isinstance(action, argparse._HelpAction):
+            continue
+        value = action.metavar if isinstance(action.metavar, str) else ""
+        if not value and action.choices is not None:
+            value = "{" + ",".join(map(str, action.choices)) + "}"
+        names = ", ".join(f"`{flag}`" for flag in action.option_strings) or f"`{value or action.dest}`"
+        shown = f"{names} `{value}`" if action.option_strings and value else names
+        rows.append([shown, _help(action)])
+    table = _table(["argument", "meaning"], rows) if rows else "The command has no arguments."
+    return f"## tandem {name}\n\n{(sub.description or '').strip()}\n\n{table}"
+
+
+def _help(action: argparse.Action) -> str:
+    values = {name: value for name, value in vars(action).items() if name not in ("type", "help")}
+    text = action.help or ""
+    try:
+        return text % (values | {"prog": "tandem"})
+    except (KeyError, TypeError, ValueError):
+        return text
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    "scenario": partial(fields_of, ScenarioFile),
+    "mission": partial(fields_of, Mission),
+    "planner": partial(fields_of, PlannerTable),
+    "robot": partial(fields_of, RobotTable),
+    "attack": partial(fields_of, Attack),
+    "noise": partial(fields_of, Noise),
+    "velocity-noise": partial(fields_of, VelocityNoise),
+    "fault": partial(fields_of, FaultTable),
+    "kill": partial(fields_of, KillTable),
+    "sweep": partial(fields_of, SpecFile),
+    "axis": partial(fields_of, AxisTable),
+    "draw": partial(fields_of, DrawTable),
+    "starts": partial(fields_of, StartsTable),
+    "trial-columns": partial(columns_of, TrialRow),
+    "robot-columns": partial(columns_of, RobotRow),
+    "tick-columns": partial(columns_of, TickRow),
+    "final-report": partial(columns_of, messages.FinalReport),
+    "wire-version": wire_version,
+    "wire-keys": wire_keys,
+    "wire-messages": wire_messages,
+    "wire-parts": wire_parts,
+    "command-line": command_line,
+}
+"""the tables by the names that pages use"""
+
+
+def on_page_markdown(markdown: str, **_: object) -> str:
+    """Return a page with its generated tables. MkDocs calls this for each page. Raises KeyError."""
+    return MARKER.sub(lambda marker: TABLES[marker["name"]](), markdown)
+
+
+if __name__ == "__main__":
+    print(*[TABLES[name]() for name in sys.argv[1:] or TABLES], sep="\n\n")
