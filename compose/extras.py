@@ -29,7 +29,7 @@ class Library(NamedTuple):
 
     @property
     def fits(self) -> bool:
-        """Whether it is installed in a version within the bounds."""
+        """True if it is installed in a version within the bounds."""
         return self.version is not None and all(
             (_numbers(self.version) >= _numbers(bound["version"])) == (bound["way"] == ">=")
             for bound in _BOUND.finditer(self.bounds)

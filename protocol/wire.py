@@ -11,7 +11,7 @@ from typing import Any, TypeVar, overload
 
 import msgspec
 
-VERSION = 1
+VERSION = 2
 """The version of the protocol."""
 MAX_SENT_BYTES = 1 << 15
 """The maximum size of a frame on the network. From about 48 kB on, a low-latency Zenoh link breaks."""

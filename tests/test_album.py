@@ -396,7 +396,7 @@ def test_a_torn_record_is_drawn_to_the_tear(ticks: int, recordings: Path, tmp_pa
     figures = {name: one for kind in PICTURES[:-1] for name, one in catalogue.pictures(told, kind)}
     path = drawn(figures["trajectory-a-b"])
     assert len(line(path, "path-a")) == max(1, ticks)
-    assert any("the record breaks off" in text.get_text() for text in path.texts)
+    assert any("the recording breaks off" in text.get_text() for text in path.texts)
     assert isinstance(figures["encounter-a-b"], Absent) == (ticks < 47)
     assert isinstance(figures["plan-a-b"], Absent)
     assert isinstance(figures["phase-1-a"], Absent) == (ticks < 30)

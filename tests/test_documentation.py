@@ -54,7 +54,7 @@ class Block(NamedTuple):
 
     @property
     def run(self) -> bool:
-        """Whether a test runs it with its page."""
+        """True if a test runs it with its page."""
         return not self.comment.startswith(("not run", "together"))
 
     @property

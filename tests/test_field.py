@@ -236,7 +236,7 @@ def test_a_robot_whose_peer_does_not_come_has_not_moved(tmp_path: Path) -> None:
         (("a", "--mission", "paper-1", "--listen", "7447"), "--listen: '7447' is not an endpoint"),
         (
             ("a", "--mission", "paper-1", "--out", "{recording}"),
-            "driver-a.journal is not",
+            "driver-a.journal does not",
         ),
     ],
 )

@@ -163,7 +163,7 @@ def test_a_recording_that_a_power_cut_may_have_shortened_is_refused(
     if fsync:
         assert taken_up().tick == 2
     else:
-        with pytest.raises(CorruptJournal, match=r"written without --fsync, and this computer has been"):
+        with pytest.raises(CorruptJournal, match=r"written without --fsync, and this computer has restarted"):
             taken_up()
         assert path.read_bytes() == before
 

@@ -272,7 +272,7 @@ def test_output_that_nobody_takes_is_one_line_and_no_traceback() -> None:
     ):
         ended = run.ended()
     assert ended.status == 3
-    assert ended.err == "tandem run: cannot go on: No space left on device\n"
+    assert ended.err == "tandem run: cannot continue: No space left on device\n"
 
 
 def test_a_world_whose_output_nobody_takes_does_not_blame_its_record(tmp_path: Path) -> None:
@@ -283,7 +283,7 @@ def test_a_world_whose_output_nobody_takes_does_not_blame_its_record(tmp_path: P
     ):
         ended = run.ended()
     assert ended.status == 3
-    assert ended.err == "tandem world: cannot go on: No space left on device\n"
+    assert ended.err == "tandem world: cannot continue: No space left on device\n"
 
 
 def test_a_terminal_shows_each_robots_phase_and_state_while_it_runs() -> None:

@@ -520,12 +520,12 @@ def test_a_setting_in_which_nobody_can_meet_is_a_refused_cell(folder: Path) -> N
     (folder / "slow.toml").write_text(start + "[[1.0, 1.0], [1e-6, 1e-3]]")
     ended = sweep(folder, "slow.toml", "out")
     assert ended.status in (0, 1)
-    assert "cell 1 cannot run: mission: a tick moves a robot by " in ended.out
+    assert "cell 1 cannot run: mission: a robot moves at most " in ended.out
     summary = summary_rows(folder / "out")
     assert [row["trials"] for row in summary] == ["2", "0"]
     assert [bool(row["refused"]) for row in summary] == [False, True]
     (folder / "slow.toml").write_text(start + "[[1e-6, 1e-3]]")
-    with pytest.raises(UserError, match="no cell can run; cell 0: mission: a tick moves a robot by"):
+    with pytest.raises(UserError, match="no cell can run; cell 0: mission: a robot moves at most"):
         played(folder, "slow.toml", "none")
     assert not (folder / "none").exists()
 
@@ -648,7 +648,7 @@ JOINT = 'name = "both"\nfields = ["mission.period", "mission.max_speed"]\nvalues
     ("was", "new", "says"),
     [
         ('name = "both"', "name = 1", "name: expected"),
-        ('name = "both"', 'name = "a b"', "name: no name"),
+        ('name = "both"', 'name = "a b"', "name: invalid name"),
         ("trials = 12", "", "missing field 'trials'"),
         ("trials = 12", "trials = 0", "trials: "),
         ("trials = 12", 'trials = "12"', "trials: "),

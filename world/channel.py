@@ -42,9 +42,9 @@ class LinkState(msgspec.Struct, frozen=True):
     contacts: int = 0
     """The number of ticks so far in which the two robots were in contact."""
     bursts: tuple[bool, ...] = ()
-    """For each fault of the link, whether it is in a burst."""
+    """A flag for each fault of the link: True during a burst."""
     room: tuple[float, ...] = ()
-    """For each fault of the link, the number of Reports for which its bandwidth still has room."""
+    """The number of Reports, for each fault of the link, for which its bandwidth still has room."""
 
 
 class LinkFaults(NamedTuple):

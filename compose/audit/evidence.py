@@ -53,7 +53,7 @@ class Evidence(msgspec.Struct, frozen=True):
 
     @property
     def forced(self) -> bool:
-        """Whether the world may have continued without an answer: in real time, or after a timeout."""
+        """True if the world may have continued without an answer: in real time, or after a timeout."""
         failed = self.history.end is not None and self.history.end.outcome == "failed"
         return failed or any(past.config.tick_s is not None for past in self.pasts.values())
 

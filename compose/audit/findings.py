@@ -25,7 +25,7 @@ class Difference(msgspec.Struct, frozen=True):
     found: str
     expected: str
     by_rounding: bool
-    """Whether all values of the two messages agree within ROUNDING."""
+    """True if all values of the two messages agree within ROUNDING."""
 
 
 class Violation(msgspec.Struct, frozen=True):
@@ -41,7 +41,7 @@ class Violation(msgspec.Struct, frozen=True):
     difference: Difference | None = None
     """First difference, if the violation is one between two messages."""
     breaks_off: bool = False
-    """Whether the violation is only that a journal ends early; its content may be correct."""
+    """True if the violation is only that a journal ends early; its content may be correct."""
 
     @property
     def line(self) -> str:

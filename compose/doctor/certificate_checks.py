@@ -37,7 +37,7 @@ class CertificateSet(NamedTuple):
     key: Path
     authority: Path
     connects: bool
-    """Whether it is used for connecting; otherwise it is used for listening."""
+    """True if it is used for connecting; otherwise it is used for listening."""
 
 
 def papers(endpoints: Endpoints, now: float | None = None) -> Iterator[Finding]:

@@ -34,7 +34,7 @@ class Participant(msgspec.Struct, frozen=True):
 
     robot: str
     there: bool
-    """Whether its agent has a liveliness token."""
+    """True if its agent has a liveliness token."""
     tick: int | None = None
     """Tick of its latest Command; None if none was received."""
     phase: Phase | None = None
@@ -46,7 +46,7 @@ class RunningMission(msgspec.Struct, frozen=True):
 
     run: str
     world: bool
-    """Whether its world has a liveliness token."""
+    """True if its world has a liveliness token."""
     tick: int | None
     """Tick of the latest Observation or MissionEnd; None if none was received."""
     outcome: Outcome | None

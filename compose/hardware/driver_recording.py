@@ -37,7 +37,7 @@ class DriverRecord(msgspec.Struct, frozen=True):
     known: int
     """Latest tick in the agent's journal; -1 if there is none."""
     again: bool
-    """Whether the journals existed before."""
+    """True if the journals existed before."""
     start: ProcessStart
     """Start of this process."""
 

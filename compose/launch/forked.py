@@ -98,7 +98,7 @@ class Process:
 
     @property
     def running(self) -> bool:
-        """Whether the process has not ended yet."""
+        """True if the process has not ended yet."""
         return not self._over.is_set()
 
     @property
@@ -109,7 +109,7 @@ class Process:
 
     @property
     def hung_up(self) -> bool:
-        """Whether it has closed its standard input, as it does by ending."""
+        """True if it has closed its standard input, as it does by ending."""
         poll = select.poll()
         poll.register(self._stdin, 0)
         return not self.running or bool(poll.poll(0))

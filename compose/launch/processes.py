@@ -77,7 +77,7 @@ class MissionProcess:
 
     @property
     def running(self) -> bool:
-        """Whether the process has not ended yet."""
+        """True if the process has not ended yet."""
         return self._process.running
 
     @property
