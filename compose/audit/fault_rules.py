@@ -25,7 +25,7 @@ def faults(evidence: Evidence) -> Checks:
                     yield Violation("faults", step.observation.tick, robot, what)
 
 
-def befallen(evidence: Evidence) -> tuple[LinkStatistics, ...]:
+def link_statistics(evidence: Evidence) -> tuple[LinkStatistics, ...]:
     """Return the statistics of each link whose receiver has a journal; none without a fault plan."""
     if not evidence.history.scenario.faults:
         return ()

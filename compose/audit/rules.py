@@ -10,7 +10,7 @@ from compose.audit.agent_rules import decision, limits, log
 from compose.audit.claim_rules import claim
 from compose.audit.delivery_rules import contact, observation, report
 from compose.audit.evidence import Evidence, case_of, other_versions
-from compose.audit.fault_rules import befallen, faults
+from compose.audit.fault_rules import faults, link_statistics
 from compose.audit.findings import Checks, Findings, findings_of
 from compose.audit.hardware_rules import Alone, judge_alone
 from compose.audit.journal_rules import config, order
@@ -75,5 +75,5 @@ def judge(
         otherwise(run.environment, of_world()) or other_versions(evidence.pasts),
         scenario=run.scenario.name,
         ticks=len(run.ticks),
-        links=befallen(evidence),
+        links=link_statistics(evidence),
     )

@@ -104,12 +104,12 @@ def of_scenario(scenario: Scenario, mode: str | None = None, tick_s: float | Non
     )
 
 
-def of_briefings(name: str, briefings: Mapping[str, RobotConfig]) -> Stage:
+def of_configs(name: str, configs_by_robot: Mapping[str, RobotConfig]) -> Stage:
     """Return the static data that the robots' configurations hold.
 
-    `briefings` maps robot ids to configurations and must not be empty.
+    `configs_by_robot` maps robot ids to configurations and must not be empty.
     """
-    configs = list(briefings.values())
+    configs = list(configs_by_robot.values())
     return Stage(
         name=name,
         robots=tuple(

@@ -8,7 +8,7 @@ import msgspec
 
 from compose.recording.run import WORLD_JOURNAL, agent_journal, journals_in, robot_of
 from compose.recording.summary_json import SUMMARY
-from compose.view.cast import Stage, of_briefings, of_scenario
+from compose.view.cast import Stage, of_configs, of_scenario
 from compose.view.facts import Gathering
 from compose.view.scene import Scene, scene
 from protocol import files
@@ -95,7 +95,7 @@ class Journals:
                 path = self.folder / agent_journal(robot)
                 self._note(f"{path}: belongs to another run: its configuration does not match world.journal")
         if self._world is None and len(configs) > (len(self.stage.robots) if self.stage is not None else 0):
-            self.stage = of_briefings(self.folder.name, configs)
+            self.stage = of_configs(self.folder.name, configs)
 
     def fill(self) -> None:
         """Compute missing observations from the world's journal. Call once the journals are complete."""

@@ -10,7 +10,7 @@ from typing import Any
 
 import zenoh
 
-from compose.view.cast import of_briefings
+from compose.view.cast import of_configs
 from compose.view.facts import Gathering
 from compose.view.web.sources import UNANSWERED, Show
 from protocol.messages import (
@@ -102,7 +102,7 @@ class Heard(Show):
         self.known.take(message, len(frame))
         if len(self.known.configs) > configured:
             order = sorted(self.known.configs)
-            self.stage = of_briefings(self.name, {robot: self.known.configs[robot] for robot in order})
+            self.stage = of_configs(self.name, {robot: self.known.configs[robot] for robot in order})
         if self.known.end is not None:
             self.live = False
 
