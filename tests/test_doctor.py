@@ -467,7 +467,7 @@ def test_a_mission_beside_which_all_is_tried_leaves_the_record_of_one_alone(
             for who in ("agent-a", "agent-b", "viewer")
         ]
         for doctor in doctors[:2]:
-            doctor.until_says("puts as Reports of")
+            doctor.until_says("can publish Reports of")
         started["b"] = part("agent-b", "agent", "b")
         listing = tandem("ps", "--connect", endpoint, "--keys", keys / "viewer")
         assert listing.status == 0

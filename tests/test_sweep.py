@@ -469,7 +469,7 @@ def test_of_more_cells_than_fit_a_screen_those_in_which_all_is_well_are_counted(
     assert len(total) == 202
     poor = [cell for cell, localised in total.items() if localised == "0"]
     lines = ended.out.splitlines()
-    listed = [line.split()[0] for line in lines if line[1:2].isdigit()]
+    listed = [line.split()[0] for line in lines if line[:1] == " " and line[1:2].isdigit()]
     assert listed == poor
     assert f"{202 - len(poor)} cells without a problem are not listed; see out/summary.csv" in lines
     assert 0 < len(poor) < 202
@@ -759,7 +759,7 @@ def test_a_sweep_of_draws_counts_what_it_refused_and_resumes(folder: Path) -> No
     assert all(row in finished for row in found)
     refused = [row for row in finished if row["outcome"] == "refused"]
     assert 0 < len(refused) < 20
-    assert all("in double precision, by the" in row["reason"] for row in refused)
+    assert all("to a micrometre in double precision" in row["reason"] for row in refused)
     assert all(row["ticks"] is None for row in refused)
     counts = f"{80 - len(refused)} localised, {len(refused)} refused of 80 trials"
     assert counts in ended.out
