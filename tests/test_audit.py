@@ -56,7 +56,7 @@ from tests.commands import (
 from tests.test_real_time import missed
 from world.referee import Judgement
 from world.scenario import Scenario
-from world.simulation import Course
+from world.simulation import Simulation
 
 Found = tuple[int | None, str | None, str]
 """The tick, robot and rule of a violation."""
@@ -172,21 +172,21 @@ def test_a_run_that_failed_was_failed_by_nobody_on_record() -> None:
     """The world ends a run without answers; a robot that did answer also answers the MissionEnd."""
     scenario = load("paper-1")
     books = {name: MemoryJournal() for name in in_process.journals(scenario)}
-    course = Course(scenario, books[WORLD_JOURNAL])
+    simulation = Simulation(scenario, books[WORLD_JOURNAL])
     robots = {robot: Robot(scenario.config(robot), books[agent_journal(robot)]) for robot in "ab"}
     for _ in range(5):
         commands = {}
-        for observation in course.observations():
+        for observation in simulation.observations():
             robots[observation.robot].observation(observation)
             commands[observation.robot] = robots[observation.robot].decide()
             robots[observation.robot].estimate()
-        assert course.command(commands) is None
-    a, _ = course.observations()
+        assert simulation.command(commands) is None
+    a, _ = simulation.observations()
     robots["a"].observation(a)
     robots["a"].decide()
     robots["a"].estimate()
-    end = course.end(Judgement("failed", "no answer from b at tick 5 for 30 s"))
-    course.final_reports([robots["a"].final_report(end)])
+    end = simulation.end(Judgement("failed", "no answer from b at tick 5 for 30 s"))
+    simulation.journal_final_reports([robots["a"].final_report(end)])
     findings = judge({name: book.frames for name, book in books.items()})
     assert found(findings) == [(4, "b", "order")]
     assert findings.violations[0].what == "its journal breaks off here, expected MissionEnd and FinalReport"

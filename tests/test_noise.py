@@ -31,7 +31,7 @@ from world.random_streams import gaussian, uniform
 from world.referee import Judgement
 from world.scenario import Scenario
 from world.sensors import Mutual, anchor_ranges, executed, mutual_ranges, odometry
-from world.simulation import Course
+from world.simulation import Simulation
 from world.tick import World, advance, observations, release
 from world.truth import Truth
 
@@ -525,15 +525,17 @@ def test_processes_leave_the_same_bytes_as_one_process(noise: str, seed: str, tm
 def driven(scenario: Scenario, folder: Path, ticks: int) -> tuple[list[Truth], list[list[Observation]]]:
     """Return the truth and observations of robots with fixed commands; the world's journal is in `folder`."""
     with closing(journal_file.Journal(folder / WORLD_JOURNAL)) as kept:
-        course = Course(scenario, kept)
+        simulation = Simulation(scenario, kept)
         truths, told = [], []
         for tick in range(ticks):
-            truths.append(course.world.truth)
-            told.append(course.observations())
+            truths.append(simulation.world.truth)
+            told.append(simulation.observations())
             v, omega = math.cos(tick), math.sin(3.0 * tick)
-            ended = course.command({robot.id: sent(v, omega, robot.id, tick) for robot in scenario.robots})
+            ended = simulation.command(
+                {robot.id: sent(v, omega, robot.id, tick) for robot in scenario.robots}
+            )
             assert ended is None
-        course.end(Judgement("undecided", "enough"))
+        simulation.end(Judgement("undecided", "enough"))
     return truths, told
 
 

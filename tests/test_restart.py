@@ -55,7 +55,7 @@ from tests.commands import (
     world,
 )
 from world.scenario import Scenario
-from world.simulation import Course, again
+from world.simulation import Simulation, resumed
 from world.world_journal import history
 
 PARTS = ("agent-a", "agent-b", "world")
@@ -271,15 +271,15 @@ def test_a_worlds_journal_torn_anywhere_is_finished_with_the_same_bytes(
     for cut in cuts(data):
         torn.write_bytes(data[:cut])
         old = Retrace(torn)
-        course = again(load("paper-1"), old)
+        simulation = resumed(load("paper-1"), old)
         assert torn.stat().st_size == cut
         book, _ = old.go_on()
         with book:
-            course.keep(book)
-            for tick in whole.ticks[course.tick :]:
-                if course.over is None:
-                    course.command(tick.commands)
-            course.final_reports(whole.final_reports.values())
+            simulation.append_to(book)
+            for tick in whole.ticks[simulation.tick :]:
+                if simulation.mission_end is None:
+                    simulation.command(tick.commands)
+            simulation.journal_final_reports(whole.final_reports.values())
         assert torn.read_bytes() == data, cut
 
 
@@ -589,12 +589,12 @@ def test_a_run_is_a_new_one(recording: Path) -> None:
 def test_an_empty_journal_is_begun(tmp_path: Path) -> None:
     (tmp_path / "world.journal").touch()
     old = Retrace(tmp_path / "world.journal")
-    course = again(load("paper-1"), old)
+    simulation = resumed(load("paper-1"), old)
     book, cut = old.go_on()
     with book:
-        assert (course.tick, cut) == (0, 0)
+        assert (simulation.tick, cut) == (0, 0)
     with Journal(tmp_path / "new") as new:
-        Course(load("paper-1"), new)
+        Simulation(load("paper-1"), new)
     assert (tmp_path / "world.journal").read_bytes() == (tmp_path / "new").read_bytes()
 
 
@@ -607,7 +607,7 @@ def test_a_mission_under_noise_is_folded_to_the_bit(tmp_path: Path) -> None:
             assert memory is not None
             assert memory.final_report is not None
     with closing(Retrace(tmp_path / "world.journal")) as old:
-        assert again(scenario, old).phase1_done_tick.keys() == {"a", "b"}
+        assert resumed(scenario, old).final_reports.keys() == {"a", "b"}
 
 
 @pytest.mark.long
