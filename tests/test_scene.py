@@ -50,7 +50,7 @@ def test_the_first_contact_of_paper_1_is_told_at_tick_46(paper_1: Path) -> None:
     shown = read(paper_1)
     assert said(shown, "contact") == [(46, "a and b are in range of each other: 2.95 m")]
     assert said(shown, "anchor")[0] == (0, "a is in its anchor's range: 2.68 m")
-    assert shown.scenes[46].player("b").mode_name == "b stands still and waits for a's second range"
+    assert shown.scenes[46].player("b").activity == "b stands still and waits for a's second range"
     assert said(shown, "candidates")[-1] == (48, "b's possible placements fall from 4 to 1")
     assert said(shown, "end") == [(48, "The mission ends: localised")]
 
@@ -191,7 +191,7 @@ def test_whose_process_is_gone_is_down_in_every_tick_until_it_is_back(paper_1: P
     present(a=False)  # its part of the mission has ended
     shown = scenes(stage, known)
     assert [one.player("a").down for one in shown] == [False, True, False, False]
-    assert shown[1].player("a").mode_name == "a is down: its process is gone"
+    assert shown[1].player("a").activity == "a is down: its process is gone"
     assert [
         (event.tick, event.kind, event.robot)
         for one in shown
