@@ -62,7 +62,7 @@ class Boaster(Robot):
 
     def estimate(self) -> bytes:
         """Return and journal an estimate that reports the robot as localised."""
-        frame = encode(replace(planner.estimate(self.mind), localised=True))
+        frame = encode(replace(planner.estimate(self.state), localised=True))
         assert self._journal is not None
         self._journal.write(frame)
         return frame

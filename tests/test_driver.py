@@ -226,7 +226,7 @@ def ended(
     ending = Ending(BRIEFING, 25, timeout)
     for tick in range(ticks):
         if tick == 12 and said is not None:
-            ending.told(said)
+            ending.receive(said)
         verdict = own if tick >= 10 else None
         end = ending.after(tick, command(tick, verdict=verdict), peer_there=True)
         if end is not None:

@@ -375,10 +375,10 @@ def test_a_journal_of_another_run_is_no_record_of_this_one(noisy: Path, tmp_path
     folder, other = copied(noisy, tmp_path), tmp_path / "other"
     play(load("paper-1"), other)
     shutil.copyfile(other / "agent-a.journal", folder / "agent-a.journal")
-    with pytest.raises(CorruptJournal, match=r"agent-a\.journal: from another run: its conf"):
+    with pytest.raises(CorruptJournal, match=r"agent-a\.journal: belongs to another run: its conf"):
         estimates(folder, "a")
     assert [note.split("/")[-1] for note in performed(folder).notes] == [
-        "agent-a.journal: belongs to another run: its configuration does not match world.journal"
+        "agent-a.journal: belongs to another run: its configuration does not match the world's"
     ]
     ended = tandem("export", folder)
     assert ended.status == 2

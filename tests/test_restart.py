@@ -245,7 +245,7 @@ def test_an_agents_journal_torn_anywhere_is_finished_with_the_same_bytes(
         old = Retrace(torn)
         memory = remember(old)
         assert torn.stat().st_size == cut
-        book, lost = old.go_on()
+        book, lost = old.open_for_append()
         assert torn.stat().st_size >= cut - lost
         with book:
             body = Robot(whole.config, book) if memory is None else memory.robot
@@ -273,7 +273,7 @@ def test_a_worlds_journal_torn_anywhere_is_finished_with_the_same_bytes(
         old = Retrace(torn)
         simulation = resumed(load("paper-1"), old)
         assert torn.stat().st_size == cut
-        book, _ = old.go_on()
+        book, _ = old.open_for_append()
         with book:
             simulation.append_to(book)
             for tick in whole.ticks[simulation.tick :]:
@@ -526,7 +526,8 @@ def test_the_worlds_record_of_another_scenario_is_refused(recording: Path) -> No
 def test_an_agents_record_of_another_briefing_is_refused(recording: Path, tmp_path: Path) -> None:
     scenario = tmp_path / "farther.toml"
     scenario.write_text(PAPER_1.replace("anchor = [10.0", "anchor = [10.5"))
-    says = f"{recording / 'agent-a.journal'}: it is of another run: its RobotConfig differs from this world's"
+    path = recording / "agent-a.journal"
+    says = f"{path}: belongs to another run: its configuration does not match the world's"
     with world(scenario) as (_, endpoint):
         refuses(recording, "agent", "a", "--connect", endpoint, says=says)
 
@@ -536,7 +537,7 @@ def test_an_agents_record_in_which_it_sensed_otherwise_is_no_use(recording: Path
     path.write_bytes(journal_file.packed(list(journal_file.read(path))[:4]))
     with TandemProcess("agent", "b", "--connect", paper_2):  # its RobotConfigs are those of paper-1
         ended = tandem("agent", "a", "--connect", paper_2, "--out", recording)
-    said = "the recording is of another run: the Observation of a at tick 0 differs"
+    said = "the recording belongs to another run: its Observation of a at tick 0 differs"
     assert (ended.status, ended.err) == (3, f"tandem agent a: {said}\n")
 
 
@@ -590,7 +591,7 @@ def test_an_empty_journal_is_begun(tmp_path: Path) -> None:
     (tmp_path / "world.journal").touch()
     old = Retrace(tmp_path / "world.journal")
     simulation = resumed(load("paper-1"), old)
-    book, cut = old.go_on()
+    book, cut = old.open_for_append()
     with book:
         assert (simulation.tick, cut) == (0, 0)
     with Journal(tmp_path / "new") as new:

@@ -178,7 +178,7 @@ def test_an_agent_that_gives_up_at_length_leaves_a_journal_that_is_read(tmp_path
     with Journal(path) as journal:
         robot = Robot(scenario.config("a"), journal)
         robot.observation(Observation(0, "a", None, 1.0))
-        robot.mind = robot.mind.undecided("\U0001f600" * 1000)
+        robot.state = robot.state.undecided("\U0001f600" * 1000)
         command = robot.decide()
         robot.estimate()
         robot.final_report(MissionEnd(1, "undecided", f"a: {'x' * 1000}"))

@@ -126,7 +126,7 @@ def test_without_a_world_a_claim_less_accurate_than_was_asked_does_not_end_local
     own, peers = (vague, good) if whose == "its own" else (good, vague)
     for mine, other, outcome in ((own, peers, "undecided"), (good, good, "localised")):
         ending = Ending(config, 100, 30.0)
-        ending.told(Report(0, "b", 3, "localised", ORIGIN, 0, 0, (), 0, (), 0, 0, other))
+        ending.receive(Report(0, "b", 3, "localised", ORIGIN, 0, 0, (), 0, (), 0, 0, other))
         command = Command(0, "a", 0.0, 0.0, 3, "localised", mine)
         ends = [ending.after(tick, command, peer_there=True) for tick in range(LAST_WORDS + 1)]
         assert ends[-1] is not None

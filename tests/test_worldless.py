@@ -217,7 +217,9 @@ def test_journals_of_two_runs_are_no_record(command: str, folders: tuple[Path, P
     (tmp_path / "agent-a.journal").write_bytes((tmp_path / "other" / "agent-a.journal").read_bytes())
     ended = tandem(command, tmp_path)
     assert (ended.status, ended.out) == (2, "")
-    assert ended.err.endswith("agent-b.journal: from another run: its configuration does not match a's\n")
+    assert ended.err.endswith(
+        "agent-b.journal: belongs to another run: its configuration does not match a's\n"
+    )
 
 
 def test_a_tick_that_is_left_out_is_no_record(folders: tuple[Path, Path], tmp_path: Path) -> None:

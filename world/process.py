@@ -247,7 +247,7 @@ class WorldProcess:
             self._inbox.refuse(arrival, error)
             return None
         if message.robot not in self._peers or message.robot != arrival.source.robot:
-            self._inbox.refuse(arrival, f"it says it is from '{message.robot}'")
+            self._inbox.refuse(arrival, f"its sender is given as '{message.robot}'")
             return None
         return message
 
@@ -261,7 +261,7 @@ class WorldProcess:
         if command.tick == self._simulation.tick:
             return command
         if command.tick > self._simulation.tick:
-            self._inbox.refuse(arrival, "it is of a tick to come")
+            self._inbox.refuse(arrival, "its tick is in the future")
         else:
             self._late += 1
         return None

@@ -268,7 +268,7 @@ def _with_consistency_test(state: RobotState) -> RobotState:
     least = min(inconsistency.p_value, belief.p_value if belief.p_value is not None else 1.0)
     inconsistent_searches = belief.inconsistent_searches + 1 if inconsistency.p_value < UNBELIEVABLE else 0
     state = replace(state, belief=replace(belief, inconsistent_searches=inconsistent_searches, p_value=least))
-    return state.inconsistent(inconsistency.alarm) if inconsistent_searches >= LOOKS else state
+    return state.inconsistent(inconsistency.verdict) if inconsistent_searches >= LOOKS else state
 
 
 def _drive_without_hypotheses(state: RobotState) -> RobotState:

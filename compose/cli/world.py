@@ -25,7 +25,7 @@ from compose.network import beyond, reach
 from compose.recording.run import WORLD_JOURNAL, folder_for, read
 from compose.scenario import kills
 from compose.scenario.scenario_file import check_rate, run_name, setting
-from compose.terminal.outcome import break_off, conclude, going_on, shown_live
+from compose.terminal.outcome import break_off, conclude, reopened, shown_live
 from protocol import limits
 from protocol.journal.journal_file import CannotRecord, CorruptJournal, Journal
 from protocol.journal.resume import Retrace
@@ -81,7 +81,7 @@ def main(options: argparse.Namespace) -> int:
             if simulation is None or recording is None:
                 journal = stack.enter_context(Journal(folder / WORLD_JOURNAL, fsync=options.fsync))
                 return _run(options, Simulation(scenario, journal), links, folder, inbox)
-            simulation.append_to(stack.enter_context(going_on(recording, inbox)))
+            simulation.append_to(stack.enter_context(reopened(recording, inbox)))
             return _run(options, simulation, links, folder, inbox)
     except session.CannotListen as error:
         raise UserError(f"--listen: {error}") from None

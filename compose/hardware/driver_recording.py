@@ -11,7 +11,7 @@ import msgspec
 
 from compose.launch.driver_loader import again
 from compose.recording.run import agent_journal
-from compose.terminal.outcome import going_on
+from compose.terminal.outcome import reopened
 from protocol.journal.journal_file import CannotRecord, CorruptJournal, Journal
 from protocol.journal.resume import Retrace
 from protocol.messages import Observation, OfRobot, RobotConfig
@@ -81,7 +81,7 @@ def recorded(folder: Path, config: RobotConfig, inbox: Inbox, *, fsync: bool) ->
     except BaseException:
         old.close()
         raise
-    with going_on(old, inbox) as journal:
+    with reopened(old, inbox) as journal:
         yield DriverRecord(journal, past, known, again=True, start=start)
 
 

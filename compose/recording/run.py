@@ -125,8 +125,8 @@ def read(folder: Path) -> Recording:
 def estimates(folder: Path, robot: str) -> tuple[Estimate, ...]:
     """Return the Estimate of each tick in the journal of `robot` in `folder`.
 
-    Raises OSError if there is no such journal, CorruptJournal if it is damaged before its end, or is the
-    journal of another robot or of another run.
+    Raises OSError if there is no such journal, CorruptJournal if it is damaged before its end, or
+    belongs to another robot or another run.
     """
     past = past_of(folder, robot)
     return past.estimates if past is not None else ()
@@ -150,7 +150,7 @@ def past_of(folder: Path, robot: str) -> Past | None:
     head = list(islice(journal_file.read(world), 2)) if world.exists() else []
     if not is_blank(head) and not opened(head, world)[0].is_of(past.config):
         raise journal_file.CorruptJournal(
-            f"{path}: from another run: its configuration does not match the world's"
+            f"{path}: belongs to another run: its configuration does not match the world's"
         )
     return past
 

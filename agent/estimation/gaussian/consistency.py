@@ -40,7 +40,7 @@ class Inconsistency(NamedTuple):
     p_value: float
 
     @property
-    def alarm(self) -> Inconsistent:
+    def verdict(self) -> Inconsistent:
         """Return the verdict on the peer for this result."""
         return Inconsistent(self.what, self.sigmas, self.p_value)
 
