@@ -48,7 +48,8 @@ class Retrace:
     def write(self, *frames: bytes) -> None:
         """Compare `frames` with the next recorded ones.
 
-        Frames beyond the last recorded one are stored until `open_for_append`, which writes them. Raises ReplayMismatch if a frame differs.
+        Frames beyond the last recorded one are stored until `open_for_append`, which writes them.
+        Raises ReplayMismatch if a frame differs.
         """
         for frame in frames:
             if self._matched == len(self.frames):
