@@ -26,7 +26,7 @@ from protocol.motion import ORIGIN, REST
 from protocol.network import inbox, keys, session
 from protocol.network.endpoints import listening
 from protocol.network.inbox import Arrival, Inbox, Interrupted, Topic
-from protocol.wire import decode, encode
+from protocol.wire import VERSION, decode, encode
 from tests.commands import (
     BOUND_S,
     LONG,
@@ -66,7 +66,7 @@ GHOST, OTHER = keys.command(RUN, "ghost"), keys.command(RUN, "b")
 """The keys of a robot that does not exist, and of one that did not send the Command put there."""
 
 
-def framed(content: object, version: int = 1) -> bytes:
+def framed(content: object, version: int = VERSION) -> bytes:
     """Return a frame with a correct CRC and any content."""
     body = content if isinstance(content, bytes) else msgspec.msgpack.encode(content)
     return struct.pack(">BI", version, zlib.crc32(body)) + body
@@ -100,8 +100,8 @@ def bad_frames(topic: str) -> dict[bytes, str]:
         frame[:-1]: "damaged: the CRC does not match",
         flipped(frame, 9): "damaged: the CRC does not match",
         flipped(frame, 8 * len(frame) - 20): "damaged: the CRC does not match",
-        framed(said, 0): "protocol version 0, this is version 1",
-        framed(said, 2): "protocol version 2, this is version 1",
+        framed(said, VERSION - 1): f"protocol version {VERSION - 1}, this is version {VERSION}",
+        framed(said, VERSION + 1): f"protocol version {VERSION + 1}, this is version {VERSION}",
         with_number(math.nan): "Expected `float` >= .* - at ",
         with_number(math.inf): "Expected `float` <= .* - at ",
         with_number(-1e300): "Expected `float` >= .* - at ",
