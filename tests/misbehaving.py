@@ -46,15 +46,15 @@ def astray(one: trial.Trial) -> trial.TrialRow:
         case 5:
             Path(tempfile.gettempdir(), HANGS).touch()
             threading.Event().wait()
-    return trial.play(one)
+    return trial.run_trial(one)
 
 
 def boastful(one: trial.Trial) -> trial.TrialRow:
     """Run a trial; in the third of a cell, estimates report too early that robots are localised."""
     if one.number != 2:
-        return trial.play(one)
+        return trial.run_trial(one)
     with patch.object(in_process, "Robot", Boaster):
-        return trial.play(one)
+        return trial.run_trial(one)
 
 
 class Boaster(Robot):
@@ -72,7 +72,7 @@ def endless(one: trial.Trial) -> trial.TrialRow:
     """Run a trial that writes the file `playing` and never ends."""
     Path(tempfile.gettempdir(), "playing").touch()
     threading.Event().wait()
-    return trial.play(one)
+    return trial.run_trial(one)
 
 
 def main(function: str, source: str, out: str) -> None:

@@ -136,18 +136,18 @@ def test_without_noise_nothing_is_drawn_and_every_tick_is_the_same_to_the_bit(
     without, zero = tmp_path / "without", tmp_path / "zero"
     for folder in (without, zero):
         folder.mkdir()
-    table = ticks_csv(in_process.play(exact, without))
+    table = ticks_csv(in_process.run_mission(exact, without))
     for name in ("gaussian", "uniform"):
         monkeypatch.setattr(sensors, name, drawn)
     zeros = Noise(outlier_bias=(0.1, 0.2), actuation=VelocityNoise(0.0, 0.0, 0.0, 0.0))
     assert zeros.exact
     scenario = replace(exact, mission=replace(exact.mission, noise=zeros))
-    assert ticks_csv(in_process.play(scenario, zero)) == table
+    assert ticks_csv(in_process.run_mission(scenario, zero)) == table
     assert len(table.splitlines()) == 1 + 2 * 49
     for robot in ("a", "b"):
         assert frames(zero, robot) == frames(without, robot)
     with pytest.raises(AssertionError, match="something is drawn"):
-        in_process.play(near("anchor_sigma = 0.1"))
+        in_process.run_mission(near("anchor_sigma = 0.1"))
 
 
 def frames(folder: Path, robot: str) -> list[bytes]:
@@ -314,7 +314,7 @@ def test_reports_are_heard_where_the_range_was_dropped(tmp_path: Path) -> None:
     dropping = next(
         seed for seed in range(1000) if mutual(near("drop_outs = 0.5", seed=seed), 4) == [None] * 4
     )
-    recording = in_process.play(near("drop_outs = 0.5", seed=dropping, max_ticks=3), tmp_path)
+    recording = in_process.run_mission(near("drop_outs = 0.5", seed=dropping, max_ticks=3), tmp_path)
     said = recording.final_reports
     assert (said["a"].mutual_ranges, said["b"].mutual_ranges) == (0, 0)
     assert said["a"].reports_sent >= 1
@@ -542,13 +542,13 @@ def driven(scenario: Scenario, folder: Path, ticks: int) -> tuple[list[Truth], l
 @by_noise
 def test_the_record_folds_to_the_same_truth(noise: str, tmp_path: Path) -> None:
     truths, _ = driven(near(noise), tmp_path, 60)
-    assert [moment.truth for moment in read(tmp_path).moments] == truths
+    assert [moment.truth for moment in read(tmp_path).ticks] == truths
 
 
 @by_noise
 @pytest.mark.parametrize("seed", [2, 10, 11])
 def test_the_record_of_a_mission_is_read_as_it_was_played(noise: str, seed: int, tmp_path: Path) -> None:
-    played = in_process.play(load(str(noisy(noise, tmp_path)), seed=seed), tmp_path)
+    played = in_process.run_mission(load(str(noisy(noise, tmp_path)), seed=seed), tmp_path)
     assert read(tmp_path) == played
 
 

@@ -21,7 +21,7 @@ from agent.process.agent_journal import past
 from agent.process.recovery import remember
 from agent.process.robot import Robot
 from compose.errors import BadKill
-from compose.launch.in_process import play
+from compose.launch.in_process import run_mission
 from compose.launch.processes import free_endpoint
 from compose.scenario.kills import parse
 from compose.scenario.scenario_file import load
@@ -601,7 +601,7 @@ def test_an_empty_journal_is_begun(tmp_path: Path) -> None:
 
 def test_a_mission_under_noise_is_folded_to_the_bit(tmp_path: Path) -> None:
     scenario = load("noisy")
-    play(scenario, tmp_path)
+    run_mission(scenario, tmp_path)
     for robot in ("a", "b"):
         with closing(Retrace(tmp_path / f"agent-{robot}.journal")) as old:
             memory = remember(old)

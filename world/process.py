@@ -51,7 +51,7 @@ class RobotsLinkLost(Exception):
 
 
 class WorldProcess:
-    """One run, over one session after another. A session has to be attached before `play`."""
+    """One run, over one session after another. A session has to be attached before `run`."""
 
     def __init__(
         self,
@@ -107,7 +107,7 @@ class WorldProcess:
     def attach(self, link: zenoh.Session, *, replaceable: bool = False) -> None:
         """Send and receive over the session `link` from now on.
 
-        If it is `replaceable`, `play` raises RobotsLinkLost after LINK_TIMEOUT_S and a tick without messages.
+        If it is `replaceable`, `run` raises RobotsLinkLost after LINK_TIMEOUT_S and a tick without messages.
         """
         run, inbox = self._run, self._inbox
         self._link_timeout = LINK_TIMEOUT_S + self._tick_s if replaceable else math.inf
@@ -122,10 +122,10 @@ class WorldProcess:
         session.answer(link, keys.config(run, "*"), self._config)
         self._token = session.show_alive(link, keys.world_alive(run))
 
-    def play(self) -> MissionEnd:
+    def run(self) -> MissionEnd:
         """Run to the end of the mission, collect the FinalReports, and return the MissionEnd.
 
-        Raises RobotsLinkLost, after which `play` continues over another session; Interrupted by a signal;
+        Raises RobotsLinkLost, after which `run` continues over another session; Interrupted by a signal;
         CannotRecord.
         """
         simulation = self._simulation
@@ -397,7 +397,7 @@ class WorldLinks:
             assert self.session is not None
             process.attach(self.session, replaceable=self.endpoints.mode == "client")
             try:
-                process.play()
+                process.run()
             except RobotsLinkLost:
                 self.open()
             else:

@@ -30,7 +30,7 @@ class World(msgspec.Struct, frozen=True):
     """The true pose in <W> of each localised robot at the tick of its claim. Noise may move it afterwards."""
     pairs: tuple[tuple[int, int], ...]
     """The pairs of peers, as indices into the scenario's robots."""
-    air: tuple[LinkState, ...] = ()
+    links: tuple[LinkState, ...] = ()
     """The state of the links: for each pair, from the first to the second robot, then back.
 
     Empty without faults.
@@ -62,7 +62,7 @@ def observations(world: World) -> list[Observation]:
     for i, ((one, other), mutual) in enumerate(zip(world.pairs, mutuals, strict=True)):
         if mutual is not None:
             to_other, to_one = (
-                world.air[2 * i : 2 * i + 2] if world.air else (LinkState((tick,)), LinkState((tick,)))
+                world.links[2 * i : 2 * i + 2] if world.links else (LinkState((tick,)), LinkState((tick,)))
             )
             contacts[one] = (Contact(robots[other].id, mutual.range, to_one.heard, to_one.damaged),)
             contacts[other] = (Contact(robots[one].id, mutual.range, to_other.heard, to_other.damaged),)
@@ -91,15 +91,15 @@ def advance(world: World, commands: Mapping[str, Command]) -> World | Judgement:
         if judgement is not None:
             return judgement
     moved = truth.moved(driven, scenario.mission.period)
-    air = _carried(world.air, scenario, moved, world.pairs)
-    return World(scenario, moved, tuple(driven), verdicts, claimed, world.pairs, air)
+    links = _carried(world.links, scenario, moved, world.pairs)
+    return World(scenario, moved, tuple(driven), verdicts, claimed, world.pairs, links)
 
 
 def _carried(
-    air: Sequence[LinkState], scenario: Scenario, truth: Truth, pairs: Sequence[tuple[int, int]]
+    before: Sequence[LinkState], scenario: Scenario, truth: Truth, pairs: Sequence[tuple[int, int]]
 ) -> tuple[LinkState, ...]:
-    """Return the state of each link at the tick of `truth`, given its state `air` at the tick before."""
-    if not air:
+    """Return the state of each link at the tick of `truth`, given its state in `before` one tick earlier."""
+    if not before:
         return ()
     mutuals = mutual_ranges(truth, scenario, pairs)
     ids = [robot.id for robot in scenario.robots]
@@ -107,12 +107,12 @@ def _carried(
     return tuple(
         [
             carried(
-                before,
+                link,
                 of_plan(scenario.faults, ids[sender], ids[receiver]),
                 scenario.seed,
                 truth.tick,
                 in_contact=mutual is not None,
             )
-            for before, ((sender, receiver), mutual) in zip(air, links, strict=True)
+            for link, ((sender, receiver), mutual) in zip(before, links, strict=True)
         ]
     )

@@ -94,7 +94,7 @@ def _continue_phase1(state: RobotState) -> RobotState:
         state = inference.with_own(state, scored)
     if _ticks_without_range(state) >= LOST_AFTER * active_sensing.stride(state.config.mission):
         return _return_to_anchor(state)
-    if not scored or scored[0].silence < MISLEADING + _drop_out_log_likelihood(state):
+    if not scored or scored[0].detection_log_likelihood < MISLEADING + _drop_out_log_likelihood(state):
         if not ranged:
             return _return_to_anchor(state)
         return replace(state, mode=Straight("anchor", state.odometry, state.log.ranges[-1].range))

@@ -94,7 +94,7 @@ class AgentProcess:
         """The MissionEnd, once it is accepted."""
         self._final_report = memory.final_report
 
-    def play(self) -> MissionEnd:
+    def run(self) -> MissionEnd:
         """Run the mission over the attached link and return its MissionEnd.
 
         Raises WorldLinkLost if nothing arrives over this link, NoWorld if the world is absent for too long,
@@ -350,7 +350,7 @@ def run_agent(
                     on_joined(*joined)
                 else:
                     process.attach(link)
-                found = process.play()
+                found = process.run()
                 on_end()
                 return found
         except WorldLinkLost:

@@ -138,7 +138,7 @@ def _frame_sizes(scenario: Scenario) -> tuple[int, int]:
     simulation = Simulation(scenario)
     observations: list[int] = []
     commands: list[int] = []
-    for moment in in_process.play(scenario).moments:
+    for moment in in_process.run_mission(scenario).ticks:
         observations += [len(encode(observation)) for observation in simulation.observations()]
         commands += [len(encode(command)) for command in moment.commands.values()]
         simulation.command(moment.commands)
@@ -187,7 +187,7 @@ def _mission_rate(
         ):
             process = WorldProcess(Simulation(scenario, journal), "bench", Inbox("tandem bench"))
             process.attach(link)
-            end = process.play()
+            end = process.run()
             return end.tick / process.playing_s
 
 
@@ -225,13 +225,13 @@ def _missions(rounds: int, done: Callable[[], None]) -> Table:
     whole: list[float] = []
     world_part: list[float] = []
     audited: list[float] = []
-    ticks = sum(len(in_process.play(one).moments) for one in scenarios)
+    ticks = sum(len(in_process.run_mission(one).ticks) for one in scenarios)
     for _ in range(rounds):
         began = time.perf_counter()
         for one in scenarios:
-            in_process.play(one)
+            in_process.run_mission(one)
         whole.append(time.perf_counter() - began)
-        world_part.append(sum(_world_s(in_process.play(one)) for one in scenarios))
+        world_part.append(sum(_world_s(in_process.run_mission(one)) for one in scenarios))
         began = time.perf_counter()
         for one in scenarios:
             run_in_process(one, audit=True)
@@ -250,7 +250,7 @@ def _world_s(recording: run.Recording) -> float:
     """Return the time (s) that the world takes to run `recording` again with the recorded Commands."""
     began = time.perf_counter()
     simulation = Simulation(recording.scenario)
-    for moment in recording.moments:
+    for moment in recording.ticks:
         simulation.observations()
         simulation.command(moment.commands)
     return time.perf_counter() - began

@@ -187,7 +187,7 @@ def _run(
             if not options.quiet:
                 where = f", resumed at tick {field.tick}" if field.tick >= 0 else ", waiting for its peer"
                 say(f"{options.id}: in run {field.run}{where}")
-            end = field.play(options.connect_timeout, agent.restart)
+            end = field.run_mission(options.connect_timeout, agent.restart)
             agent.end(STOP_S)
         finally:
             agent.end()

@@ -19,7 +19,7 @@ from compose.cli.arguments import (
     name,
 )
 from compose.errors import ENDED, FAILED, STOPPED, UserError
-from compose.launch.processes import handed
+from compose.launch.processes import scenario_from_launcher
 from compose.launch.signals import stop_by_signal, stop_with_launcher
 from compose.network import beyond, reach
 from compose.recording.run import WORLD_JOURNAL, folder_for, read
@@ -100,7 +100,7 @@ def main(options: argparse.Namespace) -> int:
 def _scenario(options: argparse.Namespace) -> Scenario:
     """Return the scenario of the launcher or of the command line. Raises UserError."""
     if options.launched:
-        return handed()
+        return scenario_from_launcher()
     found = setting(options.scenario, options.fault)
     if found.file.kill:
         raise UserError(

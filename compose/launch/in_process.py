@@ -15,7 +15,7 @@ from world.scenario import Scenario
 from world.simulation import Simulation
 
 
-def play(scenario: Scenario, out: Path | None = None) -> Recording:
+def run_mission(scenario: Scenario, out: Path | None = None) -> Recording:
     """Run `scenario`, and write its journals to `out`. They are identical to those of a run as processes.
 
     Raises CannotRecord if `out` contains a recording, or cannot be written.

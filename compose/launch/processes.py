@@ -99,9 +99,9 @@ class MissionProcess:
         )
         return f"{how}: {'; '.join(errors.splitlines())}" if (errors := self.said()) else how
 
-    def hand(self, frame: bytes) -> None:
+    def send(self, frame: bytes) -> None:
         """Send `frame`, preceded by its length, to the standard input of the process."""
-        self._process.hand(len(frame).to_bytes(4, "big") + frame)
+        self._process.send(len(frame).to_bytes(4, "big") + frame)
 
     def stop(self) -> None:
         """Send SIGTERM, and SIGCONT in case the process is suspended."""
@@ -117,13 +117,13 @@ class MissionProcess:
         self._errors.close()
 
 
-def handed() -> Scenario:
+def scenario_from_launcher() -> Scenario:
     """Return the scenario that the launcher sent to the standard input of this child process."""
     size = int.from_bytes(sys.stdin.buffer.read(4), "big")
     return decode(sys.stdin.buffer.read(size), Scenario, MAX_FRAME_BYTES)
 
 
-def play(
+def run_mission(
     scenario: Scenario,
     out: Path,
     inbox: Inbox,
@@ -211,7 +211,7 @@ class _Run:
             self.children[name].forget()
         self.children[name] = MissionProcess(name, self._arguments[name], self._inbox, kills)
         if name == WORLD:
-            self.children[name].hand(encode(self._scenario))
+            self.children[name].send(encode(self._scenario))
 
     def watch(self) -> None:
         """Wait until all have ended, the agents at most FOLLOW_S after the world. Raises ChildFailed."""

@@ -25,7 +25,7 @@ def nearest(recording: Recording) -> float | None:
 
 def _of_pair(recording: Recording, pair: tuple[int, int]) -> float | None:
     scenario, least = recording.scenario, None
-    for moment in recording.moments:
+    for moment in recording.ticks:
         (mutual,) = mutual_ranges(moment.truth, scenario, [pair])
         if least is None and (mutual is None or mutual.range is None):
             continue
@@ -38,7 +38,7 @@ def _of_pair(recording: Recording, pair: tuple[int, int]) -> float | None:
 def _path(recording: Recording, moment: TickRecord, place: int) -> list[Pose]:
     """Return INSTANTS + 1 poses of a robot from this tick to the next; in the last tick, it is at rest."""
     scenario, pose = recording.scenario, moment.truth.poses[place]
-    if moment is recording.moments[-1]:
+    if moment is recording.ticks[-1]:
         return [pose] * (INSTANTS + 1)
     robot = scenario.robots[place].id
     command = moment.commands.get(robot)

@@ -55,8 +55,8 @@ class TickRow(msgspec.Struct, frozen=True):
 def rows(recording: Recording) -> Iterator[TickRow]:
     """Yield one row per tick and robot, from tick 0."""
     scenario = recording.scenario
-    last = recording.moments[-1].truth.tick if recording.moments else 0
-    for moment in recording.moments:
+    last = recording.ticks[-1].truth.tick if recording.ticks else 0
+    for moment in recording.ticks:
         tick = moment.truth.tick
         anchor = anchor_ranges(moment.truth, scenario)
         mutual = _mutual(scenario, moment.truth)

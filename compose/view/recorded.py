@@ -152,9 +152,9 @@ class Journals:
         facts = self.known.at(world.truth.tick)
         facts.truth.update(zip(ids, world.truth.poses, strict=True))
         self.known.has_truth = True
-        if world.air:
+        if world.links:
             links = [link for one, other in world.pairs for link in ((one, other), (other, one))]
-            for (sender, receiver), air in zip(links, world.air, strict=True):
+            for (sender, receiver), air in zip(links, world.links, strict=True):
                 facts.under_way[ids[sender], ids[receiver]] = tuple([flying.tick for flying in air.flying])
 
     def _mode(self) -> str | None:

@@ -157,7 +157,7 @@ class Field:
         session.answer(link, keys.config(run, me), lambda _: self._config)
         self._token = session.show_alive(link, keys.world_alive(run))
 
-    def play(self, wait: float, ended: Callable[[], None]) -> MissionEnd:
+    def run_mission(self, wait: float, ended: Callable[[], None]) -> MissionEnd:
         """Run the whole mission, stop the robot, and return the MissionEnd.
 
         `wait` is the time in s to wait for both agents to connect. `ended` is called when the agent's process
