@@ -1,4 +1,4 @@
-"""The process of the world: it sends Observations, waits for Commands, and so is the clock of all robots.
+"""The process of the world: it sends Observations and waits for Commands, which sets the pace of all robots.
 
 In lockstep, a tick lasts until all robots have answered, and no decision depends on a timeout. In real time,
 a tick lasts its period, and a robot without a Command rests for that tick.
@@ -51,7 +51,7 @@ class RobotsLinkLost(Exception):
 
 
 class WorldProcess:
-    """One run, over one session after another. A session has to be attached before `run`."""
+    """One run, over one or more sessions in turn. A session has to be attached before `run`."""
 
     def __init__(
         self,
@@ -97,8 +97,8 @@ class WorldProcess:
         """The time in s without a message after which the link counts as lost."""
         self._began: float | None = None
         """The time at which all robots had answered the first Observation."""
-        self.playing_s = 0.0
-        """The wall time in s from then to the MissionEnd."""
+        self.running_s = 0.0
+        """The wall time in s from `_began` to the MissionEnd."""
         self._ended: float | None = None
         """The time at which the MissionEnd was first sent."""
         self._final_reports: dict[str, FinalReport] = {}
@@ -125,8 +125,8 @@ class WorldProcess:
     def run(self) -> MissionEnd:
         """Run to the end of the mission, collect the FinalReports, and return the MissionEnd.
 
-        Raises RobotsLinkLost, after which `run` continues over another session; Interrupted by a signal;
-        CannotRecord.
+        Raises RobotsLinkLost if the link is lost; `run` may then be called again with another session. Raises
+        Interrupted by a signal, and CannotRecord.
         """
         simulation = self._simulation
         due: float | None = None
@@ -149,7 +149,7 @@ class WorldProcess:
         except NoAnswer as error:
             end = simulation.end(Judgement("failed", str(error)))
         self._ended = time.monotonic() if self._ended is None else self._ended
-        self.playing_s = self._ended - self._began if self._began is not None else 0.0
+        self.running_s = self._ended - self._began if self._began is not None else 0.0
         simulation.journal_final_reports(self._collect_final_reports(end, expected))
         self._print_missing_final_reports()
         self._put({robot: encode(final_report) for robot, final_report in simulation.final_reports.items()})
@@ -344,8 +344,8 @@ class WorldProcess:
             now = time.monotonic()
 
 
-LOOK_AGAIN_S = 0.05
-"""s to wait before trying to reach a router again."""
+POLL_S = 0.05
+"""The time in s between two attempts to reach a router."""
 
 
 class NoRouter(TimeoutError):
@@ -353,7 +353,7 @@ class NoRouter(TimeoutError):
 
 
 class WorldLinks:
-    """The Zenoh sessions of a world, one after another; a context manager that opens the first."""
+    """The Zenoh sessions of a world, one at a time; a context manager that opens the first."""
 
     def __init__(self, endpoints: Endpoints, timeout: float, inbox: Inbox, busy_timeout: float) -> None:
         """Wait at most `timeout` s for a router, and `busy_timeout` s for a port in use to become free."""
@@ -376,7 +376,7 @@ class WorldLinks:
             if time.monotonic() >= give_up:
                 why = diagnosis.why(self.endpoints)
                 raise NoRouter(f"no router at {self.endpoints}; gave up after {self._timeout:g} s: {why}")
-            self._inbox.next(LOOK_AGAIN_S)
+            self._inbox.next(POLL_S)
 
         if self.endpoints.connect:
             later = threading.Timer(diagnosis.FIRST_WORD_S, self._warn_without_link)

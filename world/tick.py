@@ -8,11 +8,11 @@ import msgspec
 
 from protocol.messages import Command, Contact, Localised, Observation, Verdict
 from protocol.motion import Controls, Pose
-from world.channel import LinkState, carried, of_plan
+from world.channel import LinkState, link_faults, next_link_state
 from world.referee import Judgement, judge
 from world.scenario import Scenario
 from world.sensors import anchor_ranges, executed, mutual_ranges, odometry
-from world.truth import Truth, asked
+from world.truth import Truth, limited_controls
 
 
 class World(msgspec.Struct, frozen=True):
@@ -80,7 +80,7 @@ def advance(world: World, commands: Mapping[str, Command]) -> World | Judgement:
     exact = scenario.mission.noise.exact
     for place, robot in enumerate(scenario.robots):
         command = commands.get(robot.id)
-        controls = asked(command, scenario.mission)
+        controls = limited_controls(command, scenario.mission)
         driven.append(controls if exact else executed(controls, scenario, robot.id, truth.tick))
         if command is not None and command.verdict is not None and robot.id not in verdicts:
             verdicts = verdicts | {robot.id: command.verdict}
@@ -106,9 +106,9 @@ def _carried(
     links = [(way, mutual) for pair, mutual in zip(pairs, mutuals, strict=True) for way in (pair, pair[::-1])]
     return tuple(
         [
-            carried(
+            next_link_state(
                 link,
-                of_plan(scenario.faults, ids[sender], ids[receiver]),
+                link_faults(scenario.faults, ids[sender], ids[receiver]),
                 scenario.seed,
                 truth.tick,
                 in_contact=mutual is not None,

@@ -52,24 +52,24 @@ def orientation(local: Pose) -> float:
     return wrap(local.heading - math.atan2(local.y, local.x))
 
 
-def onward(state: Phase2Mode, odometry: Pose, start: Pose, orbit: Orbit, mission: Mission) -> Phase2Mode:
-    """Return the mode of phase 2 at the pose `odometry`. Completed steps are skipped.
+def onward(mode: Phase2Mode, odometry: Pose, start: Pose, orbit: Orbit, mission: Mission) -> Phase2Mode:
+    """Return the mode that follows `mode` at the pose `odometry`. Completed steps are skipped.
 
     `start` is the pose of tick 0 in the anchor's frame.
     """
     distance_tolerance, angle_tolerance = arrival_tolerances(mission)
     while True:
-        match state:
+        match mode:
             case Aligning(heading) if abs(heading - odometry.heading) <= angle_tolerance:
-                state = Radial()
+                mode = Radial()
             case Radial() if abs(left_to_orbit(odometry, start, orbit)) <= distance_tolerance:
                 if orbit.v == 0.0:
                     return Orbiting()
-                state = Tangent(odometry.heading + math.copysign(math.pi / 2, orbit.omega))
+                mode = Tangent(odometry.heading + math.copysign(math.pi / 2, orbit.omega))
             case Tangent(heading) if abs(heading - odometry.heading) <= angle_tolerance:
                 return Orbiting()
             case _:
-                return state
+                return mode
 
 
 def left_to_orbit(odometry: Pose, start: Pose, orbit: Orbit) -> float:
@@ -87,9 +87,9 @@ def off_anchor(local: Pose, orbit: Orbit) -> bool:
     return math.hypot(local.x, local.y) >= 0.5 * orbit.radius
 
 
-def controls(state: Phase2Mode, odometry: Pose, start: Pose, orbit: Orbit, mission: Mission) -> Controls:
-    """Return the controls of the mode `state` at the pose `odometry`."""
-    match state:
+def controls(mode: Phase2Mode, odometry: Pose, start: Pose, orbit: Orbit, mission: Mission) -> Controls:
+    """Return the controls of `mode` at the pose `odometry`."""
+    match mode:
         case Aligning(heading) | Tangent(heading):
             return turn(odometry, heading, mission)
         case Radial():

@@ -31,7 +31,7 @@ RULES: tuple[Callable[[Evidence], Checks], ...] = (
     log,
     claim,
 )
-"""The rules of the audit; a rule whose violations follow from another's comes after it."""
+"""The rules of the audit, in order: if violations of one cause violations of another, it comes first."""
 
 
 def audit(folder: Path) -> Findings:
@@ -47,15 +47,16 @@ def audit_journals(
     journals: Mapping[str, Iterable[bytes]],
     folder: object,
     rules: Sequence[Callable[[Evidence], Checks]] = RULES,
-    without: Sequence[Callable[[Alone], Checks]] = hardware_rules.RULES,
+    rules_without_world: Sequence[Callable[[Alone], Checks]] = hardware_rules.RULES,
 ) -> Findings:
     """Return the findings in the frames of `journals`, by file name; errors name `folder`.
 
-    The rules are `rules`, or `without` if there is no world's journal. Raises CorruptJournal like `audit`.
+    The rules are `rules`, or `rules_without_world` if there is no world's journal. Raises CorruptJournal like
+    `audit`.
     """
     if WORLD_JOURNAL in journals:
         return audit_world_run(journals, folder, rules)
-    return audit_hardware_run(journals, folder, without)
+    return audit_hardware_run(journals, folder, rules_without_world)
 
 
 def audit_world_run(

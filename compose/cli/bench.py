@@ -188,7 +188,7 @@ def _mission_rate(
             process = WorldProcess(Simulation(scenario, journal), "bench", Inbox("tandem bench"))
             process.attach(link)
             end = process.run()
-            return end.tick / process.playing_s
+            return end.tick / process.running_s
 
 
 def _endpoints(

@@ -7,7 +7,7 @@ import math
 from compose.recording.run import Recording, TickRecord
 from protocol.motion import Pose, step
 from world.sensors import executed, mutual_ranges
-from world.truth import asked
+from world.truth import limited_controls
 
 INSTANTS = 32
 """The number of equal parts of a tick, at whose ends the distance is computed."""
@@ -42,6 +42,6 @@ def _path(recording: Recording, moment: TickRecord, place: int) -> list[Pose]:
         return [pose] * (INSTANTS + 1)
     robot = scenario.robots[place].id
     command = moment.commands.get(robot)
-    driven = executed(asked(command, scenario.mission), scenario, robot, moment.truth.tick)
+    driven = executed(limited_controls(command, scenario.mission), scenario, robot, moment.truth.tick)
     period = scenario.mission.period
     return [step(pose, driven.v, driven.omega, period * i / INSTANTS) for i in range(INSTANTS + 1)]

@@ -18,7 +18,7 @@ from agent.estimation.gaussian.range_model import Ranges
 from compose.recording.run import Recording
 from protocol.motion import Controls, Pose
 from world.sensors import anchor_ranges, executed, mutual_ranges
-from world.truth import asked
+from world.truth import limited_controls
 
 
 def position_bounds(recording: Recording, pair: tuple[int, int], tick: int) -> tuple[float, float] | None:
@@ -66,7 +66,9 @@ def _driven(recording: Recording, place: int, tick: int) -> Track:
     scenario = recording.scenario
     robot = scenario.robots[place].id
     driven: Sequence[Controls] = [
-        executed(asked(moment.commands.get(robot), scenario.mission), scenario, robot, moment.truth.tick)
+        executed(
+            limited_controls(moment.commands.get(robot), scenario.mission), scenario, robot, moment.truth.tick
+        )
         for moment in recording.ticks[:tick]
     ]
     v, omega = np.array([one.v for one in driven]), np.array([one.omega for one in driven])

@@ -100,7 +100,7 @@ class Views:
         yield from self.passing(scene)
         yield from self._whole(scene)
 
-    def again(self) -> Iterator[Shown]:
+    def latest(self) -> Iterator[Shown]:
         """Yield the messages of the latest tick again, for new viewers."""
         if self._latest is not None:
             yield from self._lines(self._latest)
