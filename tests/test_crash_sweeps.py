@@ -95,7 +95,7 @@ def test_a_trial_that_leaves_another_record_has_failed_and_says_where(
     def otherwise(scenario: Scenario, sinks: dict[str, MemoryJournal]) -> Recording:
         recording = real(scenario, sinks)
         if name == "ticks.csv":
-            return replace(recording, moments=recording.ticks[:-1])
+            return replace(recording, ticks=recording.ticks[:-1])
         sinks[name].frames[-1] += b"!"
         return recording
 
