@@ -43,7 +43,7 @@ def main() -> None:
 
 def draw(name: str, shown: Mapping[str, str], folder: Path) -> None:
     """Run the scenario in `folder`, and copy those of its figures to docs/ that `shown` names."""
-    recording = in_process.play(scenario_file.load(name), folder)
+    recording = in_process.run_mission(scenario_file.load(name), folder)
     robots = [robot.id for robot in recording.scenario.robots]
     pair = of_record(recording, (0, 1), {robot: account(folder, robot) for robot in robots})
     for kind in PICTURES:

@@ -19,7 +19,7 @@ DRAFT = ".unfinished"
 """The suffix of a file that is being written."""
 
 
-def said(error: OSError) -> str:
+def error_text(error: OSError) -> str:
     """Return the message for a user: what went wrong, and with which file."""
     why = error.strerror or str(error)
     return f"{error.filename}: {why}" if error.filename else why

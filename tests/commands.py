@@ -26,7 +26,7 @@ from tests import warm
 
 BOUND_S = 60.0
 """The time in s after which a wait fails; longer than any successful wait, even on a busy machine."""
-LOOK_AGAIN_S = 0.002
+POLL_S = 0.002
 """The time in s between two checks of a condition."""
 
 SECTION_IV = """
@@ -253,7 +253,7 @@ def until(condition: Callable[[], object], what: str, bound: float = BOUND_S) ->
     give_up = time.monotonic() + bound
     while not condition():
         assert time.monotonic() < give_up, f"not within {bound:g} s: {what}"
-        time.sleep(LOOK_AGAIN_S)
+        time.sleep(POLL_S)
 
 
 def processes_of(mark: str | Path) -> dict[int, list[str]]:

@@ -64,7 +64,7 @@ def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the recording of paper-1, which tests must not change."""
     folder = tmp_path_factory.mktemp("recorded") / "paper-1"
     folder.mkdir()
-    in_process.play(load("paper-1"), folder)
+    in_process.run_mission(load("paper-1"), folder)
     return folder
 
 

@@ -39,7 +39,7 @@ def main() -> int:
                 began = time.monotonic()
                 recording = run_mission(Path(folder), rate, stopped)
                 wall = time.monotonic() - began
-            ticks = recording.moments[-1].truth.tick
+            ticks = recording.ticks[-1].truth.tick
             missed = {robot: late(recording, robot) for robot in "ab"}
             moved = max([moved_by(recording, tick) for tick in missed["a"]], default=0.0)
             well &= ticks == rate * LASTS_S and moved == 0.0
@@ -67,12 +67,12 @@ def run_mission(folder: Path, rate: int, stopped: float) -> Recording:
 
 def late(recording: Recording, robot: str) -> list[int]:
     """Return the ticks whose command from `robot` was late."""
-    return [moment.truth.tick for moment in recording.moments[:-1] if robot not in moment.commands]
+    return [moment.truth.tick for moment in recording.ticks[:-1] if robot not in moment.commands]
 
 
 def moved_by(recording: Recording, tick: int) -> float:
     """Return the distance in m (1-norm) that a moved in `tick`."""
-    before, after = recording.moments[tick].truth.poses[0], recording.moments[tick + 1].truth.poses[0]
+    before, after = recording.ticks[tick].truth.poses[0], recording.ticks[tick + 1].truth.poses[0]
     return abs(after.x - before.x) + abs(after.y - before.y)
 
 

@@ -46,15 +46,15 @@ def astray(one: trial.Trial) -> trial.TrialRow:
         case 5:
             Path(tempfile.gettempdir(), HANGS).touch()
             threading.Event().wait()
-    return trial.play(one)
+    return trial.run_trial(one)
 
 
 def boastful(one: trial.Trial) -> trial.TrialRow:
     """Run a trial; in the third of a cell, estimates report too early that robots are localised."""
     if one.number != 2:
-        return trial.play(one)
+        return trial.run_trial(one)
     with patch.object(in_process, "Robot", Boaster):
-        return trial.play(one)
+        return trial.run_trial(one)
 
 
 class Boaster(Robot):
@@ -62,7 +62,7 @@ class Boaster(Robot):
 
     def estimate(self) -> bytes:
         """Return and journal an estimate that reports the robot as localised."""
-        frame = encode(replace(planner.estimate(self.mind), localised=True))
+        frame = encode(replace(planner.estimate(self.state), localised=True))
         assert self._journal is not None
         self._journal.write(frame)
         return frame
@@ -72,7 +72,7 @@ def endless(one: trial.Trial) -> trial.TrialRow:
     """Run a trial that writes the file `playing` and never ends."""
     Path(tempfile.gettempdir(), "playing").touch()
     threading.Event().wait()
-    return trial.play(one)
+    return trial.run_trial(one)
 
 
 def main(function: str, source: str, out: str) -> None:

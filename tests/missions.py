@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from compose.launch.in_process import play
+from compose.launch.in_process import run_mission
 from compose.recording.run import Recording
 from compose.scenario.scenario_file import parse
 
@@ -35,4 +35,4 @@ def mission_of(
         anchor = [10.0, 0.0]
         start = [10.4, 0.3, 3.6]
         """
-    return play(parse(text, "mission"))
+    return run_mission(parse(text, "mission"))

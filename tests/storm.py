@@ -119,9 +119,9 @@ class Genuine:
     """Every frame of a mission in one process without a storm, by key and tick."""
 
     def __init__(self, played: Scenario, folder: Path) -> None:
-        recording = in_process.play(played, folder)
+        recording = in_process.run_mission(played, folder)
         leave(recording, summary(recording, "in-process", None), folder)
-        self.ticks = recording.moments[-1].truth.tick
+        self.ticks = recording.ticks[-1].truth.tick
         self.final_reports = {
             robot: encode(final_report) for robot, final_report in recording.final_reports.items()
         }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from functools import cache
 
-from compose.launch.in_process import play
+from compose.launch.in_process import run_mission
 from compose.recording.run import Recording
 from compose.recording.summary_json import summary
 from compose.scenario.scenario_file import parse
@@ -53,7 +53,7 @@ def scenario_of(
 @cache
 def survey(noise: str, seed: int, planner_name: str = "assured", accuracy: float = 0.1) -> Recording:
     """Return the recording of the mission of `scenario_of`, run in this process."""
-    return play(scenario_of(noise, seed, planner_name=planner_name, accuracy=accuracy))
+    return run_mission(scenario_of(noise, seed, planner_name=planner_name, accuracy=accuracy))
 
 
 def assert_localised(recording: Recording) -> None:
@@ -76,4 +76,4 @@ ROUNDING = 1e-6
 
 def states(recording: Recording, robot: str) -> list[str]:
     """Return the state of the robot at every tick."""
-    return [moment.commands[robot].state for moment in recording.moments]
+    return [moment.commands[robot].state for moment in recording.ticks]

@@ -28,7 +28,7 @@ from compose.figures.account import account
 from compose.figures.pair import PairRecord, of_record
 from compose.figures.sheet import Absent
 from compose.figures.style import look
-from compose.launch.in_process import play
+from compose.launch.in_process import run_mission
 from compose.recording.run import estimates, read
 from compose.recording.summary_json import first_claim
 from compose.scenario.scenario_file import load, parse
@@ -85,7 +85,7 @@ def recorded(name: str, recordings: Path) -> Path:
     folder = recordings / name
     if not (folder / "world.journal").exists():
         folder.mkdir(exist_ok=True)
-        play(scenario_of(name), folder)
+        run_mission(scenario_of(name), folder)
     return folder
 
 
@@ -243,7 +243,7 @@ def test_the_encounter_has_a_panel_for_each_mutual_range(
 def test_the_key_of_an_encounter_is_on_the_paper_however_few_ranges_it_has(
     ticks: int, tmp_path: Path
 ) -> None:
-    play(parse(PAPER_1.replace("seed = 1", f"seed = 1\nmax_ticks = {ticks}"), "mine.toml"), tmp_path)
+    run_mission(parse(PAPER_1.replace("seed = 1", f"seed = 1\nmax_ticks = {ticks}"), "mine.toml"), tmp_path)
     told = pair(tmp_path)
     assert len(steps.steps(told)) == ticks - 45
     with look():

@@ -29,7 +29,7 @@ def played(trial: int) -> str:
         setting = validate(table, "anywhere")
     except Unworkable:
         return "refused"
-    end = in_process.play(setting.seeded(table["seed"])).end
+    end = in_process.run_mission(setting.seeded(table["seed"])).end
     assert end is not None
     return end.outcome if end.reason is None else f"trial {trial}: {end.outcome}: {end.reason}"
 
@@ -116,7 +116,7 @@ def test_the_paper_is_never_wrong_either() -> None:
         except Unworkable:
             continue
         if setting.scenario.max_ticks < 3000:
-            end = in_process.play(setting.seeded(table["seed"])).end
+            end = in_process.run_mission(setting.seeded(table["seed"])).end
             assert end is not None
             assert end.outcome in ("localised", "undecided"), (trial, end)
 

@@ -21,7 +21,7 @@ from agent.planning import planner
 from agent.planning.phase3_last_manoeuvre import SPEEDS, TURN_RATES, LastManoeuvre, base, solve
 from agent.planning.precision import combined_error, odometry_rounding
 from agent.planning.state import RobotState
-from compose.launch.in_process import play
+from compose.launch.in_process import run_mission
 from compose.recording.run import Recording, TickRecord
 from compose.scenario.scenario_file import parse
 from protocol.messages import Localised
@@ -90,12 +90,12 @@ def text_of(
 @cache
 def drawn(setting: Setting, seed: int, planner_name: str = "assured") -> Recording:
     """Return the recording of the mission with starts drawn from `seed`."""
-    return play(parse(text_of(setting, seed=seed, planner_name=planner_name), "assured"))
+    return run_mission(parse(text_of(setting, seed=seed, planner_name=planner_name), "assured"))
 
 
 def released(setting: Setting, a: Pose | None, b: Pose | None, frame: Pose = ORIGIN) -> Recording:
     """Return the recording of the mission with these starts; a start that is None is drawn."""
-    return play(parse(text_of(setting, a, b, seed=11, frame=frame), "assured"))
+    return run_mission(parse(text_of(setting, a, b, seed=11, frame=frame), "assured"))
 
 
 def steps_of(folder: Path, setting: Setting, seed: int) -> Iterator[Step]:
@@ -109,7 +109,7 @@ def assert_localised(recording: Recording) -> None:
     starts = [robot.start for robot in recording.scenario.robots]
     assert recording.end is not None
     assert recording.end.outcome == "localised", (recording.end, starts)
-    last = recording.moments[-1]
+    last = recording.ticks[-1]
     for robot, truth in zip(recording.scenario.robots, last.truth.poses, strict=True):
         verdict = last.commands[robot.id].verdict
         assert isinstance(verdict, Localised)
@@ -123,18 +123,18 @@ def in_contact(recording: Recording, moment: TickRecord) -> bool:
 
 def met(recording: Recording) -> int:
     """Return the tick in which phase 3 begins."""
-    return next(m.truth.tick for m in recording.moments if any(d.phase == 3 for d in m.commands.values()))
+    return next(m.truth.tick for m in recording.ticks if any(d.phase == 3 for d in m.commands.values()))
 
 
 def claimed(recording: Recording) -> int:
     """Return the tick of the first claim."""
-    return next(m.truth.tick for m in recording.moments if any(d.verdict for d in m.commands.values()))
+    return next(m.truth.tick for m in recording.ticks if any(d.verdict for d in m.commands.values()))
 
 
 def states(recording: Recording, robot: str) -> list[tuple[int, str]]:
     """Return the successive phases and states of `robot`."""
     found: list[tuple[int, str]] = []
-    for moment in recording.moments:
+    for moment in recording.ticks:
         command = moment.commands[robot]
         if not found or found[-1] != (command.phase, command.state):
             found.append((command.phase, command.state))
@@ -164,14 +164,14 @@ def test_phase_3_begins_in_the_first_tick_of_contact_in_which_both_know_their_an
         recording = drawn(setting, seed)
         first = next(
             moment
-            for moment in recording.moments
+            for moment in recording.ticks
             if in_contact(recording, moment)
             and all(command.phase > 1 for command in moment.commands.values())
             and off_anchor(recording, moment)
         )
         assert met(recording) == first.truth.tick, seed
         assert [command.phase for command in first.commands.values()] == [3, 3], seed
-        last = recording.moments[first.truth.tick - 1]
+        last = recording.ticks[first.truth.tick - 1]
         before_orbit += any(command.state != "orbiting" for command in last.commands.values())
     assert before_orbit >= on_the_way
 
@@ -181,7 +181,7 @@ def test_who_is_done_with_phase_1_stands_still_while_a_peer_in_range_is_not(sett
     waited = 0
     for seed in range(100):
         recording = drawn(setting, seed)
-        for moment in recording.moments:
+        for moment in recording.ticks:
             for one, other in (("a", "b"), ("b", "a")):
                 command = moment.commands[one]
                 if in_contact(recording, moment) and command.phase == 2 and moment.commands[other].phase == 1:
@@ -195,13 +195,13 @@ def test_a_stands_still_while_b_in_range_drives_off_its_anchor() -> None:
     recording = released(CLOSE._replace(speed=0.1), Pose(4.0, 0.5, 1.0), Pose(7.0, 0.0, 2.0))
     waited = [
         moment.commands["a"]
-        for moment in recording.moments
+        for moment in recording.ticks
         if [moment.commands[robot].phase for robot in "ab"] == [2, 2] and not off_anchor(recording, moment)
     ]
     assert len(waited) >= 3
     assert {(command.v, command.omega) for command in waited} == {(0.0, 0.0)}
-    assert off_anchor(recording, recording.moments[met(recording)])
-    assert not off_anchor(recording, recording.moments[met(recording) - 1])
+    assert off_anchor(recording, recording.ticks[met(recording)])
+    assert not off_anchor(recording, recording.ticks[met(recording) - 1])
     assert_localised(recording)
 
 
@@ -211,7 +211,7 @@ def test_once_both_orbit_phase_3_begins_within_the_bound(setting: Setting) -> No
         recording = drawn(setting, seed)
         orbits = sum(
             all(command.state == "orbiting" for command in moment.commands.values())
-            for moment in recording.moments
+            for moment in recording.ticks
         )
         bound = recording.scenario.robots[0].rendezvous.bound
         assert orbits * setting.period <= bound + 1e-9, seed
@@ -241,7 +241,7 @@ def test_however_long_b_has_waited_the_first_report_tells_the_whole_way(
 
 def encounter(recording: Recording) -> list[TickRecord]:
     """Return the ticks from the beginning of phase 3 until b's last manoeuvre begins, or until the claim."""
-    moments = recording.moments[met(recording) :]
+    moments = recording.ticks[met(recording) :]
     end = next(
         i
         for i, moment in enumerate(moments)
@@ -268,12 +268,12 @@ def test_ranges_before_phase_3_make_a_last_manoeuvre_needless() -> None:
     spared = 0
     for seed in range(150):
         recording = drawn(CLOSE, seed)
-        ranged = [moment.truth.tick for moment in recording.moments if in_contact(recording, moment)]
+        ranged = [moment.truth.tick for moment in recording.ticks if in_contact(recording, moment)]
         since = [tick for tick in ranged if met(recording) <= tick <= claimed(recording)]
         if len(since) < 3:
             assert len(since) == 2
             assert len([tick for tick in ranged if tick <= claimed(recording)]) >= 3
-            assert all(moment.commands["b"].state != "last-manoeuvre" for moment in recording.moments)
+            assert all(moment.commands["b"].state != "last-manoeuvre" for moment in recording.ticks)
             spared += 1
     assert spared >= 15
 
@@ -310,7 +310,7 @@ def test_nobody_claims_before_ranges_from_three_different_places(setting: Settin
         recording = drawn(setting, seed)
         assert_localised(recording)
         different: list[tuple[float, ...]] = []
-        for moment in recording.moments[: claimed(recording) + 1]:
+        for moment in recording.ticks[: claimed(recording) + 1]:
             here = places(moment)
             if in_contact(recording, moment) and all(math.dist(here, there) > 1e-6 for there in different):
                 different.append(here)
@@ -335,7 +335,7 @@ def test_who_leaves_the_range_straight_ahead_looks_behind_before_it_circles(sett
         recording = drawn(setting, seed)
         for robot, phase in (("a", 1), ("b", 1), ("a", 3)):
             ways.add((phase, *sought(recording, robot, phase)))
-        for moment in recording.moments:
+        for moment in recording.ticks:
             for command in moment.commands.values():
                 assert command.state != "backing" or (command.v < 0.0 and command.omega == 0.0)
     whole = ("straight", "backing", "turning", "circling")
@@ -349,13 +349,13 @@ def test_the_letter_never_looks_behind() -> None:
     for seed in range(100):
         recording = drawn(SECTION_IV, seed, "paper")
         assert all(
-            command.state != "backing" for moment in recording.moments for command in moment.commands.values()
+            command.state != "backing" for moment in recording.ticks for command in moment.commands.values()
         )
 
 
 def known(recording: Recording, robot: str) -> int:
     """Return the tick at which phase 1 ends."""
-    return next(moment.truth.tick for moment in recording.moments if moment.commands[robot].phase > 1)
+    return next(moment.truth.tick for moment in recording.ticks if moment.commands[robot].phase > 1)
 
 
 @pytest.mark.parametrize("reach", [1.0, 3.0, 5.0])
@@ -436,7 +436,7 @@ def places_of(moment: Step) -> list[tuple[float, float]]:
 @pytest.mark.parametrize("setting", [SECTION_IV, CLOSE, SHORTENED, Setting(speed=5.0)])
 def test_b_sets_out_only_once_a_stands(setting: Setting) -> None:
     for seed in range(100):
-        for moment in drawn(setting, seed).moments:
+        for moment in drawn(setting, seed).ticks:
             if moment.commands["b"].state == "last-manoeuvre":
                 assert (moment.commands["a"].v, moment.commands["a"].omega) == (0.0, 0.0), seed
 
@@ -557,7 +557,7 @@ def test_a_mission_is_the_same_wherever_in_the_plane_it_is(frame: Pose) -> None:
         a, b = (robot.start for robot in here.scenario.robots)
         there = released(setting, a, b, frame)
         assert_localised(there)
-        assert len(there.moments) == len(here.moments), seed
+        assert len(there.ticks) == len(here.ticks), seed
         for robot in "ab":
             assert states(there, robot) == states(here, robot), seed
 
@@ -649,7 +649,7 @@ def test_who_turns_slowly_gets_through_phase_1_from_next_to_its_anchor(rho0: flo
     setting = Setting(reach=1.0, period=0.05, turn_rate=0.2)
     for heading in (*RADIAL_AND_TANGENT, 1.0, 4.0):
         text = text_of(setting, Pose(rho0, 0.0, heading), None, max_ticks=200)
-        assert play(parse(text, "assured")).moments[-1].commands["a"].phase > 1, heading
+        assert run_mission(parse(text, "assured")).ticks[-1].commands["a"].phase > 1, heading
 
 
 # --- limits of size -----------------------------------------------------------------------------------

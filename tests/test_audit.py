@@ -19,7 +19,7 @@ from agent.planning import planner
 from agent.planning.state import RobotState
 from agent.process.robot import Robot
 from compose.audit.findings import Findings, Violation
-from compose.audit.rules import RULES, audit, judge
+from compose.audit.rules import RULES, audit, audit_world_run
 from compose.launch import in_process
 from compose.recording.frames import KINDS
 from compose.recording.run import WORLD_JOURNAL, agent_journal, read
@@ -56,7 +56,7 @@ from tests.commands import (
 from tests.test_real_time import missed
 from world.referee import Judgement
 from world.scenario import Scenario
-from world.simulation import Course
+from world.simulation import Simulation
 
 Found = tuple[int | None, str | None, str]
 """The tick, robot and rule of a violation."""
@@ -119,7 +119,7 @@ def checks(findings: Findings) -> dict[str, int]:
 )
 def test_an_honest_run_keeps_every_rule(scenario: Scenario) -> None:
     journals = kept(scenario)
-    findings = judge(journals)
+    findings = audit_world_run(journals)
     assert findings.violations == ()
     made, ticks, robots = checks(findings), findings.ticks, len(scenario.robots)
     assert list(made) == [rule.__name__ for rule in RULES]
@@ -135,10 +135,10 @@ def test_an_honest_run_keeps_every_rule(scenario: Scenario) -> None:
 
 def test_journals_in_memory_are_those_on_disk(tmp_path: Path) -> None:
     scenario = load("paper-1")
-    in_process.play(scenario, tmp_path)
+    in_process.run_mission(scenario, tmp_path)
     journals = kept(scenario)
     assert {path.name: list(journal_file.read(path)) for path in tmp_path.iterdir()} == journals
-    assert audit(tmp_path) == judge(journals)
+    assert audit(tmp_path) == audit_world_run(journals)
 
 
 def test_a_run_as_processes_keeps_every_rule_and_the_command_says_so(tmp_path: Path) -> None:
@@ -146,7 +146,7 @@ def test_a_run_as_processes_keeps_every_rule_and_the_command_says_so(tmp_path: P
     ended = tandem("audit", tmp_path / "out")
     assert (ended.status, ended.err) == (0, "")
     lines = ended.out.splitlines()
-    ticks = len(read(tmp_path / "out").moments)
+    ticks = len(read(tmp_path / "out").ticks)
     assert lines[:3] == [f"noisy: no violations in {ticks} ticks", "", "rule        checks  violations"]
     assert [line.split()[0] for line in lines[3:]] == [rule.__name__ for rule in RULES]
     assert [line.split()[2] for line in lines[3:]] == ["0"] * len(RULES)
@@ -172,22 +172,22 @@ def test_a_run_that_failed_was_failed_by_nobody_on_record() -> None:
     """The world ends a run without answers; a robot that did answer also answers the MissionEnd."""
     scenario = load("paper-1")
     books = {name: MemoryJournal() for name in in_process.journals(scenario)}
-    course = Course(scenario, books[WORLD_JOURNAL])
+    simulation = Simulation(scenario, books[WORLD_JOURNAL])
     robots = {robot: Robot(scenario.config(robot), books[agent_journal(robot)]) for robot in "ab"}
     for _ in range(5):
         commands = {}
-        for observation in course.observations():
+        for observation in simulation.observations():
             robots[observation.robot].observation(observation)
             commands[observation.robot] = robots[observation.robot].decide()
             robots[observation.robot].estimate()
-        assert course.command(commands) is None
-    a, _ = course.observations()
+        assert simulation.command(commands) is None
+    a, _ = simulation.observations()
     robots["a"].observation(a)
     robots["a"].decide()
     robots["a"].estimate()
-    end = course.end(Judgement("failed", "no answer from b at tick 5 for 30 s"))
-    course.final_reports([robots["a"].final_report(end)])
-    findings = judge({name: book.frames for name, book in books.items()})
+    end = simulation.end(Judgement("failed", "no answer from b at tick 5 for 30 s"))
+    simulation.journal_final_reports([robots["a"].final_report(end)])
+    findings = audit_world_run({name: book.frames for name, book in books.items()})
     assert found(findings) == [(4, "b", "order")]
     assert findings.violations[0].what == "its journal breaks off here, expected MissionEnd and FinalReport"
 
@@ -206,7 +206,7 @@ def test_a_journal_that_breaks_off_anywhere_breaks_no_other_rule(
 ) -> None:
     whole = paper_1[name]
     for count in range(2 * (name == WORLD_JOURNAL), len(whole)):  # at least its scenario
-        findings = judge(paper_1 | {name: whole[:count]})
+        findings = audit_world_run(paper_1 | {name: whole[:count]})
         if name == WORLD_JOURNAL and count >= len(whole) - 2:  # a FinalReport is lacking, or both
             assert {one.what for one in findings.violations} == {"the world has no FinalReport from it"}
             continue
@@ -226,7 +226,7 @@ def test_a_journal_that_breaks_off_anywhere_breaks_no_other_rule(
 
 
 def test_a_robot_that_has_left_no_journal_is_named(paper_1: dict[str, list[bytes]]) -> None:
-    findings = judge({name: frames for name, frames in paper_1.items() if name != B})
+    findings = audit_world_run({name: frames for name, frames in paper_1.items() if name != B})
     assert [one.line for one in findings.violations] == ["no tick, b, order: its journal is missing"]
     assert checks(findings)["decision"] == 2 * (LAST + 1) + 3 + 1
 
@@ -247,7 +247,7 @@ def written(path: Path, told: Iterable[Any]) -> None:
 def honest(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The recording of paper-1."""
     folder = tmp_path_factory.mktemp("honest")
-    in_process.play(load("paper-1"), folder)
+    in_process.run_mission(load("paper-1"), folder)
     return folder
 
 
@@ -441,7 +441,7 @@ def test_a_robot_that_starts_outside_the_range_of_its_anchor_is_found(tmp_path: 
     a, b = scenario.robots
     reach = scenario.mission.sensing_range
     outside = replace(a, start=replace(a.start, x=a.anchor.x + reach * (1.0 + 1e-9), y=a.anchor.y))
-    in_process.play(replace(scenario, robots=(outside, b), max_ticks=5), tmp_path)
+    in_process.run_mission(replace(scenario, robots=(outside, b), max_ticks=5), tmp_path)
     findings = audit(tmp_path)
     assert found(findings) == [(None, "a", "scenario")]
     assert what(findings, "scenario") == ["it starts 3.000000003 m from its anchor, outside R = 3 m"]
@@ -660,7 +660,7 @@ def claims(pose: Any, covariance: Covariance | None = None) -> Callable[[Any], A
 
 
 def test_a_claim_that_is_wrong_is_found_and_so_is_an_end_that_hides_it(folder: Path) -> None:
-    pose = read(folder).moments[LAST].truth.poses[0]
+    pose = read(folder).ticks[LAST].truth.poses[0]
     for name in (A, WORLD_JOURNAL):
         plant(folder / name, (of(Command, LAST, "a"), claims(replace(pose, x=pose.x + 2e-6))))
     findings = audit(folder)
@@ -672,7 +672,7 @@ def test_a_claim_that_is_wrong_is_found_and_so_is_an_end_that_hides_it(folder: P
 
 
 def test_a_claim_that_is_less_accurate_than_was_asked_is_found(folder: Path) -> None:
-    pose = read(folder).moments[LAST].truth.poses[0]
+    pose = read(folder).ticks[LAST].truth.poses[0]
     vague = Covariance(1e15, 0.0, 0.0, 1e15, 0.0, 1e-4)
     for name in (A, WORLD_JOURNAL):
         plant(folder / name, (of(Command, LAST, "a"), claims(pose, vague)))
@@ -683,7 +683,7 @@ def test_a_claim_that_is_less_accurate_than_was_asked_is_found(folder: Path) -> 
 
 
 def test_a_claim_without_a_redundant_range_is_found(folder: Path) -> None:
-    pose = read(folder).moments[47].truth.poses[0]
+    pose = read(folder).ticks[47].truth.poses[0]
     for name in (A, WORLD_JOURNAL):
         plant(folder / name, (of(Command, 47, "a"), claims(pose)))
     findings = audit(folder)
@@ -695,7 +695,7 @@ def test_a_claim_without_a_redundant_range_is_found(folder: Path) -> None:
 
 def test_ranges_taken_twice_in_the_same_place_are_not_redundant(folder: Path) -> None:
     """In real time, no robot moved before the third range."""
-    pose = read(folder).moments[47].truth.poses[0]
+    pose = read(folder).ticks[47].truth.poses[0]
     for name in (A, WORLD_JOURNAL):
         plant(folder / name, (of(Command, LAST, "a"), claims(pose)))
     plant(folder / B, (of(Command, 47), to(v=0.0, omega=0.0)))
@@ -714,10 +714,10 @@ def test_ranges_taken_twice_in_the_same_place_are_not_redundant(folder: Path) ->
     ],
 )
 def test_a_claim_by_too_few_noisy_ranges_is_found(planner_name: str, says: str, tmp_path: Path) -> None:
-    in_process.play(noise(1, planner_name), tmp_path)
+    in_process.run_mission(noise(1, planner_name), tmp_path)
     recording = read(tmp_path)
     first = next(one.tick for one in messages(tmp_path / A) if isinstance(one, Observation) and one.contacts)
-    pose = recording.moments[first].truth.poses[0]
+    pose = recording.ticks[first].truth.poses[0]
     sure = Covariance(1e-6, 0.0, 0.0, 1e-6, 0.0, 1e-6)
     for name in (A, WORLD_JOURNAL):
         plant(tmp_path / name, (of(Command, first, "a"), claims(pose, sure)))
@@ -754,7 +754,7 @@ def test_a_robot_that_gave_up_and_a_run_that_is_said_to_be_localised_are_found(f
 
 
 def test_nothing_is_claimed_of_another_pair(tmp_path: Path) -> None:
-    in_process.play(parse(several_pairs(3), "pairs"), tmp_path)
+    in_process.run_mission(parse(several_pairs(3), "pairs"), tmp_path)
     plant(tmp_path / agent_journal("d"), (of(Estimate, 3), to(localised=True)))
     assert found(audit(tmp_path)) == [(3, "d", "decision")]
 
@@ -831,7 +831,9 @@ def test_a_violation_is_one_line() -> None:
 
 def test_what_befell_the_reports_is_listed_and_another_plan_is_found(tmp_path: Path) -> None:
     text = shipped()["random"].read_text()
-    in_process.play(parse(text, "random", faults=["b->a: loss=0.5, delay=0..2, corrupt=0.2"]), tmp_path)
+    in_process.run_mission(
+        parse(text, "random", faults=["b->a: loss=0.5, delay=0..2, corrupt=0.2"]), tmp_path
+    )
     findings = audit(tmp_path)
     assert found(findings) == []
     to_a, to_b = findings.links
@@ -857,5 +859,5 @@ def test_a_liar_that_tells_what_it_was_told_to_tell_breaks_no_rule(tmp_path: Pat
     text = (
         shipped()["random"].read_text().replace('id = "b"', 'id = "b"\nattack = {kind = "scale", size = 0.5}')
     )
-    in_process.play(parse(text, "random"), tmp_path)
+    in_process.run_mission(parse(text, "random"), tmp_path)
     assert found(audit(tmp_path)) == []

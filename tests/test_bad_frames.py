@@ -100,7 +100,7 @@ def bad_frames(topic: str) -> dict[bytes, str]:
         frame[:-1]: "damaged: the CRC does not match",
         flipped(frame, 9): "damaged: the CRC does not match",
         flipped(frame, 8 * len(frame) - 20): "damaged: the CRC does not match",
-        framed(said, 0): f"protocol version 0, this is version {VERSION}",
+        framed(said, VERSION - 1): f"protocol version {VERSION - 1}, this is version {VERSION}",
         framed(said, VERSION + 1): f"protocol version {VERSION + 1}, this is version {VERSION}",
         with_number(math.nan): "Expected `float` >= .* - at ",
         with_number(math.inf): "Expected `float` <= .* - at ",
@@ -184,8 +184,8 @@ def test_nonsense_before_the_first_tick_is_refused_told_once_and_counted(tmp_pat
         refused_on(TRUSTED["command"], clock, nonsense[TRUSTED["command"]])
         for topic in ("observation", "report"):
             refused_on(TRUSTED[topic], agents[0], nonsense[TRUSTED[topic]])
-        assert complaints(clock, GHOST) == ["it says it is from 'ghost'"]
-        assert complaints(clock, OTHER) == ["it says it is from 'a'"]
+        assert complaints(clock, GHOST) == ["its sender is given as 'ghost'"]
+        assert complaints(clock, OTHER) == ["its sender is given as 'a'"]
         assert not any("Traceback" in command.err for command in (clock, *agents))
 
     assert tandem("run", scenario, "--in-process", "-q", "--out", alone).status == 0

@@ -23,7 +23,7 @@ SEEDS = range(4, 9)
 
 
 def bounds(recording: Recording, tick: int | None = None) -> tuple[float, float]:
-    found = position_bounds(recording, PAIR, recording.moments[-1].truth.tick if tick is None else tick)
+    found = position_bounds(recording, PAIR, recording.ticks[-1].truth.tick if tick is None else tick)
     assert found is not None
     return found
 
@@ -38,13 +38,13 @@ def ends_and_ranges(recording: Recording, starts: Sequence[float]) -> tuple[Arra
     """Return the final x, y of a and b and all true ranges, for other starts and the same commands."""
     scenario = recording.scenario
     poses = [[Pose(*starts[:3])], [Pose(*starts[3:])]]
-    for moment in recording.moments[:-1]:
+    for moment in recording.ticks[:-1]:
         for path, robot in zip(poses, scenario.robots, strict=True):
             asked = moment.commands[robot.id]
             done = executed(Controls(asked.v, asked.omega), scenario, robot.id, moment.truth.tick)
             path.append(step(path[-1], done.v, done.omega, scenario.mission.period))
     reach, ranges = scenario.mission.sensing_range, []
-    for moment, a, b in zip(recording.moments, *poses, strict=True):
+    for moment, a, b in zip(recording.ticks, *poses, strict=True):
         true = moment.truth.poses
         (m1, m2) = (robot.anchor for robot in scenario.robots)
         for seen, now in (
@@ -61,7 +61,7 @@ def ends_and_ranges(recording: Recording, starts: Sequence[float]) -> tuple[Arra
 def by_differences(recording: Recording, sigma: float) -> tuple[float, float]:
     """Return the bound from the Fisher information of the six unknowns, by finite differences."""
     starts = np.array(
-        [value for pose in recording.moments[0].truth.poses for value in (pose.x, pose.y, pose.heading)]
+        [value for pose in recording.ticks[0].truth.poses for value in (pose.x, pose.y, pose.heading)]
     )
     ends, ranges = [], []
     for i in range(6):

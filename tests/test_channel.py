@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from tests.test_noise import Z, has_share
-from world.channel import LinkState, carried, of_plan
+from world.channel import LinkState, link_faults, next_link_state
 from world.faults import (
     LATEST,
     MAX_DELAY,
@@ -59,9 +59,9 @@ def flown(
     plan: Sequence[Fault], contact: Sequence[bool], seed: int = 1, way: tuple[str, str] = ("a", "b")
 ) -> list[LinkState]:
     """Return the state of a link, tick by tick."""
-    links, air, found = of_plan(plan, *way), LinkState(), []
+    links, air, found = link_faults(plan, *way), LinkState(), []
     for tick, together in enumerate(contact):
-        air = carried(air, links, seed, tick, in_contact=together)
+        air = next_link_state(air, links, seed, tick, in_contact=together)
         found.append(air)
     return found
 

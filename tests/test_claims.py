@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 from scipy.stats import chi2  # type: ignore[import-untyped]
 
-from compose.launch.in_process import play
+from compose.launch.in_process import run_mission
 from compose.recording.claim import matrix, nees
 from compose.recording.run import Recording, TickRecord
 from compose.recording.summary_json import leave, summary
@@ -147,7 +147,7 @@ def test_summary_says_what_was_claimed_and_what_it_was_worth(tmp_path: Path) -> 
 def test_an_error_is_that_of_the_tick_of_the_claim(tmp_path: Path) -> None:
     recording = claimed(NOISY, SURE)
     told = robots(recording, tmp_path)["a"]
-    last = recording.moments[-1].truth.poses[0]
+    last = recording.ticks[-1].truth.poses[0]
     assert told["truth"][:2] == [last.x, last.y]
     assert abs(math.dist(told["estimate"][:2], told["truth"][:2]) - told["position_error_m"]) > 1e-3
 
@@ -281,7 +281,7 @@ def test_the_table_of_a_sweep_gives_the_nees_where_covariances_are_claimed(
 # --- the table ----------------------------------------------------------------------------------------
 
 
-PLAYED = play(load("paper-1"))
+PLAYED = run_mission(load("paper-1"))
 
 
 def missing_at(recording: Recording, robot: str, ticks: Container[int]) -> Recording:
@@ -290,10 +290,10 @@ def missing_at(recording: Recording, robot: str, ticks: Container[int]) -> Recor
         replace(one, commands={who: command for who, command in one.commands.items() if who != robot})
         if one.truth.tick in ticks
         else one
-        for one in recording.moments
+        for one in recording.ticks
     ]
     final_reports = {who: said for who, said in recording.final_reports.items() if who != robot}
-    return replace(recording, moments=tuple(moments), final_reports=final_reports)
+    return replace(recording, ticks=tuple(moments), final_reports=final_reports)
 
 
 def test_the_end_says_how_many_deadlines_each_robot_missed_and_suggests_a_lower_rate(
@@ -301,7 +301,7 @@ def test_the_end_says_how_many_deadlines_each_robot_missed_and_suggests_a_lower_
 ) -> None:
     recording = missing_at(missing_at(PLAYED, "a", range(3, 10)), "b", [5])
     result(summary(recording, "processes", 0.5), 40.0)
-    last = recording.moments[-1].truth.tick
+    last = recording.ticks[-1].truth.tick
     said = capsys.readouterr().out.splitlines()[-1]
     assert said == (
         f"deadlines missed, of {last}: a 7, b 1; "
@@ -320,7 +320,7 @@ def test_the_end_says_how_many_deadlines_each_robot_missed_and_suggests_a_lower_
 def test_the_summary_says_why_a_robot_has_no_farewell(ticks: Container[int], why: str) -> None:
     recording = missing_at(PLAYED, "a", ticks)
     told = summary(recording, "processes", 0.5)["robots"]
-    assert told["a"]["no_farewell"] == why.replace("LAST", str(recording.moments[-1].truth.tick))
+    assert told["a"]["no_farewell"] == why.replace("LAST", str(recording.ticks[-1].truth.tick))
     assert told["b"]["no_farewell"] is None
     assert told["a"]["reports_sent"] is None
     cut = summary(replace(recording, end=None), "processes", 0.5)["robots"]

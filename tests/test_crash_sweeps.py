@@ -24,7 +24,7 @@ from compose.scenario.scenario_file import load, parse, validate
 from compose.scenario.toml_file import table_in
 from compose.sweep import spec
 from compose.sweep.cells import cells
-from compose.sweep.trial import Trial, play
+from compose.sweep.trial import Trial, run_trial
 from protocol.journal.journal_file import MemoryJournal
 from tests.commands import ENDLESS, PAPER_1, TandemProcess, tandem, temporary_in, until
 from tests.test_bad_input import refused
@@ -95,12 +95,12 @@ def test_a_trial_that_leaves_another_record_has_failed_and_says_where(
     def otherwise(scenario: Scenario, sinks: dict[str, MemoryJournal]) -> Recording:
         recording = real(scenario, sinks)
         if name == "ticks.csv":
-            return replace(recording, moments=recording.moments[:-1])
+            return replace(recording, ticks=recording.ticks[:-1])
         sinks[name].frames[-1] += b"!"
         return recording
 
     monkeypatch.setattr(in_process, "played", otherwise)
-    found = play(Trial(0, 0, load("paper-1"), processes=False, kills=()))
+    found = run_trial(Trial(0, 0, load("paper-1"), processes=False, kills=()))
     assert (found.outcome, found.ticks, found.same_record) == ("failed", 48, False)
     assert found.reason == f"the recording differs from the run in one process: {name}"
 
@@ -108,7 +108,7 @@ def test_a_trial_that_leaves_another_record_has_failed_and_says_where(
 def test_a_process_that_is_never_started_again_ends_its_trial() -> None:
     kills = drawn([KillTable("b", 2, after="never")], 1, ("a", "b"))
     with pytest.raises(ChildFailed, match=r"agent b was killed at tick 2 \(--kill b@2:observation\+never\)"):
-        play(Trial(0, 0, load("paper-1"), processes=False, kills=kills))
+        run_trial(Trial(0, 0, load("paper-1"), processes=False, kills=kills))
 
 
 @pytest.mark.long
@@ -206,7 +206,7 @@ def killed(name: str, seed: int) -> list[tuple[Any, ...]]:
 
 
 def test_the_sweep_of_crashes_kills_everyone_in_every_tick_at_every_point() -> None:
-    end = in_process.play(load("paper-1")).end
+    end = in_process.run_mission(load("paper-1")).end
     assert end is not None
     ticks = range(end.tick + 1)
     everything = {((who, tick, point),) for who in ("a", "b", WORLD) for tick in ticks for point in POINTS}
@@ -214,7 +214,7 @@ def test_the_sweep_of_crashes_kills_everyone_in_every_tick_at_every_point() -> N
 
 
 def test_the_sweep_of_two_kills_kills_any_two_or_both_robots_in_one_tick() -> None:
-    end = in_process.play(load("paper-2")).end
+    end = in_process.run_mission(load("paper-2")).end
     assert end is not None
     for seed in range(50):
         two, one = killed("crash-twice", seed)

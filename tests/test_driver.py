@@ -115,7 +115,7 @@ def played(stage: Stage) -> Play:
         stage.alive("a", "b")
         field = Field(driver, BRIEFING, "r", stage, max_ticks=ticks, manoeuvre_s=MANOEUVRE_S, timeout=timeout)
         field.attach(LINK)
-        return field, field.play(10.0, lambda: None), ends
+        return field, field.run_mission(10.0, lambda: None), ends
 
     return play
 
@@ -226,7 +226,7 @@ def ended(
     ending = Ending(BRIEFING, 25, timeout)
     for tick in range(ticks):
         if tick == 12 and said is not None:
-            ending.told(said)
+            ending.receive(said)
         verdict = own if tick >= 10 else None
         end = ending.after(tick, command(tick, verdict=verdict), peer_there=True)
         if end is not None:
@@ -287,7 +287,7 @@ def test_b_begins_when_a_does_and_counts_a_s_ticks(stage: Stage) -> None:
     for tick, after in ((7, 0.5), (0, later), (500, later)):  # tick 0 is of an a that lost its journal
         stage.comes("tick-start", keys.tick_start("r", "a"), encode(TickStart(tick, "a")), after)
     field.attach(LINK)
-    end = field.play(10.0, lambda: None)
+    end = field.run_mission(10.0, lambda: None)
     assert end.tick == 12
     assert driver.ticks[0][1] == pytest.approx(0.5)
     assert [tick for tick, _ in driver.ticks] == list(range(13))
@@ -335,7 +335,7 @@ def test_a_robot_that_was_down_catches_up_with_its_peer_standing(robot: str, pee
     stage.alive(robot)
     stage.comes("tick-start", keys.tick_start("r", peer), encode(TickStart(300, peer)), 0.01)
     field.attach(LINK)
-    end = field.play(10.0, lambda: None)
+    end = field.run_mission(10.0, lambda: None)
     assert end.tick == 305
     assert sent == list(range(18, 306))
     assert [tick for tick, _ in driver.ticks] == list(range(20, 306))
@@ -363,7 +363,7 @@ def test_a_b_that_was_killed_before_tick_0_begins_though_a_waits_for_it(stage: S
     tick_s = (1.0 + THINKING) * MANOEUVRE_S
     stage.comes("tick-start", keys.tick_start("r", "a"), encode(TickStart(0, "a")), 9.5 * tick_s)
     field.attach(LINK)
-    end = field.play(10.0, lambda: None)
+    end = field.run_mission(10.0, lambda: None)
     times = dict(driver.ticks)
     assert times[0] == pytest.approx(UNHEARD * tick_s)
     assert times[5] == pytest.approx(times[0] + 5 * tick_s)
@@ -375,7 +375,7 @@ def test_a_robot_says_why_there_is_no_farewell(stage: Stage, capsys: pytest.Capt
     stage.alive("a", "b")
     field = Field(Recorded(), BRIEFING, "r", stage, max_ticks=2, manoeuvre_s=MANOEUVRE_S)
     field.attach(LINK)
-    field.play(10.0, lambda: None)
+    field.run_mission(10.0, lambda: None)
     assert "no FinalReport of a: no answer to the MissionEnd" in capsys.readouterr().err
 
 
@@ -391,7 +391,7 @@ def test_a_robot_that_was_killed_waits_for_its_agent_however_long_its_peer_is_th
     stage.alive("b" if robot == "a" else "a")
     stage.comes("alive", keys.robot_alive("r", robot), after=3.0)
     field.attach(LINK)
-    assert field.play(10.0, lambda: None).tick == 25
+    assert field.run_mission(10.0, lambda: None).tick == 25
     tick, began = driver.ticks[0]
     assert tick == 20
     assert began == pytest.approx(3.0)
@@ -417,5 +417,5 @@ def test_a_robot_whose_driver_takes_a_whole_tick_to_sense_hears_its_agent(stage:
     stage.answer = answer
     stage.alive("a", "b")
     field.attach(LINK)
-    end = field.play(10.0, lambda: None)
+    end = field.run_mission(10.0, lambda: None)
     assert (end.outcome, end.tick) == ("undecided", 100)

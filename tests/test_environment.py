@@ -28,7 +28,7 @@ OLDER = "0.0.9"
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
-    in_process.play(load("paper-1"), tmp_path)
+    in_process.run_mission(load("paper-1"), tmp_path)
     return tmp_path
 
 

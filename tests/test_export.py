@@ -62,7 +62,7 @@ A, B = agent_journal("a"), agent_journal("b")
 
 def exported(scenario: Scenario, folder: Path) -> Path:
     """Return the folder of the recording and exports of a run of `scenario`."""
-    in_process.play(scenario, folder)
+    in_process.run_mission(scenario, folder)
     export(folder, folder)
     return folder
 
@@ -156,7 +156,7 @@ def test_every_viewers_channel_decodes_with_its_own_schema(faulty: Path) -> None
         )
     assert {topic for topic, _, _ in decoded} == topics
     assert all(schema == kind for _, schema, kind in decoded)
-    ticks = len(read(faulty).moments)
+    ticks = len(read(faulty).ticks)
     assert decoded["/a/pose", "foxglove.PoseInFrame", "foxglove.PoseInFrame"] == ticks
     assert {name for _, name, _ in decoded} == {
         f"foxglove.{kind}"
@@ -196,8 +196,8 @@ def test_viewers_see_robots_where_they_were_and_their_trails(paper_1: Path) -> N
     recording = read(paper_1)
     poses, trails = seen(paper_1 / "run.mcap", "/b/pose"), seen(paper_1 / "run.mcap", "/b/trail")
     transforms = seen(paper_1 / "run.mcap", "/tf")
-    assert len(poses) == len(trails) == len(transforms) == len(recording.moments)
-    for moment, pose, trail, tf in zip(recording.moments, poses, trails, transforms, strict=True):
+    assert len(poses) == len(trails) == len(transforms) == len(recording.ticks)
+    for moment, pose, trail, tf in zip(recording.ticks, poses, trails, transforms, strict=True):
         truth = moment.truth.poses[1]
         assert (pose.frame_id, pose.pose.position.x, pose.pose.position.y) == ("world", truth.x, truth.y)
         turn = pose.pose.orientation

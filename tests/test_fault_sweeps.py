@@ -87,7 +87,7 @@ def test_a_fault_may_be_varied_that_the_base_scenario_leaves_out() -> None:
 
 def test_a_row_counts_what_was_lost_and_refused() -> None:
     scenario = load("random", faults=["loss=0.5, corrupt=0.3"])
-    recording = in_process.play(scenario)
+    recording = in_process.run_mission(scenario)
     found = row(Trial(0, 0, scenario, processes=False), recording, 0.1)
     said = recording.final_reports.values()
     assert found.reports_lost == sum([one.reports_lost for one in said]) > 0

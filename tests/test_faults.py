@@ -66,7 +66,7 @@ def localises(recording: Recording) -> bool:
 @pytest.mark.parametrize("seed", series([1, 2, 3, 4]))
 @pytest.mark.parametrize("plan", PLANS)
 def test_a_mission_localises_whatever_befalls_its_reports(plan: str, seed: int) -> None:
-    assert localises(in_process.play(load("random", seed=seed, faults=PLANS[plan])))
+    assert localises(in_process.run_mission(load("random", seed=seed, faults=PLANS[plan])))
 
 
 @pytest.mark.parametrize("seed", series([1, 2]))
@@ -76,13 +76,13 @@ def test_a_mission_localises_whatever_befalls_its_reports(plan: str, seed: int) 
 def test_under_noise_too(plan: str, seed: int) -> None:
     quiet = scenario_of(NOISE, seed)
     faults = load("random", faults=PLANS[plan]).faults
-    assert localises(in_process.play(replace(quiet, faults=faults, max_ticks=3000)))
+    assert localises(in_process.run_mission(replace(quiet, faults=faults, max_ticks=3000)))
 
 
 def test_what_is_lost_costs_ticks() -> None:
     ticks = []
     for faults in ([], PLANS["loss"], ["loss=0.98"]):
-        found = [in_process.play(load("random", seed=seed, faults=faults)).end for seed in range(8)]
+        found = [in_process.run_mission(load("random", seed=seed, faults=faults)).end for seed in range(8)]
         ticks.append(sum([end.tick for end in found if end is not None]))
     assert ticks[0] < ticks[1] < ticks[2]
 
@@ -93,11 +93,11 @@ def test_a_partition_costs_what_it_lasts_since_nobody_goes_on_unanswered(begin: 
     cut = 30
     for seed in range(1, 9):
         whole, parted = (
-            in_process.play(load("random", seed=seed, faults=faults))
+            in_process.run_mission(load("random", seed=seed, faults=faults))
             for faults in ([], [f"{way}: partition, contact_ticks={begin}..{begin + cut}"])
         )
         assert localises(parted)
-        assert parted.moments[-1].truth.tick == whole.moments[-1].truth.tick + cut
+        assert parted.ticks[-1].truth.tick == whole.ticks[-1].truth.tick + cut
 
 
 @pytest.mark.parametrize("delay", [1, 7, 20])
@@ -105,19 +105,20 @@ def test_a_delay_costs_three_times_what_it_lasts(delay: int) -> None:
     """The robots wait for a Report before they can meet, before the last manoeuvre and before the claim."""
     for seed in range(1, 9):
         prompt, late = (
-            in_process.play(load("random", seed=seed, faults=faults)) for faults in ([], [f"delay={delay}"])
+            in_process.run_mission(load("random", seed=seed, faults=faults))
+            for faults in ([], [f"delay={delay}"])
         )
         assert localises(late)
-        assert late.moments[-1].truth.tick == prompt.moments[-1].truth.tick + 3 * delay
+        assert late.ticks[-1].truth.tick == prompt.ticks[-1].truth.tick + 3 * delay
 
 
 def test_under_noise_a_robot_that_has_not_been_answered_stands_and_listens() -> None:
     quiet = scenario_of(NOISE, 1)
-    recording = in_process.play(
+    recording = in_process.run_mission(
         replace(quiet, faults=load("random", faults=["delay=6"]).faults, max_ticks=3000)
     )
     assert localises(recording)
-    commands = [moment.commands[robot] for moment in recording.moments for robot in "ab"]
+    commands = [moment.commands[robot] for moment in recording.ticks for robot in "ab"]
     listening = [command for command in commands if command.state == "listening"]
     assert len(listening) > 20
     assert all((command.phase, command.v, command.omega) == (3, 0.0, 0.0) for command in listening)
@@ -125,7 +126,7 @@ def test_under_noise_a_robot_that_has_not_been_answered_stands_and_listens() -> 
 
 def test_two_that_never_hear_each_other_claim_nothing() -> None:
     scenario = load("random", faults=["partition"])
-    recording = in_process.play(replace(scenario, max_ticks=300))
+    recording = in_process.run_mission(replace(scenario, max_ticks=300))
     assert recording.end is not None
     assert recording.end.outcome == "undecided"
     told = summary(recording, "in-process", None)["robots"]
@@ -135,7 +136,7 @@ def test_two_that_never_hear_each_other_claim_nothing() -> None:
 
 def test_one_that_is_never_heard_keeps_both_from_a_claim() -> None:
     scenario = load("random", faults=["a->b: partition"])
-    recording = in_process.play(replace(scenario, max_ticks=300))
+    recording = in_process.run_mission(replace(scenario, max_ticks=300))
     assert recording.end is not None
     assert recording.end.outcome == "undecided"
     assert recording.final_reports["a"].reports_lost == 0 < recording.final_reports["a"].reports_heard
@@ -146,7 +147,7 @@ def test_one_that_is_never_heard_keeps_both_from_a_claim() -> None:
 def test_what_was_heard_refused_and_lost_adds_up_to_what_the_world_let_through(
     plan: str, tmp_path: Path
 ) -> None:
-    recording = in_process.play(load("random", seed=3, faults=PLANS[plan]), tmp_path)
+    recording = in_process.run_mission(load("random", seed=3, faults=PLANS[plan]), tmp_path)
     for robot, peer in (("a", "b"), ("b", "a")):
         contacts = [
             (observation.tick, contact)
@@ -219,7 +220,7 @@ def test_a_plan_in_which_nothing_happens_is_no_plan_to_the_byte(base: str, tmp_p
     nothing = load("random", faults=["loss=0", "a->b: delay=0..0, duplicate=0", "partition, ticks=7..7"])
     for folder, faults in (("without", ()), ("with", nothing.faults)):
         (tmp_path / folder).mkdir()
-        in_process.play(replace(scenario, faults=faults), tmp_path / folder)
+        in_process.run_mission(replace(scenario, faults=faults), tmp_path / folder)
     without, with_it = journals(tmp_path / "without"), journals(tmp_path / "with")
     for robot in "ab":
         assert without[f"agent-{robot}.journal"] == with_it[f"agent-{robot}.journal"]

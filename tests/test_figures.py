@@ -19,7 +19,7 @@ from compose.figures import belief, plane
 from compose.figures.one_robot import figure_of
 from compose.figures.story import Story
 from compose.figures.style import PLACES, look, save
-from compose.launch.in_process import play
+from compose.launch.in_process import run_mission
 from compose.recording.run import estimates, read
 from compose.recording.summary_json import first_claim
 from compose.scenario.scenario_file import load, parse
@@ -50,7 +50,7 @@ def drawn(noisy: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def recorded(scenario: Scenario, folder: Path) -> Path:
-    play(scenario, folder)
+    run_mission(scenario, folder)
     return folder
 
 
@@ -162,7 +162,7 @@ def test_each_part_of_a_noisy_mission_is_in_its_picture(noisy: Path, drawn: Path
 
 def test_what_is_drawn_over_time_is_what_the_robot_said_held_against_the_truth(noisy: Path) -> None:
     story = Story(read(noisy), 0, estimates(noisy, "a"))
-    truth = [moment.truth.poses[0] for moment in story.recording.moments]
+    truth = [moment.truth.poses[0] for moment in story.recording.ticks]
     said = [one for one in story.held if one.world]
     off = [math.hypot(one.world[0].x - truth[one.tick].x, one.world[0].y - truth[one.tick].y) for one in said]
     errors, probability = Figure().subplots(2)
@@ -249,7 +249,7 @@ def test_odds_are_said_in_as_many_digits_as_they_have(probability: float, said: 
 @pytest.mark.parametrize("planner_name", series(["assured", "paper"]))
 def test_a_mission_that_ends_undecided_is_drawn(noise: str, planner_name: str, tmp_path: Path) -> None:
     text = BRIEF.replace("assured", planner_name).replace("[planner]", f"{noise}[planner]")
-    recording = play(parse(text, "brief"), tmp_path)
+    recording = run_mission(parse(text, "brief"), tmp_path)
     assert recording.end is not None
     assert recording.end.outcome == "undecided"
     svg = picture(tmp_path, "b")
@@ -265,7 +265,7 @@ def test_a_record_that_breaks_off_is_drawn_as_far_as_it_goes(ticks: int, noisy: 
     folder = copied(noisy, tmp_path)
     cut(folder / "world.journal", 2 + 2 * ticks)
     cut(folder / "agent-b.journal", 2 + ticks)
-    assert len(read(folder).moments) == ticks
+    assert len(read(folder).ticks) == ticks
     for robot in "ab":
         words = texts(picture(folder, robot))
         assert f"Robot {robot} of noisy, seed 5: the recording breaks off" in words
@@ -281,7 +281,7 @@ def test_an_agent_killed_before_its_briefing_has_a_picture_without_estimates(
 
 
 def test_a_robot_of_which_nothing_is_on_record_is_drawn_without_a_warning(tmp_path: Path) -> None:
-    play(load("paper-1"), tmp_path)
+    run_mission(load("paper-1"), tmp_path)
     (tmp_path / "agent-a.journal").write_bytes(b"")
     ended = draw(tmp_path)
     assert (ended.status, ended.err) == (0, "")
@@ -353,7 +353,7 @@ def test_a_robot_without_a_journal_is_named_and_the_others_are_drawn(noisy: Path
 
 def test_a_robots_estimates_are_one_a_tick_as_it_journaled_them(noisy: Path) -> None:
     held = estimates(noisy, "b")
-    assert [one.tick for one in held] == list(range(len(read(noisy).moments)))
+    assert [one.tick for one in held] == list(range(len(read(noisy).ticks)))
     assert {one.robot for one in held} == {"b"}
     assert all(isinstance(one, Estimate) for one in held)
     assert held[-1].localised
@@ -373,12 +373,12 @@ def test_the_journal_of_another_robot_is_not_taken_for_its_own(noisy: Path, tmp_
 
 def test_a_journal_of_another_run_is_no_record_of_this_one(noisy: Path, tmp_path: Path) -> None:
     folder, other = copied(noisy, tmp_path), tmp_path / "other"
-    play(load("paper-1"), other)
+    run_mission(load("paper-1"), other)
     shutil.copyfile(other / "agent-a.journal", folder / "agent-a.journal")
-    with pytest.raises(CorruptJournal, match=r"agent-a\.journal: from another run: its conf"):
+    with pytest.raises(CorruptJournal, match=r"agent-a\.journal: belongs to another run: its conf"):
         estimates(folder, "a")
     assert [note.split("/")[-1] for note in performed(folder).notes] == [
-        "agent-a.journal: belongs to another run: its configuration does not match world.journal"
+        "agent-a.journal: belongs to another run: its configuration does not match the world's"
     ]
     ended = tandem("export", folder)
     assert ended.status == 2

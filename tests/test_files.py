@@ -53,7 +53,7 @@ OTHERS: dict[str, Callable[[Path], None]] = {
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recording")
-    in_process.play(load("paper-1"), folder)
+    in_process.run_mission(load("paper-1"), folder)
     return folder
 
 
@@ -137,7 +137,7 @@ def test_every_file_of_a_run_and_an_export_is_whole_or_absent_however_little_roo
     recording: Path, tmp_path: Path, no_room: Callable[[int], None]
 ) -> None:
     pytest.importorskip("foxglove")
-    played = in_process.play(load("paper-1"))
+    played = in_process.run_mission(load("paper-1"))
     told = summary_json.summary(played, "in-process", None)
     whole = tmp_path / "whole"
     whole.mkdir()
@@ -194,7 +194,7 @@ def test_what_is_written_replaces_a_link_and_leaves_what_it_led_to(recording: Pa
     names = ("summary.json", *export.FILES)
     for name in names:
         (out / name).symlink_to(kept)
-    played = in_process.play(load("paper-1"))
+    played = in_process.run_mission(load("paper-1"))
     summary_json.leave(played, summary_json.summary(played, "in-process", None), out)
     export.export(recording, out)
     assert kept.read_text() == "kept"

@@ -23,7 +23,7 @@ from agent.estimation.gaussian.least_squares import Fit, poses
 from agent.estimation.gaussian.range_model import PairRanges
 from agent.planning import inference, planner
 from agent.planning.state import Done, RobotState
-from compose.launch.in_process import play
+from compose.launch.in_process import run_mission
 from compose.scenario.scenario_file import parse
 from protocol.journal import journal_file
 from protocol.messages import (
@@ -115,7 +115,7 @@ def recorded(number: int, folder: Path) -> None:
     """Run a mission, and write its recording to `folder`."""
     scenario, noise = parse(TEXT.format(seed=number), "recorded"), noisy(number)
     mission = replace(scenario.mission, noise=noise, accuracy=accuracy(noise))
-    recording = play(replace(scenario, mission=mission), folder)
+    recording = run_mission(replace(scenario, mission=mission), folder)
     assert recording.end is not None
     assert recording.end.outcome == "localised", recording.end
 

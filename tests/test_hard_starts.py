@@ -22,10 +22,10 @@ HEADINGS = {"outward": 0.0, "inward": math.pi, "tangent left": math.pi / 2, "tan
 
 
 def assert_localised(scenario: Scenario) -> None:
-    recording = in_process.play(scenario)
+    recording = in_process.run_mission(scenario)
     assert recording.end is not None
     assert recording.end.outcome == "localised", recording.end
-    last = recording.moments[-1]
+    last = recording.ticks[-1]
     for robot, truth in zip(scenario.robots, last.truth.poses, strict=True):
         verdict = last.commands[robot.id].verdict
         assert isinstance(verdict, Localised)

@@ -13,7 +13,13 @@ from hypothesis import strategies as st
 
 from agent.estimation import closed_forms
 from agent.estimation.closed_forms import Placement, same_placement
-from agent.estimation.gaussian.hypotheses import ScoredHypothesis, missing, of_anchor, search, silence
+from agent.estimation.gaussian.hypotheses import (
+    ScoredHypothesis,
+    missing,
+    no_detection_log_likelihood,
+    of_anchor,
+    search,
+)
 from agent.estimation.gaussian.least_squares import fit, poses
 from agent.estimation.gaussian.odometry_noise import Array, track
 from agent.estimation.gaussian.range_model import PairRanges, Ranges
@@ -44,19 +50,26 @@ def test_silence_is_the_mean_over_what_all_predictions_have_in_common(
     beyond: list[float], sigma: float, drop_outs: float
 ) -> None:
     mean = by_quadrature(beyond, sigma, drop_outs)
-    assert math.exp(silence(np.array(beyond), sigma, drop_outs)) == pytest.approx(mean, rel=1e-2, abs=1e-3)
+    assert math.exp(no_detection_log_likelihood(np.array(beyond), sigma, drop_outs)) == pytest.approx(
+        mean, rel=1e-2, abs=1e-3
+    )
 
 
 def test_no_silence_says_nothing_and_what_is_far_out_of_range_is_silent_for_sure() -> None:
-    assert silence(np.array([]), 0.1, 0.1) == 0.0
-    assert silence(np.array([5.0, 7.0]), 0.1, 0.0) == pytest.approx(0.0, abs=1e-12)
-    assert silence(np.array([5.0, 7.0]), 0.1, 0.1) == pytest.approx(0.0, abs=1e-12)
+    assert no_detection_log_likelihood(np.array([]), 0.1, 0.1) == 0.0
+    assert no_detection_log_likelihood(np.array([5.0, 7.0]), 0.1, 0.0) == pytest.approx(0.0, abs=1e-12)
+    assert no_detection_log_likelihood(np.array([5.0, 7.0]), 0.1, 0.1) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_silence_in_range_is_the_chance_of_that_many_drop_outs_and_without_them_no_chance_at_all() -> None:
-    assert silence(np.array([-1.0, -2.0, 3.0]), 0.1, 0.1) == pytest.approx(2.0 * math.log(0.1))
-    assert silence(np.array([-10.0]), 0.1, 0.0) == pytest.approx(-5000.0, rel=2e-3)
-    falling = [silence(np.array([-0.1 * sigmas]), 0.1, 0.0) for sigmas in np.linspace(-5.0, 60.0, 131)]
+    assert no_detection_log_likelihood(np.array([-1.0, -2.0, 3.0]), 0.1, 0.1) == pytest.approx(
+        2.0 * math.log(0.1)
+    )
+    assert no_detection_log_likelihood(np.array([-10.0]), 0.1, 0.0) == pytest.approx(-5000.0, rel=2e-3)
+    falling = [
+        no_detection_log_likelihood(np.array([-0.1 * sigmas]), 0.1, 0.0)
+        for sigmas in np.linspace(-5.0, 60.0, 131)
+    ]
     assert all(later < earlier for earlier, later in pairwise(falling)), "down to the farthest tail"
 
 

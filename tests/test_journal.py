@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from compose.launch.in_process import play
+from compose.launch.in_process import run_mission
 from compose.scenario.scenario_file import load
 from protocol.journal import journal_file
 from protocol.journal.environment import of_world
@@ -44,7 +44,7 @@ def test_one_write_of_many_is_the_same_as_many_of_one(tmp_path: Path) -> None:
 
 
 def test_any_msgpack_library_reads_a_journal(tmp_path: Path) -> None:
-    play(load("paper-1"), tmp_path)
+    run_mission(load("paper-1"), tmp_path)
     with (tmp_path / "world.journal").open("rb") as file:
         frames = list(msgpack.Unpacker(file))
     kinds = Environment | Scenario | Command | MissionEnd | FinalReport

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from compose.launch.in_process import play
+from compose.launch.in_process import run_mission
 from compose.recording.summary_json import summary
 from tests.surveys import SIGMA, scenario_of, states, survey
 
@@ -67,7 +67,7 @@ def test_the_letter_claims_nothing_that_is_wrong(noise: str) -> None:
 )
 def test_where_there_are_outliers_the_letters_ranges_are_never_enough(sigma: float, seed: int) -> None:
     noise = f"anchor_sigma = {sigma}\nmutual_sigma = {sigma}\noutliers = 0.05"
-    recording = play(scenario_of(noise, seed, planner_name="paper", accuracy=0.03))
+    recording = run_mission(scenario_of(noise, seed, planner_name="paper", accuracy=0.03))
     said = summary(recording, "in-process", None)
     assert said["outcome"] == "undecided"
     assert "the paper's manoeuvres give no further ranges: " in said["reason"]

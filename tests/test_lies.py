@@ -13,7 +13,7 @@ from agent.peer import false_reports, peer_state
 from agent.peer.motion_log import MotionLog
 from agent.planning import planner, plausibility
 from compose.errors import BadScenario
-from compose.launch.in_process import play
+from compose.launch.in_process import run_mission
 from compose.recording.run import Recording
 from compose.recording.summary_json import summary
 from compose.scenario.scenario_file import parse, shipped
@@ -39,7 +39,7 @@ def mission(seed: int, lies: dict[str, Attack], noise: str = "") -> Recording:
     text = shipped()["random"].read_text().replace("[mission]\n", f"[mission]\n{noise}")
     scenario = parse(text, "random", seed=seed)
     robots = tuple(replace(robot, attack=lies.get(robot.id)) for robot in scenario.robots)
-    return play(replace(scenario, robots=robots, max_ticks=400))
+    return run_mission(replace(scenario, robots=robots, max_ticks=400))
 
 
 def outcome(recording: Recording) -> str:
@@ -70,7 +70,7 @@ def _tells_otherwise(recording: Recording, liar: str, attack: Attack) -> bool:
     return attack.part == "all" or any(
         command.phase == phases[attack.part]
         and (command.v if attack.kind == "scale" else command.v or command.omega)
-        for moment in recording.moments
+        for moment in recording.ticks
         for command in [moment.commands[liar]]
     )
 
@@ -92,7 +92,7 @@ def test_two_liars_are_no_more_believed_than_one() -> None:
 
 def test_the_liar_hears_that_it_is_not_believed_and_gives_up() -> None:
     recording = mission(0, {"a": Attack("scale", 0.5)})
-    last = recording.moments[-1].commands
+    last = recording.ticks[-1].commands
     assert isinstance(last["b"].verdict, Inconsistent)
     met = next(step for step in steps("paper-1") if step.heard["a"])
     told = [replace(report, verdict=Inconsistent("a tall story")) for report in met.heard["a"]]
@@ -119,7 +119,7 @@ def test_under_noise_a_lie_that_is_large_beside_it_is_an_alarm(attack: Attack) -
         assert outcome(recording) == "inconsistent", seed
         alarm = next(
             command.verdict
-            for moment in recording.moments
+            for moment in recording.ticks
             for command in moment.commands.values()
             if isinstance(command.verdict, Inconsistent)
         )

@@ -14,7 +14,7 @@ from agent.estimation.closed_forms import Placement
 from agent.planning import planner
 from agent.planning.phase1_anchor import third_point
 from agent.planning.phase3_last_manoeuvre import SPEEDS, TURN_RATES, last_manoeuvre
-from compose.launch.in_process import play
+from compose.launch.in_process import run_mission
 from compose.recording.run import Recording, TickRecord
 from compose.scenario.scenario_file import load, parse
 from protocol.messages import Localised
@@ -175,7 +175,7 @@ def test_a_range_is_taken_up_to_r_and_at_r() -> None:
 
 def turns(recording: Recording, state: str) -> list[float]:
     """Return the turns of a on the spot before it meets b."""
-    commands = [moment.commands["a"] for moment in recording.moments if moment.commands["a"].phase < 3]
+    commands = [moment.commands["a"] for moment in recording.ticks if moment.commands["a"].phase < 3]
     assert all(command.v == 0.0 for command in commands if command.state == state)
     return [command.omega for command in commands if command.state == state]
 
@@ -197,7 +197,7 @@ def test_a_small_omega_max_makes_every_turn_take_several_ticks() -> None:
 def test_no_robot_ever_asks_for_more_than_its_actuators_give() -> None:
     for recording in (mission_of((2.4, -1.2, 4.8), turn_rate=0.5), mission_of((0.5, 0.2, 2.0), reach=1.0)):
         mission = recording.scenario.mission
-        for moment in recording.moments:
+        for moment in recording.ticks:
             for command in moment.commands.values():
                 assert abs(command.v) <= mission.max_speed * (1 + 1e-12)
                 assert abs(command.omega) <= mission.max_turn_rate
@@ -210,7 +210,7 @@ def test_the_first_straight_is_shortened_where_it_would_come_near_the_range(
     reach: float, speed: float, straight: float
 ) -> None:
     recording = mission_of((0.5, 0.2, 2.0), reach=reach, speed=speed)
-    first = recording.moments[0].commands["a"]
+    first = recording.ticks[0].commands["a"]
     assert first.state == "straight"
     assert (first.v, first.omega) == pytest.approx((straight, 0.0))
     assert recording.scenario.mission.first_straight == pytest.approx(straight)
@@ -221,20 +221,20 @@ def test_the_first_straight_is_shortened_where_it_would_come_near_the_range(
 def test_a_robot_released_on_its_anchor_knows_its_branch_at_once() -> None:
     recording = mission_of((0.0, 0.0, 2.0))
     assert recording.final_reports["a"].branch == "on-anchor"
-    assert recording.moments[0].commands["a"].phase == 2
+    assert recording.ticks[0].commands["a"].phase == 2
     assert recording.end is not None
     assert recording.end.outcome == "localised"
 
 
 def test_nobody_claims_before_a_third_mutual_range() -> None:
     for seed in range(40):
-        recording = play(load("random", seed=seed))
+        recording = run_mission(load("random", seed=seed))
         assert recording.end is not None
         assert recording.end.outcome == "localised"
-        ranged = [moment.truth.tick for moment in recording.moments if math.dist(*_places(moment)) <= 3.0]
+        ranged = [moment.truth.tick for moment in recording.ticks if math.dist(*_places(moment)) <= 3.0]
         for robot in "ab":
             claims = [
-                m.truth.tick for m in recording.moments if isinstance(m.commands[robot].verdict, Localised)
+                m.truth.tick for m in recording.ticks if isinstance(m.commands[robot].verdict, Localised)
             ]
             assert sum(tick <= claims[0] for tick in ranged) >= 3
 
@@ -360,7 +360,7 @@ def test_where_in_the_plane_the_anchors_stand_costs_no_digit() -> None:
             anchor = [{shift + 10.0}, {-shift}]
             start = [{shift + 9.25}, {1.5 - shift}, 4.0]
             """
-        moments = play(parse(text, "far-out")).moments
+        moments = run_mission(parse(text, "far-out")).ticks
         return [(d.v, d.omega, d.state) for moment in moments for d in moment.commands.values()]
 
     assert driven(2.0**19) == driven(0.0)

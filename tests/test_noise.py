@@ -31,7 +31,7 @@ from world.random_streams import gaussian, uniform
 from world.referee import Judgement
 from world.scenario import Scenario
 from world.sensors import Mutual, anchor_ranges, executed, mutual_ranges, odometry
-from world.simulation import Course
+from world.simulation import Simulation
 from world.tick import World, advance, observations, release
 from world.truth import Truth
 
@@ -136,18 +136,18 @@ def test_without_noise_nothing_is_drawn_and_every_tick_is_the_same_to_the_bit(
     without, zero = tmp_path / "without", tmp_path / "zero"
     for folder in (without, zero):
         folder.mkdir()
-    table = ticks_csv(in_process.play(exact, without))
+    table = ticks_csv(in_process.run_mission(exact, without))
     for name in ("gaussian", "uniform"):
         monkeypatch.setattr(sensors, name, drawn)
     zeros = Noise(outlier_bias=(0.1, 0.2), actuation=VelocityNoise(0.0, 0.0, 0.0, 0.0))
     assert zeros.exact
     scenario = replace(exact, mission=replace(exact.mission, noise=zeros))
-    assert ticks_csv(in_process.play(scenario, zero)) == table
+    assert ticks_csv(in_process.run_mission(scenario, zero)) == table
     assert len(table.splitlines()) == 1 + 2 * 49
     for robot in ("a", "b"):
         assert frames(zero, robot) == frames(without, robot)
     with pytest.raises(AssertionError, match="something is drawn"):
-        in_process.play(near("anchor_sigma = 0.1"))
+        in_process.run_mission(near("anchor_sigma = 0.1"))
 
 
 def frames(folder: Path, robot: str) -> list[bytes]:
@@ -314,7 +314,7 @@ def test_reports_are_heard_where_the_range_was_dropped(tmp_path: Path) -> None:
     dropping = next(
         seed for seed in range(1000) if mutual(near("drop_outs = 0.5", seed=seed), 4) == [None] * 4
     )
-    recording = in_process.play(near("drop_outs = 0.5", seed=dropping, max_ticks=3), tmp_path)
+    recording = in_process.run_mission(near("drop_outs = 0.5", seed=dropping, max_ticks=3), tmp_path)
     said = recording.final_reports
     assert (said["a"].mutual_ranges, said["b"].mutual_ranges) == (0, 0)
     assert said["a"].reports_sent >= 1
@@ -525,28 +525,30 @@ def test_processes_leave_the_same_bytes_as_one_process(noise: str, seed: str, tm
 def driven(scenario: Scenario, folder: Path, ticks: int) -> tuple[list[Truth], list[list[Observation]]]:
     """Return the truth and observations of robots with fixed commands; the world's journal is in `folder`."""
     with closing(journal_file.Journal(folder / WORLD_JOURNAL)) as kept:
-        course = Course(scenario, kept)
+        simulation = Simulation(scenario, kept)
         truths, told = [], []
         for tick in range(ticks):
-            truths.append(course.world.truth)
-            told.append(course.observations())
+            truths.append(simulation.world.truth)
+            told.append(simulation.observations())
             v, omega = math.cos(tick), math.sin(3.0 * tick)
-            ended = course.command({robot.id: sent(v, omega, robot.id, tick) for robot in scenario.robots})
+            ended = simulation.command(
+                {robot.id: sent(v, omega, robot.id, tick) for robot in scenario.robots}
+            )
             assert ended is None
-        course.end(Judgement("undecided", "enough"))
+        simulation.end(Judgement("undecided", "enough"))
     return truths, told
 
 
 @by_noise
 def test_the_record_folds_to_the_same_truth(noise: str, tmp_path: Path) -> None:
     truths, _ = driven(near(noise), tmp_path, 60)
-    assert [moment.truth for moment in read(tmp_path).moments] == truths
+    assert [moment.truth for moment in read(tmp_path).ticks] == truths
 
 
 @by_noise
 @pytest.mark.parametrize("seed", [2, 10, 11])
 def test_the_record_of_a_mission_is_read_as_it_was_played(noise: str, seed: int, tmp_path: Path) -> None:
-    played = in_process.play(load(str(noisy(noise, tmp_path)), seed=seed), tmp_path)
+    played = in_process.run_mission(load(str(noisy(noise, tmp_path)), seed=seed), tmp_path)
     assert read(tmp_path) == played
 
 

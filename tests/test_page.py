@@ -219,7 +219,7 @@ def test_an_error_is_told_of_a_pose_that_leads_and_else_as_a_range(
 ) -> None:
     page = opened(f"{address}#tick=47", height=720)
     until_shown(page, 47)
-    truth = read(paper_1).moments[47].truth.poses[1]
+    truth = read(paper_1).ticks[47].truth.poses[1]
     off = sorted(errors(pose, truth)[0] for pose in estimates(paper_1, "b")[47].world)
     assert len(off) == 4
     assert off[3] > 1.0

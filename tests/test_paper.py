@@ -12,7 +12,7 @@ from typing import NamedTuple
 import pytest
 
 from agent.estimation.closed_forms import Placement, placements
-from compose.launch.in_process import play
+from compose.launch.in_process import run_mission
 from compose.recording.run import Recording
 from compose.recording.summary_json import summary
 from compose.recording.ticks_csv import ticks_csv
@@ -42,15 +42,15 @@ EXACT = 1e-9
 
 @cache
 def played(name: str) -> Recording:
-    return play(load(name))
+    return run_mission(load(name))
 
 
 def first_tick(recording: Recording, robot: str, state: str) -> int:
-    return next(moment.truth.tick for moment in recording.moments if moment.commands[robot].state == state)
+    return next(moment.truth.tick for moment in recording.ticks if moment.commands[robot].state == state)
 
 
 def command(recording: Recording, robot: str, tick: int) -> Command:
-    return recording.moments[tick].commands[robot]
+    return recording.ticks[tick].commands[robot]
 
 
 def optional(cell: str) -> float | None:
@@ -91,7 +91,7 @@ def test_a_robot_senses_the_references_ranges_and_what_it_drove(
     name: str, robot: str, tmp_path: Path
 ) -> None:
     reference = SIMULATIONS[name]
-    play(load(name), tmp_path)
+    run_mission(load(name), tmp_path)
     kinds = Environment | RobotConfig | Observation | Report | Command | Estimate | MissionEnd | FinalReport
     frames = [decode(frame, kinds) for frame in journal_file.read(tmp_path / f"agent-{robot}.journal")]
     observations = [frame for frame in frames if isinstance(frame, Observation)]
@@ -182,7 +182,7 @@ def test_a_takes_its_second_mutual_range_while_b_stands(
     recording = played(name)
     rows = list(csv.DictReader(io.StringIO(ticks_csv(recording))))
     mutual = {int(row["tick"]): float(row["mutual_range"]) for row in rows if row["mutual_range"]}
-    assert list(mutual) == [first, second, recording.moments[-1].truth.tick]
+    assert list(mutual) == [first, second, recording.ticks[-1].truth.tick]
     assert mutual[first] == pytest.approx(first_range, abs=5.1e-7)
     assert mutual[second] == pytest.approx(second_range, abs=5.1e-7)
     assert [command(recording, "a", tick).state for tick in range(first, second)] == way
@@ -211,7 +211,7 @@ def test_b_chooses_the_last_manoeuvre_that_the_table_says(
     assert b.last_turn_rate == pytest.approx(reference.w2, abs=EXACT)
     assert b.separation_m2 == pytest.approx(separation, abs=5.1e-6)
     assert b.separation_m2 == pytest.approx(reference.J, abs=EXACT)
-    assert recording.moments[-1].truth.tick == last == reference.k_last
+    assert recording.ticks[-1].truth.tick == last == reference.k_last
     assert command(recording, "b", last - 1).v == 1.0
 
 
@@ -262,14 +262,12 @@ def test_phase_1_finds_the_references_branch_and_orientation(case: Phase1) -> No
     assert first_tick(recording, "a", "aligning") == case.k_end
     aligning = command(recording, "a", case.k_end)
     assert (aligning.v, -aligning.omega) == pytest.approx((0.0, case.mu), abs=EXACT)
-    radial = [
-        moment.commands["a"].v for moment in recording.moments if moment.commands["a"].state == "radial"
-    ]
+    radial = [moment.commands["a"].v for moment in recording.ticks if moment.commands["a"].state == "radial"]
     assert sum(radial) == pytest.approx(6.5 - case.r_end, abs=EXACT)
 
 
 def _place(recording: Recording, tick: int) -> tuple[float, float]:
-    pose = recording.moments[tick].truth.poses[0]
+    pose = recording.ticks[tick].truth.poses[0]
     return pose.x, pose.y
 
 

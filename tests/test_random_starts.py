@@ -30,10 +30,10 @@ def share(number: int) -> range:
 @pytest.mark.parametrize("number", series(range(SHARES)))
 def test_assured_localises_every_random_start_to_a_micrometre(number: int) -> None:
     for seed in share(number):
-        recording = in_process.play(started(seed, "assured"))
+        recording = in_process.run_mission(started(seed, "assured"))
         assert recording.end is not None
         assert recording.end.outcome == "localised", f"seed {seed}: {recording.end}"
-        last = recording.moments[-1]
+        last = recording.ticks[-1]
         for robot, truth in zip(recording.scenario.robots, last.truth.poses, strict=True):
             verdict = last.commands[robot.id].verdict
             assert isinstance(verdict, Localised)
@@ -46,7 +46,7 @@ def test_assured_localises_every_random_start_to_a_micrometre(number: int) -> No
 def test_the_letter_localises_most_random_starts_and_guesses_at_none(number: int) -> None:
     outcomes = Counter[str]()
     for seed in share(number):
-        recording = in_process.play(started(seed, "paper"))
+        recording = in_process.run_mission(started(seed, "paper"))
         assert recording.end is not None
         outcomes[recording.end.outcome] += 1
     # 93 to 95 % of all 5000 localise; three standard deviations of a tenth of them are 3.2 %

@@ -118,7 +118,7 @@ def planted(folder: Path, name: str, kind: type, tick: int, **fields: Any) -> tu
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
-    in_process.play(load("paper-1"), tmp_path / "record")
+    in_process.run_mission(load("paper-1"), tmp_path / "record")
     return tmp_path / "record"
 
 

@@ -21,7 +21,7 @@ from agent.process.agent_journal import past
 from agent.process.recovery import remember
 from agent.process.robot import Robot
 from compose.errors import BadKill
-from compose.launch.in_process import play
+from compose.launch.in_process import run_mission
 from compose.launch.processes import free_endpoint
 from compose.scenario.kills import parse
 from compose.scenario.scenario_file import load
@@ -55,7 +55,7 @@ from tests.commands import (
     world,
 )
 from world.scenario import Scenario
-from world.simulation import Course, again
+from world.simulation import Simulation, resumed
 from world.world_journal import history
 
 PARTS = ("agent-a", "agent-b", "world")
@@ -245,7 +245,7 @@ def test_an_agents_journal_torn_anywhere_is_finished_with_the_same_bytes(
         old = Retrace(torn)
         memory = remember(old)
         assert torn.stat().st_size == cut
-        book, lost = old.go_on()
+        book, lost = old.open_for_append()
         assert torn.stat().st_size >= cut - lost
         with book:
             body = Robot(whole.config, book) if memory is None else memory.robot
@@ -271,15 +271,15 @@ def test_a_worlds_journal_torn_anywhere_is_finished_with_the_same_bytes(
     for cut in cuts(data):
         torn.write_bytes(data[:cut])
         old = Retrace(torn)
-        course = again(load("paper-1"), old)
+        simulation = resumed(load("paper-1"), old)
         assert torn.stat().st_size == cut
-        book, _ = old.go_on()
+        book, _ = old.open_for_append()
         with book:
-            course.keep(book)
-            for tick in whole.ticks[course.tick :]:
-                if course.over is None:
-                    course.command(tick.commands)
-            course.final_reports(whole.final_reports.values())
+            simulation.append_to(book)
+            for tick in whole.ticks[simulation.tick :]:
+                if simulation.mission_end is None:
+                    simulation.command(tick.commands)
+            simulation.journal_final_reports(whole.final_reports.values())
         assert torn.read_bytes() == data, cut
 
 
@@ -526,7 +526,8 @@ def test_the_worlds_record_of_another_scenario_is_refused(recording: Path) -> No
 def test_an_agents_record_of_another_briefing_is_refused(recording: Path, tmp_path: Path) -> None:
     scenario = tmp_path / "farther.toml"
     scenario.write_text(PAPER_1.replace("anchor = [10.0", "anchor = [10.5"))
-    says = f"{recording / 'agent-a.journal'}: it is of another run: its RobotConfig differs from this world's"
+    path = recording / "agent-a.journal"
+    says = f"{path}: belongs to another run: its configuration does not match the world's"
     with world(scenario) as (_, endpoint):
         refuses(recording, "agent", "a", "--connect", endpoint, says=says)
 
@@ -536,7 +537,7 @@ def test_an_agents_record_in_which_it_sensed_otherwise_is_no_use(recording: Path
     path.write_bytes(journal_file.packed(list(journal_file.read(path))[:4]))
     with TandemProcess("agent", "b", "--connect", paper_2):  # its RobotConfigs are those of paper-1
         ended = tandem("agent", "a", "--connect", paper_2, "--out", recording)
-    said = "the recording is of another run: the Observation of a at tick 0 differs"
+    said = "the recording belongs to another run: its Observation of a at tick 0 differs"
     assert (ended.status, ended.err) == (3, f"tandem agent a: {said}\n")
 
 
@@ -589,25 +590,25 @@ def test_a_run_is_a_new_one(recording: Path) -> None:
 def test_an_empty_journal_is_begun(tmp_path: Path) -> None:
     (tmp_path / "world.journal").touch()
     old = Retrace(tmp_path / "world.journal")
-    course = again(load("paper-1"), old)
-    book, cut = old.go_on()
+    simulation = resumed(load("paper-1"), old)
+    book, cut = old.open_for_append()
     with book:
-        assert (course.tick, cut) == (0, 0)
+        assert (simulation.tick, cut) == (0, 0)
     with Journal(tmp_path / "new") as new:
-        Course(load("paper-1"), new)
+        Simulation(load("paper-1"), new)
     assert (tmp_path / "world.journal").read_bytes() == (tmp_path / "new").read_bytes()
 
 
 def test_a_mission_under_noise_is_folded_to_the_bit(tmp_path: Path) -> None:
     scenario = load("noisy")
-    play(scenario, tmp_path)
+    run_mission(scenario, tmp_path)
     for robot in ("a", "b"):
         with closing(Retrace(tmp_path / f"agent-{robot}.journal")) as old:
             memory = remember(old)
             assert memory is not None
             assert memory.final_report is not None
     with closing(Retrace(tmp_path / "world.journal")) as old:
-        assert again(scenario, old).phase1_done_tick.keys() == {"a", "b"}
+        assert resumed(scenario, old).final_reports.keys() == {"a", "b"}
 
 
 @pytest.mark.long

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from agent.planning import separation
-from compose.launch.in_process import play
+from compose.launch.in_process import run_mission
 from compose.recording.closest_approach import nearest
 from compose.scenario.scenario_file import load, validate
 from protocol.motion import Controls, Pose, step
@@ -61,7 +61,7 @@ def test_a_robot_goes_the_same_arc_only_not_so_far(v: float, omega: float, metre
 
 
 def test_robots_that_may_come_near_do() -> None:
-    recording = play(load("random", seed=NEAR))
+    recording = run_mission(load("random", seed=NEAR))
     found = nearest(recording)
     assert found is not None
     assert found < 0.8
@@ -69,7 +69,7 @@ def test_robots_that_may_come_near_do() -> None:
 
 @pytest.mark.parametrize("seed", [NEAR, *range(1, 40)])
 def test_none_comes_nearer_and_both_localise(seed: int) -> None:
-    recording = play(safe(seed))
+    recording = run_mission(safe(seed))
     assert recording.end is not None
     assert recording.end.outcome == "localised"
     found = nearest(recording)
@@ -79,7 +79,7 @@ def test_none_comes_nearer_and_both_localise(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(1, 9))
 def test_none_comes_nearer_under_noise(seed: int) -> None:
-    recording = play(safe(seed, anchor_sigma=0.05, mutual_sigma=0.05))
+    recording = run_mission(safe(seed, anchor_sigma=0.05, mutual_sigma=0.05))
     assert recording.end is not None
     assert recording.end.outcome == "localised"
     found = nearest(recording)
@@ -91,7 +91,7 @@ def test_none_comes_nearer_under_noise(seed: int) -> None:
 @given(st.integers(1, 10**6), st.floats(0.0, 0.9))
 def test_none_comes_nearer_however_many_reports_are_lost(seed: int, loss: float) -> None:
     scenario = load("random", seed=seed, faults=[f"a<->b: loss={loss:.3f}", "b->a: delay=0..3"])
-    recording = play(replace(scenario, mission=replace(scenario.mission, safety_distance=SAFE)))
+    recording = run_mission(replace(scenario, mission=replace(scenario.mission, safety_distance=SAFE)))
     assert recording.end is not None
     assert recording.end.outcome == "localised"
     found = nearest(recording)
@@ -113,10 +113,10 @@ def test_robots_that_begin_in_range_of_each_other_come_no_nearer_than_that(seed:
         "robot": [{"id": "a", "anchor": [0.0, 0.0]}, {"id": "b", "anchor": [3.0, 0.0]}],
         "max_ticks": 60,
     }
-    recording = play(validate(table, "near.toml").seeded(seed))
+    recording = run_mission(validate(table, "near.toml").seeded(seed))
     assert recording.end is not None
     assert recording.end.outcome in ("localised", "undecided")
-    a, b = recording.moments[0].truth.poses
+    a, b = recording.ticks[0].truth.poses
     found = nearest(recording)
     assert found is not None
     assert found >= min(SAFE, math.hypot(a.x - b.x, a.y - b.y)) - 1e-9
@@ -125,7 +125,7 @@ def test_robots_that_begin_in_range_of_each_other_come_no_nearer_than_that(seed:
 def test_the_letter_keeps_it_too_or_gives_up() -> None:
     outcomes = set()
     for seed in range(1, 40):
-        recording = play(replace(safe(seed), planner_name="paper"))
+        recording = run_mission(replace(safe(seed), planner_name="paper"))
         assert recording.end is not None
         outcomes.add(recording.end.outcome)
         found = nearest(recording)

@@ -27,7 +27,7 @@ from world.world_journal import history
 @pytest.fixture(scope="module")
 def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("paper-1")
-    in_process.play(load("paper-1"), folder)
+    in_process.run_mission(load("paper-1"), folder)
     return folder
 
 
@@ -37,8 +37,8 @@ def said(shown: Performance, kind: str) -> list[tuple[int, str]]:
 
 def test_a_scene_shows_where_everyone_is_and_what_everyone_does(paper_1: Path) -> None:
     recording, shown = read_record(paper_1), read(paper_1)
-    assert [one.tick for one in shown.scenes] == [moment.truth.tick for moment in recording.moments]
-    for moment, one in zip(recording.moments, shown.scenes, strict=True):
+    assert [one.tick for one in shown.scenes] == [moment.truth.tick for moment in recording.ticks]
+    for moment, one in zip(recording.ticks, shown.scenes, strict=True):
         for player, pose in zip(one.players, moment.truth.poses, strict=True):
             command = moment.commands[player.robot]
             assert player.pose == replace(pose, heading=wrap(pose.heading))
@@ -50,7 +50,7 @@ def test_the_first_contact_of_paper_1_is_told_at_tick_46(paper_1: Path) -> None:
     shown = read(paper_1)
     assert said(shown, "contact") == [(46, "a and b are in range of each other: 2.95 m")]
     assert said(shown, "anchor")[0] == (0, "a is in its anchor's range: 2.68 m")
-    assert shown.scenes[46].player("b").mode_name == "b stands still and waits for a's second range"
+    assert shown.scenes[46].player("b").activity == "b stands still and waits for a's second range"
     assert said(shown, "candidates")[-1] == (48, "b's possible placements fall from 4 to 1")
     assert said(shown, "end") == [(48, "The mission ends: localised")]
 
@@ -113,14 +113,14 @@ def test_a_folder_without_a_journal_holds_nothing_to_see(tmp_path: Path) -> None
 def test_what_becomes_of_every_report_is_what_the_air_made_of_it(tmp_path: Path) -> None:
     faults = ["loss=0.3, delay=0..3, corrupt=0.2, duplicate=0.3, reorder=0.2", "a->b: reports_per_tick=0.7"]
     scenario = load("random", seed=3, faults=faults)
-    in_process.play(scenario, tmp_path)
+    in_process.run_mission(scenario, tmp_path)
     told = history(journal_file.read(tmp_path / "world.journal"), tmp_path)
     shown = {one.tick: one.passages for one in read(tmp_path).scenes}
     ever: set[str] = set()
     for place, sender in enumerate(("a", "b")):
         flying: set[int] = set()
         for tick in told.ticks:
-            k, air = tick.world.truth.tick, tick.world.air[place]
+            k, air = tick.world.truth.tick, tick.world.links[place]
             here = {
                 what: [one.tick for one in shown[k] if (one.sender, one.what) == (sender, what)]
                 for what in ("sent", "heard", "damaged", "lost")
@@ -136,12 +136,14 @@ def test_what_becomes_of_every_report_is_what_the_air_made_of_it(tmp_path: Path)
 def test_every_report_has_the_fate_that_the_air_gave_it(tmp_path: Path) -> None:
     faults = ["loss=0.3, delay=0..3, corrupt=0.2, duplicate=0.3, reorder=0.2", "a->b: reports_per_tick=0.7"]
     scenario = load("random", seed=3, faults=faults)
-    in_process.play(scenario, tmp_path)
+    in_process.run_mission(scenario, tmp_path)
     shown = read(tmp_path)
     flights = fates(shown.scenes, over=True)
     assert {flight.fate for flight in flights} == {"heard", "late", "damaged", "lost"}
     told = history(journal_file.read(tmp_path / "world.journal"), tmp_path)
-    airs = {sender: [tick.world.air[place] for tick in told.ticks] for place, sender in enumerate(("a", "b"))}
+    airs = {
+        sender: [tick.world.links[place] for tick in told.ticks] for place, sender in enumerate(("a", "b"))
+    }
     lost = {
         (passage.sender, passage.tick)
         for one in shown.scenes
@@ -191,7 +193,7 @@ def test_whose_process_is_gone_is_down_in_every_tick_until_it_is_back(paper_1: P
     present(a=False)  # its part of the mission has ended
     shown = scenes(stage, known)
     assert [one.player("a").down for one in shown] == [False, True, False, False]
-    assert shown[1].player("a").mode_name == "a is down: its process is gone"
+    assert shown[1].player("a").activity == "a is down: its process is gone"
     assert [
         (event.tick, event.kind, event.robot)
         for one in shown

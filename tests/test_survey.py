@@ -17,7 +17,7 @@ from agent.planning import planner
 from agent.planning.assured import OFF_RADIUS
 from agent.planning.phase2_orbit import Aligning, Radial, orientation
 from agent.planning.state import RobotState
-from compose.launch.in_process import play
+from compose.launch.in_process import run_mission
 from compose.recording.run import Recording
 from compose.recording.summary_json import summary
 from protocol.messages import Undecided
@@ -62,7 +62,7 @@ def biases(scenario: Scenario, robot: int, ticks: int) -> list[float]:
 def in_contact(recording: Recording) -> list[bool]:
     """Return, tick by tick, whether the robots were in contact."""
     pairs = recording.scenario.pairs()
-    return [mutual_ranges(moment.truth, recording.scenario, pairs) != [None] for moment in recording.moments]
+    return [mutual_ranges(moment.truth, recording.scenario, pairs) != [None] for moment in recording.ticks]
 
 
 def apart(one: Pose, other: Pose) -> float:
@@ -89,7 +89,7 @@ def test_both_localise_in_the_same_tick_as_well_as_was_asked_for(noise: str) -> 
 )
 def test_both_localise_in_other_settings(scenario: Callable[[int], Scenario]) -> None:
     for seed in (4, 5, 6):
-        assert_localised(play(scenario(seed)))
+        assert_localised(run_mission(scenario(seed)))
 
 
 @pytest.mark.long
@@ -109,8 +109,8 @@ def test_a_mission_that_is_cut_short_is_undecided_and_says_what_was_left() -> No
     whole = survey(SIGMA, 4)
     met = next(tick for tick, contact in enumerate(in_contact(whole)) if contact)
     left = []
-    for ticks in range(met + 2, len(whole.moments) - 1):
-        said = summary(play(scenario_of(SIGMA, 4, max_ticks=ticks)), "in-process", None)
+    for ticks in range(met + 2, len(whole.ticks) - 1):
+        said = summary(run_mission(scenario_of(SIGMA, 4, max_ticks=ticks)), "in-process", None)
         assert said["outcome"] == "undecided"
         assert said["ticks"] == ticks
         robots = [said["robots"][robot] for robot in ("a", "b")]
@@ -135,7 +135,7 @@ def test_the_robots_keep_apart_and_b_stays_in_range_of_its_anchor(noise: str) ->
     for seed in SEEDS:
         recording = survey(noise, seed)
         reach, (_, anchor) = recording.scenario.mission.sensing_range, recording.scenario.robots
-        for moment in recording.moments:
+        for moment in recording.ticks:
             a, b = moment.truth.poses
             assert apart(a, b) > 0.1 * reach, (seed, moment.truth.tick)
             if moment.commands["b"].phase == 3:
@@ -150,7 +150,7 @@ def test_a_lost_contact_is_found_again() -> None:
         contact = in_contact(recording)
         met = next(
             tick
-            for tick, moment in enumerate(recording.moments)
+            for tick, moment in enumerate(recording.ticks)
             if moment.commands["a"].state == "surveying" and moment.commands["a"].phase == 3
         )
         lost += not all(contact[met:])
@@ -169,7 +169,7 @@ def test_who_hears_nothing_where_its_anchor_should_be_goes_back() -> None:
         back = len(done) - 1 - done[::-1].index("homing")
         assert done[back + 1] in ("straight", "surveying", "aligning"), "and is ranged again"
         place = ("a", "b").index(robot)
-        assert anchor_ranges(recording.moments[back + 1].truth, recording.scenario)[place] is not None
+        assert anchor_ranges(recording.ticks[back + 1].truth, recording.scenario)[place] is not None
     assert_localised(recording)
 
 
@@ -314,19 +314,19 @@ def test_a_robot_that_turns_out_to_head_off_its_radius_turns_onto_it_again() -> 
 
 def test_a_robot_that_left_its_peers_range_does_not_go_there_again() -> None:
     """An outlier misled both robots' plans to stay in range, and driving back is not enough."""
-    recording = play(scenario_of("outliers = 0.05", 4253053381025039869, accuracy=0.03))
+    recording = run_mission(scenario_of("outliers = 0.05", 4253053381025039869, accuracy=0.03))
     assert "retreating" in states(recording, "a")
     assert_localised(recording)
 
 
 def test_nothing_is_claimed_by_a_fit_that_still_moves(monkeypatch: pytest.MonkeyPatch) -> None:
-    ticks = len(survey(SIGMA, SHORT).moments)
+    ticks = len(survey(SIGMA, SHORT).ticks)
 
     def searched(pair: PairRanges) -> tuple[ScoredHypothesis, ...]:
         return tuple([one._replace(fit=one.fit._replace(last_step=0.5)) for one in search(pair)])
 
     monkeypatch.setattr(agent.planning.assured, "search", searched)
-    recording = play(scenario_of(SIGMA, SHORT, max_ticks=ticks + 2))
+    recording = run_mission(scenario_of(SIGMA, SHORT, max_ticks=ticks + 2))
     assert summary(recording, "in-process", None)["outcome"] == "undecided"
     assert all(
         "has not converged" in (final_report.blocking_reason or "")

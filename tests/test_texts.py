@@ -38,7 +38,7 @@ from tests.commands import BOUND_S, PAPER_1, tandem, world
 from tests.examples import EXAMPLES
 from tests.test_wire import changed, framed, packed, parts, plain
 from world.referee import Judgement
-from world.simulation import Course, again
+from world.simulation import Simulation, resumed
 from world.world_journal import history
 
 RUN = "mine"
@@ -166,10 +166,10 @@ def test_every_word_for_a_state_is_within_its_bound() -> None:
 def test_a_world_whose_reason_is_too_long_leaves_a_journal_that_is_read_and_taken_up(tmp_path: Path) -> None:
     scenario, path = load("paper-1"), tmp_path / "world.journal"
     with Journal(path) as journal:
-        end = Course(scenario, journal).end(Judgement("failed", "no answer from " + "robot, " * 200))
+        end = Simulation(scenario, journal).end(Judgement("failed", "no answer from " + "robot, " * 200))
     assert history(read(path), path).end == end
     recording = Retrace(path)
-    assert again(scenario, recording).over == end
+    assert resumed(scenario, recording).mission_end == end
     recording.close()
 
 
@@ -178,7 +178,7 @@ def test_an_agent_that_gives_up_at_length_leaves_a_journal_that_is_read(tmp_path
     with Journal(path) as journal:
         robot = Robot(scenario.config("a"), journal)
         robot.observation(Observation(0, "a", None, 1.0))
-        robot.mind = robot.mind.undecided("\U0001f600" * 1000)
+        robot.state = robot.state.undecided("\U0001f600" * 1000)
         command = robot.decide()
         robot.estimate()
         robot.final_report(MissionEnd(1, "undecided", f"a: {'x' * 1000}"))

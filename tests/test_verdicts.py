@@ -8,7 +8,7 @@ import pytest
 from msgspec.structs import replace
 
 from agent.planning import planner, precision
-from compose.launch.in_process import play
+from compose.launch.in_process import run_mission
 from compose.scenario.scenario_file import parse, shipped
 from protocol.messages import Command, Localised, Report, Undecided
 from protocol.motion import ORIGIN, Covariance
@@ -62,11 +62,11 @@ def test_the_letter_gives_up_where_the_third_mutual_range_settles_nothing(
     """b has driven its last manoeuvre, and a stops, as in the paper. No placement is well determined here."""
     monkeypatch.setattr(precision, "pinned_down", lambda *_: False)
     text = f'{shipped()["random"].read_text()}\n[planner]\nname = "paper"\n'
-    recording = play(parse(text, "random", seed=441))
+    recording = run_mission(parse(text, "random", seed=441))
     assert recording.end is not None
     assert recording.end.outcome == "undecided"
     assert recording.end.reason == "b: the third mutual range does not select a placement"
-    states = [(moment.commands["a"].state, moment.commands["b"].state) for moment in recording.moments]
+    states = [(moment.commands["a"].state, moment.commands["b"].state) for moment in recording.ticks]
     assert states[-3:] == [("straight", "standing"), ("waiting", "last-manoeuvre"), ("waiting", "undecided")]
 
 
@@ -126,7 +126,7 @@ def test_without_a_world_a_claim_less_accurate_than_was_asked_does_not_end_local
     own, peers = (vague, good) if whose == "its own" else (good, vague)
     for mine, other, outcome in ((own, peers, "undecided"), (good, good, "localised")):
         ending = Ending(config, 100, 30.0)
-        ending.told(Report(0, "b", 3, "localised", ORIGIN, 0, 0, (), 0, (), 0, 0, other))
+        ending.receive(Report(0, "b", 3, "localised", ORIGIN, 0, 0, (), 0, (), 0, 0, other))
         command = Command(0, "a", 0.0, 0.0, 3, "localised", mine)
         ends = [ending.after(tick, command, peer_there=True) for tick in range(LAST_WORDS + 1)]
         assert ends[-1] is not None
@@ -141,9 +141,9 @@ def honest_claims(
     for sigma in sigmas:
         for seed in seeds:
             noise = f"anchor_sigma = {sigma}\nmutual_sigma = {sigma}\noutliers = {outliers}"
-            recording = play(scenario_of(noise, seed, planner_name=planner_name))
+            recording = run_mission(scenario_of(noise, seed, planner_name=planner_name))
             assert recording.end is not None
-            for moment in recording.moments:
+            for moment in recording.ticks:
                 for command in moment.commands.values():
                     if isinstance(command.verdict, Localised):
                         claims += 1

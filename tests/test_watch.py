@@ -105,7 +105,7 @@ def test_what_becomes_of_reports_is_drawn_on_their_way(opened: Open, tmp_path: P
     for fault in ("loss=0", "loss=1", "corrupt=1"):
         recording = tmp_path / fault
         recording.mkdir()
-        in_process.play(load("paper-1", faults=[f"{fault}, contact_ticks=0..1"]), recording)
+        in_process.run_mission(load("paper-1", faults=[f"{fault}, contact_ticks=0..1"]), recording)
         with watching(recording) as (_, where):
             page = opened(f"{where}#tick=46")
             until_shown(page, 46)
@@ -246,7 +246,7 @@ def test_fifty_robots_are_shown(opened: Open, tmp_path: Path) -> None:
     scenario.write_text(f'name = "fifty"\nseed = 5\n{SECTION_IV}' + "".join(robots))
     recording = tmp_path / "record"
     recording.mkdir()
-    in_process.play(load(str(scenario)), recording)
+    in_process.run_mission(load(str(scenario)), recording)
     with watching(recording) as (_, where):
         page = opened(f"{where}#tick=20")
         until_shown(page, 20)
@@ -263,7 +263,9 @@ def test_fifty_robots_are_shown(opened: Open, tmp_path: Path) -> None:
 def test_lost_late_and_damaged_reports_are_told(opened: Open, tmp_path: Path) -> None:
     recording = tmp_path / "record"
     recording.mkdir()
-    in_process.play(load("noisy", faults=["loss=0.3, delay=0..3, corrupt=0.1, duplicate=0.2"]), recording)
+    in_process.run_mission(
+        load("noisy", faults=["loss=0.3, delay=0..3, corrupt=0.1, duplicate=0.2"]), recording
+    )
     with watching(recording) as (_, where):
         page = opened(f"{where}#tick=26")
         until_shown(page, 26)
@@ -366,7 +368,7 @@ def test_a_page_keeps_up_with_a_mission_as_fast_as_it_goes(opened: Open, tmp_pat
 
         for tick in (FAST_TICKS, 2 * FAST_TICKS):
             until(lambda tick=tick: shown() >= tick, f"tick {tick} is shown")  # type: ignore[misc]
-            until(lambda: len(read(out).moments) - shown() < FAST_TICKS // 2, "the page is nearly there")
+            until(lambda: len(read(out).ticks) - shown() < FAST_TICKS // 2, "the page is nearly there")
         assert run.tell(SIGINT)
         assert run.ended().status == 130
 

@@ -12,12 +12,12 @@ import pyarrow.parquet as pq
 import pytest
 from msgspec.structs import replace
 
-from compose.audit.hardware_rules import RULES, judge_alone
+from compose.audit.hardware_rules import RULES, audit_hardware_run
 from compose.figures import over_time, phase_one, steps, trajectory
 from compose.figures.account import account
 from compose.figures.pair import PairRecord, of_record, of_robots
 from compose.figures.sheet import NO_PLACES, Absent
-from compose.launch.in_process import play
+from compose.launch.in_process import run_mission
 from compose.recording.run import past_of, read
 from compose.scenario.scenario_file import load, parse
 from protocol.journal import journal_file
@@ -37,7 +37,7 @@ MEASURED = ("tick", "robot", "anchor_range", "mutual_range", "phase", "state")
 def folders(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Return a recording, and a folder with only the robots' journals of it."""
     whole, alone = tmp_path_factory.mktemp("whole"), tmp_path_factory.mktemp("alone")
-    play(load(request.param), whole)
+    run_mission(load(request.param), whole)
     for robot in "ab":
         name = f"agent-{robot}.journal"
         (alone / name).write_bytes((whole / name).read_bytes())
@@ -201,7 +201,7 @@ def test_paths_of_two_lengths_are_drawn(folders: tuple[Path, Path]) -> None:
 
 
 def test_each_pair_has_pictures_of_its_own(tmp_path: Path) -> None:
-    play(parse(several_pairs(2), "two pairs"), tmp_path)
+    run_mission(parse(several_pairs(2), "two pairs"), tmp_path)
     (tmp_path / "world.journal").unlink()
     ended = tandem("figures", tmp_path, "--only", "trajectory", "--format", "png")
     assert (ended.status, ended.err) == (0, "")
@@ -213,11 +213,13 @@ def test_journals_of_two_runs_are_no_record(command: str, folders: tuple[Path, P
     _, alone = folders
     (tmp_path / "agent-b.journal").write_bytes((alone / "agent-b.journal").read_bytes())
     (tmp_path / "other").mkdir()
-    play(parse(several_pairs(1), "another"), tmp_path / "other")
+    run_mission(parse(several_pairs(1), "another"), tmp_path / "other")
     (tmp_path / "agent-a.journal").write_bytes((tmp_path / "other" / "agent-a.journal").read_bytes())
     ended = tandem(command, tmp_path)
     assert (ended.status, ended.out) == (2, "")
-    assert ended.err.endswith("agent-b.journal: from another run: its configuration does not match a's\n")
+    assert ended.err.endswith(
+        "agent-b.journal: belongs to another run: its configuration does not match a's\n"
+    )
 
 
 def test_a_tick_that_is_left_out_is_no_record(folders: tuple[Path, Path], tmp_path: Path) -> None:
@@ -267,5 +269,5 @@ def test_without_a_world_the_audit_finds_what_breaks_a_rule(
         if other is not message:
             frames[place] = encode(other)
             break
-    findings = judge_alone(found, alone)
+    findings = audit_hardware_run(found, alone)
     assert {one.rule for one in findings.violations} == rules

@@ -63,13 +63,15 @@ class LinkFaults(NamedTuple):
         return f"{self.sender}->{self.receiver}"
 
 
-def of_plan(plan: Sequence[Fault], sender: str, receiver: str) -> LinkFaults:
+def link_faults(plan: Sequence[Fault], sender: str, receiver: str) -> LinkFaults:
     """Return the faults of `plan` that affect the link from `sender` to `receiver`."""
     on_it = [(i, fault) for i, fault in enumerate(plan) if fault.on(sender, receiver)]
     return LinkFaults(sender, receiver, tuple(on_it))
 
 
-def carried(air: LinkState, links: LinkFaults, seed: int, tick: int, *, in_contact: bool) -> LinkState:
+def next_link_state(
+    air: LinkState, links: LinkFaults, seed: int, tick: int, *, in_contact: bool
+) -> LinkState:
     """Return the state of the link at `tick`, given its state `air` at the tick before.
 
     The sender sends a Report at `tick` if the robots are in contact. Reports that are due while they are not

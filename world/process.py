@@ -1,4 +1,4 @@
-"""The process of the world: it sends Observations, waits for Commands, and so is the clock of all robots.
+"""The process of the world: it sends Observations and waits for Commands, which sets the pace of all robots.
 
 In lockstep, a tick lasts until all robots have answered, and no decision depends on a timeout. In real time,
 a tick lasts its period, and a robot without a Command rests for that tick.
@@ -27,7 +27,7 @@ from protocol.network.inbox import NOTHING, Arrival, Inbox
 from protocol.spelling import did_you_mean
 from protocol.wire import MalformedFrame, decode, encode
 from world.referee import Judgement
-from world.simulation import Course
+from world.simulation import Simulation
 
 LINK_TIMEOUT_S = 3.0
 """The time in s without a message after which a replaceable link is replaced. Agents do the same."""
@@ -51,11 +51,11 @@ class RobotsLinkLost(Exception):
 
 
 class WorldProcess:
-    """One run, over one session after another. A session has to be attached before `play`."""
+    """One run, over one or more sessions in turn. A session has to be attached before `run`."""
 
     def __init__(
         self,
-        course: Course,
+        simulation: Simulation,
         run: str,
         inbox: Inbox,
         *,
@@ -63,15 +63,15 @@ class WorldProcess:
         timeout: float = 30.0,
         on_kill_point: Callable[[str, int], None] | None = None,
     ) -> None:
-        """Run `course`, which may be a resumed one, under the run name `run`.
+        """Run `simulation`, which may be a resumed one, under the run name `run`.
 
         `rate` is the speed of real time; None for lockstep. `timeout` (s) limits each wait for an answer.
         `on_kill_point` is called with the name and tick of each point at which the process can be killed.
         """
         self._run = run
-        scenario = course.world.scenario
+        scenario = simulation.world.scenario
         self._scenario = scenario
-        self._course = course
+        self._simulation = simulation
         self._on_kill_point = on_kill_point
         self._period = scenario.mission.period / rate if rate is not None else None
         self._tick_s = self._period or 0.0
@@ -97,8 +97,8 @@ class WorldProcess:
         """The time in s without a message after which the link counts as lost."""
         self._began: float | None = None
         """The time at which all robots had answered the first Observation."""
-        self.playing_s = 0.0
-        """The wall time in s from then to the MissionEnd."""
+        self.running_s = 0.0
+        """The wall time in s from `_began` to the MissionEnd."""
         self._ended: float | None = None
         """The time at which the MissionEnd was first sent."""
         self._final_reports: dict[str, FinalReport] = {}
@@ -107,7 +107,7 @@ class WorldProcess:
     def attach(self, link: zenoh.Session, *, replaceable: bool = False) -> None:
         """Send and receive over the session `link` from now on.
 
-        If it is `replaceable`, `play` raises RobotsLinkLost after LINK_TIMEOUT_S and a tick without messages.
+        If it is `replaceable`, `run` raises RobotsLinkLost after LINK_TIMEOUT_S and a tick without messages.
         """
         run, inbox = self._run, self._inbox
         self._link_timeout = LINK_TIMEOUT_S + self._tick_s if replaceable else math.inf
@@ -122,37 +122,37 @@ class WorldProcess:
         session.answer(link, keys.config(run, "*"), self._config)
         self._token = session.show_alive(link, keys.world_alive(run))
 
-    def play(self) -> MissionEnd:
+    def run(self) -> MissionEnd:
         """Run to the end of the mission, collect the FinalReports, and return the MissionEnd.
 
-        Raises RobotsLinkLost, after which `play` continues over another session; Interrupted by a signal;
-        CannotRecord.
+        Raises RobotsLinkLost if the link is lost; `run` may then be called again with another session. Raises
+        Interrupted by a signal, and CannotRecord.
         """
-        course = self._course
+        simulation = self._simulation
         due: float | None = None
-        end = course.over
+        end = simulation.mission_end
         expected = self._robots if end is not None else []
-        if course.tick > 0 and self._period is not None:  # a resumed run does not wait for all robots
+        if simulation.tick > 0 and self._period is not None:  # a resumed run does not wait for all robots
             due = time.monotonic() + self._period
         try:
             while end is None:
-                commands = self._answers(course.observations(), due)
+                commands = self._answers(simulation.observations(), due)
                 if self._on_kill_point is not None:
-                    self._on_kill_point("command", course.tick)
-                course.recording(commands)
+                    self._on_kill_point("command", simulation.tick)
+                simulation.journal_commands(commands)
                 if self._on_kill_point is not None:
-                    self._on_kill_point("journal", course.tick)
-                end = course.advance(commands)
+                    self._on_kill_point("journal", simulation.tick)
+                end = simulation.advance(commands)
                 self._began = time.monotonic() if self._began is None else self._began
                 if self._period is not None:
                     due = max((due or self._began) + self._period, time.monotonic())
         except NoAnswer as error:
-            end = course.end(Judgement("failed", str(error)))
+            end = simulation.end(Judgement("failed", str(error)))
         self._ended = time.monotonic() if self._ended is None else self._ended
-        self.playing_s = self._ended - self._began if self._began is not None else 0.0
-        course.final_reports(self._collect_final_reports(end, expected))
+        self.running_s = self._ended - self._began if self._began is not None else 0.0
+        simulation.journal_final_reports(self._collect_final_reports(end, expected))
         self._print_missing_final_reports()
-        self._put({robot: encode(final_report) for robot, final_report in course.phase1_done_tick.items()})
+        self._put({robot: encode(final_report) for robot, final_report in simulation.final_reports.items()})
         if refused := self._inbox.refused.total():
             late = f", and discarded {self._late} Commands of earlier ticks" if self._late else ""
             self._inbox.say(f"refused {refused} frames in all{late}")
@@ -165,7 +165,7 @@ class WorldProcess:
 
         Raises NoAnswer, RobotsLinkLost and Interrupted.
         """
-        tick = self._course.tick
+        tick = self._simulation.tick
         frames = {observation.robot: encode(observation) for observation in observations}
         if self._on_kill_point is not None:
             self._on_kill_point("observation", tick)
@@ -220,7 +220,7 @@ class WorldProcess:
 
     def _send_missed(self, robot: str) -> None:
         """Send the Observations of the ticks in which `robot` did not answer in time, in real time."""
-        for observation in self._course.missed.get(robot, ()):
+        for observation in self._simulation.missed.get(robot, ()):
             self._observation[robot].put(encode(observation))
 
     def _next(self, timeout: float) -> Arrival:
@@ -247,7 +247,7 @@ class WorldProcess:
             self._inbox.refuse(arrival, error)
             return None
         if message.robot not in self._peers or message.robot != arrival.source.robot:
-            self._inbox.refuse(arrival, f"it says it is from '{message.robot}'")
+            self._inbox.refuse(arrival, f"its sender is given as '{message.robot}'")
             return None
         return message
 
@@ -256,12 +256,12 @@ class WorldProcess:
         command = self._accepted(arrival, Command)
         if not isinstance(command, Command):
             return None
-        if command.tick <= self._course.tick:
+        if command.tick <= self._simulation.tick:
             self._latest[command.robot] = command.tick
-        if command.tick == self._course.tick:
+        if command.tick == self._simulation.tick:
             return command
-        if command.tick > self._course.tick:
-            self._inbox.refuse(arrival, "it is of a tick to come")
+        if command.tick > self._simulation.tick:
+            self._inbox.refuse(arrival, "its tick is in the future")
         else:
             self._late += 1
         return None
@@ -269,13 +269,13 @@ class WorldProcess:
     def _who_is_missing(self, commands: Mapping[str, Command]) -> str:
         missing = [robot for robot in self._robots if robot not in commands]
         names = ", ".join(robot if robot in self._alive else f"{robot} (not connected)" for robot in missing)
-        return f"no answer from {names} at tick {self._course.tick} for {self._timeout:g} s"
+        return f"no answer from {names} at tick {self._simulation.tick} for {self._timeout:g} s"
 
     def _print_missing_final_reports(self) -> None:
         """Print the robots without a FinalReport, and why."""
         reasons: dict[str, list[str]] = {}
         for robot in self._robots:
-            if robot not in self._course.phase1_done_tick:
+            if robot not in self._simulation.final_reports:
                 reasons.setdefault(self._why_missing(robot), []).append(robot)
         for reason, robots in reasons.items():
             self._inbox.say(f"no FinalReport of {', '.join(robots)}: {reason}")
@@ -286,16 +286,16 @@ class WorldProcess:
             return "not connected" if latest is None else f"gone; the last Command was of tick {latest}"
         if latest is None:
             return "connected, but it sent no Command"
-        if latest < self._course.tick:
+        if latest < self._simulation.tick:
             slower = "; a lower --rate leaves more time for each tick" if self._period is not None else ""
-            return f"behind, at tick {latest} of {self._course.tick}{slower}"
+            return f"behind, at tick {latest} of {self._simulation.tick}{slower}"
         return "no answer to the MissionEnd"
 
     # --- outside the tick ---
 
     def _show_truth(self) -> None:
         if self._truth_wanted:
-            truth = self._course.world.truth
+            truth = self._simulation.world.truth
             poses = dict(zip(self._robots, truth.poses, strict=True))
             self._truth.put(encode(GroundTruth(truth.tick, poses)))
 
@@ -315,13 +315,13 @@ class WorldProcess:
         The `expected` ones and all others that are connected are waited for up to FINAL_REPORT_TIMEOUT_S.
         """
         frames = dict.fromkeys(self._robots, encode(end))
-        received = self._final_reports = {**self._course.phase1_done_tick, **self._final_reports}
+        received = self._final_reports = {**self._simulation.final_reports, **self._final_reports}
         now = time.monotonic()
         began = self._ended or now
         self._repeat = self._repeat_to_all = now
         printed = False
         while True:
-            required = set(self._course.witnesses) - received.keys()
+            required = set(self._simulation.last_answered) - received.keys()
             others = self._alive.union(expected) - received.keys()
             give_up = began + (self._timeout if required else FINAL_REPORT_TIMEOUT_S)
             if now >= give_up or not (required or others):
@@ -344,8 +344,8 @@ class WorldProcess:
             now = time.monotonic()
 
 
-LOOK_AGAIN_S = 0.05
-"""s to wait before trying to reach a router again."""
+POLL_S = 0.05
+"""The time in s between two attempts to reach a router."""
 
 
 class NoRouter(TimeoutError):
@@ -353,7 +353,7 @@ class NoRouter(TimeoutError):
 
 
 class WorldLinks:
-    """The Zenoh sessions of a world, one after another; a context manager that opens the first."""
+    """The Zenoh sessions of a world, one at a time; a context manager that opens the first."""
 
     def __init__(self, endpoints: Endpoints, timeout: float, inbox: Inbox, busy_timeout: float) -> None:
         """Wait at most `timeout` s for a router, and `busy_timeout` s for a port in use to become free."""
@@ -376,7 +376,7 @@ class WorldLinks:
             if time.monotonic() >= give_up:
                 why = diagnosis.why(self.endpoints)
                 raise NoRouter(f"no router at {self.endpoints}; gave up after {self._timeout:g} s: {why}")
-            self._inbox.next(LOOK_AGAIN_S)
+            self._inbox.next(POLL_S)
 
         if self.endpoints.connect:
             later = threading.Timer(diagnosis.FIRST_WORD_S, self._warn_without_link)
@@ -397,7 +397,7 @@ class WorldLinks:
             assert self.session is not None
             process.attach(self.session, replaceable=self.endpoints.mode == "client")
             try:
-                process.play()
+                process.run()
             except RobotsLinkLost:
                 self.open()
             else:

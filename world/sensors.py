@@ -69,9 +69,11 @@ def measured(
     return rho
 
 
-def executed(asked: Controls, scenario: Scenario, robot: str, tick: int) -> Controls:
+def executed(limited_controls: Controls, scenario: Scenario, robot: str, tick: int) -> Controls:
     """Return the controls that the robot executes over [tick, tick + 1], given the commanded ones."""
-    return _disturbed(asked, scenario.mission.noise.actuation, scenario.seed, "actuation", robot, tick)
+    return _disturbed(
+        limited_controls, scenario.mission.noise.actuation, scenario.seed, "actuation", robot, tick
+    )
 
 
 def odometry(driven: Controls, scenario: Scenario, robot: str, tick: int) -> Controls:

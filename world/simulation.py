@@ -15,7 +15,7 @@ from world.tick import advance, observations, release
 from world.world_journal import history
 
 
-class Course:
+class Simulation:
     """The simulation of one run. All modes of execution use it, so they all write the same journal.
 
     The journal contains the environment, the scenario, the Commands of each tick in the scenario's order,
@@ -24,11 +24,11 @@ class Course:
 
     def __init__(self, scenario: Scenario, journal: Sink | None = None) -> None:
         self.world = release(scenario)
-        self.over: MissionEnd | None = None
+        self.mission_end: MissionEnd | None = None
         """The end of the run; None while it is running."""
-        self.witnesses: tuple[str, ...] = ()
-        """The robots that answered in the last tick, if their results ended the run."""
-        self.phase1_done_tick: dict[str, FinalReport] = {}
+        self.last_answered: tuple[str, ...] = ()
+        """The robots that answered in the last tick; empty unless their results ended the run."""
+        self.final_reports: dict[str, FinalReport] = {}
         """The journaled FinalReports, by robot."""
         self.missed: dict[str, list[Observation]] = {}
         """The Observations of each robot since its last Command in time, which a restarted agent may lack."""
@@ -45,8 +45,8 @@ class Course:
         """Return the Observation of each robot, in the order of the scenario."""
         return observations(self.world)
 
-    def keep(self, journal: Sink) -> None:
-        """Write all further frames to `journal`."""
+    def append_to(self, journal: Sink) -> None:
+        """Write all frames from now on to `journal`."""
         self._journal = journal
 
     def command(self, commands: Mapping[str, Command]) -> MissionEnd | None:
@@ -54,10 +54,10 @@ class Course:
 
         A robot that is not in `commands` rests for this tick. Raises CannotRecord.
         """
-        self.recording(commands)
+        self.journal_commands(commands)
         return self.advance(commands)
 
-    def recording(self, commands: Mapping[str, Command]) -> None:
+    def journal_commands(self, commands: Mapping[str, Command]) -> None:
         """Journal the Commands of this tick: the first half of `command`. Raises CannotRecord."""
         if self._journal is not None:
             self._journal.write(
@@ -75,7 +75,7 @@ class Course:
             self._note_missed(commands)
         onward = advance(self.world, commands)
         if isinstance(onward, Judgement):
-            self.witnesses = tuple(commands)
+            self.last_answered = tuple(commands)
             return self.end(onward)
         self.world = onward
         return None
@@ -89,55 +89,57 @@ class Course:
 
     def end(self, judgement: Judgement) -> MissionEnd:
         """End the run with this outcome, and journal and return the MissionEnd. Raises CannotRecord."""
-        self.over = MissionEnd(self.tick, judgement.outcome, judgement.reason)
+        self.mission_end = MissionEnd(self.tick, judgement.outcome, judgement.reason)
         if self._journal is not None:
-            self._journal.write(encode(self.over))
-        return self.over
+            self._journal.write(encode(self.mission_end))
+        return self.mission_end
 
-    def final_reports(self, final_reports: Iterable[FinalReport]) -> None:
+    def journal_final_reports(self, final_reports: Iterable[FinalReport]) -> None:
         """Journal the FinalReports that are not in the journal yet, in the order of the scenario.
 
-        Those of robots that precede a journaled one are dropped, to keep the order. Raises CannotRecord.
+        To keep this order, the FinalReport of a robot is dropped if one of a later robot has been journaled.
+        Raises CannotRecord.
         """
         received = {final_report.robot: final_report for final_report in final_reports}
         ids = [robot.id for robot in self.world.scenario.robots]
-        latest = max([ids.index(robot) for robot in self.phase1_done_tick], default=-1)
+        latest = max([ids.index(robot) for robot in self.final_reports], default=-1)
         new = [received[robot] for robot in ids[latest + 1 :] if robot in received]
-        self.phase1_done_tick |= {final_report.robot: final_report for final_report in new}
+        self.final_reports |= {final_report.robot: final_report for final_report in new}
         if self._journal is not None and new:
             self._journal.write(*[encode(final_report) for final_report in new])
 
 
-def again(scenario: Scenario, recording: Retrace) -> Course:
+def resumed(scenario: Scenario, recording: Retrace) -> Simulation:
     """Return the simulation at the end of the journal `recording`; at tick 0 if the journal is empty.
 
     Raises CorruptJournal if the journal is damaged, has another scenario, or differs from this simulation.
     """
-    course = Course(scenario)
-    course.keep(recording)
+    simulation = Simulation(scenario)
+    simulation.append_to(recording)
     named = environment.named_in(recording.frames)
     if environment.is_blank(recording.frames):
         recording.write(encode(named or environment.of_world()), encode(scenario))
     else:
-        _retrace(course, recording, named)
-    return course
+        _retrace(simulation, recording, named)
+    return simulation
 
 
-def _retrace(course: Course, recording: Retrace, named: Environment | None) -> None:
+def _retrace(simulation: Simulation, recording: Retrace, named: Environment | None) -> None:
     recorded = history(recording.frames, recording.path)
     if recorded.disorder is not None:
         raise CorruptJournal(f"{recording.path}: {recorded.disorder.what}")
-    if recorded.scenario != course.world.scenario:
+    if recorded.scenario != simulation.world.scenario:
         raise CorruptJournal(f"{recording.path}: a recording of another scenario, {recorded.scenario.name}")
     try:
         recording.write(*[encode(one) for one in (named, recorded.scenario) if one is not None])
         for tick in recorded.ticks:
-            course.command(tick.commands)
-        if recorded.end is not None and course.over is None:
-            course.end(Judgement(recorded.end.outcome, recorded.end.reason))
-        course.final_reports(recorded.final_reports.values())
+            simulation.command(tick.commands)
+        if recorded.end is not None and simulation.mission_end is None:
+            simulation.end(Judgement(recorded.end.outcome, recorded.end.reason))
+        simulation.journal_final_reports(recorded.final_reports.values())
     except ReplayMismatch:
         raise CorruptJournal(
-            f"{recording.path}: the recorded world differs from the recomputed one at tick {course.tick}: "
+            f"{recording.path}: the recorded world differs from the recomputed one at tick "
+            f"{simulation.tick}: "
             + (environment.otherwise(named, environment.of_world()) or "the journal is another version's")
         ) from None

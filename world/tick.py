@@ -8,11 +8,11 @@ import msgspec
 
 from protocol.messages import Command, Contact, Localised, Observation, Verdict
 from protocol.motion import Controls, Pose
-from world.channel import LinkState, carried, of_plan
+from world.channel import LinkState, link_faults, next_link_state
 from world.referee import Judgement, judge
 from world.scenario import Scenario
 from world.sensors import anchor_ranges, executed, mutual_ranges, odometry
-from world.truth import Truth, asked
+from world.truth import Truth, limited_controls
 
 
 class World(msgspec.Struct, frozen=True):
@@ -30,7 +30,7 @@ class World(msgspec.Struct, frozen=True):
     """The true pose in <W> of each localised robot at the tick of its claim. Noise may move it afterwards."""
     pairs: tuple[tuple[int, int], ...]
     """The pairs of peers, as indices into the scenario's robots."""
-    air: tuple[LinkState, ...] = ()
+    links: tuple[LinkState, ...] = ()
     """The state of the links: for each pair, from the first to the second robot, then back.
 
     Empty without faults.
@@ -62,7 +62,7 @@ def observations(world: World) -> list[Observation]:
     for i, ((one, other), mutual) in enumerate(zip(world.pairs, mutuals, strict=True)):
         if mutual is not None:
             to_other, to_one = (
-                world.air[2 * i : 2 * i + 2] if world.air else (LinkState((tick,)), LinkState((tick,)))
+                world.links[2 * i : 2 * i + 2] if world.links else (LinkState((tick,)), LinkState((tick,)))
             )
             contacts[one] = (Contact(robots[other].id, mutual.range, to_one.heard, to_one.damaged),)
             contacts[other] = (Contact(robots[one].id, mutual.range, to_other.heard, to_other.damaged),)
@@ -80,7 +80,7 @@ def advance(world: World, commands: Mapping[str, Command]) -> World | Judgement:
     exact = scenario.mission.noise.exact
     for place, robot in enumerate(scenario.robots):
         command = commands.get(robot.id)
-        controls = asked(command, scenario.mission)
+        controls = limited_controls(command, scenario.mission)
         driven.append(controls if exact else executed(controls, scenario, robot.id, truth.tick))
         if command is not None and command.verdict is not None and robot.id not in verdicts:
             verdicts = verdicts | {robot.id: command.verdict}
@@ -91,28 +91,28 @@ def advance(world: World, commands: Mapping[str, Command]) -> World | Judgement:
         if judgement is not None:
             return judgement
     moved = truth.moved(driven, scenario.mission.period)
-    air = _carried(world.air, scenario, moved, world.pairs)
-    return World(scenario, moved, tuple(driven), verdicts, claimed, world.pairs, air)
+    links = _carried(world.links, scenario, moved, world.pairs)
+    return World(scenario, moved, tuple(driven), verdicts, claimed, world.pairs, links)
 
 
 def _carried(
-    air: Sequence[LinkState], scenario: Scenario, truth: Truth, pairs: Sequence[tuple[int, int]]
+    before: Sequence[LinkState], scenario: Scenario, truth: Truth, pairs: Sequence[tuple[int, int]]
 ) -> tuple[LinkState, ...]:
-    """Return the state of each link at the tick of `truth`, given its state `air` at the tick before."""
-    if not air:
+    """Return the state of each link at the tick of `truth`, given its state in `before` one tick earlier."""
+    if not before:
         return ()
     mutuals = mutual_ranges(truth, scenario, pairs)
     ids = [robot.id for robot in scenario.robots]
     links = [(way, mutual) for pair, mutual in zip(pairs, mutuals, strict=True) for way in (pair, pair[::-1])]
     return tuple(
         [
-            carried(
-                before,
-                of_plan(scenario.faults, ids[sender], ids[receiver]),
+            next_link_state(
+                link,
+                link_faults(scenario.faults, ids[sender], ids[receiver]),
                 scenario.seed,
                 truth.tick,
                 in_contact=mutual is not None,
             )
-            for before, ((sender, receiver), mutual) in zip(air, links, strict=True)
+            for link, ((sender, receiver), mutual) in zip(before, links, strict=True)
         ]
     )

@@ -61,7 +61,7 @@ class Truth(msgspec.Struct, frozen=True):
         return Truth(self.tick + 1, tuple(local), self.origins, tuple(legs))
 
 
-def asked(command: Command | None, mission: Mission) -> Controls:
+def limited_controls(command: Command | None, mission: Mission) -> Controls:
     """Return the controls of `command`, limited to v_max and omega_max; REST for None."""
     if command is None:
         return REST

@@ -73,7 +73,7 @@ def history(frames: Iterable[bytes], source: object) -> History:
                 break
     except MalformedFrame as error:
         raise CorruptJournal(f"{source}: {error}") from None
-    return replace(reading.told(), environment=named)
+    return replace(reading.content(), environment=named)
 
 
 def opened(frames: Sequence[bytes], source: object) -> tuple[Scenario, Environment | None, Sequence[bytes]]:
@@ -145,7 +145,7 @@ class JournalReading:
         else:
             self.world = onward
 
-    def told(self) -> History:
+    def content(self) -> History:
         """Return the content that has been read so far."""
         ahead = self.world if self.judgement is None else None
         return History(

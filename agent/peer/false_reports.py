@@ -23,8 +23,8 @@ def falsified_log(
 ) -> MotionLog:
     """Return `log` as falsified by `attack`.
 
-    The ticks tell in which part of the log each phase lies: phase 1 ended at `phase1_done_tick`, and phase 3
-    began at `encounter_tick`; None if that has not happened. `period` is T_s in s.
+    Phase 1 ended at `phase1_done_tick`, and phase 3 began at `encounter_tick`; None if that has not happened.
+    `period` is T_s in s.
     """
     if attack.kind == "radius":
         ranges = tuple([Ranged(one.tick, max(0.0, one.range + attack.size)) for one in log.ranges])
@@ -45,9 +45,10 @@ def falsified_log(
 def _attacked_span(
     attack: Attack, through: int, phase1_done_tick: int | None, encounter_tick: int | None
 ) -> tuple[int, int]:
-    """Return the first tick of the attacked part, and the one after its last.
+    """Return the first tick of the attacked part of the log, and the tick after its last.
 
-    The span is empty if the part has not begun.
+    `through` is the last tick of the log. Phase 1 ended at `phase1_done_tick`, and phase 3 began at
+    `encounter_tick`; None if that has not happened. The span is empty if the part has not begun.
     """
     end = through + 1
     phase1_done_tick = phase1_done_tick if phase1_done_tick is not None else end

@@ -1,7 +1,7 @@
 """The `assured` planner with noisy sensors: measure until the poses are as accurate as the mission asks.
 
 The phases are those of the paper. In phase 1, a robot collects ranges to its anchor until a better estimate
-is worth less than moving on. In phase 3, both robots move, each to where its next ranges are expected to tell
+is not worth the time. In phase 3, both robots move, each to where its next ranges are expected to tell
 most (see `active_sensing`).
 """
 
@@ -12,7 +12,12 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from agent.estimation.gaussian.consistency import DOUBTFUL, LOOKS, UNBELIEVABLE, WARY
+from agent.estimation.gaussian.consistency import (
+    CLAIM_P_VALUE,
+    EARLY_CLAIM_P_VALUE,
+    INCONSISTENT_P_VALUE,
+    INCONSISTENT_SEARCHES,
+)
 from agent.estimation.gaussian.hypotheses import ScoredHypothesis, follow, search
 from agent.planning import active_sensing, inference, phase2_orbit, range_seeking
 from agent.planning.active_sensing import Listening, Retreating, Surveying
@@ -94,7 +99,7 @@ def _continue_phase1(state: RobotState) -> RobotState:
         state = inference.with_own(state, scored)
     if _ticks_without_range(state) >= LOST_AFTER * active_sensing.stride(state.config.mission):
         return _return_to_anchor(state)
-    if not scored or scored[0].silence < MISLEADING + _drop_out_log_likelihood(state):
+    if not scored or scored[0].detection_log_likelihood < MISLEADING + _drop_out_log_likelihood(state):
         if not ranged:
             return _return_to_anchor(state)
         return replace(state, mode=Straight("anchor", state.odometry, state.log.ranges[-1].range))
@@ -229,7 +234,7 @@ def _decide_phase3(state: RobotState) -> RobotState:
         state = replace(state, belief=replace(state.belief, ranges_at_last_search=mutual))
     required_ranges = CHECKED_WITH_OUTLIERS if mission.noise.outliers else CHECKED
     tested = inference.with_pair(state, scored, pair, required_ranges)
-    if (tested.belief.blocking_reason is None or _p_value_below(tested, DOUBTFUL)) and not searched:
+    if (tested.belief.blocking_reason is None or _p_value_below(tested, CLAIM_P_VALUE)) and not searched:
         scored, searched = search(pair), True
         tested = inference.with_pair(state, scored, pair, required_ranges)
     tested = inference.with_convergence_check(tested, scored)
@@ -238,7 +243,9 @@ def _decide_phase3(state: RobotState) -> RobotState:
     if tested.verdict is not None:
         return tested
     few_ranges = len(pair.places) < 2 * required_ranges
-    if tested.belief.blocking_reason is None and not (few_ranges and _p_value_below(tested, WARY)):
+    if tested.belief.blocking_reason is None and not (
+        few_ranges and _p_value_below(tested, EARLY_CLAIM_P_VALUE)
+    ):
         return claim_pose(tested)
     if role == "a" and len(pair.places) >= MANY_MUTUAL_RANGES * (1 + state.belief.returns):
         return _return_to_anchor(tested)
@@ -257,18 +264,23 @@ def _p_value_below(state: RobotState, bound: float) -> bool:
 
 
 def _with_consistency_test(state: RobotState) -> RobotState:
-    """Return `state` with the consistency test of a search, and with its verdict after LOOKS failed tests.
+    """Return `state` with the consistency test of a search, and with the verdict if too many tests failed.
 
-    A test fails if its p-value is below UNBELIEVABLE. The failed tests must be consecutive.
+    A test fails if its p-value is below INCONSISTENT_P_VALUE. The verdict is Inconsistent after
+    INCONSISTENT_SEARCHES consecutive failures.
     """
     belief = state.belief
     inconsistency = belief.inconsistency
     if inconsistency is None:
         return state
     least = min(inconsistency.p_value, belief.p_value if belief.p_value is not None else 1.0)
-    inconsistent_searches = belief.inconsistent_searches + 1 if inconsistency.p_value < UNBELIEVABLE else 0
+    inconsistent_searches = (
+        belief.inconsistent_searches + 1 if inconsistency.p_value < INCONSISTENT_P_VALUE else 0
+    )
     state = replace(state, belief=replace(belief, inconsistent_searches=inconsistent_searches, p_value=least))
-    return state.inconsistent(inconsistency.alarm) if inconsistent_searches >= LOOKS else state
+    return (
+        state.inconsistent(inconsistency.verdict) if inconsistent_searches >= INCONSISTENT_SEARCHES else state
+    )
 
 
 def _drive_without_hypotheses(state: RobotState) -> RobotState:

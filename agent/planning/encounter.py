@@ -59,7 +59,7 @@ def begin_phase3(state: RobotState) -> RobotState:
     belief = replace(state.belief, encounter_tick=state.tick)
     if state.config.role == "b":
         return replace(state, mode=Standing(), belief=belief)
-    # the range was not measured
+    # In contact without a range (a drop-out), the peer is only known to be within R.
     rho = state.mutual[-1].range if state.mutual else state.config.mission.sensing_range
     if state.config.mission.safety_distance and not _may_drive_straight(state):
         return state
@@ -104,7 +104,7 @@ def _decide_exact(state: RobotState) -> RobotState:
     observations_in_range = [at for at in pair_observations if at.range is not None]
     away_from_m2 = [at for at in observations_in_range if off_anchor(at.b, state.config.rendezvous.b)]
     base = phase3_last_manoeuvre.base(away_from_m2, precision.odometry_rounding(state))
-    if base is None:  # No base yet. Or a report was missed, and b was still driving while a went straight.
+    if base is None:  # There are too few ranges, or b was still driving while a drove straight on.
         b_is_standing = isinstance(state.mode, Waiting) and state.peer_state.state == MODE_NAMES[Standing]
         return begin_phase3(state) if b_is_standing and planner_name == "assured" else state
     if state.belief.peer_anchor is None:
@@ -124,9 +124,8 @@ def _decide_exact(state: RobotState) -> RobotState:
     ):
         return replace(state, mode=Done(3, Localised(state.world_pose(remaining[0]))))
     mover = state.config.role
-    peer_has_ended = planner_name == "assured" and isinstance(
-        state.peer_state.verdict, Localised
-    )  # the peer has localised itself and does not move again
+    # A peer that has localised itself does not move again.
+    peer_has_ended = planner_name == "assured" and isinstance(state.peer_state.verdict, Localised)
     if not peer_has_ended and mover != (
         phase3_last_manoeuvre.turn(pair_observations) if checked and planner_name == "assured" else "b"
     ):

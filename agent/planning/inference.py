@@ -9,7 +9,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from agent.estimation.exact import Branch
-from agent.estimation.gaussian.consistency import DOUBTFUL, FINISHED, Inconsistency, doubt
+from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, Inconsistency, consistency_test
 from agent.estimation.gaussian.hypotheses import ScoredHypothesis, missing, of_anchor
 from agent.estimation.gaussian.least_squares import deviation, poses
 from agent.estimation.gaussian.odometry_noise import Array, Track, track
@@ -158,7 +158,7 @@ def blocking_reason_for(
             f"the most probable of {len(scored)} hypotheses has probability {probability:.6f}, "
             f"required {mission.confidence:g}"
         )
-    if not inconsistency.p_value >= DOUBTFUL:
+    if not inconsistency.p_value >= CLAIM_P_VALUE:
         return f"the most probable hypothesis fails the consistency test: {inconsistency.what}"
     _, covariance = to_second_order(hypotheses[0], pair.apart)
     for i, robot in ((0, "a"), (3, "b")):
@@ -193,7 +193,7 @@ def with_pair(
     robot, m1 = (0, config.anchor) if config.role == "a" else (1, config.peer_anchor)
     hypotheses = pair_planning_hypotheses(scored, pair)
     enough = len(pair.places) >= mutual
-    inconsistency = doubt(scored[0].fit, pair) if enough and scored else None
+    inconsistency = consistency_test(scored[0].fit, pair) if enough and scored else None
     blocking_reason = blocking_reason_for(scored, hypotheses, inconsistency, pair, config.mission)
     claims = [claim(one, robot, pair) for one in hypotheses]
     first, _ = state.belief.candidates or (len(scored), 0)

@@ -11,6 +11,9 @@ from protocol.mission import Mission
 from protocol.motion import Controls, Pose, compose, wrap
 from protocol.orbits import Orbit
 
+LOOKAHEAD = 2.0
+"""The distance of the pursued point ahead on the orbit, in ticks of the orbit's speed."""
+
 
 class Aligning(msgspec.Struct, frozen=True):
     """The robot turns by -mu on the spot, until it heads radially away from its anchor."""
@@ -39,7 +42,7 @@ class Orbiting(msgspec.Struct, frozen=True):
     """Noisy sensors: the tick in which the robot reached its orbit."""
 
 
-Meeting = Aligning | Radial | Tangent | Orbiting
+Phase2Mode = Aligning | Radial | Tangent | Orbiting
 
 
 def orientation(local: Pose) -> float:
@@ -49,24 +52,24 @@ def orientation(local: Pose) -> float:
     return wrap(local.heading - math.atan2(local.y, local.x))
 
 
-def onward(state: Meeting, odometry: Pose, start: Pose, orbit: Orbit, mission: Mission) -> Meeting:
-    """Return the mode of phase 2 at the pose `odometry`. Completed steps are skipped.
+def onward(mode: Phase2Mode, odometry: Pose, start: Pose, orbit: Orbit, mission: Mission) -> Phase2Mode:
+    """Return the mode that follows `mode` at the pose `odometry`. Completed steps are skipped.
 
     `start` is the pose of tick 0 in the anchor's frame.
     """
     distance_tolerance, angle_tolerance = arrival_tolerances(mission)
     while True:
-        match state:
+        match mode:
             case Aligning(heading) if abs(heading - odometry.heading) <= angle_tolerance:
-                state = Radial()
+                mode = Radial()
             case Radial() if abs(left_to_orbit(odometry, start, orbit)) <= distance_tolerance:
                 if orbit.v == 0.0:
                     return Orbiting()
-                state = Tangent(odometry.heading + math.copysign(math.pi / 2, orbit.omega))
+                mode = Tangent(odometry.heading + math.copysign(math.pi / 2, orbit.omega))
             case Tangent(heading) if abs(heading - odometry.heading) <= angle_tolerance:
                 return Orbiting()
             case _:
-                return state
+                return mode
 
 
 def left_to_orbit(odometry: Pose, start: Pose, orbit: Orbit) -> float:
@@ -84,9 +87,9 @@ def off_anchor(local: Pose, orbit: Orbit) -> bool:
     return math.hypot(local.x, local.y) >= 0.5 * orbit.radius
 
 
-def controls(state: Meeting, odometry: Pose, start: Pose, orbit: Orbit, mission: Mission) -> Controls:
-    """Return the controls of the mode `state` at the pose `odometry`."""
-    match state:
+def controls(mode: Phase2Mode, odometry: Pose, start: Pose, orbit: Orbit, mission: Mission) -> Controls:
+    """Return the controls of `mode` at the pose `odometry`."""
+    match mode:
         case Aligning(heading) | Tangent(heading):
             return turn(odometry, heading, mission)
         case Radial():
@@ -105,7 +108,3 @@ def pursuit(local: Pose, orbit: Orbit, mission: Mission) -> Controls:
     omega = 2.0 * wrap(math.atan2(y, x) - local.heading) / (LOOKAHEAD * mission.period)
     limit = mission.max_turn_rate
     return Controls(orbit.v, min(max(omega, -limit), limit))
-
-
-LOOKAHEAD = 2.0
-"""The distance of the pursued point, in ticks of the orbit's speed."""

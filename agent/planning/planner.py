@@ -350,7 +350,7 @@ def _end_phase1(
     return _continue_phase2(state, Aligning(state.odometry.heading - mu))
 
 
-def _continue_phase2(state: RobotState, mode: phase2_orbit.Meeting) -> RobotState:
+def _continue_phase2(state: RobotState, mode: phase2_orbit.Phase2Mode) -> RobotState:
     """Continue phase 2 from `mode`. With noisy sensors, the robot follows its orbit by pure pursuit."""
     next_mode = phase2_orbit.onward(mode, state.odometry, state.start, state.orbit, state.config.mission)
     if isinstance(next_mode, Orbiting) and not state.config.mission.noise.exact:

@@ -48,7 +48,7 @@ class Search:
         self._began = time.monotonic()
         self._reported = False
 
-    def go_on(self, *, linked: bool = False, why: str | None = None) -> None:
+    def wait(self, *, linked: bool = False, why: str | None = None) -> None:
         """Wait briefly before the next attempt.
 
         `linked` is whether the session has a link to a router. `why` explains why an answer was unusable.
@@ -114,7 +114,7 @@ def join(link: zenoh.Session, run: str | None, robot: str, search: Search) -> tu
         elif time.monotonic() > refused + REFUSED_S:
             raise Unwelcome(offers.refused)
         if occupied is None and offers.refused is None:
-            search.go_on(linked=session.linked(link), why=offers.unusable)
+            search.wait(linked=session.linked(link), why=offers.unusable)
         else:
             search.pause()
     if occupied is not None:

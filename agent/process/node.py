@@ -18,7 +18,7 @@ import zenoh
 from agent.process.discovery import ASK_AGAIN_S, NoWorld, Search, join
 from agent.process.link import AgentLink, WorldLinkLost
 from agent.process.out_of_step import OutOfStep
-from agent.process.recovery import REPORTS_KEPT, REPORTS_TOLD, Memory
+from agent.process.recovery import OWN_REPORTS_KEPT, REPORTS_KEPT, Memory
 from agent.process.report_buffer import Post
 from agent.process.robot import FramedReport
 from protocol.messages import MissionEnd, Observation, RobotConfig
@@ -88,13 +88,13 @@ class AgentProcess:
         """The time (monotonic clock) of the last repetition."""
         self._repeat_at: float | None = None
         """The time of the next repetition, if one was requested within AGAIN_S of the last."""
-        self._own_reports = deque(memory.told, maxlen=REPORTS_TOLD)
+        self._own_reports = deque(memory.own_reports, maxlen=OWN_REPORTS_KEPT)
         """The robot's own latest reports."""
         self.end: MissionEnd | None = memory.end if memory.final_report is not None else None
         """The MissionEnd, once it is accepted."""
         self._final_report = memory.final_report
 
-    def play(self) -> MissionEnd:
+    def run(self) -> MissionEnd:
         """Run the mission over the attached link and return its MissionEnd.
 
         Raises WorldLinkLost if nothing arrives over this link, NoWorld if the world is absent for too long,
@@ -247,7 +247,7 @@ class AgentProcess:
     def _send_command(self, tick: int) -> None:
         if self._on_kill_point is not None:
             self._on_kill_point("journal", tick)
-        self._link.command(self._robot.drive_frame)
+        self._link.command(self._robot.command_frame)
         if self._on_kill_point is not None:
             self._on_kill_point("command", tick)
 
@@ -261,8 +261,8 @@ class AgentProcess:
             self._repeat_at = self._repeated_at + AGAIN_S
             return
         self._repeated_at, self._repeat_at = now, None
-        if self._robot.told is not None:
-            oldest = self._robot.told.report.tick - REPORTS_TOLD
+        if self._robot.report is not None:
+            oldest = self._robot.report.report.tick - OWN_REPORTS_KEPT
             for framed in self._own_reports:
                 if framed.report.tick > oldest:
                     self._send_report(framed)
@@ -336,7 +336,7 @@ def run_agent(
     linked = False
     while True:
         try:
-            unanswered = search.go_on if process is None else process.unanswered
+            unanswered = search.wait if process is None else process.unanswered
             with session.open_session(endpoints, unanswered, session.CLOSE_TIMEOUT_S) as link:
                 if not linked:
                     on_first_link()
@@ -350,7 +350,7 @@ def run_agent(
                     on_joined(*joined)
                 else:
                     process.attach(link)
-                found = process.play()
+                found = process.run()
                 on_end()
                 return found
         except WorldLinkLost:

@@ -52,7 +52,8 @@ class OutOfStep:
             return
         if tick == known:
             raise NoWorld(
-                f"the recording is of another run: the Observation of {self._robot} at tick {tick} differs"
+                f"the recording belongs to another run: "
+                f"its Observation of {self._robot} at tick {tick} differs"
             )
         late = "too late" if tick > known else "the world was restarted without its recording"
         raise NoWorld(f"{late}: the world is at tick {tick}, {self._robot} at tick {known}")

@@ -19,7 +19,7 @@ from protocol.wire import encode
 
 REPORTS_KEPT = 64
 """The number of ticks for which a report of the peer is stored that no Observation has listed yet."""
-REPORTS_TOLD = REPORTS_KEPT - 4
+OWN_REPORTS_KEPT = REPORTS_KEPT - 4
 """The number of ticks for which a robot can repeat its own reports.
 
 It is smaller than REPORTS_KEPT. Otherwise the peer would count a report twice.
@@ -33,7 +33,7 @@ class Memory(msgspec.Struct, frozen=True):
     robot: Robot
     observation: Observation | None = None
     """The latest Observation."""
-    told: tuple[FramedReport, ...] = ()
+    own_reports: tuple[FramedReport, ...] = ()
     """The robot's own latest reports."""
     heard: tuple[FramedReport, ...] = ()
     """The latest reports received from the peer."""
@@ -54,7 +54,7 @@ def remember(recording: Retrace) -> Memory | None:
     robot = Robot(journal.config)
     robot.keep(recording)
     recording.write(*[encode(one) for one in (recorded_with, journal.config) if one is not None])
-    own_reports: deque[FramedReport] = deque(maxlen=REPORTS_TOLD)
+    own_reports: deque[FramedReport] = deque(maxlen=OWN_REPORTS_KEPT)
     for step in journal.steps:
         try:
             report = robot.observation(step.observation, step.frame)
@@ -80,7 +80,7 @@ def remember(recording: Retrace) -> Memory | None:
         config=journal.config,
         robot=robot,
         observation=observation,
-        told=tuple(own_reports),
+        own_reports=tuple(own_reports),
         heard=tuple([one for step in latest for one in step.heard if now - one.report.tick <= REPORTS_KEPT]),
         end=journal.end if journal.final_report is not None else None,
         final_report=journal.final_report,

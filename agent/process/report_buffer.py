@@ -34,12 +34,12 @@ class Post:
             return
         wrong = peer_state.contradiction(report)
         if report.robot != arrival.source.robot:
-            wrong = f"it says it is from '{report.robot}'"
+            wrong = f"its sender is given as '{report.robot}'"
         if wrong is not None:
             self._inbox.refuse(arrival, wrong)
             return
         if not self._real_time and report.tick > known + 1:
-            self._inbox.refuse(arrival, "it is of a tick to come")
+            self._inbox.refuse(arrival, "its tick is in the future")
         elif abs(report.tick - max(known, 0)) > REPORTS_KEPT:
             self.unheard += 1
         elif (

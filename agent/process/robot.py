@@ -36,8 +36,8 @@ class Robot:
     """The state of one robot, and the journal of its inputs and outputs."""
 
     def __init__(self, config: RobotConfig, journal: Sink | None = None) -> None:
-        self.mind = RobotState(config)
-        self.told: FramedReport | None = None
+        self.state = RobotState(config)
+        self.report: FramedReport | None = None
         """The report of this tick; None if no peer is in contact."""
         self.command: Command | None = None
         """The Command of this tick; None until it is decided."""
@@ -64,7 +64,7 @@ class Robot:
         return self._journal is not None
 
     @property
-    def drive_frame(self) -> bytes:
+    def command_frame(self) -> bytes:
         """Return the frame of this tick's Command, which must have been decided."""
         if self._command_frame is None:
             assert self.command is not None
@@ -76,38 +76,38 @@ class Robot:
 
         `frame` is the encoded Observation, if it was received as one.
         """
-        self.mind = planner.observe(self.mind, observation)
-        self.told = self.command = self._command_frame = None
+        self.state = planner.observe(self.state, observation)
+        self.report = self.command = self._command_frame = None
         for contact in observation.contacts:
             self.unheard.add(observation.tick)
             self.unheard.difference_update(contact.heard or (), contact.damaged)
             self.damaged += len(contact.damaged)
         if observation.contacts:
-            report = planner.report(self.mind)
-            self.told = FramedReport(report, encode(report))
+            report = planner.report(self.state)
+            self.report = FramedReport(report, encode(report))
             self.reports_sent += 1
-            self.bytes_sent += len(self.told.frame)
+            self.bytes_sent += len(self.report.frame)
             if self._journal is not None:
-                self._journal.write(frame or encode(observation), self.told.frame)
+                self._journal.write(frame or encode(observation), self.report.frame)
         elif self._journal is not None:
             self._unwritten = frame or encode(observation)
-        return self.told
+        return self.report
 
     def decide(self, heard: Sequence[FramedReport] = (), missed: Sequence[str] = ()) -> Command:
         """Update the state with the received reports, and return the Command of this tick.
 
         `missed` names the peers whose reports did not arrive in time.
         """
-        self.mind = planner.decide(self.mind, [framed.report for framed in heard])
+        self.state = planner.decide(self.state, [framed.report for framed in heard])
         self.unheard.difference_update([framed.report.tick for framed in heard])
-        self.command = planner.command(self.mind)
+        self.command = planner.command(self.state)
         if self._journal is not None:
             frames = [framed.frame for framed in heard]
-            frames += [encode(DeadlineMissed(self.mind.tick, peer)) for peer in missed]
+            frames += [encode(DeadlineMissed(self.state.tick, peer)) for peer in missed]
             if self._unwritten is not None:
                 frames.insert(0, self._unwritten)
                 self._unwritten = None
-            self._journal.write(*frames, self.drive_frame)
+            self._journal.write(*frames, self.command_frame)
         return self.command
 
     def estimate(self) -> bytes:
@@ -115,7 +115,7 @@ class Robot:
 
         No process waits for an Estimate, so it is computed and journaled after the Command has been sent.
         """
-        frame = encode(planner.estimate(self.mind))
+        frame = encode(planner.estimate(self.state))
         if self._journal is not None:
             self._journal.write(frame)
         return frame
@@ -127,7 +127,7 @@ class Robot:
 
         The arguments count the frames that the transport refused and the reports that no Observation listed.
         """
-        state, belief = self.mind, self.mind.belief
+        state, belief = self.state, self.state.belief
         plan = belief.plan
         final_report = FinalReport(
             robot=state.config.robot,

@@ -52,7 +52,7 @@ def _answers(replayed: Robot, robot: str, step: Step, *, cut: bool) -> Checks:
         yield Violation("decision", tick, robot, "it sent a Report, expected none: no peer is in contact")
     if step.command is not None:
         replayed.decide(step.heard, step.missed)
-        yield _same(tick, robot, step.command, replayed.drive_frame)
+        yield _same(tick, robot, step.command, replayed.command_frame)
     if step.estimate is not None:
         yield _same(tick, robot, step.estimate, replayed.estimate())
 

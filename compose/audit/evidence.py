@@ -68,7 +68,7 @@ class Evidence(msgspec.Struct, frozen=True):
         return self.history.ticks[tick].commands.get(robot)
 
 
-def case_of(journals: Mapping[str, Iterable[bytes]], folder: object) -> Evidence:
+def evidence_of(journals: Mapping[str, Iterable[bytes]], folder: object) -> Evidence:
     """Return the evidence in the frames of `journals`, by file name; `folder` appears in error messages.
 
     Raises CorruptJournal, whose text names the journal.

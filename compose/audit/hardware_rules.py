@@ -46,7 +46,7 @@ RULES: tuple[Callable[[Alone], Checks], ...] = (order, config, report, decision,
 """The rules of the audit of hardware mode; a rule whose violations follow from another's comes after it."""
 
 
-def judge_alone(
+def audit_hardware_run(
     journals: Mapping[str, Iterable[bytes]],
     folder: object,
     rules: Sequence[Callable[[Alone], Checks]] = RULES,

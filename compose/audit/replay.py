@@ -20,8 +20,8 @@ from compose.audit.findings import Checks, Violation
 from compose.audit.hardware_rules import Alone
 from compose.audit.hardware_rules import order as order_alone
 from compose.audit.journal_rules import config, order
-from compose.audit.rules import judged
-from compose.recording.run import books
+from compose.audit.rules import audit_journals
+from compose.recording.run import read_journals
 
 RULES: tuple[Callable[[Evidence], Checks], ...] = (
     config,
@@ -60,7 +60,7 @@ def replay(folder: Path) -> tuple[Replay, dict[str, int]]:
     Raises OSError if there is no recording, CorruptJournal if a frame cannot be decoded or is in the journal
     of another robot.
     """
-    found = books(folder)
+    found = read_journals(folder)
     result = replayed({name: book.frames for name, book in found.items()}, folder)
     return result, {name: book.torn for name, book in found.items()}
 
@@ -70,7 +70,7 @@ def replayed(journals: Mapping[str, Iterable[bytes]], folder: object = "the reco
 
     Raises CorruptJournal like `replay`.
     """
-    findings = judged(journals, folder, RULES, ALONE)
+    findings = audit_journals(journals, folder, RULES, ALONE)
     return Replay(
         findings.scenario,
         findings.ticks,

@@ -9,13 +9,13 @@ from compose.audit import hardware_rules
 from compose.audit.agent_rules import decision, limits, log
 from compose.audit.claim_rules import claim
 from compose.audit.delivery_rules import contact, observation, report
-from compose.audit.evidence import Evidence, case_of, other_versions
+from compose.audit.evidence import Evidence, evidence_of, other_versions
 from compose.audit.fault_rules import faults, link_statistics
 from compose.audit.findings import Checks, Findings, findings_of
-from compose.audit.hardware_rules import Alone, judge_alone
+from compose.audit.hardware_rules import Alone, audit_hardware_run
 from compose.audit.journal_rules import config, order
 from compose.audit.scenario_rules import scenario
-from compose.recording.run import WORLD_JOURNAL, books
+from compose.recording.run import WORLD_JOURNAL, read_journals
 from protocol.journal.environment import of_world, otherwise
 
 RULES: tuple[Callable[[Evidence], Checks], ...] = (
@@ -31,7 +31,7 @@ RULES: tuple[Callable[[Evidence], Checks], ...] = (
     log,
     claim,
 )
-"""The rules of the audit; a rule whose violations follow from another's comes after it."""
+"""The rules of the audit, in order: if violations of one cause violations of another, it comes first."""
 
 
 def audit(folder: Path) -> Findings:
@@ -40,25 +40,26 @@ def audit(folder: Path) -> Findings:
     Raises OSError if there is no recording. Raises CorruptJournal if a frame cannot be decoded, if it is in
     the journal of another robot, or if two peers' journals are of different runs.
     """
-    return judged({name: book.frames for name, book in books(folder).items()}, folder)
+    return audit_journals({name: book.frames for name, book in read_journals(folder).items()}, folder)
 
 
-def judged(
+def audit_journals(
     journals: Mapping[str, Iterable[bytes]],
     folder: object,
     rules: Sequence[Callable[[Evidence], Checks]] = RULES,
-    without: Sequence[Callable[[Alone], Checks]] = hardware_rules.RULES,
+    rules_without_world: Sequence[Callable[[Alone], Checks]] = hardware_rules.RULES,
 ) -> Findings:
     """Return the findings in the frames of `journals`, by file name; errors name `folder`.
 
-    The rules are `rules`, or `without` if there is no world's journal. Raises CorruptJournal like `audit`.
+    The rules are `rules`, or `rules_without_world` if there is no world's journal. Raises CorruptJournal like
+    `audit`.
     """
     if WORLD_JOURNAL in journals:
-        return judge(journals, folder, rules)
-    return judge_alone(journals, folder, without)
+        return audit_world_run(journals, folder, rules)
+    return audit_hardware_run(journals, folder, rules_without_world)
 
 
-def judge(
+def audit_world_run(
     journals: Mapping[str, Iterable[bytes]],
     folder: object = "the recording",
     rules: Sequence[Callable[[Evidence], Checks]] = RULES,
@@ -67,7 +68,7 @@ def judge(
 
     Errors name `folder`. Raises CorruptJournal like `audit`.
     """
-    evidence = case_of(journals, folder)
+    evidence = evidence_of(journals, folder)
     run = evidence.history
     return findings_of(
         rules,

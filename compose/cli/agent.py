@@ -25,7 +25,7 @@ from compose.launch.signals import stop_by_signal, stop_with_launcher
 from compose.network import beyond, reach
 from compose.recording.summary_json import ended
 from compose.scenario import kills
-from compose.terminal.outcome import going_on
+from compose.terminal.outcome import reopened
 from protocol.journal.journal_file import CannotRecord, CorruptJournal, Journal
 from protocol.journal.resume import Retrace
 from protocol.messages import MissionEnd, RobotConfig
@@ -98,7 +98,7 @@ def _run(options: argparse.Namespace, inbox: Inbox) -> MissionEnd:
     def start(run: str, config: RobotConfig) -> AgentProcess:
         if memory is not None and old is not None and memory.config != config:
             raise CorruptJournal(
-                f"{old.path}: it is of another run: its RobotConfig differs from this world's"
+                f"{old.path}: belongs to another run: its configuration does not match the world's"
             )
         ready = _ready(options, config, old, memory, inbox)
         return AgentProcess(ready, run, inbox, timeout=timeout, on_kill_point=kills.taker(options.kill))
@@ -150,7 +150,7 @@ def _ready(
     """Return the state of a new or resumed robot, with its journal open. Raises CannotRecord."""
     journal: Journal | None = None
     if old is not None:
-        journal = going_on(old, inbox)
+        journal = reopened(old, inbox)
     elif options.out is not None:
         journal = Journal(options.out / f"agent-{options.id}.journal", fsync=options.fsync)
     if memory is None:

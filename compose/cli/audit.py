@@ -10,7 +10,7 @@ from compose.audit.findings import Findings, LinkStatistics
 from compose.audit.rules import audit
 from compose.cli.arguments import add_closing, add_recording
 from compose.errors import CLEAN, VIOLATED
-from compose.recording.run import legible
+from compose.recording.run import user_errors
 from compose.terminal import text_width
 from protocol.output import say
 
@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(options: argparse.Namespace) -> int:
     """Audit the recording, print the findings, and return VIOLATED if a rule is violated."""
-    with legible(options.recording):
+    with user_errors(options.recording):
         findings = audit(options.recording)
     _show(findings)
     return VIOLATED if findings.violations else CLEAN

@@ -43,7 +43,7 @@ from protocol.orbits import rendezvous, tick_budget
 from protocol.wire import encode
 from world.process import WorldProcess
 from world.scenario import Scenario
-from world.simulation import Course
+from world.simulation import Simulation
 
 MISSION = "far"
 """A scenario of thousands of ticks, so that the start of the processes does not affect the rate."""
@@ -135,13 +135,13 @@ def _ticks(rounds: int, done: Callable[[], None]) -> Table:
 
 def _frame_sizes(scenario: Scenario) -> tuple[int, int]:
     """Return the median sizes of an Observation and of a Command (bytes)."""
-    course = Course(scenario)
+    simulation = Simulation(scenario)
     observations: list[int] = []
     commands: list[int] = []
-    for moment in in_process.play(scenario).moments:
-        observations += [len(encode(observation)) for observation in course.observations()]
+    for moment in in_process.run_mission(scenario).ticks:
+        observations += [len(encode(observation)) for observation in simulation.observations()]
         commands += [len(encode(command)) for command in moment.commands.values()]
-        course.command(moment.commands)
+        simulation.command(moment.commands)
     return int(median(observations)), int(median(commands))
 
 
@@ -185,10 +185,10 @@ def _mission_rate(
             session.open_router(endpoints) as link,
             Journal(Path(folder) / run.WORLD_JOURNAL) if journals else nullcontext() as journal,
         ):
-            process = WorldProcess(Course(scenario, journal), "bench", Inbox("tandem bench"))
+            process = WorldProcess(Simulation(scenario, journal), "bench", Inbox("tandem bench"))
             process.attach(link)
-            end = process.play()
-            return end.tick / process.playing_s
+            end = process.run()
+            return end.tick / process.running_s
 
 
 def _endpoints(
@@ -225,13 +225,13 @@ def _missions(rounds: int, done: Callable[[], None]) -> Table:
     whole: list[float] = []
     world_part: list[float] = []
     audited: list[float] = []
-    ticks = sum(len(in_process.play(one).moments) for one in scenarios)
+    ticks = sum(len(in_process.run_mission(one).ticks) for one in scenarios)
     for _ in range(rounds):
         began = time.perf_counter()
         for one in scenarios:
-            in_process.play(one)
+            in_process.run_mission(one)
         whole.append(time.perf_counter() - began)
-        world_part.append(sum(_world_s(in_process.play(one)) for one in scenarios))
+        world_part.append(sum(_world_s(in_process.run_mission(one)) for one in scenarios))
         began = time.perf_counter()
         for one in scenarios:
             run_in_process(one, audit=True)
@@ -249,10 +249,10 @@ def _missions(rounds: int, done: Callable[[], None]) -> Table:
 def _world_s(recording: run.Recording) -> float:
     """Return the time (s) that the world takes to run `recording` again with the recorded Commands."""
     began = time.perf_counter()
-    course = Course(recording.scenario)
-    for moment in recording.moments:
-        course.observations()
-        course.command(moment.commands)
+    simulation = Simulation(recording.scenario)
+    for moment in recording.ticks:
+        simulation.observations()
+        simulation.command(moment.commands)
     return time.perf_counter() - began
 
 
@@ -292,12 +292,12 @@ def _parts(scenarios: Sequence[Scenario]) -> tuple[float, float, float]:
     """Return the time (s) of the robots' observations, of their decisions, and of the world."""
     sensing = deciding = world = 0.0
     for one in scenarios:
-        course = Course(one)
+        simulation = Simulation(one)
         robots = {robot.id: Robot(one.config(robot.id)) for robot in one.robots}
         end = None
         while end is None:
             began = time.perf_counter()
-            observations = course.observations()
+            observations = simulation.observations()
             sensed = time.perf_counter()
             own_reports = {
                 observation.robot: robots[observation.robot].observation(observation)
@@ -313,7 +313,7 @@ def _parts(scenarios: Sequence[Scenario]) -> tuple[float, float, float]:
                     [one for one in reports if one is not None]
                 )
             decided = time.perf_counter()
-            end = course.command(commands)
+            end = simulation.command(commands)
             world += sensed - began + time.perf_counter() - decided
             sensing += observed - sensed
             deciding += decided - observed

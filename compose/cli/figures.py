@@ -12,7 +12,7 @@ from compose.errors import ENDED, FAILED, UserError
 from compose.extras import need
 from compose.figures import FORMATS, PICTURES
 from compose.recording.robots import alone, casts
-from compose.recording.run import Recording, agent_journal, legible, read
+from compose.recording.run import Recording, agent_journal, read, user_errors
 from compose.terminal.outcome import counting
 from protocol.journal.journal_file import CorruptJournal
 from protocol.output import say
@@ -47,7 +47,7 @@ def main(options: argparse.Namespace) -> int:
     Return FAILED if the journal of a robot is missing or cannot be replayed to its end.
     """
     need("matplotlib")
-    with legible(options.recording):
+    with user_errors(options.recording):
         recording = None if alone(options.recording) else read(options.recording)
         pairs = _casts(options.recording, recording)
     folder, status = options.recording / "figures", ENDED

@@ -18,7 +18,7 @@ from typing import NamedTuple, NoReturn, TextIO
 
 from compose.errors import BROKEN_PIPE, BUG, FAILED, USER_ERROR, UserError
 from protocol import limits
-from protocol.files import said
+from protocol.files import error_text
 from protocol.output import one_line, say
 from protocol.spelling import did_you_mean
 
@@ -149,7 +149,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         status = BROKEN_PIPE
     except OSError as error:
         _discard(sys.stdout)
-        say(f"tandem {command.name}: cannot continue: {said(error)}", error=True)
+        say(f"tandem {command.name}: cannot continue: {error_text(error)}", error=True)
         status = FAILED
     except BaseException as error:  # its exit status must differ from those of missions
         shortage = limits.shortage(error)

@@ -8,7 +8,7 @@ from compose.audit.findings import Violation
 from compose.audit.replay import replay
 from compose.cli.arguments import add_closing, add_recording
 from compose.errors import CLEAN, VIOLATED
-from compose.recording.run import legible
+from compose.recording.run import user_errors
 from protocol.output import say
 
 
@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(options: argparse.Namespace) -> int:
     """Replay the recording, print the first difference, and return VIOLATED if there is one."""
-    with legible(options.recording):
+    with user_errors(options.recording):
         replayed, torn = replay(options.recording)
     if replayed.differences:
         first, *more = replayed.differences

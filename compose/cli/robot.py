@@ -63,7 +63,7 @@ class Agent:
         if status == ENDED:
             return
         if status > 0:
-            raise ChildFailed(f"{self._child.name} {self._child.how()}")
+            raise ChildFailed(f"{self._child.name} {self._child.how_ended()}")
         self._inbox.say(f"{self._child.name} was killed by signal {-status} and is restarted")
         self.end()
         time.sleep(max(0.0, self._started + LEAST_S - time.monotonic()))
@@ -74,7 +74,7 @@ class Agent:
         if self._child.running and not within:
             self._child.stop()
         self._child.end(within or STOP_S)
-        if not self._output_printed and self._child.status == ENDED and (output := self._child.said()):
+        if not self._output_printed and self._child.status == ENDED and (output := self._child.stderr_text()):
             say(*output.splitlines(), error=True)
         self._output_printed = True
         self._child.forget()
@@ -187,7 +187,7 @@ def _run(
             if not options.quiet:
                 where = f", resumed at tick {field.tick}" if field.tick >= 0 else ", waiting for its peer"
                 say(f"{options.id}: in run {field.run}{where}")
-            end = field.play(options.connect_timeout, agent.restart)
+            end = field.run_mission(options.connect_timeout, agent.restart)
             agent.end(STOP_S)
         finally:
             agent.end()

@@ -131,11 +131,11 @@ def _in_process(options: argparse.Namespace, scenario: Scenario, kills: tuple[Ki
         raise UserError("--foxglove: with --in-process, the run is over before a viewer can connect")
     began = time.perf_counter()
     if options.out is None and not options.watch:
-        return conclude(options, in_process.play(scenario), None, "in-process", began)
+        return conclude(options, in_process.run_mission(scenario), None, "in-process", began)
     with folder_for(options.out) as folder, _viewers(options, scenario, folder) as viewing:
         began = time.perf_counter()
         try:
-            finished = in_process.play(scenario, folder)
+            finished = in_process.run_mission(scenario, folder)
         except CannotRecord as error:
             raise UserError(f"--out: {error}") from None
         status = conclude(options, finished, folder, "in-process", began)
@@ -156,7 +156,7 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[
         began = time.perf_counter()
         try:
             with shown_live(options, scenario, folder):
-                spared = processes.play(
+                spared = processes.run_mission(
                     scenario,
                     folder,
                     inbox,

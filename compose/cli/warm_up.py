@@ -22,7 +22,7 @@ def missions() -> None:
     for command in COMMANDS:
         if command.name in FORKED:
             command_parser(command)
-    in_process.play(load(MISSION))
+    in_process.run_mission(load(MISSION))
     for kind in RECEIVED:
         wire.prepare(kind)
     environment.of_world()

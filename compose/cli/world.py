@@ -19,13 +19,13 @@ from compose.cli.arguments import (
     name,
 )
 from compose.errors import ENDED, FAILED, STOPPED, UserError
-from compose.launch.processes import handed
+from compose.launch.processes import scenario_from_launcher
 from compose.launch.signals import stop_by_signal, stop_with_launcher
 from compose.network import beyond, reach
 from compose.recording.run import WORLD_JOURNAL, folder_for, read
 from compose.scenario import kills
 from compose.scenario.scenario_file import check_rate, run_name, setting
-from compose.terminal.outcome import break_off, conclude, going_on, shown_live
+from compose.terminal.outcome import break_off, conclude, reopened, shown_live
 from protocol import limits
 from protocol.journal.journal_file import CannotRecord, CorruptJournal, Journal
 from protocol.journal.resume import Retrace
@@ -35,7 +35,7 @@ from protocol.network.inbox import Inbox, Interrupted
 from protocol.output import say
 from world.process import NoRouter, WorldLinks, WorldProcess
 from world.scenario import Scenario
-from world.simulation import Course, again
+from world.simulation import Simulation, resumed
 
 RELISTEN_S = 5.0
 """s to wait for the port of a world that has just been killed to become free."""
@@ -70,7 +70,7 @@ def main(options: argparse.Namespace) -> int:
     try:
         endpoints = _endpoints(options)
         recording = _old_journal(options)
-        course = again(scenario, recording) if recording is not None else None
+        simulation = resumed(scenario, recording) if recording is not None else None
         limits.need_files(limits.SESSION_FILES + len(scenario.robots), "a world with a link to each robot")
         with ExitStack() as stack:
             wait = RELISTEN_S if recording is not None else 0.0
@@ -78,11 +78,11 @@ def main(options: argparse.Namespace) -> int:
             if (warning := beyond(endpoints)) is not None:
                 inbox.say(warning)
             folder = stack.enter_context(folder_for(options.out))
-            if course is None or recording is None:
+            if simulation is None or recording is None:
                 journal = stack.enter_context(Journal(folder / WORLD_JOURNAL, fsync=options.fsync))
-                return _run(options, Course(scenario, journal), links, folder, inbox)
-            course.keep(stack.enter_context(going_on(recording, inbox)))
-            return _run(options, course, links, folder, inbox)
+                return _run(options, Simulation(scenario, journal), links, folder, inbox)
+            simulation.append_to(stack.enter_context(reopened(recording, inbox)))
+            return _run(options, simulation, links, folder, inbox)
     except session.CannotListen as error:
         raise UserError(f"--listen: {error}") from None
     except CannotRecord as error:
@@ -100,7 +100,7 @@ def main(options: argparse.Namespace) -> int:
 def _scenario(options: argparse.Namespace) -> Scenario:
     """Return the scenario of the launcher or of the command line. Raises UserError."""
     if options.launched:
-        return handed()
+        return scenario_from_launcher()
     found = setting(options.scenario, options.fault)
     if found.file.kill:
         raise UserError(
@@ -123,13 +123,15 @@ def _old_journal(options: argparse.Namespace) -> Retrace | None:
     return Retrace(path, fsync=options.fsync) if path is not None and path.exists() else None
 
 
-def _run(options: argparse.Namespace, course: Course, links: WorldLinks, folder: Path, inbox: Inbox) -> int:
+def _run(
+    options: argparse.Namespace, simulation: Simulation, links: WorldLinks, folder: Path, inbox: Inbox
+) -> int:
     """Run the mission, write its files, and return the exit status. Raises Interrupted or NoRouter."""
     began = time.perf_counter()
-    scenario = course.world.scenario
+    scenario = simulation.world.scenario
     run = options.run or run_name(scenario, options.out)
     process = WorldProcess(
-        course,
+        simulation,
         run,
         inbox,
         rate=options.rate,
@@ -138,7 +140,7 @@ def _run(options: argparse.Namespace, course: Course, links: WorldLinks, folder:
     )
     if not (options.quiet or options.launched):
         robots = ", ".join(robot.id for robot in scenario.robots)
-        where = f", resumed at tick {course.tick}" if course.tick else ""
+        where = f", resumed at tick {simulation.tick}" if simulation.tick else ""
         at = " and ".join(links.endpoints.listen) or links.endpoints
         say(f"run {run} at {at}{where}: waiting for {robots}")
     try:

@@ -28,7 +28,7 @@ from protocol.wire import MalformedFrame, decode
 
 ASK_S = 2.0
 """Time in s to wait for one answer."""
-LOOK_AGAIN_S = 0.01
+POLL_S = 0.01
 """The polling interval in s."""
 MATCHED_S = 0.5
 """Time in s that a world has to learn of a subscriber to its ground truth."""
@@ -165,7 +165,7 @@ def _reading(pair: SessionPair, run: str, robot: str, wait: float) -> Iterator[F
     now = time.monotonic()
     matched, until = now + MATCHED_S, now + MATCHED_S + wait
     while len(ticks) < TICKS and len(received) < len(subscribers) and now < until:
-        time.sleep(LOOK_AGAIN_S)
+        time.sleep(POLL_S)
         now = time.monotonic()
         if (sample := _under(keys.observation(run, robot), own)) is not None and now >= matched:
             ticks |= _ticks(sample.payload.to_bytes())

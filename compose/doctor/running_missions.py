@@ -23,7 +23,7 @@ ASK_S = 2.0
 """Time in s to wait for one answer."""
 FIND_S = 0.5
 """Time in s to look for a mission if there is none: routers may just have connected to each other."""
-LOOK_AGAIN_S = 0.02
+POLL_S = 0.02
 """The polling interval in s."""
 AHEAD = 4
 """The number of ticks by which a Command may be ahead of the latest received Observation."""
@@ -84,7 +84,7 @@ def _alive(link: zenoh.Session) -> dict[str, frozenset[str]]:
         robots = session.alive(link, keys.robot_alive("*", "*"), ASK_S)
         if worlds or robots or time.monotonic() >= until:
             break
-        time.sleep(LOOK_AGAIN_S)
+        time.sleep(POLL_S)
     found: dict[str, set[str]] = {}
     for key in (*worlds, *robots):
         found.setdefault(key.run, set()).add(key.robot)
@@ -110,7 +110,7 @@ class _LatestFrames:
         ]
         until = time.monotonic() + wait
         while not all(map(self._is_complete, self._alive)) and time.monotonic() < until:
-            time.sleep(LOOK_AGAIN_S)
+            time.sleep(POLL_S)
         self._over = True
         for one in declared:
             one.undeclare()

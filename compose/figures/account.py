@@ -54,8 +54,8 @@ def _recomputed(past: Past) -> Account:
         except Exception as error:  # noqa: BLE001  # recorded inputs may raise any error in the planner
             why = f"the planner fails on its inputs of tick {tick}: {type(error).__name__}: {error}"
             return Account(past, tuple(states), why)
-        if robot.drive_frame != encode(step.command):
+        if robot.command_frame != encode(step.command):
             why = f"the recorded decision at tick {tick} differs: another version wrote the journal"
             return Account(past, tuple(states), why)
-        states.append(robot.mind)
+        states.append(robot.state)
     return Account(past, tuple(states))

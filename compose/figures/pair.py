@@ -147,7 +147,7 @@ def of_record(recording: Recording, places: tuple[int, int], accounts: Mapping[s
 
     `accounts` holds the readable journals by robot id.
     """
-    scenario, moments = recording.scenario, recording.moments
+    scenario, moments = recording.scenario, recording.ticks
     last = len(moments) - 1
     how = (
         ended(recording.end.outcome, last, recording.end.reason)

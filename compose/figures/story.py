@@ -51,13 +51,13 @@ class Story(msgspec.Struct, frozen=True, dict=True):
     @property
     def last(self) -> int:
         """The last recorded tick."""
-        return max(0, len(self.recording.moments) - 1)
+        return max(0, len(self.recording.ticks) - 1)
 
     def truth(self, robot: str | None = None) -> list[Pose]:
         """Return the true pose of `robot`, by default this robot, in every tick; at least its start."""
         places = {one.id: i for i, one in enumerate(self.recording.scenario.robots)}
         place = self.place if robot is None else places[robot]
-        poses = [moment.truth.poses[place] for moment in self.recording.moments]
+        poses = [moment.truth.poses[place] for moment in self.recording.ticks]
         return poses or [self.recording.scenario.robots[place].start]
 
     @cached_property
@@ -94,7 +94,7 @@ class Story(msgspec.Struct, frozen=True, dict=True):
     def phases(self) -> tuple[Span, ...]:
         """The phases in order, over all recorded ticks. A tick without a Command has the phase before it."""
         by_tick, phase = [], 1
-        for moment in self.recording.moments:
+        for moment in self.recording.ticks:
             command = moment.commands.get(self.own.id)
             phase = command.phase if command is not None else phase
             by_tick.append((phase, moment.truth.tick))

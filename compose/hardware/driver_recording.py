@@ -9,9 +9,9 @@ from pathlib import Path
 
 import msgspec
 
-from compose.launch.driver_loader import again
+from compose.launch.driver_loader import resume_driver
 from compose.recording.run import agent_journal
-from compose.terminal.outcome import going_on
+from compose.terminal.outcome import reopened
 from protocol.journal.journal_file import CannotRecord, CorruptJournal, Journal
 from protocol.journal.resume import Retrace
 from protocol.messages import Observation, OfRobot, RobotConfig
@@ -23,7 +23,7 @@ from world.hardware.driver_journal import DriverPast, ProcessStart, boot, driver
 
 RELEASE_S = 10.0
 """Time in s that the agent of a killed launcher has to end, which unlocks its journal."""
-LOOK_AGAIN_S = 0.02
+POLL_S = 0.02
 """The polling interval in s."""
 
 
@@ -44,7 +44,7 @@ class DriverRecord(msgspec.Struct, frozen=True):
     def take_up(self, driver: Driver, name: str, field: Field) -> None:
         """Resume the mission with `driver`, called `name` in errors. Raises UserError if it cannot."""
         if self.past.ticks:
-            again(driver, name, self.past)
+            resume_driver(driver, name, self.past)
         if self.again:
             field.resume(self.past, self.known)
         if self.past.end is None and self.past.start != self.start:
@@ -81,7 +81,7 @@ def recorded(folder: Path, config: RobotConfig, inbox: Inbox, *, fsync: bool) ->
     except BaseException:
         old.close()
         raise
-    with going_on(old, inbox) as journal:
+    with reopened(old, inbox) as journal:
         yield DriverRecord(journal, past, known, again=True, start=start)
 
 
@@ -94,7 +94,7 @@ def _frames(path: Path, inbox: Inbox) -> list[bytes]:
         except CannotRecord:
             if time.monotonic() >= give_up:
                 raise
-            inbox.next(LOOK_AGAIN_S)
+            inbox.next(POLL_S)
         else:
             old.close()
             return old.frames

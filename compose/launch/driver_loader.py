@@ -57,7 +57,7 @@ def made(
         raise UserError(f"{name}: cannot be created: {type(error).__name__}: {error}") from None
 
 
-def again(driver: Driver, name: str, past: DriverPast) -> None:
+def resume_driver(driver: Driver, name: str, past: DriverPast) -> None:
     """Stop the robot, and resume its driver at the end of `past`. Raises UserError."""
     resume = getattr(driver, "resume", None)
     if not callable(resume):

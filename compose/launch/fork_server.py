@@ -28,7 +28,7 @@ NOT_FORKED = 71
 """The exit status reported for a process that could not be forked (EX_OSERR)."""
 LINGER_S = 5.0
 """Time in s that processes have to end after their launcher has ended; then they are killed."""
-LOOK_AGAIN_S = 0.01
+POLL_S = 0.01
 """The polling interval in s."""
 PR_SET_PDEATHSIG = 1
 """The option of prctl(2) for a signal on the end of the parent, from <sys/prctl.h>."""
@@ -63,7 +63,7 @@ class _RequestLoop:
         """Wait at most LINGER_S until all children have ended."""
         give_up = time.monotonic() + LINGER_S
         while self._numbers and time.monotonic() < give_up:
-            time.sleep(LOOK_AGAIN_S)
+            time.sleep(POLL_S)
 
     def _request(self) -> tuple[ForkRequest | Signal, list[int]] | None:
         head, streams, _, _ = socket.recv_fds(self._launcher, LENGTH_BYTES, STREAMS)

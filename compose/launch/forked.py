@@ -139,7 +139,7 @@ class Process:
         for stream in streams:
             os.close(stream)
 
-    def hand(self, data: bytes) -> None:
+    def send(self, data: bytes) -> None:
         """Write `data` to the standard input of the process, unless it has ended."""
         rest = memoryview(data)
         with suppress(BrokenPipeError):

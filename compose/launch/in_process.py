@@ -12,10 +12,10 @@ from protocol.journal.journal_file import Journal, Sink
 from protocol.messages import Command, FinalReport, MissionEnd
 from world.faults import LATEST
 from world.scenario import Scenario
-from world.simulation import Course
+from world.simulation import Simulation
 
 
-def play(scenario: Scenario, out: Path | None = None) -> Recording:
+def run_mission(scenario: Scenario, out: Path | None = None) -> Recording:
     """Run `scenario`, and write its journals to `out`. They are identical to those of a run as processes.
 
     Raises CannotRecord if `out` contains a recording, or cannot be written.
@@ -36,13 +36,13 @@ def journals(scenario: Scenario) -> list[str]:
 def played(scenario: Scenario, sinks: Mapping[str, Sink]) -> Recording:
     """Run `scenario`, and write its journals to `sinks`, by file name; without sinks, write none."""
     ids = [robot.id for robot in scenario.robots]
-    course = Course(scenario, sinks.get(WORLD_JOURNAL))
+    simulation = Simulation(scenario, sinks.get(WORLD_JOURNAL))
     robots = {robot: Robot(scenario.config(robot), sinks.get(agent_journal(robot))) for robot in ids}
     moments: list[TickRecord] = []
     end: MissionEnd | None = None
     sent: dict[tuple[str, int], FramedReport] = {}
     while end is None:
-        observations = course.observations()
+        observations = simulation.observations()
         for observation in observations:
             report = robots[observation.robot].observation(observation)
             if report is not None:
@@ -57,9 +57,9 @@ def played(scenario: Scenario, sinks: Mapping[str, Sink]) -> Recording:
                 robots[observation.robot].estimate()
         if sent:
             for robot in ids:  # it can no longer be received
-                sent.pop((robot, course.tick - LATEST), None)
-        moments.append(TickRecord(course.world.truth, commands))
-        end = course.command(commands)
+                sent.pop((robot, simulation.tick - LATEST), None)
+        moments.append(TickRecord(simulation.world.truth, commands))
+        end = simulation.command(commands)
     final_reports: dict[str, FinalReport] = {robot: robots[robot].final_report(end) for robot in ids}
-    course.final_reports(final_reports.values())
+    simulation.journal_final_reports(final_reports.values())
     return Recording(scenario, tuple(moments), end, final_reports)

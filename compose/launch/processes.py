@@ -85,23 +85,23 @@ class MissionProcess:
         """Wait for the process to end, and return its exit status; negative is the signal that killed it."""
         return self._process.status
 
-    def said(self) -> str:
+    def stderr_text(self) -> str:
         """Return what the process has written to its standard error."""
         self._errors.seek(0)
         return self._errors.read().decode(errors="replace").strip()
 
-    def how(self) -> str:
+    def how_ended(self) -> str:
         """Return how the process ended, as part of an error message."""
         if self._server.gone:
             return f"was killed: {self._server.why_gone()}"
-        how = (
+        ending = (
             f"was killed by signal {-self.status}" if self.status < 0 else f"ended with status {self.status}"
         )
-        return f"{how}: {'; '.join(errors.splitlines())}" if (errors := self.said()) else how
+        return f"{ending}: {'; '.join(errors.splitlines())}" if (errors := self.stderr_text()) else ending
 
-    def hand(self, frame: bytes) -> None:
+    def send(self, frame: bytes) -> None:
         """Send `frame`, preceded by its length, to the standard input of the process."""
-        self._process.hand(len(frame).to_bytes(4, "big") + frame)
+        self._process.send(len(frame).to_bytes(4, "big") + frame)
 
     def stop(self) -> None:
         """Send SIGTERM, and SIGCONT in case the process is suspended."""
@@ -117,13 +117,13 @@ class MissionProcess:
         self._errors.close()
 
 
-def handed() -> Scenario:
+def scenario_from_launcher() -> Scenario:
     """Return the scenario that the launcher sent to the standard input of this child process."""
     size = int.from_bytes(sys.stdin.buffer.read(4), "big")
     return decode(sys.stdin.buffer.read(size), Scenario, MAX_FRAME_BYTES)
 
 
-def play(
+def run_mission(
     scenario: Scenario,
     out: Path,
     inbox: Inbox,
@@ -211,10 +211,13 @@ class _Run:
             self.children[name].forget()
         self.children[name] = MissionProcess(name, self._arguments[name], self._inbox, kills)
         if name == WORLD:
-            self.children[name].hand(encode(self._scenario))
+            self.children[name].send(encode(self._scenario))
 
     def watch(self) -> None:
-        """Wait until all have ended, the agents at most FOLLOW_S after the world. Raises ChildFailed."""
+        """Wait until all processes have ended, the agents at most FOLLOW_S after the world.
+
+        Raises ChildFailed.
+        """
         running = set(self.names)
         while running:
             arrival = self._inbox.next(self._timeout(WORLD in running))
@@ -243,9 +246,9 @@ class _Run:
 
         Raises ChildFailed if the child did not end by one of its kills, or by a kill without a restart.
         """
-        kill = taken(child.kills, child.said()) if child.status == -signal.SIGKILL else None
+        kill = taken(child.kills, child.stderr_text()) if child.status == -signal.SIGKILL else None
         if kill is None:
-            raise ChildFailed(f"{child.name} {child.how()}")
+            raise ChildFailed(f"{child.name} {child.how_ended()}")
         if kill.after is None:
             raise ChildFailed(f"{child.name} was killed at tick {kill.tick} (--kill {kill.text})")
         child.kills.remove(kill)
@@ -258,7 +261,7 @@ class _Run:
         """End all processes, and print what those that ended well wrote to standard error."""
         _stop(self.children.values())
         for child in self.children.values():
-            if child.status == ENDED and (errors := child.said()):
+            if child.status == ENDED and (errors := child.stderr_text()):
                 say(*errors.splitlines(), error=True)
             child.forget()
 

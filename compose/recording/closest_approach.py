@@ -7,7 +7,7 @@ import math
 from compose.recording.run import Recording, TickRecord
 from protocol.motion import Pose, step
 from world.sensors import executed, mutual_ranges
-from world.truth import asked
+from world.truth import limited_controls
 
 INSTANTS = 32
 """The number of equal parts of a tick, at whose ends the distance is computed."""
@@ -25,7 +25,7 @@ def nearest(recording: Recording) -> float | None:
 
 def _of_pair(recording: Recording, pair: tuple[int, int]) -> float | None:
     scenario, least = recording.scenario, None
-    for moment in recording.moments:
+    for moment in recording.ticks:
         (mutual,) = mutual_ranges(moment.truth, scenario, [pair])
         if least is None and (mutual is None or mutual.range is None):
             continue
@@ -38,10 +38,10 @@ def _of_pair(recording: Recording, pair: tuple[int, int]) -> float | None:
 def _path(recording: Recording, moment: TickRecord, place: int) -> list[Pose]:
     """Return INSTANTS + 1 poses of a robot from this tick to the next; in the last tick, it is at rest."""
     scenario, pose = recording.scenario, moment.truth.poses[place]
-    if moment is recording.moments[-1]:
+    if moment is recording.ticks[-1]:
         return [pose] * (INSTANTS + 1)
     robot = scenario.robots[place].id
     command = moment.commands.get(robot)
-    driven = executed(asked(command, scenario.mission), scenario, robot, moment.truth.tick)
+    driven = executed(limited_controls(command, scenario.mission), scenario, robot, moment.truth.tick)
     period = scenario.mission.period
     return [step(pose, driven.v, driven.omega, period * i / INSTANTS) for i in range(INSTANTS + 1)]

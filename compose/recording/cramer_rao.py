@@ -18,7 +18,7 @@ from agent.estimation.gaussian.range_model import Ranges
 from compose.recording.run import Recording
 from protocol.motion import Controls, Pose
 from world.sensors import anchor_ranges, executed, mutual_ranges
-from world.truth import asked
+from world.truth import limited_controls
 
 
 def position_bounds(recording: Recording, pair: tuple[int, int], tick: int) -> tuple[float, float] | None:
@@ -30,7 +30,7 @@ def position_bounds(recording: Recording, pair: tuple[int, int], tick: int) -> t
     noise = scenario.mission.noise
     if noise.exact or noise.outliers or noise.anchor_sigma == noise.mutual_sigma == 0.0:
         return None
-    moments = recording.moments[: tick + 1]
+    moments = recording.ticks[: tick + 1]
     anchors = [scenario.robots[place].anchor for place in pair]
     own: list[list[tuple[int, float]]] = [[], []]
     mutual: list[tuple[int, float]] = []
@@ -66,8 +66,10 @@ def _driven(recording: Recording, place: int, tick: int) -> Track:
     scenario = recording.scenario
     robot = scenario.robots[place].id
     driven: Sequence[Controls] = [
-        executed(asked(moment.commands.get(robot), scenario.mission), scenario, robot, moment.truth.tick)
-        for moment in recording.moments[:tick]
+        executed(
+            limited_controls(moment.commands.get(robot), scenario.mission), scenario, robot, moment.truth.tick
+        )
+        for moment in recording.ticks[:tick]
     ]
     v, omega = np.array([one.v for one in driven]), np.array([one.omega for one in driven])
     return track(v, omega, scenario.mission.period)

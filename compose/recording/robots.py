@@ -31,7 +31,7 @@ def pasts(folder: Path) -> dict[str, Past]:
     """Return the content of each agent's journal in `folder`, by robot.
 
     Journals without a RobotConfig are omitted. Raises OSError if a journal cannot be read, CorruptJournal if
-    one is damaged before its end or is of another run than its peer's.
+    one is damaged before its end or belongs to another run than its peer's.
     """
     contents = {robot: past_of(folder, robot) for robot in map(robot_of, journals_in(folder))}
     found = {robot: past for robot, past in contents.items() if past is not None}
@@ -43,7 +43,7 @@ def casts(folder: Path) -> list[tuple[str, ...]]:
     """Return the pairs of which at least one robot has a journal in `folder`, role a first.
 
     A robot whose journal has no RobotConfig is in a tuple of its own. Raises OSError if a journal cannot be
-    read, CorruptJournal if one is of another run than its peer's.
+    read, CorruptJournal if one belongs to another run than its peer's.
     """
     robots = [robot_of(path) for path in journals_in(folder)]
     configs = {
@@ -63,7 +63,9 @@ def agree(configs: Mapping[str, RobotConfig], folder: object) -> None:
         other = configs.get(one.peer)
         if other is not None and _shared(one, robot) != _shared(other, robot):
             path = f"{folder}/{agent_journal(one.peer)}"
-            raise CorruptJournal(f"{path}: from another run: its configuration does not match {robot}'s")
+            raise CorruptJournal(
+                f"{path}: belongs to another run: its configuration does not match {robot}'s"
+            )
 
 
 def _shared(config: RobotConfig, robot: str) -> tuple[object, ...]:

@@ -71,33 +71,33 @@ class TickRecord(msgspec.Struct, frozen=True):
     """One tick of a run."""
 
     truth: Truth
-    """Ground truth at the tick."""
+    """The true poses at the tick."""
     commands: dict[str, Command]
-    """Commands of the tick, by robot; a Command that was late is missing."""
+    """The Commands of the tick, by robot, without those that were late."""
 
 
 class Recording(msgspec.Struct, frozen=True):
     """The content of the world's journal of a run."""
 
     scenario: Scenario
-    moments: tuple[TickRecord, ...]
-    """Ticks, from tick 0."""
+    ticks: tuple[TickRecord, ...]
+    """The ticks of the run, from tick 0."""
     end: MissionEnd | None
-    """End of the mission; None if the recording breaks off."""
+    """The end of the mission; None if the recording breaks off."""
     final_reports: dict[str, FinalReport]
-    """FinalReports, by robot."""
+    """The FinalReports, by robot."""
 
 
 class JournalFile(msgspec.Struct, frozen=True):
     """A journal on disk."""
 
     frames: list[bytes]
-    """Complete frames."""
+    """The complete frames."""
     torn: int
-    """Number of bytes of a torn write at the end."""
+    """The number of bytes of a torn write at the end."""
 
 
-def books(folder: Path) -> dict[str, JournalFile]:
+def read_journals(folder: Path) -> dict[str, JournalFile]:
     """Return the journals of the recording in `folder`, by file name; the world's is first.
 
     Raises OSError if there is no journal or one cannot be read, CorruptJournal if one contains anything other
@@ -118,15 +118,15 @@ def read(folder: Path) -> Recording:
     run = history(journal_file.read(path), path)
     if run.disorder is not None:
         raise journal_file.CorruptJournal(f"{path}: {run.disorder.what}")
-    moments = tuple([TickRecord(tick.world.truth, tick.commands) for tick in run.ticks])
-    return Recording(run.scenario, moments, run.end, run.final_reports)
+    ticks = tuple([TickRecord(tick.world.truth, tick.commands) for tick in run.ticks])
+    return Recording(run.scenario, ticks, run.end, run.final_reports)
 
 
 def estimates(folder: Path, robot: str) -> tuple[Estimate, ...]:
     """Return the Estimate of each tick in the journal of `robot` in `folder`.
 
-    Raises OSError if there is no such journal, CorruptJournal if it is damaged before its end, or is the
-    journal of another robot or of another run.
+    Raises OSError if there is no such journal, CorruptJournal if it is damaged before its end, or
+    belongs to another robot or another run.
     """
     past = past_of(folder, robot)
     return past.estimates if past is not None else ()
@@ -150,13 +150,13 @@ def past_of(folder: Path, robot: str) -> Past | None:
     head = list(islice(journal_file.read(world), 2)) if world.exists() else []
     if not is_blank(head) and not opened(head, world)[0].is_of(past.config):
         raise journal_file.CorruptJournal(
-            f"{path}: from another run: its configuration does not match the world's"
+            f"{path}: belongs to another run: its configuration does not match the world's"
         )
     return past
 
 
 @contextmanager
-def legible(folder: Path) -> Iterator[None]:
+def user_errors(folder: Path) -> Iterator[None]:
     """Raise UserError, with one line, for every error that prevents reading the recording in `folder`."""
     try:
         yield

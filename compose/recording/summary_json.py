@@ -31,7 +31,7 @@ def summary(recording: Recording, mode: Mode, wall_s: float | None) -> dict[str,
 
     `wall_s` is the wall time of the run in s.
     """
-    scenario, moments = recording.scenario, recording.moments
+    scenario, moments = recording.scenario, recording.ticks
     return {
         "scenario": scenario.name,
         "seed": scenario.seed,
@@ -63,7 +63,7 @@ def summary(recording: Recording, mode: Mode, wall_s: float | None) -> dict[str,
 def first_contact(recording: Recording) -> int | None:
     """Return the first tick at which two peers were in range of each other; None if there is none."""
     pairs = recording.scenario.pairs()
-    for moment in recording.moments:
+    for moment in recording.ticks:
         if any(mutual is not None for mutual in mutual_ranges(moment.truth, recording.scenario, pairs)):
             return moment.truth.tick
     return None
@@ -72,7 +72,7 @@ def first_contact(recording: Recording) -> int | None:
 def first_claim(recording: Recording, place: int) -> Claim | None:
     """Return the first claim of the robot at `place` in the scenario; None if it made none."""
     robot = recording.scenario.robots[place].id
-    for moment in recording.moments:
+    for moment in recording.ticks:
         command = moment.commands.get(robot)
         if command is not None and isinstance(command.verdict, Localised):
             return claim(moment.truth.tick, command.verdict, moment.truth.poses[place])
@@ -89,7 +89,7 @@ def _robot_summary(recording: Recording, place: int) -> dict[str, Any]:
         "localised_tick": claimed.tick if claimed is not None else None,
         "estimate": _listed(claimed.pose) if claimed is not None else None,
         "covariance": matrix(covariance) if covariance is not None else None,
-        "truth": _listed(recording.moments[-1].truth.poses[place]) if recording.moments else None,
+        "truth": _listed(recording.ticks[-1].truth.poses[place]) if recording.ticks else None,
         "position_error_m": claimed.position_error if claimed is not None else None,
         "heading_error_rad": claimed.heading_error if claimed is not None else None,
         "position_sigma_m": covariance.position_sigma if covariance is not None else None,
@@ -97,7 +97,7 @@ def _robot_summary(recording: Recording, place: int) -> dict[str, Any]:
         "nees": claimed.nees if claimed is not None else None,
         **{field: getattr(final_report, field, None) for field in _COUNTS},
         "no_farewell": None if final_report is not None else _missing_final_report(recording, robot),
-        "deadlines_missed": sum([robot not in moment.commands for moment in recording.moments[:-1]]),
+        "deadlines_missed": sum([robot not in moment.commands for moment in recording.ticks[:-1]]),
     }
 
 
@@ -105,9 +105,7 @@ def _missing_final_report(recording: Recording, robot: str) -> str:
     """Return why the world's journal has no FinalReport of `robot`."""
     if recording.end is None:
         return "the recording breaks off"
-    latest = max(
-        [moment.truth.tick for moment in recording.moments if robot in moment.commands], default=None
-    )
+    latest = max([moment.truth.tick for moment in recording.ticks if robot in moment.commands], default=None)
     if latest is None:
         return "none of its Commands arrived in time"
     if latest < recording.end.tick:

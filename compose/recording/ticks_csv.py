@@ -14,7 +14,7 @@ from compose.recording.run import Recording
 from protocol.motion import Pose, wrap
 from world.scenario import Scenario
 from world.sensors import anchor_ranges, executed, mutual_ranges
-from world.truth import Truth, asked
+from world.truth import Truth, limited_controls
 
 if TYPE_CHECKING:
     from agent.process.agent_journal import Past
@@ -55,8 +55,8 @@ class TickRow(msgspec.Struct, frozen=True):
 def rows(recording: Recording) -> Iterator[TickRow]:
     """Yield one row per tick and robot, from tick 0."""
     scenario = recording.scenario
-    last = recording.moments[-1].truth.tick if recording.moments else 0
-    for moment in recording.moments:
+    last = recording.ticks[-1].truth.tick if recording.ticks else 0
+    for moment in recording.ticks:
         tick = moment.truth.tick
         anchor = anchor_ranges(moment.truth, scenario)
         mutual = _mutual(scenario, moment.truth)
@@ -64,7 +64,7 @@ def rows(recording: Recording) -> Iterator[TickRow]:
             command = moment.commands.get(robot.id)
             v = omega = None
             if tick != last:
-                driven = executed(asked(command, scenario.mission), scenario, robot.id, tick)
+                driven = executed(limited_controls(command, scenario.mission), scenario, robot.id, tick)
                 v, omega = driven.v, driven.omega
             yield TickRow(
                 *(tick, robot.id, pose.x, pose.y, wrap(pose.heading), v, omega),

@@ -111,7 +111,7 @@ def sweep(sweep: Sweep, out: Path, means: ExecutionOptions, inbox: Inbox, progre
             except BrokenPipeError:
                 raise
             except OSError as error:
-                stopped = f"cannot continue: {files.said(error)}"
+                stopped = f"cannot continue: {files.error_text(error)}"
         return _gathered(folder, stopped, interrupted)
 
 
@@ -189,7 +189,7 @@ def _gathered(folder: Folder, stopped: str | None, interrupted: bool) -> Results
         folder.gather(table)
         files.write(folder.path / SUMMARY, summary_csv(folder.sweep, cells, figures))
     except OSError as error:
-        stopped = stopped or f"cannot be written: {files.said(error)}"
+        stopped = stopped or f"cannot be written: {files.error_text(error)}"
     trials = folder.sweep.trials * (len(cells) - len(folder.refused))
     return Results(folder.sweep, cells, table, figures, stopped, interrupted, trials)
 

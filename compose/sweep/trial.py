@@ -163,7 +163,7 @@ def lost(cell: int, trial: int, seed: int, error: str, wall_s: float | None) -> 
     )
 
 
-def play(trial: Trial) -> TrialRow:
+def run_trial(trial: Trial) -> TrialRow:
     """Run the trial, and return its row.
 
     The outcome is `failed` if kills changed the recording. The caller turns exceptions into lost trials.
@@ -291,7 +291,7 @@ def _meeting(recording: Recording, a: str, b: str) -> tuple[int | None, int | No
     The first is None if phase 3 begins earlier, and each is None if it never happens.
     """
     orbiting = None
-    for moment in recording.moments:
+    for moment in recording.ticks:
         commands = [
             command for command in (moment.commands.get(a), moment.commands.get(b)) if command is not None
         ]

@@ -42,10 +42,10 @@ def run_in_process(scenario: Scenario, *, audit: bool) -> Played:
     """Run `scenario` in this process. Journals are written, to memory, only for an audit."""
     began = time.perf_counter()
     if not audit:
-        return Played(in_process.play(scenario), None, time.perf_counter() - began)
+        return Played(in_process.run_mission(scenario), None, time.perf_counter() - began)
     journals = {name: MemoryJournal() for name in in_process.journals(scenario)}
     recording = in_process.played(scenario, journals)
-    findings = rules.judge({name: journal.frames for name, journal in journals.items()})
+    findings = rules.audit_world_run({name: journal.frames for name, journal in journals.items()})
     return Played(recording, findings, time.perf_counter() - began)
 
 
@@ -59,7 +59,7 @@ def as_processes(scenario: Scenario, *, audit: bool, kills: Sequence[Kill] | Non
     began = time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="tandem-") as folder:
         out = Path(folder)
-        missed = processes.play(
+        missed = processes.run_mission(
             scenario,
             out,
             Inbox("tandem sweep"),

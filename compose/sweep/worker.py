@@ -28,7 +28,7 @@ from compose.sweep import trial
 from compose.sweep.draws import Draws
 from protocol.output import one_line
 
-PLAY = "compose.sweep.trial:play"
+PLAY = "compose.sweep.trial:run_trial"
 """The default function that runs a trial."""
 READY = b""
 """The first frame, sent when all modules are imported."""

@@ -55,7 +55,7 @@ class WorkerProcess:
 
     def ask(self, chunk: Chunk) -> None:
         """Send the trials of `chunk` to the process, which runs them."""
-        self._process.hand(framed(msgspec.msgpack.encode(chunk)))
+        self._process.send(framed(msgspec.msgpack.encode(chunk)))
 
     def answer(self, timeout: float) -> bytes:
         """Return the next frame. Raises Hung after `timeout` seconds, and Died if the process has ended."""

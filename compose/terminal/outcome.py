@@ -86,9 +86,9 @@ def break_off(options: argparse.Namespace, folder: Path, reason: str, began: flo
         leave(recording, result | {"reason": reason}, folder)
 
 
-def going_on(old: Retrace, inbox: Inbox) -> Journal:
+def reopened(old: Retrace, inbox: Inbox) -> Journal:
     """Return the journal of `old`, open for appending; report a torn end. Raises CannotRecord."""
-    journal, cut = old.go_on()
+    journal, cut = old.open_for_append()
     if cut:
         inbox.say(f"{old.path}: the last {cut} bytes are of a torn write and are cut off")
     return journal

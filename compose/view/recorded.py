@@ -93,7 +93,7 @@ class Journals:
             scenario = self._world.world.scenario
             for robot in [robot for robot, one in configs.items() if not scenario.is_of(one)]:
                 path = self.folder / agent_journal(robot)
-                self._note(f"{path}: belongs to another run: its configuration does not match world.journal")
+                self._note(f"{path}: belongs to another run: its configuration does not match the world's")
         if self._world is None and len(configs) > (len(self.stage.robots) if self.stage is not None else 0):
             self.stage = of_configs(self.folder.name, configs)
 
@@ -101,7 +101,7 @@ class Journals:
         """Compute missing observations from the world's journal. Call once the journals are complete."""
         if self._world is None:
             return
-        for world in self._world.told().worlds:
+        for world in self._world.content().worlds:
             facts = self.known.at(world.truth.tick)
             if len(facts.observations) < len(world.scenario.robots):
                 for observation in observations(world):
@@ -152,9 +152,9 @@ class Journals:
         facts = self.known.at(world.truth.tick)
         facts.truth.update(zip(ids, world.truth.poses, strict=True))
         self.known.has_truth = True
-        if world.air:
+        if world.links:
             links = [link for one, other in world.pairs for link in ((one, other), (other, one))]
-            for (sender, receiver), air in zip(links, world.air, strict=True):
+            for (sender, receiver), air in zip(links, world.links, strict=True):
                 facts.under_way[ids[sender], ids[receiver]] = tuple([flying.tick for flying in air.flying])
 
     def _mode(self) -> str | None:

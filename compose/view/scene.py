@@ -57,7 +57,7 @@ class Player(msgspec.Struct, frozen=True, omit_defaults=True):
     """One robot in one tick. A field is None if it did not occur or is unknown."""
 
     robot: str
-    mode_name: str
+    activity: str
     """The robot's activity, as a sentence."""
     pose: Pose | None = None
     """The true pose; its heading is wrapped."""
@@ -112,7 +112,7 @@ def _player(seat: Seat, now: Facts) -> Player:
         sentence = f"{robot} has missed the deadline and stands still"
     return Player(
         robot=robot,
-        mode_name=sentence,
+        activity=sentence,
         pose=Pose(pose.x, pose.y, wrap(pose.heading)) if pose is not None else None,
         sensed=observation is not None,
         down=down,

@@ -2,7 +2,7 @@
 
 The process recomputes its state from the frames in the journal, and writes every frame again to a `Retrace`,
 which compares it with the recorded one. It therefore only adds to a journal that it would have written
-itself. Until `go_on`, nothing changes on disk.
+itself. Until `open_for_append`, nothing changes on disk.
 """
 
 from __future__ import annotations
@@ -46,8 +46,9 @@ class Retrace:
             raise
 
     def write(self, *frames: bytes) -> None:
-        """Compare `frames` with the next recorded ones, and store those beyond the last one for `go_on`.
+        """Compare `frames` with the next recorded ones.
 
+        Frames beyond the last recorded one are stored until `open_for_append`, which writes them.
         Raises ReplayMismatch if a frame differs.
         """
         for frame in frames:
@@ -58,11 +59,11 @@ class Retrace:
             else:
                 raise ReplayMismatch
 
-    def go_on(self) -> tuple[Journal, int]:
+    def open_for_append(self) -> tuple[Journal, int]:
         """Return the journal, open for appending, and the number of bytes that were cut off its end.
 
-        The bytes that are cut off are those of a torn frame, and of frames that were not written again. The
-        stored new frames are appended. Raises CannotRecord.
+        A torn frame and the recorded frames that were not written again are cut off. The stored new frames
+        are appended. Raises CannotRecord.
         """
         size = len(packed(self.frames[: self._matched]))
         cut = os.fstat(self._file).st_size - size

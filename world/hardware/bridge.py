@@ -128,7 +128,7 @@ class Field:
         self._restarted = True
         for one in past.ticks:
             for report in one.reports:
-                self._ending.told(report)
+                self._ending.receive(report)
             self._end = self._ending.after(one.observation.tick, one.command, peer_there=True)
             self.missed += one.command is None
         self._end = past.end or self._end
@@ -157,7 +157,7 @@ class Field:
         session.answer(link, keys.config(run, me), lambda _: self._config)
         self._token = session.show_alive(link, keys.world_alive(run))
 
-    def play(self, wait: float, ended: Callable[[], None]) -> MissionEnd:
+    def run_mission(self, wait: float, ended: Callable[[], None]) -> MissionEnd:
         """Run the whole mission, stop the robot, and return the MissionEnd.
 
         `wait` is the time in s to wait for both agents to connect. `ended` is called when the agent's process
@@ -313,7 +313,7 @@ class Field:
             self._inbox.refuse(arrival, error)
             return None
         if message.robot != arrival.source.robot:
-            self._inbox.refuse(arrival, f"it says it is from '{message.robot}'")
+            self._inbox.refuse(arrival, f"its sender is given as '{message.robot}'")
             return None
         return message
 
@@ -321,7 +321,7 @@ class Field:
         command = self._accepted(arrival, Command)
         if command is None or command.tick > self._tick:
             if command is not None:
-                self._inbox.refuse(arrival, "it is of a tick to come")
+                self._inbox.refuse(arrival, "its tick is in the future")
             return None
         while self._unanswered and self._unanswered[0][0] <= command.tick:
             self._unanswered.popleft()
@@ -348,7 +348,7 @@ class Field:
 
     def _on_report(self, arrival: Arrival) -> None:
         report = self._accepted(arrival, Report)
-        if report is not None and self._ending.told(report):
+        if report is not None and self._ending.receive(report):
             self._write(arrival.frame)
 
     # --- the end ---

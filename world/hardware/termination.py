@@ -46,7 +46,7 @@ class Ending:
         self._known: int | None = None
         """The tick in which both results were known and acknowledged."""
 
-    def told(self, report: Report) -> bool:
+    def receive(self, report: Report) -> bool:
         """Add the peer's `report`, and return whether it changes what is known."""
         before = self._peers, self._is_acknowledged
         self._acknowledged = max(self._acknowledged, report.heard)

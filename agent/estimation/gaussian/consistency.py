@@ -11,16 +11,19 @@ from agent.estimation.gaussian.least_squares import Fit
 from agent.estimation.gaussian.range_model import PairRanges
 from protocol.messages import Inconsistent
 
-DOUBTFUL = 1e-3
-"""The p-value below which a robot does not claim by a fit, but measures more ranges."""
+CLAIM_P_VALUE = 1e-3
+"""The p-value below which a robot does not claim a pose, but measures more ranges."""
 
-WARY = 1e-2
+EARLY_CLAIM_P_VALUE = 1e-2
 """The same bound while a robot has fewer than twice the mutual ranges that a claim requires."""
 
-UNBELIEVABLE = 2e-4
-"""The p-value below which a search counts towards LOOKS: chance alone does not repeat it."""
+INCONSISTENT_P_VALUE = 2e-4
+"""The p-value below which a search counts towards INCONSISTENT_SEARCHES.
 
-LOOKS = 5
+It is so small that chance alone does not cause this many such searches in a row.
+"""
+
+INCONSISTENT_SEARCHES = 5
 """The number of consecutive inconsistent searches before a robot ends with `inconsistent`.
 
 Each search covers the whole plane with more ranges than the last, because one search may miss the true
@@ -40,12 +43,12 @@ class Inconsistency(NamedTuple):
     p_value: float
 
     @property
-    def alarm(self) -> Inconsistent:
+    def verdict(self) -> Inconsistent:
         """Return the verdict on the peer for this result."""
         return Inconsistent(self.what, self.sigmas, self.p_value)
 
 
-def doubt(fit: Fit, pair: PairRanges) -> Inconsistency:
+def consistency_test(fit: Fit, pair: PairRanges) -> Inconsistency:
     """Return the less probable of two tests: all residuals, and the distance between the anchors.
 
     The motion of a robot between its anchor and the encounter affects no single range. It is tested only by

@@ -50,7 +50,7 @@ class ScoredHypothesis(NamedTuple):
 
     hypothesis: Hypothesis
     fit: Fit
-    silence: float
+    detection_log_likelihood: float
     """The log-likelihood of the detections and of the ticks without one, given this fit."""
 
 
@@ -82,7 +82,7 @@ def _same(one: Fit, other: Fit) -> bool:
     return float(change @ one.information @ change) < SAME_SIGMAS**2
 
 
-def silence(beyond: Array, sigma: float, drop_outs: float) -> float:
+def no_detection_log_likelihood(beyond: Array, sigma: float, drop_outs: float) -> float:
     """Return the log-likelihood of no detection at several ticks.
 
     `beyond` is the predicted distance (m) beyond R at each of these ticks. The prediction has an error of
@@ -162,7 +162,7 @@ def _anchor_log_likelihood(
         u = np.array((x[worst], y[worst])) / max(math.hypot(x[worst], y[worst]), SIGMA_FLOOR)
         sigma = math.hypot(deviation(float(u @ place @ u)), EDGE * sensing_range)
         if sign > 0.0:
-            weight += silence(beyond, sigma, noise.drop_outs)
+            weight += no_detection_log_likelihood(beyond, sigma, noise.drop_outs)
         else:
             weight += _log_cdf(float(beyond[worst]) / sigma)
     return weight
@@ -257,4 +257,4 @@ def _mutual_log_likelihood(one: Fit, pair: PairRanges) -> float:
             sign * (ny * x - nx * y),
         )
     sigma = math.hypot(deviation(float(gradient @ one.covariance @ gradient)), EDGE * pair.sensing_range)
-    return silence(beyond, sigma, pair.noise.drop_outs)
+    return no_detection_log_likelihood(beyond, sigma, pair.noise.drop_outs)

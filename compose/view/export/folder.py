@@ -57,7 +57,7 @@ def export(
     Raises OSError if there is no recording, journal_file.CorruptJournal if it is damaged before its end,
     UserError if it is too long for a format or `out` cannot be written.
     """
-    books = run.books(folder)
+    books = run.read_journals(folder)
     check()
     robots, tables = _of_world(folder, books) if WORLD_JOURNAL in books else _of_robots(folder)
     check()
@@ -95,11 +95,7 @@ def _of_world(folder: Path, books: Collection[str]) -> tuple[list[str], _Ticks]:
     there = [robot for robot in ids if run.agent_journal(robot) in books]
     return ids, _Ticks(
         list(rows(recording)),
-        {
-            (robot, at.truth.tick): command
-            for at in recording.moments
-            for robot, command in at.commands.items()
-        },
+        {(robot, at.truth.tick): command for at in recording.ticks for robot, command in at.commands.items()},
         {(robot, one.tick): one for robot in there for one in run.estimates(folder, robot)},
         recording.scenario.mission.period,
     )

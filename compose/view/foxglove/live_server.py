@@ -93,8 +93,8 @@ class Live:
         if self.subscribed or due:
             self._once_more = now + SETTLED_S if self.subscribed else None
             self.subscribed = False
-            self._channels.again()
-            for view in (self._views.standing(), *self._views.again()):
+            self._channels.republish()
+            for view in (self._views.standing(), *self._views.latest()):
                 self._channels.view(*view, nanoseconds(stage, max(0, self._next - 1)))
         return nanoseconds(stage, self._next)
 

@@ -65,7 +65,7 @@ class Channels:
         channel.log(one.body, log_time=at)
         self._latest[channel] = (one.body, at)
 
-    def again(self) -> None:
+    def republish(self) -> None:
         """Publish the latest journaled frame of each channel again, for new viewers."""
         for channel, (body, at) in self._latest.items():
             channel.log(body, log_time=at)

@@ -100,7 +100,7 @@ class Views:
         yield from self.passing(scene)
         yield from self._whole(scene)
 
-    def again(self) -> Iterator[Shown]:
+    def latest(self) -> Iterator[Shown]:
         """Yield the messages of the latest tick again, for new viewers."""
         if self._latest is not None:
             yield from self._lines(self._latest)
@@ -161,7 +161,7 @@ class Views:
         """Return the drawing of a robot with its activity, its trail, and its anchor range if it has one."""
         assert player.pose is not None
         colour = shapes.colour(COLOURS[seat.role])
-        lines, texts = [], [shapes.words(f"{seat.id}: {player.mode_name}", player.pose, self._unit, colour)]
+        lines, texts = [], [shapes.words(f"{seat.id}: {player.activity}", player.pose, self._unit, colour)]
         trail = self._trails[seat.id].points
         if len(trail) > 1:
             lines.append(shapes.line(trail, colour, 2.0))

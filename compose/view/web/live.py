@@ -59,7 +59,7 @@ MOST_RUNS = 1000
 """The maximum number of listed missions."""
 MOST_APPEARING = 10_000
 """The maximum number of robots that wait for the query of their configuration."""
-LOOK_AGAIN_S = 0.25
+POLL_S = 0.25
 """The interval in s between checks for the stop request, and between attempts to connect."""
 QUERY_S = 2.0
 """The timeout of a query in s."""
@@ -213,7 +213,7 @@ class Listener:
         elif not self._reported and time.monotonic() >= self._looking_since + diagnosis.FIRST_WORD_S:
             self._reported = True
             self._inbox.say(f"no router at {self.endpoint} yet: {diagnosis.why(self._endpoints)}")
-        if self._stop.wait(LOOK_AGAIN_S):
+        if self._stop.wait(POLL_S):
             raise Interrupted("stop")
 
     def _attend(self, link: zenoh.Session) -> None:
@@ -235,9 +235,9 @@ class Listener:
         idle_s = 0.0
         while not self._stop.is_set():
             try:
-                robot = appeared.get(timeout=LOOK_AGAIN_S)
+                robot = appeared.get(timeout=POLL_S)
             except Empty:
-                idle_s = 0.0 if received.is_set() else idle_s + LOOK_AGAIN_S
+                idle_s = 0.0 if received.is_set() else idle_s + POLL_S
                 received.clear()
                 if idle_s >= STALE_SESSION_S:
                     return

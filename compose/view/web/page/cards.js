@@ -52,7 +52,7 @@ export class Cards {
       if (entry.textContent !== text) entry.textContent = text;
       entry.dataset.phase = phase;
       entry.setAttribute("aria-pressed", String(id === focus));
-      entry.setAttribute("aria-label", player?.mode_name ?? id);
+      entry.setAttribute("aria-label", player?.activity ?? id);
     }
   }
 }
@@ -95,7 +95,7 @@ class Card {
     this.root.dataset.phase = phase;
     this.root.classList.toggle("down", Boolean(player.down));
     this.phase.textContent = `phase ${phase}: ${PHASES[phase]}${player.down ? "; down" : ""}`;
-    if (this.doing.textContent !== player.mode_name) this.doing.textContent = player.mode_name;
+    if (this.doing.textContent !== player.activity) this.doing.textContent = player.activity;
     const [off, range] = truth && player.pose && held?.world.length ? error(held, player.pose) : ["", ""];
     this.error.textContent = off;
     this.error.title = range;

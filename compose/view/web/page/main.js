@@ -243,7 +243,7 @@ function draw() {
 function activities() {
   const players = store.scene(view.tick)?.players ?? [];
   const chosen = view.focus ? players.filter((player) => player.robot === view.focus) : players.slice(0, 4);
-  return chosen.map((player) => player.mode_name).join(". ");
+  return chosen.map((player) => player.activity).join(". ");
 }
 
 function controls() {

@@ -153,4 +153,4 @@ export class Store {
   }
 }
 
-const unknown = (robot) => ({ robot: robot.id, mode_name: `no data of ${robot.id} in this tick` });
+const unknown = (robot) => ({ robot: robot.id, activity: `no data of ${robot.id} in this tick` });
