@@ -96,13 +96,14 @@ class Rover:
         self._save()
 
     def resume(self, tick: int, mark: tuple[float, ...]) -> None:  # noqa: ARG002  # `state` has it all
-        """Report the motion of an unrecorded reading again. Raises RuntimeError without a `state`."""
+        """Report an unrecorded reading again, from the same pose. Raises RuntimeError without a `state`."""
         if not self._found:
             raise RuntimeError("where the body was is not known without --option state=FILE")
         if self._tick > tick:
             self._driven = Controls(
                 self._executed.v + self._driven.v, self._executed.omega + self._driven.omega
             )
+            self._controls, self._done = REST, 1.0  # the beacon has the pose of that reading already
 
     def stop(self) -> None:
         """Stop, and stay available for the peer's mutual ranges."""

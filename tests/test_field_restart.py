@@ -17,6 +17,7 @@ import pytest
 from compose.hardware.driver_recording import recorded
 from compose.launch.processes import free_endpoint
 from compose.scenario.scenario_file import load
+from docs.rover import Rover
 from protocol.journal.journal_file import CorruptJournal
 from protocol.messages import Observation
 from protocol.motion import REST
@@ -258,3 +259,17 @@ def test_a_robot_that_is_killed_at_any_moment_goes_on(
     pair.kill(*killed)
     pair.again(*killed)
     all_is_well(tmp_path, pair)
+
+
+def test_a_rover_that_repeats_a_reading_is_where_it_was(tmp_path: Path) -> None:
+    """Its wheels do not finish the manoeuvre meanwhile: its peer may have been ranged from there already."""
+    config, state = load("paper-1").config("a"), str(tmp_path / "body")
+    rover = Rover(config, 1000.0, state=state)
+    rover.sense(0)
+    rover.drive(1000.0, 0.0)
+    first = rover.sense(1)
+    place = rover.pose
+    again = Rover(config, 1000.0, state=state)
+    again.resume(0, ())
+    assert again.sense(1) == first
+    assert again.pose == place
