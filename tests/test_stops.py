@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from signal import SIGCONT, SIGSTOP
 
 import pytest
 
+from agent.process.link import AgentLink, WorldLinkLost
 from compose.launch.processes import free_endpoint
 from compose.scenario.scenario_file import load
 from protocol.journal import journal_file
@@ -32,7 +35,9 @@ from tests.commands import (
     until,
 )
 from tests.series import series
+from world.process import RobotsLinkLost, WorldProcess
 from world.scenario import Scenario
+from world.simulation import Simulation
 
 NAMES = ("agent a", "agent b", "world")
 PATIENCE_S = 6.0
@@ -57,6 +62,10 @@ def same(out: Path, undisturbed: Path) -> bool:
 
 def journal_bytes(out: Path) -> list[bytes]:
     return [path.read_bytes() for path in sorted(out.glob("*.journal"))]
+
+
+def give_up() -> None:
+    raise AssertionError("the router does not answer")
 
 
 def states(pid: int) -> set[str]:
@@ -167,6 +176,62 @@ def test_a_link_over_which_nothing_comes_is_replaced_by_another() -> None:
             for topic in ("alive", "gone", "alive"):
                 until(lambda topic=topic: inbox.next(0.1).topic == topic, f"a is {topic}")  # type: ignore[misc]
                 assert agent.running
+
+
+class Unlinked:
+    """A switch that makes sessions list no router, as a reconnected one occasionally does for ever."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.on = False
+        monkeypatch.setattr(session, "linked", lambda _session: not self.on)
+
+
+def repeated(put: Callable[[], None], stop: threading.Event) -> None:
+    while not stop.wait(0.05):
+        put()
+
+
+@contextmanager
+def repeating(put: Callable[[], None]) -> Iterator[None]:
+    """Call `put` again and again in another thread."""
+    stop = threading.Event()
+    thread = threading.Thread(target=repeated, args=(put, stop))
+    thread.start()
+    yield
+    stop.set()
+    thread.join()
+
+
+def test_an_agent_s_session_that_receives_and_cannot_send_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    endpoint, inbox, unlinked = free_endpoint(), Inbox("agent a"), Unlinked(monkeypatch)
+    link = AgentLink(load("paper-1").config("a", None), "mute", inbox)
+    with (
+        session.open_router(listening(endpoint)) as world,
+        session.open_client(at(endpoint), give_up) as client,
+    ):
+        link.attach(client)
+        observation = session.publisher(world, keys.observation("mute", "a"))
+        with repeating(lambda: observation.put(b"again")):
+            over = time.monotonic() + 2.5 * session.LINK_CHECK_S
+            while time.monotonic() < over:
+                link.next(over)
+            unlinked.on = True
+            with pytest.raises(WorldLinkLost):
+                until(lambda: link.next(time.monotonic() + 1.0).topic == "gone", "the session is lost")
+
+
+def test_a_world_s_session_that_receives_and_cannot_send_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    endpoint, inbox, unlinked = free_endpoint(), Inbox("world"), Unlinked(monkeypatch)
+    process = WorldProcess(Simulation(load("paper-1")), "mute", inbox)
+    with (
+        session.open_router(listening(endpoint)) as robot,
+        session.open_client(at(endpoint), give_up) as client,
+    ):
+        process.attach(client, replaceable=True)
+        unlinked.on = True
+        command = session.publisher(robot, keys.command("mute", "a"))
+        with repeating(lambda: command.put(b"again")), pytest.raises(RobotsLinkLost):
+            process.run()
 
 
 # --- in real time -------------------------------------------------------------------------------------

@@ -47,7 +47,7 @@ class NoAnswer(TimeoutError):
 
 
 class RobotsLinkLost(Exception):
-    """Nothing is received over this link any more. The robots may be reachable over another one."""
+    """Nothing passes over this link in one direction. The robots may be reachable over another one."""
 
 
 class WorldProcess:
@@ -107,8 +107,10 @@ class WorldProcess:
     def attach(self, link: zenoh.Session, *, replaceable: bool = False) -> None:
         """Send and receive over the session `link` from now on.
 
-        If it is `replaceable`, `run` raises RobotsLinkLost after LINK_TIMEOUT_S and a tick without messages.
+        If it is `replaceable`, `run` raises RobotsLinkLost after LINK_TIMEOUT_S and a tick without messages,
+        and if the session can only receive.
         """
+        self._check = session.LinkCheck(link) if replaceable else None
         run, inbox = self._run, self._inbox
         self._link_timeout = LINK_TIMEOUT_S + self._tick_s if replaceable else math.inf
         self._link_deadline = time.monotonic() + self._link_timeout
@@ -228,6 +230,8 @@ class WorldProcess:
         arrival = self._inbox.next(min(timeout, self._link_deadline - now))
         if arrival is not NOTHING:
             self._link_deadline = now + self._link_timeout
+            if self._check is not None and self._check.is_mute(now):
+                raise RobotsLinkLost
         elif time.monotonic() >= self._link_deadline:
             raise RobotsLinkLost
         robot = arrival.source.robot

@@ -21,7 +21,7 @@ the reconnected link.
 
 
 class WorldLinkLost(Exception):
-    """Nothing arrives over this session any more; the world may be reachable over a new one."""
+    """Nothing passes over this session in one direction; the world may be reachable over a new one."""
 
 
 class AgentLink:
@@ -48,17 +48,20 @@ class AgentLink:
         session.watch_liveliness(link, keys.world_alive(run), self._inbox)
         self._show_alive = partial(session.show_alive, link, keys.robot_alive(run, me))
         self._token = self._show_alive()
+        self._check = session.LinkCheck(link)
         self._received_at = time.monotonic()
 
     def next(self, until: float) -> Arrival:
         """Return the next arrival, or NOTHING once the monotonic clock reaches `until`.
 
-        Raises WorldLinkLost if no Observation has arrived for too long.
+        Raises WorldLinkLost if no Observation has arrived for too long, or if the session cannot send.
         """
         lost = self._received_at + self._link_timeout
         arrival = self._inbox.next(min(until, lost) - time.monotonic())
         if arrival.topic == "observation":
             self._received_at = time.monotonic()
+            if self._check.is_mute(self._received_at):
+                raise WorldLinkLost
         elif arrival is NOTHING and time.monotonic() >= lost:
             raise WorldLinkLost
         return arrival

@@ -29,6 +29,8 @@ from protocol.wire import encode
 
 CLOSE_TIMEOUT_S = 2.0
 """The time in s to wait for a session to close. Under loss it can take ten seconds."""
+LINK_CHECK_S = 1.0
+"""The time in s between two checks whether a session that receives can also send."""
 LISTEN_AGAIN_S = 0.1
 """The time in s between two attempts to listen on a port."""
 
@@ -166,6 +168,33 @@ def alive(session: zenoh.Session, key: str, timeout: float) -> list[Key]:
 def linked(session: zenoh.Session) -> bool:
     """Return whether the session has a link to a router."""
     return bool(session.info.routers_zid())
+
+
+class LinkCheck:
+    """Checks of a session that receives messages: it may have lost the ability to send.
+
+    A process that is stopped until Zenoh gives up its link connects again when it continues. Occasionally
+    (in about one of a hundred such reconnections on a busy machine), its session then receives everything
+    and sends nothing: its publishers match, its tokens are visible, but it lists no router.
+    """
+
+    def __init__(self, session: zenoh.Session) -> None:
+        """Check `session`, unless it has no router from the start because it is one."""
+        self._session = session
+        self._failed = 0 if linked(session) else None
+        """The number of failed checks in sequence; None if the session is not checked."""
+        self._check_at = time.monotonic() + LINK_CHECK_S
+
+    def is_mute(self, now: float) -> bool:
+        """Return whether the session cannot send, given that it has received a message at time `now`.
+
+        Time is that of the monotonic clock. A link that is just being replaced fails one check at most.
+        """
+        if now < self._check_at or self._failed is None:
+            return False
+        self._check_at = now + LINK_CHECK_S
+        self._failed = 0 if linked(self._session) else self._failed + 1
+        return self._failed > 1
 
 
 def ask(
