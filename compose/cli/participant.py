@@ -10,7 +10,7 @@ from compose.cli import arguments
 from compose.errors import FAILED, STOPPED, UserError
 from compose.launch.signals import stop_by_signal, stop_with_launcher
 from compose.network import beyond, reach
-from protocol.journal.journal_file import CannotRecord, CorruptJournal
+from protocol.journal.journal_file import CannotRecord, CorruptJournal, OtherVersion
 from protocol.journal.resume import Retrace
 from protocol.network import session
 from protocol.network.endpoints import Endpoints
@@ -61,6 +61,8 @@ def participate(
         raise UserError(f"--listen: {error}") from None
     except CannotRecord as error:
         raise UserError(f"--out: {error}") from None
+    except OtherVersion as error:
+        raise UserError(f"--out: {error.path}: {error.versions}; choose another folder") from None
     except CorruptJournal as error:
         raise UserError(f"--out: {error}; choose another folder") from None
     except Interrupted as signal_name:
