@@ -25,6 +25,8 @@ from typing import NamedTuple
 
 import msgspec
 
+from compose.launch.child import KILL_S, ChildProcess, ending
+
 LENGTH_BYTES = 4
 """The size of the length that precedes each request."""
 STREAMS = 3
@@ -50,8 +52,6 @@ class Signal(msgspec.Struct, frozen=True, tag=True):
     signal: int
 
 
-KILL_S = 5.0
-"""Time in s that a killed process has to end; then its fork server is considered hung, and is killed."""
 TAKE_S = 60.0
 """Time in s for retries while too many descriptors are in flight: the fork server may still import."""
 LOOK_S = 1.0
@@ -79,80 +79,6 @@ class Ended(NamedTuple):
         return cls(int.from_bytes(frame[:4], "big"), int.from_bytes(frame[4:], "big", signed=True))
 
 
-class Process:
-    """A forked process. It ends when its standard input is closed, which its launcher holds open."""
-
-    def __init__(
-        self, server: ForkServer, number: int, stdin: int, stdout: int | None, on_end: Callable[[], None]
-    ) -> None:
-        self._stdin = stdin
-        self.stdout = stdout
-        """Descriptor from which its standard output is read; None if it is discarded."""
-        self._streams = [stream for stream in (stdin, stdout) if stream is not None]
-        """Descriptors of the launcher, closed once the process has ended."""
-        self._server = server
-        self._number = number
-        self._on_end = on_end
-        self._over = threading.Event()
-        self._status = 0
-
-    @property
-    def running(self) -> bool:
-        """True if the process has not ended yet."""
-        return not self._over.is_set()
-
-    @property
-    def status(self) -> int:
-        """Wait for the process to end, and return its exit status; negative is the signal that killed it."""
-        self._over.wait()
-        return self._status
-
-    @property
-    def hung_up(self) -> bool:
-        """True if it has closed its standard input, as it does by ending."""
-        poll = select.poll()
-        poll.register(self._stdin, 0)
-        return not self.running or bool(poll.poll(0))
-
-    def wait(self, timeout: float) -> bool:
-        """Wait at most `timeout` seconds, and return whether the process has ended."""
-        return self._over.wait(max(timeout, 0.0))
-
-    def signal(self, number: int) -> None:
-        """Send a signal to the process and its group, unless it has ended."""
-        if self.running:
-            self._server.signal(self._number, number)
-
-    def end(self, timeout: float = 0.0) -> int:
-        """Wait `timeout` seconds, then kill the process; return its exit status."""
-        if not self.wait(timeout):
-            self.signal(signal.SIGKILL)
-            if not self.wait(KILL_S):
-                self._server.kill()
-        status = self.status
-        self.hang_up()
-        return status
-
-    def hang_up(self) -> None:
-        """Close the launcher's ends of the process's streams."""
-        streams, self._streams = self._streams, []
-        for stream in streams:
-            os.close(stream)
-
-    def send(self, data: bytes) -> None:
-        """Write `data` to the standard input of the process, unless it has ended."""
-        rest = memoryview(data)
-        with suppress(BrokenPipeError):
-            while rest:
-                rest = rest[os.write(self._stdin, rest) :]
-
-    def ended(self, status: int) -> None:
-        """Store the exit status; called by the server when the process has ended."""
-        self._status = status
-        self._over.set()
-        self._on_end()
-
-
 class ForkServer:
     """A fork server whose launcher is this process."""
 
@@ -171,7 +97,7 @@ class ForkServer:
         its.close()
         self.pid = self._process.pid
         self._numbers = count()
-        self._running: dict[int, Process] = {}
+        self._running: dict[int, ChildProcess] = {}
         self._lock = threading.Lock()
         self.gone = False
         """Whether the server, and with it all its processes, has ended."""
@@ -183,20 +109,26 @@ class ForkServer:
         main: str,
         title: str,
         *arguments: str,
-        errors: int,
+        errors: int | None = None,
         answers: bool = False,
         on_end: Callable[[], None] = lambda: None,
-    ) -> Process:
+    ) -> ChildProcess:
         """Fork a process that calls `main`, a module:function, with `arguments` in sys.argv.
 
-        Its standard error goes to the descriptor `errors`. Its standard output goes to a pipe if `answers`
-        is set, otherwise to /dev/null. `on_end` is called in another thread when the process has ended.
+        Its standard error goes to the descriptor `errors`, otherwise to a file that the result reads. Its
+        standard output goes to a pipe if `answers` is set, otherwise to /dev/null. `on_end` is called in
+        another thread when the process has ended.
         """
         its_input, our_input = os.pipe()
         our_output, its_output = os.pipe() if answers else (None, os.open(os.devnull, os.O_WRONLY))
+        file = None
+        if errors is None:
+            file = tempfile.TemporaryFile()  # noqa: SIM115  # closed by the process
+            errors = file.fileno()
         with self._lock:
             number = next(self._numbers)
-            process = self._running[number] = Process(self, number, our_input, our_output, on_end)
+            process = ChildProcess(self, number, (our_input, our_output), file, on_end)
+            self._running[number] = process
             self._ask(ForkRequest(number, main, title, arguments), [its_input, its_output, errors])
         os.close(its_input)
         os.close(its_output)
@@ -210,22 +142,26 @@ class ForkServer:
             self._ask(Signal(process, number), [])
 
     def why_gone(self) -> str:
-        """Wait for the server to end, and return how it did, in a line."""
-        status = self._process.wait()
+        """Return how the server ended, in a line; it is waited for, and then killed, if it has not ended."""
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(KILL_S)
+        status = self.kill()
         self._errors.seek(0)
         errors = self._errors.read().decode(errors="replace").strip().splitlines()
-        how = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
-        return f"the fork server {how}{f': {errors[-1]}' if errors else ''}"
+        return f"the fork server {ending(status)}{f': {errors[-1]}' if errors else ''}"
 
-    def kill(self) -> None:
-        """Kill the server and all its processes."""
+    def kill(self) -> int:
+        """Kill the server and all its processes, and return the server's exit status."""
         self._process.kill()
-        self._process.wait()
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(KILL_S)
+        status = self._process.poll()
+        return -signal.SIGKILL if status is None else status
 
     def close(self) -> None:
         """Kill the server and its processes, and free its thread, socket and file in the launcher."""
         self.kill()
-        self._listener.join()
+        self._listener.join(KILL_S)
         self._socket.close()
         self._errors.close()
 

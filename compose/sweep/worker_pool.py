@@ -6,8 +6,6 @@ a new process runs the remaining trials. Dask therefore sees only completed chun
 
 from __future__ import annotations
 
-import os
-import select
 import signal
 import tempfile
 import threading
@@ -22,8 +20,6 @@ from protocol.output import one_line
 
 START_S = 60.0
 """The time in s within which a new process must have imported its modules."""
-READ_BYTES = 1 << 16
-"""The largest number of bytes in one read from a process."""
 
 
 class Died(Exception):
@@ -38,32 +34,24 @@ class WorkerProcess:
     """A process in which trials run. It has its own session, so Ctrl-C reaches only its owner."""
 
     def __init__(self) -> None:
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # closed by `close`
         self._folder = tempfile.TemporaryDirectory(prefix="tandem-trials-", ignore_cleanup_errors=True)
-        self._process = fork_server("compose.sweep.worker:warm_up").start(
-            "compose.sweep.worker:main",
-            "tandem sweep worker",
-            self._folder.name,
-            errors=self._errors.fileno(),
-            answers=True,
+        self._child = fork_server("compose.sweep.worker:warm_up").start(
+            "compose.sweep.worker:main", "tandem sweep worker", self._folder.name, answers=True
         )
-        assert self._process.stdout is not None
-        self._output = self._process.stdout
-        self._poll = select.poll()
-        self._poll.register(self._output, select.POLLIN)
         self._read = b""
 
     def ask(self, chunk: Chunk) -> None:
         """Send the trials of `chunk` to the process, which runs them."""
-        self._process.send(framed(msgspec.msgpack.encode(chunk)))
+        self._child.send(framed(msgspec.msgpack.encode(chunk)))
 
     def answer(self, timeout: float) -> bytes:
         """Return the next frame. Raises Hung after `timeout` seconds, and Died if the process has ended."""
         give_up = time.monotonic() + timeout
         while (body := self._frame()) is None:
-            if not self._poll.poll(max(0.0, 1e3 * (give_up - time.monotonic()))):
-                raise Hung
-            news = os.read(self._output, READ_BYTES)
+            try:
+                news = self._child.receive(give_up - time.monotonic())
+            except TimeoutError:
+                raise Hung from None
             if not news:
                 raise Died(self._how())
             self._read += news
@@ -79,24 +67,21 @@ class WorkerProcess:
 
     def _how(self) -> str:
         """Return how the process ended, with the last line of its standard error."""
-        if not self._process.wait(1.0):  # its standard output is closed, but it still runs
+        if not self._child.wait(1.0):  # its standard output is closed, but it still runs
             self.kill()
             return "it closed its standard output"
-        status = self._process.status
-        size = os.fstat(self._errors.fileno()).st_size
-        errors = os.pread(self._errors.fileno(), MAX_ERROR, max(0, size - MAX_ERROR)).decode(errors="replace")
-        last = one_line(errors.strip().splitlines()[-1]) if errors.strip() else ""
+        status = self._child.status or 0
+        errors = self._child.stderr_text()[-MAX_ERROR:].splitlines()
         how = f"killed by {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
-        return f"{how}: {last}" if last else how
+        return f"{how}: {one_line(errors[-1])}" if errors else how
 
     def kill(self) -> None:
         """Kill the process. Processes that its trials started end with it."""
-        self._process.signal(signal.SIGKILL)
+        self._child.kill()
 
     def close(self) -> None:
         """Kill the process, and remove its files."""
-        self._process.end()
-        self._errors.close()
+        self._child.end()
         self._folder.cleanup()
 
 
