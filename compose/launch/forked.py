@@ -21,14 +21,13 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from itertools import count
-from typing import NamedTuple
 
 import msgspec
 
 from compose.launch.child import KILL_S, ChildProcess, ending
 
-LENGTH_BYTES = 4
-"""The size of the length that precedes each request."""
+REQUEST_BYTES = 1 << 18
+"""The largest size of a request, which is more than a socket takes by default."""
 STREAMS = 3
 """The number of descriptors sent with a request for a process: its standard input, output and error."""
 
@@ -53,30 +52,19 @@ class Signal(msgspec.Struct, frozen=True, tag=True):
 
 
 TAKE_S = 60.0
-"""Time in s for retries while too many descriptors are in flight: the fork server may still import."""
+"""Time in s for retries of a request to fork: the fork server may still import."""
 LOOK_S = 1.0
 """The interval in s at which processes are checked while the fork server reports nothing."""
-TRY_AGAIN_S = 0.01
+TRY_AGAIN_S = 0.001
 """The interval in s between these retries."""
-ENDED_BYTES = 8
-"""The size of a report that a process has ended."""
 
 
-class Ended(NamedTuple):
+class Ended(msgspec.Struct, frozen=True):
     """The report to the launcher that a process has ended."""
 
     number: int
     status: int
     """Exit status; negative is the signal that killed it."""
-
-    def frame(self) -> bytes:
-        """Return the report as ENDED_BYTES bytes."""
-        return self.number.to_bytes(4, "big") + self.status.to_bytes(4, "big", signed=True)
-
-    @classmethod
-    def read(cls, frame: bytes) -> Ended:
-        """Return the report that `frame` encodes."""
-        return cls(int.from_bytes(frame[:4], "big"), int.from_bytes(frame[4:], "big", signed=True))
 
 
 class ForkServer:
@@ -84,7 +72,7 @@ class ForkServer:
 
     def __init__(self, warm_up: str) -> None:
         """Start the server; it first calls `warm_up`, a module:function."""
-        self._socket, its = socket.socketpair()
+        self._socket, its = socket.socketpair(type=socket.SOCK_SEQPACKET)
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # closed with the server
         # -P: the working directory may contain a folder named world or agent
         self._process = subprocess.Popen(
@@ -166,38 +154,37 @@ class ForkServer:
         self._errors.close()
 
     def _ask(self, request: ForkRequest | Signal, streams: list[int]) -> None:
-        body = msgspec.msgpack.encode(request)
-        frame = len(body).to_bytes(LENGTH_BYTES, "big") + body
         try:
-            sent = self._send_streams(frame, streams) if streams else 0
-            self._socket.sendall(frame[sent:])
+            self._send(msgspec.msgpack.encode(request), streams)
         except OSError:  # a request must not be lost unnoticed: `_listen` sees that the server has ended
             self._process.kill()
 
-    def _send_streams(self, frame: bytes, streams: list[int]) -> int:
-        """Send `streams` with the beginning of `frame`, and return how many bytes of it were sent.
+    def _send(self, frame: bytes, streams: list[int]) -> None:
+        """Send `frame` with `streams`.
 
-        The kernel limits the descriptors in flight of all processes of a user to the number that one process
-        may have open (ETOOMANYREFS). Sending is therefore retried for TAKE_S, until the server has received
-        those of earlier requests. Raises OSError.
+        A server that is suspended, or still imports, takes few requests (EAGAIN), and the kernel limits the
+        descriptors in flight of all processes of a user to the number that one process may have open
+        (ETOOMANYREFS). Sending is therefore retried, for TAKE_S, and without `streams` for KILL_S.
+
+        Raises OSError.
         """
-        give_up = time.monotonic() + TAKE_S
+        give_up = time.monotonic() + (TAKE_S if streams else KILL_S)
         while True:
             try:
-                return socket.send_fds(self._socket, [frame], streams)
+                socket.send_fds(self._socket, [frame], streams, socket.MSG_DONTWAIT)
             except OSError as error:
-                if error.errno != errno.ETOOMANYREFS or time.monotonic() >= give_up:
+                if error.errno not in (errno.EAGAIN, errno.ETOOMANYREFS) or time.monotonic() >= give_up:
                     raise
+            else:
+                return
             time.sleep(TRY_AGAIN_S)
 
     def _listen(self) -> None:
-        news = b""
+        decoder = msgspec.msgpack.Decoder(Ended)
         with suppress(OSError):
             while received := self._received():
-                news += received
-                while len(news) >= ENDED_BYTES:
-                    one, news = Ended.read(news[:ENDED_BYTES]), news[ENDED_BYTES:]
-                    self._running.pop(one.number).ended(one.status)
+                one = decoder.decode(received)
+                self._running.pop(one.number).ended(one.status)
         self.gone = True
         self._end_all()
 
