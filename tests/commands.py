@@ -71,7 +71,7 @@ ASSURED = "max_ticks = 1_000_000\n" + PAPER_1.replace('"paper"', '"assured"').re
 ).replace("11.3", "61.3")
 """A scenario of the planner that tolerates any number of missed deadlines, as on a busy machine."""
 REAL_TIME = ASSURED.replace("1_000_000", "600")
-"""The same scenario for `--rate 20`. It ends after half a minute, with any outcome."""
+"""ASSURED for `--rate 20`, with fewer ticks. It ends after half a minute, with any outcome."""
 OVER = (0, 1)
 """The exit statuses of a mission that has ended; in real time, either is possible."""
 ENDLESS = (
