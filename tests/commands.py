@@ -158,7 +158,7 @@ class TandemProcess:
         until(check, f"{what}\n{self.err}")
         assert holds or condition(), f"ended before {what}: {self.out}{self.err}"
 
-    def until_says(self, words: str) -> None:
+    def until_prints(self, words: str) -> None:
         """Wait until the command has printed `words` on either stream."""
         self.until(lambda: words in self.out + self.err, f"it prints '{words}'")
 
@@ -244,7 +244,7 @@ def world(scenario: str | Path, *arguments: str | Path) -> Iterator[tuple[Tandem
     """Yield a simulator process that waits for its robots, and its endpoint."""
     endpoint = free_endpoint()
     with TandemProcess("world", scenario, "--listen", endpoint, *arguments) as command:
-        command.until_says("waiting for")
+        command.until_prints("waiting for")
         yield command, endpoint
 
 
