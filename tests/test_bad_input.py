@@ -16,6 +16,7 @@ LISTEN = ("--listen", "tcp/127.0.0.1:7447")
 CONNECT = ("--connect", "tcp/127.0.0.1:7447")
 GOOD = PAPER_1.replace("seed = 1", "seed = 1\nmax_ticks = 500")
 FOUR = several_pairs(2)
+SWEEP = 'name = "mine"\nscenario = "paper-1"\ntrials = 1\n'
 
 
 def refused(ended: Ended, *words: str) -> None:
@@ -492,6 +493,24 @@ def test_a_misspelt_name_is_refused_with_the_nearest_one(words: str, said: str, 
     assert (ended.status, ended.out) == (2, "")
     assert ended.err.rstrip("\n").endswith(said)
     assert ended.err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("command", "text", "kind", "runs_it"),
+    [
+        (("run",), SWEEP, "sweep", "sweep"),
+        (("world", *LISTEN), SWEEP, "sweep", "sweep"),
+        (("sweep",), PAPER_1, "scenario", "run"),
+    ],
+    ids=["run", "world", "sweep"],
+)
+def test_a_file_of_the_other_kind_is_refused_with_the_command_that_runs_it(
+    command: tuple[str, ...], text: str, kind: str, runs_it: str, tmp_path: Path
+) -> None:
+    (tmp_path / "my file.toml").write_text(text)
+    ended = tandem(*command[:1], "my file.toml", *command[1:], cwd=tmp_path)
+    said = f"my file.toml is a {kind}; run it with `tandem {runs_it} 'my file.toml'`"
+    assert ended == (2, "", f"tandem {command[0]}: {said}\n")
 
 
 def test_an_agent_with_a_misspelt_name_prints_the_nearest_one(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import socket
 import subprocess
@@ -94,7 +95,9 @@ def both_have_ended(out: Path, robots: dict[str, TandemProcess]) -> None:
         assert not (out / name / "world.journal").exists()
         replayed = tandem("replay", out / name)
         assert replayed.status == 0, replayed.out
-        assert f"{name}, hardware mode: as recorded, to the bit" in replayed.out
+        assert f"{name}, hardware mode: as recorded, to the bit, over" in replayed.out
+        (ticks,) = re.findall(r"(?:localised|undecided) after (\d+) ticks", ended.out)
+        assert f" over {ticks} ticks " in replayed.out
 
 
 def test_two_robots_localise_in_hardware_mode(tmp_path: Path) -> None:

@@ -60,8 +60,16 @@ def test_a_run_as_processes_is_replayed_bit_by_bit(tmp_path: Path) -> None:
     before = journals(out)
     ended = tandem("replay", out)
     assert (ended.status, ended.err) == (0, "")
-    assert ended.out.startswith("random: as recorded, to the bit, in ")
+    assert ended.out.startswith("random: as recorded, to the bit, over ")
     assert journals(out) == before
+
+
+def test_run_replay_and_audit_count_the_same_ticks(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    ran = tandem("run", "paper-1", "--in-process", "--no-export", "-q", "--out", out).out
+    assert ran == "localised after 48 ticks\n"
+    assert "as recorded, to the bit, over 48 ticks" in tandem("replay", out).out
+    assert "no violations over 48 ticks" in tandem("audit", out).out
 
 
 # --- one bit --------------------------------------------------------------------------------------------
@@ -220,7 +228,7 @@ def test_the_place_of_a_truncation_is_reported(recording: Path) -> None:
     ended = tandem("replay", recording)
     assert (ended.status, ended.err) == (0, "")
     as_recorded, *tears = ended.out.splitlines()
-    assert as_recorded.startswith("paper-1: as recorded, to the bit, in 49 ticks ")
+    assert as_recorded.startswith("paper-1: as recorded, to the bit, over 48 ticks ")
     assert rest > 0
     assert tears == [
         "no tick, b: its journal is missing",

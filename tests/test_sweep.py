@@ -503,6 +503,18 @@ def test_a_trial_that_breaks_a_rule_fails_the_sweep_and_is_named(
     assert line[heading.index("clean")] == "3"
 
 
+def test_the_command_that_runs_a_trial_again_records_to_a_new_folder(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    results = played(folder, "both.toml", "out", trials=4, play="tests.misbehaving:boastful")
+    monkeypatch.chdir(folder)
+    for name in ("recording-both-0-2", "recording-both-0-2-2", "recording-both-0-2-3"):
+        report.show(results, Path("out"), quiet=False)
+        (line,) = [one for one in capsys.readouterr().out.splitlines() if one.startswith("  tandem run ")]
+        assert line.endswith(f" --out {name}")
+        Path(name).mkdir()
+
+
 @pytest.mark.long
 def test_a_sweep_without_audit_does_not_mention_it(folder: Path) -> None:
     ended = sweep(folder, "both.toml", "out", "--trials", "1", "--no-audit")
