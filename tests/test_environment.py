@@ -96,7 +96,7 @@ def test_a_robot_names_the_instructions_that_numpy_and_linear_algebra_really_use
 
 
 @pytest.mark.parametrize("command", ["replay", "audit"])
-def test_last_bits_under_other_versions_are_told_as_such(command: str, recording: Path) -> None:
+def test_last_bits_that_differ_under_other_versions_are_explained(command: str, recording: Path) -> None:
     elsewhere(recording / A)
     changed(recording / A, Estimate, turned(1e-13), first=20)
     ended = tandem(command, recording)
@@ -167,7 +167,7 @@ def test_a_recording_of_another_protocol_is_not_resumed(recording: Path) -> None
     assert ended == (2, "", said)
 
 
-def test_a_robot_goes_on_elsewhere_where_it_decides_the_same_and_says_why_where_not(recording: Path) -> None:
+def test_a_robot_resumes_on_another_machine_unless_its_decisions_differ(recording: Path) -> None:
     path = recording / A
     elsewhere(path)
     before = path.read_bytes()

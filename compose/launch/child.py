@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from typing import IO, Protocol
+from typing import IO
 
 KILL_S = 5.0
 """Time in s that a killed process has to end; then its fork server is considered hung, and is killed."""
@@ -21,23 +21,6 @@ ERROR_BYTES = 1 << 20
 """The number of bytes of standard error, counted from its end, that are kept."""
 
 
-class Parent(Protocol):
-    """The part of a fork server that its processes use."""
-
-    @property
-    def gone(self) -> bool:
-        """True if it, and with it all its processes, has ended."""
-
-    def signal(self, process: int, number: int) -> None:
-        """Send signal `number` to the process numbered `process`, unless it has ended."""
-
-    def kill(self) -> object:
-        """Kill it and all its processes."""
-
-    def why_gone(self) -> str:
-        """Return how it ended, in a line."""
-
-
 class ChildProcess:
     """A forked process. It ends when its standard input is closed, which its launcher holds open.
 
@@ -46,29 +29,29 @@ class ChildProcess:
 
     def __init__(
         self,
-        parent: Parent,
-        number: int,
         streams: tuple[int, int | None],
         errors: IO[bytes] | None,
+        signal: Callable[[int], None],
+        kill_parent: Callable[[], object],
         on_end: Callable[[], None],
     ) -> None:
-        """`number` identifies the process at `parent`.
+        """`streams` are the launcher's ends of its standard input and output, `errors` its standard error.
 
-        `streams` are the launcher's ends of its standard input and output, and `errors` is the file of its
-        standard error. `on_end` is called in another thread when the process has ended.
+        `signal` sends it a signal. `on_end` is called in another thread when it has ended.
         """
         self.started = time.monotonic()
         """Monotonic time of its start in s."""
         self.status: int | None = None
         """Exit status; negative is the signal that killed the process, and None that it has not ended."""
-        self._parent = parent
-        self._number = number
+        self._signal = signal
+        self._kill_parent = kill_parent
         self._stdin, self._stdout = streams
         os.set_blocking(self._stdin, False)
         self._open = [stream for stream in streams if stream is not None]
         self._errors = errors
         self._stderr_text = ""
         """Its standard error once the file is closed."""
+        self._why = ""
         self._on_end = on_end
         self._over = threading.Event()
 
@@ -89,7 +72,7 @@ class ChildProcess:
     def signal(self, number: int) -> None:
         """Send a signal to the process and its group, unless it has ended."""
         if self.running:
-            self._parent.signal(self._number, number)
+            self._signal(number)
 
     def terminate(self) -> None:
         """Send SIGTERM, and SIGCONT in case the process is suspended."""
@@ -105,7 +88,7 @@ class ChildProcess:
         if not self.wait(timeout):
             self.kill()
             if not self.wait(KILL_S):
-                self._parent.kill()
+                self._kill_parent()
                 self.wait(KILL_S)
         self.hang_up()
         if self._errors is not None:
@@ -148,14 +131,13 @@ class ChildProcess:
     def how_ended(self) -> str:
         """Return how the process ended, as part of an error message."""
         assert self.status is not None
-        if self._parent.gone:
-            return f"was killed: {self._parent.why_gone()}"
-        lines = self.stderr_text().splitlines()
-        return f"{ending(self.status)}: {'; '.join(lines)}" if lines else ending(self.status)
+        how = self._why or ending(self.status)
+        lines = [] if self._why else self.stderr_text().splitlines()
+        return f"{how}: {'; '.join(lines)}" if lines else how
 
-    def ended(self, status: int) -> None:
-        """Store the exit status; called by the fork server's listener when the process has ended."""
-        self.status = status
+    def ended(self, status: int, why: str = "") -> None:
+        """Store the exit status, and why the process was killed if its fork server has ended."""
+        self.status, self._why = status, why
         self._over.set()
         self._on_end()
 

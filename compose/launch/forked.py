@@ -20,6 +20,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from itertools import count
 
 import msgspec
@@ -88,7 +89,7 @@ class ForkServer:
         self._running: dict[int, ChildProcess] = {}
         self._lock = threading.Lock()
         self.gone = False
-        """Whether the server, and with it all its processes, has ended."""
+        """True once the server, and with it all its processes, has ended."""
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
 
@@ -115,8 +116,9 @@ class ForkServer:
             errors = file.fileno()
         with self._lock:
             number = next(self._numbers)
-            process = ChildProcess(self, number, (our_input, our_output), file, on_end)
-            self._running[number] = process
+            process = self._running[number] = ChildProcess(
+                (our_input, our_output), file, partial(self.signal, number), self.kill, on_end
+            )
             self._ask(ForkRequest(number, main, title, arguments), [its_input, its_output, errors])
         os.close(its_input)
         os.close(its_output)
@@ -212,7 +214,7 @@ class ForkServer:
         with self._lock:
             ended, self._running = self._running, {}
         for process in ended.values():
-            process.ended(-signal.SIGKILL)
+            process.ended(-signal.SIGKILL, f"was killed: {self.why_gone()}")
 
 
 _servers: dict[str, ForkServer] = {}
