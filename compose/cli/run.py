@@ -76,7 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(options: argparse.Namespace) -> int:
     """Run the mission, as processes or in this one, and return the exit status of its outcome."""
-    if options.watch or not options.in_process:
+    if not options.in_process:
         supervisor.fork_server()  # it imports modules while this process does
     found = setting(options.scenario, options.fault)
     scenario = found.seeded(options.seed)

@@ -16,6 +16,8 @@ STOP_S = 3.0
 """Time in s that a process has to end after SIGTERM; then it is killed."""
 COMMAND = "compose.cli.main:main"
 """The function that runs a `tandem` command."""
+MISSIONS = "compose.cli.warm_up:missions"
+"""The function that prepares a fork server for worlds and agents."""
 
 
 class ChildFailed(RuntimeError):
@@ -23,8 +25,8 @@ class ChildFailed(RuntimeError):
 
 
 def fork_server() -> ForkServer:
-    """Return the fork server of this process's worlds, agents and viewers."""
-    return forked.fork_server("compose.cli.warm_up:missions")
+    """Return the fork server of this process's worlds and agents."""
+    return forked.fork_server(MISSIONS)
 
 
 class Supervisor:
@@ -33,9 +35,13 @@ class Supervisor:
     A signal such as Ctrl-C reaches only this process, and its children by `stop`.
     """
 
-    def __init__(self, inbox: Inbox) -> None:
-        """Put "ended", with the name of the child, into `inbox` whenever a child ends."""
+    def __init__(self, inbox: Inbox, warm_up: str = MISSIONS) -> None:
+        """Put "ended", with the name of the child, into `inbox` whenever a child ends.
+
+        `warm_up` is the function that prepares the fork server of the children.
+        """
         self._inbox = inbox
+        self._warm_up = warm_up
         self._children: dict[str, ChildProcess] = {}
         self._due: list[tuple[float, Callable[[], object]]] = []
         """Monotonic times in s of later starts, and the functions that start."""
@@ -50,7 +56,7 @@ class Supervisor:
         """
         if name in self._children:
             self._children[name].end()
-        child = fork_server().start(
+        child = forked.fork_server(self._warm_up).start(
             main, "tandem", *arguments, answers=answers, on_end=lambda: self._inbox.put("ended", name)
         )
         self._children[name] = child

@@ -23,6 +23,10 @@ READY_S = 30.0
 """Time in s that a viewer has to be ready."""
 
 
+def warm_up() -> None:
+    """Prepare a fork server for viewers, which share few modules. Importing this module does all of it."""
+
+
 class ViewerCommand(NamedTuple):
     """The command line of a viewer."""
 
@@ -75,7 +79,7 @@ def viewing(wanted: Sequence[ViewerCommand], inbox: Inbox) -> Iterator[list[View
 
     Raises UserError, with the last line of its standard error, if one is not ready within READY_S.
     """
-    children = Supervisor(inbox)
+    children = Supervisor(inbox, "compose.launch.viewers:warm_up")
     try:
         yield [_started(children, command) for command in wanted]
     finally:
