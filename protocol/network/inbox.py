@@ -112,8 +112,9 @@ class Inbox:
         self._ring()
 
     def _ring(self) -> None:
-        if self._line is not None:
-            self._line.ring()
+        line = self._line  # another thread may be the one that drops it
+        if line is not None:
+            line.ring()
 
     def turn_away(self, topic: Topic, key: str, why: str) -> None:
         """Refuse a frame without queueing it, from any thread. `next` then counts and prints it."""
