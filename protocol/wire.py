@@ -77,7 +77,7 @@ def decode(frame: bytes, kind: Any, limit: int = MAX_SENT_BYTES) -> Any:
     version, crc = _HEAD.unpack_from(frame)
     if version != VERSION:
         raise MalformedFrame(f"protocol version {version}, this is version {VERSION}")
-    payload = memoryview(frame)[_HEAD.size :]
+    payload = body(frame)
     if zlib.crc32(payload) != crc:
         raise MalformedFrame("damaged: the CRC does not match")
     try:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import inspect
 import json
+import threading
+import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +22,7 @@ from protocol.messages import Command, Observation, Report
 from protocol.motion import ORIGIN
 from protocol.network import keys, session
 from protocol.network.endpoints import listening
-from protocol.network.inbox import COMPLAINTS, NOTHING, Inbox
+from protocol.network.inbox import COMPLAINTS, NOTHING, Arrival, Inbox, Interrupted
 from protocol.wire import encode
 from tests.commands import BOUND_S, TandemProcess, several_pairs, tandem, until, world
 from tests.storm import stranger_at
@@ -231,3 +234,57 @@ def test_a_frame_under_a_wildcard_key_is_not_delivered(capsys: pytest.CaptureFix
             "all told",
         )
     assert "tandem/**: not a key of one mission and robot" in capsys.readouterr().err
+
+
+@contextmanager
+def taking_from_a_line() -> Iterator[tuple[Inbox, zenoh.Session]]:
+    """Yield an inbox that takes Commands from a session, and the session."""
+    inbox = Inbox("test")
+    with session.open_router(listening("tcp/127.0.0.1:0")) as link:
+        session.subscribe_directly(link, keys.command(RUN, "*"), inbox, "command")
+        yield inbox, link
+
+
+def test_a_wait_for_a_line_ends_with_a_frame_another_event_or_the_timeout() -> None:
+    with taking_from_a_line() as (inbox, link):
+        for timeout in (0.0, 0.01, 0.3, 0.02):
+            began = time.monotonic()
+            assert inbox.next(timeout) is NOTHING
+            assert time.monotonic() >= began + timeout
+        threading.Timer(0.01, link.put, (keys.command(RUN, "a"), FRAMES[2])).start()
+        assert inbox.next(None).frame == FRAMES[2]
+        threading.Timer(0.01, inbox.put, ("ended", "agent a")).start()
+        assert inbox.next(BOUND_S) == Arrival("ended", "agent a")
+        threading.Timer(0.01, inbox.put, ("stop", "SIGTERM")).start()
+        with pytest.raises(Interrupted, match="SIGTERM"):
+            inbox.next(BOUND_S)
+    inbox.put("ended", "agent b")
+    assert inbox.next(BOUND_S) == Arrival("ended", "agent b"), "without a session"
+    assert inbox.next(0.01) is NOTHING
+
+
+def test_a_flood_of_a_line_and_a_flood_of_events_wait_for_each_other() -> None:
+    with taking_from_a_line() as (inbox, link):
+        for _ in range(10):
+            inbox.put("ended", "agent a")
+            link.put(keys.command(RUN, "a"), FRAMES[2])
+        topics = [inbox.next(BOUND_S).topic for _ in range(20)]
+        assert inbox.next(0.0) is NOTHING
+    assert all(len(set(topics[i : i + 4])) == 2 for i in range(0, 12, 4)), topics
+
+
+def test_what_a_line_has_no_room_for_replaces_the_oldest() -> None:
+    with taking_from_a_line() as (inbox, link):
+        for number in range(session.LINE_FRAMES + 3):
+            link.put(keys.command(RUN, "a"), str(number).encode())
+        came = list(iter(partial(inbox.next, 0.0), NOTHING))
+    assert [int(arrival.frame) for arrival in came] == [*range(3, session.LINE_FRAMES + 3)]
+
+
+def test_what_comes_over_a_line_under_a_wildcard_is_refused() -> None:
+    with taking_from_a_line() as (inbox, link):
+        link.put("tandem/**", FRAMES[2])
+        link.delete(keys.command(RUN, "a"))
+        link.put(keys.command(RUN, "a"), FRAMES[2], attachment=b"\xff" * 100)
+        assert inbox.next(BOUND_S).frame == FRAMES[2]
+        assert inbox.refused == {"command": 2}

@@ -135,9 +135,13 @@ def test_a_process_suspended_until_its_link_times_out_continues(
     out = tmp_path / "out"
     with TandemProcess("run", undisturbed, "--out", out, "-q") as run:
         run.until_written(out / "world.journal", 2_000)
-        pid = process_of(out, *name.split())
+        pid, other = [
+            process_of(out, *one.split()) for one in (name, "agent b" if name == "agent a" else "agent a")
+        ]
+        stop(other)  # the run waits until it is watched
         with watched(out, name) as bystander:
             stop(pid)
+            os.kill(other, SIGCONT)
             until(lambda: given_up(bystander), "its link is given up")
         written = size(out / "world.journal")
         assert written < size(undisturbed.parent / "out" / "world.journal"), "it was stopped too late"

@@ -119,7 +119,7 @@ class WorldProcess:
         }
         self._truth = session.publisher(link, keys.truth(run))
         session.on_matching(self._truth, self._want_truth)
-        session.subscribe(link, keys.command(run, "*"), inbox, "command")
+        session.subscribe_directly(link, keys.command(run, "*"), inbox, "command")
         session.watch_liveliness(link, keys.robot_alive(run, "*"), inbox)
         session.answer(link, keys.config(run, "*"), self._config)
         self._token = session.show_alive(link, keys.world_alive(run))

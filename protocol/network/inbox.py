@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import threading
+import time
 from collections import Counter
 from queue import Empty, SimpleQueue
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol
 
+from protocol.network.alarm import Alarm
 from protocol.network.keys import NOWHERE, Key
 from protocol.output import say
 
@@ -45,11 +48,31 @@ NOTHING = Arrival("nothing")
 """The result of `Inbox.next` after its timeout."""
 
 
+class LineClosed(Exception):
+    """The session of a Line is closed."""
+
+
+class Line(Protocol):
+    """The contract of a subscription from which the thread that empties the inbox takes frames itself."""
+
+    def receive(self, *, wait: bool) -> Arrival | None:
+        """Return the next frame; None after a call of `ring`, without a frame, or if the frame is refused.
+
+        Raises LineClosed.
+        """
+
+    def ring(self) -> None:
+        """End a wait in `receive`. This may be called from any thread and from a signal handler."""
+
+
 class Inbox:
     """A queue that callbacks and signal handlers fill and one thread empties, with a timeout on each wait.
 
     Its size is limited. Each topic has ROOM_BYTES of its own, so a flood of one topic does not affect the
     others. A frame without room is refused. If the mission needs it, it is repeated, as after any loss.
+
+    The frames that set the pace of a mission do not pass through the queue, but come over a Line. With a
+    callback, each of them would wake a thread that only wakes another one.
     """
 
     def __init__(self, owner: str) -> None:
@@ -67,6 +90,14 @@ class Inbox:
         self._turned_away = Counter[tuple[Topic, str, str]]()
         """The number of frames refused by `turn_away` since the last `next`, by topic, key and reason."""
         self._lock = threading.RLock()  # a signal handler may interrupt its holder
+        self._line: Line | None = None
+        self._line_is_next = True
+        """Whether the next event is taken from the line, if both have one. A flood of one waits for both."""
+        self._alarm = Alarm(self._ring)
+
+    def take_from(self, line: Line) -> None:
+        """Take frames from `line`, too, until its session is closed. It replaces an earlier line."""
+        self._line = line
 
     def put(self, topic: Topic, key: str = "", frame: bytes = b"", source: Key = NOWHERE) -> None:
         """Add an event. This may be called from any thread and from a signal handler."""
@@ -78,6 +109,12 @@ class Inbox:
                 return
             self._waiting[topic] = waiting + _size(arrival)
         self._queue.put(arrival)
+        self._ring()
+
+    def _ring(self) -> None:
+        line = self._line  # another thread may be the one that drops it
+        if line is not None:
+            line.ring()
 
     def turn_away(self, topic: Topic, key: str, why: str) -> None:
         """Refuse a frame without queueing it, from any thread. `next` then counts and prints it."""
@@ -89,19 +126,47 @@ class Inbox:
 
     def next(self, timeout: float | None) -> Arrival:
         """Return the next event, or NOTHING after `timeout` s. Raises Interrupted for the topic "stop"."""
+        arrival = self._queued(timeout) if self._line is None else self._from(self._line, timeout)
+        if self._turned_away:
+            self._count_turned_away()
+        return arrival
+
+    def _queued(self, timeout: float | None) -> Arrival:
+        """Return the next event of the queue, or NOTHING after `timeout` s. Raises Interrupted."""
         try:
             arrival = self._queue.get(timeout=max(timeout, 0.0) if timeout is not None else None)
         except Empty:
-            arrival = NOTHING
-        if self._turned_away:
-            self._count_turned_away()
-        if arrival is NOTHING:
             return NOTHING
         with self._lock:
             self._waiting[arrival.topic] -= _size(arrival)
         if arrival.topic == "stop":
             raise Interrupted(arrival.key)
         return arrival
+
+    def _from(self, line: Line, timeout: float | None) -> Arrival:
+        """Return the next event of `line` or the queue, or NOTHING after `timeout` s. Raises Interrupted."""
+        until = time.monotonic() + timeout if timeout is not None else math.inf
+        while True:
+            idle = self._queue.empty()
+            if idle or self._line_is_next:
+                self._line_is_next = False
+                wait = idle and time.monotonic() < until
+                if wait:
+                    self._alarm.set(until)
+                try:
+                    arrival = line.receive(wait=wait)
+                except LineClosed:
+                    self._line = None
+                    return self._queued(until - time.monotonic() if timeout is not None else None)
+                if arrival is not None:
+                    return arrival
+            if not idle:
+                self._line_is_next = True
+                return self._queued(0.0)
+            if self._turned_away:
+                self._count_turned_away()
+            if time.monotonic() >= until:
+                return NOTHING
 
     def refuse(self, arrival: Arrival, why: object) -> None:
         """Count a refused frame, and print a message for the first with this key and reason."""

@@ -23,7 +23,7 @@ from protocol import limits
 from protocol.messages import Message
 from protocol.network import keys
 from protocol.network.endpoints import Endpoints, zenoh_config
-from protocol.network.inbox import COMPLAINT, Inbox, Topic
+from protocol.network.inbox import COMPLAINT, Arrival, Inbox, Line, LineClosed, Topic
 from protocol.network.keys import Key
 from protocol.wire import encode
 
@@ -34,6 +34,10 @@ LINK_CHECK_S = 1.0
 LISTEN_AGAIN_S = 0.1
 """The time in s between two attempts to listen on a port."""
 
+LINE_FRAMES = 1 << 10
+"""The number of messages that a Line stores; the next one replaces the oldest. A frame has at most 64 kB."""
+RING = b"ring"
+"""The attachment of the message that ends a wait. From another process, it has no effect."""
 NO_KEY = "not a key of one mission and robot"
 """The reason for refusing a message on a wildcard or an unknown key."""
 
@@ -118,21 +122,28 @@ def open_session(
 
 
 def subscribe(session: zenoh.Session, key: str, inbox: Inbox, topic: Topic) -> None:
-    """Put all messages on `key` into `inbox`."""
-    handler: zenoh.handlers.Callback[zenoh.Sample] = _at_once(lambda sample: deliver(sample, inbox, topic))
-    session.declare_subscriber(key, handler)
+    """Put all messages on `key` into `inbox`. Zenoh hands each of them to a thread of the subscriber."""
+    session.declare_subscriber(key, lambda sample: deliver(sample, inbox, topic))
 
 
 def _at_once(hand_over: Callable[[T], None]) -> zenoh.handlers.Callback[T]:
     """Return a callback that runs on the receiving thread. It must be short, and must not wait for Zenoh.
 
-    By default, Zenoh hands each message to a separate thread of the subscriber.
+    By default, Zenoh hands each message to a separate thread of the subscriber. That is faster for many
+    messages, because the receiving thread enters and leaves the interpreter for each of them.
     """
     return zenoh.handlers.Callback(hand_over, indirect=False)
 
 
 def deliver(sample: zenoh.Sample, inbox: Inbox, topic: Topic) -> None:
     """Put the message into `inbox`, which refuses it if it is a deletion, or on a wildcard or unknown key."""
+    arrival = _arrival(sample, inbox, topic)
+    if arrival is not None:
+        inbox.put(*arrival)
+
+
+def _arrival(sample: zenoh.Sample, inbox: Inbox, topic: Topic) -> Arrival | None:
+    """Return the message, or None if `inbox` refuses it: a deletion, or on a wildcard or unknown key."""
     key = str(sample.key_expr)
     source = keys.parse(key)
     if source is None:
@@ -140,7 +151,43 @@ def deliver(sample: zenoh.Sample, inbox: Inbox, topic: Topic) -> None:
     elif sample.kind == zenoh.SampleKind.DELETE:
         inbox.turn_away(topic, key, "a deletion")
     else:
-        inbox.put(topic, key, sample.payload.to_bytes(), source)
+        return Arrival(topic, key, sample.payload.to_bytes(), source)
+    return None
+
+
+def subscribe_directly(session: zenoh.Session, key: str, inbox: Inbox, topic: Topic) -> None:
+    """Let `inbox` take all messages on `key` from Zenoh itself, without a callback (see `inbox.Line`)."""
+    inbox.take_from(_Subscription(session, key, inbox, topic))
+
+
+class _Subscription(Line):
+    """A subscription to `key`, with room for the latest LINE_FRAMES messages.
+
+    Zenoh's channels have no timeout, but one wakes for every message. `ring` therefore sends one that only
+    this session receives.
+    """
+
+    def __init__(self, session: zenoh.Session, key: str, inbox: Inbox, topic: Topic) -> None:
+        self._session = session
+        self._key = key
+        self._inbox = inbox
+        self._topic: Topic = topic
+        self._subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(LINE_FRAMES))
+
+    def receive(self, *, wait: bool) -> Arrival | None:
+        try:
+            sample = self._subscriber.recv() if wait else self._subscriber.try_recv()
+        except zenoh.ZError:
+            raise LineClosed from None
+        if sample is None or (sample.attachment is not None and sample.attachment.to_bytes() == RING):
+            return None
+        return _arrival(sample, self._inbox, self._topic)
+
+    def ring(self) -> None:
+        with suppress(zenoh.ZError):  # the session is closed
+            self._session.put(
+                self._key, b"", attachment=RING, allowed_destination=zenoh.Locality.SESSION_LOCAL
+            )
 
 
 def watch_liveliness(session: zenoh.Session, key: str, inbox: Inbox) -> None:
