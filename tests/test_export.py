@@ -41,7 +41,7 @@ from compose.cli import export_bar, run
 from compose.cli.main import parse
 from compose.launch import in_process
 from compose.launch.processes import free_endpoint
-from compose.recording.run import WORLD_JOURNAL, agent_journal, estimates, read
+from compose.recording.run import WORLD_JOURNAL, agent_journal, read
 from compose.scenario.scenario_file import load
 from compose.view.export.folder import export
 from compose.view.foxglove.gate import GUESTS, GUESTS_FILES
@@ -63,7 +63,7 @@ A, B = agent_journal("a"), agent_journal("b")
 def exported(scenario: Scenario, folder: Path) -> Path:
     """Return the folder of the recording and exports of a run of `scenario`."""
     in_process.run_mission(scenario, folder)
-    export(folder, folder)
+    export(read(folder), folder)
     return folder
 
 
@@ -223,7 +223,7 @@ def test_viewers_see_anchors_with_their_ranges_and_contact_while_there_is_any(pa
 
 
 def test_viewers_see_what_a_robot_holds_possible_in_the_frame_that_it_knows(paper_1: Path) -> None:
-    held = estimates(paper_1, "a")
+    held = read(paper_1).estimates("a")
     shown = seen(paper_1 / "run.mcap", "/a/hypotheses")
     for one, poses in zip(held, shown, strict=True):
         expected = one.world or one.local
@@ -233,7 +233,7 @@ def test_viewers_see_what_a_robot_holds_possible_in_the_frame_that_it_knows(pape
 
 
 def test_viewers_see_an_ellipse_where_there_is_a_covariance(noisy: Path) -> None:
-    held = estimates(noisy, "a")
+    held = read(noisy).estimates("a")
     shown = seen(noisy / "run.mcap", "/a/belief")
     for one, belief in zip(held, shown, strict=True):
         (entity,) = belief.entities
@@ -285,7 +285,7 @@ def test_ticks_as_a_table_are_those_of_ticks_csv_with_what_was_held_possible(noi
     table = pq.ParquetFile(noisy / "ticks.parquet").read().to_pylist()
     rows = rows_of(noisy / "ticks.csv")
     assert len(table) == len(rows) > 0
-    held = {robot: {one.tick: one for one in estimates(noisy, robot)} for robot in "ab"}
+    held = {robot: {one.tick: one for one in read(noisy).estimates(robot)} for robot in "ab"}
     for row, line in zip(table, rows, strict=True):
         for name, text in line.items():
             assert ("" if row[name] is None else str(row[name])) == text
@@ -441,7 +441,7 @@ def test_ctrl_c_ends_an_export_and_leaves_nothing_half_written(paper_1: Path, tm
     assert (ended.status, ended.out, ended.err) == (130, "", "tandem export: stopped by SIGINT\n")
     assert not (tmp_path / "out").exists()
     all_checks = itertools.count()
-    export(paper_1, tmp_path / "whole", check=lambda: next(all_checks))
+    export(read(paper_1), tmp_path / "whole", check=lambda: next(all_checks))
     for checks, left in (
         (10, set()),
         (60, {"run.mcap"}),
@@ -449,7 +449,7 @@ def test_ctrl_c_ends_an_export_and_leaves_nothing_half_written(paper_1: Path, tm
     ):
         some = iter(range(checks))
         with pytest.raises(StopIteration):
-            export(paper_1, tmp_path / "out", check=functools.partial(next, some))
+            export(read(paper_1), tmp_path / "out", check=functools.partial(next, some))
         assert {path.name for path in (tmp_path / "out").iterdir()} == left
 
 

@@ -23,7 +23,7 @@ from compose.launch.in_process import run_mission
 from compose.recording.run import estimates, read
 from compose.recording.summary_json import first_claim
 from compose.scenario.scenario_file import load, parse
-from compose.view.recorded import read as performed
+from compose.view.recorded import Journals
 from protocol.journal.journal_file import CorruptJournal
 from protocol.journal.journal_file import read as frames
 from protocol.messages import Estimate
@@ -377,7 +377,9 @@ def test_a_journal_of_another_run_is_no_record_of_this_one(noisy: Path, tmp_path
     shutil.copyfile(other / "agent-a.journal", folder / "agent-a.journal")
     with pytest.raises(CorruptJournal, match=r"agent-a\.journal: belongs to another run: its conf"):
         estimates(folder, "a")
-    assert [note.split("/")[-1] for note in performed(folder).notes] == [
+    journals = Journals(folder)
+    journals.read()
+    assert [note.split("/")[-1] for note in journals.notes] == [
         "agent-a.journal: belongs to another run: its configuration does not match the world's"
     ]
     ended = tandem("export", folder)

@@ -13,7 +13,7 @@ from signal import SIGKILL
 import pytest
 from playwright.sync_api import Page, expect
 
-from compose.recording.run import WORLD_JOURNAL, estimates, read
+from compose.recording.run import WORLD_JOURNAL, read
 from protocol.journal import journal_file
 from protocol.journal.journal_file import Journal
 from protocol.messages import Command, Observation
@@ -220,7 +220,7 @@ def test_an_error_is_told_of_a_pose_that_leads_and_else_as_a_range(
     page = opened(f"{address}#tick=47", height=720)
     until_shown(page, 47)
     truth = read(paper_1).ticks[47].truth.poses[1]
-    off = sorted(errors(pose, truth)[0] for pose in estimates(paper_1, "b")[47].world)
+    off = sorted(errors(pose, truth)[0] for pose in read(paper_1).estimates("b")[47].world)
     assert len(off) == 4
     assert off[3] > 1.0
     error = page.locator(".card[data-robot=b] .error")

@@ -12,13 +12,13 @@ import pyarrow.parquet as pq
 import pytest
 from msgspec.structs import replace
 
-from compose.audit.hardware_rules import RULES, audit_hardware_run
+from compose.audit.rules import HARDWARE_RULES, audit_run
 from compose.figures import over_time, phase_one, steps, trajectory
 from compose.figures.account import account
 from compose.figures.pair import PairRecord, of_record, of_robots
 from compose.figures.sheet import NO_PLACES, Absent
 from compose.launch.in_process import run_mission
-from compose.recording.run import past_of, read
+from compose.recording.run import of_frames, past_of, read
 from compose.scenario.scenario_file import load, parse
 from protocol.journal import journal_file
 from protocol.messages import Command, Message, OfRobot, Report
@@ -240,7 +240,9 @@ def test_the_audit_holds_robots_to_their_limits_and_to_what_they_sensed(folders:
     ended = tandem("audit", alone)
     assert ended.status == 0, ended.out
     assert "a and b, hardware mode: no violations" in ended.out
-    assert [line.split()[0] for line in ended.out.splitlines()[3:]] == [rule.__name__ for rule in RULES]
+    assert [line.split()[0] for line in ended.out.splitlines()[3:]] == [
+        rule.__name__ for rule in HARDWARE_RULES
+    ]
 
 
 def too_fast(message: Message) -> Message:
@@ -269,5 +271,5 @@ def test_without_a_world_the_audit_finds_what_breaks_a_rule(
         if other is not message:
             frames[place] = encode(other)
             break
-    findings = audit_hardware_run(found, alone)
+    findings = audit_run(of_frames(found, alone))
     assert {one.rule for one in findings.violations} == rules

@@ -23,7 +23,7 @@ from compose.cli.arguments import (
 from compose.errors import ENDED, FAILED, STOPPED, UserError, status_of
 from compose.launch.signals import stop_by_signal, stop_with_launcher
 from compose.network import beyond, reach
-from compose.recording.summary_json import ended
+from compose.recording.run import ended
 from compose.scenario import kills
 from compose.terminal.outcome import reopened
 from protocol.journal.journal_file import CannotRecord, CorruptJournal, Journal

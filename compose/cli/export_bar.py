@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from compose.recording.run import user_errors
+from compose.recording.run import read, user_errors
 from compose.terminal.outcome import counting
 from protocol.network.inbox import Inbox
 
@@ -24,4 +24,4 @@ def exported(folder: Path, out: Path, inbox: Inbox, *, quiet: bool = False) -> E
     from compose.view.export.folder import FILES, export  # noqa: PLC0415  # slow to import, and optional
 
     with user_errors(folder), counting("tandem export", 0 if quiet else len(FILES)) as done:
-        return export(folder, out, done=done, check=lambda: inbox.next(0.0))
+        return export(read(folder), out, done=done, check=lambda: inbox.next(0.0))

@@ -11,8 +11,7 @@ from compose.cli.arguments import add_closing, add_recording
 from compose.errors import ENDED, FAILED, UserError
 from compose.extras import need
 from compose.figures import FORMATS, PICTURES
-from compose.recording.robots import alone, casts
-from compose.recording.run import Recording, agent_journal, read, user_errors
+from compose.recording.run import Run, agent_journal, read, user_errors
 from compose.terminal.outcome import counting
 from protocol.journal.journal_file import CorruptJournal
 from protocol.output import say
@@ -48,13 +47,12 @@ def main(options: argparse.Namespace) -> int:
     """
     need("matplotlib")
     with user_errors(options.recording):
-        recording = None if alone(options.recording) else read(options.recording)
-        pairs = _casts(options.recording, recording)
+        run = read(options.recording)
     folder, status = options.recording / "figures", ENDED
     kinds = [kind for kind in PICTURES if kind in (options.only or PICTURES)]
     formats = [one for one in FORMATS if one in (options.format or FORMATS)]
-    with counting("tandem figures", sum([len(robots) + len(kinds) for robots in pairs])) as done:
-        for robots in pairs:
+    with counting("tandem figures", sum([len(robots) + len(kinds) for robots in run.pairs])) as done:
+        for robots in run.pairs:
             accounts = {}
             for robot in robots:
                 account = _account(options.recording, robot)
@@ -64,10 +62,10 @@ def main(options: argparse.Namespace) -> int:
                     status = FAILED
                 done()
             torn = [name for name, one in accounts.items() if one.past is not None and one.past.end is None]
-            torn += ["the world"] if recording is not None and recording.end is None else []
+            torn += ["the world"] if run.world is not None and run.world.end is None else []
             if torn:
                 _say(f"the recording of {' and '.join(torn)} ends before the mission does")
-            pair = _pair(recording, robots, accounts)
+            pair = _pair(run, robots, accounts)
             if pair is None:
                 _say(f"no figure of {' and '.join(robots)}: the recording has no data")
                 status = FAILED
@@ -81,23 +79,13 @@ def main(options: argparse.Namespace) -> int:
     return status
 
 
-def _casts(folder: Path, recording: Recording | None) -> list[tuple[str, ...]]:
-    """Return the robots of each pair, role a first; in hardware mode, only those with a journal."""
-    if recording is None:
-        return casts(folder)
-    robots = recording.scenario.robots
-    return [(robots[a].id, robots[b].id) for a, b in recording.scenario.pairs()]
-
-
-def _pair(
-    recording: Recording | None, robots: Sequence[str], accounts: Mapping[str, Account]
-) -> PairRecord | None:
+def _pair(run: Run, robots: Sequence[str], accounts: Mapping[str, Account]) -> PairRecord | None:
     """Return the data of a pair, or None if there is no journal of either robot."""
     from compose.figures.pair import of_record, of_robots  # noqa: PLC0415
 
-    if recording is not None:
-        places = {robot.id: place for place, robot in enumerate(recording.scenario.robots)}
-        return of_record(recording, (places[robots[0]], places[robots[1]]), accounts)
+    if run.world is not None:
+        places = run.robots.index(robots[0]), run.robots.index(robots[1])
+        return of_record(run, places, accounts)
     known = {robot: account for robot, account in accounts.items() if account.past is not None}
     return of_robots(known) if known else None
 

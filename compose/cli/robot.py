@@ -23,8 +23,7 @@ from compose.launch.driver_loader import briefed, driver_class, made, mission, o
 from compose.launch.processes import STOP_S, ChildFailed, MissionProcess, free_endpoint
 from compose.launch.signals import stop_by_signal
 from compose.network import beyond, reach
-from compose.recording.run import folder_for
-from compose.recording.summary_json import ended
+from compose.recording.run import ended, folder_for
 from compose.scenario.scenario_file import check_rate
 from protocol.journal.journal_file import CannotRecord, CorruptJournal
 from protocol.messages import Localised, MissionEnd

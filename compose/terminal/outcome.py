@@ -50,7 +50,7 @@ def counting(what: str, steps: int) -> Iterator[Callable[[], None]]:
 
 def conclude(
     options: argparse.Namespace,
-    recording: run.Recording,
+    recording: run.Run,
     folder: Path | None,
     mode: Mode,
     began: float,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,9 @@ from msgspec.structs import asdict
 
 from compose.recording.claim import nees
 from compose.recording.frames import Journaled
+from compose.recording.run import Run
 from compose.recording.ticks_csv import TickRow
-from protocol.messages import Command, Estimate, Localised
+from protocol.messages import Estimate, Localised
 from protocol.motion import Covariance, Pose
 from world.referee import errors
 
@@ -41,27 +42,22 @@ COLUMNS = [
     *_MEASURES,
 ]
 """The columns of `ticks.parquet`."""
-At = tuple[str, int]
-"""A robot's id and a tick."""
 
 
-def write_ticks(
-    rows: Iterable[TickRow],
-    commands: Mapping[At, Command],
-    held: Mapping[At, Estimate],
-    period: float,
-    path: Path,
-) -> None:
-    """Write `ticks.parquet` to `path`: `rows` with estimates, and their errors if there is a ground truth.
+def write_ticks(run: Run, rows: Iterable[TickRow], period: float, path: Path) -> None:
+    """Write `ticks.parquet` to `path`: the `rows` of `run`, with estimates and their errors.
 
     `period` is T_s in s.
     """
+    estimates = {(robot, one.tick): one for robot, past in run.pasts.items() for one in past.estimates}
     lines = []
     for row in rows:
-        at = row.robot, row.tick
-        verdict = commands[at].verdict if at in commands else None
-        extra = {"time_s": row.tick * period, "verdict": _tag(verdict)}
-        lines.append(asdict(row) | extra | _estimate(held.get(at), row.pose))
+        command = run.command(row.robot, row.tick)
+        extra = {
+            "time_s": row.tick * period,
+            "verdict": _tag(command.verdict if command is not None else None),
+        }
+        lines.append(asdict(row) | extra | _estimate(estimates.get((row.robot, row.tick)), row.pose))
     schema = pa.schema([pa.field(name, _KINDS.get(name, pa.float64())) for name in COLUMNS])
     pq.write_table(pa.Table.from_pylist(lines, schema=schema), path)
 
