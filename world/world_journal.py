@@ -16,6 +16,9 @@ from world.scenario import Scenario
 from world.tick import World, advance, release
 from world.truth import Truth
 
+_AFTER_THE_SCENARIO = Command | DeadlineMissed | MissionEnd | FinalReport
+"""The messages that follow the scenario in a world's journal."""
+
 
 class Tick(msgspec.Struct, frozen=True):
     """A tick with all its recorded Commands."""
@@ -109,7 +112,7 @@ class JournalReading:
         if self.world is None:
             self._begin(frame)
             return True
-        message = decode(frame, Command | DeadlineMissed | MissionEnd | FinalReport)
+        message = decode(frame, _AFTER_THE_SCENARIO)
         is_running = self.end is None and self.judgement is None
         tick = self.world.truth.tick
         match message:

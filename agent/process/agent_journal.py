@@ -139,28 +139,37 @@ class JournalReading:
 
     def _fits(self, message: object, frame: bytes) -> bool:
         """Add `message`, and return True if it may be next."""
-        step, ended = self._step, self._end is not None
+        if self.config is None:
+            return self._begins(message)
+        step = self._step
         match message:
-            case Environment() if not self.messages:
-                self.environment = message
-            case RobotConfig() if self.config is None:
-                self.config = message
-            case _ if self.config is None:
-                raise MalformedFrame("an agent's journal must begin with a RobotConfig")
-            case Observation(tick) if not ended and tick == len(self._steps) + (step is not None):
+            case _ if self._end is not None:
+                if not isinstance(message, FinalReport) or self._final_report is not None:
+                    return False
+                self._final_report = message
+            case Command() | Estimate() | Report() | DeadlineMissed():
+                return step is not None and step.take(message, frame, self.config.robot)
+            case Observation(tick) if tick == len(self._steps) + (step is not None):
                 if step is not None:
                     if step.command is None:
                         return False
                     self._steps.append(step.closed())
                 self._step = _OpenStep(message, frame)
-            case Report() | DeadlineMissed() | Command() | Estimate() if step is not None and not ended:
-                return step.take(message, frame, self.config.robot)
-            case MissionEnd() if not ended:
+            case MissionEnd():
                 self._end = message
-            case FinalReport() if ended and self._final_report is None:
-                self._final_report = message
             case _:
                 return False
+        return True
+
+    def _begins(self, message: object) -> bool:
+        """Add the environment, which is missing in older recordings, or the configuration."""
+        match message:
+            case Environment() if not self.messages:
+                self.environment = message
+            case RobotConfig():
+                self.config = message
+            case _:
+                raise MalformedFrame("an agent's journal must begin with a RobotConfig")
         return True
 
     def content(self) -> Past | None:

@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 import pyarrow as pa
 import pyarrow.parquet as pq
-from msgspec.structs import asdict
+from msgspec.structs import asdict, astuple
 
 from compose.recording.claim import nees
 from compose.recording.frames import Journaled
@@ -106,16 +106,17 @@ def frames_csv(frames: Iterable[Journaled], check: Callable[[], object] = lambda
 
 
 def _named(value: Any) -> Any:
-    match value:
-        case Localised():
-            return {"verdict": "localised", **_named_fields(value)}
-        case msgspec.Struct():
-            return _named_fields(value)
-        case tuple():
-            return [_named(one) for one in value]
-        case _:
-            return value
+    """Return a message, or a value in one, with the names of its fields."""
+    if isinstance(value, tuple):
+        return [_named(one) for one in value]
+    if not isinstance(value, msgspec.Struct):
+        return value
+    named = {
+        name: one if type(one) in _PLAIN else _named(one)
+        for name, one in zip(value.__struct_fields__, astuple(value), strict=True)
+    }
+    return {"verdict": "localised", **named} if isinstance(value, Localised) else named
 
 
-def _named_fields(value: msgspec.Struct) -> dict[str, Any]:
-    return {name: _named(getattr(value, name)) for name in value.__struct_fields__}
+_PLAIN = frozenset((int, float, str, bool, type(None)))
+"""The types of values without parts."""

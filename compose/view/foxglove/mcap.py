@@ -60,8 +60,9 @@ class Channels:
         `at` is the simulated time in ns.
         """
         channel = self._of_frames(one.journal, type(one.message))
-        channel.log(one.body, log_time=at)
-        self._latest[channel] = (one.body, at)
+        body = one.body
+        channel.log(body, log_time=at)
+        self._latest[channel] = (body, at)
 
     def republish(self) -> None:
         """Publish the latest journaled frame of each channel again, for new viewers."""
