@@ -41,11 +41,12 @@ from compose.cli import export_bar, run
 from compose.cli.main import parse
 from compose.launch import in_process
 from compose.launch.processes import free_endpoint
-from compose.recording.run import WORLD_JOURNAL, agent_journal, read
+from compose.recording.run import WORLD_JOURNAL, Run, agent_journal, read
 from compose.scenario.scenario_file import load
 from compose.view.export.folder import export
 from compose.view.foxglove.gate import GUESTS, GUESTS_FILES
 from compose.view.foxglove.views import LEAST
+from protocol import wire
 from protocol.journal import journal_file
 from protocol.messages import Estimate, Observation
 from protocol.motion import wrap
@@ -637,3 +638,50 @@ def test_a_port_that_is_taken_is_said_before_anything_moves(tmp_path: Path) -> N
     assert (ended.status, ended.out) == (2, "")
     assert ended.err.startswith(f"tandem run: --foxglove: port {port} cannot be served: ")
     assert list((tmp_path / "out").iterdir()) == []
+
+
+# --- reading ------------------------------------------------------------------------------------------
+
+
+class CountedHeads:
+    """The heads of frames, counted whenever a frame is decoded."""
+
+    def __init__(self, heads: struct.Struct) -> None:
+        self.size, self.pack, self._heads = heads.size, heads.pack, heads
+        self.decoded = 0
+
+    def unpack_from(self, frame: bytes) -> tuple[int, int]:
+        self.decoded += 1
+        version, crc = self._heads.unpack_from(frame)
+        return version, crc
+
+
+@pytest.mark.parametrize("hardware", [False, True])
+def test_an_export_decodes_each_frame_once(
+    faulty: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hardware: bool
+) -> None:
+    for path in faulty.glob("agent-*.journal" if hardware else "*.journal"):
+        shutil.copyfile(path, tmp_path / path.name)
+    frames = sum([len(list(journal_file.read(path))) for path in tmp_path.glob("*.journal")])
+    heads = CountedHeads(wire._HEAD)
+    monkeypatch.setattr(wire, "_HEAD", heads)
+    export(read(tmp_path), tmp_path / "out")
+    assert heads.decoded == frames
+
+
+def test_a_run_with_an_export_reads_its_recording_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The outcome and the export are of one Run."""
+    found: list[Run] = []
+
+    def counted(folder: Path) -> Run:
+        found.append(read(folder))
+        return found[-1]
+
+    monkeypatch.setattr(run, "stop_by_signal", lambda _: None)  # it would affect the process of the tests
+    monkeypatch.setattr(run, "read", counted)
+    monkeypatch.setattr(export_bar, "read", counted)
+    assert run.main(parse(["run", "paper-1", "-q", "--out", str(tmp_path)])) == 0
+    assert (tmp_path / "run.mcap").exists()
+    assert len(found) == 1

@@ -145,8 +145,10 @@ def _publish(
     views = Views(stage)
     channels.open_views(stage.ids)
     both: Iterable[Journaled | Scene] = (*frames, *scenes)
+    tick, at = 0, nanoseconds(stage, 0)
     for one in sorted(both, key=lambda one: one.tick):
-        at = nanoseconds(stage, one.tick)
+        if one.tick != tick:
+            tick, at = one.tick, nanoseconds(stage, one.tick)
         if isinstance(one, Journaled):
             channels.frame(one, at)
             continue
