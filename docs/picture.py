@@ -11,7 +11,7 @@ from compose.figures import PICTURES, catalogue
 from compose.figures.account import account
 from compose.figures.pair import of_record
 from compose.figures.sheet import Absent
-from compose.figures.style import save
+from compose.figures.style import SCREEN, look, save
 from compose.launch import in_process
 from compose.scenario import scenario_file
 
@@ -47,7 +47,7 @@ def draw(name: str, shown: Mapping[str, str], folder: Path) -> None:
     robots = [robot.id for robot in recording.scenario.robots]
     pair = of_record(recording, (0, 1), {robot: account(folder, robot) for robot in robots})
     for kind in PICTURES:
-        with catalogue.settings(kind):
+        with look(SCREEN):
             for title, figure in catalogue.pictures(pair, kind):
                 if title in shown and not isinstance(figure, Absent):
                     (svg,) = save(figure, folder / title, ["svg"])

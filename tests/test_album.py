@@ -23,11 +23,20 @@ from msgspec.structs import replace
 from agent.planning.active_sensing import stride
 from agent.planning.phase3_last_manoeuvre import compared
 from compose.cli.figures import draw as draw_all
-from compose.figures import PICTURES, catalogue, decisions, manoeuvre, over_time, phase_one, steps, trajectory
+from compose.figures import (
+    PICTURES,
+    catalogue,
+    encounter,
+    hypotheses,
+    manoeuvre,
+    over_time,
+    phase_one,
+    trajectory,
+)
 from compose.figures.account import account
 from compose.figures.pair import PairRecord, of_record
 from compose.figures.sheet import Absent
-from compose.figures.style import look
+from compose.figures.style import SCREEN, look
 from compose.launch.in_process import run_mission
 from compose.recording.run import estimates, read
 from compose.recording.summary_json import first_claim
@@ -228,8 +237,8 @@ def test_the_encounter_has_a_panel_for_each_mutual_range(
     name: str, ticks: list[int], recordings: Path
 ) -> None:
     told = pair(recorded(name, recordings))
-    assert steps.steps(told) == ticks
-    figure = drawn(steps.draw(told))
+    assert encounter.steps(told) == ticks
+    figure = drawn(encounter.draw(told))
     assert len(figure.axes) == 3
     for axes, tick in zip(figure.axes, ticks, strict=True):
         assert axes.get_title(loc="left").startswith(f"({ticks.index(tick) + 1}) $k$ = {tick}, ")
@@ -245,9 +254,9 @@ def test_the_key_of_an_encounter_is_on_the_paper_however_few_ranges_it_has(
 ) -> None:
     run_mission(parse(PAPER_1.replace("seed = 1", f"seed = 1\nmax_ticks = {ticks}"), "mine.toml"), tmp_path)
     told = pair(tmp_path)
-    assert len(steps.steps(told)) == ticks - 45
-    with look():
-        figure = drawn(steps.draw(told))
+    assert len(encounter.steps(told)) == ticks - 45
+    with look(SCREEN):
+        figure = drawn(encounter.draw(told))
         figure.draw_without_rendering()
     (key,) = figure.legends
     paper, signs = figure.bbox, key.get_window_extent()
@@ -324,7 +333,7 @@ def test_in_grey_no_line_of_errors_looks_like_one_of_the_other_robot_or_of_somet
 def test_under_noise_a_panel_has_each_hypothesis_that_the_journal_tells_of(recordings: Path) -> None:
     folder = recorded("noisy", recordings)
     told = pair(folder)
-    figure = drawn(decisions.draw(told))
+    figure = drawn(hypotheses.draw(told))
     shown = {int(one.get_gid().split("-")[1]) for one in found(figure, r"truth-.*")}  # type: ignore[union-attr]
     assert len(shown) == len(figure.axes) > 1
     for role in ("a", "b"):
@@ -380,7 +389,7 @@ def test_each_kind_is_drawn_of_each_run_or_says_why_not(
 def test_every_pair_has_figures_of_its_own(recordings: Path) -> None:
     folder = recorded("pairs", recordings)
     names = []
-    with look(symbols=True):
+    with look(SCREEN):
         for number in range(2):
             names += [name for name, _ in catalogue.pictures(pair(folder, number), "trajectory")]
             names += [name for name, _ in catalogue.pictures(pair(folder, number), "phase-1")]

@@ -15,10 +15,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from compose.figures import belief, plane
-from compose.figures.one_robot import figure_of
-from compose.figures.story import Story
-from compose.figures.style import PLACES, look, save
+from compose.figures import over_time
+from compose.figures import robot as robot_figure
+from compose.figures.account import account
+from compose.figures.pair import PairRecord, of_record
+from compose.figures.sheet import Absent
+from compose.figures.style import PLACES, SCREEN, look, save
 from compose.launch.in_process import run_mission
 from compose.recording.run import estimates, read
 from compose.recording.summary_json import first_claim
@@ -62,15 +64,23 @@ def draw(folder: Path) -> Ended:
     return tandem("figures", folder, "--only", "robot", "--format", "svg")
 
 
-def picture(folder: Path, robot: str) -> Path:
+def picture(folder: Path, name: str) -> Path:
     """Return the figure of one robot, drawn in this process."""
-    recording = read(folder)
-    place = [one.id for one in recording.scenario.robots].index(robot)
-    story = Story(recording, place, estimates(folder, robot))
     (folder / "figures").mkdir(exist_ok=True)
-    with look():
-        svg, *_ = save(figure_of(story), folder / "figures" / f"robot-{robot}")
+    with look(SCREEN):
+        svg, *_ = save(figure_of(folder, name), folder / "figures" / f"robot-{name}")
     return svg
+
+
+def figure_of(folder: Path, name: str) -> Figure:
+    """Return the figure of the robot `name` of the first pair."""
+    figure = robot_figure.draw(pair_of(folder), "a" if name == "a" else "b")
+    assert not isinstance(figure, Absent), figure
+    return figure
+
+
+def pair_of(folder: Path) -> PairRecord:
+    return of_record(read(folder), (0, 1), {name: account(folder, name) for name in "ab"})
 
 
 def texts(svg: Path) -> set[str]:
@@ -128,14 +138,14 @@ def test_a_picture_says_what_the_robot_claimed_and_how_far_off_it_was(
     claim = first_claim(recording, place)
     assert claim is not None
     assert claim.covariance is not None
-    robot = recording.scenario.robots[place].id
-    words = texts(drawn / f"robot-{robot}.svg")
+    name = recording.scenario.robots[place].id
+    words = texts(drawn / f"robot-{name}.svg")
     (said,) = [line for line in words if line.startswith("The robot claims its pose")]
     assert f"in tick {claim.tick}: errors {claim.position_error:.2g} m" in said
     assert f"(sigmas {claim.covariance.position_sigma:.2g} m" in said
-    assert f"claim, tick {claim.tick}" in words
+    assert f"claim of {name}, tick {claim.tick}" in words
     assert (
-        f"Robot {robot} of noisy, seed {recording.scenario.seed}: localised after {claim.tick} ticks" in words
+        f"Robot {name} of noisy, seed {recording.scenario.seed}: localised after {claim.tick} ticks" in words
     )
 
 
@@ -144,14 +154,23 @@ def test_a_picture_names_its_axes_with_units_and_what_was_asked_for(drawn: Path)
     assert {"x [m]", "y [m]", "position error [m]", "probability of a hypothesis"} <= words
     assert {"required sigma: 0.1 m", "required: 99.99 %", "sensing range, 3 m"} <= words
     assert {"1: own anchor", "2: search for the peer", "3: encounter"} <= words
-    assert {"anchor of a", "anchor of b", "true path of a", "true path of b"} <= words
+    assert {"$M_1$", "$M_2$", "true path of a", "true path of b"} <= words
 
 
 def test_each_part_of_a_noisy_mission_is_in_its_picture(noisy: Path, drawn: Path) -> None:
     held = [one for one in estimates(noisy, "a") if one.world]
     found = ids(drawn / "robot-a.svg")
     assert {"path-a", "path-b", "anchor-a", "range-b", "met", "final", "estimates"} <= found
-    assert {"error", "sigma", "envelope", "accuracy", "claim", "phase-1", "phase-2", "phase-3"} <= found
+    assert {
+        "position-a",
+        "sigma",
+        "envelope",
+        "accuracy",
+        "claim-a",
+        "phase-1",
+        "phase-2",
+        "phase-3",
+    } <= found
     assert {"probability-1-anchor", "probability-1-plane", "confidence", "near-truth"} <= found
     assert ("ghosts" in found) == any(len(one.world) > 1 for one in held)
     assert {f"ellipse-{held[-1].tick}", f"near-{held[-1].tick}"} <= found
@@ -161,14 +180,14 @@ def test_each_part_of_a_noisy_mission_is_in_its_picture(noisy: Path, drawn: Path
 
 
 def test_what_is_drawn_over_time_is_what_the_robot_said_held_against_the_truth(noisy: Path) -> None:
-    story = Story(read(noisy), 0, estimates(noisy, "a"))
-    truth = [moment.truth.poses[0] for moment in story.recording.ticks]
-    said = [one for one in story.held if one.world]
+    pair, held = pair_of(noisy), estimates(noisy, "a")
+    truth = [moment.truth.poses[0] for moment in read(noisy).ticks]
+    said = [one for one in held if one.world]
     off = [math.hypot(one.world[0].x - truth[one.tick].x, one.world[0].y - truth[one.tick].y) for one in said]
     errors, probability = Figure().subplots(2)
-    belief.draw_error(errors, story)
-    belief.draw_probability(probability, story)
-    assert line(errors, "error") == ([one.tick for one in said], off)
+    over_time.draw_errors(errors, pair, "position", "a")
+    over_time.draw_hypotheses(probability, pair, "a")
+    assert line(errors, "position-a") == ([one.tick for one in said], off)
     assert line(errors, "sigma")[1] == [one.covariance.position_sigma for one in said if one.covariance]
     likeliest = line(probability, "probability-1-plane")
     assert likeliest[0] == [one.tick for one in said]
@@ -177,17 +196,16 @@ def test_what_is_drawn_over_time_is_what_the_robot_said_held_against_the_truth(n
     )  # the limit is 99.9995 %
     assert max(likeliest[1]) < 1.0
     before = line(probability, "probability-1-anchor")
-    assert before[0] == [one.tick for one in story.held if not one.world]
-    (claimed,) = line(errors, "claim")[0][:1]
-    assert story.held[claimed].localised
-    assert not story.held[claimed - 1].localised
+    assert before[0] == [one.tick for one in held if not one.world]
+    (claimed,) = line(errors, "claim-a")[0][:1]
+    assert held[claimed].localised
+    assert not held[claimed - 1].localised
 
 
 def test_an_ellipse_holds_what_is_within_3_sigma(noisy: Path) -> None:
-    story = Story(read(noisy), 0, estimates(noisy, "a"))
     axes = Figure().subplots()
-    plane.draw(axes, story)
-    last = story.held[-1]
+    robot_figure.draw_estimates(axes, pair_of(noisy), "a")
+    last = estimates(noisy, "a")[-1]
     assert last.covariance is not None
     (ellipse,) = axes.findobj(lambda artist: artist.get_gid() == f"ellipse-{last.tick}")
     assert isinstance(ellipse, Ellipse)
@@ -211,8 +229,8 @@ def test_the_same_record_gives_the_same_picture(noisy: Path, drawn: Path, tmp_pa
 def test_where_panels_stand_does_not_depend_on_the_last_bits_of_their_layout(
     noisy: Path, tmp_path: Path
 ) -> None:
-    with look():
-        figure = figure_of(Story(read(noisy), 0, estimates(noisy, "a")))
+    with look(SCREEN):
+        figure = figure_of(noisy, "a")
         save(figure, tmp_path / "robot-a", ["svg"])
     corners = np.array([axes.get_position(original=True).get_points() for axes in figure.axes])
     assert len({place.tobytes() for place in corners}) == len(figure.axes)
@@ -223,7 +241,7 @@ def test_an_exact_record_has_counts_for_odds_and_no_ellipse(tmp_path: Path) -> N
     svg = picture(recorded(load("paper-1"), tmp_path), "a")
     words, found = texts(svg), ids(svg)
     assert {"possible poses", "one pose", "tolerance: 1e-6 m"} <= words
-    assert {"count", "tolerance", "error", "ghosts", "near-truth"} <= found
+    assert {"count", "tolerance", "position-a", "ghosts", "near-truth"} <= found
     assert not {"envelope", "sigma", "confidence", "accuracy"} & found
     assert not [name for name in found if name.startswith(("ellipse-", "probability-"))]
 
@@ -239,7 +257,7 @@ def test_seconds_stand_below_the_ticks_where_a_tick_is_no_second(tmp_path: Path)
     ("probability", "said"), [(0.5, "50 %"), (0.9999, "99.99 %"), (0.999999, "99.9999 %"), (1e-4, "0.01 %")]
 )
 def test_odds_are_said_in_as_many_digits_as_they_have(probability: float, said: str) -> None:
-    assert belief.percent(probability) == said
+    assert over_time.percent(probability) == said
 
 
 # --- all kinds of recordings ----------------------------------------------------------------------------
@@ -256,7 +274,7 @@ def test_a_mission_that_ends_undecided_is_drawn(noise: str, planner_name: str, t
     words = texts(svg)
     assert "The robot claims no pose." in words
     assert any("undecided after" in line for line in words)
-    assert not {"met", "claim"} & ids(svg)
+    assert not {"met", "claim-b"} & ids(svg)
 
 
 @pytest.mark.parametrize("ticks", series([17, 0, 1]))
@@ -269,7 +287,7 @@ def test_a_record_that_breaks_off_is_drawn_as_far_as_it_goes(ticks: int, noisy: 
     for robot in "ab":
         words = texts(picture(folder, robot))
         assert f"Robot {robot} of noisy, seed 5: the recording breaks off" in words
-        assert {"anchor of a", "anchor of b", "start"} <= words
+        assert {"$M_1$", "$M_2$", "start"} <= words
 
 
 def test_an_agent_killed_before_its_briefing_has_a_picture_without_estimates(

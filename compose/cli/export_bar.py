@@ -25,20 +25,6 @@ def exported(
     `run` is the recording if it has been read already. Raises UserError if a file cannot be read or written,
     and Interrupted if `inbox` stops the export.
     """
-    from compose.view.export.folder import Exported
-
-
-MODULES = ("foxglove", "pyarrow")
-"""The optional libraries that an export needs; the caller checks that they are installed."""
-
-
-def exported(
-    folder: Path, out: Path, inbox: Inbox, *, run: Run | None = None, quiet: bool = False
-) -> Exported:
-    """Export the recording in `folder` to `out`, with a progress bar unless `quiet`.
-
-    `run` is the recording if it has been read already. Raises UserError if a file cannot be read or written, and Interrupted if `inbox` stops the export.
-    """
     from compose.view.export.folder import FILES, export  # noqa: PLC0415  # slow to import, and optional
 
     with user_errors(folder), counting("tandem export", 0 if quiet else len(FILES)) as done:

@@ -37,6 +37,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=FORMATS,
         help=f"write only this format; may be repeated [default: all of {', '.join(FORMATS)}]",
     )
+    parser.add_argument(
+        "--paper",
+        action="store_true",
+        help="draw for a paper: 3.5 or 7.16 inches wide, 8 point text, no title",
+    )
     add_closing(parser, "tandem figures recording --only encounter --format svg", "docs/recordings.md")
 
 
@@ -71,7 +76,7 @@ def main(options: argparse.Namespace) -> int:
                 status = FAILED
                 continue
             try:
-                draw(pair, kinds, formats, folder, done, torn=bool(torn))
+                draw(pair, kinds, formats, folder, done, torn=bool(torn), paper=options.paper)
             except BrokenPipeError:
                 raise
             except OSError as error:
@@ -98,23 +103,25 @@ def draw(
     done: Callable[[], None],
     *,
     torn: bool,
+    paper: bool = False,
 ) -> None:
     """Draw the figures of `kinds`; print a line for each file, and for each figure that does not apply.
 
     `done` is called after each kind. `torn` states that the recording is incomplete, so that an event that it
-    lacks may have happened. Raises OSError.
+    lacks may have happened; `paper` is the flag. Raises OSError.
     """
     from compose.figures import catalogue, style  # noqa: PLC0415
     from compose.figures.sheet import Absent  # noqa: PLC0415
 
+    medium = style.PAPER if paper else style.SCREEN
     folder.mkdir(exist_ok=True)
     for kind in kinds:
-        with catalogue.settings(kind):
-            for name, figure in catalogue.pictures(pair, kind):
+        with style.look(medium):
+            for name, figure in catalogue.pictures(pair, kind, medium):
                 if isinstance(figure, Absent):
                     _say(f"no {name}: {figure.why}{' (in the incomplete recording)' if torn else ''}")
                     continue
-                for path in style.save(figure, folder / name, formats):
+                for path in style.save(figure, folder / name, formats, medium.dpi):
                     say(str(path))
         done()
 

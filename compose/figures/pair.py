@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import cached_property
+from itertools import groupby
 
 import msgspec
 from msgspec.structs import replace
@@ -15,7 +16,7 @@ from compose.recording.claim import Claim
 from compose.recording.robots import outcome
 from compose.recording.run import Recording
 from compose.recording.summary_json import broken_off, ended, first_claim
-from protocol.messages import Command
+from protocol.messages import Command, Estimate
 from protocol.mission import Anchor, Mission, PlannerName, Role
 from protocol.motion import Pose
 from protocol.orbits import Orbit
@@ -24,7 +25,15 @@ from world.sensors import anchor_ranges, mutual_ranges
 ROLES: tuple[Role, Role] = ("a", "b")
 
 
-class Side(msgspec.Struct, frozen=True):
+class Span(msgspec.Struct, frozen=True):
+    """The consecutive ticks `first` to `last` in which a robot is in one of the paper's phases."""
+
+    phase: int
+    first: int
+    last: int
+
+
+class Side(msgspec.Struct, frozen=True, dict=True):
     """One robot of a pair, with one entry per tick in each sequence."""
 
     id: str
@@ -40,6 +49,34 @@ class Side(msgspec.Struct, frozen=True):
     """The recomputed planner states; None if the robot's journal cannot be read."""
     claim: Claim | None = None
     """The robot's first claim, compared with the ground truth; None in hardware mode."""
+
+    @cached_property
+    def estimates(self) -> tuple[tuple[Estimate, Pose], ...]:
+        """The journaled estimates, each with the pose of `path` in the same tick, where both are known."""
+        held = self.account.held if self.account is not None else ()
+        return tuple([(one, self.path[one.tick]) for one in held if one.tick < len(self.path)])
+
+    @cached_property
+    def placed(self) -> tuple[tuple[Estimate, Pose], ...]:
+        """The estimates with poses in the world frame, which exist only from the encounter on."""
+        return tuple([(one, truth) for one, truth in self.estimates if one.world])
+
+    @cached_property
+    def likeliest(self) -> tuple[tuple[Estimate, Pose], ...]:
+        """The estimates in `placed` whose first pose is the most probable or the only one."""
+        return tuple([(one, truth) for one, truth in self.placed if one.probabilities or len(one.world) == 1])
+
+    @cached_property
+    def phases(self) -> tuple[int, ...]:
+        """The phase in each tick. A tick without a Command has the phase before it."""
+        found: list[int] = []
+        for command in self.commands:
+            found.append(command.phase if command is not None else found[-1] if found else 1)
+        return tuple(found)
+
+    def phase(self, tick: int) -> int:
+        """Return the phase in `tick`, or the last one known."""
+        return self.phases[min(tick, len(self.phases) - 1)] if self.phases else 1
 
 
 class PairRecord(msgspec.Struct, frozen=True, dict=True):
@@ -135,11 +172,31 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
     @cached_property
     def encounter_tick(self) -> int | None:
         """The first tick in which one of the robots is in phase 3; None if there is none."""
-        for tick in range(len(self.mutual)):
-            commands = [self.command(role, tick) for role in ROLES]
-            if any(command is not None and command.phase == 3 for command in commands):
-                return tick
-        return None
+        ticks = [side.phases.index(3) for side in (self.a, self.b) if 3 in side.phases]
+        return min(ticks, default=None)
+
+    def spans(self, *roles: Role) -> tuple[Span, ...]:
+        """Return the phases of the robots with `roles`, the earlier one where they differ, over all ticks."""
+        sides = [self.robot(role) for role in roles]
+        known = [side for side in sides if side.phases] or sides
+        phases = [min(side.phase(tick) for side in known) for tick in range(len(self.mutual))]
+        if self.encounter_tick is not None and len(roles) > 1:
+            phases[self.encounter_tick :] = [3] * (len(phases) - self.encounter_tick)
+        spans = []
+        for phase, group in groupby(enumerate(phases), key=lambda one: one[1]):
+            ticks = [tick for tick, _ in group]
+            spans.append(Span(phase, ticks[0], ticks[-1]))
+        return tuple(spans) or (Span(1, 0, 0),)
+
+
+def error(pose: Pose, truth: Pose) -> float:
+    """Return the distance between the positions of two poses, in m."""
+    return math.hypot(pose.x - truth.x, pose.y - truth.y)
+
+
+def others(estimate: Estimate) -> tuple[Pose, ...]:
+    """Return the possible world poses but the most probable; all of them if none is more probable."""
+    return estimate.world[1:] if estimate.probabilities or len(estimate.world) == 1 else estimate.world
 
 
 def of_record(recording: Recording, places: tuple[int, int], accounts: Mapping[str, Account]) -> PairRecord:
