@@ -34,12 +34,11 @@ from compose.figures import (
     trajectory,
 )
 from compose.figures.account import account
-from compose.figures.pair import PairRecord, of_record
+from compose.figures.pair import PairRecord, pair_of
 from compose.figures.sheet import Absent
 from compose.figures.style import SCREEN, look
 from compose.launch.in_process import run_mission
-from compose.recording.run import estimates, read
-from compose.recording.summary_json import first_claim
+from compose.recording.run import agent_journal, read
 from compose.scenario.scenario_file import load, parse
 from protocol.journal.journal_file import read as frames
 from protocol.messages import Command
@@ -99,10 +98,12 @@ def recorded(name: str, recordings: Path) -> Path:
 
 
 def pair(folder: Path, number: int = 0) -> PairRecord:
-    recording = read(folder)
-    places = recording.scenario.pairs()[number]
-    robots = [recording.scenario.robots[place].id for place in places]
-    return of_record(recording, places, {robot: account(folder, robot) for robot in robots})
+    run = read(folder)
+    robots = run.pairs[number]
+    known = [robot for robot in robots if (folder / agent_journal(robot)).exists()]
+    found = pair_of(run, robots, {robot: account(run, robot) for robot in known})
+    assert found is not None
+    return found
 
 
 def found(figure: Figure, gid: str) -> list[Artist]:
@@ -147,8 +148,7 @@ def test_a_plan_shows_each_candidate_and_the_axis_of_each_two_and_the_choice(
 ) -> None:
     told, computed = pair(recorded(name, recordings)), REFERENCE.sims[simulation]
     (figure,) = [drawn(one) for one in manoeuvre.draw(told).values()]
-    assert told.recording is not None
-    final_report = told.recording.final_reports["b"]
+    final_report = told.run.final_reports["b"]
     assert final_report.candidates is not None
     count = final_report.candidates[1]
     assert len(found(figure, r"candidate-\d+")) == count == len(computed.d_i)
@@ -301,10 +301,9 @@ def test_ranges_are_those_that_were_measured_and_contact_is_shaded(recordings: P
 @pytest.mark.parametrize("name", ["paper-1", "noisy"])
 def test_the_last_error_is_that_of_the_claim(name: str, recordings: Path) -> None:
     told = pair(recorded(name, recordings))
-    assert told.recording is not None
     figure = drawn(over_time.errors(told))
     for place, role in enumerate("ab"):
-        claim = first_claim(told.recording, place)
+        claim = told.run.claim(told.run.robots[place])
         assert claim is not None
         for what, error in (("position", claim.position_error), ("heading", claim.heading_error)):
             tick, value = line(figure, f"{what}-{role}")[-1]
@@ -337,7 +336,7 @@ def test_under_noise_a_panel_has_each_hypothesis_that_the_journal_tells_of(recor
     shown = {int(one.get_gid().split("-")[1]) for one in found(figure, r"truth-.*")}  # type: ignore[union-attr]
     assert len(shown) == len(figure.axes) > 1
     for role in ("a", "b"):
-        held = estimates(folder, role)
+        held = read(folder).estimates(role)
         for tick in shown:
             marks = [
                 line(figure, f"hypothesis-{tick}-{role}-{i + 1}")[0] for i in range(len(held[tick].world))

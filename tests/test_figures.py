@@ -17,13 +17,10 @@ from matplotlib.patches import Ellipse
 
 from compose.figures import over_time
 from compose.figures import robot as robot_figure
-from compose.figures.account import account
-from compose.figures.pair import PairRecord, of_record
 from compose.figures.sheet import Absent
 from compose.figures.style import PLACES, SCREEN, look, save
 from compose.launch.in_process import run_mission
-from compose.recording.run import estimates, read
-from compose.recording.summary_json import first_claim
+from compose.recording.run import read
 from compose.scenario.scenario_file import load, parse
 from compose.view.recorded import Journals
 from protocol.journal.journal_file import CorruptJournal
@@ -31,6 +28,7 @@ from protocol.journal.journal_file import read as frames
 from protocol.messages import Estimate
 from tests.commands import PAPER_1, Ended, several_pairs, tandem
 from tests.series import series
+from tests.test_album import pair as pair_of
 from world.scenario import Scenario
 
 NOISE = "[mission.noise]\nanchor_sigma = 0.05\nmutual_sigma = 0.05\n"
@@ -77,10 +75,6 @@ def figure_of(folder: Path, name: str) -> Figure:
     figure = robot_figure.draw(pair_of(folder), "a" if name == "a" else "b")
     assert not isinstance(figure, Absent), figure
     return figure
-
-
-def pair_of(folder: Path) -> PairRecord:
-    return of_record(read(folder), (0, 1), {name: account(folder, name) for name in "ab"})
 
 
 def texts(svg: Path) -> set[str]:
@@ -135,7 +129,7 @@ def test_a_picture_says_what_the_robot_claimed_and_how_far_off_it_was(
     place: int, noisy: Path, drawn: Path
 ) -> None:
     recording = read(noisy)
-    claim = first_claim(recording, place)
+    claim = recording.claim(recording.robots[place])
     assert claim is not None
     assert claim.covariance is not None
     name = recording.scenario.robots[place].id
@@ -158,7 +152,7 @@ def test_a_picture_names_its_axes_with_units_and_what_was_asked_for(drawn: Path)
 
 
 def test_each_part_of_a_noisy_mission_is_in_its_picture(noisy: Path, drawn: Path) -> None:
-    held = [one for one in estimates(noisy, "a") if one.world]
+    held = [one for one in read(noisy).estimates("a") if one.world]
     found = ids(drawn / "robot-a.svg")
     assert {"path-a", "path-b", "anchor-a", "range-b", "met", "final", "estimates"} <= found
     assert {
@@ -180,7 +174,7 @@ def test_each_part_of_a_noisy_mission_is_in_its_picture(noisy: Path, drawn: Path
 
 
 def test_what_is_drawn_over_time_is_what_the_robot_said_held_against_the_truth(noisy: Path) -> None:
-    pair, held = pair_of(noisy), estimates(noisy, "a")
+    pair, held = pair_of(noisy), read(noisy).estimates("a")
     truth = [moment.truth.poses[0] for moment in read(noisy).ticks]
     said = [one for one in held if one.world]
     off = [math.hypot(one.world[0].x - truth[one.tick].x, one.world[0].y - truth[one.tick].y) for one in said]
@@ -205,7 +199,7 @@ def test_what_is_drawn_over_time_is_what_the_robot_said_held_against_the_truth(n
 def test_an_ellipse_holds_what_is_within_3_sigma(noisy: Path) -> None:
     axes = Figure().subplots()
     robot_figure.draw_estimates(axes, pair_of(noisy), "a")
-    last = estimates(noisy, "a")[-1]
+    last = read(noisy).estimates("a")[-1]
     assert last.covariance is not None
     (ellipse,) = axes.findobj(lambda artist: artist.get_gid() == f"ellipse-{last.tick}")
     assert isinstance(ellipse, Ellipse)
@@ -370,7 +364,7 @@ def test_a_robot_without_a_journal_is_named_and_the_others_are_drawn(noisy: Path
 
 
 def test_a_robots_estimates_are_one_a_tick_as_it_journaled_them(noisy: Path) -> None:
-    held = estimates(noisy, "b")
+    held = read(noisy).estimates("b")
     assert [one.tick for one in held] == list(range(len(read(noisy).ticks)))
     assert {one.robot for one in held} == {"b"}
     assert all(isinstance(one, Estimate) for one in held)
@@ -381,12 +375,12 @@ def test_the_journal_of_another_robot_is_not_taken_for_its_own(noisy: Path, tmp_
     folder = copied(noisy, tmp_path)
     shutil.copyfile(folder / "agent-b.journal", folder / "agent-a.journal")
     with pytest.raises(CorruptJournal, match=r"agent-a\.journal is the journal of b"):
-        estimates(folder, "a")
+        read(folder).estimates("a")
     shutil.copyfile(folder / "world.journal", folder / "agent-a.journal")
     with pytest.raises(CorruptJournal, match=r"agent-a\.journal: "):
-        estimates(folder, "a")
+        read(folder).estimates("a")
     with pytest.raises(FileNotFoundError):
-        estimates(folder, "z")
+        read(folder).estimates("z")
 
 
 def test_a_journal_of_another_run_is_no_record_of_this_one(noisy: Path, tmp_path: Path) -> None:
@@ -394,7 +388,7 @@ def test_a_journal_of_another_run_is_no_record_of_this_one(noisy: Path, tmp_path
     run_mission(load("paper-1"), other)
     shutil.copyfile(other / "agent-a.journal", folder / "agent-a.journal")
     with pytest.raises(CorruptJournal, match=r"agent-a\.journal: belongs to another run: its conf"):
-        estimates(folder, "a")
+        read(folder).estimates("a")
     journals = Journals(folder)
     journals.read()
     assert [note.split("/")[-1] for note in journals.notes] == [

@@ -14,11 +14,9 @@ from msgspec.structs import replace
 
 from compose.audit.rules import HARDWARE_RULES, audit_run
 from compose.figures import encounter, over_time, phase_one, trajectory
-from compose.figures.account import account
-from compose.figures.pair import PairRecord, of_record, of_robots
 from compose.figures.sheet import NO_PLACES, Absent
 from compose.launch.in_process import run_mission
-from compose.recording.run import of_frames, past_of, read
+from compose.recording.run import of_frames, read
 from compose.scenario.scenario_file import load, parse
 from protocol.journal import journal_file
 from protocol.messages import Command, Message, OfRobot, Report
@@ -27,7 +25,7 @@ from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from tests.commands import several_pairs, tandem
 from tests.doctor import complaints
 from tests.replays import journals_of
-from tests.test_album import drawn, line
+from tests.test_album import drawn, line, pair
 
 KNOWN_TO_A_WORLD = ("x", "y", "heading")
 MEASURED = ("tick", "robot", "anchor_range", "mutual_range", "phase", "state")
@@ -44,14 +42,6 @@ def folders(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     return whole, alone
 
 
-def pair_of(whole: Path) -> PairRecord:
-    return of_record(read(whole), (0, 1), {robot: account(whole, robot) for robot in "ab"})
-
-
-def alone_of(alone: Path, robots: str = "ab") -> PairRecord:
-    return of_robots({robot: account(alone, robot) for robot in robots})
-
-
 def table(folder: Path) -> list[dict[str, str]]:
     with (folder / "ticks.csv").open() as file:
         return list(csv.DictReader(file))
@@ -62,7 +52,7 @@ def test_an_export_has_what_was_measured_and_believed_and_no_truth(folders: tupl
     for folder in folders:
         ended = tandem("export", folder)
         assert (ended.status, ended.err) == (0, "")
-    pasts = {robot: past_of(alone, robot) for robot in "ab"}
+    pasts = {robot: read(alone).past(robot) for robot in "ab"}
     for told, known in zip(table(alone), table(whole), strict=True):
         assert {told[name] for name in KNOWN_TO_A_WORLD} == {""}
         assert [told[name] for name in MEASURED] == [known[name] for name in MEASURED]
@@ -84,7 +74,7 @@ def test_an_export_has_what_was_measured_and_believed_and_no_truth(folders: tupl
 
 def test_paths_are_the_odometry_laid_through_the_claim(folders: tuple[Path, Path]) -> None:
     whole, alone = folders
-    known, told = pair_of(whole), alone_of(alone)
+    known, told = pair(whole), pair(alone)
     for role in ("a", "b"):
         claim = known.robot(role).claim
         assert claim is not None
@@ -100,7 +90,7 @@ def test_paths_are_the_odometry_laid_through_the_claim(folders: tuple[Path, Path
 
 def test_what_needs_no_truth_is_drawn_as_with_a_world(folders: tuple[Path, Path]) -> None:
     whole, alone = folders
-    known, told = pair_of(whole), alone_of(alone)
+    known, told = pair(whole), pair(alone)
     assert told.mutual == known.mutual
     assert told.contacts == known.contacts
     assert told.encounter_tick == known.encounter_tick
@@ -139,7 +129,7 @@ def test_the_command_draws_what_can_be_known_and_says_what_cannot(folders: tuple
 def test_of_one_robot_there_is_what_it_alone_knows(folders: tuple[Path, Path], tmp_path: Path) -> None:
     _, alone = folders
     (tmp_path / "agent-b.journal").write_bytes((alone / "agent-b.journal").read_bytes())
-    told = alone_of(tmp_path, "b")
+    told = pair(tmp_path)
     assert trajectory.draw(told) == Absent(NO_PLACES)
     assert told.a.id == "a"
     assert told.readable == ["b"]
@@ -179,7 +169,7 @@ def test_whose_journal_is_shorter_takes_nothing_from_its_peer(
     (tmp_path / "agent-a.journal").write_bytes((alone / "agent-a.journal").read_bytes())
     frames = list(journal_file.read(alone / "agent-b.journal"))[:20]
     (tmp_path / "agent-b.journal").write_bytes(b"".join([msgpack.packb(frame) for frame in frames]))
-    known, told = pair_of(whole), alone_of(tmp_path)
+    known, told = pair(whole), pair(tmp_path)
     assert told.a.anchor_ranges == known.a.anchor_ranges
     assert told.states("a") == known.states("a")
     assert len(told.a.path) == len(known.a.path)
@@ -192,7 +182,7 @@ def test_whose_journal_is_shorter_takes_nothing_from_its_peer(
 
 def test_paths_of_two_lengths_are_drawn(folders: tuple[Path, Path]) -> None:
     _, alone = folders
-    told = alone_of(alone)
+    told = pair(alone)
     shorter = replace(told, b=replace(told.b, path=told.b.path[: told.contacts[0][0]]))
     figure = drawn(trajectory.draw(shorter))
     assert line(figure, "path-b") == [(p.x, p.y) for p in shorter.b.path]

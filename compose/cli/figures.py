@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -51,6 +51,8 @@ def main(options: argparse.Namespace) -> int:
     Return FAILED if the journal of a robot is missing or cannot be replayed to its end.
     """
     need("matplotlib")
+    from compose.figures.pair import pair_of  # noqa: PLC0415
+
     with user_errors(options.recording):
         run = read(options.recording)
     folder, status = options.recording / "figures", ENDED
@@ -60,7 +62,7 @@ def main(options: argparse.Namespace) -> int:
         for robots in run.pairs:
             accounts = {}
             for robot in robots:
-                account = _account(options.recording, robot)
+                account = _account(run, robot)
                 if account is not None:
                     accounts[robot] = account
                 if account is None or account.broken is not None:
@@ -70,7 +72,7 @@ def main(options: argparse.Namespace) -> int:
             torn += ["the world"] if run.world is not None and run.world.end is None else []
             if torn:
                 _say(f"the recording of {' and '.join(torn)} ends before the mission does")
-            pair = _pair(run, robots, accounts)
+            pair = pair_of(run, robots, accounts)
             if pair is None:
                 _say(f"no figure of {' and '.join(robots)}: the recording has no data")
                 status = FAILED
@@ -82,17 +84,6 @@ def main(options: argparse.Namespace) -> int:
             except OSError as error:
                 raise UserError(f"{folder} cannot be written: {error.strerror or error}") from None
     return status
-
-
-def _pair(run: Run, robots: Sequence[str], accounts: Mapping[str, Account]) -> PairRecord | None:
-    """Return the data of a pair, or None if there is no journal of either robot."""
-    from compose.figures.pair import of_record, of_robots  # noqa: PLC0415
-
-    if run.world is not None:
-        places = run.robots.index(robots[0]), run.robots.index(robots[1])
-        return of_record(run, places, accounts)
-    known = {robot: account for robot, account in accounts.items() if account.past is not None}
-    return of_robots(known) if known else None
 
 
 def draw(
@@ -126,12 +117,12 @@ def draw(
         done()
 
 
-def _account(folder: Path, robot: str) -> Account | None:
+def _account(run: Run, robot: str) -> Account | None:
     """Return the account of a robot; print why and return None if its journal cannot be read."""
     from compose.figures.account import account  # noqa: PLC0415
 
     try:
-        found = account(folder, robot)
+        found = account(run, robot)
     except FileNotFoundError:
         why = f"{agent_journal(robot)} is missing"
     except OSError as error:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import msgspec
 
 from agent.planning.state import RobotState
 from agent.process.agent_journal import Past
 from agent.process.replay import Replay
-from compose.recording.run import past_of
+from compose.recording.run import Run
 from protocol.messages import Estimate
 
 
@@ -29,13 +27,13 @@ class Account(msgspec.Struct, frozen=True):
         return self.past.estimates if self.past is not None else ()
 
 
-def account(folder: Path, robot: str) -> Account:
-    """Read the journal of `robot` in `folder`, and run its planner again on the journaled inputs.
+def account(run: Run, robot: str) -> Account:
+    """Take the journal of `robot` in `run`, and run its planner again on the journaled inputs.
 
     Raises OSError if there is no journal, CorruptJournal if it is damaged before its end or belongs to
     another robot or run.
     """
-    past = past_of(folder, robot)
+    past = run.past(robot)
     return _recomputed(past) if past is not None else Account(None)
 
 

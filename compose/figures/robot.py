@@ -31,7 +31,7 @@ from compose.figures.sheet import (
 )
 from compose.figures.style import INK, PALE, SCREEN, Medium
 from compose.figures.trajectory import draw_plane, window
-from compose.recording.summary_json import ended
+from compose.recording.run import ended
 from protocol.messages import Estimate
 from protocol.mission import Role
 from protocol.motion import ORIGIN, Pose
@@ -104,14 +104,8 @@ def _top(sheet: Sheet, pair: PairRecord, role: Role) -> None:
 
 def _title(pair: PairRecord, role: Role) -> list[str]:
     """Return the title: the robot, the outcome of the mission, and the robot's claim."""
-    recording, one = pair.recording, pair.robot(role)
-    assert recording is not None
-    scenario = recording.scenario
-    end = (
-        "the recording breaks off"
-        if recording.end is None
-        else ended(recording.end.outcome, pair.last, recording.end.reason)
-    )
+    one, scenario, ending = pair.robot(role), pair.run.scenario, pair.run.end
+    end = "the recording breaks off" if ending is None else ended(ending.outcome, pair.last, ending.reason)
     first = f"Robot {one.id} of {scenario.name}, seed {scenario.seed}: {end}"
     if one.claim is None:
         return [first, "The robot claims no pose."]

@@ -297,17 +297,20 @@ class Run(msgspec.Struct, frozen=True, dict=True):
         }
 
     def title(self, pair: Sequence[str]) -> str:
-        """Return the name of the run and its outcome, in one line; in hardware mode, those of `pair`."""
+        """Return the name of the run and its outcome, in one line.
+
+        In hardware mode, these are of the robots in `pair`, which must have a RobotConfig.
+        """
         if self.world is not None:
             one, last, end = self.world.scenario, len(self.world.ticks) - 1, self.world.end
             how = ended(end.outcome, last, end.reason) if end is not None else broken_off(last)
             return f"{one.name}, seed {one.seed}, {one.planner_name}: {how}"
-        pasts = {robot: self.pasts[robot] for robot in self.robots if robot in pair and robot in self.pasts}
+        pasts = {robot: self.pasts[robot] for robot in pair}
         planner_name = next(iter(pasts.values())).config.planner_name
-        return f"{' and '.join(pasts)} in hardware mode, {planner_name}: {outcome(pasts)}"
+        return f"{' and '.join(pasts)} in hardware mode, {planner_name}: {_outcome(pasts)}"
 
 
-def outcome(pasts: Mapping[str, Past]) -> str:
+def _outcome(pasts: Mapping[str, Past]) -> str:
     """Return the outcome that each robot recorded, in one line; if all agree, once."""
     ends = {
         robot: ended(past.end.outcome, past.end.tick, past.end.reason)
@@ -452,18 +455,3 @@ def user_errors(folder: Path) -> Iterator[None]:
         raise UserError(f"{folder} cannot be read: {error.strerror or error}") from None
     except CorruptJournal as error:
         raise UserError(str(error)) from None
-
-
-# --- to be removed once compose/figures reads a Run ---
-
-Recording = Run
-
-
-def past_of(folder: Path, robot: str) -> Past | None:
-    """Return the content of the journal of `robot` in `folder`. Raises like `Run.past`."""
-    return read(folder).past(robot)
-
-
-def estimates(folder: Path, robot: str) -> tuple[Estimate, ...]:
-    """Return the Estimates in the journal of `robot` in `folder`. Raises like `Run.estimates`."""
-    return read(folder).estimates(robot)

@@ -13,10 +13,8 @@ from typing import Any, Literal
 import msgspec
 
 from compose.extras import version
-from compose.recording.claim import Claim, matrix
-from compose.recording.run import Run
-from compose.recording.run import broken_off as broken_off  # noqa: PLC0414
-from compose.recording.run import ended as ended  # noqa: PLC0414
+from compose.recording.claim import matrix
+from compose.recording.run import Run, ended
 from compose.recording.ticks_csv import ticks_csv
 from protocol import files
 from protocol.messages import FinalReport
@@ -129,11 +127,3 @@ def leave(run: Run, summary: Mapping[str, Any], folder: Path) -> None:
 def outcome_line(summary: Mapping[str, Any]) -> str:
     """Return the outcome in one line."""
     return ended(summary["outcome"], summary["ticks"], summary["reason"])
-
-
-# --- to be removed once compose/figures reads a Run ---
-
-
-def first_claim(run: Run, place: int) -> Claim | None:
-    """Return the first claim of the robot at `place` in the scenario; None if it made none."""
-    return run.claim(run.robots[place])
