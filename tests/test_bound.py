@@ -31,7 +31,8 @@ def bounds(recording: Run, tick: int | None = None) -> tuple[float, float]:
 def with_noise(recording: Run, noise: Noise) -> Run:
     """Return the same trajectories, with the noise of other sensors."""
     scenario = recording.scenario
-    return replace(recording, scenario=replace(scenario, mission=replace(scenario.mission, noise=noise)))
+    mission = replace(scenario.mission, noise=noise)
+    return Run(replace(recording.history, scenario=replace(scenario, mission=mission)))
 
 
 def ends_and_ranges(recording: Run, starts: Sequence[float]) -> tuple[Array, Array]:

@@ -11,7 +11,6 @@ from protocol import motion
 from protocol.journal.journal_file import CorruptJournal, UnexpectedFrame
 from protocol.messages import (
     Command,
-    Contact,
     DeadlineMissed,
     Environment,
     Estimate,
@@ -98,11 +97,6 @@ class Past(msgspec.Struct, frozen=True):
         frame = compose(verdict.pose, inverse(odometry[tick]))
         return tuple([compose(frame, pose) for pose in odometry])
 
-    def contact(self, tick: int) -> Contact | None:
-        """Return the contact with the peer in the Observation of `tick`; None if there is none."""
-        contacts = self.steps[tick].observation.contacts if tick < len(self.steps) else ()
-        return contacts[0] if contacts else None
-
 
 class JournalReading:
     """A reader of an agent's journal, frame by frame."""
@@ -116,8 +110,8 @@ class JournalReading:
         self.disorder: UnexpectedFrame | None = None
         """The first frame out of order."""
         self._steps: list[Step] = []
-        self._step: _OpenStep | None = None
-        """The latest tick, which may be incomplete."""
+        self._step: dict[str, Any] = {}
+        """The fields of the latest step, to which frames can be added; empty before the first."""
         self._end: MissionEnd | None = None
         self._final_report: FinalReport | None = None
 
@@ -141,22 +135,46 @@ class JournalReading:
         """Add `message`, and return True if it may be next."""
         if self.config is None:
             return self._begins(message)
-        step = self._step
         match message:
             case _ if self._end is not None:
                 if not isinstance(message, FinalReport) or self._final_report is not None:
                     return False
                 self._final_report = message
             case Command() | Estimate() | Report() | DeadlineMissed():
-                return step is not None and step.take(message, frame, self.config.robot)
-            case Observation(tick) if tick == len(self._steps) + (step is not None):
-                if step is not None:
-                    if step.command is None:
+                return bool(self._step) and self._answers(message, frame, self._step)
+            case Observation(tick) if tick == len(self._steps) + bool(self._step):
+                if self._step:
+                    if "command" not in self._step:
                         return False
-                    self._steps.append(step.closed())
-                self._step = _OpenStep(message, frame)
+                    self._steps.append(Step(**self._step))
+                self._step = {"observation": message, "frame": frame}
             case MissionEnd():
                 self._end = message
+            case _:
+                return False
+        return True
+
+    def _answers(
+        self, message: Command | Estimate | Report | DeadlineMissed, frame: bytes, step: dict[str, Any]
+    ) -> bool:
+        """Add `message` to `step`, and return True if it may be next."""
+        assert self.config is not None
+        is_open = "command" not in step
+        if isinstance(message, Report) and message.robot != self.config.robot:
+            if is_open:
+                step["heard"] = (*step.get("heard", ()), FramedReport(message, frame))
+            return is_open
+        match message:
+            case _ if message.tick != step["observation"].tick:
+                return False
+            case Command() if is_open:
+                step["command"], step["command_frame"] = message, frame
+            case Estimate() if not is_open and "estimate" not in step:
+                step["estimate"], step["estimate_frame"] = message, frame
+            case Report() if "report" not in step:
+                step["report"] = FramedReport(message, frame)
+            case DeadlineMissed() if is_open:
+                step["missed"] = (*step.get("missed", ()), message.robot)
             case _:
                 return False
         return True
@@ -176,70 +194,8 @@ class JournalReading:
         """Return the content that has been read so far; None if there is no RobotConfig."""
         if self.config is None:
             return None
-        steps = [*self._steps, self._step.closed()] if self._step is not None else self._steps
+        steps = [*self._steps, Step(**self._step)] if self._step else self._steps
         return Past(self.config, tuple(steps), self._end, self._final_report, self.environment, self.disorder)
-
-
-class _OpenStep:
-    """A tick to which frames can be added."""
-
-    __slots__ = (
-        "command",
-        "command_frame",
-        "estimate",
-        "estimate_frame",
-        "frame",
-        "heard",
-        "missed",
-        "observation",
-        "report",
-    )
-
-    def __init__(self, observation: Observation, frame: bytes) -> None:
-        self.observation, self.frame = observation, frame
-        self.report: FramedReport | None = None
-        self.heard: tuple[FramedReport, ...] = ()
-        self.missed: tuple[str, ...] = ()
-        self.command: Command | None = None
-        self.command_frame: bytes | None = None
-        self.estimate: Estimate | None = None
-        self.estimate_frame: bytes | None = None
-
-    def take(self, message: Report | DeadlineMissed | Command | Estimate, frame: bytes, robot: str) -> bool:
-        """Add a message to the journal of `robot`, and return True if it may be next."""
-        is_open = self.command is None
-        if isinstance(message, Report) and message.robot != robot:
-            if is_open:
-                self.heard += (FramedReport(message, frame),)
-            return is_open
-        if message.tick != self.observation.tick:
-            return False
-        match message:
-            case Command() if is_open:
-                self.command, self.command_frame = message, frame
-            case Estimate() if not is_open and self.estimate is None:
-                self.estimate, self.estimate_frame = message, frame
-            case Report() if self.report is None:
-                self.report = FramedReport(message, frame)
-            case DeadlineMissed() if is_open:
-                self.missed += (message.robot,)
-            case _:
-                return False
-        return True
-
-    def closed(self) -> Step:
-        """Return the tick with all that has been added."""
-        return Step(
-            self.observation,
-            self.frame,
-            self.report,
-            self.heard,
-            self.missed,
-            self.command,
-            self.command_frame,
-            self.estimate,
-            self.estimate_frame,
-        )
 
 
 def past(frames: Iterable[bytes], source: object) -> Past:

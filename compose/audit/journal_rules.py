@@ -15,15 +15,16 @@ def order(run: Run) -> Checks:
 
     A journal that ends early, or has a frame out of order, is one violation. Its earlier content is checked.
     """
+    forced = run.forced
     if run.world is not None:
         yield _world_journal(run.world)
     for robot in run.robots:
-        yield _agent_journal(run, robot)
+        yield _agent_journal(run, robot, forced=forced)
         past = run.pasts.get(robot)
         if past is None:
             continue
         for step in past.steps:
-            yield _whole(robot, past, step, excused=run.forced)
+            yield _whole(robot, past, step, excused=forced)
             if run.world is not None:
                 yield _same_command(run, robot, past, step)
         if run.world is not None and past.end is not None and run.end is not None:
@@ -41,7 +42,7 @@ def _world_journal(world: History) -> Violation | None:
     return None
 
 
-def _agent_journal(run: Run, robot: str) -> Violation | None:
+def _agent_journal(run: Run, robot: str, *, forced: bool) -> Violation | None:
     """Return a violation if the robot's journal is missing, has a frame out of order, or ends early."""
     past = run.pasts.get(robot)
     if agent_journal(robot) not in run.journals:
@@ -52,7 +53,7 @@ def _agent_journal(run: Run, robot: str) -> Violation | None:
         last = past.steps[-1].observation.tick if past is not None and past.steps else None
         what = "its journal breaks off here, expected MissionEnd and FinalReport"
         return Violation("order", last, robot, what, breaks_off=True)
-    if run.end is not None and len(past.steps) != run.end.tick + 1 and not run.forced:
+    if run.end is not None and len(past.steps) != run.end.tick + 1 and not forced:
         what = f"its journal has {len(past.steps)} ticks, expected {run.end.tick + 1}"
         return Violation("order", run.end.tick, robot, what)
     return None

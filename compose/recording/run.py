@@ -219,20 +219,20 @@ class Run(msgspec.Struct, frozen=True, dict=True):
         if self.world is None:
             steps = self.pasts[robot].steps
             return steps[tick + 1].observation.executed if tick + 1 < len(steps) else None
-        after = self.world.ticks[tick + 1].world if tick + 1 < len(self.world.ticks) else None
-        return (
-            after.executed[self._place[robot]] if after is not None and after.executed is not None else None
-        )
+        if tick + 1 >= len(self.world.ticks):
+            return None
+        executed = self.world.ticks[tick + 1].world.executed
+        assert executed is not None
+        return executed[self._place[robot]]
 
     def truth(self, robot: str) -> tuple[Pose, ...]:
         """Return the true pose of `robot` at each tick; empty in hardware mode."""
-        return self._truths[self._place[robot]] if self.world is not None else ()
+        return tuple([poses[self._place[robot]] for poses in self._poses])
 
     @cached_property
-    def _truths(self) -> list[tuple[Pose, ...]]:
-        return list(zip(*[tick.world.truth.poses for tick in self.ticks], strict=True)) or [()] * len(
-            self.robots
-        )
+    def _poses(self) -> list[tuple[Pose, ...]]:
+        """The true poses at each tick, in the order of the scenario."""
+        return [tick.truth.poses for tick in self.world.ticks] if self.world is not None else []
 
     @cached_property
     def _place(self) -> dict[str, int]:
