@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from compose.hardware.conformance import judged
+from compose.hardware.conformance import check_results
 from compose.hardware.exercise import ExerciseRun
 from compose.launch.driver_loader import briefed
 from compose.scenario.scenario_file import load
@@ -12,10 +12,10 @@ from tests import broken_drivers, virtual_time
 from tests.commands import tandem
 
 MANOEUVRE_S = 0.1
-BRIEFING = briefed(load("paper-1"), "a", MANOEUVRE_S)
+CONFIG = briefed(load("paper-1"), "a", MANOEUVRE_S)
 
 
-def test_the_example_keeps_the_contract() -> None:
+def test_the_example_fulfils_the_driver_contract() -> None:
     ended = tandem("check-driver", "tests.virtual_time:Rover", "--rate", "8")
     assert ended.status == 0, ended.out
     lines = [line for line in ended.out.splitlines() if "truly at" not in line]
@@ -41,16 +41,16 @@ def test_the_example_keeps_the_contract() -> None:
         ("WaitsForItsWheels", "of a manoeuvre, expected at most 0.05: it must not wait"),
     ],
 )
-def test_a_broken_driver_is_told_what_it_breaks(
+def test_a_broken_driver_is_reported_with_what_it_violates(
     broken: str, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = virtual_time.Clock()
     for module in virtual_time.MODULES:
         monkeypatch.setattr(module, "time", clock)
-    driver = getattr(broken_drivers, broken)(BRIEFING, MANOEUVRE_S)
-    trial = ExerciseRun(driver, BRIEFING, MANOEUVRE_S)
+    driver = getattr(broken_drivers, broken)(CONFIG, MANOEUVRE_S)
+    trial = ExerciseRun(driver, CONFIG, MANOEUVRE_S)
     trial.go_through()
-    assert said in "; ".join([one.wrong for one in judged(trial) if one.wrong is not None])
+    assert said in "; ".join([one.wrong for one in check_results(trial) if one.wrong is not None])
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ link = "a<->b"
 partition = true
 contact_ticks = [4, 9]
 """
-ROUGH_SAID = [
+ROUGH_OPTIONS = [
     "a->b: loss=0.3, burst_start=0.2, burst_end=0.25, burst_loss=0.9, delay=0..3, ticks=5..500",
     "delay=2, duplicate=0.3, reorder=0.2, corrupt=0.1, reports_per_tick=.75, contact_ticks=2..100",
     "a <-> b: partition, contact_ticks=4..9",
@@ -43,8 +43,8 @@ RANDOM = PAPER_1.replace("start", "# start").replace('"paper"', '"assured"')
 """A scenario with random starts."""
 
 
-def test_a_file_and_the_command_line_say_the_same(tmp_path: Path) -> None:
-    written, said = parse(RANDOM + ROUGH, "mine.toml"), parse(RANDOM, "mine.toml", faults=ROUGH_SAID)
+def test_a_file_and_the_command_line_give_the_same_faults(tmp_path: Path) -> None:
+    written, said = parse(RANDOM + ROUGH, "mine.toml"), parse(RANDOM, "mine.toml", faults=ROUGH_OPTIONS)
     assert written == said
     assert written.faults == (
         Fault(
@@ -68,14 +68,14 @@ def test_a_file_and_the_command_line_say_the_same(tmp_path: Path) -> None:
     )
     (tmp_path / "rough.toml").write_text(RANDOM + ROUGH)
     (tmp_path / "plain.toml").write_text(RANDOM)
-    more = [word for fault in ROUGH_SAID for word in ("--fault", fault)]
+    more = [word for fault in ROUGH_OPTIONS for word in ("--fault", fault)]
     tandem("run", "rough.toml", "--in-process", "--out", "rough", cwd=tmp_path)
     tandem("run", "plain.toml", "--in-process", "--out", "plain", *more, cwd=tmp_path)
     assert journals(tmp_path / "rough") == journals(tmp_path / "plain") != {}
 
 
 @pytest.mark.parametrize("said", ["partition", "partition=true"])
-def test_a_partition_is_said_with_or_without_true(said: str) -> None:
+def test_a_partition_may_be_written_with_or_without_true(said: str) -> None:
     assert parse(RANDOM, "mine.toml", faults=[said]).faults == (Fault(partition=True),)
     assert parse(RANDOM, "mine.toml", faults=["partition=false"]).faults == (Fault(),)
 
@@ -85,7 +85,7 @@ def test_the_command_lines_faults_come_after_those_of_the_file() -> None:
     assert [fault.loss for fault in found.faults] == [0.1, 0.2, 0.3]
 
 
-def test_a_seed_draws_other_accidents_of_the_same_plan() -> None:
+def test_another_seed_draws_other_deliveries_of_the_same_plan() -> None:
     one, other = (parse(RANDOM, "mine.toml", seed=seed, faults=["loss=0.5"]) for seed in (1, 2))
     assert one.faults == other.faults
     assert (one.seed, other.seed) == (1, 2)
@@ -163,7 +163,7 @@ def test_a_link_of_another_pair_takes_nothing_of_this_ones_room() -> None:
         parse(text, "mine.toml", faults=["a->c: delay=1"])
 
 
-SAID_BADLY = [
+INVALID_FAULTS = [
     ("", "'' has an empty entry; expected the form a->b: loss=0.3, delay=0..3"),
     ("a->b:", "has an empty entry"),
     ("loss=0.1,", "has an empty entry"),
@@ -190,8 +190,8 @@ SAID_BADLY = [
 ]
 
 
-@pytest.mark.parametrize(("said", "says"), SAID_BADLY)
-def test_a_fault_said_badly_is_repeated_with_what_is_wrong(said: str, says: str) -> None:
+@pytest.mark.parametrize(("said", "says"), INVALID_FAULTS)
+def test_an_invalid_fault_is_quoted_with_its_error(said: str, says: str) -> None:
     with pytest.raises(BadScenario) as bad:
         parse(RANDOM, "mine.toml", faults=["loss=0.1", said])
     assert str(bad.value).startswith(f"--fault '{said}': ")

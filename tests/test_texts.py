@@ -37,7 +37,7 @@ from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode, encode
 from tests.commands import BOUND_S, PAPER_1, tandem, world
 from tests.examples import EXAMPLES
 from tests.test_wire import changed, framed, packed, parts, plain
-from world.referee import Judgement
+from world.referee import MissionOutcome
 from world.simulation import Simulation, resumed
 from world.world_journal import history
 
@@ -166,7 +166,7 @@ def test_every_word_for_a_state_is_within_its_bound() -> None:
 def test_a_world_whose_reason_is_too_long_leaves_a_journal_that_is_read_and_taken_up(tmp_path: Path) -> None:
     scenario, path = load("paper-1"), tmp_path / "world.journal"
     with Journal(path) as journal:
-        end = Simulation(scenario, journal).end(Judgement("failed", "no answer from " + "robot, " * 200))
+        end = Simulation(scenario, journal).end(MissionOutcome("failed", "no answer from " + "robot, " * 200))
     assert history(read(path), path).end == end
     recording = Retrace(path)
     assert resumed(scenario, recording).mission_end == end
@@ -188,7 +188,7 @@ def test_an_agent_that_gives_up_at_length_leaves_a_journal_that_is_read(tmp_path
         decode(frame, OfRobot, MAX_FRAME_BYTES)
 
 
-def test_a_verdict_of_as_many_words_as_there_may_be_ends_a_run_whose_record_is_read(tmp_path: Path) -> None:
+def test_a_run_that_ends_with_the_longest_verdict_is_read(tmp_path: Path) -> None:
     """The test replaces both robots, which give up at once."""
     scenario, out = tmp_path / "paper.toml", tmp_path / "out"
     scenario.write_text(PAPER_1)

@@ -9,6 +9,7 @@ from msgspec.structs import astuple
 from agent.planning.assured import CHECKED, CHECKED_WITH_OUTLIERS
 from agent.planning.paper import CHECKED as CHECKED_BY_LETTER
 from agent.planning.phase3_last_manoeuvre import ELSEWHERE
+from agent.planning.planner import uses_active_sensing
 from agent.planning.range_seeking import travelled
 from agent.process.agent_journal import Past
 from compose.audit.findings import Checks, Violation, between
@@ -64,7 +65,8 @@ def _redundant(run: Run, placed: RobotSpec, past: Past, tick: int) -> Violation 
     if noise.exact:
         places = _places(run, placed, mutual)
         return _too_few(tick, placed, "relative placements with a mutual range", places, PLACES)
-    least = CHECKED if scenario.planner_name == "assured" else CHECKED_BY_LETTER
+    active = uses_active_sensing(scenario.planner_name, scenario.mission)
+    least = CHECKED if active else CHECKED_BY_LETTER
     if noise.outliers:
         least = CHECKED_WITH_OUTLIERS
     return _too_few(tick, placed, "mutual ranges", len(mutual), least)
@@ -101,14 +103,14 @@ def _places(run: Run, placed: RobotSpec, ticks: Sequence[int]) -> int:
 
 
 def outcome(run: Run) -> Checks:
-    """Check that the MissionEnd is the referee's judgement of the ground truth.
+    """Check that the MissionEnd has the outcome that the referee derives from the ground truth.
 
-    A run that failed before the referee had a judgement is accepted.
+    A run that failed before the referee had an outcome is accepted.
     """
-    end, judgement = run.end, run.history.judgement
+    end, mission_outcome = run.end, run.history.mission_outcome
     if end is None:
         return
-    expected = MissionEnd(end.tick, *astuple(judgement)) if judgement is not None else None
+    expected = MissionEnd(end.tick, *astuple(mission_outcome)) if mission_outcome is not None else None
     if expected is not None and end != expected:
         what = f"it ends {_ending(end)}, expected {_ending(expected)}"
         yield Violation("claim", end.tick, None, what, between(end, expected))

@@ -57,14 +57,14 @@ def audit_run(run: Run, rules: Rules = RULES, hardware_rules: Rules = HARDWARE_R
             run,
             _other_versions(run),
             scenario=f"{' and '.join(run.robots)}, hardware mode",
-            ticks=run.length,
+            ticks=max(0, run.length - 1),
         )
     return findings_of(
         rules,
         run,
         otherwise(run.world.environment, of_world()) or _other_versions(run),
         scenario=run.scenario.name,
-        ticks=run.length,
+        ticks=max(0, run.length - 1),
         links=link_statistics(run),
     )
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 
 from matplotlib.figure import Figure
 
+from agent.planning.planner import uses_active_sensing
 from compose.figures import encounter, hypotheses, manoeuvre, over_time, phase_one, robot, trajectory
 from compose.figures.pair import PairRecord
 from compose.figures.sheet import Absent
@@ -32,8 +33,8 @@ def _phase_one(pair: PairRecord, medium: Medium) -> Iterator[Picture]:
 
 
 def _plan(pair: PairRecord, medium: Medium) -> Iterator[Picture]:
-    """Yield the planned manoeuvres; with noisy sensors and `assured`, the hypotheses at its decisions."""
-    if pair.readable and pair.planner_name == "assured" and not pair.exact:
+    """Yield the planned manoeuvres; with active sensing, the hypotheses at its decisions."""
+    if pair.readable and uses_active_sensing(pair.planner_name, pair.mission):
         yield f"plan-{pair.name}", hypotheses.draw(pair, medium)
     elif pair.readable:
         for name, figure in manoeuvre.draw(pair, medium).items():

@@ -13,7 +13,7 @@ from protocol.journal import environment
 from protocol.journal.journal_file import Journal, Sink
 from protocol.messages import Command, FinalReport, MissionEnd
 from world.faults import LATEST
-from world.referee import Judgement
+from world.referee import MissionOutcome
 from world.scenario import Scenario
 from world.simulation import Simulation
 from world.world_journal import History, Tick
@@ -66,8 +66,8 @@ def played(scenario: Scenario, sinks: Mapping[str, Sink]) -> Run:
         end = simulation.command(commands)
     final_reports: dict[str, FinalReport] = {robot: robots[robot].final_report(end) for robot in ids}
     simulation.journal_final_reports(final_reports.values())
-    judgement = Judgement(end.outcome, end.reason)
+    mission_outcome = MissionOutcome(end.outcome, end.reason)
     history = History(
-        scenario, tuple(ticks), None, judgement, end, final_reports, environment=environment.of_world()
+        scenario, tuple(ticks), None, mission_outcome, end, final_reports, environment=environment.of_world()
     )
     return Run(history)

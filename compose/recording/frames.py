@@ -59,8 +59,8 @@ def kind_of(kind: type[msgspec.Struct]) -> str:
     return str(kind.__struct_config__.tag)
 
 
-class Placing:
-    """The ticks in which the messages of one journal were journaled. It may be given in parts."""
+class JournalDecoder:
+    """A reader of the frames of one journal, which finds their ticks. They may be given in parts."""
 
     def __init__(self, name: str) -> None:
         """`name` is the file name of the journal."""
@@ -95,5 +95,5 @@ class Placing:
 
 def in_time(run: Run) -> list[Journaled]:
     """Return the messages of all journals by tick, and within a tick in the order of the journals."""
-    each = [Placing(name).of(one.messages, one.frames) for name, one in run.journals.items()]
+    each = [JournalDecoder(name).of(one.messages, one.frames) for name, one in run.journals.items()]
     return sorted([one for some in each for one in some], key=lambda one: one.tick)

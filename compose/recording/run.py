@@ -351,7 +351,7 @@ def _opened(path: Path) -> JournalFile:
     try:
         return JournalFile(*journal_file.torn(path))
     except (OSError, CorruptJournal) as error:
-        if path.name == WORLD_JOURNAL:
+        if path.name == WORLD_JOURNAL or isinstance(error, journal_file.OtherVersion):
             raise
         return JournalFile([], problem=error)
 

@@ -7,6 +7,7 @@ import math
 import platform
 import random
 import secrets
+import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from importlib import resources
@@ -72,13 +73,16 @@ class PlannerTable(_Table, frozen=True):
     """The `[planner]` table."""
 
     name: PlannerName = "assured"
+    """The planner of all robots."""
 
 
 class RobotTable(_Table, frozen=True):
     """A `[[robot]]` table."""
 
     id: RobotId
+    """The robot's name."""
     anchor: tuple[Place, Place]
+    """x, y of the robot's anchor, in m."""
     start: tuple[Place, Place, Annotated[float, Meta(ge=-1e6, le=1e6)]] | None = None
     """Start pose x, y in m and heading in rad; None: drawn from the seed, within range of the anchor."""
     peer: RobotId | None = None
@@ -91,11 +95,17 @@ class ScenarioFile(_Table, frozen=True):
     """The content of a scenario file."""
 
     name: Annotated[str, Meta(pattern=NAME, max_length=48)]
+    """The name of the scenario, and the beginning of the names of its runs."""
     mission: Mission
+    """The `[mission]` table."""
     robot: Annotated[list[RobotTable], Meta(min_length=2, max_length=MAX_ROBOTS)]
+    """One `[[robot]]` for each robot."""
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
+    """The seed of all random draws, starts included."""
     max_ticks: Annotated[int, Meta(ge=1, le=MAX_TICKS)] | None = None
+    """The last tick of an undecided run; computed from the mission by default."""
     planner: PlannerTable = PlannerTable()
+    """The `[planner]` table."""
     fault: list[FaultTable] = []
     """Faults of the radio, applied to each report one after the other."""
     kill: list[KillTable] = []
@@ -138,6 +148,8 @@ def shipped(package: str = "scenario") -> dict[str, Path]:
 
 SHIPPED = {"scenario": ("scenario", "run"), "sweep": ("sweep", "sweep")}
 """The kind of file in each package, and the command that runs it."""
+MARKS = {"scenario": {"mission", "robot"}, "sweep": {"scenario", "trials"}}
+"""The required fields of the files in each package that files of the other kind cannot have."""
 
 
 def unknown(source: str, folder: str) -> str:
@@ -145,10 +157,26 @@ def unknown(source: str, folder: str) -> str:
     names = {one: shipped(one) for one in SHIPPED}
     for other, (kind, command) in SHIPPED.items():
         if other != folder and source in names[other]:
-            return f"{source} is a {kind}; run it with `tandem {command} {source}`"
+            return _other_kind(source, kind, command)
     near = did_you_mean(source, [name for found in names.values() for name in found])
     ships = ", ".join(names[folder])
     return f"{source}: neither a file nor a shipped {SHIPPED[folder][0]} ({ships}){near}"
+
+
+def misplaced(source: str, table: Mapping[str, Any], folder: str) -> str | None:
+    """Return an error message if the file `source`, whose content is `table`, is not of the kind in `folder`.
+
+    Return None if `table` has a field that marks the kind of file in `folder`, or no mark at all.
+    """
+    if MARKS[folder].isdisjoint(table):
+        for other, (kind, command) in SHIPPED.items():
+            if not MARKS[other].isdisjoint(table):
+                return _other_kind(source, kind, command)
+    return None
+
+
+def _other_kind(source: str, kind: str, command: str) -> str:
+    return f"{source} is a {kind}; run it with `tandem {command} {shlex.quote(source)}`"
 
 
 def run_name(scenario: Scenario, out: Path | None = None) -> str:
@@ -193,7 +221,10 @@ def setting(source: str, faults: Sequence[str] = ()) -> ScenarioTemplate:
         raise BadScenario(unknown(source, "scenario")) from None
     except ValueError as error:
         raise BadScenario(f"{source}: {error}") from None
-    return validate(table_in(text, source), source, faults)
+    table = table_in(text, source)
+    if (why := misplaced(source, table, "scenario")) is not None:
+        raise BadScenario(why)
+    return validate(table, source, faults)
 
 
 def parse(text: str, source: str, *, seed: int | None = None, faults: Sequence[str] = ()) -> Scenario:

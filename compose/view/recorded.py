@@ -12,7 +12,7 @@ from compose.recording.summary_json import SUMMARY
 from compose.view.facts import Gathering
 from compose.view.scene import Scene, scene
 from protocol import files
-from protocol.journal.journal_file import CorruptJournal, Tail
+from protocol.journal.journal_file import CorruptJournal, OtherVersion, Tail
 from protocol.messages import OfRobot
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 from world.world_journal import JournalReading
@@ -78,6 +78,8 @@ class Journals:
                     self._fold_world(frames, path)
                 else:
                     self._fold_agent(frames, path)
+            except OtherVersion as error:
+                self._note(f"{self.folder}: {error.versions}; {error.remedy}")  # the same in all journals
             except (CorruptJournal, MalformedFrame) as error:
                 text = str(error)
                 self._note(text if text.startswith(str(path)) else f"{path}: {text}")
@@ -121,7 +123,7 @@ class Journals:
             self.stage = of_scenario(reading.world.scenario, self._mode())
         for tick in reading.ticks[first_new:]:
             self.known.take_tick(tick)
-        if reading.judgement is None:
+        if reading.mission_outcome is None:
             self.known.take_world(reading.world)
         self.known.end = reading.end or self.known.end
         self.known.final_reports.update(reading.final_reports)

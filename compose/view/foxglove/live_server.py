@@ -23,7 +23,7 @@ from foxglove.websocket import Capability, ChannelView, Client, ServerListener, 
 
 from compose.launch.signals import stop_with_launcher
 from compose.recording.cast import Stage
-from compose.recording.frames import Placing
+from compose.recording.frames import JournalDecoder
 from compose.recording.run import WORLD_JOURNAL, agent_journal
 from compose.view.foxglove.gate import GUESTS_FILES, Gate, private_host
 from compose.view.foxglove.mcap import Channels
@@ -59,7 +59,7 @@ class Live:
         self._folder = folder
         self._channels = channels
         self._journals = Journals(folder)
-        self._tails: dict[str, tuple[Tail, Placing]] = {}
+        self._tails: dict[str, tuple[Tail, JournalDecoder]] = {}
         self._views: Views | None = None
         self._next = 0
         """The next tick to show."""
@@ -100,9 +100,9 @@ class Live:
 
     def _publish_frames(self, stage: Stage) -> None:
         for name in (WORLD_JOURNAL, *map(agent_journal, stage.ids)):
-            tail, placing = self._tails.setdefault(name, (Tail(self._folder / name), Placing(name)))
+            tail, decoder = self._tails.setdefault(name, (Tail(self._folder / name), JournalDecoder(name)))
             with suppress(OSError, CorruptJournal):
-                for one in placing.decoded(tail.news()):
+                for one in decoder.decoded(tail.news()):
                     self._channels.frame(one, nanoseconds(stage, one.tick))
 
     def _ready(self, stage: Stage, now: float) -> list[Scene]:
