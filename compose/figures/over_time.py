@@ -20,7 +20,7 @@ from protocol.mission import Role
 from protocol.motion import Covariance, Pose, wrap
 from protocol.rounding import TOLERANCE
 
-AXIS, TALL = 0.62, 1.9
+AXIS, TALL = 0.72, 1.9
 """The space left of a panel over time for its axis, and the height of the panel, in inches."""
 PHASES = {1: "own anchor", 2: "search for the peer", 3: "encounter"}
 SHADES = {1: "0.93", 2: "1.0", 3: "0.97"}

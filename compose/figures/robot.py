@@ -217,7 +217,7 @@ def draw_near(axes: Axes, pair: PairRecord, role: Role) -> None:
             transform=axes.transAxes, ha="center", va="center", color=PALE, gid="nothing-near",
         )  # fmt: skip
         return
-    axes.set_title("estimates relative to the true pose", color=PALE, pad=3, x=0.4)
+    axes.set_title("relative to the true pose", color=PALE, pad=5, loc="left")
     axes.set_xlabel("x error [m]")
     axes.set_ylabel("y error [m]")
     colours, (last, truth), half = _ages(one, role), one.likeliest[-1], _half(pair, role)

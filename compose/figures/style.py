@@ -66,7 +66,7 @@ _SIZES = dict.fromkeys(
 )  # fmt: skip
 _FINE = {"axes.linewidth": 0.6, "xtick.major.width": 0.6, "ytick.major.width": 0.6, "axes.labelpad": 2.0}
 
-SCREEN = Medium(True, PAGE, 160, {**_SIZES, **_FINE})
+SCREEN = Medium(True, PAGE, 160, {**_SIZES, **_FINE, "mathtext.fontset": "stix"})
 """Figures to look at: titled, all of one width."""
 PAPER = Medium(
     False, COLUMN, 300, {**_SIZES, **_FINE, "font.family": "STIXGeneral", "mathtext.fontset": "stix"}
