@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 from PIL import Image
 
-from compose.colours import COLOURS
 from compose.figures import PICTURES, catalogue
 from compose.figures.account import account
 from compose.figures.pair import PairRecord, of_record, of_robots
@@ -21,6 +20,7 @@ from compose.figures.style import PAPER, SCREEN, Medium, look, save
 from compose.launch.in_process import run_mission
 from compose.recording.run import read
 from compose.scenario.scenario_file import load
+from compose.view.colours import COLOURS
 from tests.commands import tandem
 
 WIDTHS = {3.5: (252.0, 1050), 7.16: (515.52, 2148)}

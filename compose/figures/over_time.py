@@ -11,11 +11,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
-from compose.colours import COLOURS
 from compose.figures.pair import ROLES, PairRecord, Span, error, others
 from compose.figures.sheet import ANCHORS, EDGE, FOOT, GAP, NO_TRUTH, WORDS, Absent, Sheet, measured
 from compose.figures.style import INK, MARKS, PALE, SCREEN, SHADE, Medium
 from compose.recording.claim import Claim
+from compose.view.colours import COLOURS
 from protocol.mission import Role
 from protocol.motion import Covariance, Pose, wrap
 from protocol.rounding import TOLERANCE

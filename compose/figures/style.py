@@ -13,8 +13,8 @@ from matplotlib import _mathtext
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
-from compose.colours import COLOURS
 from compose.figures import FORMATS
+from compose.view.colours import COLOURS
 from protocol import files
 from protocol.mission import Role
 
@@ -45,7 +45,7 @@ logging.getLogger("fontTools").setLevel(logging.ERROR)
 
 
 class Medium(NamedTuple):
-    """What figures are drawn for."""
+    """The size, resolution and fonts of figures for one use."""
 
     titled: bool
     """True if figures have a title."""

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from foxglove import messages as fox
 
-from compose import colours
+from compose.view import colours
 from compose.view.cast import Seat, Stage
 from compose.view.events import Event
 from compose.view.foxglove import shapes
