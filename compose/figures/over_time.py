@@ -254,7 +254,7 @@ def draw_errors(axes: Axes, pair: PairRecord, quantity: Quantity, *roles: Role) 
         axes.axhline(required, ls="-.", lw=0.9, color=PALE, gid="accuracy", zorder=1,
                      label=f"required sigma: {required:g} m")  # fmt: skip
     if len(roles) == 1 and sigmas:
-        _line(axes, sigmas, lw=1.1, ls="--", color=COLOURS[roles[0]], gid="sigma", label="claimed sigma")
+        _line(axes, sigmas, lw=0.7, ls="-", color=COLOURS[roles[0]], gid="sigma", label="claimed sigma")
     _scale(axes)
     if len(roles) == 1 and sigmas:
         low, _ = axes.get_ylim()
