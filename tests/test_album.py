@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import math
 import os
+import pty
 import re
+import subprocess
+import sys
 from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
@@ -23,16 +26,7 @@ from msgspec.structs import replace
 from agent.planning.active_sensing import stride
 from agent.planning.phase3_last_manoeuvre import compared
 from compose.cli.figures import draw as draw_all
-from compose.figures import (
-    PICTURES,
-    catalogue,
-    encounter,
-    hypotheses,
-    manoeuvre,
-    over_time,
-    phase_one,
-    trajectory,
-)
+from compose.figures import PICTURES, catalogue, decisions, manoeuvre, over_time, phase_one, steps, trajectory
 from compose.figures.account import account
 from compose.figures.pair import PairRecord, pair_of
 from compose.figures.sheet import Absent
@@ -237,8 +231,8 @@ def test_the_encounter_has_a_panel_for_each_mutual_range(
     name: str, ticks: list[int], recordings: Path
 ) -> None:
     told = pair(recorded(name, recordings))
-    assert encounter.steps(told) == ticks
-    figure = drawn(encounter.draw(told))
+    assert steps.steps(told) == ticks
+    figure = drawn(steps.draw(told))
     assert len(figure.axes) == 3
     for axes, tick in zip(figure.axes, ticks, strict=True):
         assert axes.get_title(loc="left").startswith(f"({ticks.index(tick) + 1}) $k$ = {tick}, ")
@@ -254,9 +248,9 @@ def test_the_key_of_an_encounter_is_on_the_paper_however_few_ranges_it_has(
 ) -> None:
     run_mission(parse(PAPER_1.replace("seed = 1", f"seed = 1\nmax_ticks = {ticks}"), "mine.toml"), tmp_path)
     told = pair(tmp_path)
-    assert len(encounter.steps(told)) == ticks - 45
+    assert len(steps.steps(told)) == ticks - 45
     with look(SCREEN):
-        figure = drawn(encounter.draw(told))
+        figure = drawn(steps.draw(told))
         figure.draw_without_rendering()
     (key,) = figure.legends
     paper, signs = figure.bbox, key.get_window_extent()
@@ -332,7 +326,7 @@ def test_all_error_lines_differ_in_grey(
 def test_a_panel_has_each_hypothesis_of_the_journal_under_noise(recordings: Path) -> None:
     folder = recorded("noisy", recordings)
     told = pair(folder)
-    figure = drawn(hypotheses.draw(told))
+    figure = drawn(decisions.draw(told))
     shown = {int(one.get_gid().split("-")[1]) for one in found(figure, r"truth-.*")}  # type: ignore[union-attr]
     assert len(shown) == len(figure.axes) > 1
     for role in ("a", "b"):
@@ -496,6 +490,23 @@ def test_a_terminal_shows_how_far_it_is_and_each_file_on_a_line_of_its_own(
     percentages = [int(percentage) for percentage in re.findall(r"(\d+)%", shown)]
     assert percentages == sorted(percentages)
     assert (percentages[0], percentages[-1]) == (0, 100)
+
+
+def test_with_its_output_in_a_file_the_progress_bar_stays_on_the_terminal(
+    recordings: Path, tmp_path: Path
+) -> None:
+    folder = copied(recorded("undecided", recordings), tmp_path)
+    ours, theirs = pty.openpty()
+    arguments = ["figures", str(folder), "--only", "ranges", "--format", "svg"]
+    with (tmp_path / "out").open("wb") as out:
+        command = [sys.executable, "-P", "-m", "compose.cli", *arguments]
+        subprocess.run(command, stdout=out, stderr=theirs, check=True)
+    shown = os.read(ours, 65536).decode()
+    os.close(ours)
+    os.close(theirs)
+    assert (tmp_path / "out").read_text() == f"{folder}/figures/ranges-a-b.svg\n"
+    assert "tandem figures" in shown
+    assert "ranges-a-b" not in shown
 
 
 @pytest.mark.parametrize(("journal", "torn"), [("world.journal", "the world"), ("agent-b.journal", "b")])

@@ -19,6 +19,7 @@ import socket
 import struct
 import subprocess
 import sys
+import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -655,9 +656,8 @@ def test_an_export_decodes_each_frame_once(
 
     def checksum(payload: memoryview) -> int:
         decoded.append(payload)
-        return crc32(payload)
+        return zlib.crc32(payload)
 
-    crc32 = wire.zlib.crc32
     monkeypatch.setattr(wire, "zlib", SimpleNamespace(crc32=checksum))
     export(read(tmp_path), tmp_path / "out")
     assert len(decoded) == frames

@@ -15,8 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from compose.figures import over_time
-from compose.figures import robot as robot_figure
+from compose.figures import one_robot, over_time
 from compose.figures.sheet import Absent
 from compose.figures.style import PLACES, SCREEN, look, save
 from compose.launch.in_process import run_mission
@@ -72,7 +71,7 @@ def picture(folder: Path, name: str) -> Path:
 
 def figure_of(folder: Path, name: str) -> Figure:
     """Return the figure of the robot `name` of the first pair."""
-    figure = robot_figure.draw(pair_of(folder), "a" if name == "a" else "b")
+    figure = one_robot.draw(pair_of(folder), "a" if name == "a" else "b")
     assert not isinstance(figure, Absent), figure
     return figure
 
@@ -196,7 +195,7 @@ def test_the_error_over_time_is_that_of_the_estimates_against_the_truth(noisy: P
 
 def test_an_ellipse_holds_what_is_within_3_sigma(noisy: Path) -> None:
     axes = Figure().subplots()
-    robot_figure.draw_estimates(axes, pair_of(noisy), "a")
+    one_robot.draw_estimates(axes, pair_of(noisy), "a")
     last = read(noisy).estimates("a")[-1]
     assert last.covariance is not None
     (ellipse,) = axes.findobj(lambda artist: artist.get_gid() == f"ellipse-{last.tick}")

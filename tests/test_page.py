@@ -206,7 +206,7 @@ def test_without_the_truth_the_page_opens_with_the_estimates(
             "aria-label", re.compile(r"The plane at tick 48: a at .*; b at ")
         )
         drawn = inks(page)
-        assert min(drawn[f"phase-{phase}"] for phase in (2, 3)) > 100  # trails
+        assert min(drawn[f"robot-{role}"] for role in "ab") > 100  # trails
         page.keyboard.press("t")
         assert inks(page) == drawn
         assert "truth=0" not in page.url

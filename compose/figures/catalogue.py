@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from matplotlib.figure import Figure
 
 from agent.planning.planner import uses_active_sensing
-from compose.figures import encounter, hypotheses, manoeuvre, over_time, phase_one, robot, trajectory
+from compose.figures import decisions, manoeuvre, one_robot, over_time, phase_one, steps, trajectory
 from compose.figures.pair import PairRecord
 from compose.figures.sheet import Absent
 from compose.figures.style import SCREEN, Medium
@@ -35,14 +35,14 @@ def _phase_one(pair: PairRecord, medium: Medium) -> Iterator[Picture]:
 def _plan(pair: PairRecord, medium: Medium) -> Iterator[Picture]:
     """Yield the planned manoeuvres; with active sensing, the hypotheses at its decisions."""
     if pair.readable and uses_active_sensing(pair.planner_name, pair.mission):
-        yield f"plan-{pair.name}", hypotheses.draw(pair, medium)
+        yield f"plan-{pair.name}", decisions.draw(pair, medium)
     elif pair.readable:
         for name, figure in manoeuvre.draw(pair, medium).items():
             yield f"plan-{name}", figure
 
 
 def _encounter(pair: PairRecord, medium: Medium) -> Iterator[Picture]:
-    yield f"encounter-{pair.name}", encounter.draw(pair, medium)
+    yield f"encounter-{pair.name}", steps.draw(pair, medium)
 
 
 def _ranges(pair: PairRecord, medium: Medium) -> Iterator[Picture]:
@@ -56,7 +56,7 @@ def _errors(pair: PairRecord, medium: Medium) -> Iterator[Picture]:
 
 def _robot(pair: PairRecord, medium: Medium) -> Iterator[Picture]:
     for role in pair.readable:
-        yield f"robot-{pair.robot(role).id}", robot.draw(pair, role, medium)
+        yield f"robot-{pair.robot(role).id}", one_robot.draw(pair, role, medium)
 
 
 _DRAWN: dict[str, Callable[[PairRecord, Medium], Iterator[Picture]]] = {

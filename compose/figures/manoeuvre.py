@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 
 from agent.estimation.closed_forms import Placement
 from agent.planning.phase3_last_manoeuvre import Array, Compared, LastManoeuvre, Plan, compared
-from compose.colours import COLOURS
 from compose.figures.pair import ROLES, PairRecord
 from compose.figures.sheet import (
     ANCHORS,
@@ -31,6 +30,7 @@ from compose.figures.sheet import (
 )
 from compose.figures.style import INK, MARKS, PALE, PALER, SCREEN, Medium
 from compose.figures.trajectory import heading
+from compose.view.colours import COLOURS
 from protocol.mission import Mission, Role
 from protocol.motion import ORIGIN, Pose, compose, step
 

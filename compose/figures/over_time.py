@@ -11,16 +11,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
-from compose.colours import COLOURS
 from compose.figures.pair import ROLES, PairRecord, Span, error, others
 from compose.figures.sheet import ANCHORS, EDGE, FOOT, GAP, NO_TRUTH, WORDS, Absent, Sheet, measured
 from compose.figures.style import INK, MARKS, PALE, SCREEN, SHADE, Medium
 from compose.recording.claim import Claim
+from compose.view.colours import COLOURS
 from protocol.mission import Role
 from protocol.motion import Covariance, Pose, wrap
 from protocol.rounding import TOLERANCE
 
-AXIS, TALL = 0.62, 1.9
+AXIS, TALL = 0.72, 1.9
 """The space left of a panel over time for its axis, and the height of the panel, in inches."""
 PHASES = {1: "own anchor", 2: "search for the peer", 3: "encounter"}
 SHADES = {1: "0.93", 2: "1.0", 3: "0.97"}
@@ -254,7 +254,7 @@ def draw_errors(axes: Axes, pair: PairRecord, quantity: Quantity, *roles: Role) 
         axes.axhline(required, ls="-.", lw=0.9, color=PALE, gid="accuracy", zorder=1,
                      label=f"required sigma: {required:g} m")  # fmt: skip
     if len(roles) == 1 and sigmas:
-        _line(axes, sigmas, lw=1.1, ls="--", color=COLOURS[roles[0]], gid="sigma", label="claimed sigma")
+        _line(axes, sigmas, lw=0.7, ls="-", color=COLOURS[roles[0]], gid="sigma", label="claimed sigma")
     _scale(axes)
     if len(roles) == 1 and sigmas:
         low, _ = axes.get_ylim()

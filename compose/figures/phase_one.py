@@ -12,10 +12,10 @@ from matplotlib.figure import Figure
 from agent.estimation.exact import Branch
 from agent.planning.range_seeking import travelled
 from agent.planning.state import RobotState
-from compose.colours import COLOURS
 from compose.figures.pair import PairRecord
 from compose.figures.sheet import ANCHORS, LABEL, Absent, Sheet, around, circle
 from compose.figures.style import INK, MARKS, PALE, PALER, SCREEN, Medium
+from compose.view.colours import COLOURS
 from protocol.messages import BranchKind
 from protocol.mission import Role
 from protocol.motion import Pose, compose

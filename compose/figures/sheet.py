@@ -22,7 +22,7 @@ from matplotlib.legend import Legend
 from matplotlib.patches import Circle
 from matplotlib.transforms import Bbox
 
-from compose.figures.style import INK, PAGE, PLACES, TEXT, Medium
+from compose.figures.style import INK, PAGE, PLACES, SCREEN, TEXT, Medium
 from protocol.mission import Role
 
 EDGE, GAP = 0.06, 0.12
@@ -31,11 +31,15 @@ LEFT, FOOT, HEAD, WORDS = 0.48, 0.36, 0.06, 0.155
 """The space left of a panel for its axis, below it, above it, and per line of a text, in inches."""
 HANDLE, SPACE, BETWEEN = 2.2, 0.5, 1.0
 """The lengths of a key's handles and of the gaps after handles and between columns, in font sizes."""
+BESIDE = 0.6
+"""The least fraction of the width that a plane has if its key is beside it."""
 ROW = 0.165
 """The height of a row of a key, in inches."""
 PANELS, ACROSS = 6, 3
 """The maximum number of panels of a series, in total and in a row."""
-FINE = 720
+HINTED = 1.03
+"""The largest ratio of the widths of a text at two resolutions, which differ by its hinting."""
+FINE = SCREEN.dpi
 """The resolution at which texts are measured, in dots per inch."""
 NO_ENCOUNTER = "the robots had no encounter (phase 3)"
 NO_TRUTH = "a recording in hardware mode has no ground truth"
@@ -82,7 +86,7 @@ class Sheet:
     @property
     def room(self) -> float:
         """The width of a panel that takes the whole width, in inches."""
-        return self.width - LEFT - 2 * EDGE
+        return self.width - LEFT - 3 * EDGE
 
     def panel(self) -> Axes:
         """Add and return axes, which are yet to be placed."""
@@ -97,8 +101,8 @@ class Sheet:
         handles, labels = panel.get_legend_handles_labels()
         if not handles:
             return 0.0
-        columns = next((n for n in range(len(labels), 1, -1) if _width(labels, n) <= width), 1)
-        columns = math.ceil(len(labels) / math.ceil(len(labels) / columns))  # rows of one length
+        rows = next((n for n in range(1, len(labels)) if _width(labels, n) <= width), len(labels))
+        columns = math.ceil(len(labels) / rows)
         key = self.figure.legend(
             handles,
             labels,
@@ -115,13 +119,13 @@ class Sheet:
             **look,
         )
         self._keys.append((key, left, top))
-        return (math.ceil(len(labels) / columns) + ("title" in look)) * ROW
+        return (rows + ("title" in look)) * ROW
 
     def plane(self, axes: Axes, window: Window, tallest: float) -> None:
         """Place a plane that shows `window`, with its key beside it if there is room, and below it else."""
         _, labels = axes.get_legend_handles_labels()
-        beside = _width(labels, 1) + GAP
-        if (left := self.room - beside) < self.room / 2:
+        beside = _width(labels, len(labels)) + GAP
+        if (left := self.room - beside) < BESIDE * self.room:
             left = self.room
         width, height = fitted(window, left, tallest)
         top = self.top + HEAD
@@ -173,17 +177,21 @@ class Sheet:
         return self.figure
 
 
+def measured(text: str) -> float:
+    """Return the width of a line of text in the font of `look`, in inches, rounded up to 0.01."""
+    return _measured(text, rcParams["font.family"][0])
+
+
+@cache
+def _measured(text: str, family: str) -> float:
+    font, symbols = FontProperties(family=family, size=TEXT), text.replace(r"\$", "").count("$") > 0
+    size = _renderer().get_text_width_height_descent(text, font, symbols)  # type: ignore[no-untyped-call]
+    return math.ceil(100.0 * float(size[0]) / FINE) / 100.0
+
+
 @cache
 def _renderer() -> RendererAgg:
     return RendererAgg(1, 1, FINE)  # type: ignore[no-untyped-call]
-
-
-def measured(text: str) -> float:
-    """Return the width of a line of text in the font of `look`, in inches, rounded up to 0.01."""
-    font = FontProperties(family=rcParams["font.family"], size=TEXT)
-    symbols = text.replace(r"\$", "").count("$") > 0
-    size = _renderer().get_text_width_height_descent(text, font, symbols)  # type: ignore[no-untyped-call]
-    return math.ceil(100.0 * float(size[0]) / FINE) / 100.0
 
 
 def wrapped(words: Iterable[str], width: float, between: str) -> list[str]:
@@ -197,15 +205,19 @@ def wrapped(words: Iterable[str], width: float, between: str) -> list[str]:
     return lines
 
 
-def _width(labels: Sequence[str], columns: int) -> float:
-    """Return the width of a key in inches; Matplotlib fills its columns one after the other."""
+def _width(labels: Sequence[str], rows: int) -> float:
+    """Return the width of a key with at most `rows` rows, in inches.
+
+    Matplotlib fills its columns one after the other, the first ones with a row more than the last ones.
+    """
+    columns = math.ceil(len(labels) / rows)
     rows, longer = divmod(len(labels), columns)
     wide, start = 0.0, 0
     for column in range(columns):
         end = start + rows + (column < longer)
         wide += max(map(measured, labels[start:end]), default=0.0)
         start = end
-    return wide + (columns * (HANDLE + SPACE) + (columns - 1) * BETWEEN) * TEXT / 72.0
+    return HINTED * wide + (columns * (HANDLE + SPACE) + (columns - 1) * BETWEEN) * TEXT / 72.0
 
 
 def circle(axes: Axes, place: tuple[float, float], radius: float, **look: Any) -> None:

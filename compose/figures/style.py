@@ -13,8 +13,8 @@ from matplotlib import _mathtext
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
-from compose.colours import COLOURS
 from compose.figures import FORMATS
+from compose.view.colours import COLOURS
 from protocol import files
 from protocol.mission import Role
 
@@ -45,7 +45,7 @@ logging.getLogger("fontTools").setLevel(logging.ERROR)
 
 
 class Medium(NamedTuple):
-    """What figures are drawn for."""
+    """The size, resolution and fonts of figures for one use."""
 
     titled: bool
     """True if figures have a title."""
@@ -66,7 +66,7 @@ _SIZES = dict.fromkeys(
 )  # fmt: skip
 _FINE = {"axes.linewidth": 0.6, "xtick.major.width": 0.6, "ytick.major.width": 0.6, "axes.labelpad": 2.0}
 
-SCREEN = Medium(True, PAGE, 160, {**_SIZES, **_FINE})
+SCREEN = Medium(True, PAGE, 160, {**_SIZES, **_FINE, "mathtext.fontset": "stix"})
 """Figures to look at: titled, all of one width."""
 PAPER = Medium(
     False, COLUMN, 300, {**_SIZES, **_FINE, "font.family": "STIXGeneral", "mathtext.fontset": "stix"}

@@ -9,10 +9,10 @@ from itertools import groupby
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from compose.colours import COLOURS, line_style
 from compose.figures.pair import ROLES, PairRecord, Side
 from compose.figures.sheet import ANCHORS, LABEL, NO_PLACES, Absent, Sheet, Window, around, circle
 from compose.figures.style import INK, MARKS, PALE, SCREEN, Medium
+from compose.view.colours import COLOURS, line_style
 from protocol.mission import Role
 from protocol.motion import Pose
 

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from foxglove import messages as fox
 
 from compose.recording.cast import Seat, Stage
+from compose.view import colours
 from compose.view.events import Event
 from compose.view.foxglove import shapes
 from compose.view.scene import HeldPoses, Player, Scene
@@ -26,7 +27,7 @@ BODY = 0.12
 """The drawn length of a robot, as a fraction of the sensing range R."""
 LEAST = 0.06
 """The minimum opacity of a hypothesis."""
-COLOURS: dict[Role, tuple[float, float, float]] = {"a": (0.04, 0.38, 0.64), "b": (0.77, 0.27, 0.11)}
+COLOURS: dict[Role, tuple[float, float, float]] = {"a": colours.rgb("a"), "b": colours.rgb("b")}
 GREY = (0.5, 0.5, 0.5)
 GREEN = (0.0, 0.5, 0.35)
 LEVELS = {

@@ -5,11 +5,11 @@ from __future__ import annotations
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from compose.colours import COLOURS, line_style
 from compose.figures.pair import ROLES, PairRecord
 from compose.figures.sheet import NO_ENCOUNTER, NO_PLACES, Absent, Sheet, Window, circle, some, square
 from compose.figures.style import INK, MARKS, PALE, SCREEN, Medium
 from compose.figures.trajectory import draw_trail, heading
+from compose.view.colours import COLOURS, line_style
 from protocol.mission import Role
 
 BEFORE = 2

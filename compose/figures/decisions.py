@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 
 from agent.planning.active_sensing import Surveying, stride
 from agent.planning.state import RobotState
-from compose.colours import COLOURS
 from compose.figures.pair import ROLES, PairRecord
 from compose.figures.sheet import NO_ENCOUNTER, Absent, Sheet, Window, circle, some, square
 from compose.figures.style import INK, MARKS, PALE, PALER, SCREEN, Medium
+from compose.view.colours import COLOURS
 from protocol.mission import Role
 from protocol.motion import Pose, step
 

@@ -12,7 +12,6 @@ from matplotlib.patches import Ellipse, FancyArrowPatch, Wedge
 from matplotlib.ticker import MaxNLocator
 from matplotlib.typing import ColorType
 
-from compose.colours import COLOURS
 from compose.figures.over_time import AXIS, TALL, draw_errors, draw_hypotheses, timed
 from compose.figures.pair import PairRecord, Side, error, others
 from compose.figures.sheet import (
@@ -32,12 +31,13 @@ from compose.figures.sheet import (
 from compose.figures.style import INK, PALE, SCREEN, Medium
 from compose.figures.trajectory import draw_plane, window
 from compose.recording.run import ended
+from compose.view.colours import COLOURS
 from protocol.messages import Estimate
 from protocol.mission import Role
 from protocol.motion import ORIGIN, Pose
 from protocol.rounding import TOLERANCE
 
-NEAR, BESIDE, TALLEST = 1.9, 2.4, 4.4
+NEAR, BESIDE, TALLEST = 1.9, 2.1, 4.4
 """The widths of the enlarged panel and of the keys, and the maximum height of the plane, in inches."""
 AGES: dict[Role, LinearSegmentedColormap] = {
     "a": LinearSegmentedColormap.from_list("ages-a", ["#9cc9ea", COLOURS["a"], "#04263f"]),
@@ -211,7 +211,7 @@ def draw_near(axes: Axes, pair: PairRecord, role: Role) -> None:
             transform=axes.transAxes, ha="center", va="center", color=PALE, gid="nothing-near",
         )  # fmt: skip
         return
-    axes.set_title("estimates relative to the true pose", color=PALE, pad=3, x=0.4)
+    axes.set_title("relative to the true pose", color=PALE, pad=5, loc="left")
     axes.set_xlabel("x error [m]")
     axes.set_ylabel("y error [m]")
     colours, (last, truth), half = _ages(one, role), one.likeliest[-1], _half(pair, role)
