@@ -9,10 +9,11 @@ from pathlib import Path
 
 from compose.figures import PICTURES, catalogue
 from compose.figures.account import account
-from compose.figures.pair import of_record
+from compose.figures.pair import pair_of
 from compose.figures.sheet import Absent
-from compose.figures.style import save
+from compose.figures.style import SCREEN, look, save
 from compose.launch import in_process
+from compose.recording.run import read
 from compose.scenario import scenario_file
 
 DOCS = Path(__file__).parent
@@ -43,11 +44,12 @@ def main() -> None:
 
 def draw(name: str, shown: Mapping[str, str], folder: Path) -> None:
     """Run the scenario in `folder`, and copy those of its figures to docs/ that `shown` names."""
-    recording = in_process.run_mission(scenario_file.load(name), folder)
-    robots = [robot.id for robot in recording.scenario.robots]
-    pair = of_record(recording, (0, 1), {robot: account(folder, robot) for robot in robots})
+    in_process.run_mission(scenario_file.load(name), folder)
+    run = read(folder)
+    pair = pair_of(run, run.pairs[0], {robot: account(run, robot) for robot in run.robots})
+    assert pair is not None
     for kind in PICTURES:
-        with catalogue.settings(kind):
+        with look(SCREEN):
             for title, figure in catalogue.pictures(pair, kind):
                 if title in shown and not isinstance(figure, Absent):
                     (svg,) = save(figure, folder / title, ["svg"])

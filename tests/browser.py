@@ -107,7 +107,7 @@ def picture(page: Page) -> str:
 INKS = """() => {
   const canvas = document.getElementById('canvas'), style = getComputedStyle(document.documentElement);
   const data = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data, found = {};
-  for (const name of ['ring', 'orbit', 'ghost', 'range', 'link', 'fault', 'phase-1', 'phase-2', 'phase-3']) {
+  for (const name of ['ring', 'orbit', 'ghost', 'range', 'link', 'fault', 'robot-a', 'robot-b']) {
     const hex = style.getPropertyValue('--' + name).trim();
     const ink = [1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16));
     found[name] = 0;

@@ -111,9 +111,12 @@ class TandemProcess:
         *arguments: str | Path,
         cwd: Path | None = None,
         terminal: int | None = None,
+        errors: int | None = None,
         through: Sequence[str] = (),
     ) -> None:
-        """Start the command. `terminal` receives its standard output; `through` is a command that execs it.
+        """Start the command. `through` is a command that execs it.
+
+        `terminal` receives its standard output, and `errors` its standard error.
 
         `run` gets `--no-export` unless the arguments say otherwise, because an export takes longer.
         """
@@ -124,7 +127,7 @@ class TandemProcess:
             [*through, sys.executable, "-P", "-m", "compose.cli", *words],
             stdin=subprocess.DEVNULL,
             stdout=self._out if terminal is None else terminal,
-            stderr=self._err,
+            stderr=self._err if errors is None else errors,
             start_new_session=True,
             cwd=cwd,
         )
@@ -228,7 +231,7 @@ def on_a_terminal(*arguments: str | Path) -> tuple[int, str]:
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))  # the last two are pixels
     shown = b""
-    with TandemProcess(*arguments, terminal=theirs) as command:
+    with TandemProcess(*arguments, terminal=theirs, errors=theirs) as command:
         os.close(theirs)
         while True:
             try:

@@ -18,7 +18,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from compose.recording.run import Recording, read
+from compose.recording.run import Run, read
 from tests.commands import ENDLESS, TandemProcess, process_of
 
 RATES = (1, 10, 100)
@@ -50,7 +50,7 @@ def main() -> int:
     return 0 if well else 1
 
 
-def run_mission(folder: Path, rate: int, stopped: float) -> Recording:
+def run_mission(folder: Path, rate: int, stopped: float) -> Run:
     """Return the recording of LASTS_S s at `rate`, with the agent of a stopped for `stopped` s."""
     scenario, out = folder / "mission.toml", folder / "out"
     scenario.write_text(f"max_ticks = {rate * LASTS_S}\n" + ENDLESS.replace("max_ticks", "# max_ticks"))
@@ -65,12 +65,12 @@ def run_mission(folder: Path, rate: int, stopped: float) -> Recording:
     return read(out)
 
 
-def late(recording: Recording, robot: str) -> list[int]:
+def late(recording: Run, robot: str) -> list[int]:
     """Return the ticks whose command from `robot` was late."""
     return [moment.truth.tick for moment in recording.ticks[:-1] if robot not in moment.commands]
 
 
-def moved_by(recording: Recording, tick: int) -> float:
+def moved_by(recording: Run, tick: int) -> float:
     """Return the distance in m (1-norm) that a moved in `tick`."""
     before, after = recording.ticks[tick].truth.poses[0], recording.ticks[tick + 1].truth.poses[0]
     return abs(after.x - before.x) + abs(after.y - before.y)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from compose.launch.in_process import run_mission
-from compose.recording.run import Recording
+from compose.recording.run import Run
 from compose.scenario.scenario_file import parse
 
 
@@ -16,7 +16,7 @@ def mission_of(
     reach: float = 3.0,
     speed: float = 1.0,
     turn_rate: float = math.pi,
-) -> Recording:
+) -> Run:
     """Run such a mission in this process. The peer starts half a metre from its own anchor."""
     text = f"""
         name = "mission"

@@ -25,7 +25,7 @@ import msgpack
 from mcap.reader import make_reader
 
 from compose.audit.replay import Replay, replay
-from compose.recording.run import WORLD_JOURNAL, agent_journal
+from compose.recording.run import WORLD_JOURNAL, agent_journal, read
 from compose.view.export.folder import export
 from protocol.journal import journal_file
 from tests.commands import LONG, TandemProcess, journals, process_of, processes_of, tandem, until
@@ -88,7 +88,7 @@ def killed(draw: random.Random, folder: Path) -> tuple[str, bool]:
         run.ended()
     until(lambda: not processes_of(out), "no process writes any more")
     result, torn = replay(out)
-    export(out, folder / "exported")
+    export(read(out), folder / "exported")
     there = {name: journal_file.packed(journal_file.read(out / name)) for name in torn}
     whole = all(len(there[name]) + torn[name] == (out / name).stat().st_size for name in torn)
     exported = journals_of(folder / "exported" / "run.mcap") == {k: v for k, v in there.items() if v}

@@ -6,7 +6,7 @@ import math
 from functools import cache
 
 from compose.launch.in_process import run_mission
-from compose.recording.run import Recording
+from compose.recording.run import Run
 from compose.recording.summary_json import summary
 from compose.scenario.scenario_file import parse
 from world.scenario import Scenario
@@ -51,12 +51,12 @@ def scenario_of(
 
 
 @cache
-def survey(noise: str, seed: int, planner_name: str = "assured", accuracy: float = 0.1) -> Recording:
+def survey(noise: str, seed: int, planner_name: str = "assured", accuracy: float = 0.1) -> Run:
     """Return the recording of the mission of `scenario_of`, run in this process."""
     return run_mission(scenario_of(noise, seed, planner_name=planner_name, accuracy=accuracy))
 
 
-def assert_localised(recording: Recording) -> None:
+def assert_localised(recording: Run) -> None:
     """Check that both robots localise in the same tick, to mission.accuracy and within the claimed sigmas."""
     result = summary(recording, "in-process", None)
     assert result["outcome"] == "localised", (recording.scenario.seed, result["reason"])
@@ -74,6 +74,6 @@ ROUNDING = 1e-6
 """The tolerance of the referee, in m and rad."""
 
 
-def states(recording: Recording, robot: str) -> list[str]:
+def states(recording: Run, robot: str) -> list[str]:
     """Return the state of the robot at every tick."""
     return [moment.commands[robot].state for moment in recording.ticks]

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import math
 import os
+import pty
 import re
+import subprocess
+import sys
 from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
@@ -25,12 +28,11 @@ from agent.planning.phase3_last_manoeuvre import compared
 from compose.cli.figures import draw as draw_all
 from compose.figures import PICTURES, catalogue, decisions, manoeuvre, over_time, phase_one, steps, trajectory
 from compose.figures.account import account
-from compose.figures.pair import PairRecord, of_record
+from compose.figures.pair import PairRecord, pair_of
 from compose.figures.sheet import Absent
-from compose.figures.style import look
+from compose.figures.style import SCREEN, look
 from compose.launch.in_process import run_mission
-from compose.recording.run import estimates, read
-from compose.recording.summary_json import first_claim
+from compose.recording.run import agent_journal, read
 from compose.scenario.scenario_file import load, parse
 from protocol.journal.journal_file import read as frames
 from protocol.messages import Command
@@ -90,10 +92,12 @@ def recorded(name: str, recordings: Path) -> Path:
 
 
 def pair(folder: Path, number: int = 0) -> PairRecord:
-    recording = read(folder)
-    places = recording.scenario.pairs()[number]
-    robots = [recording.scenario.robots[place].id for place in places]
-    return of_record(recording, places, {robot: account(folder, robot) for robot in robots})
+    run = read(folder)
+    robots = run.pairs[number]
+    known = [robot for robot in robots if (folder / agent_journal(robot)).exists()]
+    found = pair_of(run, robots, {robot: account(run, robot) for robot in known})
+    assert found is not None
+    return found
 
 
 def found(figure: Figure, gid: str) -> list[Artist]:
@@ -138,8 +142,7 @@ def test_a_plan_shows_each_candidate_and_the_axis_of_each_two_and_the_choice(
 ) -> None:
     told, computed = pair(recorded(name, recordings)), REFERENCE.sims[simulation]
     (figure,) = [drawn(one) for one in manoeuvre.draw(told).values()]
-    assert told.recording is not None
-    final_report = told.recording.final_reports["b"]
+    final_report = told.run.final_reports["b"]
     assert final_report.candidates is not None
     count = final_report.candidates[1]
     assert len(found(figure, r"candidate-\d+")) == count == len(computed.d_i)
@@ -246,7 +249,7 @@ def test_the_key_of_an_encounter_is_on_the_paper_however_few_ranges_it_has(
     run_mission(parse(PAPER_1.replace("seed = 1", f"seed = 1\nmax_ticks = {ticks}"), "mine.toml"), tmp_path)
     told = pair(tmp_path)
     assert len(steps.steps(told)) == ticks - 45
-    with look():
+    with look(SCREEN):
         figure = drawn(steps.draw(told))
         figure.draw_without_rendering()
     (key,) = figure.legends
@@ -292,10 +295,9 @@ def test_ranges_are_those_that_were_measured_and_contact_is_shaded(recordings: P
 @pytest.mark.parametrize("name", ["paper-1", "noisy"])
 def test_the_last_error_is_that_of_the_claim(name: str, recordings: Path) -> None:
     told = pair(recorded(name, recordings))
-    assert told.recording is not None
     figure = drawn(over_time.errors(told))
     for place, role in enumerate("ab"):
-        claim = first_claim(told.recording, place)
+        claim = told.run.claim(told.run.robots[place])
         assert claim is not None
         for what, error in (("position", claim.position_error), ("heading", claim.heading_error)):
             tick, value = line(figure, f"{what}-{role}")[-1]
@@ -328,7 +330,7 @@ def test_a_panel_has_each_hypothesis_of_the_journal_under_noise(recordings: Path
     shown = {int(one.get_gid().split("-")[1]) for one in found(figure, r"truth-.*")}  # type: ignore[union-attr]
     assert len(shown) == len(figure.axes) > 1
     for role in ("a", "b"):
-        held = estimates(folder, role)
+        held = read(folder).estimates(role)
         for tick in shown:
             marks = [
                 line(figure, f"hypothesis-{tick}-{role}-{i + 1}")[0] for i in range(len(held[tick].world))
@@ -380,7 +382,7 @@ def test_each_kind_of_figure_is_drawn_or_the_reason_is_printed(
 def test_every_pair_has_figures_of_its_own(recordings: Path) -> None:
     folder = recorded("pairs", recordings)
     names = []
-    with look(symbols=True):
+    with look(SCREEN):
         for number in range(2):
             names += [name for name, _ in catalogue.pictures(pair(folder, number), "trajectory")]
             names += [name for name, _ in catalogue.pictures(pair(folder, number), "phase-1")]
@@ -488,6 +490,23 @@ def test_a_terminal_shows_how_far_it_is_and_each_file_on_a_line_of_its_own(
     percentages = [int(percentage) for percentage in re.findall(r"(\d+)%", shown)]
     assert percentages == sorted(percentages)
     assert (percentages[0], percentages[-1]) == (0, 100)
+
+
+def test_with_its_output_in_a_file_the_progress_bar_stays_on_the_terminal(
+    recordings: Path, tmp_path: Path
+) -> None:
+    folder = copied(recorded("undecided", recordings), tmp_path)
+    ours, theirs = pty.openpty()
+    arguments = ["figures", str(folder), "--only", "ranges", "--format", "svg"]
+    with (tmp_path / "out").open("wb") as out:
+        command = [sys.executable, "-P", "-m", "compose.cli", *arguments]
+        subprocess.run(command, stdout=out, stderr=theirs, check=True)
+    shown = os.read(ours, 65536).decode()
+    os.close(ours)
+    os.close(theirs)
+    assert (tmp_path / "out").read_text() == f"{folder}/figures/ranges-a-b.svg\n"
+    assert "tandem figures" in shown
+    assert "ranges-a-b" not in shown
 
 
 @pytest.mark.parametrize(("journal", "torn"), [("world.journal", "the world"), ("agent-b.journal", "b")])

@@ -22,13 +22,14 @@ from agent.planning.phase3_last_manoeuvre import SPEEDS, TURN_RATES, LastManoeuv
 from agent.planning.precision import combined_error, odometry_rounding
 from agent.planning.state import RobotState
 from compose.launch.in_process import run_mission
-from compose.recording.run import Recording, TickRecord
+from compose.recording.run import Run
 from compose.scenario.scenario_file import parse
 from protocol.messages import Localised
 from protocol.mission import Mission, infeasibility
 from protocol.motion import ORIGIN, Pose, compose, step
 from tests.steps import Step, steps
 from world.referee import errors
+from world.world_journal import Tick
 
 
 class Setting(NamedTuple):
@@ -88,12 +89,12 @@ def text_of(
 
 
 @cache
-def drawn(setting: Setting, seed: int, planner_name: str = "assured") -> Recording:
+def drawn(setting: Setting, seed: int, planner_name: str = "assured") -> Run:
     """Return the recording of the mission with starts drawn from `seed`."""
     return run_mission(parse(text_of(setting, seed=seed, planner_name=planner_name), "assured"))
 
 
-def released(setting: Setting, a: Pose | None, b: Pose | None, frame: Pose = ORIGIN) -> Recording:
+def released(setting: Setting, a: Pose | None, b: Pose | None, frame: Pose = ORIGIN) -> Run:
     """Return the recording of the mission with these starts; a start that is None is drawn."""
     return run_mission(parse(text_of(setting, a, b, seed=11, frame=frame), "assured"))
 
@@ -105,7 +106,7 @@ def steps_of(folder: Path, setting: Setting, seed: int) -> Iterator[Step]:
     return steps(str(path))
 
 
-def assert_localised(recording: Recording) -> None:
+def assert_localised(recording: Run) -> None:
     starts = [robot.start for robot in recording.scenario.robots]
     assert recording.end is not None
     assert recording.end.outcome == "localised", (recording.end, starts)
@@ -116,22 +117,22 @@ def assert_localised(recording: Recording) -> None:
         assert max(errors(verdict.pose, truth)) < 1e-6, starts
 
 
-def in_contact(recording: Recording, moment: TickRecord) -> bool:
+def in_contact(recording: Run, moment: Tick) -> bool:
     a, b = moment.truth.local
     return math.hypot(a.x - b.x, a.y - b.y) <= recording.scenario.mission.sensing_range
 
 
-def met(recording: Recording) -> int:
+def met(recording: Run) -> int:
     """Return the tick in which phase 3 begins."""
     return next(m.truth.tick for m in recording.ticks if any(d.phase == 3 for d in m.commands.values()))
 
 
-def claimed(recording: Recording) -> int:
+def claimed(recording: Run) -> int:
     """Return the tick of the first claim."""
     return next(m.truth.tick for m in recording.ticks if any(d.verdict for d in m.commands.values()))
 
 
-def states(recording: Recording, robot: str) -> list[tuple[int, str]]:
+def states(recording: Run, robot: str) -> list[tuple[int, str]]:
     """Return the successive phases and states of `robot`."""
     found: list[tuple[int, str]] = []
     for moment in recording.ticks:
@@ -144,7 +145,7 @@ def states(recording: Recording, robot: str) -> list[tuple[int, str]]:
 # --- phase 3 begins as soon as possible ---------------------------------------------------------------
 
 
-def off_anchor(recording: Recording, moment: TickRecord) -> bool:
+def off_anchor(recording: Run, moment: Tick) -> bool:
     """Return whether b is at least half way to its waiting position, R / 8 from its anchor."""
     anchor, place = recording.scenario.robots[1].anchor, moment.truth.local[1]
     return (
@@ -239,7 +240,7 @@ def test_the_first_report_has_the_whole_path_however_long_b_has_waited(
 # --- observations before phase 3 count ----------------------------------------------------------------
 
 
-def encounter(recording: Recording) -> list[TickRecord]:
+def encounter(recording: Run) -> list[Tick]:
     """Return the ticks from the beginning of phase 3 until b's last manoeuvre begins, or until the claim."""
     moments = recording.ticks[met(recording) :]
     end = next(
@@ -299,7 +300,7 @@ def test_observations_before_phase_3_rule_out_further_placements(tmp_path: Path)
 # --- no claim without a check -------------------------------------------------------------------------
 
 
-def places(moment: TickRecord) -> tuple[float, ...]:
+def places(moment: Tick) -> tuple[float, ...]:
     """Return the positions of a and b in m."""
     a, b = moment.truth.local
     return a.x, a.y, b.x, b.y
@@ -324,7 +325,7 @@ def test_no_robot_claims_before_ranges_from_three_different_places(setting: Sett
 # --- a second range: straight ahead, straight behind, on a circle -------------------------------------
 
 
-def sought(recording: Recording, robot: str, phase: int) -> list[str]:
+def sought(recording: Run, robot: str, phase: int) -> list[str]:
     """Return the successive states of `robot` in `phase` while it sought a second range."""
     words = ("straight", "backing", "turning", "circling")
     return [word for of, word in states(recording, robot) if of == phase and word in words]
@@ -355,7 +356,7 @@ def test_the_paper_planner_never_drives_back() -> None:
         )
 
 
-def known(recording: Recording, robot: str) -> int:
+def known(recording: Run, robot: str) -> int:
     """Return the tick at which phase 1 ends."""
     return next(moment.truth.tick for moment in recording.ticks if moment.commands[robot].phase > 1)
 

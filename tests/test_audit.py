@@ -19,10 +19,10 @@ from agent.planning import planner
 from agent.planning.state import RobotState
 from agent.process.robot import Robot
 from compose.audit.findings import Findings, Violation
-from compose.audit.rules import RULES, audit, audit_world_run
+from compose.audit.rules import RULES, audit, audit_run
 from compose.launch import in_process
 from compose.recording.frames import KINDS
-from compose.recording.run import WORLD_JOURNAL, agent_journal, read
+from compose.recording.run import WORLD_JOURNAL, agent_journal, of_frames, read
 from compose.scenario.scenario_file import load, parse, shipped
 from protocol.attack import Attack
 from protocol.journal import journal_file
@@ -120,7 +120,7 @@ def checks(findings: Findings) -> dict[str, int]:
 )
 def test_an_honest_run_violates_no_rule(scenario: Scenario) -> None:
     journals = kept(scenario)
-    findings = audit_world_run(journals)
+    findings = audit_run(of_frames(journals))
     assert findings.violations == ()
     made, ticks, robots = checks(findings), findings.ticks + 1, len(scenario.robots)
     assert list(made) == [rule.__name__ for rule in RULES]
@@ -139,7 +139,7 @@ def test_journals_in_memory_are_those_on_disk(tmp_path: Path) -> None:
     in_process.run_mission(scenario, tmp_path)
     journals = kept(scenario)
     assert {path.name: list(journal_file.read(path)) for path in tmp_path.iterdir()} == journals
-    assert audit(tmp_path) == audit_world_run(journals)
+    assert audit(tmp_path) == audit_run(of_frames(journals))
 
 
 def test_a_run_as_processes_violates_no_rule_and_the_command_reports_it(tmp_path: Path) -> None:
@@ -188,7 +188,7 @@ def test_a_failed_run_violates_no_rule() -> None:
     robots["a"].estimate()
     end = simulation.end(MissionOutcome("failed", "no answer from b at tick 5 for 30 s"))
     simulation.journal_final_reports([robots["a"].final_report(end)])
-    findings = audit_world_run({name: book.frames for name, book in books.items()})
+    findings = audit_run(of_frames({name: book.frames for name, book in books.items()}))
     assert found(findings) == [(4, "b", "order")]
     assert findings.violations[0].what == "its journal breaks off here, expected MissionEnd and FinalReport"
 
@@ -207,7 +207,7 @@ def test_a_journal_that_breaks_off_anywhere_breaks_no_other_rule(
 ) -> None:
     whole = paper_1[name]
     for count in range(2 * (name == WORLD_JOURNAL), len(whole)):  # at least its scenario
-        findings = audit_world_run(paper_1 | {name: whole[:count]})
+        findings = audit_run(of_frames(paper_1 | {name: whole[:count]}))
         if name == WORLD_JOURNAL and count >= len(whole) - 2:  # a FinalReport is lacking, or both
             assert {one.what for one in findings.violations} == {"the world has no FinalReport from it"}
             continue
@@ -227,7 +227,7 @@ def test_a_journal_that_breaks_off_anywhere_breaks_no_other_rule(
 
 
 def test_a_robot_that_has_left_no_journal_is_named(paper_1: dict[str, list[bytes]]) -> None:
-    findings = audit_world_run({name: frames for name, frames in paper_1.items() if name != B})
+    findings = audit_run(of_frames({name: frames for name, frames in paper_1.items() if name != B}))
     assert [one.line for one in findings.violations] == ["no tick, b, order: its journal is missing"]
     assert checks(findings)["decision"] == 2 * (LAST + 1) + 3 + 1
 

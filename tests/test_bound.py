@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from agent.estimation.gaussian.odometry_noise import Array
 from compose.recording.cramer_rao import position_bounds
-from compose.recording.run import Recording
+from compose.recording.run import Run
 from compose.recording.summary_json import summary
 from protocol.motion import Controls, Pose, step
 from protocol.noise import Noise
@@ -22,19 +22,20 @@ PAIR = (0, 1)
 SEEDS = range(4, 9)
 
 
-def bounds(recording: Recording, tick: int | None = None) -> tuple[float, float]:
+def bounds(recording: Run, tick: int | None = None) -> tuple[float, float]:
     found = position_bounds(recording, PAIR, recording.ticks[-1].truth.tick if tick is None else tick)
     assert found is not None
     return found
 
 
-def with_noise(recording: Recording, noise: Noise) -> Recording:
+def with_noise(recording: Run, noise: Noise) -> Run:
     """Return the same trajectories, with the noise of other sensors."""
     scenario = recording.scenario
-    return replace(recording, scenario=replace(scenario, mission=replace(scenario.mission, noise=noise)))
+    mission = replace(scenario.mission, noise=noise)
+    return Run(replace(recording.history, scenario=replace(scenario, mission=mission)))
 
 
-def ends_and_ranges(recording: Recording, starts: Sequence[float]) -> tuple[Array, Array]:
+def ends_and_ranges(recording: Run, starts: Sequence[float]) -> tuple[Array, Array]:
     """Return the final x, y of a and b and all true ranges, for other starts and the same commands."""
     scenario = recording.scenario
     poses = [[Pose(*starts[:3])], [Pose(*starts[3:])]]
@@ -58,7 +59,7 @@ def ends_and_ranges(recording: Recording, starts: Sequence[float]) -> tuple[Arra
     return np.array([a.x, a.y, b.x, b.y]), np.array(ranges)
 
 
-def by_differences(recording: Recording, sigma: float) -> tuple[float, float]:
+def by_differences(recording: Run, sigma: float) -> tuple[float, float]:
     """Return the bound from the Fisher information of the six unknowns, by finite differences."""
     starts = np.array(
         [value for pose in recording.ticks[0].truth.poses for value in (pose.x, pose.y, pose.heading)]

@@ -17,7 +17,7 @@ from scipy.stats import chi2  # type: ignore[import-untyped]
 
 from compose.launch.in_process import run_mission
 from compose.recording.claim import matrix, nees
-from compose.recording.run import Recording, TickRecord
+from compose.recording.run import Run
 from compose.recording.summary_json import leave, summary
 from compose.scenario.scenario_file import load, parse
 from compose.sweep import execution, report, spec, trial
@@ -30,6 +30,7 @@ from protocol.motion import Covariance, Pose
 from tests.commands import SECTION_IV, tandem
 from world.referee import MissionOutcome
 from world.tick import World, advance, release
+from world.world_journal import History, Tick
 
 FLOOR = 1e-6
 """The least standard deviation in m and rad."""
@@ -64,7 +65,7 @@ def off(pose: Pose, by: float) -> Pose:
     return Pose(pose.x + by, pose.y, pose.heading)
 
 
-def claimed(text: str, covariance: Covariance | None, *, by: float = 0.03) -> Recording:
+def claimed(text: str, covariance: Covariance | None, *, by: float = 0.03) -> Run:
     """Return a recording in which a claims at once, `by` m off, b never claims, and time runs out."""
     scenario = parse("max_ticks = 1\n" + text, "noisy")
     world = release(scenario)
@@ -77,7 +78,7 @@ def claimed(text: str, covariance: Covariance | None, *, by: float = 0.03) -> Re
     mission_outcome = advance(onward, {})
     assert isinstance(mission_outcome, MissionOutcome)
     end = MissionEnd(1, mission_outcome.outcome, mission_outcome.reason)
-    return Recording(scenario, (TickRecord(world.truth, first), TickRecord(onward.truth, {})), end, {})
+    return Run(History(scenario, (Tick(world, first), Tick(onward, {})), None, None, end, {}))
 
 
 # --- NEES ---------------------------------------------------------------------------------------------
@@ -124,7 +125,7 @@ def test_nees_of_a_singular_covariance_counts_no_sigma_below_a_micrometre() -> N
 # --- summary.json -------------------------------------------------------------------------------------
 
 
-def robots(recording: Recording, folder: Path) -> dict[str, dict[str, Any]]:
+def robots(recording: Run, folder: Path) -> dict[str, dict[str, Any]]:
     leave(recording, summary(recording, "in-process", 0.5), folder)
     told: dict[str, dict[str, Any]] = json.loads((folder / "summary.json").read_text())["robots"]
     return told
@@ -176,7 +177,7 @@ HONEST = ["cov_xx", "cov_xy", "cov_xh", "cov_yy", "cov_yh", "cov_hh"]
 SWEEP = 'name = "noisy"\nscenario = "noisy.toml"\ntrials = 3\n'
 
 
-def row_of(recording: Recording, number: int = 0) -> trial.TrialRow:
+def row_of(recording: Run, number: int = 0) -> trial.TrialRow:
     return trial.row(trial.Trial(0, number, recording.scenario, processes=False), recording, 0.5)
 
 
@@ -188,10 +189,8 @@ def final_report(robot: str, hypotheses: int, probability: float) -> FinalReport
 
 
 def test_a_row_has_what_each_robot_claimed() -> None:
-    recording = replace(
-        claimed(NOISY, SURE),
-        final_reports={"a": final_report("a", 1, 0.99995), "b": final_report("b", 3, 0.6)},
-    )
+    final_reports = {"a": final_report("a", 1, 0.99995), "b": final_report("b", 3, 0.6)}
+    recording = Run(replace(claimed(NOISY, SURE).history, final_reports=final_reports))
     row = row_of(recording)
     a, b = row.robots["a"], row.robots["b"]
     assert [getattr(a, name) for name in HONEST] == [0.0009, 0.0002, -0.0001, 0.0016, 0.0003, 0.0004]
@@ -257,7 +256,7 @@ def test_a_trial_with_two_claims_counts_once_in_the_mean_nees() -> None:
         for robot, pose, by in zip("ab", poses, (0.01, 0.05), strict=True)
     }
     row = row_of(
-        Recording(scenario, (TickRecord(world.truth, commands),), MissionEnd(0, "localised", None), {})
+        Run(History(scenario, (Tick(world, commands),), None, None, MissionEnd(0, "localised", None)))
     )
     each = [nees(off(pose, by), pose, SURE) for pose, by in zip(poses, (0.01, 0.05), strict=True)]
     assert row.claims == 2
@@ -284,7 +283,7 @@ def test_the_table_of_a_sweep_gives_the_nees_where_covariances_are_claimed(
 PLAYED = run_mission(load("paper-1"))
 
 
-def missing_at(recording: Recording, robot: str, ticks: Container[int]) -> Recording:
+def missing_at(recording: Run, robot: str, ticks: Container[int]) -> Run:
     """Return the recording without that robot's Commands of `ticks`, and without its FinalReport."""
     moments = [
         replace(one, commands={who: command for who, command in one.commands.items() if who != robot})
@@ -293,7 +292,7 @@ def missing_at(recording: Recording, robot: str, ticks: Container[int]) -> Recor
         for one in recording.ticks
     ]
     final_reports = {who: said for who, said in recording.final_reports.items() if who != robot}
-    return replace(recording, ticks=tuple(moments), final_reports=final_reports)
+    return Run(replace(recording.history, ticks=tuple(moments), final_reports=final_reports))
 
 
 def test_the_last_lines_have_the_missed_deadlines_of_each_robot_and_suggest_a_lower_rate(
@@ -323,7 +322,7 @@ def test_the_summary_has_the_reason_for_a_missing_final_report(ticks: Container[
     assert told["a"]["no_farewell"] == why.replace("LAST", str(recording.ticks[-1].truth.tick))
     assert told["b"]["no_farewell"] is None
     assert told["a"]["reports_sent"] is None
-    cut = summary(replace(recording, end=None), "processes", 0.5)["robots"]
+    cut = summary(Run(replace(recording.history, end=None)), "processes", 0.5)["robots"]
     assert cut["a"]["no_farewell"] == "the recording breaks off"
 
 
@@ -345,7 +344,7 @@ def test_the_table_of_many_robots_fits_a_narrow_terminal_and_explains_only_its_c
         assert (column in heading) == (note in notes)
 
 
-def table(recording: Recording, capsys: pytest.CaptureFixture[str]) -> list[str]:
+def table(recording: Run, capsys: pytest.CaptureFixture[str]) -> list[str]:
     result(summary(recording, "in-process", 0.5))
     return capsys.readouterr().out.splitlines()
 

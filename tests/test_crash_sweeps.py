@@ -18,7 +18,7 @@ from msgspec.structs import replace
 from compose.errors import BadScenario
 from compose.launch import in_process
 from compose.launch.supervisor import ChildFailed
-from compose.recording.run import WORLD_JOURNAL, Recording, agent_journal
+from compose.recording.run import WORLD_JOURNAL, Run, agent_journal
 from compose.scenario.kills import POINTS, WORLD, KillTable, drawn
 from compose.scenario.scenario_file import load, parse, validate
 from compose.scenario.toml_file import table_in
@@ -92,10 +92,10 @@ def test_a_trial_with_a_different_recording_fails_and_names_the_difference(
 ) -> None:
     real = in_process.played
 
-    def otherwise(scenario: Scenario, sinks: dict[str, MemoryJournal]) -> Recording:
+    def otherwise(scenario: Scenario, sinks: dict[str, MemoryJournal]) -> Run:
         recording = real(scenario, sinks)
         if name == "ticks.csv":
-            return replace(recording, ticks=recording.ticks[:-1])
+            return Run(replace(recording.history, ticks=recording.ticks[:-1]))
         sinks[name].frames[-1] += b"!"
         return recording
 

@@ -25,7 +25,7 @@ from typing import NamedTuple
 import pytest
 
 from compose import errors
-from compose.audit import hardware_rules, rules
+from compose.audit import rules
 from compose.cli import main
 from compose.figures import PICTURES
 from compose.launch.processes import free_endpoint
@@ -248,8 +248,8 @@ def first_column(page: Path, heading: str) -> list[str]:
 def test_the_page_of_the_audit_lists_its_rules() -> None:
     page = ROOT / "docs" / "howto-audit.md"
     assert first_column(page, "| rule | condition |") == [rule.__name__ for rule in rules.RULES]
-    named = ", ".join(f"`{rule.__name__}`" for rule in hardware_rules.RULES[:-1])
-    assert f"{named} and `{hardware_rules.RULES[-1].__name__}`" in " ".join(page.read_text().split())
+    named = ", ".join(f"`{rule.__name__}`" for rule in rules.HARDWARE_RULES[:-1])
+    assert f"{named} and `{rules.HARDWARE_RULES[-1].__name__}`" in " ".join(page.read_text().split())
 
 
 def test_the_page_of_the_figures_lists_their_names() -> None:

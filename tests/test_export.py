@@ -19,10 +19,12 @@ import socket
 import struct
 import subprocess
 import sys
+import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from signal import Signals
+from types import SimpleNamespace
 from typing import Any
 
 import msgpack
@@ -41,11 +43,12 @@ from compose.cli import export_bar, run
 from compose.cli.main import parse
 from compose.launch import in_process
 from compose.launch.processes import free_endpoint
-from compose.recording.run import WORLD_JOURNAL, agent_journal, estimates, read
+from compose.recording.run import WORLD_JOURNAL, Run, agent_journal, read
 from compose.scenario.scenario_file import load
 from compose.view.export.folder import export
 from compose.view.foxglove.gate import GUESTS, GUESTS_FILES
 from compose.view.foxglove.views import LEAST
+from protocol import wire
 from protocol.journal import journal_file
 from protocol.messages import Estimate, Observation
 from protocol.motion import wrap
@@ -63,7 +66,7 @@ A, B = agent_journal("a"), agent_journal("b")
 def exported(scenario: Scenario, folder: Path) -> Path:
     """Return the folder of the recording and exports of a run of `scenario`."""
     in_process.run_mission(scenario, folder)
-    export(folder, folder)
+    export(read(folder), folder)
     return folder
 
 
@@ -223,7 +226,7 @@ def test_viewers_see_anchors_with_their_ranges_and_contact_while_there_is_any(pa
 
 
 def test_viewers_see_the_hypotheses_of_a_robot_in_its_own_frame(paper_1: Path) -> None:
-    held = estimates(paper_1, "a")
+    held = read(paper_1).estimates("a")
     shown = seen(paper_1 / "run.mcap", "/a/hypotheses")
     for one, poses in zip(held, shown, strict=True):
         expected = one.world or one.local
@@ -233,7 +236,7 @@ def test_viewers_see_the_hypotheses_of_a_robot_in_its_own_frame(paper_1: Path) -
 
 
 def test_viewers_see_an_ellipse_where_there_is_a_covariance(noisy: Path) -> None:
-    held = estimates(noisy, "a")
+    held = read(noisy).estimates("a")
     shown = seen(noisy / "run.mcap", "/a/belief")
     for one, belief in zip(held, shown, strict=True):
         (entity,) = belief.entities
@@ -285,7 +288,7 @@ def test_ticks_as_a_table_are_those_of_ticks_csv_with_what_was_held_possible(noi
     table = pq.ParquetFile(noisy / "ticks.parquet").read().to_pylist()
     rows = rows_of(noisy / "ticks.csv")
     assert len(table) == len(rows) > 0
-    held = {robot: {one.tick: one for one in estimates(noisy, robot)} for robot in "ab"}
+    held = {robot: {one.tick: one for one in read(noisy).estimates(robot)} for robot in "ab"}
     for row, line in zip(table, rows, strict=True):
         for name, text in line.items():
             assert ("" if row[name] is None else str(row[name])) == text
@@ -441,7 +444,7 @@ def test_ctrl_c_ends_an_export_and_leaves_nothing_half_written(paper_1: Path, tm
     assert (ended.status, ended.out, ended.err) == (130, "", "tandem export: stopped by SIGINT\n")
     assert not (tmp_path / "out").exists()
     all_checks = itertools.count()
-    export(paper_1, tmp_path / "whole", check=lambda: next(all_checks))
+    export(read(paper_1), tmp_path / "whole", check=lambda: next(all_checks))
     for checks, left in (
         (10, set()),
         (60, {"run.mcap"}),
@@ -449,7 +452,7 @@ def test_ctrl_c_ends_an_export_and_leaves_nothing_half_written(paper_1: Path, tm
     ):
         some = iter(range(checks))
         with pytest.raises(StopIteration):
-            export(paper_1, tmp_path / "out", check=functools.partial(next, some))
+            export(read(paper_1), tmp_path / "out", check=functools.partial(next, some))
         assert {path.name for path in (tmp_path / "out").iterdir()} == left
 
 
@@ -637,3 +640,42 @@ def test_a_port_in_use_is_reported_before_the_mission_starts(tmp_path: Path) -> 
     assert (ended.status, ended.out) == (2, "")
     assert ended.err.startswith(f"tandem run: --foxglove: port {port} cannot be served: ")
     assert list((tmp_path / "out").iterdir()) == []
+
+
+# --- reading ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("hardware", [False, True])
+def test_an_export_decodes_each_frame_once(
+    faulty: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hardware: bool
+) -> None:
+    for path in faulty.glob("agent-*.journal" if hardware else "*.journal"):
+        shutil.copyfile(path, tmp_path / path.name)
+    frames = sum([len(list(journal_file.read(path))) for path in tmp_path.glob("*.journal")])
+    decoded: list[memoryview] = []
+
+    def checksum(payload: memoryview) -> int:
+        decoded.append(payload)
+        return zlib.crc32(payload)
+
+    monkeypatch.setattr(wire, "zlib", SimpleNamespace(crc32=checksum))
+    export(read(tmp_path), tmp_path / "out")
+    assert len(decoded) == frames
+
+
+def test_a_run_with_an_export_reads_its_recording_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The outcome and the export are of one Run."""
+    found: list[Run] = []
+
+    def counted(folder: Path) -> Run:
+        found.append(read(folder))
+        return found[-1]
+
+    monkeypatch.setattr(run, "stop_by_signal", lambda _: None)  # it would affect the process of the tests
+    monkeypatch.setattr(run, "read", counted)
+    monkeypatch.setattr(export_bar, "read", counted)
+    assert run.main(parse(["run", "paper-1", "-q", "--out", str(tmp_path)])) == 0
+    assert (tmp_path / "run.mcap").exists()
+    assert len(found) == 1

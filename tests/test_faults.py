@@ -10,7 +10,7 @@ import pytest
 from msgspec.structs import replace
 
 from compose.launch import in_process
-from compose.recording.run import Recording
+from compose.recording.run import Run
 from compose.recording.summary_json import summary
 from compose.scenario.scenario_file import load
 from protocol.journal import journal_file
@@ -54,7 +54,7 @@ PLANS: dict[str, list[str]] = {
 NOISE = "anchor_sigma = 0.1\nmutual_sigma = 0.1\nactuation = {v = 0.001}\nodometry = {omega = 0.001}"
 
 
-def localises(recording: Recording) -> bool:
+def localises(recording: Run) -> bool:
     """Return whether all robots have claimed correct poses."""
     assert recording.end is not None
     return recording.end.outcome == "localised"

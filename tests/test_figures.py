@@ -15,20 +15,19 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from compose.figures import belief, plane
-from compose.figures.one_robot import figure_of
-from compose.figures.story import Story
-from compose.figures.style import PLACES, look, save
+from compose.figures import one_robot, over_time
+from compose.figures.sheet import Absent
+from compose.figures.style import PLACES, SCREEN, look, save
 from compose.launch.in_process import run_mission
-from compose.recording.run import estimates, read
-from compose.recording.summary_json import first_claim
+from compose.recording.run import read
 from compose.scenario.scenario_file import load, parse
-from compose.view.recorded import read as performed
+from compose.view.recorded import Journals
 from protocol.journal.journal_file import CorruptJournal
 from protocol.journal.journal_file import read as frames
 from protocol.messages import Estimate
 from tests.commands import PAPER_1, Ended, several_pairs, tandem
 from tests.series import series
+from tests.test_album import pair as pair_of
 from world.scenario import Scenario
 
 NOISE = "[mission.noise]\nanchor_sigma = 0.05\nmutual_sigma = 0.05\n"
@@ -62,15 +61,19 @@ def draw(folder: Path) -> Ended:
     return tandem("figures", folder, "--only", "robot", "--format", "svg")
 
 
-def picture(folder: Path, robot: str) -> Path:
+def picture(folder: Path, name: str) -> Path:
     """Return the figure of one robot, drawn in this process."""
-    recording = read(folder)
-    place = [one.id for one in recording.scenario.robots].index(robot)
-    story = Story(recording, place, estimates(folder, robot))
     (folder / "figures").mkdir(exist_ok=True)
-    with look():
-        svg, *_ = save(figure_of(story), folder / "figures" / f"robot-{robot}")
+    with look(SCREEN):
+        svg, *_ = save(figure_of(folder, name), folder / "figures" / f"robot-{name}")
     return svg
+
+
+def figure_of(folder: Path, name: str) -> Figure:
+    """Return the figure of the robot `name` of the first pair."""
+    figure = one_robot.draw(pair_of(folder), "a" if name == "a" else "b")
+    assert not isinstance(figure, Absent), figure
+    return figure
 
 
 def texts(svg: Path) -> set[str]:
@@ -123,17 +126,17 @@ def test_a_run_draws_nothing_by_itself(tmp_path: Path) -> None:
 @pytest.mark.parametrize("place", [0, 1])
 def test_a_figure_has_the_claim_of_the_robot_and_its_error(place: int, noisy: Path, drawn: Path) -> None:
     recording = read(noisy)
-    claim = first_claim(recording, place)
+    claim = recording.claim(recording.robots[place])
     assert claim is not None
     assert claim.covariance is not None
-    robot = recording.scenario.robots[place].id
-    words = texts(drawn / f"robot-{robot}.svg")
+    name = recording.scenario.robots[place].id
+    words = texts(drawn / f"robot-{name}.svg")
     (said,) = [line for line in words if line.startswith("The robot claims its pose")]
     assert f"in tick {claim.tick}: errors {claim.position_error:.2g} m" in said
     assert f"(sigmas {claim.covariance.position_sigma:.2g} m" in said
-    assert f"claim, tick {claim.tick}" in words
+    assert f"claim of {name}, tick {claim.tick}" in words
     assert (
-        f"Robot {robot} of noisy, seed {recording.scenario.seed}: localised after {claim.tick} ticks" in words
+        f"Robot {name} of noisy, seed {recording.scenario.seed}: localised after {claim.tick} ticks" in words
     )
 
 
@@ -142,14 +145,23 @@ def test_a_figure_names_its_axes_with_units_and_the_required_accuracy(drawn: Pat
     assert {"x [m]", "y [m]", "position error [m]", "probability of a hypothesis"} <= words
     assert {"required sigma: 0.1 m", "required: 99.99 %", "sensing range, 3 m"} <= words
     assert {"1: own anchor", "2: search for the peer", "3: encounter"} <= words
-    assert {"anchor of a", "anchor of b", "true path of a", "true path of b"} <= words
+    assert {"$M_1$", "$M_2$", "true path of a", "true path of b"} <= words
 
 
 def test_each_part_of_a_noisy_mission_is_in_its_picture(noisy: Path, drawn: Path) -> None:
-    held = [one for one in estimates(noisy, "a") if one.world]
+    held = [one for one in read(noisy).estimates("a") if one.world]
     found = ids(drawn / "robot-a.svg")
     assert {"path-a", "path-b", "anchor-a", "range-b", "met", "final", "estimates"} <= found
-    assert {"error", "sigma", "envelope", "accuracy", "claim", "phase-1", "phase-2", "phase-3"} <= found
+    assert {
+        "position-a",
+        "sigma",
+        "envelope",
+        "accuracy",
+        "claim-a",
+        "phase-1",
+        "phase-2",
+        "phase-3",
+    } <= found
     assert {"probability-1-anchor", "probability-1-plane", "confidence", "near-truth"} <= found
     assert ("ghosts" in found) == any(len(one.world) > 1 for one in held)
     assert {f"ellipse-{held[-1].tick}", f"near-{held[-1].tick}"} <= found
@@ -159,14 +171,14 @@ def test_each_part_of_a_noisy_mission_is_in_its_picture(noisy: Path, drawn: Path
 
 
 def test_the_error_over_time_is_that_of_the_estimates_against_the_truth(noisy: Path) -> None:
-    story = Story(read(noisy), 0, estimates(noisy, "a"))
-    truth = [moment.truth.poses[0] for moment in story.recording.ticks]
-    said = [one for one in story.held if one.world]
+    pair, held = pair_of(noisy), read(noisy).estimates("a")
+    truth = [moment.truth.poses[0] for moment in read(noisy).ticks]
+    said = [one for one in held if one.world]
     off = [math.hypot(one.world[0].x - truth[one.tick].x, one.world[0].y - truth[one.tick].y) for one in said]
     errors, probability = Figure().subplots(2)
-    belief.draw_error(errors, story)
-    belief.draw_probability(probability, story)
-    assert line(errors, "error") == ([one.tick for one in said], off)
+    over_time.draw_errors(errors, pair, "position", "a")
+    over_time.draw_hypotheses(probability, pair, "a")
+    assert line(errors, "position-a") == ([one.tick for one in said], off)
     assert line(errors, "sigma")[1] == [one.covariance.position_sigma for one in said if one.covariance]
     likeliest = line(probability, "probability-1-plane")
     assert likeliest[0] == [one.tick for one in said]
@@ -175,17 +187,16 @@ def test_the_error_over_time_is_that_of_the_estimates_against_the_truth(noisy: P
     )  # the limit is 99.9995 %
     assert max(likeliest[1]) < 1.0
     before = line(probability, "probability-1-anchor")
-    assert before[0] == [one.tick for one in story.held if not one.world]
-    (claimed,) = line(errors, "claim")[0][:1]
-    assert story.held[claimed].localised
-    assert not story.held[claimed - 1].localised
+    assert before[0] == [one.tick for one in held if not one.world]
+    (claimed,) = line(errors, "claim-a")[0][:1]
+    assert held[claimed].localised
+    assert not held[claimed - 1].localised
 
 
 def test_an_ellipse_holds_what_is_within_3_sigma(noisy: Path) -> None:
-    story = Story(read(noisy), 0, estimates(noisy, "a"))
     axes = Figure().subplots()
-    plane.draw(axes, story)
-    last = story.held[-1]
+    one_robot.draw_estimates(axes, pair_of(noisy), "a")
+    last = read(noisy).estimates("a")[-1]
     assert last.covariance is not None
     (ellipse,) = axes.findobj(lambda artist: artist.get_gid() == f"ellipse-{last.tick}")
     assert isinstance(ellipse, Ellipse)
@@ -209,8 +220,8 @@ def test_a_recording_always_gives_the_same_figure(noisy: Path, drawn: Path, tmp_
 def test_where_panels_stand_does_not_depend_on_the_last_bits_of_their_layout(
     noisy: Path, tmp_path: Path
 ) -> None:
-    with look():
-        figure = figure_of(Story(read(noisy), 0, estimates(noisy, "a")))
+    with look(SCREEN):
+        figure = figure_of(noisy, "a")
         save(figure, tmp_path / "robot-a", ["svg"])
     corners = np.array([axes.get_position(original=True).get_points() for axes in figure.axes])
     assert len({place.tobytes() for place in corners}) == len(figure.axes)
@@ -221,7 +232,7 @@ def test_an_exact_recording_has_counts_for_probabilities_and_no_ellipse(tmp_path
     svg = picture(recorded(load("paper-1"), tmp_path), "a")
     words, found = texts(svg), ids(svg)
     assert {"possible poses", "one pose", "tolerance: 1e-6 m"} <= words
-    assert {"count", "tolerance", "error", "ghosts", "near-truth"} <= found
+    assert {"count", "tolerance", "position-a", "ghosts", "near-truth"} <= found
     assert not {"envelope", "sigma", "confidence", "accuracy"} & found
     assert not [name for name in found if name.startswith(("ellipse-", "probability-"))]
 
@@ -237,7 +248,7 @@ def test_seconds_stand_below_the_ticks_where_a_tick_is_no_second(tmp_path: Path)
     ("probability", "said"), [(0.5, "50 %"), (0.9999, "99.99 %"), (0.999999, "99.9999 %"), (1e-4, "0.01 %")]
 )
 def test_probabilities_are_shown_with_their_significant_digits(probability: float, said: str) -> None:
-    assert belief.percent(probability) == said
+    assert over_time.percent(probability) == said
 
 
 # --- all kinds of recordings ----------------------------------------------------------------------------
@@ -254,7 +265,7 @@ def test_a_mission_that_ends_undecided_is_drawn(noise: str, planner_name: str, t
     words = texts(svg)
     assert "The robot claims no pose." in words
     assert any("undecided after" in line for line in words)
-    assert not {"met", "claim"} & ids(svg)
+    assert not {"met", "claim-b"} & ids(svg)
 
 
 @pytest.mark.parametrize("ticks", series([17, 0, 1]))
@@ -267,7 +278,7 @@ def test_a_truncated_recording_is_drawn_as_far_as_it_goes(ticks: int, noisy: Pat
     for robot in "ab":
         words = texts(picture(folder, robot))
         assert f"Robot {robot} of noisy, seed 5: the recording breaks off" in words
-        assert {"anchor of a", "anchor of b", "start"} <= words
+        assert {"$M_1$", "$M_2$", "start"} <= words
 
 
 def test_an_agent_killed_before_its_configuration_has_a_figure_without_estimates(
@@ -350,7 +361,7 @@ def test_a_robot_without_a_journal_is_named_and_the_others_are_drawn(noisy: Path
 
 
 def test_a_robots_estimates_are_one_a_tick_as_it_journaled_them(noisy: Path) -> None:
-    held = estimates(noisy, "b")
+    held = read(noisy).estimates("b")
     assert [one.tick for one in held] == list(range(len(read(noisy).ticks)))
     assert {one.robot for one in held} == {"b"}
     assert all(isinstance(one, Estimate) for one in held)
@@ -361,12 +372,12 @@ def test_the_journal_of_another_robot_is_not_taken_for_its_own(noisy: Path, tmp_
     folder = copied(noisy, tmp_path)
     shutil.copyfile(folder / "agent-b.journal", folder / "agent-a.journal")
     with pytest.raises(CorruptJournal, match=r"agent-a\.journal is the journal of b"):
-        estimates(folder, "a")
+        read(folder).estimates("a")
     shutil.copyfile(folder / "world.journal", folder / "agent-a.journal")
     with pytest.raises(CorruptJournal, match=r"agent-a\.journal: "):
-        estimates(folder, "a")
+        read(folder).estimates("a")
     with pytest.raises(FileNotFoundError):
-        estimates(folder, "z")
+        read(folder).estimates("z")
 
 
 def test_a_journal_of_another_run_is_not_used(noisy: Path, tmp_path: Path) -> None:
@@ -374,8 +385,10 @@ def test_a_journal_of_another_run_is_not_used(noisy: Path, tmp_path: Path) -> No
     run_mission(load("paper-1"), other)
     shutil.copyfile(other / "agent-a.journal", folder / "agent-a.journal")
     with pytest.raises(CorruptJournal, match=r"agent-a\.journal: belongs to another run: its conf"):
-        estimates(folder, "a")
-    assert [note.split("/")[-1] for note in performed(folder).notes] == [
+        read(folder).estimates("a")
+    journals = Journals(folder)
+    journals.read()
+    assert [note.split("/")[-1] for note in journals.notes] == [
         "agent-a.journal: belongs to another run: its configuration does not match the world's"
     ]
     ended = tandem("export", folder)

@@ -18,6 +18,7 @@ import pytest
 from compose.errors import UserError
 from compose.launch import in_process
 from compose.recording import summary_json
+from compose.recording.run import read
 from compose.scenario.scenario_file import load
 from compose.view.export import folder as export
 from protocol import files
@@ -142,7 +143,7 @@ def test_every_file_of_a_run_and_an_export_is_whole_or_absent_however_little_roo
     whole = tmp_path / "whole"
     whole.mkdir()
     summary_json.leave(played, told, whole)
-    export.export(recording, whole)
+    export.export(read(recording), whole)
     wanted = {path.name: path.read_bytes() for path in whole.iterdir()}
     for room in (0, 5_000, 12_000):
         out = tmp_path / str(room)
@@ -151,7 +152,7 @@ def test_every_file_of_a_run_and_an_export_is_whole_or_absent_however_little_roo
         with suppress(OSError):
             summary_json.leave(played, told, out)
         with pytest.raises(UserError, match="too large"):
-            export.export(recording, out)
+            export.export(read(recording), out)
         left = {path.name: path.read_bytes() for path in out.iterdir()}
         assert left == {name: wanted[name] for name in left}
         assert len(left) < len(wanted)
@@ -196,7 +197,7 @@ def test_what_is_written_replaces_a_link_and_leaves_what_it_led_to(recording: Pa
         (out / name).symlink_to(kept)
     played = in_process.run_mission(load("paper-1"))
     summary_json.leave(played, summary_json.summary(played, "in-process", None), out)
-    export.export(recording, out)
+    export.export(read(recording), out)
     assert kept.read_text() == "kept"
     assert not [name for name in names if (out / name).is_symlink()]
 

@@ -14,7 +14,7 @@ from agent.peer.motion_log import MotionLog
 from agent.planning import planner, plausibility
 from compose.errors import BadScenario
 from compose.launch.in_process import run_mission
-from compose.recording.run import Recording
+from compose.recording.run import Run
 from compose.recording.summary_json import summary
 from compose.scenario.scenario_file import parse, shipped
 from protocol.attack import Attack, Kind, Part
@@ -34,7 +34,7 @@ OF_STARTS = [Attack("radius", 0.01), Attack("radius", 0.3), Attack("heading", DE
 FINE = "noise = {anchor_sigma = 0.01, mutual_sigma = 0.01}\n"
 
 
-def mission(seed: int, lies: dict[str, Attack], noise: str = "") -> Recording:
+def mission(seed: int, lies: dict[str, Attack], noise: str = "") -> Run:
     """Return the recording of a random mission with these attacks."""
     text = shipped()["random"].read_text().replace("[mission]\n", f"[mission]\n{noise}")
     scenario = parse(text, "random", seed=seed)
@@ -42,7 +42,7 @@ def mission(seed: int, lies: dict[str, Attack], noise: str = "") -> Recording:
     return run_mission(replace(scenario, robots=robots, max_ticks=400))
 
 
-def outcome(recording: Recording) -> str:
+def outcome(recording: Run) -> str:
     return str(summary(recording, "in-process", None)["outcome"])
 
 
@@ -64,7 +64,7 @@ def test_every_false_manoeuvre_or_start_is_inconsistent(attack: Attack, attacker
         assert (recording.end.reason or "").startswith(f"{peer}: {attacker} reports "), recording.end.reason
 
 
-def _is_falsified(recording: Recording, attacker: str, attack: Attack) -> bool:
+def _is_falsified(recording: Run, attacker: str, attack: Attack) -> bool:
     """Return whether the attack changes anything: whether the robot has moved in that part of its log."""
     phases = {"phase-1": 1, "orbit": 2, "encounter": 3}
     return attack.part == "all" or any(

@@ -15,7 +15,7 @@ from agent.planning import planner
 from agent.planning.phase1_anchor import third_point
 from agent.planning.phase3_last_manoeuvre import SPEEDS, TURN_RATES, last_manoeuvre
 from compose.launch.in_process import run_mission
-from compose.recording.run import Recording, TickRecord
+from compose.recording.run import Run
 from compose.scenario.scenario_file import load, parse
 from protocol.messages import Localised
 from protocol.mission import OPTIMAL_TURN, Mission, PlannerName, third_point_turn_rate
@@ -25,6 +25,7 @@ from tests.missions import mission_of
 from tests.steps import steps
 from world.sensors import anchor_ranges, mutual_ranges
 from world.truth import Truth
+from world.world_journal import Tick
 
 SECTION_IV = Mission(3.0, 1.0, 1.0, math.pi)
 D = 10.0
@@ -173,7 +174,7 @@ def test_a_range_is_taken_up_to_r_and_at_r() -> None:
 # --- missions at the limits of parameters -------------------------------------------------------------------
 
 
-def turns(recording: Recording, state: str) -> list[float]:
+def turns(recording: Run, state: str) -> list[float]:
     """Return the turns of a on the spot before it meets b."""
     commands = [moment.commands["a"] for moment in recording.ticks if moment.commands["a"].phase < 3]
     assert all(command.v == 0.0 for command in commands if command.state == state)
@@ -239,7 +240,7 @@ def test_no_robot_claims_before_a_third_mutual_range() -> None:
             assert sum(tick <= claims[0] for tick in ranged) >= 3
 
 
-def _places(moment: TickRecord) -> list[tuple[float, float]]:
+def _places(moment: Tick) -> list[tuple[float, float]]:
     return [(pose.x, pose.y) for pose in moment.truth.poses]
 
 

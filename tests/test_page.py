@@ -13,7 +13,7 @@ from signal import SIGKILL
 import pytest
 from playwright.sync_api import Page, expect
 
-from compose.recording.run import WORLD_JOURNAL, estimates, read
+from compose.recording.run import WORLD_JOURNAL, read
 from protocol.journal import journal_file
 from protocol.journal.journal_file import Journal
 from protocol.messages import Command, Observation
@@ -206,7 +206,7 @@ def test_without_the_truth_the_page_opens_with_the_estimates(
             "aria-label", re.compile(r"The plane at tick 48: a at .*; b at ")
         )
         drawn = inks(page)
-        assert min(drawn[f"phase-{phase}"] for phase in (2, 3)) > 100  # trails
+        assert min(drawn[f"robot-{role}"] for role in "ab") > 100  # trails
         page.keyboard.press("t")
         assert inks(page) == drawn
         assert "truth=0" not in page.url
@@ -220,7 +220,7 @@ def test_the_error_is_that_of_the_likeliest_pose_or_else_a_range(
     page = opened(f"{address}#tick=47", height=720)
     until_shown(page, 47)
     truth = read(paper_1).ticks[47].truth.poses[1]
-    off = sorted(errors(pose, truth)[0] for pose in estimates(paper_1, "b")[47].world)
+    off = sorted(errors(pose, truth)[0] for pose in read(paper_1).estimates("b")[47].world)
     assert len(off) == 4
     assert off[3] > 1.0
     error = page.locator(".card[data-robot=b] .error")

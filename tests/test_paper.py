@@ -13,7 +13,7 @@ import pytest
 
 from agent.estimation.closed_forms import Placement, placements
 from compose.launch.in_process import run_mission
-from compose.recording.run import Recording
+from compose.recording.run import Run
 from compose.recording.summary_json import summary
 from compose.recording.ticks_csv import ticks_csv
 from compose.scenario.scenario_file import load
@@ -41,15 +41,15 @@ EXACT = 1e-9
 
 
 @cache
-def played(name: str) -> Recording:
+def played(name: str) -> Run:
     return run_mission(load(name))
 
 
-def first_tick(recording: Recording, robot: str, state: str) -> int:
+def first_tick(recording: Run, robot: str, state: str) -> int:
     return next(moment.truth.tick for moment in recording.ticks if moment.commands[robot].state == state)
 
 
-def command(recording: Recording, robot: str, tick: int) -> Command:
+def command(recording: Run, robot: str, tick: int) -> Command:
     return recording.ticks[tick].commands[robot]
 
 
@@ -266,7 +266,7 @@ def test_phase_1_finds_the_references_branch_and_orientation(case: Phase1) -> No
     assert sum(radial) == pytest.approx(6.5 - case.r_end, abs=EXACT)
 
 
-def _place(recording: Recording, tick: int) -> tuple[float, float]:
+def _place(recording: Run, tick: int) -> tuple[float, float]:
     pose = recording.ticks[tick].truth.poses[0]
     return pose.x, pose.y
 

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from compose.audit.replay import replayed
 from compose.launch import in_process
 from compose.recording.frames import KINDS
-from compose.recording.run import WORLD_JOURNAL, agent_journal
+from compose.recording.run import WORLD_JOURNAL, agent_journal, of_frames
 from compose.scenario.scenario_file import load, parse
 from protocol.journal import journal_file
 from protocol.messages import Command, MissionEnd, Observation, Report
@@ -49,7 +49,7 @@ def paper_1() -> dict[str, list[bytes]]:
     ],
 )
 def test_a_run_in_one_process_is_replayed_bit_by_bit(played: Scenario) -> None:
-    again = replayed(kept(played))
+    again = replayed(of_frames(kept(played)))
     assert (again.differences, again.tears) == ((), ())
     assert again.checks > 2 * len(played.robots) * again.ticks > 0
 
@@ -108,7 +108,7 @@ def test_one_flipped_bit_in_any_value_that_matters_is_found(name: str) -> None:
     recording = kept(load(name))
     for book, place, flipped in flips(recording, TRIES // 2):
         frames = [*recording[book][:place], flipped, *recording[book][place + 1 :]]
-        again = replayed(recording | {book: frames})
+        again = replayed(of_frames(recording | {book: frames}))
         was, now = (decode(one, KINDS, MAX_FRAME_BYTES) for one in (recording[book][place], flipped))
         assert again.differences, (book, place, was, now)
 
@@ -178,7 +178,7 @@ def changed(recording: dict[str, list[bytes]], name: str, was: Any, **fields: An
 def test_a_report_that_was_received_differently_than_sent_is_found(paper_1: dict[str, list[bytes]]) -> None:
     heard = [decode(frame, KINDS, MAX_FRAME_BYTES) for frame in paper_1[B]]
     told = next(one for one in heard if isinstance(one, Report) and one.robot == "a")
-    first, *_ = replayed(changed(paper_1, B, told, state="listening")).differences
+    first, *_ = replayed(of_frames(changed(paper_1, B, told, state="listening"))).differences
     assert (first.rule, first.robot) == ("report", "b")
 
 
@@ -187,7 +187,7 @@ def test_a_received_report_that_no_observation_lists_is_found(paper_1: dict[str,
     heard = [decode(frame, KINDS, MAX_FRAME_BYTES) for frame in frames]
     place = next(i for i, one in enumerate(heard) if isinstance(one, Report) and one.robot == "a")
     frames.insert(place, frames[place])
-    assert "contact" in {one.rule for one in replayed(paper_1 | {B: frames}).differences}
+    assert "contact" in {one.rule for one in replayed(of_frames(paper_1 | {B: frames})).differences}
 
 
 def test_a_wrong_mission_end_is_found_though_all_journals_agree(
@@ -199,7 +199,9 @@ def test_a_wrong_mission_end_is_found_though_all_journals_agree(
     recording = paper_1
     for name in paper_1:
         recording = changed(recording, name, end, outcome="undecided")
-    assert [(one.rule, one.tick) for one in replayed(recording).differences] == [("claim", end.tick)]
+    assert [(one.rule, one.tick) for one in replayed(of_frames(recording)).differences] == [
+        ("claim", end.tick)
+    ]
 
 
 # --- truncation -----------------------------------------------------------------------------------------
@@ -216,7 +218,7 @@ def test_a_truncated_recording_is_replayed_up_to_the_truncation(
     name: str, paper_1: dict[str, list[bytes]]
 ) -> None:
     for count in range(2, len(paper_1[name]), 3):  # after the versions and the scenario, or a RobotConfig
-        again = replayed(paper_1 | {name: paper_1[name][:count]})
+        again = replayed(of_frames(paper_1 | {name: paper_1[name][:count]}))
         assert again.differences == ()
         assert again.tears
 

@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 from msgspec.structs import replace
 
 from agent.planning.state import MODE_NAMES
 from compose.launch import in_process
+from compose.recording.cast import Stage, of_scenario
 from compose.recording.run import read as read_record
 from compose.scenario.scenario_file import load
-from compose.view.cast import of_scenario
 from compose.view.facts import Gathering
-from compose.view.recorded import Journals, Performance, read, scenes
+from compose.view.recorded import Journals, scenes, scenes_of
 from compose.view.report_outcomes import flights_of
+from compose.view.scene import Scene
 from compose.view.web.sources import writers_of
 from compose.view.words import DOING, SEEKING, doing
 from protocol.journal import journal_file
 from protocol.journal.journal_file import Journal
+from protocol.messages import MissionEnd
 from protocol.motion import compose, wrap
 from world.world_journal import history
 
@@ -29,6 +32,29 @@ def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("paper-1")
     in_process.run_mission(load("paper-1"), folder)
     return folder
+
+
+class Performance(NamedTuple):
+    """A recorded run with all its scenes, and what a viewer notes about its journals."""
+
+    stage: Stage
+    scenes: tuple[Scene, ...]
+    end: MissionEnd | None
+    notes: tuple[str, ...]
+
+
+def read(folder: Path) -> Performance:
+    """Read the journals as a viewer does, and as a recording: both show the same."""
+    run, journals = read_record(folder), Journals(folder)
+    journals.read()
+    journals.fill()
+    assert journals.stage is not None
+    assert run.stage == journals.stage
+    shown = scenes(journals.stage, journals.known)
+    assert scenes_of(run) == shown
+    assert run.end == journals.known.end
+    assert run.final_reports == journals.known.final_reports
+    return Performance(journals.stage, shown, run.end, tuple(journals.notes))
 
 
 def said(shown: Performance, kind: str) -> list[tuple[int, str]]:
@@ -110,7 +136,7 @@ def test_a_truncated_recording_is_shown_up_to_the_truncation(
 
 
 def test_a_folder_without_a_journal_holds_nothing_to_see(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="holds no journal"):
+    with pytest.raises(FileNotFoundError, match="No such file"):
         read(tmp_path)
 
 

@@ -18,7 +18,7 @@ from agent.planning.assured import OFF_RADIUS
 from agent.planning.phase2_orbit import Aligning, Radial, orientation
 from agent.planning.state import RobotState
 from compose.launch.in_process import run_mission
-from compose.recording.run import Recording
+from compose.recording.run import Run
 from compose.recording.summary_json import summary
 from protocol.messages import Undecided
 from protocol.motion import Pose
@@ -59,7 +59,7 @@ def biases(scenario: Scenario, robot: int, ticks: int) -> list[float]:
     return [(one or 0.0) - (other or 0.0) for one, other in zip(measured, true, strict=True)]
 
 
-def in_contact(recording: Recording) -> list[bool]:
+def in_contact(recording: Run) -> list[bool]:
     """Return, tick by tick, whether the robots were in contact."""
     pairs = recording.scenario.pairs()
     return [mutual_ranges(moment.truth, recording.scenario, pairs) != [None] for moment in recording.ticks]

@@ -12,13 +12,11 @@ import pyarrow.parquet as pq
 import pytest
 from msgspec.structs import replace
 
-from compose.audit.hardware_rules import RULES, audit_hardware_run
+from compose.audit.rules import HARDWARE_RULES, audit_run
 from compose.figures import over_time, phase_one, steps, trajectory
-from compose.figures.account import account
-from compose.figures.pair import PairRecord, of_record, of_robots
 from compose.figures.sheet import NO_PLACES, Absent
 from compose.launch.in_process import run_mission
-from compose.recording.run import past_of, read
+from compose.recording.run import of_frames, read
 from compose.scenario.scenario_file import load, parse
 from protocol.journal import journal_file
 from protocol.messages import Command, Message, OfRobot, Report
@@ -27,7 +25,7 @@ from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from tests.commands import several_pairs, tandem
 from tests.doctor import complaints
 from tests.replays import journals_of
-from tests.test_album import drawn, line
+from tests.test_album import drawn, line, pair
 
 KNOWN_TO_A_WORLD = ("x", "y", "heading")
 MEASURED = ("tick", "robot", "anchor_range", "mutual_range", "phase", "state")
@@ -44,14 +42,6 @@ def folders(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     return whole, alone
 
 
-def pair_of(whole: Path) -> PairRecord:
-    return of_record(read(whole), (0, 1), {robot: account(whole, robot) for robot in "ab"})
-
-
-def alone_of(alone: Path, robots: str = "ab") -> PairRecord:
-    return of_robots({robot: account(alone, robot) for robot in robots})
-
-
 def table(folder: Path) -> list[dict[str, str]]:
     with (folder / "ticks.csv").open() as file:
         return list(csv.DictReader(file))
@@ -64,7 +54,7 @@ def test_an_export_of_hardware_mode_has_measurements_and_estimates_and_no_truth(
     for folder in folders:
         ended = tandem("export", folder)
         assert (ended.status, ended.err) == (0, "")
-    pasts = {robot: past_of(alone, robot) for robot in "ab"}
+    pasts = {robot: read(alone).past(robot) for robot in "ab"}
     for told, known in zip(table(alone), table(whole), strict=True):
         assert {told[name] for name in KNOWN_TO_A_WORLD} == {""}
         assert [told[name] for name in MEASURED] == [known[name] for name in MEASURED]
@@ -86,7 +76,7 @@ def test_an_export_of_hardware_mode_has_measurements_and_estimates_and_no_truth(
 
 def test_paths_are_the_odometry_laid_through_the_claim(folders: tuple[Path, Path]) -> None:
     whole, alone = folders
-    known, told = pair_of(whole), alone_of(alone)
+    known, told = pair(whole), pair(alone)
     for role in ("a", "b"):
         claim = known.robot(role).claim
         assert claim is not None
@@ -102,7 +92,7 @@ def test_paths_are_the_odometry_laid_through_the_claim(folders: tuple[Path, Path
 
 def test_figures_without_the_truth_are_drawn_as_in_simulation(folders: tuple[Path, Path]) -> None:
     whole, alone = folders
-    known, told = pair_of(whole), alone_of(alone)
+    known, told = pair(whole), pair(alone)
     assert told.mutual == known.mutual
     assert told.contacts == known.contacts
     assert told.encounter_tick == known.encounter_tick
@@ -143,7 +133,7 @@ def test_a_single_journal_shows_the_estimates_of_one_robot(
 ) -> None:
     _, alone = folders
     (tmp_path / "agent-b.journal").write_bytes((alone / "agent-b.journal").read_bytes())
-    told = alone_of(tmp_path, "b")
+    told = pair(tmp_path)
     assert trajectory.draw(told) == Absent(NO_PLACES)
     assert told.a.id == "a"
     assert told.readable == ["b"]
@@ -183,7 +173,7 @@ def test_a_shorter_journal_does_not_shorten_that_of_the_peer(
     (tmp_path / "agent-a.journal").write_bytes((alone / "agent-a.journal").read_bytes())
     frames = list(journal_file.read(alone / "agent-b.journal"))[:20]
     (tmp_path / "agent-b.journal").write_bytes(b"".join([msgpack.packb(frame) for frame in frames]))
-    known, told = pair_of(whole), alone_of(tmp_path)
+    known, told = pair(whole), pair(tmp_path)
     assert told.a.anchor_ranges == known.a.anchor_ranges
     assert told.states("a") == known.states("a")
     assert len(told.a.path) == len(known.a.path)
@@ -196,7 +186,7 @@ def test_a_shorter_journal_does_not_shorten_that_of_the_peer(
 
 def test_paths_of_two_lengths_are_drawn(folders: tuple[Path, Path]) -> None:
     _, alone = folders
-    told = alone_of(alone)
+    told = pair(alone)
     shorter = replace(told, b=replace(told.b, path=told.b.path[: told.contacts[0][0]]))
     figure = drawn(trajectory.draw(shorter))
     assert line(figure, "path-b") == [(p.x, p.y) for p in shorter.b.path]
@@ -244,7 +234,9 @@ def test_the_audit_checks_the_limits_of_robots_and_their_observations(folders: t
     ended = tandem("audit", alone)
     assert ended.status == 0, ended.out
     assert "a and b, hardware mode: no violations" in ended.out
-    assert [line.split()[0] for line in ended.out.splitlines()[3:]] == [rule.__name__ for rule in RULES]
+    assert [line.split()[0] for line in ended.out.splitlines()[3:]] == [
+        rule.__name__ for rule in HARDWARE_RULES
+    ]
 
 
 def too_fast(message: Message) -> Message:
@@ -273,5 +265,5 @@ def test_the_audit_finds_violations_in_hardware_mode(
         if other is not message:
             frames[place] = encode(other)
             break
-    findings = audit_hardware_run(found, alone)
+    findings = audit_run(of_frames(found, alone))
     assert {one.rule for one in findings.violations} == rules

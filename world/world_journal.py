@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
+from typing import Any
 
 import msgspec
-from msgspec.structs import replace
 
 from protocol.journal.environment import named_in
-from protocol.journal.journal_file import CorruptJournal
+from protocol.journal.journal_file import CorruptJournal, UnexpectedFrame
 from protocol.messages import Command, DeadlineMissed, Environment, FinalReport, MissionEnd
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 from world.referee import MissionOutcome
 from world.scenario import Scenario
 from world.tick import World, advance, release
+from world.truth import Truth
+
+_AFTER_THE_SCENARIO = Command | DeadlineMissed | MissionEnd | FinalReport
+"""The messages that follow the scenario in a world's journal."""
 
 
 class Tick(msgspec.Struct, frozen=True):
@@ -24,14 +28,10 @@ class Tick(msgspec.Struct, frozen=True):
     commands: dict[str, Command]
     """The Commands, by robot. A robot that missed the deadline has none."""
 
-
-class UnexpectedFrame(msgspec.Struct, frozen=True):
-    """The first frame that must not be at its place. The frames after it are not read."""
-
-    tick: int | None
-    """The tick of the frame; None if it has none."""
-    what: str
-    """The description of the problem, for a user."""
+    @property
+    def truth(self) -> Truth:
+        """The true poses at this tick."""
+        return self.world.truth
 
 
 class History(msgspec.Struct, frozen=True):
@@ -65,37 +65,31 @@ def history(frames: Iterable[bytes], source: object) -> History:
 
     Raises CorruptJournal, with `source` as the journal's name.
     """
-    scenario, named, rest = opened(list(frames), source)
-    reading = JournalReading(scenario)
+    reading = JournalReading()
     try:
-        for frame in rest:
+        for frame in frames:
             if not reading.take(frame):
                 break
     except MalformedFrame as error:
         raise CorruptJournal(f"{source}: {error}") from None
-    return replace(reading.content(), environment=named)
-
-
-def opened(frames: Sequence[bytes], source: object) -> tuple[Scenario, Environment | None, Sequence[bytes]]:
-    """Return the scenario and the environment at the beginning of a world's journal, and the other frames.
-
-    Raises CorruptJournal, with `source` as the journal's name.
-    """
-    named = named_in(frames)
-    rest = frames if named is None else frames[1:]
-    return _scenario_of(rest[0] if rest else b"", source), named, rest[1:]
+    content = reading.content()
+    if content is None:
+        raise CorruptJournal(f"{source}: it contains no scenario")
+    return content
 
 
 class JournalReading:
-    """A reader of a world's journal after its scenario, frame by frame. The journal may still be growing."""
+    """A reader of a world's journal, frame by frame. The journal may still be growing."""
 
-    def __init__(self, scenario: Scenario) -> None:
-        self._scenario = scenario
-        self._ids = [robot.id for robot in scenario.robots]
-        self._answers: dict[str, Command | DeadlineMissed] = {}
-        """The frames of the incomplete tick, by robot."""
-        self.world: World = release(scenario)
-        """The state at the tick after the last complete one, or at the last tick of the run."""
+    def __init__(self) -> None:
+        self.environment: Environment | None = None
+        self.world: World | None = None
+        """The state at the tick after the last complete one, or at the last tick of the run.
+
+        None until the scenario has been read.
+        """
+        self.messages: list[Any] = []
+        """The messages that have been read, in order."""
         self.ticks: list[Tick] = []
         """The complete ticks."""
         self.mission_outcome: MissionOutcome | None = None
@@ -106,13 +100,19 @@ class JournalReading:
         """The recorded FinalReports, by robot."""
         self.disorder: UnexpectedFrame | None = None
         """The first frame out of order."""
+        self._ids: list[str] = []
+        self._answers: dict[str, Command | DeadlineMissed] = {}
+        """The frames of the incomplete tick, by robot."""
 
     def take(self, frame: bytes) -> bool:
         """Add the next frame, and return whether it is in order. Add no frame after one that is not.
 
-        Raises MalformedFrame.
+        Raises MalformedFrame, also if the journal does not begin with a scenario of pairs.
         """
-        message = decode(frame, Command | DeadlineMissed | MissionEnd | FinalReport)
+        if self.world is None:
+            self._begin(frame)
+            return True
+        message = decode(frame, _AFTER_THE_SCENARIO)
         is_running = self.end is None and self.mission_outcome is None
         tick = self.world.truth.tick
         match message:
@@ -121,7 +121,7 @@ class JournalReading:
             ):
                 self._answers[message.robot] = message
                 if len(self._answers) == len(self._ids):
-                    self._advance()
+                    self._advance(self.world)
             case MissionEnd() if message.tick == tick and self.end is None and not self._answers:
                 self.end = message
             case FinalReport() if self.end is not None and message.robot in _still_to_come(
@@ -131,46 +131,50 @@ class JournalReading:
             case _:
                 self.disorder = UnexpectedFrame(getattr(message, "tick", None), _named(message))
                 return False
+        self.messages.append(message)
         return True
 
-    def _advance(self) -> None:
+    def _begin(self, frame: bytes) -> None:
+        """Take the environment, which is missing in older recordings, or the scenario."""
+        named = named_in([frame]) if not self.messages else None
+        if named is not None:
+            self.environment = named
+            self.messages.append(named)
+            return
+        scenario = decode(frame, Scenario, MAX_FRAME_BYTES)
+        problem = _unpaired(scenario)
+        if problem is not None:
+            raise MalformedFrame(problem)
+        self._ids = [robot.id for robot in scenario.robots]
+        self.world = release(scenario)
+        self.messages.append(scenario)
+
+    def _advance(self, world: World) -> None:
         commands = {
             robot: command for robot, command in self._answers.items() if isinstance(command, Command)
         }
-        self.ticks.append(Tick(self.world, commands))
+        self.ticks.append(Tick(world, commands))
         self._answers = {}
-        onward = advance(self.world, commands)
+        onward = advance(world, commands)
         if isinstance(onward, MissionOutcome):
             self.mission_outcome = onward
         else:
             self.world = onward
 
-    def content(self) -> History:
-        """Return the content that has been read so far."""
-        ahead = self.world if self.mission_outcome is None else None
+    def content(self) -> History | None:
+        """Return the content that has been read so far; None if there is no scenario."""
+        if self.world is None:
+            return None
         return History(
-            self._scenario,
+            self.world.scenario,
             tuple(self.ticks),
-            ahead,
+            self.world if self.mission_outcome is None else None,
             self.mission_outcome,
             self.end,
             dict(self.final_reports),
             self.disorder,
+            self.environment,
         )
-
-
-def _scenario_of(frame: bytes, source: object) -> Scenario:
-    """Return the scenario in `frame`. Raises CorruptJournal, with `source` as the journal's name."""
-    if not frame:
-        raise CorruptJournal(f"{source}: it contains no scenario")
-    try:
-        scenario = decode(frame, Scenario, MAX_FRAME_BYTES)
-    except MalformedFrame as error:
-        raise CorruptJournal(f"{source}: {error}") from None
-    problem = _unpaired(scenario)
-    if problem is not None:
-        raise CorruptJournal(f"{source}: {problem}")
-    return scenario
 
 
 def _unpaired(scenario: Scenario) -> str | None:

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import msgspec
-from msgspec.structs import replace
 
-from agent.process.robot import FramedReport
 from protocol import motion
-from protocol.journal.environment import named_in
-from protocol.journal.journal_file import CorruptJournal
+from protocol.journal.journal_file import CorruptJournal, UnexpectedFrame
 from protocol.messages import (
     Command,
-    Contact,
     DeadlineMissed,
     Environment,
     Estimate,
@@ -30,6 +26,13 @@ from protocol.motion import ORIGIN, REST, Pose, compose, inverse
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 
 
+class FramedReport(msgspec.Struct, frozen=True):
+    """A report together with the frame in which it was received or is sent."""
+
+    report: Report
+    frame: bytes
+
+
 class Step(msgspec.Struct, frozen=True):
     """One tick of the journal. A field is None or empty if the journal contains no such frame."""
 
@@ -42,7 +45,9 @@ class Step(msgspec.Struct, frozen=True):
     missed: tuple[str, ...] = ()
     """The peers whose report did not arrive in time."""
     command: Command | None = None
+    command_frame: bytes | None = None
     estimate: Estimate | None = None
+    estimate_frame: bytes | None = None
 
 
 class Past(msgspec.Struct, frozen=True):
@@ -54,6 +59,8 @@ class Past(msgspec.Struct, frozen=True):
     final_report: FinalReport | None = None
     environment: Environment | None = None
     """The environment in which the journal was written; None for older recordings."""
+    disorder: UnexpectedFrame | None = None
+    """The first frame out of order, if any."""
 
     @property
     def estimates(self) -> tuple[Estimate, ...]:
@@ -90,23 +97,105 @@ class Past(msgspec.Struct, frozen=True):
         frame = compose(verdict.pose, inverse(odometry[tick]))
         return tuple([compose(frame, pose) for pose in odometry])
 
-    def contact(self, tick: int) -> Contact | None:
-        """Return the contact with the peer in the Observation of `tick`; None if there is none."""
-        contacts = self.steps[tick].observation.contacts if tick < len(self.steps) else ()
-        return contacts[0] if contacts else None
 
+class JournalReading:
+    """A reader of an agent's journal, frame by frame."""
 
-class OutOfOrder(CorruptJournal):
-    """A well-formed frame at a position where its kind is not allowed."""
+    def __init__(self) -> None:
+        self.environment: Environment | None = None
+        self.config: RobotConfig | None = None
+        """The configuration; None until it has been read."""
+        self.messages: list[Any] = []
+        """The messages that have been read, in order."""
+        self.disorder: UnexpectedFrame | None = None
+        """The first frame out of order."""
+        self._steps: list[Step] = []
+        self._step: dict[str, Any] = {}
+        """The fields of the latest step, to which frames can be added; empty before the first."""
+        self._end: MissionEnd | None = None
+        self._final_report: FinalReport | None = None
 
-    def __init__(self, message: msgspec.Struct, place: int, source: object) -> None:
-        self.place = place
-        """The number of frames before it."""
-        self.tick: int | None = getattr(message, "tick", None)
-        at = f" of tick {self.tick}" if self.tick is not None else ""
-        kind = type(message).__name__
-        self.what = f"{'an' if kind[0] in 'AEIO' else 'a'} {kind}{at} is out of order"
-        super().__init__(f"{source}: {self.what}")
+    def take(self, frame: bytes) -> bool:
+        """Add the next frame, and return whether it is in order. Add no frame after one that is not.
+
+        Raises MalformedFrame, also if the first frame besides the environment is no RobotConfig.
+        """
+        message = decode(frame, OfRobot, MAX_FRAME_BYTES)
+        if not self._fits(message, frame):
+            tick: int | None = getattr(message, "tick", None)
+            at = f" of tick {tick}" if tick is not None else ""
+            kind = type(message).__name__
+            what = f"{'an' if kind[0] in 'AEIO' else 'a'} {kind}{at} is out of order"
+            self.disorder = UnexpectedFrame(tick, what)
+            return False
+        self.messages.append(message)
+        return True
+
+    def _fits(self, message: object, frame: bytes) -> bool:
+        """Add `message`, and return True if it may be next."""
+        if self.config is None:
+            return self._begins(message)
+        match message:
+            case _ if self._end is not None:
+                if not isinstance(message, FinalReport) or self._final_report is not None:
+                    return False
+                self._final_report = message
+            case Command() | Estimate() | Report() | DeadlineMissed():
+                return bool(self._step) and self._answers(message, frame, self._step)
+            case Observation(tick) if tick == len(self._steps) + bool(self._step):
+                if self._step:
+                    if "command" not in self._step:
+                        return False
+                    self._steps.append(Step(**self._step))
+                self._step = {"observation": message, "frame": frame}
+            case MissionEnd():
+                self._end = message
+            case _:
+                return False
+        return True
+
+    def _answers(
+        self, message: Command | Estimate | Report | DeadlineMissed, frame: bytes, step: dict[str, Any]
+    ) -> bool:
+        """Add `message` to `step`, and return True if it may be next."""
+        assert self.config is not None
+        is_open = "command" not in step
+        if isinstance(message, Report) and message.robot != self.config.robot:
+            if is_open:
+                step["heard"] = (*step.get("heard", ()), FramedReport(message, frame))
+            return is_open
+        match message:
+            case _ if message.tick != step["observation"].tick:
+                return False
+            case Command() if is_open:
+                step["command"], step["command_frame"] = message, frame
+            case Estimate() if not is_open and "estimate" not in step:
+                step["estimate"], step["estimate_frame"] = message, frame
+            case Report() if "report" not in step:
+                step["report"] = FramedReport(message, frame)
+            case DeadlineMissed() if is_open:
+                step["missed"] = (*step.get("missed", ()), message.robot)
+            case _:
+                return False
+        return True
+
+    def _begins(self, message: object) -> bool:
+        """Add the environment, which is missing in older recordings, or the configuration."""
+        match message:
+            case Environment() if not self.messages:
+                self.environment = message
+            case RobotConfig():
+                self.config = message
+            case _:
+                raise MalformedFrame("an agent's journal must begin with a RobotConfig")
+        return True
+
+    def content(self) -> Past | None:
+        """Return the content that has been read so far; None if there is no RobotConfig."""
+        if self.config is None:
+            return None
+        steps = [*self._steps, Step(**self._step)] if self._step else self._steps
+        return Past(self.config, tuple(steps), self._end, self._final_report, self.environment, self.disorder)
 
 
 def past(frames: Iterable[bytes], source: object) -> Past:
@@ -114,63 +203,16 @@ def past(frames: Iterable[bytes], source: object) -> Past:
 
     Raises CorruptJournal, with a text that begins with `source`.
     """
-    frames = list(frames)
-    environment = named_in(frames)
-    first = int(environment is not None)
-    config: RobotConfig | None = None
-    steps: list[Step] = []
-    end: MissionEnd | None = None
-    final_report: FinalReport | None = None
-    for place, frame in enumerate(frames[first:], first):
-        message = _message(frame, source)
-        if place == first and not isinstance(message, RobotConfig):
-            raise CorruptJournal(f"{source}: an agent's journal must begin with a RobotConfig")
-        match message:
-            case RobotConfig() if place == first:
-                config = message
-            case MissionEnd() if end is None:
-                end = message
-            case FinalReport() if end is not None and final_report is None:
-                final_report = message
-            case Observation(tick) if end is None and tick == len(steps) and _answered(steps):
-                steps.append(Step(message, frame))
-            case Report() | DeadlineMissed() | Command() | Estimate() if steps and end is None:
-                assert config is not None
-                extended = _extended(steps[-1], message, frame, config.robot)
-                if extended is None:
-                    raise OutOfOrder(message, place, source)
-                steps[-1] = extended
-            case _:
-                raise OutOfOrder(message, place, source)
-    if config is None:
-        raise CorruptJournal(f"{source}: it contains no RobotConfig")
-    return Past(config, tuple(steps), end, final_report, environment)
-
-
-def _answered(steps: Sequence[Step]) -> bool:
-    """Return whether the latest step has its Command, so that the next tick may follow."""
-    return not steps or steps[-1].command is not None
-
-
-def _message(frame: bytes, source: object) -> Any:
+    reading = JournalReading()
     try:
-        return decode(frame, OfRobot, MAX_FRAME_BYTES)
+        for frame in frames:
+            if not reading.take(frame):
+                break
     except MalformedFrame as error:
         raise CorruptJournal(f"{source}: {error}") from None
-
-
-def _extended(step: Step, message: object, frame: bytes, robot: str) -> Step | None:
-    """Return `step` extended by `message`, or None if `message` cannot follow."""
-    match message:
-        case Estimate(tick=step.observation.tick) if step.command is not None and step.estimate is None:
-            return replace(step, estimate=message)
-        case Command(tick=step.observation.tick) if step.command is None:
-            return replace(step, command=message)
-        case DeadlineMissed(tick=step.observation.tick) if step.command is None:
-            return replace(step, missed=(*step.missed, message.robot))
-        case Report(tick=step.observation.tick) if message.robot == robot and step.report is None:
-            return replace(step, report=FramedReport(message, frame))
-        case Report() if message.robot != robot and step.command is None:
-            return replace(step, heard=(*step.heard, FramedReport(message, frame)))
-        case _:
-            return None
+    if reading.disorder is not None:
+        raise CorruptJournal(f"{source}: {reading.disorder.what}")
+    content = reading.content()
+    if content is None:
+        raise CorruptJournal(f"{source}: it contains no RobotConfig")
+    return content

@@ -15,12 +15,12 @@ from collections.abc import Callable
 
 import zenoh
 
+from agent.process.agent_journal import FramedReport
 from agent.process.discovery import ASK_AGAIN_S, NoWorld, Search, join
 from agent.process.link import AgentLink, WorldLinkLost
 from agent.process.out_of_step import OutOfStep
 from agent.process.recovery import OWN_REPORTS_KEPT, REPORTS_KEPT, Memory
 from agent.process.report_buffer import Post
-from agent.process.robot import FramedReport
 from protocol.messages import MissionEnd, Observation, RobotConfig
 from protocol.network import session
 from protocol.network.endpoints import Endpoints

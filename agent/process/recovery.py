@@ -9,8 +9,9 @@ from collections import deque
 
 import msgspec
 
-from agent.process.agent_journal import past
-from agent.process.robot import FramedReport, Robot
+from agent.process.agent_journal import FramedReport, past
+from agent.process.replay import Replay
+from agent.process.robot import Robot
 from protocol.journal import environment
 from protocol.journal.journal_file import CorruptJournal
 from protocol.journal.resume import ReplayMismatch, Retrace
@@ -49,28 +50,26 @@ def remember(recording: Retrace) -> Memory | None:
     """
     if environment.is_blank(recording.frames):
         return None
-    recorded_with = environment.named_in(recording.frames)
     journal = past(recording.frames, recording.path)
-    robot = Robot(journal.config)
-    robot.keep(recording)
-    recording.write(*[encode(one) for one in (recorded_with, journal.config) if one is not None])
+    head = (journal.environment, journal.config)
+    recording.write(*[encode(one) for one in head if one is not None])
+    replay = Replay(journal, recording)
+    robot = replay.robot
     own_reports: deque[FramedReport] = deque(maxlen=OWN_REPORTS_KEPT)
-    for step in journal.steps:
-        try:
-            report = robot.observation(step.observation, step.frame)
-            if report is not None:  # although its frame may be torn in the journal
-                own_reports.append(report)
+    try:
+        for step in replay:
+            if robot.report is not None:  # although its frame may be torn in the journal
+                own_reports.append(robot.report)
             if step.command is not None:
-                robot.decide(step.heard, step.missed)
                 robot.estimate()
-        except ReplayMismatch:
-            raise CorruptJournal(
-                f"{recording.path}: the recorded decision differs at tick {step.observation.tick}: "
-                + (
-                    environment.otherwise(recorded_with, environment.of_robot())
-                    or "the journal was written by another version"
-                )
-            ) from None
+    except ReplayMismatch:
+        raise CorruptJournal(
+            f"{recording.path}: the recorded decision differs at tick {replay.tick}: "
+            + (
+                environment.otherwise(journal.environment, environment.of_robot())
+                or "the journal was written by another version"
+            )
+        ) from None
     if journal.final_report is not None:  # it also counts received frames, which a replay cannot reproduce
         recording.write(*recording.frames[-2:])
     observation = journal.steps[-1].observation if journal.steps else None

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Sequence
 
 from agent.peer import peer_state
+from agent.process.agent_journal import FramedReport
 from agent.process.recovery import REPORTS_KEPT
-from agent.process.robot import FramedReport
 from protocol.messages import Report
 from protocol.network.inbox import Arrival, Inbox
 from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode

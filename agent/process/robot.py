@@ -7,10 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import msgspec
-
 from agent.planning import planner
 from agent.planning.state import RobotState
+from agent.process.agent_journal import FramedReport
 from protocol.journal import environment
 from protocol.journal.journal_file import Sink
 from protocol.messages import (
@@ -19,17 +18,9 @@ from protocol.messages import (
     FinalReport,
     MissionEnd,
     Observation,
-    Report,
     RobotConfig,
 )
 from protocol.wire import encode
-
-
-class FramedReport(msgspec.Struct, frozen=True):
-    """A report together with the frame in which it was received or is sent."""
-
-    report: Report
-    frame: bytes
 
 
 class Robot:

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 
 from agent.peer import peer_state
 from agent.process.agent_journal import Step
+from agent.process.replay import Replay
 from agent.process.robot import Robot
-from compose.audit.evidence import Testified
 from compose.audit.findings import Checks, Violation, between, difference, quoted
+from compose.recording.run import Run
 from protocol.messages import FinalReport, Message, MissionEnd, Report
 from protocol.mission import Mission
 from protocol.motion import Controls
@@ -18,23 +19,23 @@ ROUNDING = 1e-12
 """The part of a limit by which rounding may move a quotient of a length and a period beyond it."""
 
 
-def decision(evidence: Testified) -> Checks:
+def decision(run: Run) -> Checks:
     """Check that the planner makes each Report, Command, Estimate and FinalReport from the journaled inputs.
 
     The frames are compared to the bit.
     """
-    for robot, past in evidence.pasts.items():
-        tick = None
+    for robot, past in run.pasts.items():
+        replay = Replay(past)
         try:
-            replayed = Robot(past.config)
-            for step in past.steps:
-                tick = step.observation.tick
-                yield from _answers(replayed, robot, step, cut=step is past.steps[-1] and past.end is None)
+            for step in replay:
+                yield from _answers(
+                    replay.robot, robot, step, cut=step is past.steps[-1] and past.end is None
+                )
             if past.end is not None and past.final_report is not None:
-                yield _final_report(replayed, robot, past.end, past.final_report)
+                yield _final_report(replay.robot, robot, past.end, past.final_report)
         except Exception as error:  # noqa: BLE001  # an exception of the planner is a violation
             what = f"the planner fails on its inputs: {type(error).__name__}: {error}"
-            yield Violation("decision", tick, robot, what)
+            yield Violation("decision", replay.tick, robot, what)
 
 
 def _answers(replayed: Robot, robot: str, step: Step, *, cut: bool) -> Checks:
@@ -42,24 +43,22 @@ def _answers(replayed: Robot, robot: str, step: Step, *, cut: bool) -> Checks:
 
     If `cut`, the journal ends in this tick, and messages may be missing.
     """
-    tick = step.observation.tick
-    report = replayed.observation(step.observation, step.frame)
+    tick, report = step.observation.tick, replayed.report
     if report is not None and step.report is not None:
-        yield _same(tick, robot, step.report.report, report.frame)
+        yield _same(tick, robot, step.report.report, step.report.frame, report.frame)
     elif report is not None and not (cut and step.command is None):
         yield Violation("decision", tick, robot, "it sent no Report, expected one")
     elif step.report is not None:
         yield Violation("decision", tick, robot, "it sent a Report, expected none: no peer is in contact")
     if step.command is not None:
-        replayed.decide(step.heard, step.missed)
-        yield _same(tick, robot, step.command, replayed.command_frame)
+        yield _same(tick, robot, step.command, step.command_frame, replayed.command_frame)
     if step.estimate is not None:
-        yield _same(tick, robot, step.estimate, replayed.estimate())
+        yield _same(tick, robot, step.estimate, step.estimate_frame, replayed.estimate())
 
 
-def _same(tick: int, robot: str, found: Message, expected: bytes) -> Violation | None:
-    """Return a violation if the journaled message `found` does not encode to the frame `expected`."""
-    if encode(found) == expected:
+def _same(tick: int, robot: str, found: Message, frame: bytes | None, expected: bytes) -> Violation | None:
+    """Return a violation if the journaled message `found`, from `frame`, does not encode to `expected`."""
+    if frame == expected or encode(found) == expected:
         return None
     wanted = decode(expected, type(found))
     what = f"in its {type(found).__name__}, {difference(found, wanted)}"
@@ -77,16 +76,16 @@ def _final_report(replayed: Robot, robot: str, end: MissionEnd, found: FinalRepo
         reports_unheard=found.reports_unheard,
         frames_refused=found.frames_refused,
     )
-    return _same(end.tick, robot, found, encode(expected))
+    return _same(end.tick, robot, found, None, encode(expected))
 
 
-def limits(evidence: Testified) -> Checks:
+def limits(run: Run) -> Checks:
     """Check that no robot commanded or drove more than v_max and omega_max.
 
     With noise, only the commanded speeds are checked: the executed ones include wheel noise, and the
     Observation contains measurements of them.
     """
-    for robot, past in evidence.pasts.items():
+    for robot, past in run.pasts.items():
         mission = past.config.mission
         for step in past.steps:
             tick, command, driven = step.observation.tick, step.command, step.observation.executed
@@ -107,12 +106,12 @@ def _within(tick: int, robot: str, how: str, controls: Controls, mission: Missio
     return None
 
 
-def log(evidence: Testified) -> Checks:
+def log(run: Run) -> Checks:
     """Check that the manoeuvres and ranges in each robot's Reports are those of its own Observations.
 
     Attackers are skipped. `decision` checks their Reports, because the attack is part of the configuration.
     """
-    for robot, past in evidence.pasts.items():
+    for robot, past in run.pasts.items():
         if past.config.attack is not None:
             continue
         driven = [step.observation.executed for step in past.steps]

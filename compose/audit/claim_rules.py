@@ -12,8 +12,8 @@ from agent.planning.phase3_last_manoeuvre import ELSEWHERE
 from agent.planning.planner import uses_active_sensing
 from agent.planning.range_seeking import travelled
 from agent.process.agent_journal import Past
-from compose.audit.evidence import Evidence
 from compose.audit.findings import Checks, Violation, between
+from compose.recording.run import Run
 from protocol.messages import Localised, MissionEnd
 from protocol.motion import Pose
 from world.referee import inaccuracy, mistake
@@ -23,47 +23,47 @@ PLACES = 3
 """The number of relative placements that a claim from exact ranges needs; two leave several solutions."""
 
 
-def claim(evidence: Evidence) -> Checks:
+def claim(run: Run) -> Checks:
     """Check that each claim was right, as accurate as the mission requires, and based on a redundant range.
 
     The rule also checks `outcome`.
     """
-    for place, placed in enumerate(evidence.history.scenario.robots):
-        tick, made = _first_claim(evidence, placed.id)
+    for place, placed in enumerate(run.scenario.robots):
+        tick, made = _first_claim(run, placed.id)
         if made is None:
             continue
-        mission = evidence.history.scenario.mission
-        why = mistake(made, evidence.history.ticks[tick].world.truth.poses[place], mission)
+        mission = run.scenario.mission
+        why = mistake(made, run.ticks[tick].world.truth.poses[place], mission)
         yield None if why is None else Violation("claim", tick, placed.id, f"it claims a pose that is {why}")
         vague = inaccuracy(made, mission)
         yield None if vague is None else Violation("claim", tick, placed.id, f"it {vague}")
-        past = evidence.pasts.get(placed.id)
+        past = run.pasts.get(placed.id)
         if past is not None and tick < len(past.steps) and past.steps[tick].command is not None:
-            yield _redundant(evidence, placed, past, tick)
-    yield from outcome(evidence)
+            yield _redundant(run, placed, past, tick)
+    yield from outcome(run)
 
 
-def _first_claim(evidence: Evidence, robot: str) -> tuple[int, Localised | None]:
+def _first_claim(run: Run, robot: str) -> tuple[int, Localised | None]:
     """Return the tick and the content of the robot's first claim; (0, None) if it made none."""
-    for tick, one in enumerate(evidence.history.ticks):
+    for tick, one in enumerate(run.ticks):
         command = one.commands.get(robot)
         if command is not None and isinstance(command.verdict, Localised):
             return tick, command.verdict
     return 0, None
 
 
-def _redundant(evidence: Evidence, placed: RobotSpec, past: Past, tick: int) -> Violation | None:
+def _redundant(run: Run, placed: RobotSpec, past: Past, tick: int) -> Violation | None:
     """Return a violation if the claim at `tick` is based on too few mutual ranges.
 
     Ranges count up to the latest tick for which the robot had received the peer's log.
     """
-    scenario = evidence.history.scenario
+    scenario = run.scenario
     noise = scenario.mission.noise
     ends = [framed.report.through for step in past.steps[: tick + 1] for framed in step.heard]
     through = min(max(ends, default=-1), tick)
     mutual = _ranged(past, through)
     if noise.exact:
-        places = _places(evidence, placed, mutual)
+        places = _places(run, placed, mutual)
         return _too_few(tick, placed, "relative placements with a mutual range", places, PLACES)
     active = uses_active_sensing(scenario.planner_name, scenario.mission)
     least = CHECKED if active else CHECKED_BY_LETTER
@@ -87,13 +87,13 @@ def _ranged(past: Past, through: int) -> list[int]:
     ]
 
 
-def _places(evidence: Evidence, placed: RobotSpec, ticks: Sequence[int]) -> int:
+def _places(run: Run, placed: RobotSpec, ticks: Sequence[int]) -> int:
     """Return the number of different relative placements of the pair at `ticks`."""
-    ids = [robot.id for robot in evidence.history.scenario.robots]
+    ids = [robot.id for robot in run.scenario.robots]
     one, other = ids.index(placed.id), ids.index(placed.peer)
     found: list[tuple[Pose, Pose]] = []
     for tick in ticks:
-        local = evidence.history.ticks[tick].world.truth.local
+        local = run.ticks[tick].world.truth.local
         here = local[one], local[other]
         if all(
             any(travelled(*both) > ELSEWHERE for both in zip(here, there, strict=True)) for there in found
@@ -102,12 +102,12 @@ def _places(evidence: Evidence, placed: RobotSpec, ticks: Sequence[int]) -> int:
     return len(found)
 
 
-def outcome(evidence: Evidence) -> Checks:
+def outcome(run: Run) -> Checks:
     """Check that the MissionEnd has the outcome that the referee derives from the ground truth.
 
     A run that failed before the referee had an outcome is accepted.
     """
-    end, mission_outcome = evidence.history.end, evidence.history.mission_outcome
+    end, mission_outcome = run.end, run.history.mission_outcome
     if end is None:
         return
     expected = MissionEnd(end.tick, *astuple(mission_outcome)) if mission_outcome is not None else None

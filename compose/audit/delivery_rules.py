@@ -5,18 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from agent.process.agent_journal import Past, Step
-from agent.process.robot import FramedReport
-from compose.audit.evidence import Evidence, Testified
+from agent.process.agent_journal import FramedReport, Past, Step
 from compose.audit.findings import Checks, Violation, between, difference, quoted
+from compose.recording.run import Run
 from protocol.wire import encode
 
 
-def observation(evidence: Evidence) -> Checks:
+def observation(run: Run) -> Checks:
     """Check that the sensor models give each Observation, to the bit, from the journaled Commands."""
-    for robot, past in evidence.pasts.items():
-        for step in past.steps[: len(evidence.observations)]:
-            expected = evidence.observations[step.observation.tick][robot]
+    for robot, past in run.pasts.items():
+        for step in past.steps[: len(run.observations)]:
+            expected = run.observations[step.observation.tick][robot]
             if step.frame == encode(expected):
                 yield None
             else:
@@ -26,20 +25,20 @@ def observation(evidence: Evidence) -> Checks:
                 )
 
 
-def contact(evidence: Evidence) -> Checks:
+def contact(run: Run) -> Checks:
     """Check that Reports were sent and received only in contact, and that those received are listed."""
-    for robot, past in evidence.pasts.items():
+    for robot, past in run.pasts.items():
         for step in past.steps:
-            if step.report is not None and step.observation.tick < len(evidence.observations):
-                yield _sent(evidence, robot, step)
+            if step.report is not None and step.observation.tick < len(run.observations):
+                yield _sent(run, robot, step)
             if step.command is not None:
                 yield _listed(robot, step)
             for framed in step.heard:
-                yield _received(evidence, robot, step, framed)
+                yield _received(run, robot, step, framed)
 
 
-def _sent(evidence: Evidence, robot: str, step: Step) -> Violation | None:
-    if evidence.contact(robot, step.observation.tick) is not None:
+def _sent(run: Run, robot: str, step: Step) -> Violation | None:
+    if run.contact(robot, step.observation.tick) is not None:
         return None
     return Violation(
         "contact", step.observation.tick, robot, "it sent a report, expected none: out of contact"
@@ -62,21 +61,21 @@ def _is_subsequence(some: Sequence[int], of: Sequence[int]) -> bool:
     return all(one in rest for one in some)
 
 
-def _received(evidence: Evidence, robot: str, step: Step, framed: FramedReport) -> Violation | None:
+def _received(run: Run, robot: str, step: Step, framed: FramedReport) -> Violation | None:
     now, then = step.observation.tick, framed.report.tick
-    if max(now, then) >= len(evidence.observations):
+    if max(now, then) >= len(run.observations):
         return None  # the ground truth of these ticks is not in the recording
     for tick in (now, then):
-        if evidence.contact(robot, tick) is None:
+        if run.contact(robot, tick) is None:
             what = f"it received the report of tick {then}, expected none: out of contact at tick {tick}"
             return Violation("contact", now, robot, what)
     return None
 
 
-def report(evidence: Testified) -> Checks:
+def report(run: Run) -> Checks:
     """Check that each received Report is, to the byte, the one in the peer's journal."""
-    for robot, past in evidence.pasts.items():
-        peer = evidence.pasts.get(past.config.peer)
+    for robot, past in run.pasts.items():
+        peer = run.pasts.get(past.config.peer)
         if peer is None:
             continue
         for step in past.steps:

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from agent.process.agent_journal import Past
-from compose.audit.evidence import Evidence
 from compose.audit.findings import Checks, LinkStatistics, Violation, quoted
+from compose.recording.run import Run
 
 
-def faults(evidence: Evidence) -> Checks:
+def faults(run: Run) -> Checks:
     """Check that each Observation lists the received and damaged Reports that follow from the fault plan."""
-    if not evidence.history.scenario.faults:
+    if not run.scenario.faults:
         return
-    for robot, past in evidence.pasts.items():
-        for step in past.steps[: len(evidence.observations)]:
-            expected = evidence.contact(robot, step.observation.tick)
+    for robot, past in run.pasts.items():
+        for step in past.steps[: len(run.observations)]:
+            expected = run.contact(robot, step.observation.tick)
             if expected is None:
                 continue
             for found in step.observation.contacts:
@@ -25,11 +25,11 @@ def faults(evidence: Evidence) -> Checks:
                     yield Violation("faults", step.observation.tick, robot, what)
 
 
-def link_statistics(evidence: Evidence) -> tuple[LinkStatistics, ...]:
+def link_statistics(run: Run) -> tuple[LinkStatistics, ...]:
     """Return the statistics of each link whose receiver has a journal; none without a fault plan."""
-    if not evidence.history.scenario.faults:
+    if not run.scenario.faults:
         return ()
-    return tuple([_statistics(past) for past in evidence.pasts.values()])
+    return tuple([_statistics(past) for past in run.pasts.values()])
 
 
 def _statistics(past: Past) -> LinkStatistics:

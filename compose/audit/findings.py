@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import msgspec
+
+from compose.recording.run import Run
 
 ROUNDING = 1e-6
 """The difference that rounding alone can cause, relative to the value or to 1, whichever is larger."""
@@ -100,20 +102,17 @@ class Findings(msgspec.Struct, frozen=True):
     """Description of how those versions differ from the ones of this process; None if they do not."""
 
 
-T = TypeVar("T")
-
-
 def findings_of(
-    rules: Sequence[Callable[[T], Checks]],
-    evidence: T,
+    rules: Sequence[Callable[[Run], Checks]],
+    run: Run,
     versions: str | None,
     *,
     scenario: str,
     ticks: int,
     links: tuple[LinkStatistics, ...] = (),
 ) -> Findings:
-    """Return the findings of `rules` in `evidence`; `versions` describes other versions, if it has any."""
-    checks = {rule.__name__: list(rule(evidence)) for rule in rules}
+    """Return the findings of `rules` in `run`; `versions` describes other versions, if it has any."""
+    checks = {rule.__name__: list(rule(run)) for rule in rules}
     found = [one for some in checks.values() for one in some if one is not None]
     found.sort(key=lambda one: -1 if one.tick is None else one.tick)
     rounding: list[Violation] = []

@@ -7,7 +7,6 @@ something. In hardware mode, only the agents' journals are replayed.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import msgspec
@@ -15,25 +14,14 @@ import msgspec
 from compose.audit.agent_rules import decision
 from compose.audit.claim_rules import outcome
 from compose.audit.delivery_rules import contact, observation, report
-from compose.audit.evidence import Evidence
-from compose.audit.findings import Checks, Violation
-from compose.audit.hardware_rules import Alone
-from compose.audit.hardware_rules import order as order_alone
+from compose.audit.findings import Violation
 from compose.audit.journal_rules import config, order
-from compose.audit.rules import audit_journals
-from compose.recording.run import read_journals
+from compose.audit.rules import Rules, audit_run
+from compose.recording.run import Run, read
 
-RULES: tuple[Callable[[Evidence], Checks], ...] = (
-    config,
-    observation,
-    contact,
-    report,
-    decision,
-    order,
-    outcome,
-)
+RULES: Rules = (config, observation, contact, report, decision, order, outcome)
 """The rules of a replay, in the order of a tick: the first difference is the cause of later ones."""
-ALONE: tuple[Callable[[Alone], Checks], ...] = (report, decision, order_alone)
+HARDWARE_RULES: Rules = (report, decision, order)
 """The rules of a replay in hardware mode."""
 
 
@@ -61,17 +49,13 @@ def replay(folder: Path) -> tuple[Replay, dict[str, int]]:
     Raises OSError if there is no recording, CorruptJournal if a frame cannot be decoded or is in the journal
     of another robot.
     """
-    found = read_journals(folder)
-    result = replayed({name: book.frames for name, book in found.items()}, folder)
-    return result, {name: book.torn for name, book in found.items()}
+    run = read(folder, audited=True)
+    return replayed(run), {name: journal.torn for name, journal in run.journals.items()}
 
 
-def replayed(journals: Mapping[str, Iterable[bytes]], folder: object = "the recording") -> Replay:
-    """Replay the frames of `journals`, by file name, and return the result; errors name `folder`.
-
-    Raises CorruptJournal like `replay`.
-    """
-    findings = audit_journals(journals, folder, RULES, ALONE)
+def replayed(run: Run) -> Replay:
+    """Replay `run`, and return the result. Raises CorruptJournal like `replay`."""
+    findings = audit_run(run, RULES, HARDWARE_RULES)
     return Replay(
         findings.scenario,
         findings.ticks,

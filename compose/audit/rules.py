@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from compose.audit import hardware_rules
+from compose.audit import scenario_rules
 from compose.audit.agent_rules import decision, limits, log
 from compose.audit.claim_rules import claim
 from compose.audit.delivery_rules import contact, observation, report
-from compose.audit.evidence import Evidence, evidence_of, other_versions
 from compose.audit.fault_rules import faults, link_statistics
 from compose.audit.findings import Checks, Findings, findings_of
-from compose.audit.hardware_rules import Alone, audit_hardware_run
 from compose.audit.journal_rules import config, order
 from compose.audit.scenario_rules import scenario
-from compose.recording.run import WORLD_JOURNAL, read_journals
-from protocol.journal.environment import of_world, otherwise
+from compose.recording.run import Run, agent_journal, read
+from protocol.journal.environment import of_robot, of_world, otherwise
 
-RULES: tuple[Callable[[Evidence], Checks], ...] = (
+Rules = Sequence[Callable[[Run], Checks]]
+RULES: Rules = (
     order,
     scenario,
     config,
@@ -32,6 +31,9 @@ RULES: tuple[Callable[[Evidence], Checks], ...] = (
     claim,
 )
 """The rules of the audit, in order: if violations of one cause violations of another, it comes first."""
+HARDWARE_RULES: Rules = (order, scenario_rules.config, report, decision, limits, log)
+"""The rules of the audit in hardware mode, where there is no ground truth: the decisions of each robot follow
+from its inputs, and it received what its peer sent."""
 
 
 def audit(folder: Path) -> Findings:
@@ -40,41 +42,37 @@ def audit(folder: Path) -> Findings:
     Raises OSError if there is no recording. Raises CorruptJournal if a frame cannot be decoded, if it is in
     the journal of another robot, or if two peers' journals are of different runs.
     """
-    return audit_journals({name: book.frames for name, book in read_journals(folder).items()}, folder)
+    return audit_run(read(folder, audited=True))
 
 
-def audit_journals(
-    journals: Mapping[str, Iterable[bytes]],
-    folder: object,
-    rules: Sequence[Callable[[Evidence], Checks]] = RULES,
-    rules_without_world: Sequence[Callable[[Alone], Checks]] = hardware_rules.RULES,
-) -> Findings:
-    """Return the findings in the frames of `journals`, by file name; errors name `folder`.
+def audit_run(run: Run, rules: Rules = RULES, hardware_rules: Rules = HARDWARE_RULES) -> Findings:
+    """Return the findings in `run`: of `rules`, or of `hardware_rules` if there is no world's journal.
 
-    The rules are `rules`, or `rules_without_world` if there is no world's journal. Raises CorruptJournal like
-    `audit`.
+    Raises OSError and CorruptJournal if a robot's journal cannot be read.
     """
-    if WORLD_JOURNAL in journals:
-        return audit_world_run(journals, folder, rules)
-    return audit_hardware_run(journals, folder, rules_without_world)
-
-
-def audit_world_run(
-    journals: Mapping[str, Iterable[bytes]],
-    folder: object = "the recording",
-    rules: Sequence[Callable[[Evidence], Checks]] = RULES,
-) -> Findings:
-    """Return the findings of `rules` in the frames of `journals`, one of which is the world's.
-
-    Errors name `folder`. Raises CorruptJournal like `audit`.
-    """
-    evidence = evidence_of(journals, folder)
-    run = evidence.history
+    run.readable(*map(agent_journal, run.robots))
+    if run.world is None:
+        return findings_of(
+            hardware_rules,
+            run,
+            _other_versions(run),
+            scenario=f"{' and '.join(run.robots)}, hardware mode",
+            ticks=max(0, run.length - 1),
+        )
     return findings_of(
         rules,
-        evidence,
-        otherwise(run.environment, of_world()) or other_versions(evidence.pasts),
+        run,
+        otherwise(run.world.environment, of_world()) or _other_versions(run),
         scenario=run.scenario.name,
-        ticks=run.ticks[-1].world.truth.tick if run.ticks else 0,
-        links=link_statistics(evidence),
+        ticks=max(0, run.length - 1),
+        links=link_statistics(run),
     )
+
+
+def _other_versions(run: Run) -> str | None:
+    """Return how the versions of the first robot that has others differ from those of this process.
+
+    The result is None if no robot has other versions.
+    """
+    differences = [otherwise(past.environment, of_robot()) for past in run.pasts.values()]
+    return next((one for one in differences if one is not None), None)

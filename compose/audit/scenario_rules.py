@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from compose.audit.evidence import Evidence, Testified
 from compose.audit.findings import Checks, Violation, difference
+from compose.recording.run import Run
 from compose.scenario.scenario_file import NEAREST_ANCHORS
 from protocol.attack import OF_THE_START
 from protocol.mission import (
@@ -20,9 +20,9 @@ from protocol.orbits import Rendezvous, rendezvous
 from world.scenario import RobotSpec
 
 
-def scenario(evidence: Evidence) -> Checks:
+def scenario(run: Run) -> Checks:
     """Check that `tandem run` accepts the scenario, and that its orbits follow from the rest of it."""
-    found = evidence.history.scenario
+    found = run.scenario
     for why in (noise_infeasibility(found.mission), safety_infeasibility(found.mission)):
         yield _violation(None, why and f"mission.{why}")
     place = {robot.id: place for place, robot in enumerate(found.robots)}
@@ -37,12 +37,12 @@ def scenario(evidence: Evidence) -> Checks:
             yield _violation(robot.id, why)
 
 
-def config(evidence: Testified) -> Checks:
+def config(run: Run) -> Checks:
     """Check that the orbits in each RobotConfig follow from the mission and the anchors in it.
 
     This is for hardware mode. Otherwise, `journal_rules.config` compares the RobotConfig with the scenario.
     """
-    for robot, past in evidence.pasts.items():
+    for robot, past in run.pasts.items():
         found = past.config
         why = _off_plan(found.rendezvous, found.mission, found.planner_name, found.anchor, found.peer_anchor)
         yield Violation("config", None, robot, why) if why is not None else None

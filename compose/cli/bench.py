@@ -248,7 +248,7 @@ def _missions(rounds: int, done: Callable[[], None]) -> Table:
     return table
 
 
-def _world_s(recording: run.Recording) -> float:
+def _world_s(recording: run.Run) -> float:
     """Return the time (s) that the world takes to run `recording` again with the recorded Commands."""
     began = time.perf_counter()
     simulation = Simulation(recording.scenario)

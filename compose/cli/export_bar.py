@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from compose.recording.run import user_errors
+from compose.recording.run import Run, read, user_errors
 from compose.terminal.outcome import counting
 from protocol.network.inbox import Inbox
 
@@ -16,12 +17,17 @@ MODULES = ("foxglove", "pyarrow")
 """The optional libraries that an export needs; the caller checks that they are installed."""
 
 
-def exported(folder: Path, out: Path, inbox: Inbox, *, quiet: bool = False) -> Exported:
+def exported(
+    folder: Path, out: Path, inbox: Inbox, *, run: Run | None = None, quiet: bool = False
+) -> Exported:
     """Export the recording in `folder` to `out`, with a progress bar unless `quiet`.
 
-    Raises UserError if a file cannot be read or written, and Interrupted if `inbox` stops the export.
+    `run` is the recording if it has been read already. Raises UserError if a file cannot be read or written,
+    and Interrupted if `inbox` stops the export.
     """
     from compose.view.export.folder import FILES, export  # noqa: PLC0415  # slow to import, and optional
 
     with user_errors(folder), counting("tandem export", 0 if quiet else len(FILES)) as done:
-        return export(folder, out, done=done, check=lambda: inbox.next(0.0))
+        run = run or read(folder)
+        gc.freeze()  # else each garbage collection goes through all messages again
+        return export(run, out, done=done, check=lambda: inbox.next(0.0))

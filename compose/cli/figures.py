@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,8 +11,7 @@ from compose.cli.arguments import add_closing, add_recording
 from compose.errors import ENDED, FAILED, UserError
 from compose.extras import need
 from compose.figures import FORMATS, PICTURES
-from compose.recording.robots import alone, casts
-from compose.recording.run import Recording, agent_journal, read, user_errors
+from compose.recording.run import Run, agent_journal, read, user_errors
 from compose.terminal.outcome import counting
 from protocol.journal.journal_file import CorruptJournal
 from protocol.output import say
@@ -38,6 +37,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=FORMATS,
         help=f"write only this format; may be repeated [default: all of {', '.join(FORMATS)}]",
     )
+    parser.add_argument(
+        "--paper",
+        action="store_true",
+        help="draw for a paper: 3.5 or 7.16 inches wide, 8 point text, no title",
+    )
     add_closing(parser, "tandem figures recording --only encounter --format svg", "docs/recordings.md")
 
 
@@ -47,59 +51,39 @@ def main(options: argparse.Namespace) -> int:
     Return FAILED if the journal of a robot is missing or cannot be replayed to its end.
     """
     need("matplotlib")
+    from compose.figures.pair import pair_of  # noqa: PLC0415
+
     with user_errors(options.recording):
-        recording = None if alone(options.recording) else read(options.recording)
-        pairs = _casts(options.recording, recording)
+        run = read(options.recording)
     folder, status = options.recording / "figures", ENDED
     kinds = [kind for kind in PICTURES if kind in (options.only or PICTURES)]
     formats = [one for one in FORMATS if one in (options.format or FORMATS)]
-    with counting("tandem figures", sum([len(robots) + len(kinds) for robots in pairs])) as done:
-        for robots in pairs:
+    with counting("tandem figures", sum([len(robots) + len(kinds) for robots in run.pairs])) as done:
+        for robots in run.pairs:
             accounts = {}
             for robot in robots:
-                account = _account(options.recording, robot)
+                account = _account(run, robot)
                 if account is not None:
                     accounts[robot] = account
                 if account is None or account.broken is not None:
                     status = FAILED
                 done()
             torn = [name for name, one in accounts.items() if one.past is not None and one.past.end is None]
-            torn += ["the world"] if recording is not None and recording.end is None else []
+            torn += ["the world"] if run.world is not None and run.world.end is None else []
             if torn:
                 _say(f"the recording of {' and '.join(torn)} ends before the mission does")
-            pair = _pair(recording, robots, accounts)
+            pair = pair_of(run, robots, accounts)
             if pair is None:
                 _say(f"no figure of {' and '.join(robots)}: the recording has no data")
                 status = FAILED
                 continue
             try:
-                draw(pair, kinds, formats, folder, done, torn=bool(torn))
+                draw(pair, kinds, formats, folder, done, torn=bool(torn), paper=options.paper)
             except BrokenPipeError:
                 raise
             except OSError as error:
                 raise UserError(f"{folder} cannot be written: {error.strerror or error}") from None
     return status
-
-
-def _casts(folder: Path, recording: Recording | None) -> list[tuple[str, ...]]:
-    """Return the robots of each pair, role a first; in hardware mode, only those with a journal."""
-    if recording is None:
-        return casts(folder)
-    robots = recording.scenario.robots
-    return [(robots[a].id, robots[b].id) for a, b in recording.scenario.pairs()]
-
-
-def _pair(
-    recording: Recording | None, robots: Sequence[str], accounts: Mapping[str, Account]
-) -> PairRecord | None:
-    """Return the data of a pair, or None if there is no journal of either robot."""
-    from compose.figures.pair import of_record, of_robots  # noqa: PLC0415
-
-    if recording is not None:
-        places = {robot.id: place for place, robot in enumerate(recording.scenario.robots)}
-        return of_record(recording, (places[robots[0]], places[robots[1]]), accounts)
-    known = {robot: account for robot, account in accounts.items() if account.past is not None}
-    return of_robots(known) if known else None
 
 
 def draw(
@@ -110,33 +94,35 @@ def draw(
     done: Callable[[], None],
     *,
     torn: bool,
+    paper: bool = False,
 ) -> None:
     """Draw the figures of `kinds`; print a line for each file, and for each figure that does not apply.
 
     `done` is called after each kind. `torn` states that the recording is incomplete, so that an event that it
-    lacks may have happened. Raises OSError.
+    lacks may have happened; `paper` is the flag. Raises OSError.
     """
     from compose.figures import catalogue, style  # noqa: PLC0415
     from compose.figures.sheet import Absent  # noqa: PLC0415
 
+    medium = style.PAPER if paper else style.SCREEN
     folder.mkdir(exist_ok=True)
     for kind in kinds:
-        with catalogue.settings(kind):
-            for name, figure in catalogue.pictures(pair, kind):
+        with style.look(medium):
+            for name, figure in catalogue.pictures(pair, kind, medium):
                 if isinstance(figure, Absent):
                     _say(f"no {name}: {figure.why}{' (in the incomplete recording)' if torn else ''}")
                     continue
-                for path in style.save(figure, folder / name, formats):
+                for path in style.save(figure, folder / name, formats, medium.dpi):
                     say(str(path))
         done()
 
 
-def _account(folder: Path, robot: str) -> Account | None:
+def _account(run: Run, robot: str) -> Account | None:
     """Return the account of a robot; print why and return None if its journal cannot be read."""
     from compose.figures.account import account  # noqa: PLC0415
 
     try:
-        found = account(folder, robot)
+        found = account(run, robot)
     except FileNotFoundError:
         why = f"{agent_journal(robot)} is missing"
     except OSError as error:

@@ -16,7 +16,7 @@ from compose.extras import need
 from compose.launch import processes, supervisor
 from compose.launch.signals import stop_by_signal
 from compose.launch.viewers import Viewer, foxglove_server, page, stay, viewing
-from compose.recording.run import folder_for, read
+from compose.recording.run import Run, folder_for, read
 from compose.scenario.kills import WORLD, Kill
 from compose.scenario.scenario_file import ScenarioTemplate, check_rate, run_name, setting
 from compose.terminal.outcome import break_off, conclude, shown_live
@@ -177,8 +177,9 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[
             return STOPPED
         for kill in spared:
             inbox.say(f"--kill {kill.text}: not reached")
-        status = conclude(options, read(folder), folder, "processes", began)
-        return _after_outcome(options, folder, viewers, inbox, status)
+        run = read(folder)
+        status = conclude(options, run, folder, "processes", began)
+        return _after_outcome(options, folder, viewers, inbox, status, run)
 
 
 @contextmanager
@@ -210,14 +211,20 @@ def _viewers(
 
 
 def _after_outcome(
-    options: argparse.Namespace, folder: Path, viewers: Sequence[Viewer], inbox: Inbox, status: int
+    options: argparse.Namespace,
+    folder: Path,
+    viewers: Sequence[Viewer],
+    inbox: Inbox,
+    status: int,
+    run: Run | None = None,
 ) -> int:
     """Export the recording, serve the viewers until they are stopped, and return the exit status.
 
-    It is called once the outcome, of exit status `status`, has been printed.
+    It is called once the outcome, of exit status `status`, has been printed. `run` is the recording if it
+    has been read already.
     """
     try:
-        exported = _export(options, folder, inbox)
+        exported = _export(options, folder, inbox, run)
     except Interrupted as signal_name:
         inbox.say(f"stopped by {signal_name} before the export was complete")
         return STOPPED
@@ -225,7 +232,7 @@ def _after_outcome(
     return FAILED if options.export and not exported else status
 
 
-def _export(options: argparse.Namespace, folder: Path, inbox: Inbox) -> bool:
+def _export(options: argparse.Namespace, folder: Path, inbox: Inbox, run: Run | None) -> bool:
     """Export the recording if the flags allow it, and return whether it was done. Raises Interrupted."""
     if options.out is None or options.export is False:
         return False
@@ -237,7 +244,7 @@ def _export(options: argparse.Namespace, folder: Path, inbox: Inbox) -> bool:
             inbox.say(f"not exported: {error}")
         return False
     try:
-        export_bar.exported(folder, folder, inbox, quiet=options.quiet)
+        export_bar.exported(folder, folder, inbox, run=run, quiet=options.quiet)
     except UserError as error:
         inbox.say(f"not exported: {error}")
         return False

@@ -1,6 +1,6 @@
 """Figures of a recording.
 
-`pair` and `story` prepare the data, `style` and `sheet` define the common layout, and `catalogue` lists all
+`pair` holds the data of all of them, `style` and `sheet` define the common layout, and `catalogue` lists all
 figures by kind.
 """
 

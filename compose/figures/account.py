@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import msgspec
 
 from agent.planning.state import RobotState
 from agent.process.agent_journal import Past
-from agent.process.robot import Robot
-from compose.recording.run import past_of
+from agent.process.replay import Replay
+from compose.recording.run import Run
 from protocol.messages import Estimate
-from protocol.wire import encode
 
 
 class Account(msgspec.Struct, frozen=True):
@@ -30,32 +27,31 @@ class Account(msgspec.Struct, frozen=True):
         return self.past.estimates if self.past is not None else ()
 
 
-def account(folder: Path, robot: str) -> Account:
-    """Read the journal of `robot` in `folder`, and run its planner again on the journaled inputs.
+def account(run: Run, robot: str) -> Account:
+    """Take the journal of `robot` in `run`, and run its planner again on the journaled inputs.
 
     Raises OSError if there is no journal, CorruptJournal if it is damaged before its end or belongs to
     another robot or run.
     """
-    past = past_of(folder, robot)
+    past = run.past(robot)
     return _recomputed(past) if past is not None else Account(None)
 
 
 def _recomputed(past: Past) -> Account:
     """Repeat every decision. Stops at the first that differs from the recording."""
-    robot = Robot(past.config)
+    replay = Replay(past)
     states: list[RobotState] = []
-    for step in past.steps:
-        tick = step.observation.tick
-        try:
-            robot.observation(step.observation, step.frame)
+    try:
+        for step in replay:
             if step.command is None:
                 break
-            robot.decide(step.heard, step.missed)
-        except Exception as error:  # noqa: BLE001  # recorded inputs may raise any error in the planner
-            why = f"the planner fails on its inputs of tick {tick}: {type(error).__name__}: {error}"
-            return Account(past, tuple(states), why)
-        if robot.command_frame != encode(step.command):
-            why = f"the recorded decision at tick {tick} differs: another version wrote the journal"
-            return Account(past, tuple(states), why)
-        states.append(robot.state)
+            if replay.robot.command_frame != step.command_frame:
+                why = (
+                    f"the recorded decision at tick {replay.tick} differs: another version wrote the journal"
+                )
+                return Account(past, tuple(states), why)
+            states.append(replay.robot.state)
+    except Exception as error:  # noqa: BLE001  # recorded inputs may raise any error in the planner
+        why = f"the planner fails on its inputs of tick {replay.tick}: {type(error).__name__}: {error}"
+        return Account(past, tuple(states), why)
     return Account(past, tuple(states))

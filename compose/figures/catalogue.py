@@ -3,76 +3,63 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
 
 from matplotlib.figure import Figure
 
 from agent.planning.planner import uses_active_sensing
 from compose.figures import decisions, manoeuvre, one_robot, over_time, phase_one, steps, trajectory
 from compose.figures.pair import PairRecord
-from compose.figures.sheet import NO_TRUTH, Absent
-from compose.figures.story import Story
-from compose.figures.style import look
+from compose.figures.sheet import Absent
+from compose.figures.style import SCREEN, Medium
 
 Picture = tuple[str, Figure | Absent]
 
 
-def settings(kind: str) -> AbstractContextManager[None]:
-    """Return the matplotlib settings for drawing and saving figures of one kind (see `PICTURES`)."""
-    return look(symbols=kind != "robot")
+def pictures(pair: PairRecord, kind: str, medium: Medium = SCREEN) -> Iterator[Picture]:
+    """Yield the figures of one kind (see `PICTURES`) with their names; none if their journals are missing.
 
-
-def pictures(pair: PairRecord, kind: str) -> Iterator[Picture]:
-    """Yield the figures of one kind with their names; none if the journals they need are missing.
-
-    Must be called within the `settings` of that kind.
+    Must be called within the `look` of the medium.
     """
-    return _DRAWN[kind](pair)
+    return _DRAWN[kind](pair, medium)
 
 
-def _trajectory(pair: PairRecord) -> Iterator[Picture]:
-    yield f"trajectory-{pair.name}", trajectory.draw(pair)
+def _trajectory(pair: PairRecord, medium: Medium) -> Iterator[Picture]:
+    yield f"trajectory-{pair.name}", trajectory.draw(pair, medium)
 
 
-def _phase_one(pair: PairRecord) -> Iterator[Picture]:
+def _phase_one(pair: PairRecord, medium: Medium) -> Iterator[Picture]:
     for role in pair.readable:
-        yield f"phase-1-{pair.robot(role).id}", phase_one.draw(pair, role)
+        yield f"phase-1-{pair.robot(role).id}", phase_one.draw(pair, role, medium)
 
 
-def _plan(pair: PairRecord) -> Iterator[Picture]:
+def _plan(pair: PairRecord, medium: Medium) -> Iterator[Picture]:
     """Yield the planned manoeuvres; with active sensing, the hypotheses at its decisions."""
     if pair.readable and uses_active_sensing(pair.planner_name, pair.mission):
-        yield f"plan-{pair.name}", decisions.draw(pair)
+        yield f"plan-{pair.name}", decisions.draw(pair, medium)
     elif pair.readable:
-        for name, figure in manoeuvre.draw(pair).items():
+        for name, figure in manoeuvre.draw(pair, medium).items():
             yield f"plan-{name}", figure
 
 
-def _encounter(pair: PairRecord) -> Iterator[Picture]:
-    yield f"encounter-{pair.name}", steps.draw(pair)
+def _encounter(pair: PairRecord, medium: Medium) -> Iterator[Picture]:
+    yield f"encounter-{pair.name}", steps.draw(pair, medium)
 
 
-def _ranges(pair: PairRecord) -> Iterator[Picture]:
-    yield f"ranges-{pair.name}", over_time.ranges(pair)
+def _ranges(pair: PairRecord, medium: Medium) -> Iterator[Picture]:
+    yield f"ranges-{pair.name}", over_time.ranges(pair, medium)
 
 
-def _errors(pair: PairRecord) -> Iterator[Picture]:
+def _errors(pair: PairRecord, medium: Medium) -> Iterator[Picture]:
     if pair.readable:
-        yield f"errors-{pair.name}", over_time.errors(pair)
+        yield f"errors-{pair.name}", over_time.errors(pair, medium)
 
 
-def _robot(pair: PairRecord) -> Iterator[Picture]:
+def _robot(pair: PairRecord, medium: Medium) -> Iterator[Picture]:
     for role in pair.readable:
-        name, account = pair.robot(role).id, pair.robot(role).account
-        assert account is not None
-        if pair.recording is None:
-            yield f"robot-{name}", Absent(NO_TRUTH)
-            continue
-        ids = [one.id for one in pair.recording.scenario.robots]
-        yield f"robot-{name}", one_robot.figure_of(Story(pair.recording, ids.index(name), account.held))
+        yield f"robot-{pair.robot(role).id}", one_robot.draw(pair, role, medium)
 
 
-_DRAWN: dict[str, Callable[[PairRecord], Iterator[Picture]]] = {
+_DRAWN: dict[str, Callable[[PairRecord, Medium], Iterator[Picture]]] = {
     "trajectory": _trajectory,
     "phase-1": _phase_one,
     "plan": _plan,

@@ -11,14 +11,12 @@ from matplotlib.figure import Figure
 from agent.planning.active_sensing import Surveying, stride
 from agent.planning.state import RobotState
 from compose.figures.pair import ROLES, PairRecord
-from compose.figures.series import Series, some, square
-from compose.figures.sheet import NO_ENCOUNTER, Absent, Window, circle
-from compose.figures.style import COLOURS, INK, MARKS, PALE, PALER
+from compose.figures.sheet import NO_ENCOUNTER, Absent, Sheet, Window, circle, some, square
+from compose.figures.style import INK, MARKS, PALE, PALER, SCREEN, Medium
+from compose.view.colours import COLOURS
 from protocol.mission import Role
 from protocol.motion import Pose, step
 
-WIDTH, NARROWEST = 2.3, 5.6
-"""The maximum width of a panel and the minimum width of the figure, in inches."""
 FINE = 12
 """The number of line segments per tick of a drawn manoeuvre."""
 LIKELY = 1e-3
@@ -47,8 +45,8 @@ def decisions(pair: PairRecord) -> list[PairDecision]:
     return [PairDecision(tick, found[tick]) for tick in sorted(found)]
 
 
-def draw(pair: PairRecord) -> Figure | Absent:
-    """Return the figure, with one panel per decision for up to `series.PANELS` decisions."""
+def draw(pair: PairRecord, medium: Medium = SCREEN) -> Figure | Absent:
+    """Return the figure, with one panel per decision for up to `sheet.PANELS` decisions."""
     found = decisions(pair)
     if not found:
         why = pair.unknown or "no robot scored hypotheses of the pair"
@@ -60,13 +58,13 @@ def draw(pair: PairRecord) -> Figure | Absent:
         else f"all {len(found)} decisions"
     )
     title = f"Hypotheses of the pair and chosen manoeuvres: {many}"
-    series = Series(len(shown), _window(pair, shown), WIDTH, NARROWEST, [pair.title, title])
-    for i, one in enumerate(shown):
-        axes = series.panel(i, _panel_title(one, i + 1))
+    sheet = Sheet(medium, len(shown) == 1, [pair.title, title])
+    panels = [sheet.panel() for _ in shown]
+    for axes, one in zip(panels, shown, strict=True):
         _panel(axes, pair, one)
-    _key(axes, pair)
-    series.key(axes)
-    return series.figure
+    _key(panels[-1], pair)
+    sheet.series(panels, [_caption(one, i + 1) for i, one in enumerate(shown)], _window(pair, shown))
+    return sheet.finished()
 
 
 def _window(pair: PairRecord, shown: list[PairDecision]) -> Window:
@@ -84,20 +82,20 @@ def _window(pair: PairRecord, shown: list[PairDecision]) -> Window:
     return square(points, 0.16, 0.5 * pair.mission.sensing_range)
 
 
-def _panel_title(one: PairDecision, number: int) -> str:
+def _caption(one: PairDecision, number: int) -> list[str]:
     state = next(iter(one.states.values()))
     count, probability = len(state.belief.pair), state.belief.pair[0].probability
     hypotheses = f"{count} hypotheses" if count > 1 else "1 hypothesis"
     first = f"{math.floor(1e4 * probability) / 100:g} %"
-    end = "; claim" if any(state.verdict is not None for state in one.states.values()) else ""
+    claim = ["claim"] if any(state.verdict is not None for state in one.states.values()) else []
     ranges = f"{len(state.mutual)} mutual ranges"
-    return f"({number}) $k$ = {one.tick}, {ranges}\n{hypotheses}, first {first}{end}"
+    return [f"({number}) $k$ = {one.tick}", ranges, hypotheses, f"first {first}", *claim]
 
 
 def _panel(axes: Axes, pair: PairRecord, one: PairDecision) -> None:
     for role in ROLES:
         anchor = pair.robot(role).anchor
-        axes.plot(anchor.x, anchor.y, "x", color="k", ms=6, mew=1.4, zorder=2)
+        axes.plot(anchor.x, anchor.y, "x", color="k", ms=5, mew=1.2, zorder=2)
         circle(
             axes,
             (anchor.x, anchor.y),
@@ -111,7 +109,7 @@ def _panel(axes: Axes, pair: PairRecord, one: PairDecision) -> None:
     for role, state in one.states.items():
         for i, (pose, held) in enumerate(zip(state.belief.poses, state.belief.pair, strict=True)):
             axes.plot(
-                pose.x, pose.y, MARKS[role]["marker"], ms=3.0 + 5.0 * math.sqrt(held.probability),
+                pose.x, pose.y, MARKS[role]["marker"], ms=2.5 + 4.5 * math.sqrt(held.probability),
                 mfc=COLOURS[role] if i == 0 else "white", mec=COLOURS[role], mew=0.9, zorder=4 + (i == 0),
                 gid=f"hypothesis-{one.tick}-{role}-{i + 1}",
             )  # fmt: skip

@@ -14,17 +14,28 @@ from matplotlib.figure import Figure
 from agent.estimation.closed_forms import Placement
 from agent.planning.phase3_last_manoeuvre import Array, Compared, LastManoeuvre, Plan, compared
 from compose.figures.pair import ROLES, PairRecord
-from compose.figures.sheet import ANCHORS, NO_ENCOUNTER, ROW, SMALL, Absent, Sheet, circle, equal
-from compose.figures.style import COLOURS, INK, MARKS, PALE, PALER
+from compose.figures.sheet import (
+    ANCHORS,
+    EDGE,
+    FOOT,
+    GAP,
+    HEAD,
+    LABEL,
+    LEFT,
+    NO_ENCOUNTER,
+    Absent,
+    Sheet,
+    circle,
+    named,
+)
+from compose.figures.style import INK, MARKS, PALE, PALER, SCREEN, Medium
 from compose.figures.trajectory import heading
+from compose.view.colours import COLOURS
 from protocol.mission import Mission, Role
 from protocol.motion import ORIGIN, Pose, compose, step
 
-PLANE, COST = 3.7, 2.4
-"""The widths of the plane's panel and of the panel with the value of eq. (8), in inches."""
-COLUMNS = 3
-SIGNS = 6
-"""The number of entries in the key, without the candidates."""
+PLANE = 3.4
+"""The width and height of the plane's panel, in inches; the panel with the value of eq. (8) is beside it."""
 AROUND = 1.14
 """The half-width of the window, as a multiple of the largest distance from the robot that must be visible."""
 FINE = 24
@@ -49,12 +60,12 @@ def planned(pair: PairRecord, role: Role) -> Iterator[Planned]:
             yield Planned(state.tick, before)
 
 
-def draw(pair: PairRecord) -> dict[str, Figure | Absent]:
+def draw(pair: PairRecord, medium: Medium = SCREEN) -> dict[str, Figure | Absent]:
     """Return a figure of each plan, by the name "ROBOT-TICK"."""
     found: dict[str, Figure | Absent] = {}
     for role in ROLES:
         for one in planned(pair, role):
-            found[f"{pair.robot(role).id}-{one.tick}"] = _figure(pair, one)
+            found[f"{pair.robot(role).id}-{one.tick}"] = _figure(pair, one, medium)
     if not found:
         why = pair.unknown or "no last manoeuvre was planned"
         found[pair.name] = Absent(NO_ENCOUNTER if pair.encounter_tick is None else why)
@@ -96,12 +107,11 @@ def _inverse(placement: Placement) -> Pose:
     )  # fmt: skip
 
 
-def _figure(pair: PairRecord, one: Planned) -> Figure:
+def _figure(pair: PairRecord, one: Planned, medium: Medium) -> Figure:
     seen, plan, mission = scene(one.plan), one.plan, pair.mission
     ways = compared(plan.question, mission, pair.planner_name)
-    below = 0.5 + ROW * math.ceil((SIGNS + len(seen.others)) / COLUMNS) + 0.05
-    sheet = Sheet(0.6 + PLANE + 0.75 + COST + 0.2, below + PLANE + 0.08, [pair.title, _title(pair, one)])
-    axes = sheet.panel(0.6, below, PLANE, PLANE)
+    sheet = Sheet(medium, False, [pair.title, _title(pair, one)])
+    axes, value = sheet.panel(), sheet.panel()
     half = AROUND * max(
         mission.max_speed * mission.period,
         *[math.hypot(p.x - seen.mover.x, p.y - seen.mover.y) for p in seen.others],
@@ -109,13 +119,16 @@ def _figure(pair: PairRecord, one: Planned) -> Figure:
     _candidates(axes, pair, one, seen, half)
     _reach(axes, pair, plan, seen, ways)
     x, y = seen.mover.x, seen.mover.y
-    equal(axes, (x - half, x + half, y - half, y + half))
-    axes.set_xlabel("$x$ [m]")
-    axes.set_ylabel("$y$ [m]")
-    value = sheet.panel(0.6 + PLANE + 0.75, below, COST, PLANE)
+    named(axes, (x - half, x + half, y - half, y + half))
     draw_cost(value, plan, ways, mission)
-    sheet.key(axes, 0.6, below - 0.48, columns=COLUMNS)
-    return sheet.figure
+    top, left = sheet.top + HEAD, LEFT + PLANE + LEFT + GAP
+    if value.get_legend_handles_labels()[0]:
+        top += sheet.key(value, left, top, sheet.width - left)
+    sheet.place(axes, LEFT, top, PLANE, PLANE)
+    sheet.place(value, left, top, sheet.width - left - 2 * EDGE, PLANE)
+    sheet.top = top + PLANE + FOOT
+    sheet.key_below(axes)
+    return sheet.finished()
 
 
 def _title(pair: PairRecord, one: Planned) -> str:
@@ -164,8 +177,7 @@ def _candidates(axes: Axes, pair: PairRecord, one: Planned, seen: ManoeuvreView,
         )  # fmt: skip
         axes.annotate(
             str(i), (place.x, place.y), xytext=(-13 * (place.x - x) / away, -13 * (place.y - y) / away),
-            textcoords="offset points", ha="center", va="center", fontsize=9, zorder=6,
-            bbox={"facecolor": "white", "alpha": 0.8, "pad": 0.6, "lw": 0},
+            textcoords="offset points", ha="center", va="center", zorder=6, bbox=LABEL,
         )  # fmt: skip
     axes.plot([], [], ls="", label=after)
 
@@ -270,8 +282,3 @@ def draw_cost(axes: Axes, plan: Plan, ways: Compared, mission: Mission) -> None:
         if plan.separation_m2 is not None
         else "decrease of squared range [m$^2$]"
     )
-    axes.tick_params(labelsize=SMALL)
-    if axes.get_legend_handles_labels()[0]:
-        axes.legend(
-            frameon=False, fontsize=SMALL, loc="lower center", bbox_to_anchor=(0.5, 1.0), borderaxespad=0.2
-        )

@@ -1,99 +1,263 @@
-"""The figure of one robot's mission: the plane, the position error, and the hypotheses."""
+"""The figure of one robot's mission: its estimates in the plane, their errors, and its hypotheses."""
 
 from __future__ import annotations
 
-import textwrap
-from typing import Any, Literal
+import math
 
+import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap, to_hex, to_rgba
 from matplotlib.figure import Figure
-from matplotlib.legend import Legend
+from matplotlib.patches import Ellipse, FancyArrowPatch, Wedge
+from matplotlib.ticker import MaxNLocator
+from matplotlib.typing import ColorType
 
-from compose.figures import belief, plane
-from compose.figures.story import Story
-from compose.recording.summary_json import ended
+from compose.figures.over_time import AXIS, TALL, draw_errors, draw_hypotheses, timed
+from compose.figures.pair import PairRecord, Side, error, others
+from compose.figures.sheet import (
+    FOOT,
+    GAP,
+    HEAD,
+    LEFT,
+    NO_TRUTH,
+    ROW,
+    WORDS,
+    Absent,
+    Sheet,
+    fitted,
+    named,
+    plain,
+)
+from compose.figures.style import INK, PALE, SCREEN, Medium
+from compose.figures.trajectory import draw_plane, window
+from compose.recording.run import ended
+from compose.view.colours import COLOURS
+from protocol.messages import Estimate
+from protocol.mission import Role
+from protocol.motion import ORIGIN, Pose
+from protocol.rounding import TOLERANCE
 
-Corner = Literal["upper left", "lower left", "upper right"]
-WIDTH, PLANE, BESIDE = 8.6, 5.2, 2.4
-"""The widths of the figure, of its left column, and of its right column, in inches."""
-NEAR, KEY, KEYS, ERROR, PROBABILITY, REST = 2.7, 0.9, 2.2, 1.9, 1.9, 0.6
-"""Heights in inches.
+NEAR, BESIDE, TALLEST = 1.9, 2.1, 4.4
+"""The widths of the enlarged panel and of the keys, and the maximum height of the plane, in inches."""
+AGES: dict[Role, LinearSegmentedColormap] = {
+    "a": LinearSegmentedColormap.from_list("ages-a", ["#9cc9ea", COLOURS["a"], "#04263f"]),
+    "b": LinearSegmentedColormap.from_list("ages-b", ["#f2b79f", COLOURS["b"], "#4a1608"]),
+}
+"""The colours of estimates over time by role, from the first to the last: the robot's hue, ever darker."""
+SIGMAS = 3.0
+ELLIPSES = 5
+"""The maximum number of error ellipses."""
+SMALLER = 0.75
+"""The largest size ratio, later over earlier, at which two overlapping ellipses are both legible."""
+AROUND = 2.2
+"""The maximum half-width of the enlarged panel, as a multiple of the last ellipse's size."""
+EXACTLY = 0.02
+"""The minimum half-width of the enlarged panel with exact sensors, as a fraction of the sensing range."""
+ARROW = 0.55
+"""The length of a heading arrow, as a fraction of that half-width."""
 
-NEAR is the enlarged panel, KEY and KEYS the keys in one row and in one column, ERROR and PROBABILITY the
-panels over time, and REST the title.
-"""
-WIDE = 3.9
-"""The height of the plane, in inches, below which the keys are placed below it."""
-OVER_TIME: list[Any] = [["error", "error key"], ["probability", "probability key"]]
-RIGHT: list[Any] = [["plane", "near"], ["plane", "key"], *OVER_TIME]
-BELOW: list[Any] = [["plane", "near"], ["key", "key"], *OVER_TIME]
-LINE = 100
-"""The maximum length of a title line, in characters."""
+
+def draw(pair: PairRecord, role: Role, medium: Medium = SCREEN) -> Figure | Absent:
+    """Return the figure: the plane, the enlarged panel with the keys beside it, and two panels over time."""
+    if not pair.true:
+        return Absent(NO_TRUTH)
+    sheet = Sheet(medium, False, _title(pair, role))
+    _top(sheet, pair, role)
+    sheet.top += GAP + WORDS
+    width = sheet.width - AXIS - BESIDE - GAP
+    for row in ("errors", "hypotheses"):
+        axes = sheet.panel()
+        timed(axes, pair, width, role, phases=row == "errors", label=row == "hypotheses")
+        if row == "errors":
+            draw_errors(axes, pair, "position", role)
+        else:
+            draw_hypotheses(axes, pair, role)
+        sheet.place(axes, AXIS, sheet.top, width, TALL - 0.3)
+        sheet.key(axes, AXIS + width + GAP, sheet.top, BESIDE)
+        sheet.top += TALL - 0.3 + GAP + WORDS
+    sheet.top += FOOT - WORDS - GAP + (WORDS if pair.mission.period != 1.0 else 0.0)
+    return sheet.finished()
 
 
-def figure_of(story: Story) -> Figure:
-    """Return the figure: panels in the left column, the enlarged panel and the keys in the right column."""
-    left, right, low, high = plane.window(story)
-    tall = min(PLANE * (high - low) / (right - left), PLANE)
-    if tall < WIDE:
-        layout, heights = BELOW, [max(tall, NEAR), KEY, ERROR, PROBABILITY]
+def _top(sheet: Sheet, pair: PairRecord, role: Role) -> None:
+    """Draw the plane, the enlarged panel to its right, and their keys below the two, or below the latter."""
+    axes, near, visible = sheet.panel(), sheet.panel(), window(pair)
+    draw_plane(axes, pair, role)
+    draw_estimates(axes, pair, role)
+    named(axes, visible)
+    draw_near(near, pair, role)
+    width, height = fitted(visible, sheet.room - NEAR - LEFT - 2 * GAP, TALLEST)
+    top, left = sheet.top + HEAD + WORDS, LEFT + width + LEFT + 2 * GAP
+    sheet.place(axes, LEFT, top, width, height)
+    sheet.place(near, left, top, NEAR, NEAR)
+    right = top + NEAR + FOOT + GAP / 2
+    if pair.robot(role).likeliest:
+        right += sheet.key(near, left, right, sheet.width - left, title="estimates, by tick") + GAP / 2
+    _, labels = axes.get_legend_handles_labels()
+    if right + len(labels) * ROW <= top + height + FOOT:
+        right += sheet.key(axes, left, right, 0.0)
+        sheet.top = max(right, top + height + FOOT)
     else:
-        layout, heights = RIGHT, [NEAR, max(tall, NEAR + KEYS) - NEAR, ERROR, PROBABILITY]
-    figure = Figure(figsize=(WIDTH, sum(heights) + REST), layout="constrained")
-    panels = figure.subplot_mosaic(layout, height_ratios=heights, width_ratios=[PLANE, BESIDE])
-    for key in ("key", "error key", "probability key"):
-        panels[key].set_axis_off()
-    plane.draw(panels["plane"], story)
-    plane.draw_near(panels["near"], story)
-    belief.draw_error(panels["error"], story)
-    belief.draw_probability(panels["probability"], story)
-    columns = 1 if layout is RIGHT else 3
-    legend = key_of(panels["key"], panels["plane"], "upper left", columns)
-    if story.likeliest:
-        panels["key"].add_artist(legend)
-        corner: Corner = "lower left" if layout is RIGHT else "upper right"
-        key_of(panels["key"], panels["near"], corner, 3, title="estimates, by tick")
-    key_of(panels["error key"], panels["error"], "upper left")
-    key_of(panels["probability key"], panels["probability"], "upper left")
-    figure.suptitle(_title(story), x=0.012, ha="left", fontsize=9.5)
-    return figure
+        sheet.top = max(right, top + height + FOOT)
+        sheet.key_below(axes)
 
 
-def key_of(beside: Axes, panel: Axes, corner: Corner, columns: int = 1, title: str | None = None) -> Legend:
-    """Draw the legend of `panel` in the empty axes `beside` it, and return it."""
-    handles, labels = panel.get_legend_handles_labels()
-    legend: Legend = beside.legend(
-        handles,
-        labels,
-        loc=corner,
-        title=title,
-        title_fontsize=8,
-        alignment="left",
-        ncols=columns,
-        handlelength=1.0 if title else 1.8,
-        columnspacing=0.9,
-        labelspacing=0.35,
-        frameon=False,
-        fontsize=8,
-        borderaxespad=0.0,
-    )
-    return legend
-
-
-def _title(story: Story) -> str:
+def _title(pair: PairRecord, role: Role) -> list[str]:
     """Return the title: the robot, the outcome of the mission, and the robot's claim."""
-    recording, claim = story.recording, story.claim
-    end = (
-        "the recording breaks off"
-        if recording.end is None
-        else ended(recording.end.outcome, story.last, recording.end.reason)
+    one, scenario, ending = pair.robot(role), pair.run.scenario, pair.run.end
+    end = "the recording breaks off" if ending is None else ended(ending.outcome, pair.last, ending.reason)
+    first = f"Robot {one.id} of {scenario.name}, seed {scenario.seed}: {end}"
+    if one.claim is None:
+        return [first, "The robot claims no pose."]
+    errors = f"errors {one.claim.position_error:.2g} m and {one.claim.heading_error:.2g} rad"
+    sigma = one.claim.covariance
+    sigmas = f" (sigmas {sigma.position_sigma:.2g} m and {sigma.heading_sigma:.2g} rad)" if sigma else ""
+    return [first, plain(f"The robot claims its pose in tick {one.claim.tick}: {errors}{sigmas}.")]
+
+
+def draw_estimates(axes: Axes, pair: PairRecord, role: Role) -> None:
+    """Draw the most probable pose over time, ever darker, legible error ellipses, and the other poses."""
+    one, ages = pair.robot(role), AGES[role]
+    left, right, low, high = window(pair)
+    ghosts = [pose for estimate, _ in one.placed for pose in others(estimate)]
+    within = [pose for pose in ghosts if left <= pose.x <= right and low <= pose.y <= high]
+    if within:
+        weighed = any(estimate.probabilities for estimate, _ in one.placed)
+        axes.plot(
+            [p.x for p in within], [p.y for p in within], "x", ms=3.6, mew=0.8, color=COLOURS[role],
+            alpha=0.5, gid="ghosts", label="other hypotheses" if weighed else "possible poses",
+        )  # fmt: skip
+    if not one.likeliest:
+        return
+    shown = legible(pair, role)
+    poses = [estimate.world[0] for estimate, _ in one.likeliest]
+    axes.scatter(
+        [p.x for p in poses], [p.y for p in poses], s=7, marker="D", c=list(_ages(one, role).values()),
+        zorder=3, gid="estimates",
+    )  # fmt: skip
+    for estimate, _ in shown:
+        _ellipse(axes, one, role, estimate, ORIGIN, f"ellipse-{estimate.tick}")
+    final = poses[-1]
+    axes.plot(final.x, final.y, "*", ms=9, mfc=ages(1.0), mec="white", mew=0.6, zorder=5, gid="final")
+    axes.plot(
+        [], [], "-" if shown else "", marker="D", ms=3, lw=1.0, color=ages(0.8),
+        label="estimate, 3 sigma" if shown else "estimate",
+    )  # fmt: skip
+
+
+def _ages(one: Side, role: Role) -> dict[int, str]:
+    """Return the colours of the estimates in `one.likeliest`, by tick."""
+    ticks = [estimate.tick for estimate, _ in one.likeliest]
+    return {
+        tick: to_hex(AGES[role](i / (len(ticks) - 1) if len(ticks) > 1 else 1.0))
+        for i, tick in enumerate(ticks)
+    }
+
+
+def legible(pair: PairRecord, role: Role) -> list[tuple[Estimate, Pose]]:
+    """Return the estimates whose ellipses are drawn, with the true poses, in order of time.
+
+    These are the last one and earlier ones that later ellipses do not hide, ELLIPSES at most. Ellipses
+    larger than the sensing range R are omitted, because they carry no information.
+    """
+    chosen: list[tuple[Estimate, Pose]] = []
+    largest = pair.mission.sensing_range
+    for estimate, truth in reversed(pair.robot(role).likeliest):
+        if estimate.covariance is None or len(chosen) == ELLIPSES:
+            continue
+        if SIGMAS * estimate.covariance.position_sigma > largest:
+            continue
+        if chosen:
+            after = chosen[-1][0]
+            assert after.covariance is not None
+            sizes = SIGMAS * estimate.covariance.position_sigma, SIGMAS * after.covariance.position_sigma
+            apart = error(estimate.world[0], after.world[0])
+            if apart < sum(sizes) and sizes[1] > SMALLER * sizes[0]:
+                continue
+        chosen.append((estimate, truth))
+    return chosen[::-1]
+
+
+def _ellipse(axes: Axes, one: Side, role: Role, estimate: Estimate, origin: Pose, gid: str) -> None:
+    """Draw the error ellipse of the most probable position relative to `origin`; the last one is filled."""
+    pose, covariance, last = estimate.world[0], estimate.covariance, estimate is one.likeliest[-1][0]
+    if covariance is None:
+        return
+    variances, directions = np.linalg.eigh([[covariance.xx, covariance.xy], [covariance.xy, covariance.yy]])
+    height, width = 2.0 * SIGMAS * np.sqrt(np.maximum(variances, 0.0))
+    colour = _ages(one, role)[estimate.tick]
+    axes.add_patch(
+        Ellipse(
+            (pose.x - origin.x, pose.y - origin.y),
+            width,
+            height,
+            angle=math.degrees(math.atan2(directions[1, 1], directions[0, 1])),
+            facecolor=to_rgba(colour, 0.12 if last else 0.0),
+            edgecolor=colour,
+            lw=1.4 if last else 0.8,
+            zorder=4,
+            gid=gid,
+        )
     )
-    lines = [f"Robot {story.own.id} of {recording.scenario.name}, seed {recording.scenario.seed}: {end}"]
-    if claim is None:
-        lines.append("The robot claims no pose.")
-    else:
-        errors = f"errors {claim.position_error:.2g} m and {claim.heading_error:.2g} rad"
-        sigma = claim.covariance
-        sigmas = f" (sigmas {sigma.position_sigma:.2g} m and {sigma.heading_sigma:.2g} rad)" if sigma else ""
-        lines.append(f"The robot claims its pose in tick {claim.tick}: {errors}{sigmas}.")
-    return "\n".join([part for line in lines for part in textwrap.wrap(line, LINE)])
+
+
+def draw_near(axes: Axes, pair: PairRecord, role: Role) -> None:
+    """Draw the estimates relative to the true pose in the same tick, enlarged."""
+    one = pair.robot(role)
+    if not one.likeliest:
+        axes.set_axis_off()
+        axes.text(
+            0.5, 0.5, "The recording has no\nmost probable pose.",
+            transform=axes.transAxes, ha="center", va="center", color=PALE, gid="nothing-near",
+        )  # fmt: skip
+        return
+    axes.set_title("relative to the true pose", color=PALE, pad=5, loc="left")
+    axes.set_xlabel("x error [m]")
+    axes.set_ylabel("y error [m]")
+    colours, (last, truth), half = _ages(one, role), one.likeliest[-1], _half(pair, role)
+    _heading(axes, (0.0, 0.0), truth.heading, half, INK)
+    axes.plot(0.0, 0.0, "o", ms=5, color=INK, gid="near-truth", label="true")
+    for estimate, then in legible(pair, role) or [(last, truth)]:
+        pose, marker = estimate.world[0], "*" if estimate is last else "D"
+        _ellipse(axes, one, role, estimate, then, f"near-{estimate.tick}")
+        axes.plot(
+            pose.x - then.x, pose.y - then.y, marker, ms=9 if estimate is last else 3.5, ls="",
+            color=colours[estimate.tick], mec="white", mew=0.5, zorder=6, label=str(estimate.tick),
+        )  # fmt: skip
+    off = last.world[0].x - truth.x, last.world[0].y - truth.y
+    _heading(axes, off, last.world[0].heading, half, AGES[role](1.0))
+    if last.covariance is not None:
+        spread = math.degrees(min(math.pi, SIGMAS * last.covariance.heading_sigma))
+        middle = math.degrees(last.world[0].heading)
+        axes.add_patch(
+            Wedge(
+                off, ARROW * half, middle - spread, middle + spread, color=AGES[role](1.0), alpha=0.15, lw=0
+            )
+        )
+    axes.set_xlim(-half, half)
+    axes.set_ylim(-half, half)
+    axes.xaxis.set_major_locator(MaxNLocator(4))
+    axes.yaxis.set_major_locator(MaxNLocator(4))
+    axes.grid(lw=0.4, color="0.9")
+
+
+def _half(pair: PairRecord, role: Role) -> float:
+    """Return the half-width of the enlarged panel, in m."""
+
+    def size(estimate: Estimate, truth: Pose) -> float:
+        sigma = estimate.covariance.position_sigma if estimate.covariance is not None else 0.0
+        return SIGMAS * sigma + error(estimate.world[0], truth)
+
+    last = size(*pair.robot(role).likeliest[-1])
+    most = max([size(*one) for one in legible(pair, role)], default=last)
+    least = EXACTLY * pair.mission.sensing_range if pair.exact else TOLERANCE
+    return max(min(1.1 * most, AROUND * last), least)
+
+
+def _heading(axes: Axes, at: tuple[float, float], heading: float, half: float, colour: ColorType) -> None:
+    tip = at[0] + ARROW * half * math.cos(heading), at[1] + ARROW * half * math.sin(heading)
+    axes.add_patch(
+        FancyArrowPatch(
+            at, tip, arrowstyle="-|>", mutation_scale=8, color=colour, lw=1.1, shrinkA=0, shrinkB=0
+        )
+    )

@@ -1,33 +1,37 @@
-"""Ranges, separation and errors over time, for the whole mission and enlarged for the encounter."""
+"""Ranges, separation, errors and hypotheses over time, on an axis that gives each phase its own scale."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatterMathtext, LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
-from compose.figures.pair import ROLES, PairRecord
-from compose.figures.sheet import ANCHORS, NO_TRUTH, ROW, SMALL, Absent, Sheet
-from compose.figures.style import COLOURS, INK, MARKS, PALE, SHADE
+from compose.figures.pair import ROLES, PairRecord, Span, error, others
+from compose.figures.sheet import ANCHORS, EDGE, FOOT, GAP, NO_TRUTH, WORDS, Absent, Sheet, measured
+from compose.figures.style import INK, MARKS, PALE, SCREEN, SHADE, Medium
 from compose.recording.claim import Claim
-from protocol.messages import Estimate
+from compose.view.colours import COLOURS
 from protocol.mission import Role
-from protocol.motion import Pose, wrap
+from protocol.motion import Covariance, Pose, wrap
 from protocol.rounding import TOLERANCE
 
-WHOLE, NEAR = 4.4, 2.2
-"""The widths of the panels of the mission and of the encounter, in inches."""
-APART = 0.5
-TALL, BETWEEN, LEFT = 2.2, 0.2, 0.75
-BEFORE = 3
-"""The number of ticks shown before the encounter."""
-MARKED = 90
-"""The maximum number of markers on a line."""
+AXIS, TALL = 0.72, 1.9
+"""The space left of a panel over time for its axis, and the height of the panel, in inches."""
+PHASES = {1: "own anchor", 2: "search for the peer", 3: "encounter"}
+SHADES = {1: "0.93", 2: "1.0", 3: "0.97"}
+NARROW = 0.18
+"""The fraction of the width below which a phase is too narrow, so that each phase gets its own scale."""
+SHARES = (0.3, 0.45)
+"""The bounds of a phase's fraction of the width in that case, before normalisation."""
+DIGIT, LABELS = 0.078, 3.2
+"""The width of a digit of a tick label, in inches, and the approximate number of tick labels per inch."""
+DENSE = 30
+"""The number of ticks in a phase from which on single ticks get no marker."""
 LEAST = 1e-16
 """The smallest error drawn, in m or rad. Smaller errors are drawn at this value."""
 LINES: dict[Role, Any] = {"a": "-", "b": (0, (4, 1.5))}
@@ -35,78 +39,150 @@ ALONE: dict[Role, Any] = {"a": "-.", "b": (0, (1, 1))}
 CLAIMED: dict[Role, Any] = {"a": (0, (6, 1.5, 1, 1.5, 1, 1.5)), "b": (0, (1, 3))}
 """Line styles by role: LINES of the most probable pose, ALONE before the encounter, CLAIMED of sigmas.
 
-No two are the same, so the lines differ without colour.
+No two are the same, so the lines differ without colour. The phase is that of the axis.
 """
 SIGMAS = 3.0
 ROOM = 4.0
 """The factor by which the error scale extends beyond the drawn values."""
-KEY_ROWS = 4
-"""The maximum number of rows in the key of the errors."""
+SHORT = 20.0
+"""The ratio of a logarithmic scale's ends below which powers of ten give too few tick labels."""
+RANKS = 6
+"""The number of hypotheses drawn as lines."""
+BEYOND = 0.05
+"""The end of the probability scale, as a fraction of 1 - confidence."""
+SUREST = 1e-12
+"""The smallest distance of the probability scale's ends from 0 and 1."""
 
-Points = list[tuple[int, float]]
-
-
-def ranges(pair: PairRecord) -> Figure:
-    """Return the figure of the measured ranges and of the robots' separation."""
-    tall, key = TALL + 0.4, 2 * ROW + 0.05
-    sheet = Sheet(_width(), 0.53 + tall + key, [pair.title])
-    panels = _panels(sheet, pair, key + 0.45, tall)
-    for axes in panels:
-        _shade(axes, pair)
-        _ranges(axes, pair)
-    for axes in panels[1:]:
-        highest = max(pair.separations[max(0, (pair.encounter_tick or 0) - BEFORE) :], default=0.0)
-        axes.set_ylim(0.0, 1.1 * max(pair.mission.sensing_range, highest))
-    panels[0].set_ylabel("distance [m]")
-    sheet.key(panels[0], LEFT, key, columns=3)
-    return sheet.figure
+Points = Sequence[tuple[int, float]]
+Quantity = Literal["position", "heading"]
 
 
-def _width() -> float:
-    return LEFT + WHOLE + APART + NEAR + 0.15
+# --- the axis -----------------------------------------------------------------------------------------
 
 
-def _panels(sheet: Sheet, pair: PairRecord, bottom: float, tall: float, *, named: bool = True) -> list[Axes]:
-    """Return the panel of all ticks, and the panel of the encounter if there was one."""
-    width = WHOLE if pair.encounter_tick is not None else WHOLE + APART + NEAR
-    panels = [sheet.panel(LEFT, bottom, width, tall)]
-    panels[0].set_xlim(-0.5, pair.last + 0.5)
-    if pair.encounter_tick is not None:
-        near = sheet.panel(LEFT + WHOLE + APART, bottom, NEAR, tall)
-        near.set_xlim(max(0, pair.encounter_tick - BEFORE) - 0.4, pair.last + 0.4)
-        panels.append(near)
-    for i, axes in enumerate(panels):
-        axes.tick_params(labelsize=SMALL)
-        axes.xaxis.set_major_locator(MaxNLocator(8 if i == 0 else 5, integer=True, min_n_ticks=1))
-        axes.xaxis.set_minor_locator(NullLocator())
-        if named:
-            period = pair.mission.period
-            axes.set_xlabel(f"tick $k$ ({period:g} s)" if i == 0 else "encounter")
-        else:
-            axes.tick_params(labelbottom=False)
-    return panels
+def timed(
+    axes: Axes, pair: PairRecord, width: float, *roles: Role, phases: bool = True, label: bool = True
+) -> None:
+    """Set up the time axis of `axes`, `width` inches wide: phases of the robots with `roles`, and contact.
 
-
-def _shade(axes: Axes, pair: PairRecord) -> None:
-    """Shade the ticks in contact."""
+    `phases` writes their names above the panel, and `label` that of the axis below it.
+    """
+    spans = pair.spans(*roles)
+    ticks, shares = _edges(spans)
+    even = np.allclose(np.diff(ticks) / (ticks[-1] - ticks[0]), np.diff(shares))
+    if not even:
+        scales = (lambda x: _along(x, ticks, shares), lambda x: _along(x, shares, ticks))
+        axes.set_xscale("function", functions=scales)
+    axes.set_xlim(ticks[0], ticks[-1])
+    for span, left, right in zip(spans, ticks, ticks[1:], strict=False):
+        axes.axvspan(left, right, color=SHADES[span.phase], lw=0, zorder=-3, gid=f"phase-{span.phase}")
+        if left > ticks[0]:
+            axes.axvline(left, color="0.6", lw=0.6, zorder=-1)
     for i, (first, last) in enumerate(pair.contacts):
         axes.axvspan(
             first - 0.5, last + 0.5, color=SHADE, lw=0, zorder=-2, gid=f"contact-{first}-{last}",
             label="in contact" if i == 0 else None,
         )  # fmt: skip
+    if phases:
+        for span, left, right in zip(spans, shares, shares[1:], strict=False):
+            names = (f"{span.phase}: {PHASES[span.phase]}", f"phase {span.phase}", str(span.phase))
+            fit = next((name for name in names[:2] if measured(name) < (right - left) * width), names[2])
+            axes.text((left + right) / 2, 1.03, fit, transform=axes.transAxes, ha="center", color="0.3")
+    scaled = [Span(0, spans[0].first, spans[-1].last)] if even else spans
+    axes.xaxis.set_major_locator(FixedLocator(_marks(scaled, ticks, [0.0, 1.0] if even else shares, width)))
+    axes.xaxis.set_minor_locator(NullLocator())
+    if not label:
+        axes.tick_params(labelbottom=False)
+        return
+    period = pair.mission.period
+    if period == 1.0:
+        axes.xaxis.set_major_formatter("{x:g}")
+        name = "tick (1 s)"
+    else:
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}\n{x * period:g} s"))
+        name = "tick and time since the start"
+    axes.set_xlabel(name if even else f"{name}; one scale per phase")
+
+
+def _edges(spans: Sequence[Span]) -> tuple[list[float], list[float]]:
+    """Return the boundaries of the phases, in ticks and as fractions of the width."""
+    ticks = [spans[0].first - 0.5, *[span.last + 0.5 for span in spans]]
+    shares = np.diff(ticks) / (ticks[-1] - ticks[0])
+    if min(shares) < NARROW:
+        shares = np.clip(shares, *SHARES)
+        shares = shares / shares.sum()
+    return ticks, [0.0, *np.cumsum(shares).tolist()]
+
+
+def _along(values: Any, here: list[float], there: list[float]) -> Any:
+    """Map `values` by the piecewise linear function from the knots `here` to `there`, with extrapolation."""
+    x, begins, goals = np.asarray(values, float), np.asarray(here), np.asarray(there)
+    piece = np.clip(np.searchsorted(begins, x) - 1, 0, len(begins) - 2)
+    slopes = np.diff(goals) / np.diff(begins)
+    return goals[piece] + slopes[piece] * (x - begins[piece])
+
+
+def _marks(spans: Sequence[Span], ticks: list[float], shares: list[float], width: float) -> list[float]:
+    """Return the ticks with labels: round numbers in each phase that do not overlap."""
+    marked: list[float] = []
+    end = -1.0
+    for span, share in zip(spans, np.diff(shares), strict=True):
+        count = max(1, int(LABELS * width * share))
+        for tick in MaxNLocator(nbins=count, integer=True, steps=[1, 2, 5, 10]).tick_values(
+            span.first, span.last
+        ):
+            half = 0.5 * DIGIT / width * (len(f"{tick:g}") + 1)
+            at = float(_along(tick, [ticks[0], ticks[-1]] if len(spans) == 1 else ticks, shares))
+            if span.first <= tick <= span.last and at - half >= end:
+                marked.append(float(tick))
+                end = at + half
+    return marked
+
+
+def _marked(pair: PairRecord, role: Role, ticks: Sequence[int]) -> list[int]:
+    """Return the indices of the ticks whose phase is short enough for a marker at each tick."""
+    sparse: set[int] = set()
+    for span in pair.spans(role):
+        if span.last - span.first < DENSE:
+            sparse.update(range(span.first, span.last + 1))
+    return [i for i, tick in enumerate(ticks) if tick in sparse]
+
+
+# --- ranges -------------------------------------------------------------------------------------------
+
+
+def ranges(pair: PairRecord, medium: Medium = SCREEN) -> Figure:
+    """Return the figure of the measured ranges and of the robots' separation."""
+    sheet = Sheet(medium, True, [pair.title])
+    axes = sheet.panel()
+    width = sheet.width - AXIS - EDGE
+    timed(axes, pair, width, *ROLES)
+    _ranges(axes, pair)
+    axes.set_ylabel("distance [m]")
+    sheet.top += WORDS
+    sheet.place(axes, AXIS, sheet.top, width, TALL + 0.3)
+    sheet.top += TALL + 0.3 + FOOT + _second_row(pair)
+    sheet.key_below(axes)
+    return sheet.finished()
+
+
+def _second_row(pair: PairRecord) -> float:
+    """Return the height of the times below the ticks, in inches."""
+    return WORDS if pair.mission.period != 1.0 else 0.0
 
 
 def _ranges(axes: Axes, pair: PairRecord) -> None:
     apart = pair.separations[: len(pair.mutual)]
     if apart:
         axes.plot(
-            range(len(apart)), apart, "-", lw=1.2, color=INK, zorder=2, gid="separation",
+            range(len(apart)), apart, "-", lw=1.1, color=INK, zorder=2, gid="separation",
             label="true separation" if pair.true else "separation, from claims",
         )  # fmt: skip
     for role in ROLES:
+        one = pair.robot(role)
         _measured(
-            axes, pair.robot(role).anchor_ranges, f"anchor-range-{role}", COLOURS[role], MARKS[role],
-            rf"$\rho$ of {pair.robot(role).id} to ${ANCHORS[role]}$, measured",
+            axes, one.anchor_ranges, f"anchor-range-{one.id}", COLOURS[role], MARKS[role],
+            rf"$\rho$ of {one.id} to ${ANCHORS[role]}$, measured",
         )  # fmt: skip
     diamonds = {"marker": "D", "markerfacecolor": INK, "markeredgecolor": INK}
     mutual = [rho for _, rho in pair.mutual]
@@ -120,96 +196,122 @@ def _measured(
     axes: Axes, values: Sequence[float | None], gid: str, colour: str, mark: dict[str, Any], label: str
 ) -> None:
     points = [(tick, rho) for tick, rho in enumerate(values) if rho is not None]
-    if not points:
-        return
-    axes.plot(
-        [tick for tick, _ in points], [rho for _, rho in points], ls="", ms=4, mew=1.0, color=colour, gid=gid,
-        markevery=max(1, math.ceil(len(points) / (2 * MARKED))), label=label, zorder=3, **mark,
-    )  # fmt: skip
+    if points:
+        ticks, measured_ranges = zip(*points, strict=True)
+        axes.plot(
+            ticks,
+            measured_ranges,
+            ls="",
+            ms=3.2,
+            mew=0.9,
+            color=colour,
+            gid=gid,
+            label=label,
+            zorder=3,
+            **mark,
+        )
 
 
 # --- errors -------------------------------------------------------------------------------------------
 
 
-def errors(pair: PairRecord) -> Figure | Absent:
+def errors(pair: PairRecord, medium: Medium = SCREEN) -> Figure | Absent:
     """Return the figure of the position and heading errors of both robots."""
     if not pair.true:
         return Absent(NO_TRUTH)
-    if not any(_held(pair, role) for role in ROLES):
+    if not any(pair.robot(role).estimates for role in ROLES):
         return Absent("neither robot has an estimate of its pose")
-    key = KEY_ROWS * ROW + 0.05
-    sheet = Sheet(_width(), 0.53 + 2 * TALL + BETWEEN + key, [pair.title])
-    rows: list[tuple[str, str, Callable[[Pose, Pose], float], Callable[[Claim], float]]] = [
-        ("position", "position error [m]", _position_error, lambda claim: claim.position_error),
-        ("heading", "heading error [rad]", _heading_error, lambda claim: claim.heading_error),
-    ]
-    for i, (name, label, off, of_claim) in enumerate(rows):
-        bottom = key + 0.45 + (1 - i) * (TALL + BETWEEN)
-        panels = _panels(sheet, pair, bottom, TALL, named=i == 1)
-        for axes in panels:
-            _shade(axes, pair)
-            for role in ROLES:
-                _errors(axes, pair, role, name, off)
-                _claimed(axes, pair, role, of_claim)
-        panels[0].set_ylabel(label)
-        _scale(panels, pair, name)
-        if i == 0:
-            sheet.key(panels[0], LEFT, key, columns=3)
-    return sheet.figure
+    sheet = Sheet(medium, True, [pair.title])
+    quantities: tuple[Quantity, ...] = ("position", "heading")
+    sheet.top += WORDS
+    width = sheet.width - AXIS - EDGE
+    for quantity in quantities:
+        axes, last = sheet.panel(), quantity == "heading"
+        timed(axes, pair, width, *ROLES, phases=not last, label=last)
+        draw_errors(axes, pair, quantity, *ROLES)
+        sheet.place(axes, AXIS, sheet.top, width, TALL)
+        sheet.top += TALL + GAP
+    sheet.top += FOOT - GAP + _second_row(pair)
+    sheet.key_below(sheet.figure.axes[0])
+    return sheet.finished()
 
 
-def _position_error(pose: Pose, truth: Pose) -> float:
-    return math.hypot(pose.x - truth.x, pose.y - truth.y)
+def draw_errors(axes: Axes, pair: PairRecord, quantity: Quantity, *roles: Role) -> None:
+    """Draw the errors of the most probable pose and of the other possible poses, and the claimed sigmas.
+
+    Before the encounter, draw those of the pose relative to the anchor. Of one robot, the claimed sigma is
+    drawn too, and the errors within 3 sigma are shaded.
+    """
+    off = error if quantity == "position" else _heading_error
+    sigmas: Points = ()
+    for role in roles:
+        sigmas = _errors(axes, pair, role, quantity, off)
+    if pair.exact:
+        axes.axhline(TOLERANCE, ls="-.", lw=0.9, color=PALE, gid="tolerance", zorder=1,
+                     label="tolerance: 1e-6 m" + (" or rad" if len(roles) > 1 else ""))  # fmt: skip
+    elif quantity == "position":
+        required = pair.mission.accuracy
+        axes.axhline(required, ls="-.", lw=0.9, color=PALE, gid="accuracy", zorder=1,
+                     label=f"required sigma: {required:g} m")  # fmt: skip
+    if len(roles) == 1 and sigmas:
+        _line(axes, sigmas, lw=0.7, ls="-", color=COLOURS[roles[0]], gid="sigma", label="claimed sigma")
+    _scale(axes)
+    if len(roles) == 1 and sigmas:
+        low, _ = axes.get_ylim()
+        ticks, values = np.array(sigmas).T
+        axes.fill_between(
+            ticks, low, np.maximum(SIGMAS * values, low), color=COLOURS[roles[0]], alpha=0.12, lw=0, zorder=0,
+            gid="envelope",
+        )  # fmt: skip
+    axes.set_ylabel(f"{quantity} error [{'m' if quantity == 'position' else 'rad'}]")
 
 
 def _heading_error(pose: Pose, truth: Pose) -> float:
     return abs(wrap(pose.heading - truth.heading))
 
 
-def _held(pair: PairRecord, role: Role) -> list[tuple[Estimate, Pose]]:
-    """Return each estimate with the true pose in the same tick."""
-    account, truth = pair.robot(role).account, pair.robot(role).path
-    held = account.held if account is not None else ()
-    return [(one, truth[one.tick]) for one in held if one.tick < len(truth)]
-
-
-def _errors(axes: Axes, pair: PairRecord, role: Role, name: str, off: Callable[[Pose, Pose], float]) -> None:
-    """Draw the errors of the most probable pose and of the other possible poses.
-
-    Before the encounter, draw those of the pose relative to the anchor.
-    """
-    held, robot, colour = _held(pair, role), pair.robot(role), COLOURS[role]
+def _errors(
+    axes: Axes, pair: PairRecord, role: Role, quantity: Quantity, off: Callable[[Pose, Pose], float]
+) -> Points:
+    """Draw the errors of one robot, and return its claimed sigmas."""
+    robot, colour = pair.robot(role), COLOURS[role]
     anchor = robot.anchor
     alone = [
-        (one.tick, max(_alone(pose, Pose(truth.x - anchor.x, truth.y - anchor.y, truth.heading))[name]
+        (one.tick, max(_alone(pose, Pose(truth.x - anchor.x, truth.y - anchor.y, truth.heading))[quantity]
                        for pose in one.local))
-        for one, truth in held
+        for one, truth in robot.estimates
         if one.local and not one.world
     ]  # fmt: skip
-    _line(axes, alone, ls=ALONE[role], lw=1.1, color=colour, gid=f"{name}-alone-{role}",
+    _line(axes, alone, ls=ALONE[role], lw=1.0, color=colour, gid=f"{quantity}-alone-{robot.id}",
           label=f"{robot.id}, relative to its anchor")  # fmt: skip
-    single = [one for one in held if one[0].world and (one[0].probabilities or len(one[0].world) == 1)]
-    others = [
-        (one.tick, off(pose, truth))
-        for one, truth in held
-        for pose in (one.world[1:] if one.probabilities or len(one.world) == 1 else one.world)
-    ]
-    _line(axes, others, ls="", marker="x" if role == "a" else "+", ms=5, mew=0.9, color=colour, alpha=0.75,
-          gid=f"{name}-others-{role}", label=f"{robot.id}, other possible poses")  # fmt: skip
-    most_probable = [(one.tick, off(one.world[0], truth)) for one, truth in single]
-    _line(axes, most_probable, lw=1.3, ls=LINES[role], ms=4.5, color=colour, gid=f"{name}-{role}",
+    _line(axes, [(one.tick, off(pose, truth)) for one, truth in robot.placed for pose in others(one)],
+          ls="", marker="x" if role == "a" else "+", ms=4, mew=0.8, color=colour, alpha=0.75,
+          gid=f"{quantity}-others-{robot.id}", label=f"{robot.id}, other possible poses")  # fmt: skip
+    likeliest = [(one.tick, off(one.world[0], truth)) for one, truth in robot.likeliest]
+    _line(axes, likeliest, lw=1.2, ls=LINES[role], ms=3.6, color=colour, gid=f"{quantity}-{robot.id}",
           label=f"{robot.id}, {'pose' if pair.exact else 'most probable pose'}",
-          markevery=max(1, math.ceil(len(most_probable) / MARKED)), **MARKS[role])  # fmt: skip
-    sigmas = [
-        (one.tick, SIGMAS * (c.position_sigma if name == "position" else c.heading_sigma))
-        for one, _ in single
-        if (c := one.covariance) is not None
-    ]
-    _line(axes, sigmas, lw=0.9, ls=CLAIMED[role], color=colour, gid=f"{name}-sigma-{role}",
-          label=rf"{robot.id}, claimed 3 $\sigma$")  # fmt: skip
+          markevery=_marked(pair, role, [tick for tick, _ in likeliest]), **MARKS[role])  # fmt: skip
+    sigmas = [(one.tick, _sigma(one.covariance, quantity)) for one, _ in robot.likeliest if one.covariance]
+    _line(axes, [(tick, SIGMAS * sigma) for tick, sigma in sigmas], lw=0.9, ls=CLAIMED[role], color=colour,
+          gid=f"{quantity}-sigma-{robot.id}", label=rf"{robot.id}, claimed 3 $\sigma$")  # fmt: skip
+    if robot.claim is not None:
+        axes.plot(
+            robot.claim.tick, max(_of_claim(robot.claim, quantity), LEAST), MARKS[role]["marker"], ms=9,
+            mfc="none", mec=INK, mew=1.1, ls="", clip_on=False, zorder=5, gid=f"claim-{robot.id}",
+            label=f"claim of {robot.id}, tick {robot.claim.tick}",
+        )  # fmt: skip
+    return sigmas
 
 
-def _alone(pose: Pose, truth: Pose) -> dict[str, float]:
+def _sigma(covariance: Covariance, quantity: Quantity) -> float:
+    return covariance.position_sigma if quantity == "position" else covariance.heading_sigma
+
+
+def _of_claim(claim: Claim, quantity: Quantity) -> float:
+    return claim.position_error if quantity == "position" else claim.heading_error
+
+
+def _alone(pose: Pose, truth: Pose) -> dict[Quantity, float]:
     """Return the errors that are defined before the encounter, for two poses in the anchor's frame.
 
     These are the error of the distance to the anchor, in m, and that of mu, the heading relative to the line
@@ -230,33 +332,102 @@ def _line(axes: Axes, points: Points, **looks: Any) -> None:
         axes.plot([tick for tick, _ in points], [max(value, LEAST) for _, value in points], **looks)
 
 
-def _claimed(axes: Axes, pair: PairRecord, role: Role, of_claim: Callable[[Claim], float]) -> None:
-    claim = pair.robot(role).claim
-    if claim is not None:
+def _scale(axes: Axes) -> None:
+    """Make the scale of errors logarithmic, ROOM times wider than what is drawn."""
+    axes.set_yscale("log")
+    values = [float(y) for one in axes.lines for y in np.ravel(one.get_ydata()) if one.get_gid() and y > 0.0]
+    low, high = (min(values) / ROOM, max(values) * ROOM) if values else (0.1 * TOLERANCE, 10.0)
+    axes.set_ylim(low, high)
+    axes.yaxis.set_major_locator(
+        LogLocator(subs=(1.0, 2.0, 5.0) if high < SHORT * low else (1.0,), numticks=7)
+    )
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}".replace("e-0", "e-")))
+    axes.yaxis.set_minor_locator(NullLocator())
+
+
+# --- hypotheses ---------------------------------------------------------------------------------------
+
+
+def draw_hypotheses(axes: Axes, pair: PairRecord, role: Role) -> None:
+    """Draw the probability of each hypothesis, or, with exact sensors, the number of possible poses."""
+    robot = pair.robot(role)
+    weighed = any(one.probabilities for one, _ in robot.estimates)
+    if weighed:
+        _probabilities(axes, pair, role)
+    else:
+        _count(axes, pair, role)
+    words: dict[str, Any] = {"transform": axes.transAxes, "color": "0.3"}
+    axes.text(0.0, 1.04, "branches in the anchor's frame", **words)
+    if robot.placed:
+        first = robot.placed[0][0].tick
+        axes.axvline(first, color="0.3", lw=0.8, ls=":", gid="placed")
+        axes.text(1.0, 1.04, f"from tick {first}: placements of the pair", ha="right", **words)
+
+
+def _probabilities(axes: Axes, pair: PairRecord, role: Role) -> None:
+    """Draw the probabilities on a logit scale, on which 99 % and 99.99 % are easy to distinguish."""
+    confidence = pair.mission.confidence
+    edge = max(SUREST, BEYOND * (1.0 - confidence))
+    axes.set_yscale("logit")
+    for rank in reversed(range(RANKS)):
+        for placed in (False, True):
+            _rank(axes, pair, role, rank, placed, edge)
+    marker, colour = MARKS[role], COLOURS[role]
+    axes.plot([], [], "-", ms=3.6, lw=1.2, color=colour, label="most probable hypothesis", **marker)
+    if any(len(one.probabilities) > 1 for one, _ in pair.robot(role).estimates):
+        axes.plot([], [], "-x", ms=3.6, mew=0.8, lw=0.7, color=colour, alpha=0.5, label="other hypotheses")
+    axes.axhline(
+        confidence, color=PALE, lw=0.9, ls="-.", gid="confidence", label=f"required: {percent(confidence)}"
+    )
+    tails = [10.0**-k for k in range(2, 13, 2) if 10.0**-k > edge]
+    ticks = [*tails[::-1], 0.5, *[1.0 - tail for tail in tails]]
+    axes.set_yticks([edge, *ticks, 1.0 - edge], ["less", *map(percent, ticks), "more"])
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.set_ylim(edge, 1.0 - edge)
+    axes.set_ylabel("probability of a hypothesis")
+
+
+def _rank(axes: Axes, pair: PairRecord, role: Role, rank: int, placed: bool, edge: float) -> None:
+    """Draw the probability of the hypothesis at `rank`: of placements if `placed`, else of branches."""
+    points = [
+        (
+            one.tick,
+            min(max(one.probabilities[rank], edge), 1.0 - edge)
+            if rank < len(one.probabilities)
+            else math.nan,
+        )
+        for one, _ in pair.robot(role).estimates
+        if bool(one.world) == placed
+    ]
+    if all(math.isnan(probability) for _, probability in points):
+        return
+    ticks, probability = zip(*points, strict=True)
+    gid = f"probability-{rank + 1}-{'plane' if placed else 'anchor'}"
+    if rank:
+        axes.plot(ticks, probability, "-x", ms=3.6, mew=0.8, lw=0.7, color=COLOURS[role], alpha=0.5, gid=gid)
+    else:
         axes.plot(
-            claim.tick, max(of_claim(claim), LEAST), MARKS[role]["marker"], ms=11, mfc="none", mec=INK,
-            mew=1.2,
-            ls="", clip_on=False, gid=f"claim-{role}",
-            label=f"claim of {pair.robot(role).id}, $k$ = {claim.tick}",
+            ticks, probability, "-", ms=3.6, lw=1.2, color=COLOURS[role], gid=gid, clip_on=False, zorder=4,
+            markevery=_marked(pair, role, ticks), **MARKS[role],
         )  # fmt: skip
 
 
-def _scale(panels: Sequence[Axes], pair: PairRecord, name: str) -> None:
-    """Set one scale for both panels, and draw the limit: the tolerance, or with noise the required sigma."""
-    for axes in panels:
-        axes.set_yscale("log")
-        if pair.exact:
-            axes.axhline(TOLERANCE, ls="-.", lw=0.9, color=PALE, gid=f"{name}-tolerance", zorder=1,
-                         label="tolerance: $10^{-6}$")  # fmt: skip
-        elif name == "position":
-            required = pair.mission.accuracy
-            axes.axhline(required, ls="--", lw=0.9, color=PALE, gid="accuracy", zorder=1,
-                         label=rf"required $\sigma$: {required:g} m")  # fmt: skip
-    values = [float(y) for axes in panels for one in axes.lines for y in np.ravel(one.get_ydata()) if y > 0.0]
-    for axes in panels:
-        if values:
-            axes.set_autoscaley_on(False)
-            axes.set_ylim(min(values) / ROOM, max(values) * ROOM)
-        axes.yaxis.set_major_locator(LogLocator(numticks=8))
-        axes.yaxis.set_major_formatter(LogFormatterMathtext())
-        axes.yaxis.set_minor_locator(NullLocator())
+def percent(probability: float) -> str:
+    """Return a probability as a percentage with all its significant digits."""
+    return f"{round(100.0 * probability, 10):.12g} %"
+
+
+def _count(axes: Axes, pair: PairRecord, role: Role) -> None:
+    """Draw the number of possible poses. It is undefined while the robot may be anywhere on a circle."""
+    counts = [(one.tick, len(one.world or one.local) or math.nan) for one, _ in pair.robot(role).estimates]
+    if counts:
+        ticks, held = zip(*counts, strict=True)
+        axes.plot(
+            ticks, held, "-", ms=3.6, lw=1.2, drawstyle="steps-post", color=COLOURS[role], gid="count",
+            markevery=_marked(pair, role, ticks), label="possible poses", **MARKS[role],
+        )  # fmt: skip
+    axes.axhline(1.0, color=PALE, lw=0.9, ls="-.", label="one pose")
+    known = [count for _, count in counts if not math.isnan(count)]
+    axes.set_ylim(0.0, 1.0 + max(known, default=1))
+    axes.yaxis.set_major_locator(MaxNLocator(nbins=5, integer=True))
+    axes.set_ylabel("possible poses")

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
+from itertools import groupby
 
 import msgspec
 from msgspec.structs import replace
@@ -12,19 +13,24 @@ from msgspec.structs import replace
 from agent.planning.state import RobotState
 from compose.figures.account import Account
 from compose.recording.claim import Claim
-from compose.recording.robots import outcome
-from compose.recording.run import Recording
-from compose.recording.summary_json import broken_off, ended, first_claim
-from protocol.messages import Command
+from compose.recording.run import Run
+from protocol.messages import Command, Estimate
 from protocol.mission import Anchor, Mission, PlannerName, Role
 from protocol.motion import Pose
 from protocol.orbits import Orbit
-from world.sensors import anchor_ranges, mutual_ranges
 
 ROLES: tuple[Role, Role] = ("a", "b")
 
 
-class Side(msgspec.Struct, frozen=True):
+class Span(msgspec.Struct, frozen=True):
+    """The consecutive ticks `first` to `last` in which a robot is in one of the paper's phases."""
+
+    phase: int
+    first: int
+    last: int
+
+
+class Side(msgspec.Struct, frozen=True, dict=True):
     """One robot of a pair, with one entry per tick in each sequence."""
 
     id: str
@@ -40,6 +46,34 @@ class Side(msgspec.Struct, frozen=True):
     """The recomputed planner states; None if the robot's journal cannot be read."""
     claim: Claim | None = None
     """The robot's first claim, compared with the ground truth; None in hardware mode."""
+
+    @cached_property
+    def estimates(self) -> tuple[tuple[Estimate, Pose], ...]:
+        """The journaled estimates, each with the pose of `path` in the same tick, where both are known."""
+        held = self.account.held if self.account is not None else ()
+        return tuple([(one, self.path[one.tick]) for one in held if one.tick < len(self.path)])
+
+    @cached_property
+    def placed(self) -> tuple[tuple[Estimate, Pose], ...]:
+        """The estimates with poses in the world frame, which exist only from the encounter on."""
+        return tuple([(one, truth) for one, truth in self.estimates if one.world])
+
+    @cached_property
+    def likeliest(self) -> tuple[tuple[Estimate, Pose], ...]:
+        """The estimates in `placed` whose first pose is the most probable or the only one."""
+        return tuple([(one, truth) for one, truth in self.placed if one.probabilities or len(one.world) == 1])
+
+    @cached_property
+    def phases(self) -> tuple[int, ...]:
+        """The phase in each tick. A tick without a Command has the phase before it."""
+        found: list[int] = []
+        for command in self.commands:
+            found.append(command.phase if command is not None else found[-1] if found else 1)
+        return tuple(found)
+
+    def phase(self, tick: int) -> int:
+        """Return the phase in `tick`, or the last one known."""
+        return self.phases[min(tick, len(self.phases) - 1)] if self.phases else 1
 
 
 class PairRecord(msgspec.Struct, frozen=True, dict=True):
@@ -57,8 +91,8 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
 
     In hardware mode, in which both robots measure, it is the range of a, or that of b if a has none.
     """
-    recording: Recording | None
-    """The recording with the ground truth; None in hardware mode."""
+    run: Run
+    """The run; without ground truth in hardware mode."""
 
     @property
     def name(self) -> str:
@@ -78,7 +112,7 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
     @property
     def true(self) -> bool:
         """True if the paths are the ground truth, and not implied by claims."""
-        return self.recording is not None
+        return self.run.world is not None
 
     @property
     def placed(self) -> int:
@@ -135,87 +169,81 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
     @cached_property
     def encounter_tick(self) -> int | None:
         """The first tick in which one of the robots is in phase 3; None if there is none."""
-        for tick in range(len(self.mutual)):
-            commands = [self.command(role, tick) for role in ROLES]
-            if any(command is not None and command.phase == 3 for command in commands):
-                return tick
-        return None
+        ticks = [side.phases.index(3) for side in (self.a, self.b) if 3 in side.phases]
+        return min(ticks, default=None)
+
+    def spans(self, *roles: Role) -> tuple[Span, ...]:
+        """Return the phases of the robots with `roles`, the earlier one where they differ, over all ticks."""
+        sides = [self.robot(role) for role in roles]
+        known = [side for side in sides if side.phases] or sides
+        phases = [min(side.phase(tick) for side in known) for tick in range(len(self.mutual))]
+        if self.encounter_tick is not None and len(roles) > 1:
+            phases[self.encounter_tick :] = [3] * (len(phases) - self.encounter_tick)
+        spans = []
+        for phase, group in groupby(enumerate(phases), key=lambda one: one[1]):
+            ticks = [tick for tick, _ in group]
+            spans.append(Span(phase, ticks[0], ticks[-1]))
+        return tuple(spans) or (Span(1, 0, 0),)
 
 
-def of_record(recording: Recording, places: tuple[int, int], accounts: Mapping[str, Account]) -> PairRecord:
-    """Return the pair at the indices `places` of the scenario's robots, role a first.
+def error(pose: Pose, truth: Pose) -> float:
+    """Return the distance between the positions of two poses, in m."""
+    return math.hypot(pose.x - truth.x, pose.y - truth.y)
+
+
+def others(estimate: Estimate) -> tuple[Pose, ...]:
+    """Return the possible world poses but the most probable; all of them if none is more probable."""
+    return estimate.world[1:] if estimate.probabilities or len(estimate.world) == 1 else estimate.world
+
+
+def pair_of(run: Run, robots: Sequence[str], accounts: Mapping[str, Account]) -> PairRecord | None:
+    """Return the pair of `robots`, role a first; None in hardware mode if no journal has a configuration.
 
     `accounts` holds the readable journals by robot id.
     """
-    scenario, moments = recording.scenario, recording.ticks
-    last = len(moments) - 1
-    how = (
-        ended(recording.end.outcome, last, recording.end.reason)
-        if recording.end is not None
-        else broken_off(last)
-    )
-    ranges = [anchor_ranges(one.truth, scenario) for one in moments]
-    mutual = [mutual_ranges(one.truth, scenario, [places])[0] for one in moments]
-
-    def side(role: Role, place: int) -> Side:
-        robot = scenario.robots[place]
-        return Side(
-            id=robot.id,
-            anchor=robot.anchor,
-            orbit=robot.rendezvous.of(role),
-            path=tuple([one.truth.poses[place] for one in moments] or [robot.start]),
-            commands=tuple([one.commands.get(robot.id) for one in moments]),
-            anchor_ranges=tuple([each[place] for each in ranges]),
-            account=accounts.get(robot.id),
-            claim=first_claim(recording, place),
-        )
-
-    return PairRecord(
-        title=f"{scenario.name}, seed {scenario.seed}, {scenario.planner_name}: {how}",
-        mission=scenario.mission,
-        planner_name=scenario.planner_name,
-        a=side("a", places[0]),
-        b=side("b", places[1]),
-        mutual=tuple([(one is not None, one.range if one is not None else None) for one in mutual]),
-        recording=recording,
-    )
-
-
-def of_robots(accounts: Mapping[str, Account]) -> PairRecord:
-    """Return a pair in hardware mode, from the journals of one or both of its robots.
-
-    At least one journal must hold a configuration.
-    """
-    pasts = {robot: one.past for robot, one in accounts.items() if one.past is not None}
-    config = next(iter(pasts.values())).config
-    in_order = sorted(pasts.values(), key=lambda past: past.config.role)
+    pasts = {one: accounts[one].past for one in robots if one in accounts}
+    known = {robot: past for robot, past in pasts.items() if past is not None}
+    if run.world is not None:
+        config = run.scenario.config(robots[0])
+        ticks = dict.fromkeys(robots, run.length)
+    elif known:
+        config = next(iter(known.values())).config
+        ticks = {robot: len(past.steps) for robot, past in known.items()}
+    else:
+        return None
     mutual: list[tuple[bool, float | None]] = []
-    for tick in range(max([len(past.steps) for past in pasts.values()])):
-        contacts = [one for past in in_order if (one := past.contact(tick)) is not None]
+    for tick in range(max(ticks.values())):
+        contacts = [one for robot in ticks if (one := run.contact(robot, tick)) is not None]
         mutual.append((bool(contacts), next((one.range for one in contacts if one.range is not None), None)))
 
     def side(role: Role) -> Side:
         own = config.role == role
         robot = config.robot if own else config.peer
-        past = pasts.get(robot)
-        steps = past.steps if past is not None else ()
+        if run.world is not None:
+            path = run.truth(robot) or (run.scenario.robot(robot).start,)
+        else:
+            path = known[robot].path if robot in known else ()
+        seen = range(ticks.get(robot, 0))
         return Side(
             id=robot,
             anchor=config.anchor if own else config.peer_anchor,
             orbit=config.rendezvous.of(role),
-            path=past.path if past is not None else (),
-            commands=tuple([step.command for step in steps]),
-            anchor_ranges=tuple([step.observation.anchor_range for step in steps]),
+            path=path,
+            commands=tuple([run.command(robot, tick) for tick in seen]),
+            anchor_ranges=tuple([run.observations[tick][robot].anchor_range for tick in seen]),
             account=accounts.get(robot),
+            claim=run.claim(robot),
         )
 
     pair = PairRecord(
-        title=f"{' and '.join(pasts)} in hardware mode, {config.planner_name}: {outcome(pasts)}",
+        title=run.title(list(known)),
         mission=config.mission,
         planner_name=config.planner_name,
         a=side("a"),
         b=side("b"),
         mutual=tuple(mutual),
-        recording=None,
+        run=run,
     )
-    return replace(pair, title=f"{pair.title}; positions from claims") if pair.placed else pair
+    if pair.true or not pair.placed:
+        return pair
+    return replace(pair, title=f"{pair.title}; positions from claims")

@@ -13,16 +13,18 @@ from agent.estimation.exact import Branch
 from agent.planning.range_seeking import travelled
 from agent.planning.state import RobotState
 from compose.figures.pair import PairRecord
-from compose.figures.sheet import ANCHORS, Absent, Sheet, around, circle, equal, fitted
-from compose.figures.style import COLOURS, INK, MARKS, PALE, PALER
+from compose.figures.sheet import ANCHORS, LABEL, Absent, Sheet, around, circle
+from compose.figures.style import INK, MARKS, PALE, PALER, SCREEN, Medium
+from compose.view.colours import COLOURS
 from protocol.messages import BranchKind
 from protocol.mission import Role
 from protocol.motion import Pose, compose
 
-WIDTH, BESIDE, TALLEST = 4.3, 2.5, 4.6
+TALLEST = 4.2
+"""The maximum height of the plane, in inches."""
 FEW = 4
 """The maximum number of ranges for which each circle has an entry in the key."""
-SAME = 0.03
+SAME = 0.1
 """The distance below which two positions share a label, as a fraction of the longest range."""
 EXPLAINED = 1e-9
 """The largest residual of a consistent range or missing detection, as a fraction of R."""
@@ -44,7 +46,7 @@ class DrawnBranch(NamedTuple):
     name: str
 
 
-def draw(pair: PairRecord, role: Role) -> Figure | Absent:
+def draw(pair: PairRecord, role: Role, medium: Medium = SCREEN) -> Figure | Absent:
     """Return the figure of the branches, with circles of the measured ranges and of the sensing range."""
     state = _at_its_end(pair.states(role))
     if state is None:
@@ -61,23 +63,18 @@ def draw(pair: PairRecord, role: Role) -> Figure | Absent:
     if state.belief.branch_kind == "three-ranges-virtual":
         virtual = branches[0].branch.distance(state.odometry)
         points += [(x, y) for x in (-virtual, virtual) for y in (-virtual, virtual)]
-    window = around(points, 0.05)
-    width, height = fitted(window, WIDTH, TALLEST)
-    sheet = Sheet(0.6 + width + BESIDE, 0.5 + height, [pair.title, _title(pair, role, state)])
-    axes = sheet.panel(0.55, 0.42, width, height)
+    sheet = Sheet(medium, True, [pair.title, _title(pair, role, state)])
+    axes = sheet.panel()
     circle(axes, (0, 0), reach, lw=1.2, ls="-", color="k", gid="range", label=f"$R$ = {reach:g} m")
-    axes.plot(0, 0, "x", color="k", ms=7, mew=1.6, ls="", gid="anchor", label=f"anchor ${ANCHORS[role]}$")
+    axes.plot(0, 0, "x", color="k", ms=6, mew=1.4, ls="", gid="anchor", label=f"anchor ${ANCHORS[role]}$")
     _circles(axes, track, branches[0].branch, state.belief.branch_kind)
     for i, one in enumerate(branches):
         _draw(axes, role, one, track, pair.exact, named=i < 2 or pair.exact)
         if one.status == "rejected" and pair.exact:
             _contradictions(axes, one.branch, track, reach)
     _name_points(axes, track, branches[0].branch)
-    equal(axes, window)
-    axes.set_xlabel("$x$ [m]")
-    axes.set_ylabel("$y$ [m]")
-    sheet.key(axes, 0.55 + width + 0.12, 0.42 + height)
-    return sheet.figure
+    sheet.plane(axes, around(points, 0.05), TALLEST)
+    return sheet.finished()
 
 
 def _at_its_end(states: Sequence[RobotState]) -> RobotState | None:
@@ -182,7 +179,7 @@ def _draw(axes: Axes, role: Role, one: DrawnBranch, track: Track, exact: bool, n
     for points, face, gid in ((ranged, colour, "ranged"), (undetected, "white", "silent")):
         if points:
             axes.plot(
-                [p.x for p in points], [p.y for p in points], MARKS[role]["marker"], ms=5, mfc=face,
+                [p.x for p in points], [p.y for p in points], MARKS[role]["marker"], ms=4, mfc=face,
                 mec=colour, mew=1.0, ls="", zorder=4 if selected else 2.5, gid=f"{gid}-{one.status}",
                 label=("range measured" if gid == "ranged" else "no detection") if selected else None,
             )  # fmt: skip
@@ -194,7 +191,7 @@ def _contradictions(axes: Axes, branch: Branch, track: Track, reach: float) -> N
     if against:
         ticks = ", ".join(map(str, against))
         axes.plot(
-            [places[k].x for k in against], [places[k].y for k in against], "x", ms=9, mew=1.3, color=INK,
+            [places[k].x for k in against], [places[k].y for k in against], "x", ms=8, mew=1.2, color=INK,
             ls="", zorder=5, gid="contradicted", label=f"ruled out by $k$ = {ticks}",
         )  # fmt: skip
 
@@ -224,6 +221,5 @@ def _name_points(axes: Axes, track: Track, branch: Branch) -> None:
         away = math.hypot(place.x, place.y) or 1.0
         axes.annotate(
             f"$p_{i}$", (place.x, place.y), xytext=(11 * place.x / away, 11 * place.y / away),
-            textcoords="offset points", fontsize=9, ha="center", va="center", zorder=6, gid=f"p-{i}",
-            bbox={"facecolor": "white", "alpha": 0.75, "pad": 0.4, "lw": 0},
+            textcoords="offset points", ha="center", va="center", zorder=6, gid=f"p-{i}", bbox=LABEL,
         )  # fmt: skip

@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import pairwise
-
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from compose.figures.pair import ROLES, PairRecord
-from compose.figures.series import Series, some, square
-from compose.figures.sheet import NO_ENCOUNTER, NO_PLACES, Absent, Window, circle
-from compose.figures.style import COLOURS, DASHES, INK, MARKS, PALE
-from compose.figures.trajectory import heading
+from compose.figures.sheet import NO_ENCOUNTER, NO_PLACES, Absent, Sheet, Window, circle, some, square
+from compose.figures.style import INK, MARKS, PALE, SCREEN, Medium
+from compose.figures.trajectory import draw_trail, heading
+from compose.view.colours import COLOURS, line_style
 from protocol.mission import Role
-from protocol.motion import Pose
 
-WIDTH, NARROWEST = 2.35, 5.4
-"""The maximum width of a panel and the minimum width of the figure, in inches."""
 BEFORE = 2
 """The number of ticks shown before the encounter."""
 ARROW = 0.12
 """The length of a heading arrow, as a fraction of the window's width."""
 
 
-def draw(pair: PairRecord) -> Figure | Absent:
+def draw(pair: PairRecord, medium: Medium = SCREEN) -> Figure | Absent:
     """Return the figure of the mutual ranges measured from new positions."""
     if not pair.placed:
         return Absent(NO_PLACES)
@@ -33,13 +27,13 @@ def draw(pair: PairRecord) -> Figure | Absent:
         return Absent(NO_ENCOUNTER if pair.encounter_tick is None else "the encounter has no mutual range")
     shown = some(ticks)
     window = _window(pair, ticks[0], shown[-1])
-    series = Series(len(shown), window, WIDTH, NARROWEST, [pair.title, _title(ticks, shown)])
+    sheet = Sheet(medium, len(shown) == 1, [pair.title, _title(ticks, shown)])
+    panels = [sheet.panel() for _ in shown]
     for i, tick in enumerate(shown):
-        axes = series.panel(i, _panel_title(pair, tick, i + 1))
-        _panel(axes, pair, ticks[0], shown[i - 1] if i else tick, tick)
-    _key(axes, pair)
-    series.key(axes)
-    return series.figure
+        _panel(panels[i], pair, ticks[0], shown[i - 1] if i else tick, tick)
+    _key(panels[-1], pair)
+    sheet.series(panels, [_caption(pair, tick, i + 1) for i, tick in enumerate(shown)], window)
+    return sheet.finished()
 
 
 def steps(pair: PairRecord) -> list[int]:
@@ -68,54 +62,43 @@ def _title(ticks: list[int], shown: list[int]) -> str:
     return f"Encounter: {many}, $k$ = {ticks[0]} to {ticks[-1]}"
 
 
-def _panel_title(pair: PairRecord, tick: int, number: int) -> str:
-    """Return the title of a panel: the range, and the state of each robot's command."""
+def _caption(pair: PairRecord, tick: int, number: int) -> list[str]:
+    """Return the caption of a panel: the range, and the state of each robot's command."""
     rho = pair.mutual[tick][1]
     states = []
     for role in ROLES:
         command = pair.command(role, tick)
         states.append(f"{pair.robot(role).id}: {command.state if command is not None else 'no command'}")
-    return f"({number}) $k$ = {tick}, " + rf"$\rho$ = {rho:.4f} m" + "\n" + ", ".join(states)
+    return [f"({number}) $k$ = {tick}", rf"$\rho$ = {rho:.4f} m", *states]
 
 
 def _panel(axes: Axes, pair: PairRecord, first: int, before: int, tick: int) -> None:
+    begin = max(0, first - BEFORE)
     for role in ROLES:
-        one = pair.robot(role)
-        place = (one.anchor.x, one.anchor.y)
-        circle(
-            axes,
-            place,
-            one.orbit.radius,
-            lw=0.9,
-            ls=DASHES[role],
-            color=COLOURS[role],
-            zorder=1,
+        one, colour = pair.robot(role), COLOURS[role]
+        circle(axes, (one.anchor.x, one.anchor.y), one.orbit.radius, lw=0.6, color=colour, alpha=0.5)
+        draw_trail(axes, one, role, range(begin, before + 1), alpha=0.4)
+        draw_trail(axes, one, role, range(before, tick + 1), lw=1.8)
+        for ranged in (True, False):
+            ticks = [k for k in range(begin, tick) if (pair.mutual[k][1] is not None) == ranged]
+            _places(axes, pair, role, ticks, ranged=ranged)
+        now = one.path[tick]
+        axes.plot(
+            now.x, now.y, MARKS[role]["marker"], ms=6.5, mfc=colour, mec="white", mew=0.7, ls="", zorder=5
         )
-        poses = pair.robot(role).path
-        _trail(axes, poses[max(0, first - BEFORE) : before + 1], 1.0, PALE)
-        _trail(axes, poses[before : tick + 1], 2.0, COLOURS[role])
-        for k in range(max(0, first - BEFORE), tick + 1):
-            _place(axes, role, poses[k], ranged=pair.mutual[k][1] is not None, now=k == tick)
     ends = [pair.robot(role).path[tick] for role in ROLES]
-    axes.plot([p.x for p in ends], [p.y for p in ends], ":", color=INK, lw=1.4, zorder=3, gid=f"rho-{tick}")
+    axes.plot([p.x for p in ends], [p.y for p in ends], ":", color=INK, lw=1.3, zorder=3, gid=f"rho-{tick}")
     left, right, _, _ = _window(pair, first, tick)
     for role, pose in zip(ROLES, ends, strict=True):
         heading(axes, pose, ARROW * (right - left), COLOURS[role], zorder=6)
 
 
-def _trail(axes: Axes, poses: Sequence[Pose], width: float, colour: str) -> None:
-    moved = [pose for before, pose in pairwise(poses) if pose != before]
-    if moved:
-        places = [poses[0], *moved]
-        axes.plot([p.x for p in places], [p.y for p in places], "-", lw=width, color=colour, zorder=2)
-
-
-def _place(axes: Axes, role: Role, pose: Pose, ranged: bool, now: bool) -> None:
-    """Mark a position: filled if a mutual range was measured there, large if it is the current one."""
-    colour = COLOURS[role]
+def _places(axes: Axes, pair: PairRecord, role: Role, ticks: list[int], *, ranged: bool) -> None:
+    """Mark earlier positions, filled if a mutual range was measured there."""
+    poses, colour = [pair.robot(role).path[k] for k in ticks], COLOURS[role]
     axes.plot(
-        pose.x, pose.y, MARKS[role]["marker"], ms=7.5 if now else 4, mfc=colour if ranged else "white",
-        mec="white" if now and ranged else colour, mew=0.7 if now else 1.0, ls="", zorder=5 if now else 4,
+        [p.x for p in poses], [p.y for p in poses], MARKS[role]["marker"], ms=3.6,
+        mfc=colour if ranged else "white", mec=colour, mew=0.9, ls="", zorder=4,
     )  # fmt: skip
 
 
@@ -127,11 +110,13 @@ def _key(axes: Axes, pair: PairRecord) -> None:
             MARKS[role]["marker"],
             ls="-",
             lw=1.6,
-            ms=6,
+            ms=5,
             color=COLOURS[role],
             label=pair.robot(role).id,
         )
-    axes.plot([], [], "o", ls="", ms=4, mfc="white", mec=INK, label="no range")
-    axes.plot([], [], ":", color=INK, lw=1.4, label="mutual range")
-    axes.plot([], [], ls="", marker=r"$\rightarrow$", ms=12, color=PALE, label="heading")
-    axes.plot([], [], ls=DASHES["a"], color=PALE, lw=0.9, label="orbits")
+    axes.plot([], [], "o", ls="", ms=3.6, mfc="white", mec=INK, label="no range")
+    axes.plot([], [], ":", color=INK, lw=1.3, label="mutual range")
+    axes.plot([], [], ls="", marker=r"$\rightarrow$", ms=10, color=PALE, label="heading")
+    axes.plot([], [], lw=0.6, color=PALE, label="orbits")
+    for phase in (2, 3):
+        axes.plot([], [], ls=line_style(phase), lw=1.2, color=PALE, label=f"path in phase {phase}")

@@ -6,16 +6,20 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 
-from agent.process.robot import FramedReport, Robot
-from compose.recording.run import WORLD_JOURNAL, Recording, TickRecord, agent_journal
+from agent.process.agent_journal import FramedReport
+from agent.process.robot import Robot
+from compose.recording.run import WORLD_JOURNAL, Run, agent_journal
+from protocol.journal import environment
 from protocol.journal.journal_file import Journal, Sink
 from protocol.messages import Command, FinalReport, MissionEnd
 from world.faults import LATEST
+from world.referee import MissionOutcome
 from world.scenario import Scenario
 from world.simulation import Simulation
+from world.world_journal import History, Tick
 
 
-def run_mission(scenario: Scenario, out: Path | None = None) -> Recording:
+def run_mission(scenario: Scenario, out: Path | None = None) -> Run:
     """Run `scenario`, and write its journals to `out`. They are identical to those of a run as processes.
 
     Raises CannotRecord if `out` contains a recording, or cannot be written.
@@ -33,12 +37,12 @@ def journals(scenario: Scenario) -> list[str]:
     return [*[agent_journal(robot.id) for robot in scenario.robots], WORLD_JOURNAL]
 
 
-def played(scenario: Scenario, sinks: Mapping[str, Sink]) -> Recording:
+def played(scenario: Scenario, sinks: Mapping[str, Sink]) -> Run:
     """Run `scenario`, and write its journals to `sinks`, by file name; without sinks, write none."""
     ids = [robot.id for robot in scenario.robots]
     simulation = Simulation(scenario, sinks.get(WORLD_JOURNAL))
     robots = {robot: Robot(scenario.config(robot), sinks.get(agent_journal(robot))) for robot in ids}
-    moments: list[TickRecord] = []
+    ticks: list[Tick] = []
     end: MissionEnd | None = None
     sent: dict[tuple[str, int], FramedReport] = {}
     while end is None:
@@ -58,8 +62,12 @@ def played(scenario: Scenario, sinks: Mapping[str, Sink]) -> Recording:
         if sent:
             for robot in ids:  # it can no longer be received
                 sent.pop((robot, simulation.tick - LATEST), None)
-        moments.append(TickRecord(simulation.world.truth, commands))
+        ticks.append(Tick(simulation.world, commands))
         end = simulation.command(commands)
     final_reports: dict[str, FinalReport] = {robot: robots[robot].final_report(end) for robot in ids}
     simulation.journal_final_reports(final_reports.values())
-    return Recording(scenario, tuple(moments), end, final_reports)
+    mission_outcome = MissionOutcome(end.outcome, end.reason)
+    history = History(
+        scenario, tuple(ticks), None, mission_outcome, end, final_reports, environment=environment.of_world()
+    )
+    return Run(history)

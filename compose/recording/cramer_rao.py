@@ -8,34 +8,32 @@ noise marginalised out.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
 from agent.estimation.gaussian.least_squares import deviation, fit, poses
 from agent.estimation.gaussian.odometry_noise import Track, track
 from agent.estimation.gaussian.range_model import Ranges
-from compose.recording.run import Recording
-from protocol.motion import Controls, Pose
-from world.sensors import anchor_ranges, executed, mutual_ranges
-from world.truth import limited_controls
+from compose.recording.run import Run
+from protocol.motion import REST, Pose
+from world.sensors import anchor_ranges, mutual_ranges
 
 
-def position_bounds(recording: Recording, pair: tuple[int, int], tick: int) -> tuple[float, float] | None:
+def position_bounds(run: Run, pair: tuple[int, int], tick: int) -> tuple[float, float] | None:
     """Return the square root in m of the trace of the bound on each robot's position at `tick`.
 
     The result is None if sensors are exact, or if ranges can be outliers, whose noise is not Gaussian.
     """
-    scenario = recording.scenario
+    scenario = run.scenario
     noise = scenario.mission.noise
     if noise.exact or noise.outliers or noise.anchor_sigma == noise.mutual_sigma == 0.0:
         return None
-    moments = recording.ticks[: tick + 1]
+    ticks = run.ticks[: tick + 1]
     anchors = [scenario.robots[place].anchor for place in pair]
     own: list[list[tuple[int, float]]] = [[], []]
     mutual: list[tuple[int, float]] = []
-    for moment in moments:
-        truth = moment.truth
+    for at in ticks:
+        truth = at.truth
         ranges = anchor_ranges(truth, scenario)
         for k, (place, anchor) in enumerate(zip(pair, anchors, strict=True)):
             if ranges[place] is not None:
@@ -45,8 +43,8 @@ def position_bounds(recording: Recording, pair: tuple[int, int], tick: int) -> t
             mutual.append((truth.tick, _apart(truth.poses[pair[0]], truth.poses[pair[1]])))
     tracks, guess = [], []
     for place, anchor in zip(pair, anchors, strict=True):
-        tracks.append(_driven(recording, place, tick))
-        start = moments[0].truth.poses[place]
+        tracks.append(_driven(run, place, tick))
+        start = ticks[0].truth.poses[place]
         c, s = math.cos(start.heading), math.sin(start.heading)
         dx, dy = anchor.x - start.x, anchor.y - start.y
         guess += [c * dx + s * dy, c * dy - s * dx, start.heading]
@@ -61,15 +59,8 @@ def _apart(one: Pose, other: Pose) -> float:
     return math.hypot(one.x - other.x, one.y - other.y)
 
 
-def _driven(recording: Recording, place: int, tick: int) -> Track:
+def _driven(run: Run, place: int, tick: int) -> Track:
     """Return the track of the controls that a robot executed until `tick`."""
-    scenario = recording.scenario
-    robot = scenario.robots[place].id
-    driven: Sequence[Controls] = [
-        executed(
-            limited_controls(moment.commands.get(robot), scenario.mission), scenario, robot, moment.truth.tick
-        )
-        for moment in recording.ticks[:tick]
-    ]
+    driven = [run.driven(run.robots[place], k) or REST for k in range(tick)]
     v, omega = np.array([one.v for one in driven]), np.array([one.omega for one in driven])
-    return track(v, omega, scenario.mission.period)
+    return track(v, omega, run.scenario.mission.period)

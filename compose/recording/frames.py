@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from heapq import merge
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import msgspec
 
-from compose.recording.run import JournalFile
+from compose.recording.run import Run
 from protocol.journal.journal_file import CorruptJournal
 from protocol.messages import (
     Command,
@@ -61,7 +60,7 @@ def kind_of(kind: type[msgspec.Struct]) -> str:
 
 
 class JournalDecoder:
-    """A decoder of the frames of one journal, which may be read in parts."""
+    """A reader of the frames of one journal, which finds their ticks. They may be given in parts."""
 
     def __init__(self, name: str) -> None:
         """`name` is the file name of the journal."""
@@ -69,13 +68,9 @@ class JournalDecoder:
         self._place = 0
         self._tick = 0
 
-    def of(self, frames: Iterable[bytes]) -> Iterator[Journaled]:
-        """Yield the next frames of the journal. Raises CorruptJournal if one cannot be decoded."""
-        for frame in frames:
-            try:
-                message: Message = decode(frame, KINDS, MAX_FRAME_BYTES)
-            except MalformedFrame as error:
-                raise CorruptJournal(f"{self._name}: {error}") from None
+    def of(self, messages: Iterable[Message], frames: Iterable[bytes]) -> Iterator[Journaled]:
+        """Yield the next messages of the journal, whose frames are `frames`."""
+        for message, frame in zip(messages, frames, strict=False):
             match message:
                 case (
                     Observation(tick)
@@ -88,11 +83,17 @@ class JournalDecoder:
             yield Journaled(self._name, self._place, self._tick, message, frame)
             self._place += 1
 
+    def decoded(self, frames: Iterable[bytes]) -> Iterator[Journaled]:
+        """Yield the next frames of the journal. Raises CorruptJournal if one cannot be decoded."""
+        for frame in frames:
+            try:
+                message: Message = decode(frame, KINDS, MAX_FRAME_BYTES)
+            except MalformedFrame as error:
+                raise CorruptJournal(f"{self._name}: {error}") from None
+            yield from self.of([message], [frame])
 
-def in_time(books: Mapping[str, JournalFile]) -> Iterator[Journaled]:
-    """Yield the frames of all journals by tick, and within a tick in the order of `books`.
 
-    Raises CorruptJournal if a frame cannot be decoded.
-    """
-    each = [JournalDecoder(name).of(book.frames) for name, book in books.items()]
-    return merge(*each, key=lambda one: one.tick)
+def in_time(run: Run) -> list[Journaled]:
+    """Return the messages of all journals by tick, and within a tick in the order of the journals."""
+    each = [JournalDecoder(name).of(one.messages, one.frames) for name, one in run.journals.items()]
+    return sorted([one for some in each for one in some], key=lambda one: one.tick)

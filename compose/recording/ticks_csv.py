@@ -4,20 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Iterator
 
 import msgspec
 from msgspec.structs import astuple
 
-from compose.recording.run import Recording
+from compose.recording.run import Run
 from protocol.motion import Pose, wrap
-from world.scenario import Scenario
-from world.sensors import anchor_ranges, executed, mutual_ranges
-from world.truth import Truth, limited_controls
-
-if TYPE_CHECKING:
-    from agent.process.agent_journal import Past
 
 
 class TickRow(msgspec.Struct, frozen=True):
@@ -54,44 +47,23 @@ class TickRow(msgspec.Struct, frozen=True):
         return Pose(self.x, self.y, self.heading)
 
 
-def rows(recording: Recording) -> Iterator[TickRow]:
-    """Yield one row per tick and robot, from tick 0."""
-    scenario = recording.scenario
-    last = recording.ticks[-1].truth.tick if recording.ticks else 0
-    for moment in recording.ticks:
-        tick = moment.truth.tick
-        anchor = anchor_ranges(moment.truth, scenario)
-        mutual = _mutual(scenario, moment.truth)
-        for i, (robot, pose) in enumerate(zip(scenario.robots, moment.truth.poses, strict=True)):
-            command = moment.commands.get(robot.id)
-            v = omega = None
-            if tick != last:
-                driven = executed(limited_controls(command, scenario.mission), scenario, robot.id, tick)
-                v, omega = driven.v, driven.omega
-            yield TickRow(
-                *(tick, robot.id, pose.x, pose.y, wrap(pose.heading), v, omega),
-                *(anchor[i], mutual.get(robot.id)),
-                *((command.phase, command.state) if command is not None else (None, None)),
-            )
-
-
-def rows_of(pasts: Mapping[str, Past]) -> Iterator[TickRow]:
-    """Yield one row per tick and robot of hardware mode, with measured speeds and without true poses."""
-    for tick in range(max([len(past.steps) for past in pasts.values()], default=0)):
-        for robot, past in pasts.items():
-            if tick >= len(past.steps):
-                continue
-            observation, command = past.steps[tick].observation, past.steps[tick].command
-            after = past.steps[tick + 1].observation.executed if tick + 1 < len(past.steps) else None
-            contact = past.contact(tick)
+def rows(run: Run) -> Iterator[TickRow]:
+    """Yield one row per tick and robot, from tick 0. A robot whose journal ends earlier has no later rows."""
+    truths = {robot: run.truth(robot) for robot in run.robots}
+    for tick in range(run.length):
+        for robot, observation in run.observations[tick].items():
+            pose = truths[robot][tick] if truths[robot] else None
+            contact = run.contact(robot, tick)
+            driven = run.driven(robot, tick)
+            command = run.command(robot, tick)
             yield TickRow(
                 tick,
                 robot,
-                x=None,
-                y=None,
-                heading=None,
-                v=after.v if after is not None else None,
-                omega=after.omega if after is not None else None,
+                x=pose.x if pose is not None else None,
+                y=pose.y if pose is not None else None,
+                heading=wrap(pose.heading) if pose is not None else None,
+                v=driven.v if driven is not None else None,
+                omega=driven.omega if driven is not None else None,
                 anchor_range=observation.anchor_range,
                 mutual_range=contact.range if contact is not None else None,
                 phase=command.phase if command is not None else None,
@@ -99,9 +71,9 @@ def rows_of(pasts: Mapping[str, Past]) -> Iterator[TickRow]:
             )
 
 
-def ticks_csv(recording: Recording) -> str:
+def ticks_csv(run: Run) -> str:
     """Return the text of `ticks.csv`."""
-    return table(rows(recording))
+    return table(rows(run))
 
 
 def table(rows: Iterable[TickRow]) -> str:
@@ -111,14 +83,3 @@ def table(rows: Iterable[TickRow]) -> str:
     writer.writerow(TickRow.__struct_fields__)
     writer.writerows([["" if one is None else one for one in astuple(row)] for row in rows])
     return out.getvalue()
-
-
-def _mutual(scenario: Scenario, truth: Truth) -> dict[str, float]:
-    """Return the measured range in m to the peer, for each robot that has one."""
-    pairs = scenario.pairs()
-    return {
-        scenario.robots[i].id: mutual.range
-        for pair, mutual in zip(pairs, mutual_ranges(truth, scenario, pairs), strict=True)
-        if mutual is not None and mutual.range is not None
-        for i in pair
-    }

@@ -18,7 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 
-from compose.figures.style import look, save
+from compose.figures.style import SWEEP, look, save
 from compose.sweep import attack_figures, crash_figures
 from compose.sweep.execution import Results
 from compose.sweep.spec import Axis
@@ -47,7 +47,7 @@ SPREAD = 0.45
 def draw(results: Results, folder: Path) -> None:
     """Draw all figures of the sweep into `folder`, each as SVG, PDF and PNG."""
     folder.mkdir(exist_ok=True)
-    with look():
+    with look(SWEEP):
         for place, axis in enumerate(results.sweep.axes):
             if len(axis.values) > 1:
                 name = re.sub(r"[^A-Za-z0-9_-]+", "-", axis.name).strip("-")

@@ -11,8 +11,8 @@ from msgspec.structs import replace
 from compose.audit.findings import Findings
 from compose.recording.claim import Claim
 from compose.recording.closest_approach import nearest
-from compose.recording.run import Recording
-from compose.recording.summary_json import first_claim, first_contact
+from compose.recording.run import Run
+from compose.recording.summary_json import first_contact
 from compose.scenario.kills import Kill
 from compose.sweep.trial_mission import as_processes, run_in_process
 from protocol.messages import FinalReport
@@ -180,7 +180,7 @@ def run_trial(trial: Trial) -> TrialRow:
         played = as_processes(trial.scenario, audit=trial.audit, kills=trial.kills)
     else:
         played = run_in_process(trial.scenario, audit=trial.audit)
-    found = row(trial, played.recording, played.wall_s, played.findings)
+    found = row(trial, played.run, played.wall_s, played.findings)
     if played.kills is None:
         return found
     found = replace(found, kills=played.kills, same_record=not played.differing)
@@ -190,21 +190,20 @@ def run_trial(trial: Trial) -> TrialRow:
     return replace(found, outcome="failed", reason=why)
 
 
-def row(trial: Trial, recording: Recording, wall_s: float, findings: Findings | None = None) -> TrialRow:
-    """Return the row of a trial, from its recording and its audit findings.
+def row(trial: Trial, run: Run, wall_s: float, findings: Findings | None = None) -> TrialRow:
+    """Return the row of a trial, from its run and its audit findings.
 
     A recording without a mission end gives the row of a lost trial.
     """
-    scenario, end = recording.scenario, recording.end
+    scenario, end = run.scenario, run.end
     if end is None:
         return lost(trial.cell, trial.number, scenario.seed, "the recording is incomplete", wall_s)
-    robots = {robot.id: _robot_row(recording, i) for i, robot in enumerate(scenario.robots)}
+    robots = {robot: _robot_row(run, robot) for robot in run.robots}
     for pair in scenario.pairs():
-        robots |= _bounded(robots, recording, pair)
+        robots |= _bounded(robots, run, pair)
     t_max_s = max(robot.rendezvous.bound for robot in scenario.robots)
-    ids = [robot.id for robot in scenario.robots]
-    encounters = [_meeting(recording, ids[a], ids[b]) for a, b in scenario.pairs()]
-    final_reports = recording.final_reports.values()
+    encounters = [_meeting(run, *pair) for pair in run.pairs]
+    final_reports = run.final_reports.values()
     errors = [robot.position_error_m for robot in robots.values() if robot.position_error_m is not None]
     nees = [robot.nees for robot in robots.values() if robot.nees is not None]
     return TrialRow(
@@ -214,7 +213,7 @@ def row(trial: Trial, recording: Recording, wall_s: float, findings: Findings | 
         outcome=end.outcome,
         reason=end.reason,
         ticks=end.tick,
-        first_contact_tick=first_contact(recording),
+        first_contact_tick=first_contact(run),
         orbiting_tick=_last([orbiting for orbiting, _ in encounters]),
         meeting_tick=_last([meeting for _, meeting in encounters]),
         period_s=scenario.mission.period,
@@ -225,7 +224,7 @@ def row(trial: Trial, recording: Recording, wall_s: float, findings: Findings | 
         position_error_m=_most([robot.position_error_m for robot in robots.values()]),
         heading_error_rad=_most([robot.heading_error_rad for robot in robots.values()]),
         hypotheses=_most([robot.hypotheses for robot in robots.values()]),
-        nearest_m=nearest(recording) if scenario.mission.safety_distance else None,
+        nearest_m=nearest(run) if scenario.mission.safety_distance else None,
         claims=len(errors),
         claims_within=sum([error <= WITHIN * scenario.mission.accuracy for error in errors]),
         nees=sum(nees) / len(nees) if nees else None,
@@ -241,9 +240,8 @@ def row(trial: Trial, recording: Recording, wall_s: float, findings: Findings | 
     )
 
 
-def _robot_row(recording: Recording, place: int) -> RobotRow:
-    robot = recording.scenario.robots[place].id
-    return _claimed(_reported(recording.final_reports.get(robot)), first_claim(recording, place))
+def _robot_row(run: Run, robot: str) -> RobotRow:
+    return _claimed(_reported(run.final_reports.get(robot)), run.claim(robot))
 
 
 def _reported(final_report: FinalReport | None) -> RobotRow:
@@ -278,39 +276,39 @@ def _claimed(row: RobotRow, claim: Claim | None) -> RobotRow:
     )
 
 
-def _bounded(robots: dict[str, RobotRow], recording: Recording, pair: tuple[int, int]) -> dict[str, RobotRow]:
+def _bounded(robots: dict[str, RobotRow], run: Run, pair: tuple[int, int]) -> dict[str, RobotRow]:
     """Return the rows of a pair with their Cramér-Rao bounds; none unless both claimed covariances."""
-    names = [recording.scenario.robots[place].id for place in pair]
-    claims = [first_claim(recording, place) for place in pair]
+    names = [run.robots[place] for place in pair]
+    claims = [run.claim(name) for name in names]
     if any(robots[name].position_sigma_m is None for name in names):
         return {}
     # imports numpy, which trials with exact sensors do not need
     from compose.recording.cramer_rao import position_bounds  # noqa: PLC0415
 
-    bounds = position_bounds(recording, pair, max([one.tick for one in claims if one is not None]))
+    bounds = position_bounds(run, pair, max([one.tick for one in claims if one is not None]))
     if bounds is None:
         return {}
     return {name: replace(robots[name], bound_m=bound) for name, bound in zip(names, bounds, strict=True)}
 
 
-def _meeting(recording: Recording, a: str, b: str) -> tuple[int | None, int | None]:
+def _meeting(run: Run, a: str, b: str) -> tuple[int | None, int | None]:
     """Return the first tick at which both robots of a pair orbit, and the tick at which phase 3 begins.
 
     The first is None if phase 3 begins earlier, and each is None if it never happens.
     """
     orbiting = None
-    for moment in recording.ticks:
+    for tick in run.ticks:
         commands = [
-            command for command in (moment.commands.get(a), moment.commands.get(b)) if command is not None
+            command for command in (tick.commands.get(a), tick.commands.get(b)) if command is not None
         ]
         if any(command.phase == 3 for command in commands):
-            return orbiting, moment.truth.tick
+            return orbiting, tick.truth.tick
         if (
             orbiting is None
             and len(commands) == 2
             and all(command.state == "orbiting" for command in commands)
         ):
-            orbiting = moment.truth.tick
+            orbiting = tick.truth.tick
     return orbiting, None
 
 

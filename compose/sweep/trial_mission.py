@@ -12,7 +12,7 @@ import msgspec
 from compose.audit import rules
 from compose.audit.findings import Findings
 from compose.launch import in_process
-from compose.recording.run import Recording, read
+from compose.recording.run import Run, of_frames, read
 from compose.recording.ticks_csv import ticks_csv
 from compose.scenario.kills import Kill
 from compose.scenario.scenario_file import run_name
@@ -27,7 +27,7 @@ TIMEOUT_S = 30.0
 class Played(msgspec.Struct, frozen=True):
     """A completed mission."""
 
-    recording: Recording
+    run: Run
     findings: Findings | None
     """findings of its audit; None if it was not audited"""
     wall_s: float
@@ -44,9 +44,9 @@ def run_in_process(scenario: Scenario, *, audit: bool) -> Played:
     if not audit:
         return Played(in_process.run_mission(scenario), None, time.perf_counter() - began)
     journals = {name: MemoryJournal() for name in in_process.journals(scenario)}
-    recording = in_process.played(scenario, journals)
-    findings = rules.audit_world_run({name: journal.frames for name, journal in journals.items()})
-    return Played(recording, findings, time.perf_counter() - began)
+    run = in_process.played(scenario, journals)
+    recorded = of_frames({name: journal.frames for name, journal in journals.items()})
+    return Played(run, rules.audit_run(recorded), time.perf_counter() - began)
 
 
 def as_processes(scenario: Scenario, *, audit: bool, kills: Sequence[Kill] | None = None) -> Played:
@@ -69,19 +69,19 @@ def as_processes(scenario: Scenario, *, audit: bool, kills: Sequence[Kill] | Non
             kills=kills or (),
             agents_journal=audit or kills is not None,
         )
-        recording = read(out)
-        findings = rules.audit(out) if audit else None
+        run = read(out, audited=audit)
+        findings = rules.audit_run(run) if audit else None
         wall_s = time.perf_counter() - began
         if kills is None:
-            return Played(recording, findings, wall_s)
-        return Played(recording, findings, wall_s, len(kills) - len(missed), _differing(recording, out))
+            return Played(run, findings, wall_s)
+        return Played(run, findings, wall_s, len(kills) - len(missed), _differing(run, out))
 
 
-def _differing(recording: Recording, out: Path) -> tuple[str, ...]:
+def _differing(run: Run, out: Path) -> tuple[str, ...]:
     """Return the names of the files in `out` whose bytes differ from those of a run in one process."""
-    undisturbed = {name: MemoryJournal() for name in in_process.journals(recording.scenario)}
-    ticks = ticks_csv(in_process.played(recording.scenario, undisturbed))
+    undisturbed = {name: MemoryJournal() for name in in_process.journals(run.scenario)}
+    ticks = ticks_csv(in_process.played(run.scenario, undisturbed))
     files = [
         name for name, journal in undisturbed.items() if (out / name).read_bytes() != packed(journal.frames)
     ]
-    return (*files, "ticks.csv") if ticks_csv(recording) != ticks else tuple(files)
+    return (*files, "ticks.csv") if ticks_csv(run) != ticks else tuple(files)

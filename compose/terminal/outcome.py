@@ -33,16 +33,20 @@ def shown_live(options: argparse.Namespace, scenario: Scenario, folder: Path) ->
 
 @contextmanager
 def counting(what: str, steps: int) -> Iterator[Callable[[], None]]:
-    """Show a progress bar if standard output is a terminal; yield a callback that advances it a step."""
-    if not steps or not sys.stdout.isatty():
+    """Show a progress bar on standard error if that is a terminal; yield a callback for each step."""
+    if not steps or not sys.stderr.isatty():
         yield lambda: None
         return
     from rich.console import Console  # noqa: PLC0415  # as above
     from rich.progress import Progress, TimeElapsedColumn  # noqa: PLC0415
 
-    console = Console(soft_wrap=True)  # other output is not wrapped
+    console = Console(stderr=True, soft_wrap=True)  # other output is not wrapped
     with Progress(
-        *Progress.get_default_columns(), TimeElapsedColumn(), console=console, transient=True
+        *Progress.get_default_columns(),
+        TimeElapsedColumn(),
+        console=console,
+        transient=True,
+        redirect_stdout=sys.stdout.isatty(),  # the console would print it on standard error
     ) as bar:
         task = bar.add_task(what, total=steps)
         yield lambda: bar.advance(task)
@@ -50,7 +54,7 @@ def counting(what: str, steps: int) -> Iterator[Callable[[], None]]:
 
 def conclude(
     options: argparse.Namespace,
-    recording: run.Recording,
+    recording: run.Run,
     folder: Path | None,
     mode: Mode,
     began: float,

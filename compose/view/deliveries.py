@@ -7,7 +7,7 @@ from typing import Literal
 
 import msgspec
 
-from compose.view.cast import Stage
+from compose.recording.cast import Stage
 from compose.view.facts import Facts
 from protocol.messages import Contact
 

@@ -9,7 +9,7 @@ from typing import Literal
 
 import msgspec
 
-from compose.view.cast import Seat, Stage
+from compose.recording.cast import Seat, Stage
 from compose.view.deliveries import Passage, contact_of
 from compose.view.facts import Facts
 from compose.view.words import doing

@@ -1,6 +1,8 @@
-"""The messages of a run, gathered by tick from journals or the network, in any order."""
+"""The messages of a run, gathered by tick from a recording or the network, in any order."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
 
 import msgspec
 
@@ -17,6 +19,8 @@ from protocol.messages import (
     RobotConfig,
 )
 from protocol.motion import Pose
+from world.tick import World, observations
+from world.world_journal import Tick
 
 Link = tuple[str, str]
 """A directed link: sender and receiver."""
@@ -80,6 +84,33 @@ class Gathering:
         if known is None:
             known = self.ticks[tick] = Facts(tick, down=set(down))
         return known
+
+    def take_world(self, world: World) -> None:
+        """Add the ground truth and the reports in flight of the world's current tick."""
+        ids = [robot.id for robot in world.scenario.robots]
+        facts = self.at(world.truth.tick)
+        facts.truth.update(zip(ids, world.truth.poses, strict=True))
+        self.has_truth = True
+        if world.links:
+            links = [link for one, other in world.pairs for link in ((one, other), (other, one))]
+            for (sender, receiver), air in zip(links, world.links, strict=True):
+                facts.under_way[ids[sender], ids[receiver]] = tuple([flying.tick for flying in air.flying])
+
+    def take_tick(self, tick: Tick) -> None:
+        """Add a complete tick of the world's journal. A robot without a Command is late."""
+        self.take_world(tick.world)
+        facts = self.at(tick.truth.tick)
+        for robot, command in tick.commands.items():
+            facts.commands.setdefault(robot, command)
+        facts.late.update({robot.id for robot in tick.world.scenario.robots} - tick.commands.keys())
+
+    def take_observations(self, worlds: Iterable[World]) -> None:
+        """Add the Observations that are still missing in the ticks of `worlds`."""
+        for world in worlds:
+            facts = self.at(world.truth.tick)
+            if len(facts.observations) < len(world.scenario.robots):
+                for observation in observations(world):
+                    facts.observations.setdefault(observation.robot, observation)
 
     def present(self, robot: str | None, there: bool) -> None:
         """Record that the process of `robot`, or of the world if None, is present or absent now.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
-from compose.view.cast import Seat, Stage
+from compose.recording.cast import Seat, Stage
 from compose.view.deliveries import Passage, passages
 from compose.view.events import Event, events
 from compose.view.facts import Facts

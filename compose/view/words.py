@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from compose.view.cast import Seat
+from compose.recording.cast import Seat
 from protocol.messages import Inconsistent, Undecided, Verdict
 
 SEEKING = {

@@ -17,6 +17,7 @@ from types import TracebackType
 from typing import Protocol
 
 import msgpack
+import msgspec
 
 from protocol.files import open_file
 from protocol.wire import MAX_FRAME_BYTES, RELEASES, VERSION, is_sound, other_version
@@ -38,6 +39,15 @@ class RecordExists(CannotRecord):
 
 class CorruptJournal(ValueError):
     """A journal is damaged before its end, or its content is not valid."""
+
+
+class UnexpectedFrame(msgspec.Struct, frozen=True):
+    """The first frame that must not be at its place. The frames after it are not read."""
+
+    tick: int | None
+    """The tick of the frame; None if it has none."""
+    what: str
+    """The description of the problem, for a user."""
 
 
 class OtherVersion(CorruptJournal):

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pyarrow as pa
 import pyarrow.parquet as pq
-from msgspec.structs import asdict
+from msgspec.structs import asdict, astuple
 
 from compose.recording.claim import nees
 from compose.recording.frames import Journaled
+from compose.recording.run import Run
 from compose.recording.ticks_csv import TickRow
-from protocol.messages import Command, Estimate, Localised
+from protocol.messages import Estimate, Localised
 from protocol.motion import Covariance, Pose
 from world.referee import errors
 
@@ -41,27 +42,22 @@ COLUMNS = [
     *_MEASURES,
 ]
 """The columns of `ticks.parquet`."""
-At = tuple[str, int]
-"""A robot's id and a tick."""
 
 
-def write_ticks(
-    rows: Iterable[TickRow],
-    commands: Mapping[At, Command],
-    held: Mapping[At, Estimate],
-    period: float,
-    path: Path,
-) -> None:
-    """Write `ticks.parquet` to `path`: `rows` with estimates, and their errors if there is a ground truth.
+def write_ticks(run: Run, rows: Iterable[TickRow], period: float, path: Path) -> None:
+    """Write `ticks.parquet` to `path`: the `rows` of `run`, with estimates and their errors.
 
     `period` is T_s in s.
     """
+    estimates = {(robot, one.tick): one for robot, past in run.pasts.items() for one in past.estimates}
     lines = []
     for row in rows:
-        at = row.robot, row.tick
-        verdict = commands[at].verdict if at in commands else None
-        extra = {"time_s": row.tick * period, "verdict": _tag(verdict)}
-        lines.append(asdict(row) | extra | _estimate(held.get(at), row.pose))
+        command = run.command(row.robot, row.tick)
+        extra = {
+            "time_s": row.tick * period,
+            "verdict": _tag(command.verdict if command is not None else None),
+        }
+        lines.append(asdict(row) | extra | _estimate(estimates.get((row.robot, row.tick)), row.pose))
     schema = pa.schema([pa.field(name, _KINDS.get(name, pa.float64())) for name in COLUMNS])
     pq.write_table(pa.Table.from_pylist(lines, schema=schema), path)
 
@@ -110,16 +106,17 @@ def frames_csv(frames: Iterable[Journaled], check: Callable[[], object] = lambda
 
 
 def _named(value: Any) -> Any:
-    match value:
-        case Localised():
-            return {"verdict": "localised", **_named_fields(value)}
-        case msgspec.Struct():
-            return _named_fields(value)
-        case tuple():
-            return [_named(one) for one in value]
-        case _:
-            return value
+    """Return a message, or a value in one, with the names of its fields."""
+    if isinstance(value, tuple):
+        return [_named(one) for one in value]
+    if not isinstance(value, msgspec.Struct):
+        return value
+    named = {
+        name: one if type(one) in _PLAIN else _named(one)
+        for name, one in zip(value.__struct_fields__, astuple(value), strict=True)
+    }
+    return {"verdict": "localised", **named} if isinstance(value, Localised) else named
 
 
-def _named_fields(value: msgspec.Struct) -> dict[str, Any]:
-    return {name: _named(getattr(value, name)) for name in value.__struct_fields__}
+_PLAIN = frozenset((int, float, str, bool, type(None)))
+"""The types of values without parts."""

@@ -22,9 +22,9 @@ from foxglove import Context
 from foxglove.websocket import Capability, ChannelView, Client, ServerListener, WebSocketServer
 
 from compose.launch.signals import stop_by_signal, stop_with_launcher
+from compose.recording.cast import Stage
 from compose.recording.frames import JournalDecoder
 from compose.recording.run import WORLD_JOURNAL, agent_journal
-from compose.view.cast import Stage
 from compose.view.foxglove.gate import GUESTS_FILES, Gate, private_host
 from compose.view.foxglove.mcap import Channels
 from compose.view.foxglove.views import Views, nanoseconds
@@ -102,7 +102,7 @@ class Live:
         for name in (WORLD_JOURNAL, *map(agent_journal, stage.ids)):
             tail, decoder = self._tails.setdefault(name, (Tail(self._folder / name), JournalDecoder(name)))
             with suppress(OSError, CorruptJournal):
-                for one in decoder.of(tail.news()):
+                for one in decoder.decoded(tail.news()):
                     self._channels.frame(one, nanoseconds(stage, one.tick))
 
     def _ready(self, stage: Stage, now: float) -> list[Scene]:

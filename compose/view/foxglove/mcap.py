@@ -6,10 +6,8 @@ Times are simulated times, beginning at 0. Equal recordings give equal bytes.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from heapq import merge
+from collections.abc import Callable, Iterable, Sequence
 from io import RawIOBase
-from operator import itemgetter
 from pathlib import Path
 from typing import Any, get_args
 
@@ -18,11 +16,11 @@ import msgspec
 from foxglove import Channel, Context, Schema
 from foxglove.mcap import MCAPWriteOptions
 
-from compose.recording.frames import Journaled, OfWorld, in_time, kind_of
-from compose.recording.run import WORLD_JOURNAL, JournalFile, agent_journal
+from compose.recording.cast import Stage
+from compose.recording.frames import Journaled, OfWorld, kind_of
+from compose.recording.run import WORLD_JOURNAL, agent_journal
 from compose.view.foxglove.schemas import schema
 from compose.view.foxglove.views import Views, nanoseconds, topics
-from compose.view.recorded import Performance
 from compose.view.scene import Scene
 from protocol.messages import OfRobot
 from protocol.wire import VERSION
@@ -62,8 +60,9 @@ class Channels:
         `at` is the simulated time in ns.
         """
         channel = self._of_frames(one.journal, type(one.message))
-        channel.log(one.body, log_time=at)
-        self._latest[channel] = (one.body, at)
+        body = one.body
+        channel.log(body, log_time=at)
+        self._latest[channel] = (body, at)
 
     def republish(self) -> None:
         """Publish the latest journaled frame of each channel again, for new viewers."""
@@ -108,18 +107,20 @@ class Channels:
 
 
 def write_mcap(
-    books: Mapping[str, JournalFile], run: Performance, path: Path, check: Callable[[], object] = lambda: None
-) -> int:
-    """Write `path`, and return the number of journaled frames in it.
+    stage: Stage,
+    frames: Sequence[Journaled],
+    scenes: Sequence[Scene],
+    path: Path,
+    check: Callable[[], object] = lambda: None,
+) -> None:
+    """Write the journaled `frames` and the `scenes` of a run, both in the order of their ticks, to `path`.
 
     Calls `check` in each tick, which may raise. Raises OSError if the file cannot be written, TooLong if the
-    run is too long, CorruptJournal if a journal is damaged.
+    run is too long.
     """
-    last = max([scene.tick for scene in run.scenes], default=0)
-    if nanoseconds(run.stage, last) >= LONGEST_S * 1_000_000_000:
-        raise TooLong(
-            f"the run lasts {last * run.stage.mission.period:g} s; MCAP can represent {LONGEST_S} s"
-        )
+    last = max([scene.tick for scene in scenes], default=0)
+    if nanoseconds(stage, last) >= LONGEST_S * 1_000_000_000:
+        raise TooLong(f"the run lasts {last * stage.mission.period:g} s; MCAP can represent {LONGEST_S} s")
     context = Context()
     channels = Channels(context)
     try:
@@ -127,43 +128,36 @@ def write_mcap(
             output = _Output(file)
             options = MCAPWriteOptions(chunk_size=CHUNK_BYTES, compression_threads=0)
             with foxglove.open_mcap(output, context=context, writer_options=options):
-                count = _publish(books, run, channels, [output.check, check])
+                _publish(stage, frames, scenes, channels, [output.check, check])
             output.check()
     finally:
         channels.close()
-    return count
 
 
 def _publish(
-    books: Mapping[str, JournalFile],
-    run: Performance,
+    stage: Stage,
+    frames: Sequence[Journaled],
+    scenes: Sequence[Scene],
     channels: Channels,
     checks: Sequence[Callable[[], object]],
-) -> int:
-    """Publish everything, tick by tick: the journaled frames, then the scene. Return the number of frames."""
-    views = Views(run.stage)
-    channels.open_views(run.stage.ids)
-    count = 0
-    for tick, one in _by_tick(books, run):
-        at = nanoseconds(run.stage, tick)
+) -> None:
+    """Publish everything, tick by tick: the journaled frames, then the scene."""
+    views = Views(stage)
+    channels.open_views(stage.ids)
+    both: Iterable[Journaled | Scene] = (*frames, *scenes)
+    tick, at = 0, nanoseconds(stage, 0)
+    for one in sorted(both, key=lambda one: one.tick):
+        if one.tick != tick:
+            tick, at = one.tick, nanoseconds(stage, one.tick)
         if isinstance(one, Journaled):
             channels.frame(one, at)
-            count += 1
             continue
-        if tick == 0:
+        if one.tick == 0:
             channels.view(*views.standing(), at)
         for shown in views.of(one):
             channels.view(*shown, at)
         for check in checks:
             check()
-    return count
-
-
-def _by_tick(books: Mapping[str, JournalFile], run: Performance) -> Iterator[tuple[int, Journaled | Scene]]:
-    frames: Iterable[tuple[int, int, Journaled | Scene]] = ((one.tick, 0, one) for one in in_time(books))
-    scenes = ((scene.tick, 1, scene) for scene in run.scenes)
-    for tick, _, one in merge(frames, scenes, key=itemgetter(0, 1)):
-        yield tick, one
 
 
 class _Output:

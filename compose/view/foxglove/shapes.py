@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 from foxglove import messages as fox
 
@@ -13,6 +14,10 @@ CORNERS = 72
 """The number of corners of a polygon drawn for a circle."""
 SIGMAS = 3.0
 """The size of an error ellipse, in standard deviations."""
+NOWHERE = fox.Pose(position=fox.Vector3(), orientation=fox.Quaternion(w=1.0))
+"""The pose of the reference frame in itself."""
+CACHED = 1000
+"""The number of colours that are stored, since most are used in every tick."""
 
 
 def timestamp(ns: int) -> fox.Timestamp:
@@ -30,6 +35,7 @@ def pose(at: Pose) -> fox.Pose:
     return fox.Pose(position=fox.Vector3(x=at.x, y=at.y, z=0.0), orientation=turned(at.heading))
 
 
+@lru_cache(CACHED)
 def colour(rgb: tuple[float, float, float], alpha: float = 1.0) -> fox.Color:
     """Return a colour from red, green, blue and alpha, each from 0 to 1."""
     return fox.Color(r=rgb[0], g=rgb[1], b=rgb[2], a=alpha)
@@ -49,7 +55,7 @@ def line(points: Sequence[fox.Point3], tint: fox.Color, width: float) -> fox.Lin
     """Return a line through Foxglove points, `width` pixels wide."""
     return fox.LinePrimitive(
         type=fox.LinePrimitiveLineType.LineStrip,
-        pose=fox.Pose(position=fox.Vector3(), orientation=fox.Quaternion(w=1.0)),
+        pose=NOWHERE,
         thickness=width,
         scale_invariant=True,
         points=list(points),

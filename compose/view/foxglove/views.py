@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 
 from foxglove import messages as fox
 
-from compose.view.cast import Seat, Stage
+from compose.recording.cast import Seat, Stage
+from compose.view import colours
 from compose.view.events import Event
 from compose.view.foxglove import shapes
 from compose.view.scene import HeldPoses, Player, Scene
@@ -26,7 +27,7 @@ BODY = 0.12
 """The drawn length of a robot, as a fraction of the sensing range R."""
 LEAST = 0.06
 """The minimum opacity of a hypothesis."""
-COLOURS: dict[Role, tuple[float, float, float]] = {"a": (0.04, 0.38, 0.64), "b": (0.77, 0.27, 0.11)}
+COLOURS: dict[Role, tuple[float, float, float]] = {"a": colours.rgb("a"), "b": colours.rgb("b")}
 GREY = (0.5, 0.5, 0.5)
 GREEN = (0.0, 0.5, 0.35)
 LEVELS = {
@@ -72,13 +73,33 @@ class Trail:
     """The latest TRAIL true poses of a robot. Each is converted once for all messages that contain it."""
 
     def __init__(self) -> None:
-        self.poses: deque[fox.Pose] = deque(maxlen=TRAIL)
         self.points: deque[fox.Point3] = deque(maxlen=TRAIL)
+        self._poses: deque[bytes] = deque(maxlen=TRAIL)
+        """The encoded poses."""
 
     def add(self, pose: Pose) -> None:
         """Append a pose."""
-        self.poses.append(shapes.pose(pose))
+        self._poses.append(_poses([shapes.pose(pose)]).encode())
         self.points.append(shapes.point(pose.x, pose.y))
+
+    def message(self, at: fox.Timestamp) -> Joined:
+        """Return the message of all poses at the time `at`."""
+        return Joined((_poses([], at).encode(), *self._poses))
+
+
+class Joined(NamedTuple):
+    """A message of Foxglove's schemas in encoded parts, which protobuf merges when they are concatenated."""
+
+    parts: tuple[bytes, ...]
+
+    def encode(self) -> bytes:
+        """Return the encoded message."""
+        return b"".join(self.parts)
+
+
+def _poses(poses: Sequence[fox.Pose], at: fox.Timestamp | None = None) -> fox.PosesInFrame:
+    """Return a part of a message of poses in the world frame; the first part has a time `at`."""
+    return fox.PosesInFrame(timestamp=at, frame_id=WORLD if at is not None else "", poses=list(poses))
 
 
 class Views:
@@ -147,8 +168,7 @@ class Views:
         if player.pose is not None:
             pose = fox.PoseInFrame(timestamp=at, frame_id=WORLD, pose=shapes.pose(player.pose))
             yield Shown(f"/{robot}/pose", pose)
-            poses = list(self._trails[robot].poses)
-            yield Shown(f"/{robot}/trail", fox.PosesInFrame(timestamp=at, frame_id=WORLD, poses=poses))
+            yield Shown(f"/{robot}/trail", self._trails[robot].message(at))
             yield Shown(f"/{robot}/body", fox.SceneUpdate(entities=[self._body(seat, player, at)]))
         if player.held is not None:
             frame, hypotheses = _hypotheses(robot, player.held)

@@ -10,7 +10,7 @@ from typing import Any
 
 import zenoh
 
-from compose.view.cast import of_configs
+from compose.recording.cast import of_configs
 from compose.view.facts import Gathering
 from compose.view.web.sources import UNANSWERED, Show
 from protocol.messages import (

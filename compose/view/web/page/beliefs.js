@@ -28,7 +28,7 @@ export class Beliefs {
       const grown = truth ? size * 1.45 : size * 1.15;
       shape(pen, robot.role, x, y, pose[2], grown);
       if (!truth && poses.length === 1) {
-        pen.fillStyle = player.down ? look.paper : look.phase[store.phase(tick, robot.id)];
+        pen.fillStyle = player.down ? look.paper : look.robot[robot.role];
         pen.fill();
       }
       pen.strokeStyle = look.ghost;

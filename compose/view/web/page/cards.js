@@ -27,6 +27,7 @@ export class Cards {
       const entry = make("button", { type: "button", className: "entry" });
       entry.addEventListener("click", () => this.choose(robot.id));
       this.roster.append(entry);
+      entry.dataset.role = robot.role;
       this.entries.set(robot.id, entry);
     }
   }
@@ -62,6 +63,7 @@ class Card {
     this.robot = robot;
     this.root = make("article", { className: "card", tabIndex: -1 });
     this.root.dataset.robot = robot.id;
+    this.root.dataset.role = robot.role;
     this.root.setAttribute("aria-label", `Robot ${robot.id}`);
     this.name = make("button", { type: "button", className: "name", textContent: robot.id });
     this.name.addEventListener("click", () => choose(robot.id));

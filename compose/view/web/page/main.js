@@ -391,6 +391,11 @@ $("view").addEventListener("submit", (event) => event.preventDefault());
 $("speed").append(...SPEEDS.map((speed) => make("option", { value: speed, textContent: speed })));
 $("key-list").append(...KEYS.flatMap(([key, action]) => [make("dt", {}, make("kbd", { textContent: key })), make("dd", { textContent: action })]));
 $("signs").append(...MEANINGS.map(([sign, meaning]) => make("li", {}, make("b", { textContent: sign }), `: ${meaning}`)));
+for (const role of ["a", "b"]) {
+  const item = make("li", { textContent: `role ${role}` });
+  item.dataset.role = role;
+  $("legend").append(item);
+}
 for (const phase of [1, 2, 3]) {
   const item = make("li", { textContent: `phase ${phase}` });
   item.dataset.phase = phase;

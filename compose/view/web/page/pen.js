@@ -46,7 +46,7 @@ export class Look {
     for (const name of ["ink", "paper", "faint", "grid", "disc", "ring", "orbit", "ghost", "cloud", "range", "link", "fault"]) {
       this[name] = of(name);
     }
-    this.phase = { 1: of("phase-1"), 2: of("phase-2"), 3: of("phase-3") };
+    this.robot = { a: of("robot-a"), b: of("robot-b") };
     const family = of("font");
     const size = 12.5;
     this.font = `${size}px ${family}`;

@@ -211,7 +211,7 @@ export class Plane {
     return between(player.pose, next.pose, next.executed, share, store.stage.mission.period);
   }
 
-  #robot({ look, size, focus, scene, store, tick }, robot, pose) {
+  #robot({ look, size, focus, scene, store }, robot, pose) {
     if (!pose) return;
     const pen = this.context, [x, y] = this.at(pose);
     const down = scene.players[store.places.get(robot.id)]?.down;
@@ -220,10 +220,10 @@ export class Plane {
     pen.lineWidth = size > 6 ? 4.5 : 3;
     pen.strokeStyle = look.paper;
     pen.stroke();
-    pen.fillStyle = down ? look.paper : look.phase[store.phase(tick, robot.id)];
+    pen.fillStyle = down ? look.paper : look.robot[robot.role];
     pen.fill();
     pen.lineWidth = down ? 3 : size > 6 ? 1.6 : 1;
-    pen.strokeStyle = down ? look.phase[store.phase(tick, robot.id)] : look.ink;
+    pen.strokeStyle = down ? look.robot[robot.role] : look.ink;
     pen.stroke();
     if (down) cross(pen, x, y, size, look);
     if (size > 6 || down || robot.id === focus) {

@@ -106,7 +106,7 @@ export class Timeline {
       for (const { from, to, value } of this.spans.get(robot.id)) {
         const left = x(from), width = Math.max(x(Math.min(to + 1, this.last)) - left, 1.5);
         const phase = Math.abs(value), inner = { 1: 0.4, 2: 0.62, 3: 1 }[phase] * band;
-        pen.fillStyle = pen.strokeStyle = of(`phase-${phase}`);
+        pen.fillStyle = pen.strokeStyle = of(`robot-${robot.role}`);
         if (value < 0) {
           pen.lineWidth = 1;
           pen.strokeRect(left + 0.5, y + (band - inner) / 2 + 0.5, Math.max(width - 1, 0.5), inner - 1);

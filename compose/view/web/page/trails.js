@@ -1,10 +1,11 @@
-// The trails of the robots: true, or as implied by their most probable current pose.
+// The trails of the robots: true, or as implied by their most probable current pose. As in the figures, the hue is the
+// robot, and the line style the phase: dotted, dashed, solid.
 
 import { between, compose, inverse } from "./geometry.js";
 import { held_now, leads } from "./held.js";
 import { unit } from "./pen.js";
 
-const TRAIL = { 1: { dash: [1.5, 4.5], width: 2.4 }, 2: { dash: [], width: 1.6 }, 3: { dash: [], width: 4 } };
+const TRAIL = { 1: { dash: [1.5, 4.5], width: 2.4 }, 2: { dash: [8, 5.5], width: 2 }, 3: { dash: [], width: 2.6 } };
 const CHUNK = 64;
 const BENDS = 6;
 const MOST_TRAILS = 6;
@@ -31,7 +32,7 @@ export class Trails {
       const { dash, width } = TRAIL[phase] ?? TRAIL[2];
       pen.lineWidth = (faint ? 0.7 * width : width) / s;
       pen.setLineDash(dash.map((length) => length / s));
-      pen.strokeStyle = look.phase[phase];
+      pen.strokeStyle = look.robot[robot.role];
       pen.stroke(path);
     };
     map();
@@ -123,7 +124,7 @@ export class Trails {
         const { dash, width } = TRAIL[phase];
         pen.setLineDash(dash);
         pen.lineWidth = width;
-        pen.strokeStyle = look.phase[phase];
+        pen.strokeStyle = look.robot[robot.role];
         pen.beginPath();
         pen.moveTo(...this.plane.at(pose));
       }

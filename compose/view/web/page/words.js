@@ -70,6 +70,6 @@ export const MEANINGS = [
   ["hollow robot, crossed out", "its process is gone"],
   ["line to an anchor", "range measured in this tick"],
   ["double line", "contact; dots are reports: filled received, with a tail late, hollow lost, crossed out damaged"],
-  ["trail", "dotted in phase 1, thin in phase 2, thick in phase 3"],
+  ["trail", "in the colour of the robot, as in the figures; dotted in phase 1, dashed in phase 2, solid in phase 3"],
   ["circle around an anchor", "solid: its sensing range; dashed: the orbit"],
 ];
