@@ -45,96 +45,6 @@ PARTS = (
     messages.Inconsistent,
 )
 """structs that messages contain, and that have no tables on other pages"""
-
-MEANINGS = {
-    "ScenarioFile.name": "the name of the scenario, and the beginning of the names of its runs",
-    "ScenarioFile.mission": "`[mission]`",
-    "ScenarioFile.robot": "one `[[robot]]` for each robot",
-    "ScenarioFile.seed": "the seed of all random draws, starts included",
-    "ScenarioFile.max_ticks": "the last tick of an undecided run; computed from the mission by default",
-    "ScenarioFile.planner": "`[planner]`",
-    "Mission.noise": "`[mission.noise]`; exact sensors if left out",
-    "PlannerTable.name": "the planner of all robots",
-    "RobotTable.id": "the robot's name",
-    "RobotTable.anchor": "x, y of the robot's anchor, in m",
-    "Attack.kind": "the kind of false data",
-    "Attack.part": "the part of the log that is false; `all` for the last three kinds",
-    "SpecFile.name": "the name of the sweep",
-    "SpecFile.seed": "the seed from which the seeds of all trials follow",
-    "SpecFile.axis": "one `[[axis]]` for each axis; a sweep without axes has one cell",
-    "AxisTable.values": "the values; with `fields`, a list of values for each",
-    "AxisTable.field": "the path of the field that varies",
-    "AxisTable.fields": "the paths of the fields that vary together",
-    "AxisTable.name": "the name of an axis with several fields, or with labels",
-    "DrawTable.field": "the path of the field that is drawn",
-    "DrawTable.uniform": "the interval of a uniform draw",
-    "DrawTable.log_uniform": "the interval of a draw whose logarithm is uniform",
-    "DrawTable.times": "the paths of fields that the draw is multiplied by",
-    "DrawTable.over": "the paths of fields that the draw is divided by",
-    "StartsTable.places": "the kinds of start position",
-    "StartsTable.headings": "the kinds of start heading",
-    "TrialRow.cell": "the number of the cell",
-    "TrialRow.trial": "the number of the trial in its cell",
-    "TrialRow.outcome": "the outcome of the mission, or `refused`",
-    "TrialRow.ticks": "the ticks of the mission",
-    "TrialRow.t_max_s": "T_max, the bound on the time that both orbit before the encounter",
-    "TrialRow.t_max_ticks": "the same in ticks",
-    "TrialRow.reports_heard": "reports received by all robots, repeated ones included",
-    "TrialRow.reports_refused": "reports refused by all robots",
-    "TrialRow.first_violation": "the first violation of a rule",
-    "TrialRow.wall_s": "s that the trial took by the clock",
-    "TrialRow.robots": "the columns of the next table, for each robot",
-    "TrialRow.heading_error_rad": "rad, of the robot with the largest heading error",
-    "RobotRow.branch": "how phase 1 ended",
-    "RobotRow.candidates": "solutions of eq. (7), before ticks without a detection are used",
-    "RobotRow.candidates_left": "solutions of eq. (7), after that",
-    "RobotRow.position_error_m": "m, the error of the claimed position",
-    "RobotRow.heading_error_rad": "rad, the error of the claimed heading",
-    "TickRow.y": "true position, m",
-    "TickRow.omega": "rad/s, likewise",
-    "TickRow.anchor_range": "m, as measured; empty out of range, or for a drop-out",
-    "TickRow.mutual_range": "m, as measured; empty likewise",
-    "Environment.tandem": "the version of Tandem",
-    "Environment.c_library": "the C library and its version",
-    "Environment.instruction_set": "the instruction set of the processor",
-    "Environment.linear_algebra": "the linear-algebra library of numpy and its version",
-    "RobotConfig.role": "the paper's a or b",
-    "RobotConfig.peer_anchor": "the peer's anchor",
-    "RobotConfig.mission": "the mission, as in the scenario",
-    "RobotConfig.planner_name": "the planner of the robot",
-    "RobotConfig.rendezvous": "the orbits of both robots, and T_max in s",
-    "Observation.anchor_range": "m, to the robot's own anchor; none out of range, or for a drop-out",
-    "Observation.contacts": "the robots in range",
-    "Report.since": "the tick in which the manoeuvres in `runs` begin",
-    "Report.runs": "the manoeuvres, equal ones in a row as one segment",
-    "Command.v": "m/s",
-    "Command.omega": "rad/s",
-    "Estimate.localised": "whether the robot has claimed a pose",
-    "GroundTruth.poses": "the true pose of each robot",
-    "MissionEnd.outcome": "the outcome of the mission",
-    "MissionEnd.reason": "the reason, if the outcome is not `localised`",
-    "Contact.range": "m, the mutual range; none for a drop-out",
-    "Ranged.range": "m",
-    "Localised.pose": "x, y in m, heading in rad, in the world frame",
-    "Undecided.reason": "the reason, in words",
-    "anchor_ranges": "the number of ranges to the anchor",
-    "mutual_ranges": "the number of ranges to the peer",
-    "branch": "how phase 1 ended",
-    "cov_xy": "likewise",
-    "cov_xh": "likewise",
-    "cov_yy": "likewise",
-    "cov_yh": "likewise",
-    "cov_hh": "likewise",
-    "peer": "the other robot of the pair",
-    "phase": "the phase of the method: 1, 2 or 3",
-    "reports_heard": "reports received, repeated ones included",
-    "reports_sent": "reports sent",
-    "robot": "the robot's name",
-    "state": "the state of the planner",
-    "tick": "the tick k",
-    "verdict": "the robot's verdict, once it has one",
-}
-"""the meaning of fields that have no docstring in the code, by struct and field, or by field"""
 NAMES = {
     "Mission": "table `[mission]`",
     "RobotTable": "`[[robot]]`",
@@ -177,12 +87,12 @@ def _pairs(body: Sequence[ast.stmt]) -> Iterable[tuple[str, str]]:
 
 
 def _described(struct: type[msgspec.Struct], field: str) -> str:
-    """Return the docstring of a field, of the class that declares it."""
+    """Return the docstring of a field, of the class that declares it; empty if it has none."""
     for cls in struct.__mro__:
         module = inspect.getmodule(cls)
         if module is not None and field in (found := _docstrings(module).get(cls.__name__, {})):
             return found[field]
-    return MEANINGS.get(f"{struct.__name__}.{field}", MEANINGS.get(field, ""))
+    return ""
 
 
 def _bounds(kind: Any) -> str:

@@ -72,7 +72,7 @@ def meeting(setting: tuple[float, Mission], a: Orbit, b: Orbit, angles: int) -> 
         beta += b.omega * mission.period
 
 
-def papers(setting: tuple[float, Mission]) -> tuple[Orbit, Orbit]:
+def paper_orbits(setting: tuple[float, Mission]) -> tuple[Orbit, Orbit]:
     """Return the paper's orbits, inside (D + R) / 2 by m0 = (v T_s (1 - Omega / pi))^2 / (16 R)."""
     distance, mission = setting
     share = half_arc(distance, mission.sensing_range) / math.pi
@@ -113,7 +113,7 @@ def main(angles: int, plans: int) -> None:
         distance, mission = setting
         plan = rendezvous(mission, distance, "assured")
         ours = meeting(setting, plan.a, plan.b, angles)
-        theirs = meeting(setting, *papers(setting), math.ceil(angles / 6))
+        theirs = meeting(setting, *paper_orbits(setting), math.ceil(angles / 6))
         drawn = soonest(setting, plans) if mission.period >= LONG_TICK else None
         values = (distance, mission.sensing_range, mission.period, mission.max_speed, mission.max_turn_rate)
         print(

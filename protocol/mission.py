@@ -82,13 +82,13 @@ class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return min(self.max_speed * self.period, FIRST_STRAIGHT_LIMIT * self.sensing_range)
 
     @property
-    def foothold(self) -> float:
+    def required_anchor_sigma(self) -> float:
         """The accuracy in m to which a robot must know its anchor's position before phase 2.
 
         This is the maximum square root of the trace of the covariance. The anchors are the two points that
         fix both robots in <W>.
         """
-        return min(self.accuracy, FOOTHOLD * self.sensing_range)
+        return min(self.accuracy, MAX_ANCHOR_SIGMA * self.sensing_range)
 
 
 HEADING_ACCURACY = 0.2
@@ -97,8 +97,11 @@ HEADING_ACCURACY = 0.2
 With a larger one, the linearised covariance no longer describes the distribution of the position.
 """
 
-FOOTHOLD = 0.05
-"""The maximum of `foothold`, as a fraction of R. A larger one makes the margin of the orbit too large."""
+MAX_ANCHOR_SIGMA = 0.05
+"""The maximum of `required_anchor_sigma`, as a fraction of R.
+
+A larger one makes the margin of the orbit too large.
+"""
 
 
 def infeasibility(mission: Mission, distance: float) -> str | None:

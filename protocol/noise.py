@@ -63,10 +63,10 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
     def standstill_bound(self) -> tuple[float, float]:
         """The bounds in m/s and rad/s that the odometry of a robot at rest hardly ever exceeds."""
         return (
-            UNREST * math.hypot(self.actuation.v_floor, self.odometry.v_floor),
-            UNREST * math.hypot(self.actuation.omega_floor, self.odometry.omega_floor),
+            STANDSTILL_SIGMAS * math.hypot(self.actuation.v_floor, self.odometry.v_floor),
+            STANDSTILL_SIGMAS * math.hypot(self.actuation.omega_floor, self.odometry.omega_floor),
         )
 
 
-UNREST = 6.0
+STANDSTILL_SIGMAS = 6.0
 """The number of standard deviations in `standstill_bound`."""

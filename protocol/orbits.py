@@ -140,7 +140,7 @@ def clearance(mission: Mission, distance: float) -> float:
     """
     if mission.noise.exact:
         return 0.0
-    known = mission.foothold
+    known = mission.required_anchor_sigma
     odometry_error = mission.noise.odometry.omega * math.pi / 2 * distance
     return min(CLEARANCE_SIGMAS * math.hypot(known, odometry_error), CLEARANCE_LIMIT * mission.sensing_range)
 

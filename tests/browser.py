@@ -81,7 +81,7 @@ def watching(*arguments: str | Path) -> Iterator[tuple[TandemProcess, str]]:
 
 def address_of(command: TandemProcess) -> str:
     """Return the address of the page of `command`, when it has printed it."""
-    command.until_says("http://127.0.0.1:")
+    command.until_prints("http://127.0.0.1:")
     found = re.search(r"http://\S+", command.out)
     assert found is not None
     return found[0]

@@ -71,7 +71,7 @@ ASSURED = "max_ticks = 1_000_000\n" + PAPER_1.replace('"paper"', '"assured"').re
 ).replace("11.3", "61.3")
 """A scenario of the planner that tolerates any number of missed deadlines, as on a busy machine."""
 REAL_TIME = ASSURED.replace("1_000_000", "600")
-"""The same scenario for `--rate 20`. It ends after half a minute, with any outcome."""
+"""ASSURED for `--rate 20`, with fewer ticks. It ends after half a minute, with any outcome."""
 OVER = (0, 1)
 """The exit statuses of a mission that has ended; in real time, either is possible."""
 ENDLESS = (
@@ -158,7 +158,7 @@ class TandemProcess:
         until(check, f"{what}\n{self.err}")
         assert holds or condition(), f"ended before {what}: {self.out}{self.err}"
 
-    def until_says(self, words: str) -> None:
+    def until_prints(self, words: str) -> None:
         """Wait until the command has printed `words` on either stream."""
         self.until(lambda: words in self.out + self.err, f"it prints '{words}'")
 
@@ -244,7 +244,7 @@ def world(scenario: str | Path, *arguments: str | Path) -> Iterator[tuple[Tandem
     """Yield a simulator process that waits for its robots, and its endpoint."""
     endpoint = free_endpoint()
     with TandemProcess("world", scenario, "--listen", endpoint, *arguments) as command:
-        command.until_says("waiting for")
+        command.until_prints("waiting for")
         yield command, endpoint
 
 

@@ -61,7 +61,7 @@ AGENTS, PUPPETS = ("a", "b"), ("c", "d")
 MOMENTS = 5
 """The number of memory measurements, from the first frame to the last."""
 
-Fate = Literal["refused", "passed over", "either", "unheard"]
+Treatment = Literal["refused", "passed over", "either", "unheard"]
 """The expected treatment of a frame.
 
 `refused`: it is counted as refused. `passed over`: it belongs to another tick and is ignored. `either`: one
@@ -112,7 +112,7 @@ class Shot(NamedTuple):
     key: str
     frame: bytes | None
     """content; None for a deletion"""
-    fate: Fate
+    treatment: Treatment
 
 
 class Genuine:
@@ -214,7 +214,7 @@ class Storm:
         if self._draw.random() < 0.1:
             shot = kind(self._draw.choice(self.acted_on), tick)
             if keys.parse(shot.key) is not None:
-                shot = shot._replace(key=self._draw.choice(self.watched), fate="unheard")
+                shot = shot._replace(key=self._draw.choice(self.watched), treatment="unheard")
             return shot
         return kind(self._draw.choice(self.acted_on), tick)
 
@@ -243,8 +243,8 @@ class Storm:
         if tick < 2 or (topic == "report" and not old):
             return self.truncated(key, tick)
         past = self._draw.choice(old) if old else self._draw.randrange(tick - 1)
-        fate: Fate = "refused" if topic == "observation" else "passed over"
-        return Shot(f"{topic} replayed", key, self._genuine[key][past], fate)
+        treatment: Treatment = "refused" if topic == "observation" else "passed over"
+        return Shot(f"{topic} replayed", key, self._genuine[key][past], treatment)
 
     def old(self, key: str, tick: int) -> Shot:
         """Return a valid frame of a past tick that differs from the one sent then."""
@@ -252,9 +252,9 @@ class Storm:
             return self.truncated(key, tick)
         past = self._draw.randrange(max(0, tick - 80), tick - 1)
         message = self._forged(key, past)
-        fates: dict[type, Fate] = {Command: "passed over", Report: "either"}
+        treatments: dict[type, Treatment] = {Command: "passed over", Report: "either"}
         kind = type(message).__name__
-        return Shot(f"{kind} of an old tick", key, encode(message), fates.get(type(message), "refused"))
+        return Shot(f"{kind} of an old tick", key, encode(message), treatments.get(type(message), "refused"))
 
     def to_come(self, key: str, _: int) -> Shot:
         message = self._forged(key, self._last + self._draw.randint(3, 10 ** self._draw.randint(1, 9)))
@@ -321,7 +321,7 @@ class Tally:
     """The counts of frames put, and the results of the storm."""
 
     def __init__(self) -> None:
-        self.fates: Counter[tuple[str, Fate]] = Counter()
+        self.treatments: Counter[tuple[str, Treatment]] = Counter()
         """number of frames by recipient and expected treatment"""
         self.kinds: Counter[tuple[str, str]] = Counter()
         """number of frames by kind and topic of the key"""
@@ -348,14 +348,14 @@ class Tally:
     def note(self, shot: Shot) -> None:
         """Count a frame that has been put."""
         for process in recipients(shot.key):
-            self.fates[process, shot.fate] += 1
-        concrete = shot.fate != "unheard" and keys.parse(shot.key) is not None
+            self.treatments[process, shot.treatment] += 1
+        concrete = shot.treatment != "unheard" and keys.parse(shot.key) is not None
         self.kinds[shot.kind, _topic(shot.key) if concrete else "others"] += 1
 
     def accounted(self, process: str) -> bool:
         """Return true if the process has refused all frames that it must, and no others than `either`."""
-        must = self.fates[process, "refused"]
-        return must <= self.refused[process] <= must + self.fates[process, "either"]
+        must = self.treatments[process, "refused"]
+        return must <= self.refused[process] <= must + self.treatments[process, "either"]
 
 
 SUBSCRIBED = (
@@ -504,13 +504,13 @@ def tables(tally: Tally) -> Sequence[Table]:
     put = Table("kind", *topics, title="frames put, by topic of the key")
     for kind in sorted({kind for kind, _ in tally.kinds}):
         put.add_row(kind, *[f"{count:,}" if (count := tally.kinds[kind, topic]) else "" for topic in topics])
-    fates: tuple[Fate, ...] = ("refused", "either", "passed over")
-    became = Table("process", *fates, "refused by it", title="expected treatment")
+    treatments: tuple[Treatment, ...] = ("refused", "either", "passed over")
+    became = Table("process", *treatments, "refused by it", title="expected treatment")
     memory = Table(
         "process", *[f"{100 * i // (MOMENTS - 1)} %" for i in range(MOMENTS)], title="resident memory, MB"
     )
     for process, sizes in tally.memory.items():
-        counts = [f"{tally.fates[process, fate]:,}" for fate in fates]
+        counts = [f"{tally.treatments[process, treatment]:,}" for treatment in treatments]
         became.add_row(process, *counts, f"{tally.refused[process]:,}")
         memory.add_row(process, *[f"{size:.1f}" for size in sizes])
     return put, became, memory

@@ -54,7 +54,7 @@ anchor = [0.0, 0.0]
 id = "b"
 anchor = [10.0, 0.0]
 """
-LETTER = RANDOM.replace("seed = 3", "seed = 5").replace(
+NOISY_PAPER = RANDOM.replace("seed = 3", "seed = 5").replace(
     "[[robot]]", f'{NOISE}[planner]\nname = "paper"\n[[robot]]', 1
 )
 BRIEF = PAPER_1.replace("seed = 1", "seed = 1\nmax_ticks = 4")
@@ -69,7 +69,7 @@ def scenario_of(name: str) -> Scenario:
         case "faulty":
             return parse(RANDOM + FAULT, name)
         case "letter":
-            return parse(LETTER, name)
+            return parse(NOISY_PAPER, name)
         case "undecided":
             return parse(BRIEF, name)
         case _:

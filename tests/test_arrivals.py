@@ -154,15 +154,15 @@ def test_wildcards_odd_keys_and_deletions_end_no_process_and_change_nothing(tmp_
             return others.enter_context(TandemProcess(*arguments, "--connect", endpoint))
 
         watch = start("watch", "--port", "0")
-        watch.until_says("http://")
+        watch.until_prints("http://")
         agents = {robot: start("agent", robot, "--out", out) for robot in "abc"}
         for robot, agent in agents.items():
             agent.until_answered(robot, out)
         stranger = others.enter_context(stranger_at(endpoint))
         shown = attack(stranger)
         for process in (clock, *agents.values()):
-            process.until_says("not a key of one mission and robot")
-            process.until_says("a deletion" if process is not agents["c"] else "not a key")
+            process.until_prints("not a key of one mission and robot")
+            process.until_prints("a deletion" if process is not agents["c"] else "not a key")
         listed = tandem("ps", "--connect", endpoint, "--json", "--timeout", "1")
         doctor = tandem("doctor", "--connect", endpoint, "--timeout", "1")
         assert (listed.status, doctor.status) == (0, 0), listed.err + doctor.out

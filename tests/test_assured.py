@@ -285,9 +285,11 @@ def test_without_what_was_sensed_before_phase_3_more_placements_would_be_left(tm
         state = planner.decide(claim.observed["b"], claim.heard["b"])
         assert state.belief.encounter_tick is not None
         late = state.pair_observations(state.belief.encounter_tick)
-        pair = base(late, odometry_rounding(state))
+        rounding_error = odometry_rounding(state, min(state.tick, state.peer_state.peer.through))
+        pair = base(late, rounding_error)
         assert pair is not None
-        left = weigh_placements(solve(CLOSE.distance, pair), late, CLOSE.reach, combined_error(state))
+        error_bound = combined_error(state, rounding_error)
+        left = weigh_placements(solve(CLOSE.distance, pair), late, CLOSE.reach, error_bound)
         (known,) = state.belief.placements
         assert any(same_placement(known, one, 1e-6) for one in left), seed
         more += len(left) > 1

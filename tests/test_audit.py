@@ -54,7 +54,7 @@ from tests.commands import (
     tandem,
 )
 from tests.test_real_time import missed
-from world.referee import Judgement
+from world.referee import MissionOutcome
 from world.scenario import Scenario
 from world.simulation import Simulation
 
@@ -185,7 +185,7 @@ def test_a_run_that_failed_was_failed_by_nobody_on_record() -> None:
     robots["a"].observation(a)
     robots["a"].decide()
     robots["a"].estimate()
-    end = simulation.end(Judgement("failed", "no answer from b at tick 5 for 30 s"))
+    end = simulation.end(MissionOutcome("failed", "no answer from b at tick 5 for 30 s"))
     simulation.journal_final_reports([robots["a"].final_report(end)])
     findings = audit_world_run({name: book.frames for name, book in books.items()})
     assert found(findings) == [(4, "b", "order")]

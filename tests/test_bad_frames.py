@@ -175,7 +175,7 @@ def test_nonsense_before_the_first_tick_is_refused_told_once_and_counted(tmp_pat
             volley(stranger, dict.fromkeys(WATCHED, bad_frames("observation")))
             stranger[GHOST].put(encode(Command(0, "ghost", 1.0, 0.0, 1, "haunting")))
             stranger[OTHER].put(encode(Command(0, "a", 1.0, 0.0, 1, "posing")))
-        clock.until_says(f"refused a frame on {OTHER}")
+        clock.until_prints(f"refused a frame on {OTHER}")
         assert isinstance(session.ask(link, keys.config(RUN, "*"), 5.0), str)
         agents.append(others.enter_context(TandemProcess("agent", "d", "--connect", endpoint, "--out", out)))
         assert clock.ended().status == 0
@@ -245,9 +245,9 @@ def test_a_storm_of_mutated_frames_on_every_key_disturbs_nothing(tmp_path: Path)
     tally = rage(STORM, seed=7, distance=40.0, folder=tmp_path)
     assert (tally.frames, tally.statuses, tally.outcome, tally.same) == (STORM, [0, 0, 0], "localised", True)
     for process, sizes in tally.memory.items():
-        assert tally.accounted(process), (process, tally.fates, tally.refused)
+        assert tally.accounted(process), (process, tally.treatments, tally.refused)
         assert sizes[-1] - sizes[2] < SETTLED_MB
-    assert tally.late >= tally.fates["world", "passed over"]
+    assert tally.late >= tally.treatments["world", "passed over"]
     assert "Traceback" not in tally.errors
 
 

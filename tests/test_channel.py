@@ -273,13 +273,13 @@ def test_a_fault_is_on_its_link_and_on_no_other(link: LinkSelector | None, cut: 
 
 def test_every_link_every_fault_and_every_seed_has_draws_of_its_own() -> None:
     half = Fault(loss=0.5)
-    fates = [
+    arrivals = [
         tuple(bool(air.heard) for air in flown(plan, [True] * 64, seed=seed, way=way))
         for plan in ([half], [Fault(), half])
         for seed in (1, 2)
         for way in (("a", "b"), ("b", "a"), ("a", "c"))
     ]
-    assert len(set(fates)) == len(fates)
+    assert len(set(arrivals)) == len(arrivals)
 
 
 # --- independence of random draws ---------------------------------------------------------------------
@@ -291,7 +291,7 @@ ROUGH = (
 )
 
 
-def fates(airs: Sequence[LinkState]) -> dict[int, Counter[tuple[int, bool]]]:
+def arrivals(airs: Sequence[LinkState]) -> dict[int, Counter[tuple[int, bool]]]:
     """Return, for each report, the ticks of arrival of its copies, and which were damaged."""
     found: dict[int, Counter[tuple[int, bool]]] = {}
     for now, tick, damaged in came(airs):
@@ -304,7 +304,7 @@ def test_more_or_less_loss_shifts_no_other_draw(loss: float) -> None:
     """A higher loss loses a superset of the reports; the others arrive unchanged."""
     contact = [True] * 2000
     less, more = [
-        fates(flown([ROUGH[0], replace(ROUGH[1], loss=share), ROUGH[2]], contact))
+        arrivals(flown([ROUGH[0], replace(ROUGH[1], loss=share), ROUGH[2]], contact))
         for share in sorted((loss, 0.3))
     ]
     assert sum(map(Counter.total, more.values())) < sum(map(Counter.total, less.values())) or loss == 0.3
@@ -314,15 +314,15 @@ def test_more_or_less_loss_shifts_no_other_draw(loss: float) -> None:
 
 def test_another_fault_shifts_no_draw_of_those_before_it() -> None:
     contact = [True] * 2000
-    without, with_it = fates(flown(ROUGH, contact)), fates(flown([*ROUGH, Fault(loss=0.5)], contact))
+    without, with_it = arrivals(flown(ROUGH, contact)), arrivals(flown([*ROUGH, Fault(loss=0.5)], contact))
     assert 0 < len(with_it) < len(without)
     assert all(copies <= without[tick] for tick, copies in with_it.items())
 
 
 def test_what_is_not_in_contact_shifts_no_draw() -> None:
-    always = fates(flown(ROUGH, [True] * 2000))
+    always = arrivals(flown(ROUGH, [True] * 2000))
     broken = [tick % 40 < 20 for tick in range(2000)]
-    now_and_then = fates(flown(ROUGH, broken))
+    now_and_then = arrivals(flown(ROUGH, broken))
     assert all(copies <= always[tick] for tick, copies in now_and_then.items())
     early = [tick for tick in range(2000) if tick % 40 < 15]
     assert all(now_and_then.get(tick) == always.get(tick) for tick in early)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from compose.hardware.conformance import judged
+from compose.hardware.conformance import check_results
 from compose.hardware.exercise import ExerciseRun
 from compose.launch.driver_loader import briefed
 from compose.scenario.scenario_file import load
@@ -12,7 +12,7 @@ from tests import broken_drivers, virtual_time
 from tests.commands import tandem
 
 MANOEUVRE_S = 0.1
-BRIEFING = briefed(load("paper-1"), "a", MANOEUVRE_S)
+CONFIG = briefed(load("paper-1"), "a", MANOEUVRE_S)
 
 
 def test_the_example_keeps_the_contract() -> None:
@@ -47,10 +47,10 @@ def test_a_broken_driver_is_told_what_it_breaks(
     clock = virtual_time.Clock()
     for module in virtual_time.MODULES:
         monkeypatch.setattr(module, "time", clock)
-    driver = getattr(broken_drivers, broken)(BRIEFING, MANOEUVRE_S)
-    trial = ExerciseRun(driver, BRIEFING, MANOEUVRE_S)
+    driver = getattr(broken_drivers, broken)(CONFIG, MANOEUVRE_S)
+    trial = ExerciseRun(driver, CONFIG, MANOEUVRE_S)
     trial.go_through()
-    assert said in "; ".join([one.wrong for one in judged(trial) if one.wrong is not None])
+    assert said in "; ".join([one.wrong for one in check_results(trial) if one.wrong is not None])
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ from compose.terminal.progress import result
 from protocol.messages import Command, FinalReport, Localised, MissionEnd
 from protocol.motion import Covariance, Pose
 from tests.commands import SECTION_IV, tandem
-from world.referee import Judgement
+from world.referee import MissionOutcome
 from world.tick import World, advance, release
 
 FLOOR = 1e-6
@@ -74,9 +74,9 @@ def claimed(text: str, covariance: Covariance | None, *, by: float = 0.03) -> Re
     }
     onward = advance(world, first)
     assert isinstance(onward, World)
-    judgement = advance(onward, {})
-    assert isinstance(judgement, Judgement)
-    end = MissionEnd(1, judgement.outcome, judgement.reason)
+    mission_outcome = advance(onward, {})
+    assert isinstance(mission_outcome, MissionOutcome)
+    end = MissionEnd(1, mission_outcome.outcome, mission_outcome.reason)
     return Recording(scenario, (TickRecord(world.truth, first), TickRecord(onward.truth, {})), end, {})
 
 

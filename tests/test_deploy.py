@@ -214,7 +214,7 @@ def test_a_stop_is_none_of_the_failures_after_which_the_unit_starts_again(tmp_pa
     service = unit()
     assert service["Restart"] == ["on-failure"]
     with TandemProcess("agent", "a", "--connect", free_endpoint(), "--out", tmp_path) as waiting:
-        waiting.until_says("searching for up to")
+        waiting.until_prints("searching for up to")
         waiting.tell(SIGTERM)
         assert [str(waiting.ended().status)] == service["SuccessExitStatus"]
     mistaken = tandem("agent", "a", "--keys", tmp_path)

@@ -16,7 +16,9 @@ def test_the_figures_of_the_rendezvous_are_printed_a_line_a_setting(
     assert heading.split()[0] == "D,"
     setting, _, figures = line.partition("3.14 ")
     assert setting.split() == ["10,", "3,", "1,", "1,"]
-    bound, mean, worst, papers, papers_worst, *_ = (float(word) for word in figures.replace("/", " ").split())
+    bound, mean, worst, paper_mean, paper_worst, *_ = (
+        float(word) for word in figures.replace("/", " ").split()
+    )
     assert worst <= bound
-    assert mean <= 0.6 * papers
-    assert worst <= 0.6 * papers_worst
+    assert mean <= 0.6 * paper_mean
+    assert worst <= 0.6 * paper_worst

@@ -23,7 +23,7 @@ from cryptography.hazmat.primitives.serialization import (
 )
 
 from compose import extras
-from compose.doctor.certificate_checks import papers
+from compose.doctor.certificate_checks import certificate_findings
 from compose.doctor.network_checks import APART_S, compared
 from compose.extras import Library
 from compose.launch.processes import free_endpoint
@@ -211,7 +211,7 @@ def test_a_certificate_that_does_not_name_where_its_owner_listens_is_told(keys: 
 
 
 def test_a_certificate_is_not_valid_before_its_time(mine: Path) -> None:
-    found = list(papers(configured(mine / KEYED), now=0.0))
+    found = list(certificate_findings(configured(mine / KEYED), now=0.0))
     # one of the robot and one of the CA
     assert [one.mark for one in found if "is not valid before" in one.text] == ["fix", "fix"]
 
@@ -295,7 +295,7 @@ def test_a_robot_that_the_world_does_not_know_is_told(keys: Path, tmp_path: Path
     endpoint = free_endpoint("tls")
     arguments = ("world", "paper-1", "--run", "mine", "--listen", endpoint, "--keys", everybody / "world")
     with TandemProcess(*arguments) as part:
-        part.until_says("waiting for")
+        part.until_prints("waiting for")
         ended = tandem("doctor", "--connect", endpoint, "--keys", everybody / "agent-c")
     only_fix(ended, "alive: mine: this world has no robot 'c'; it has a, b")
 
@@ -467,7 +467,7 @@ def test_a_mission_beside_which_all_is_tried_leaves_the_record_of_one_alone(
             for who in ("agent-a", "agent-b", "viewer")
         ]
         for doctor in doctors[:2]:
-            doctor.until_says("can publish Reports of")
+            doctor.until_prints("can publish Reports of")
         started["b"] = part("agent-b", "agent", "b")
         listing = tandem("ps", "--connect", endpoint, "--keys", keys / "viewer")
         assert listing.status == 0

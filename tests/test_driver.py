@@ -41,7 +41,7 @@ LINK = cast(zenoh.Session, None)
 """A placeholder; a stage needs no session."""
 MANOEUVRE_S = 0.1
 SCENARIO = parse(PAPER_1, "paper-1")
-BRIEFING = briefed(SCENARIO, "a", MANOEUVRE_S)
+CONFIG = briefed(SCENARIO, "a", MANOEUVRE_S)
 
 
 @pytest.fixture
@@ -76,7 +76,9 @@ class Recorded:
         pass
 
 
-FAREWELL = FinalReport("a", 0, 0, None, None, None, None, None, None, None, None, None, 0, 0, 0, 0, 0, 0, 0)
+FINAL_REPORT = FinalReport(
+    "a", 0, 0, None, None, None, None, None, None, None, None, None, 0, 0, 0, 0, 0, 0, 0
+)
 
 
 def command(tick: int, robot: str = "a", v: float = 0.5, verdict: Verdict | None = None) -> Command:
@@ -109,11 +111,11 @@ def played(stage: Stage) -> Play:
                         stage.comes("command", keys.command("r", "a"), one, after)
                 case MissionEnd() as end:
                     ends.append(end)
-                    stage.comes("command", keys.command("r", "a"), encode(FAREWELL))
+                    stage.comes("command", keys.command("r", "a"), encode(FINAL_REPORT))
 
         stage.answer = said
         stage.alive("a", "b")
-        field = Field(driver, BRIEFING, "r", stage, max_ticks=ticks, manoeuvre_s=MANOEUVRE_S, timeout=timeout)
+        field = Field(driver, CONFIG, "r", stage, max_ticks=ticks, manoeuvre_s=MANOEUVRE_S, timeout=timeout)
         field.attach(LINK)
         return field, field.run_mission(10.0, lambda: None), ends
 
@@ -223,7 +225,7 @@ def ended(
     own: Verdict | None, said: Report | None, timeout: float = 60.0, ticks: int = 30
 ) -> MissionEnd | None:
     """Return the MissionEnd if a reaches the verdict `own` at tick 10 and receives `said` at tick 12."""
-    ending = Ending(BRIEFING, 25, timeout)
+    ending = Ending(CONFIG, 25, timeout)
     for tick in range(ticks):
         if tick == 12 and said is not None:
             ending.receive(said)
@@ -278,7 +280,7 @@ def test_b_begins_when_a_does_and_counts_a_s_ticks(stage: Stage) -> None:
     def answer(key: str, frame: bytes) -> None:
         if key == keys.observation("r", "b"):
             observation = decode(frame, Observation | MissionEnd | FinalReport)
-            said = command(observation.tick, "b") if isinstance(observation, Observation) else FAREWELL
+            said = command(observation.tick, "b") if isinstance(observation, Observation) else FINAL_REPORT
             stage.comes("command", keys.command("r", "b"), encode(said), 0.001)
 
     stage.answer = answer
@@ -327,7 +329,7 @@ def test_a_robot_that_was_down_catches_up_with_its_peer_standing(robot: str, pee
             said = (
                 command(observation.tick, robot)
                 if isinstance(observation, Observation)
-                else replace(FAREWELL, robot=robot)
+                else replace(FINAL_REPORT, robot=robot)
             )
             stage.comes("command", keys.command("r", robot), encode(said), 0.001)
 
@@ -373,7 +375,7 @@ def test_a_b_that_was_killed_before_tick_0_begins_though_a_waits_for_it(stage: S
 
 def test_a_robot_says_why_there_is_no_farewell(stage: Stage, capsys: pytest.CaptureFixture[str]) -> None:
     stage.alive("a", "b")
-    field = Field(Recorded(), BRIEFING, "r", stage, max_ticks=2, manoeuvre_s=MANOEUVRE_S)
+    field = Field(Recorded(), CONFIG, "r", stage, max_ticks=2, manoeuvre_s=MANOEUVRE_S)
     field.attach(LINK)
     field.run_mission(10.0, lambda: None)
     assert "no FinalReport of a: no answer to the MissionEnd" in capsys.readouterr().err
@@ -405,7 +407,7 @@ def test_a_robot_whose_driver_takes_a_whole_tick_to_sense_hears_its_agent(stage:
 
     driver = Slow()
     driver.clock = stage.monotonic
-    field = Field(driver, BRIEFING, "r", stage, max_ticks=100, manoeuvre_s=MANOEUVRE_S, timeout=1.0)
+    field = Field(driver, CONFIG, "r", stage, max_ticks=100, manoeuvre_s=MANOEUVRE_S, timeout=1.0)
 
     def answer(key: str, frame: bytes) -> None:
         if key == keys.observation("r", "a"):

@@ -155,7 +155,7 @@ def test_a_second_ctrl_c_changes_nothing(endless: Path, tmp_path: Path) -> None:
 def test_a_world_and_an_agent_that_are_told_to_stop_say_so(number: signal.Signals) -> None:
     with world("paper-1") as (clock, endpoint):
         with TandemProcess("agent", "a", "--connect", endpoint) as agent:
-            agent.until_says("a: in run")
+            agent.until_prints("a: in run")
             agent.tell(number)
             assert agent.ended(AT_ONCE_S)[::2] == (130, f"tandem agent a: stopped by {number.name}\n")
         clock.tell(number)

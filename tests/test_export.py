@@ -505,9 +505,9 @@ def test_a_viewer_sees_a_run_while_it_is_played_and_to_its_end(tmp_path: Path) -
     with TandemProcess(
         "run", scenario, "-q", "--rate", "40", "--foxglove", str(port), "--out", out
     ) as played:
-        played.until_says(f"the Foxglove server at ws://127.0.0.1:{port}")
+        played.until_prints(f"the Foxglove server at ws://127.0.0.1:{port}")
         topics = asyncio.run(asyncio.wait_for(watched(port, "The mission ends: "), BOUND_S))
-        played.until_says("until Ctrl-C")
+        played.until_prints("until Ctrl-C")
         assert played.tell(Signals.SIGINT)
         ended = played.ended()
     assert ended.status in OVER
@@ -521,7 +521,7 @@ def test_a_viewer_sees_a_run_while_it_is_played_and_to_its_end(tmp_path: Path) -
 def test_who_comes_late_sees_what_stands_and_the_end() -> None:
     port = int(free_endpoint().rsplit(":", 1)[1])
     with TandemProcess("run", "paper-1", "-q", "--foxglove", str(port)) as played:
-        played.until_says("until Ctrl-C")
+        played.until_prints("until Ctrl-C")
         assert asyncio.run(asyncio.wait_for(watched(port, "The mission ends: localised"), BOUND_S))
         played.tell(Signals.SIGINT)
         assert played.ended().status == 0
@@ -544,7 +544,7 @@ def test_of_web_pages_only_foxglove_s_app_and_those_named_see_a_run() -> None:
     port = int(free_endpoint().rsplit(":", 1)[1])
     allowed = ("--foxglove-origin", "http://localhost:8080")
     with TandemProcess("run", "paper-1", "-q", "--foxglove", str(port), *allowed) as played:
-        played.until_says("until Ctrl-C")
+        played.until_prints("until Ctrl-C")
         for origin, status in ORIGINS.items():
             for host, known in (("127.0.0.1", True), ("localhost", True), ("elsewhere.example", False)):
                 heads = {"Host": f"{host}:{port}"} | ({"Origin": origin} if origin is not None else {})
@@ -566,7 +566,7 @@ def test_a_crowd_of_viewers_is_turned_away_and_leaves_room_for_those_that_come_a
     limited = ("sh", "-c", f'ulimit -n {files}; exec "$@"', "sh")
     heads = {"Host": f"127.0.0.1:{port}"}
     with TandemProcess("run", "paper-1", "-q", "--foxglove", str(port), through=limited) as played:
-        played.until_says("until Ctrl-C")
+        played.until_prints("until Ctrl-C")
         crowd = [asking(port, heads) for _ in range(GUESTS)]
         assert {connection.getresponse().status for connection in crowd} == {101}
         crowd += [asking(port, {}) for _ in range(files)]

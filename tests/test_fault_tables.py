@@ -34,7 +34,7 @@ link = "a<->b"
 partition = true
 contact_ticks = [4, 9]
 """
-ROUGH_SAID = [
+ROUGH_OPTIONS = [
     "a->b: loss=0.3, burst_start=0.2, burst_end=0.25, burst_loss=0.9, delay=0..3, ticks=5..500",
     "delay=2, duplicate=0.3, reorder=0.2, corrupt=0.1, reports_per_tick=.75, contact_ticks=2..100",
     "a <-> b: partition, contact_ticks=4..9",
@@ -44,7 +44,7 @@ RANDOM = PAPER_1.replace("start", "# start").replace('"paper"', '"assured"')
 
 
 def test_a_file_and_the_command_line_say_the_same(tmp_path: Path) -> None:
-    written, said = parse(RANDOM + ROUGH, "mine.toml"), parse(RANDOM, "mine.toml", faults=ROUGH_SAID)
+    written, said = parse(RANDOM + ROUGH, "mine.toml"), parse(RANDOM, "mine.toml", faults=ROUGH_OPTIONS)
     assert written == said
     assert written.faults == (
         Fault(
@@ -68,7 +68,7 @@ def test_a_file_and_the_command_line_say_the_same(tmp_path: Path) -> None:
     )
     (tmp_path / "rough.toml").write_text(RANDOM + ROUGH)
     (tmp_path / "plain.toml").write_text(RANDOM)
-    more = [word for fault in ROUGH_SAID for word in ("--fault", fault)]
+    more = [word for fault in ROUGH_OPTIONS for word in ("--fault", fault)]
     tandem("run", "rough.toml", "--in-process", "--out", "rough", cwd=tmp_path)
     tandem("run", "plain.toml", "--in-process", "--out", "plain", *more, cwd=tmp_path)
     assert journals(tmp_path / "rough") == journals(tmp_path / "plain") != {}
@@ -163,7 +163,7 @@ def test_a_link_of_another_pair_takes_nothing_of_this_ones_room() -> None:
         parse(text, "mine.toml", faults=["a->c: delay=1"])
 
 
-SAID_BADLY = [
+INVALID_FAULTS = [
     ("", "'' has an empty entry; expected the form a->b: loss=0.3, delay=0..3"),
     ("a->b:", "has an empty entry"),
     ("loss=0.1,", "has an empty entry"),
@@ -190,7 +190,7 @@ SAID_BADLY = [
 ]
 
 
-@pytest.mark.parametrize(("said", "says"), SAID_BADLY)
+@pytest.mark.parametrize(("said", "says"), INVALID_FAULTS)
 def test_a_fault_said_badly_is_repeated_with_what_is_wrong(said: str, says: str) -> None:
     with pytest.raises(BadScenario) as bad:
         parse(RANDOM, "mine.toml", faults=["loss=0.1", said])

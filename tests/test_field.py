@@ -157,7 +157,7 @@ def test_a_robot_whose_agent_is_killed_stands_still_and_goes_on_from_its_record(
         path = tmp_path / killed / f"agent-{killed}.journal"
         robots[killed].until_written(path, 2500)
         os.kill(process_of(tmp_path / killed, "agent", killed), SIGKILL)
-        robots[killed].until_says("was killed by signal 9 and is restarted")
+        robots[killed].until_prints("was killed by signal 9 and is restarted")
         both_have_ended(tmp_path, robots)
     stood = [
         step

@@ -15,7 +15,7 @@ import pytest
 from compose.launch.processes import free_endpoint
 from compose.network import KEYED
 from compose.scenario.scenario_file import load
-from compose.view.web.live import AHEAD, LEAP, Heard, RefusedFrame
+from compose.view.web.live import AHEAD, LEAP, ReceivedMission, RefusedFrame
 from protocol.messages import (
     Command,
     Estimate,
@@ -65,9 +65,9 @@ OF_A = (Key(keys.command, RUN, "a"), Key(keys.report, RUN, "a", "b"), Key(keys.e
 """The keys on which the certificate of robot a permits frames."""
 
 
-def told(heard: Heard) -> dict[str, Any]:
+def told(received: ReceivedMission) -> dict[str, Any]:
     """Return all known data, as text."""
-    known = heard.known
+    known = received.known
     return {
         "ticks": repr(known.ticks),
         "end": known.end,
@@ -77,9 +77,9 @@ def told(heard: Heard) -> dict[str, Any]:
 
 
 @pytest.fixture
-def heard() -> Heard:
+def received() -> ReceivedMission:
     """Return a mission at tick 0, of which a message of the world has been received."""
-    one = Heard(RUN)
+    one = ReceivedMission(RUN)
     for robot in "ab":
         one.take(Key(keys.config, RUN, robot), encode(load("paper-1").config(robot)))
         one.take(Key(keys.observation, RUN, robot), encode(Observation(0, robot, None, 1.0)))
@@ -89,39 +89,39 @@ def heard() -> Heard:
 @pytest.mark.parametrize("what", FORGED)
 @pytest.mark.parametrize("source", OF_A, ids=lambda source: str(source.kind.__name__))
 def test_a_viewer_takes_nothing_of_that_from_a_robot_by_its_keys(
-    what: str, source: Key, heard: Heard
+    what: str, source: Key, received: ReceivedMission
 ) -> None:
-    before = told(heard)
+    before = told(received)
     with pytest.raises((RefusedFrame, MalformedFrame)):
-        heard.take(source, encode(FORGED[what]))
-    assert told(heard) == before
+        received.take(source, encode(FORGED[what]))
+    assert told(received) == before
 
 
-def test_a_viewer_takes_what_a_key_carries(heard: Heard) -> None:
+def test_a_viewer_takes_what_a_key_carries(received: ReceivedMission) -> None:
     for source, message in zip(
         OF_A, (command(0, "a"), report(0, "a"), Estimate(0, "a", (ORIGIN,), (), localised=False)), strict=True
     ):
-        before = told(heard)
-        heard.take(source, encode(message))
-        assert told(heard) != before
-    heard.take(Key(keys.truth, RUN), encode(FORGED["the truth"]))
-    heard.take(Key(keys.observation, RUN, "a"), encode(FORGED["the end"]))
-    assert heard.known.end == FORGED["the end"]
+        before = told(received)
+        received.take(source, encode(message))
+        assert told(received) != before
+    received.take(Key(keys.truth, RUN), encode(FORGED["the truth"]))
+    received.take(Key(keys.observation, RUN, "a"), encode(FORGED["the end"]))
+    assert received.known.end == FORGED["the end"]
 
 
-def test_a_tick_is_none_before_the_world_has_said_it(heard: Heard) -> None:
+def test_a_tick_is_none_before_the_world_has_said_it(received: ReceivedMission) -> None:
     """Messages of a robot may overtake those of the world a little, but the world does not skip ticks."""
-    unheard, own, observation = Heard(RUN), OF_A[0], Key(keys.observation, RUN, "a")
+    unheard, own, observation = ReceivedMission(RUN), OF_A[0], Key(keys.observation, RUN, "a")
     unheard.take(own, encode(command(LAST, "a")))
     assert unheard.known.last == -1
-    heard.take(own, encode(command(AHEAD, "a")))
+    received.take(own, encode(command(AHEAD, "a")))
     with pytest.raises(RefusedFrame):
-        heard.take(own, encode(command(AHEAD + 1, "a")))
+        received.take(own, encode(command(AHEAD + 1, "a")))
     with pytest.raises(RefusedFrame):
-        heard.take(observation, encode(Observation(LEAP + 1, "a", None, 1.0)))
-    heard.take(observation, encode(Observation(LEAP, "a", None, 1.0)))
-    heard.take(own, encode(command(LEAP + AHEAD, "a")))
-    assert heard.known.last == LEAP + AHEAD
+        received.take(observation, encode(Observation(LEAP + 1, "a", None, 1.0)))
+    received.take(observation, encode(Observation(LEAP, "a", None, 1.0)))
+    received.take(own, encode(command(LEAP + AHEAD, "a")))
+    assert received.known.last == LEAP + AHEAD
 
 
 def shown(address: str) -> dict[str, Any]:
@@ -149,9 +149,9 @@ def test_with_one_robots_certificate_nobody_forges_end_truth_ticks_or_another_ro
             return stack.enter_context(TandemProcess(*arguments))
 
         clock = start("world", scenario, "--run", RUN, "--listen", endpoint, *keyed("world"))
-        clock.until_says("waiting for")
+        clock.until_prints("waiting for")
         watch = start("watch", "--connect", endpoint, *keyed("viewer"))
-        watch.until_says("http://")
+        watch.until_prints("http://")
         address = watch.out.split()[0].rstrip("/")
         a = start("agent", "a", "--connect", endpoint, *keyed("agent-a"))
         watch.until(lambda: shown(address).get("last") == 0, "it shows tick 0")
@@ -171,7 +171,7 @@ def test_with_one_robots_certificate_nobody_forges_end_truth_ticks_or_another_ro
             assert source.kind is not None
             key = source.kind(*[name for name in source[1:] if name])
             for why in ("it names robot 'b' as its sender", "its tick is in the future"):
-                watch.until_says(f"refused a frame on {key}: {why}")
+                watch.until_prints(f"refused a frame on {key}: {why}")
         found = shown(address)
         assert (found["last"], found["end"], found["live"]) == (0, None, True)
         listed = tandem("ps", "--connect", endpoint, *keyed("viewer"), "--json", "--timeout", "2")

@@ -342,7 +342,7 @@ def test_a_page_whose_certificate_is_refused_says_so(keys: Path, tmp_path: Path)
     own = shutil.copytree(keys / "viewer", tmp_path / "viewer")
     take_away(own, keys)
     with world_of(keys) as endpoint, TandemProcess("watch", "--connect", endpoint, "--keys", own) as page:
-        page.until_says(f"no router at {endpoint} yet: it requires a certificate, and there is none")
+        page.until_prints(f"no router at {endpoint} yet: it requires a certificate, and there is none")
 
 
 # --- invalid configurations -----------------------------------------------------------------------------
@@ -441,15 +441,15 @@ def test_who_listens_beyond_this_machine_without_keys_is_warned(keys: Path) -> N
     where = free_endpoint().replace("127.0.0.1", "0.0.0.0")
     warning = f"listening without --keys at {where}: every machine that reaches it"
     with TandemProcess("world", "paper-1", "--listen", where) as world:
-        world.until_says("waiting for")
+        world.until_prints("waiting for")
         assert world.err.startswith(f"tandem world: {warning}")
         assert world.err.count("\n") == 1
     with TandemProcess("world", "paper-1", "--listen", free_endpoint()) as world:
-        world.until_says("waiting for")
+        world.until_prints("waiting for")
         assert world.err == ""
     where = free_endpoint("tls").replace("127.0.0.1", "0.0.0.0")
     with TandemProcess("world", "paper-1", "--listen", where, "--keys", keys / "world") as world:
-        world.until_says("waiting for")
+        world.until_prints("waiting for")
         assert world.err == ""
 
 

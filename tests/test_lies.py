@@ -49,37 +49,37 @@ def outcome(recording: Recording) -> str:
 # --- exact sensors ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("liar", ["a", "b"])
+@pytest.mark.parametrize("attacker", ["a", "b"])
 @pytest.mark.parametrize(
     "attack", [*OF_DRIVES, *OF_STARTS], ids=lambda attack: f"{attack.kind}-{attack.part}-{attack.size:.2g}"
 )
-def test_every_lie_about_a_drive_or_a_start_is_an_alarm(attack: Attack, liar: str) -> None:
+def test_every_lie_about_a_drive_or_a_start_is_an_alarm(attack: Attack, attacker: str) -> None:
     for seed in range(6):
-        recording = mission(seed, {liar: attack})
-        if not _tells_otherwise(recording, liar, attack):
+        recording = mission(seed, {attacker: attack})
+        if not _is_falsified(recording, attacker, attack):
             continue
         assert outcome(recording) == "inconsistent", seed
         assert recording.end is not None
-        peer = "b" if liar == "a" else "a"
-        assert (recording.end.reason or "").startswith(f"{peer}: {liar} reports "), recording.end.reason
+        peer = "b" if attacker == "a" else "a"
+        assert (recording.end.reason or "").startswith(f"{peer}: {attacker} reports "), recording.end.reason
 
 
-def _tells_otherwise(recording: Recording, liar: str, attack: Attack) -> bool:
+def _is_falsified(recording: Recording, attacker: str, attack: Attack) -> bool:
     """Return whether the attack changes anything: whether the robot has moved in that part of its log."""
     phases = {"phase-1": 1, "orbit": 2, "encounter": 3}
     return attack.part == "all" or any(
         command.phase == phases[attack.part]
         and (command.v if attack.kind == "scale" else command.v or command.omega)
         for moment in recording.ticks
-        for command in [moment.commands[liar]]
+        for command in [moment.commands[attacker]]
     )
 
 
 def test_turning_its_whole_story_about_its_anchor_tells_nothing_false() -> None:
     """An anchor frame has no direction of its own, so this cannot be detected, and misleads no robot."""
     for seed in range(6):
-        for liar in ("a", "b"):
-            assert outcome(mission(seed, {liar: Attack("reframe", 1.0)})) == "localised"
+        for attacker in ("a", "b"):
+            assert outcome(mission(seed, {attacker: Attack("reframe", 1.0)})) == "localised"
 
 
 def test_two_liars_are_no_more_believed_than_one() -> None:

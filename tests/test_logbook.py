@@ -22,7 +22,7 @@ from protocol.wire import MAX_REPORT_BYTES, decode, encode
 Tick = tuple[float, float, float | None]
 """The v and omega over one tick, and the anchor range at its end, or None: m/s, rad/s and m."""
 
-MIND = RobotState(load("paper-1").config("a"))
+STATE = RobotState(load("paper-1").config("a"))
 
 ticks = st.builds(
     lambda few, times: few * times,
@@ -51,7 +51,7 @@ def prefixes(driven: list[Tick]) -> list[MotionLog]:
 
 def told(book: MotionLog, radio: PeerState) -> Report:
     """Return the Report of a planner with this log and this state of the peer."""
-    return planner.report(replace(MIND, log=book, peer_state=radio, tick=book.through))
+    return planner.report(replace(STATE, log=book, peer_state=radio, tick=book.through))
 
 
 @st.composite
@@ -59,10 +59,10 @@ def deliveries(draw: st.DrawFn) -> tuple[list[MotionLog], list[tuple[int, int]]]
     """Draw a growing log, and the (tick, acknowledged tick) of its Reports, in the order of arrival."""
     books = prefixes(draw(ticks))
     last = len(books) - 1
-    tellings = draw(st.lists(st.tuples(st.integers(0, last), st.integers(0, last)), max_size=20))
-    tellings = [(max(pair), min(pair)) for pair in tellings]
-    again = draw(st.lists(st.sampled_from(tellings), max_size=5)) if tellings else []
-    return books, draw(st.permutations(tellings + again))
+    acknowledgements = draw(st.lists(st.tuples(st.integers(0, last), st.integers(0, last)), max_size=20))
+    acknowledgements = [(max(pair), min(pair)) for pair in acknowledgements]
+    again = draw(st.lists(st.sampled_from(acknowledgements), max_size=5)) if acknowledgements else []
+    return books, draw(st.permutations(acknowledgements + again))
 
 
 @settings(max_examples=200)
@@ -103,8 +103,8 @@ class Side:
         self.peer_state = PeerState()
         self.held: deque[Report] = deque()
 
-    def with_report(self, report: Report, fate: str) -> None:
-        match fate:
+    def with_report(self, report: Report, delivery: str) -> None:
+        match delivery:
             case "lost":
                 return
             case "late":
@@ -113,7 +113,7 @@ class Side:
             case "twice":
                 self.peer_state = with_report(self.peer_state, report)
         self.peer_state = with_report(self.peer_state, report)
-        if self.held and fate == "late ones too":
+        if self.held and delivery == "late ones too":
             self.peer_state = with_report(self.peer_state, self.held.pop())
 
 
@@ -121,15 +121,15 @@ class Side:
     ticks, ticks, st.lists(st.sampled_from(["heard", "lost", "late", "late ones too", "twice"]), min_size=1)
 )
 def test_what_is_acknowledged_is_known_and_what_is_lost_is_told_again(
-    a_drove: list[Tick], b_drove: list[Tick], fates: list[str]
+    a_drove: list[Tick], b_drove: list[Tick], deliveries_of_reports: list[str]
 ) -> None:
     length = min(len(a_drove), len(b_drove))
     a, b = Side(a_drove[:length]), Side(b_drove[:length])
-    fate = cycle(fates)
+    delivery = cycle(deliveries_of_reports)
     for tick in range(length + 1):
         from_a, from_b = told(a.books[tick], a.peer_state), told(b.books[tick], b.peer_state)
-        a.with_report(from_b, next(fate))
-        b.with_report(from_a, next(fate))
+        a.with_report(from_b, next(delivery))
+        b.with_report(from_a, next(delivery))
         for one, other in ((a.peer_state, b.peer_state), (b.peer_state, a.peer_state)):
             assert one.acknowledged <= other.peer.through
             assert one.ranges_acknowledged <= len(other.peer.ranges)
@@ -195,9 +195,9 @@ def test_the_longest_report_that_there_is_fits_its_frame(begin: int, verdict: st
     book = longest_log(begin, ticks_a_run)
     said = VERDICTS[verdict]
     state = replace(
-        MIND,
-        config=replace(MIND.config, robot="r" * 32),
-        mode=Done(3, said) if said is not None else MIND.mode,
+        STATE,
+        config=replace(STATE.config, robot="r" * 32),
+        mode=Done(3, said) if said is not None else STATE.mode,
         log=book,
         tick=book.through,
         peer_state=PeerState(acknowledged=begin),

@@ -104,7 +104,7 @@ def test_the_bound_holds_in_every_setting(setting: Setting) -> None:
     assert np.max(meeting(setting, plan.a, plan.b, (240, 24))) * setting[2] <= plan.bound + ROUNDING
 
 
-def papers(setting: Setting) -> tuple[Orbit, Orbit]:
+def paper_orbits(setting: Setting) -> tuple[Orbit, Orbit]:
     """Return the orbits of eq. (6), smaller than (D + R) / 2 by the margin that sampled orbits need."""
     distance, reach, period, speed, turn_rate = setting
     share = math.acos(distance / (distance + reach)) / math.pi
@@ -117,7 +117,7 @@ def compared(setting: Setting) -> tuple[float, float]:
     """Return the ratio of the time to meet to that on the paper's orbits: mean and maximum."""
     plan = rendezvous(mission_of(setting), setting[0], "assured")
     ours = meeting(setting, plan.a, plan.b, COARSE)
-    theirs = meeting(setting, *papers(setting), COARSE)
+    theirs = meeting(setting, *paper_orbits(setting), COARSE)
     return float(np.mean(ours) / np.mean(theirs)), float(np.max(ours) / np.max(theirs))
 
 

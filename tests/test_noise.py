@@ -28,7 +28,7 @@ from tests.commands import SECTION_IV, journals, tandem
 from tests.series import series
 from world import sensors
 from world.random_streams import gaussian, uniform
-from world.referee import Judgement
+from world.referee import MissionOutcome
 from world.scenario import Scenario
 from world.sensors import Mutual, anchor_ranges, executed, mutual_ranges, odometry
 from world.simulation import Simulation
@@ -458,12 +458,12 @@ def test_a_claim_is_held_against_where_the_robot_was_when_it_claimed() -> None:
     later = moved_on(at_first, {"a": claims(0, "a", a), "b": sent(0.0, 0.0, "b")})
     now_a, now_b = later.truth.poses
     assert math.hypot(now_a.x - a.x, now_a.y - a.y) > 1e-3
-    assert advance(later, {"b": claims(1, "b", now_b)}) == Judgement("localised")
+    assert advance(later, {"b": claims(1, "b", now_b)}) == MissionOutcome("localised")
     stale = advance(later, {"b": claims(1, "b", b)})
-    assert isinstance(stale, Judgement)
+    assert isinstance(stale, MissionOutcome)
     assert stale.outcome == "wrong"
     gives_up = Command(1, "b", 0.0, 0.0, 3, "undecided", Undecided("no way"))
-    assert advance(later, {"b": gives_up}) == Judgement("undecided", "b: no way")
+    assert advance(later, {"b": gives_up}) == MissionOutcome("undecided", "b: no way")
 
 
 def test_a_claim_is_wrong_beyond_five_of_its_sigmas_and_the_reason_says_of_which() -> None:
@@ -478,7 +478,7 @@ def test_a_claim_is_wrong_beyond_five_of_its_sigmas_and_the_reason_says_of_which
     ):
         claim = Pose(a.x + off, a.y, a.heading + turned)
         onward = advance(world, {"a": claims(0, "a", claim, sure), "b": claims(0, "b", b)})
-        assert isinstance(onward, Judgement)
+        assert isinstance(onward, MissionOutcome)
         assert onward.outcome == (outcome or "localised")
         assert outcome is None or (onward.reason or "").endswith("rad off, with sigmas 0.05 m and 0.02 rad")
 
@@ -535,7 +535,7 @@ def driven(scenario: Scenario, folder: Path, ticks: int) -> tuple[list[Truth], l
                 {robot.id: sent(v, omega, robot.id, tick) for robot in scenario.robots}
             )
             assert ended is None
-        simulation.end(Judgement("undecided", "enough"))
+        simulation.end(MissionOutcome("undecided", "enough"))
     return truths, told
 
 

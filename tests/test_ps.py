@@ -96,7 +96,7 @@ def test_robots_whose_world_has_gone_are_listed_and_it_is_missing(tmp_path: Path
         a = stack.enter_context(TandemProcess("agent", "a", "--connect", endpoint, "--out", tmp_path))
         a.until_answered("a", tmp_path)
         part.tell(Signals.SIGKILL)
-        a.until_says("the world has gone")
+        a.until_prints("the world has gone")
         assert listed(endpoint) == [
             f"mine at {endpoint}, no tick within 2 s, missing: its world",
             "  a  connected, no message within 2 s",
@@ -125,7 +125,7 @@ def test_a_viewer_lists_over_tls_what_there_is(tmp_path: Path) -> None:
     assert tandem("keys", folder, "--robots", "a,b").status == 0
     arguments = ("world", "paper-1", "--run", "mine", "--listen", endpoint, "--keys", folder / "world")
     with TandemProcess(*arguments) as part:
-        part.until_says("waiting for")
+        part.until_prints("waiting for")
         assert listed(endpoint, "--keys", folder / "viewer")[0] == (
             f"mine at {endpoint}, tick 0, missing: a, b"
         )

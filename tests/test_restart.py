@@ -328,16 +328,16 @@ def test_a_world_and_an_agent_that_are_killed_go_on_by_the_same_commands(
     a, b = (("agent", robot, "--connect", endpoint, "--out", tmp_path) for robot in ("a", "b"))
     with ExitStack() as folder:
         first = folder.enter_context(TandemProcess(*clock))
-        first.until_says("waiting for a, b")
+        first.until_prints("waiting for a, b")
         agent = folder.enter_context(TandemProcess(*a))
         agent.until_answered("a", tmp_path)
         agent.tell(SIGKILL)
         agent = folder.enter_context(TandemProcess(*a))
-        agent.until_says("resumed at tick 0")
+        agent.until_prints("resumed at tick 0")
         first.tell(SIGKILL)
-        agent.until_says("the world has gone; waiting 30 s for it")
+        agent.until_prints("the world has gone; waiting 30 s for it")
         second = folder.enter_context(TandemProcess(*clock))
-        second.until_says("waiting for a, b")
+        second.until_prints("waiting for a, b")
         last = folder.enter_context(TandemProcess(*b))
         assert [part.ended().status for part in (second, agent, last)] == [0, 0, 0]
     same(tmp_path, undisturbed)
@@ -375,7 +375,7 @@ def test_an_agent_says_farewell_until_a_world_has_it_on_record(tmp_path: Path) -
     scenario, endpoint, run = load("paper-1"), free_endpoint(), "mine"
     there = Inbox("test")
 
-    def farewell_of(link: zenoh.Session) -> bytes:
+    def final_report_of(link: zenoh.Session) -> bytes:
         session.subscribe(link, keys.command(run, "a"), there, "command")
         session.watch_liveliness(link, keys.robot_alive(run, "*"), there)
         publisher = session.publisher(link, keys.observation(run, "a"))
@@ -394,11 +394,11 @@ def test_an_agent_says_farewell_until_a_world_has_it_on_record(tmp_path: Path) -
             agent = folder.enter_context(
                 TandemProcess("agent", "a", "--connect", endpoint, "--out", tmp_path)
             )
-            first = farewell_of(link)
-        agent.until_says("the world has gone after its MissionEnd; waiting 30 s for it")
+            first = final_report_of(link)
+        agent.until_prints("the world has gone after its MissionEnd; waiting 30 s for it")
         there = Inbox("test")
         with session.open_router(listening(endpoint), BOUND_S) as link:
-            assert farewell_of(link) == first
+            assert final_report_of(link) == first
             assert agent.running
             session.publisher(link, keys.observation(run, "a")).put(first)
             assert agent.ended(AT_ONCE_S).status == 1
@@ -620,7 +620,7 @@ def test_who_has_ended_waits_for_no_world_that_has_gone_however_patient(
         playing, endpoint = stack.enter_context(world("paper-1"))
         reach = ("--connect", endpoint, "--out", tmp_path, "--timeout", "600")
         agent = stack.enter_context(TandemProcess("agent", "a", *reach))
-        agent.until_says("resumed at tick 48")
+        agent.until_prints("resumed at tick 48")
         playing.tell(SIGKILL)
         ended = agent.ended()
     assert (ended.status, ended.out.splitlines()[-1]) == (0, f"a: {LOCALISED.strip()}")

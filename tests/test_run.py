@@ -106,7 +106,7 @@ def test_summary_says_everything_that_is_promised_of_a_run(played: tuple[str, Pa
     assert told["min_separation_m"] == pytest.approx(nearest, abs=1e-12)
 
 
-PAPERS_ROBOTS: dict[tuple[str, str], dict[str, Any]] = {
+PAPER_ROBOTS: dict[tuple[str, str], dict[str, Any]] = {
     ("paper-1", "a"): {"branch": "circle", "alpha": 1.980462, "candidates": [4, 4], "anchor_ranges": 3},
     ("paper-1", "b"): {
         "branch": "three-ranges",
@@ -135,7 +135,7 @@ def test_summary_says_everything_that_is_promised_of_a_robot(played: tuple[str, 
         *("anchor_ranges", "mutual_ranges", "branch", "alpha", "candidates", "last_turn_rate"),
         *("separation_m2", "reports_sent", "reports_heard", "reports_refused", "bytes_sent"),
     }
-    expected = {"last_turn_rate": None, "separation_m2": None} | PAPERS_ROBOTS[name, robot]
+    expected = {"last_turn_rate": None, "separation_m2": None} | PAPER_ROBOTS[name, robot]
     for field, value in expected.items():
         assert told[field] == (pytest.approx(value, abs=1e-4) if isinstance(value, float) else value), field
     assert told["localised"] is True

@@ -15,7 +15,7 @@ from compose.scenario.scenario_file import load
 from compose.view.cast import of_scenario
 from compose.view.facts import Gathering
 from compose.view.recorded import Journals, Performance, read, scenes
-from compose.view.report_outcomes import fates
+from compose.view.report_outcomes import flights_of
 from compose.view.web.sources import writers_of
 from compose.view.words import DOING, SEEKING, doing
 from protocol.journal import journal_file
@@ -138,8 +138,8 @@ def test_every_report_has_the_fate_that_the_air_gave_it(tmp_path: Path) -> None:
     scenario = load("random", seed=3, faults=faults)
     in_process.run_mission(scenario, tmp_path)
     shown = read(tmp_path)
-    flights = fates(shown.scenes, over=True)
-    assert {flight.fate for flight in flights} == {"heard", "late", "damaged", "lost"}
+    flights = flights_of(shown.scenes, over=True)
+    assert {flight.outcome for flight in flights} == {"heard", "late", "damaged", "lost"}
     told = history(journal_file.read(tmp_path / "world.journal"), tmp_path)
     airs = {
         sender: [tick.world.links[place] for tick in told.ticks] for place, sender in enumerate(("a", "b"))
@@ -155,7 +155,7 @@ def test_every_report_has_the_fate_that_the_air_gave_it(tmp_path: Path) -> None:
         assert list(flight.heard) == [k for k, one in air for sent in one.heard if sent == flight.tick]
         assert list(flight.damaged) == [k for k, one in air for sent in one.damaged if sent == flight.tick]
         came = flight.heard or flight.damaged
-        assert (flight.fate == "lost") == (not came)
+        assert (flight.outcome == "lost") == (not came)
         under_way = flight.tick in [one.tick for one in airs[flight.sender][-1].flying]
         assert came or under_way or (flight.sender, flight.tick) in lost
 

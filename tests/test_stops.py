@@ -40,7 +40,7 @@ from world.scenario import Scenario
 from world.simulation import Simulation
 
 NAMES = ("agent a", "agent b", "world")
-PATIENCE_S = 6.0
+TIMEOUT_S = 6.0
 """The timeout in s, longer than the lease of Zenoh."""
 LOCALISED = f"localised after {LONG_TICKS} ticks\n"
 
@@ -152,17 +152,17 @@ def test_stopped_for_longer_than_the_patience_a_process_fails_the_run(
     name: str, undisturbed: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    with TandemProcess("run", undisturbed, "--out", out, "-q", "--timeout", str(PATIENCE_S)) as run:
+    with TandemProcess("run", undisturbed, "--out", out, "-q", "--timeout", str(TIMEOUT_S)) as run:
         run.until_written(out / "world.journal", 2_000)
         stop(process_of(out, *name.split()))
         ended = run.ended()
     said = ended.out + ended.err
     assert ended.status == 3, ended
     if name == "world":
-        assert f"nothing received from the world for {PATIENCE_S:g} s" in said
+        assert f"nothing received from the world for {TIMEOUT_S:g} s" in said
     else:
         assert f"no answer from {name[-1]} (not connected) at tick " in said
-        assert f" for {PATIENCE_S:g} s" in said
+        assert f" for {TIMEOUT_S:g} s" in said
     assert not processes_of(out)
 
 

@@ -37,7 +37,7 @@ from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode, encode
 from tests.commands import BOUND_S, PAPER_1, tandem, world
 from tests.examples import EXAMPLES
 from tests.test_wire import changed, framed, packed, parts, plain
-from world.referee import Judgement
+from world.referee import MissionOutcome
 from world.simulation import Simulation, resumed
 from world.world_journal import history
 
@@ -166,7 +166,7 @@ def test_every_word_for_a_state_is_within_its_bound() -> None:
 def test_a_world_whose_reason_is_too_long_leaves_a_journal_that_is_read_and_taken_up(tmp_path: Path) -> None:
     scenario, path = load("paper-1"), tmp_path / "world.journal"
     with Journal(path) as journal:
-        end = Simulation(scenario, journal).end(Judgement("failed", "no answer from " + "robot, " * 200))
+        end = Simulation(scenario, journal).end(MissionOutcome("failed", "no answer from " + "robot, " * 200))
     assert history(read(path), path).end == end
     recording = Retrace(path)
     assert resumed(scenario, recording).mission_end == end

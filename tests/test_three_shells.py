@@ -46,13 +46,13 @@ def test_any_order_of_starting_gives_the_same_record(
         for name in order:
             if name == "world":
                 for agent in started.values():  # it prints this after 5 s
-                    agent.until_says(f"no world at {endpoint} yet")
+                    agent.until_prints(f"no world at {endpoint} yet")
                 part = ("world", "paper-1", "--listen", endpoint)
             else:
                 part = ("agent", name, "--connect", endpoint)
             started[name] = shells.enter_context(TandemProcess(*part, "--out", out))
             if name == "world":
-                started[name].until_says("waiting for a, b")
+                started[name].until_prints("waiting for a, b")
             if "world" in started and len(started) == 2:
                 for robot in started.keys() - {"world"}:
                     started[robot].until_answered(robot, out)
@@ -172,7 +172,7 @@ def test_whatever_a_stranger_answers_an_agent_finds_its_world(stranger: str) -> 
         else:
             link.declare_queryable(key, reply)
         with TandemProcess("agent", "a", "--connect", endpoint) as agent:
-            agent.until_says("a: in run mine, with b")
+            agent.until_prints("a: in run mine, with b")
 
 
 def test_an_agent_that_is_answered_nonsense_alone_looks_on_and_says_why() -> None:
@@ -195,4 +195,4 @@ def test_an_agent_that_meets_several_runs_must_be_told_which() -> None:
         says = "tandem agent: several runs are alive: mine, yours; choose one with --run\n"
         assert ended == (2, "", says)
         with TandemProcess("agent", "a", "--connect", endpoint, "--run", "mine") as agent:
-            agent.until_says("a: in run mine, with b")
+            agent.until_prints("a: in run mine, with b")

@@ -181,7 +181,7 @@ def test_a_router_may_come_last(tmp_path: Path) -> None:
     with ExitStack() as stack:
         mission = parts(tmp_path / "scenario.toml", out, flags, stack)
         for part in mission.values():
-            part.until_says("nothing listens there; check the address, and that the router runs")
+            part.until_prints("nothing listens there; check the address, and that the router runs")
         stack.enter_context(routing(Router(x), tmp_path))
         same(mission, out, expected)
 
@@ -206,7 +206,7 @@ def test_a_world_that_listens_says_what_to_check_of_a_router_that_is_not_there_a
 ) -> None:
     x, y = free_endpoint(), free_endpoint()
     with TandemProcess("world", "paper-1", *listen(y), *connect(x), "--out", tmp_path) as world:
-        world.until_says(f"no router at {x} yet: nothing listens there")
+        world.until_prints(f"no router at {x} yet: nothing listens there")
         robots = [TandemProcess("agent", robot, *connect(y)) for robot in "ab"]
         for robot in robots:
             with robot:

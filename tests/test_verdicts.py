@@ -16,7 +16,7 @@ from tests.steps import steps
 from tests.surveys import scenario_of
 from tests.test_claims import EXACT, NOISY
 from world.hardware.termination import LAST_WORDS, Ending
-from world.referee import Judgement, inaccuracy, judge
+from world.referee import MissionOutcome, decide_outcome, inaccuracy
 from world.tick import World, advance, release
 
 GAVE_UP = Undecided("no pose explains the anchor ranges")
@@ -24,9 +24,9 @@ GAVE_UP = Undecided("no pose explains the anchor ranges")
 
 def test_the_mission_ends_when_one_of_a_pair_has_given_up() -> None:
     world = next(steps("paper-1")).world
-    judgement = judge(world.scenario, world.truth, {"a": GAVE_UP})
-    assert judgement == Judgement("undecided", f"a: {GAVE_UP.reason}")
-    assert judge(world.scenario, world.truth, {}) is None
+    mission_outcome = decide_outcome(world.scenario, world.truth, {"a": GAVE_UP})
+    assert mission_outcome == MissionOutcome("undecided", f"a: {GAVE_UP.reason}")
+    assert decide_outcome(world.scenario, world.truth, {}) is None
 
 
 def test_a_robot_whose_peer_has_given_up_gives_up_too() -> None:
@@ -51,9 +51,9 @@ def test_a_wrong_claim_cannot_be_taken_back() -> None:
     assert isinstance(world, World)
     world = advance(world, step.commands)
     assert isinstance(world, World)
-    judgement = judge(world.scenario, world.truth, world.verdicts | {"b": GAVE_UP})
-    assert judgement is not None
-    assert judgement.outcome == "wrong"
+    mission_outcome = decide_outcome(world.scenario, world.truth, world.verdicts | {"b": GAVE_UP})
+    assert mission_outcome is not None
+    assert mission_outcome.outcome == "wrong"
 
 
 def test_the_letter_gives_up_where_the_third_mutual_range_settles_nothing(
@@ -78,8 +78,8 @@ def covariance(position: float, heading: float) -> Covariance:
     return Covariance(position**2 / 2.0, 0.0, 0.0, position**2 / 2.0, 0.0, heading**2)
 
 
-def judged(text: str, a: Covariance | None, *, off: float = 0.0) -> Judgement | World:
-    """Return the judgement on immediate claims of both; that of a is `off` by metres, with covariance `a`."""
+def after_claims(text: str, a: Covariance | None, *, off: float = 0.0) -> MissionOutcome | World:
+    """Return the result of immediate claims of both; that of a is `off` by metres, with covariance `a`."""
     world = release(parse(text, "noisy", seed=1))
     there, other = world.truth.poses
     claim = Localised(replace(there, x=there.x + off), a)
@@ -105,17 +105,17 @@ def judged(text: str, a: Covariance | None, *, off: float = 0.0) -> Judgement | 
 def test_a_robot_that_knows_its_pose_less_well_than_was_asked_is_not_localised(
     position: float, heading: float, what: str | None
 ) -> None:
-    expected = Judgement("localised") if what is None else Judgement("undecided", what)
-    assert judged(NOISY, covariance(position, heading)) == expected
+    expected = MissionOutcome("localised") if what is None else MissionOutcome("undecided", what)
+    assert after_claims(NOISY, covariance(position, heading)) == expected
 
 
 def test_no_sigma_excuses_a_claim_that_is_farther_off_than_the_accuracy_allows() -> None:
     """The limit is five times the accuracy of 0.1 m, or 1e-6 m with exact sensors."""
     huge = covariance(4.5e7, 3.0)
     for text, far, near in ((NOISY, 0.501, 0.499), (EXACT, 2e-6, 1e-7)):
-        wrong, vague = judged(text, huge, off=far), judged(text, huge, off=near)
-        assert isinstance(wrong, Judgement)
-        assert isinstance(vague, Judgement)
+        wrong, vague = after_claims(text, huge, off=far), after_claims(text, huge, off=near)
+        assert isinstance(wrong, MissionOutcome)
+        assert isinstance(vague, MissionOutcome)
         assert (wrong.outcome, vague.outcome) == ("wrong", "undecided")
 
 

@@ -378,7 +378,7 @@ def test_run_watch_stays_until_ctrl_c_and_leaves_the_record_that_it_would_have_l
 ) -> None:
     with TandemProcess("run", "paper-1", "--watch", "--out", tmp_path / "record", "-q") as run:
         page = opened(address_of(run))
-        run.until_says("the page remains at")
+        run.until_prints("the page remains at")
         expect(page.locator("#status")).to_have_text("localised after 48 ticks")
         page.keyboard.press("Home")
         until_shown(page, 0)
@@ -413,7 +413,7 @@ def test_every_test_that_opens_a_page_skips_where_there_is_no_browser(tmp_path: 
 
 def test_the_page_ends_with_whoever_launched_it(tmp_path: Path) -> None:
     with TandemProcess("run", "paper-1", "--watch", "--out", tmp_path / "record", "-q") as run:
-        run.until_says("the page remains at")
+        run.until_prints("the page remains at")
         assert processes_of(tmp_path / "record")
         run.tell(SIGKILL)
         run.ended()
@@ -501,7 +501,7 @@ def test_a_port_that_is_taken_is_one_line(paper_1: Path) -> None:
 
 def test_a_page_on_every_address_is_told_of_and_answers_to_addresses_and_to_no_names(paper_1: Path) -> None:
     with TandemProcess("watch", paper_1, "--address", "0.0.0.0") as command:
-        command.until_says("until Ctrl-C")
+        command.until_prints("until Ctrl-C")
         assert "tandem watch: --address: every machine that reaches 0.0.0.0 can watch\n" in command.err
         address = command.out.split()[0]
         assert address.startswith("http://127.0.0.1:")
@@ -516,7 +516,7 @@ def test_a_page_on_every_address_is_told_of_and_answers_to_addresses_and_to_no_n
 
 def test_a_page_on_an_address_of_this_machine_answers_to_it(paper_1: Path) -> None:
     with TandemProcess("watch", paper_1, "--address", "127.0.0.2") as command:
-        command.until_says("until Ctrl-C")
+        command.until_prints("until Ctrl-C")
         assert command.err == ""
         address = command.out.split()[0]
         assert address.startswith("http://127.0.0.2:")

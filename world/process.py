@@ -26,7 +26,7 @@ from protocol.network.endpoints import Endpoints
 from protocol.network.inbox import NOTHING, Arrival, Inbox
 from protocol.spelling import did_you_mean
 from protocol.wire import MalformedFrame, decode, encode
-from world.referee import Judgement
+from world.referee import MissionOutcome
 from world.simulation import Simulation
 
 LINK_TIMEOUT_S = 3.0
@@ -149,7 +149,7 @@ class WorldProcess:
                 if self._period is not None:
                     due = max((due or self._began) + self._period, time.monotonic())
         except NoAnswer as error:
-            end = simulation.end(Judgement("failed", str(error)))
+            end = simulation.end(MissionOutcome("failed", str(error)))
         self._ended = time.monotonic() if self._ended is None else self._ended
         self.running_s = self._ended - self._began if self._began is not None else 0.0
         simulation.journal_final_reports(self._collect_final_reports(end, expected))

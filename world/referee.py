@@ -18,7 +18,7 @@ SIGMAS = 5.0
 """The number of claimed standard deviations by which a claim may differ from the truth, with noise."""
 
 
-class Judgement(msgspec.Struct, frozen=True):
+class MissionOutcome(msgspec.Struct, frozen=True):
     """The outcome of a run."""
 
     outcome: Outcome
@@ -70,12 +70,12 @@ def mistake(claim: Localised, truth: Pose, mission: Mission) -> str | None:
     return f"{off}, with sigmas {covariance.position_sigma:.3g} m and {covariance.heading_sigma:.3g} rad"
 
 
-def judge(
+def decide_outcome(
     scenario: Scenario,
     truth: Truth,
     verdicts: Mapping[str, Verdict],
     claimed: Mapping[str, Pose] | None = None,
-) -> Judgement | None:
+) -> MissionOutcome | None:
     """Return the outcome once all results are known or `max_ticks` is reached; None before.
 
     A claim is compared with the true pose at the tick of the claim, which is in `claimed`, or with the
@@ -95,22 +95,24 @@ def judge(
         if isinstance(verdict, Localised):
             why = mistake(verdict, pose if claimed is None else claimed[robot.id], scenario.mission)
             if why is not None:
-                return Judgement("wrong", f"{robot.id} claims a pose that is {why}")
+                return MissionOutcome("wrong", f"{robot.id} claims a pose that is {why}")
     return _no_better(scenario, verdicts, open_cases)
 
 
-def _no_better(scenario: Scenario, verdicts: Mapping[str, Verdict], open_cases: Sequence[str]) -> Judgement:
+def _no_better(
+    scenario: Scenario, verdicts: Mapping[str, Verdict], open_cases: Sequence[str]
+) -> MissionOutcome:
     """Return the outcome of a run without a wrong claim."""
     for robot in scenario.robots:
         verdict = verdicts.get(robot.id)
         if isinstance(verdict, Inconsistent):
-            return Judgement("inconsistent", f"{robot.id}: {robot.peer} reports {verdict.claim}")
+            return MissionOutcome("inconsistent", f"{robot.id}: {robot.peer} reports {verdict.claim}")
     for robot in scenario.robots:
         match verdicts.get(robot.id):
             case Undecided(reason):
-                return Judgement("undecided", f"{robot.id}: {reason}")
+                return MissionOutcome("undecided", f"{robot.id}: {reason}")
             case Localised() as claim if (vague := inaccuracy(claim, scenario.mission)) is not None:
-                return Judgement("undecided", f"{robot.id} {vague}")
+                return MissionOutcome("undecided", f"{robot.id} {vague}")
     if open_cases:
-        return Judgement("undecided", f"max_ticks: {', '.join(open_cases)} not localised by then")
-    return Judgement("localised")
+        return MissionOutcome("undecided", f"max_ticks: {', '.join(open_cases)} not localised by then")
+    return MissionOutcome("localised")

@@ -9,7 +9,7 @@ from protocol.journal.journal_file import CorruptJournal, Sink
 from protocol.journal.resume import ReplayMismatch, Retrace
 from protocol.messages import Command, DeadlineMissed, Environment, FinalReport, MissionEnd, Observation
 from protocol.wire import encode
-from world.referee import Judgement
+from world.referee import MissionOutcome
 from world.scenario import Scenario
 from world.tick import advance, observations, release
 from world.world_journal import history
@@ -74,7 +74,7 @@ class Simulation:
         if self.missed or len(commands) < len(self.world.scenario.robots):
             self._note_missed(commands)
         onward = advance(self.world, commands)
-        if isinstance(onward, Judgement):
+        if isinstance(onward, MissionOutcome):
             self.last_answered = tuple(commands)
             return self.end(onward)
         self.world = onward
@@ -87,9 +87,9 @@ class Simulation:
             else:
                 self.missed.setdefault(observation.robot, []).append(observation)
 
-    def end(self, judgement: Judgement) -> MissionEnd:
+    def end(self, mission_outcome: MissionOutcome) -> MissionEnd:
         """End the run with this outcome, and journal and return the MissionEnd. Raises CannotRecord."""
-        self.mission_end = MissionEnd(self.tick, judgement.outcome, judgement.reason)
+        self.mission_end = MissionEnd(self.tick, mission_outcome.outcome, mission_outcome.reason)
         if self._journal is not None:
             self._journal.write(encode(self.mission_end))
         return self.mission_end
@@ -135,7 +135,7 @@ def _retrace(simulation: Simulation, recording: Retrace, named: Environment | No
         for tick in recorded.ticks:
             simulation.command(tick.commands)
         if recorded.end is not None and simulation.mission_end is None:
-            simulation.end(Judgement(recorded.end.outcome, recorded.end.reason))
+            simulation.end(MissionOutcome(recorded.end.outcome, recorded.end.reason))
         simulation.journal_final_reports(recorded.final_reports.values())
     except ReplayMismatch:
         raise CorruptJournal(

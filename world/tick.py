@@ -9,7 +9,7 @@ import msgspec
 from protocol.messages import Command, Contact, Localised, Observation, Verdict
 from protocol.motion import Controls, Pose
 from world.channel import LinkState, link_faults, next_link_state
-from world.referee import Judgement, judge
+from world.referee import MissionOutcome, decide_outcome
 from world.scenario import Scenario
 from world.sensors import anchor_ranges, executed, mutual_ranges, odometry
 from world.truth import Truth, limited_controls
@@ -72,7 +72,7 @@ def observations(world: World) -> list[Observation]:
     ]
 
 
-def advance(world: World, commands: Mapping[str, Command]) -> World | Judgement:
+def advance(world: World, commands: Mapping[str, Command]) -> World | MissionOutcome:
     """Return the world one tick later, or the outcome of the run. A robot without a Command rests."""
     scenario, truth = world.scenario, world.truth
     verdicts, claimed = world.verdicts, world.claimed
@@ -87,9 +87,9 @@ def advance(world: World, commands: Mapping[str, Command]) -> World | Judgement:
             if isinstance(command.verdict, Localised):
                 claimed = claimed | {robot.id: truth.poses[place]}
     if verdicts or truth.tick >= scenario.max_ticks:
-        judgement = judge(scenario, truth, verdicts, claimed)
-        if judgement is not None:
-            return judgement
+        mission_outcome = decide_outcome(scenario, truth, verdicts, claimed)
+        if mission_outcome is not None:
+            return mission_outcome
     moved = truth.moved(driven, scenario.mission.period)
     links = _carried(world.links, scenario, moved, world.pairs)
     return World(scenario, moved, tuple(driven), verdicts, claimed, world.pairs, links)

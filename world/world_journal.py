@@ -11,7 +11,7 @@ from protocol.journal.environment import named_in
 from protocol.journal.journal_file import CorruptJournal
 from protocol.messages import Command, DeadlineMissed, Environment, FinalReport, MissionEnd
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
-from world.referee import Judgement
+from world.referee import MissionOutcome
 from world.scenario import Scenario
 from world.tick import World, advance, release
 
@@ -43,7 +43,7 @@ class History(msgspec.Struct, frozen=True):
     """The complete ticks."""
     ahead: World | None
     """The state at the tick after these; None if the last of them ended the run."""
-    judgement: Judgement | None
+    mission_outcome: MissionOutcome | None
     """The recomputed outcome; None if the Commands did not end the run."""
     end: MissionEnd | None = None
     """The recorded end; None if the journal breaks off before."""
@@ -98,7 +98,7 @@ class JournalReading:
         """The state at the tick after the last complete one, or at the last tick of the run."""
         self.ticks: list[Tick] = []
         """The complete ticks."""
-        self.judgement: Judgement | None = None
+        self.mission_outcome: MissionOutcome | None = None
         """The recomputed outcome."""
         self.end: MissionEnd | None = None
         """The recorded end."""
@@ -113,7 +113,7 @@ class JournalReading:
         Raises MalformedFrame.
         """
         message = decode(frame, Command | DeadlineMissed | MissionEnd | FinalReport)
-        is_running = self.end is None and self.judgement is None
+        is_running = self.end is None and self.mission_outcome is None
         tick = self.world.truth.tick
         match message:
             case Command() | DeadlineMissed() if (
@@ -140,19 +140,19 @@ class JournalReading:
         self.ticks.append(Tick(self.world, commands))
         self._answers = {}
         onward = advance(self.world, commands)
-        if isinstance(onward, Judgement):
-            self.judgement = onward
+        if isinstance(onward, MissionOutcome):
+            self.mission_outcome = onward
         else:
             self.world = onward
 
     def content(self) -> History:
         """Return the content that has been read so far."""
-        ahead = self.world if self.judgement is None else None
+        ahead = self.world if self.mission_outcome is None else None
         return History(
             self._scenario,
             tuple(self.ticks),
             ahead,
-            self.judgement,
+            self.mission_outcome,
             self.end,
             dict(self.final_reports),
             self.disorder,

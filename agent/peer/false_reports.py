@@ -11,11 +11,9 @@ from itertools import pairwise
 from msgspec.structs import replace
 
 from agent.peer.motion_log import MotionLog
-from protocol.attack import Attack
+from protocol.attack import OF_THE_START, Attack
 from protocol.messages import Ranged
 from protocol.motion import Pose, Segment
-
-STARTS = ("radius", "heading", "reframe")
 
 
 def falsified_log(
@@ -29,7 +27,7 @@ def falsified_log(
     if attack.kind == "radius":
         ranges = tuple([Ranged(one.tick, max(0.0, one.range + attack.size)) for one in log.ranges])
         return MotionLog(log.through, log.runs, ranges)
-    if attack.kind in STARTS:
+    if attack.kind in OF_THE_START:
         return log
     first, last = _attacked_span(attack, log.through, phase1_done_tick, encounter_tick)
     falsified = MotionLog(ranges=log.ranges)

@@ -48,7 +48,7 @@ OUTSIDE_COST = 1e3
 """The cost per m in a place without informative ranges, in variances as large as the required accuracy."""
 
 OUTSIDE_COST_ALONE = 10.0
-"""The same cost near the anchor alone, where the position estimate improves in each tick."""
+"""The OUTSIDE_COST of a robot that plans for its anchor alone; each tick improves its position estimate."""
 
 
 class Surveying(msgspec.Struct, frozen=True):

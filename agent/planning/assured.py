@@ -31,7 +31,7 @@ LOST_AFTER = 3
 """The number of strides without an expected anchor detection after which the robot returns to its anchor."""
 
 LOST_AFTER_IN_PHASE_3 = 6
-"""The same number for b in phase 3, in which b may drive slightly out of its anchor's range."""
+"""The LOST_AFTER of b in phase 3, in which b may drive slightly out of its anchor's range."""
 
 MISLEADING = -8.0
 """The smallest plausible log-likelihood of the ticks without detection.

@@ -94,22 +94,21 @@ def _decide_exact(state: RobotState) -> RobotState:
     `paper` uses the mutual ranges from the encounter on. `assured` also uses earlier ticks, including those
     without detection.
     """
-    mission, planner_name, first_tick = (
-        state.config.mission,
-        state.config.planner_name,
-        state.belief.encounter_tick,
-    )
+    mission = state.config.mission
+    planner_name = state.config.planner_name
+    first_tick = state.belief.encounter_tick
     assert first_tick is not None
     pair_observations = state.pair_observations(first_tick if planner_name == "paper" else 0)
     observations_in_range = [at for at in pair_observations if at.range is not None]
     away_from_m2 = [at for at in observations_in_range if off_anchor(at.b, state.config.rendezvous.b)]
-    base = phase3_last_manoeuvre.base(away_from_m2, precision.odometry_rounding(state))
+    odometry_rounding = precision.odometry_rounding(state, min(state.tick, state.peer_state.peer.through))
+    base = phase3_last_manoeuvre.base(away_from_m2, odometry_rounding)
     if base is None:  # There are too few ranges, or b was still driving while a drove straight on.
         b_is_standing = isinstance(state.mode, Waiting) and state.peer_state.state == MODE_NAMES[Standing]
         return begin_phase3(state) if b_is_standing and planner_name == "assured" else state
     if state.belief.peer_anchor is None:
         state = replace(state, belief=replace(state.belief, peer_anchor=precision.peer_anchor(state)))
-    error_bound = precision.combined_error(state)
+    error_bound = precision.combined_error(state, odometry_rounding)
     state = _select_placements(state, pair_observations, base, error_bound)
     remaining = state.belief.placements
     checked = phase3_last_manoeuvre.redundant(observations_in_range, base)

@@ -84,7 +84,7 @@ def is_anchor_known(scored: Sequence[ScoredHypothesis], mission: Mission) -> boo
     return (
         int(np.count_nonzero(best.fit.weights > 0.5)) >= required_ranges
         and best.hypothesis.probability >= SURE_OF_BRANCH
-        and deviation(float(np.trace(best.fit.covariance))) <= mission.foothold
+        and deviation(float(np.trace(best.fit.covariance))) <= mission.required_anchor_sigma
     )
 
 

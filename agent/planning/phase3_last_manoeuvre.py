@@ -121,7 +121,7 @@ class Compared(NamedTuple):
     gap: Array
     """J in m^2, (S, W). For one candidate: the decrease of the squared range."""
     value: Array
-    """The same as `gap`, with -inf for manoeuvres that are not allowed."""
+    """`gap` of the manoeuvres that are allowed, and -inf for the others; (S, W)."""
 
 
 def base(

@@ -129,26 +129,19 @@ def peer_anchor(state: RobotState) -> float:
     return anchor(state, state.peer_state.start, state.peer_state.peer).error
 
 
-def odometry_rounding(state: RobotState) -> float:
-    """Return the bound in m on the sum of both odometries' rounding errors until now."""
-    return _odometry_rounding_until(state, min(state.tick, state.peer_state.peer.through))
-
-
-def _odometry_rounding_until(state: RobotState, tick: int) -> float:
+def odometry_rounding(state: RobotState, tick: int) -> float:
     """Return the bound in m on the sum of both odometries' rounding errors until `tick`."""
     return range_rounding(state, state.log, tick) + range_rounding(state, state.peer_state.peer, tick)
 
 
-def combined_error(state: RobotState) -> float:
-    """Return the bound in m on both anchor errors and both odometries' rounding errors until now."""
-    return _combined_error_until(state, min(state.tick, state.peer_state.peer.through))
+def combined_error(state: RobotState, rounding_error: float) -> float:
+    """Return the bound in m on both anchor errors and both odometries' rounding errors.
 
-
-def _combined_error_until(state: RobotState, tick: int) -> float:
-    """Return the bound in m on both anchor errors and both odometries' rounding errors until `tick`."""
+    `rounding_error` is `odometry_rounding`.
+    """
     own, peers = state.belief.own_anchor, state.belief.peer_anchor
     assert peers is not None
-    return own + peers + _odometry_rounding_until(state, tick)
+    return own + peers + rounding_error
 
 
 def pinned_down(
@@ -165,5 +158,7 @@ def pinned_down(
     floor = 0.0
     for log in (state.log, state.peer_state.peer):
         floor += 0.5 * _path_rounding(extent, log.between(first, last), period)
-    rotation_error = turn_error(placement, ranged, floor, _combined_error_until(state, first))
+    rotation_error = turn_error(
+        placement, ranged, floor, combined_error(state, odometry_rounding(state, first))
+    )
     return error_bound + rotation_error * max(1.0, extent) <= SURE

@@ -20,7 +20,7 @@ ARRIVED = 1e-9
 """The tolerance in rad, and relative to A_0, at which a target is reached. The odometry is exact."""
 
 CLOSE = 0.05
-"""The same tolerance with noisy actuation or sensors."""
+"""The tolerance in rad, and relative to A_0, at which a target is reached with noisy actuation or sensors."""
 
 Beacon = Literal["anchor", "peer"]
 

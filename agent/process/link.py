@@ -34,7 +34,7 @@ class AgentLink:
         self._inbox = inbox
         self._link_timeout = SILENCE_S + (config.tick_s or 0.0)
         self.estimate_wanted = False
-        """Whether any viewer subscribes to estimates."""
+        """True while any viewer subscribes to estimates."""
 
     def attach(self, link: zenoh.Session) -> None:
         """Use `link` to send and receive from now on."""

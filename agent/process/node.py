@@ -30,7 +30,7 @@ from protocol.wire import MalformedFrame, decode, encode
 REPORT_SHARE = 0.5
 """The fraction of a tick to wait for the peer's report, in real time."""
 FIELD_SHARE = 0.1
-"""The same fraction in hardware mode, which needs the rest of the tick for the manoeuvre."""
+"""The REPORT_SHARE of hardware mode, which needs the rest of the tick for the manoeuvre."""
 LAST_WORD_S = 0.5
 """The seconds for which frames of the world may still arrive after its liveliness token has disappeared."""
 ENDED_S = 1.0
@@ -83,7 +83,7 @@ class AgentProcess:
         self._out_of_step = OutOfStep(self._id, inbox, self._link.appear, real_time=real_time)
         self._report_buffer = Post(inbox, memory.heard, real_time=real_time)
         self._loss_reported = False
-        """Whether the loss of the world has been reported to the user."""
+        """True once the loss of the world has been reported to the user."""
         self._repeated_at = 0.0
         """The time (monotonic clock) of the last repetition."""
         self._repeat_at: float | None = None

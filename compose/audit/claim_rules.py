@@ -101,14 +101,14 @@ def _places(evidence: Evidence, placed: RobotSpec, ticks: Sequence[int]) -> int:
 
 
 def outcome(evidence: Evidence) -> Checks:
-    """Check that the MissionEnd is the referee's judgement of the ground truth.
+    """Check that the MissionEnd has the outcome that the referee derives from the ground truth.
 
-    A run that failed before the referee had a judgement is accepted.
+    A run that failed before the referee had an outcome is accepted.
     """
-    end, judgement = evidence.history.end, evidence.history.judgement
+    end, mission_outcome = evidence.history.end, evidence.history.mission_outcome
     if end is None:
         return
-    expected = MissionEnd(end.tick, *astuple(judgement)) if judgement is not None else None
+    expected = MissionEnd(end.tick, *astuple(mission_outcome)) if mission_outcome is not None else None
     if expected is not None and end != expected:
         what = f"it ends {_ending(end)}, expected {_ending(expected)}"
         yield Violation("claim", end.tick, None, what, between(end, expected))

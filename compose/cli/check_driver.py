@@ -7,7 +7,7 @@ from contextlib import closing
 
 from compose.cli.arguments import add_closing, add_driver_options, name
 from compose.errors import CLEAN, VIOLATED
-from compose.hardware.conformance import judged
+from compose.hardware.conformance import check_results
 from compose.hardware.exercise import Broken, ExerciseRun
 from compose.launch.driver_loader import briefed, driver_class, made, mission, options_of
 from compose.scenario.scenario_file import check_rate
@@ -50,7 +50,7 @@ def main(options: argparse.Namespace) -> int:
             where = trial.tries[-1].what if trial.tries else "the start"
             say(f"wrong  the exercise can be completed: after '{where}': {broken}")
             return VIOLATED
-    found = judged(trial)
+    found = check_results(trial)
     for one in found:
         line = f"wrong  {one.check}: {one.wrong}" if one.wrong else f"ok     {one.check}"
         say(*text_width.wrapped(one_line(line), MARKED))

@@ -6,7 +6,7 @@ import argparse
 from itertools import chain
 
 from compose.cli.arguments import add_closing, add_connection, add_listen, add_listening_time
-from compose.doctor.certificate_checks import papers
+from compose.doctor.certificate_checks import certificate_findings
 from compose.doctor.finding import FIX
 from compose.doctor.machine_checks import ports, versions
 from compose.doctor.network_checks import network
@@ -28,7 +28,12 @@ def main(options: argparse.Namespace) -> int:
     """Run all checks, and return AMISS if one of them failed."""
     endpoints = reach(options, None)
     status = CLEAN
-    checks = (versions(), ports(endpoints), papers(endpoints), network(endpoints, options.timeout))
+    checks = (
+        versions(),
+        ports(endpoints),
+        certificate_findings(endpoints),
+        network(endpoints, options.timeout),
+    )
     for finding in chain.from_iterable(checks):
         say(*text_width.wrapped(one_line(str(finding)), len(finding.mark) + 2))
         status = AMISS if finding.mark == FIX else status

@@ -37,61 +37,30 @@ class CommandEntry(NamedTuple):
     """The heading under which `tandem --help` lists it."""
     summary: str
     """One line that says what it does."""
-    module: str
-    """The module that defines its `add_arguments` and `main`."""
+
+    @property
+    def module(self) -> str:
+        """The module that defines its `add_arguments` and `main`."""
+        return f"compose.cli.{self.name.replace('-', '_')}"
 
 
 COMMANDS = (
-    CommandEntry("run", "Run", "Run a mission on this machine.", "compose.cli.run"),
-    CommandEntry(
-        "replay",
-        "Run",
-        "Run a recording again and compare it with the original bit by bit.",
-        "compose.cli.replay",
-    ),
-    CommandEntry(
-        "scenarios", "Run", "List the scenarios and sweeps that ship with Tandem.", "compose.cli.scenarios"
-    ),
-    CommandEntry(
-        "sweep", "Run", "Run many trials of a scenario, over ranges of its fields.", "compose.cli.sweep"
-    ),
-    CommandEntry(
-        "world", "Deploy", "Run the simulator of a mission; agents connect to it.", "compose.cli.world"
-    ),
-    CommandEntry(
-        "agent", "Deploy", "Run the agent of one robot; it connects to a world.", "compose.cli.agent"
-    ),
-    CommandEntry(
-        "robot", "Deploy", "Run one robot on its own hardware, with its driver.", "compose.cli.robot"
-    ),
-    CommandEntry(
-        "keys",
-        "Deploy",
-        "Create certificates and access rules for networks without trust.",
-        "compose.cli.keys",
-    ),
-    CommandEntry(
-        "audit", "Analyse", "Check a recording against the rules of the system.", "compose.cli.audit"
-    ),
-    CommandEntry("figures", "Analyse", "Draw the figures of a recording.", "compose.cli.figures"),
-    CommandEntry("export", "Analyse", "Convert a recording to MCAP, CSV and Parquet.", "compose.cli.export"),
-    CommandEntry(
-        "watch", "Analyse", "Serve a web page that shows recordings or live missions.", "compose.cli.watch"
-    ),
-    CommandEntry(
-        "doctor",
-        "Check",
-        "Check this machine, its keys and its network before a mission.",
-        "compose.cli.doctor",
-    ),
-    CommandEntry("ps", "Check", "List the missions on a network and the robots in them.", "compose.cli.ps"),
-    CommandEntry(
-        "check-driver",
-        "Check",
-        "Check a driver against its contract; the robot moves.",
-        "compose.cli.check_driver",
-    ),
-    CommandEntry("bench", "Check", "Measure speed against baselines in the same run.", "compose.cli.bench"),
+    CommandEntry("run", "Run", "Run a mission on this machine."),
+    CommandEntry("replay", "Run", "Run a recording again and compare it with the original bit by bit."),
+    CommandEntry("scenarios", "Run", "List the scenarios and sweeps that ship with Tandem."),
+    CommandEntry("sweep", "Run", "Run many trials of a scenario, over ranges of its fields."),
+    CommandEntry("world", "Deploy", "Run the simulator of a mission; agents connect to it."),
+    CommandEntry("agent", "Deploy", "Run the agent of one robot; it connects to a world."),
+    CommandEntry("robot", "Deploy", "Run one robot on its own hardware, with its driver."),
+    CommandEntry("keys", "Deploy", "Create certificates and access rules for networks without trust."),
+    CommandEntry("audit", "Analyse", "Check a recording against the rules of the system."),
+    CommandEntry("figures", "Analyse", "Draw the figures of a recording."),
+    CommandEntry("export", "Analyse", "Convert a recording to MCAP, CSV and Parquet."),
+    CommandEntry("watch", "Analyse", "Serve a web page that shows recordings or live missions."),
+    CommandEntry("doctor", "Check", "Check this machine, its keys and its network before a mission."),
+    CommandEntry("ps", "Check", "List the missions on a network and the robots in them."),
+    CommandEntry("check-driver", "Check", "Check a driver against its contract; the robot moves."),
+    CommandEntry("bench", "Check", "Measure speed against baselines in the same run."),
 )
 """All commands, in the order of `tandem --help`."""
 

@@ -40,7 +40,7 @@ class CertificateSet(NamedTuple):
     """True if it is used for connecting; otherwise it is used for listening."""
 
 
-def papers(endpoints: Endpoints, now: float | None = None) -> Iterator[Finding]:
+def certificate_findings(endpoints: Endpoints, now: float | None = None) -> Iterator[Finding]:
     """Check all certificates in the configuration; `now` is the time in s since 1970."""
     yielded = set()
     for side in ("connect", "listen"):

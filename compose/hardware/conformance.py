@@ -167,7 +167,7 @@ def reach(mission: Mission, tries: Sequence[Try]) -> str | None:
 CHECKS: tuple[Check, ...] = (prompt, stands, drives, lasts, stops, fresh, ranges, reach)
 
 
-def judged(trial: ExerciseRun) -> list[Found]:
+def check_results(trial: ExerciseRun) -> list[Found]:
     """Return the result of each check of an exercise."""
     return [Found(str(check.__doc__), check(trial.config.mission, trial.tries)) for check in CHECKS]
 

@@ -174,7 +174,7 @@ class ForkServer:
         self._running: dict[int, Process] = {}
         self._lock = threading.Lock()
         self.gone = False
-        """Whether the server, and with it all its processes, has ended."""
+        """True once the server, and with it all its processes, has ended."""
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
 

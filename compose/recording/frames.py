@@ -60,7 +60,7 @@ def kind_of(kind: type[msgspec.Struct]) -> str:
     return str(kind.__struct_config__.tag)
 
 
-class Telling:
+class JournalDecoder:
     """A decoder of the frames of one journal, which may be read in parts."""
 
     def __init__(self, name: str) -> None:
@@ -94,5 +94,5 @@ def in_time(books: Mapping[str, JournalFile]) -> Iterator[Journaled]:
 
     Raises CorruptJournal if a frame cannot be decoded.
     """
-    each = [Telling(name).of(book.frames) for name, book in books.items()]
+    each = [JournalDecoder(name).of(book.frames) for name, book in books.items()]
     return merge(*each, key=lambda one: one.tick)

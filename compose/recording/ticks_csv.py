@@ -24,7 +24,9 @@ class TickRow(msgspec.Struct, frozen=True):
     """One row of `ticks.csv`: one robot in one tick. None is an empty field of the file."""
 
     tick: int
+    """The tick k."""
     robot: str
+    """The robot's name."""
     x: float | None
     """True x in m; None in hardware mode."""
     y: float | None

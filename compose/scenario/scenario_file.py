@@ -72,13 +72,16 @@ class PlannerTable(_Table, frozen=True):
     """The `[planner]` table."""
 
     name: PlannerName = "assured"
+    """The planner of all robots."""
 
 
 class RobotTable(_Table, frozen=True):
     """A `[[robot]]` table."""
 
     id: RobotId
+    """The robot's name."""
     anchor: tuple[Place, Place]
+    """x, y of the robot's anchor, in m."""
     start: tuple[Place, Place, Annotated[float, Meta(ge=-1e6, le=1e6)]] | None = None
     """Start pose x, y in m and heading in rad; None: drawn from the seed, within range of the anchor."""
     peer: RobotId | None = None
@@ -91,11 +94,17 @@ class ScenarioFile(_Table, frozen=True):
     """The content of a scenario file."""
 
     name: Annotated[str, Meta(pattern=NAME, max_length=48)]
+    """The name of the scenario, and the beginning of the names of its runs."""
     mission: Mission
+    """The `[mission]` table."""
     robot: Annotated[list[RobotTable], Meta(min_length=2, max_length=MAX_ROBOTS)]
+    """One `[[robot]]` for each robot."""
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
+    """The seed of all random draws, starts included."""
     max_ticks: Annotated[int, Meta(ge=1, le=MAX_TICKS)] | None = None
+    """The last tick of an undecided run; computed from the mission by default."""
     planner: PlannerTable = PlannerTable()
+    """The `[planner]` table."""
     fault: list[FaultTable] = []
     """Faults of the radio, applied to each report one after the other."""
     kill: list[KillTable] = []

@@ -35,6 +35,7 @@ class DrawTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The table [[draw]]: a `field` drawn from one of two distributions, scaled by other fields."""
 
     field: str
+    """the path of the field that is drawn"""
     uniform: Interval | None = None
     """bounds of a uniform distribution"""
     log_uniform: Interval | None = None
@@ -49,7 +50,9 @@ class StartsTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The table [starts]: kinds of place and heading, from which each robot draws with equal probability."""
 
     places: Annotated[tuple[Place, ...], Meta(min_length=1)] = ("inside",)
+    """the kinds of start position"""
     headings: Annotated[tuple[Heading, ...], Meta(min_length=1)] = ("any",)
+    """the kinds of start heading"""
 
 
 class Draw(msgspec.Struct, frozen=True):

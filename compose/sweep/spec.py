@@ -34,9 +34,13 @@ class AxisTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The table [[axis]]: one `field` and its values, or a `name` and several `fields` that vary together."""
 
     values: Annotated[list[Any], Meta(min_length=1)]
+    """the values; with `fields`, a list of values for each"""
     field: str | None = None
+    """the path of the field that varies"""
     fields: Annotated[list[str], Meta(min_length=1)] | None = None
+    """the paths of the fields that vary together"""
     name: Annotated[str, Meta(pattern=NAME, max_length=48)] | None = None
+    """the name of an axis with several fields, or with labels"""
     labels: list[Label] | None = None
     """names of the values in tables and figures"""
     paired: bool = False
@@ -47,14 +51,17 @@ class SpecFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The schema of a sweep file."""
 
     name: Annotated[str, Meta(pattern=NAME, max_length=48)]
+    """the name of the sweep"""
     scenario: str
     """name of a shipped scenario, or path of a scenario file relative to the sweep file's folder"""
     trials: Annotated[int, Meta(ge=1, le=MAX_TRIALS)]
     """number of trials per cell"""
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
+    """the seed from which the seeds of all trials follow"""
     trial_timeout: Annotated[float, Meta(gt=0.0, le=1e6)] = TRIAL_TIMEOUT_S
     """wall time in s after which a trial counts as hung"""
     axis: list[AxisTable] = []
+    """one `[[axis]]` for each axis; a sweep without axes has one cell"""
     draw: list[DrawTable] = []
     """fields whose values are drawn for each trial, in this order"""
     starts: StartsTable | None = None

@@ -74,20 +74,28 @@ class RobotRow(msgspec.Struct, frozen=True, array_like=True):
     cov_xx: float | None = None
     """claimed covariance of (x, y, heading h), in m^2, m rad and rad^2"""
     cov_xy: float | None = None
+    """likewise"""
     cov_xh: float | None = None
+    """likewise"""
     cov_yy: float | None = None
+    """likewise"""
     cov_yh: float | None = None
+    """likewise"""
     cov_hh: float | None = None
+    """likewise"""
 
 
 class TrialRow(msgspec.Struct, frozen=True, array_like=True):
     """The row of a trial that has run, was lost or was refused. A value that does not apply is None."""
 
     cell: int
+    """the number of the cell"""
     trial: int
+    """the number of the trial in its cell"""
     seed: int
     """seed of the scenario"""
     outcome: TrialOutcome
+    """the outcome of the mission, or `refused`"""
     reason: str | None = None
     """reason for an outcome other than `localised`"""
     error: str | None = None

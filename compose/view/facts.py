@@ -22,7 +22,7 @@ Link = tuple[str, str]
 """A directed link: sender and receiver."""
 
 
-class Said(msgspec.Struct, frozen=True):
+class SizedReport(msgspec.Struct, frozen=True):
     """A report and the size of its frame."""
 
     report: Report
@@ -36,7 +36,7 @@ class Facts(msgspec.Struct, frozen=True):
     tick: int
     truth: dict[str, Pose] = msgspec.field(default_factory=dict)
     observations: dict[str, Observation] = msgspec.field(default_factory=dict)
-    reports: dict[str, Said] = msgspec.field(default_factory=dict)
+    reports: dict[str, SizedReport] = msgspec.field(default_factory=dict)
     """Reports by sender."""
     commands: dict[str, Command] = msgspec.field(default_factory=dict)
     estimates: dict[str, Estimate] = msgspec.field(default_factory=dict)
@@ -114,7 +114,7 @@ class Gathering:
             case Estimate(tick, robot):
                 self.at(tick).estimates.setdefault(robot, message)
             case Report(tick, robot):
-                self.at(tick).reports.setdefault(robot, Said(message, size))
+                self.at(tick).reports.setdefault(robot, SizedReport(message, size))
             case GroundTruth(tick, poses):
                 self.at(tick).truth.update(poses)
                 self.has_truth = True

@@ -141,7 +141,7 @@ class Journals:
             for command in tick.commands.values():
                 self.known.take(command, 0)
             facts.late.update({robot.id for robot in tick.world.scenario.robots} - tick.commands.keys())
-        if reading.judgement is None:
+        if reading.mission_outcome is None:
             self._show(reading.world)
         self.known.end = reading.end or self.known.end
         self.known.final_reports.update(reading.final_reports)

@@ -10,7 +10,7 @@ import msgspec
 from compose.view.scene import Scene
 from world.faults import LATEST
 
-Fate = Literal["heard", "late", "damaged", "lost", "under way"]
+ReportOutcome = Literal["heard", "late", "damaged", "lost", "under way"]
 """The outcome of a report.
 
 "heard" means received in the tick in which it was sent, "late" received in a later tick, "lost" never
@@ -25,7 +25,7 @@ class Flight(msgspec.Struct, frozen=True):
     receiver: str
     tick: int
     """The tick in which the report was sent."""
-    fate: Fate
+    outcome: ReportOutcome
     """The outcome of its first copy received intact, or, if there is none, of its first copy."""
     heard: tuple[int, ...]
     """The ticks in which a copy was received intact."""
@@ -33,7 +33,7 @@ class Flight(msgspec.Struct, frozen=True):
     """The ticks in which a damaged copy was received."""
 
 
-def fates(scenes: Iterable[Scene], over: bool) -> tuple[Flight, ...]:
+def flights_of(scenes: Iterable[Scene], over: bool) -> tuple[Flight, ...]:
     """Return the outcomes of all reports in `scenes`, in the order in which they were sent.
 
     `over` is true if the run is complete, so that no report is under way.
@@ -50,10 +50,10 @@ def fates(scenes: Iterable[Scene], over: bool) -> tuple[Flight, ...]:
                 damaged.append(one.tick)
     flights = []
     for (sender, receiver, tick), (received, damaged) in sent.items():
-        fate: Fate = "lost" if over or last - tick >= LATEST else "under way"
+        outcome: ReportOutcome = "lost" if over or last - tick >= LATEST else "under way"
         if received:
-            fate = "heard" if received[0] == tick else "late"
+            outcome = "heard" if received[0] == tick else "late"
         elif damaged:
-            fate = "damaged"
-        flights.append(Flight(sender, receiver, tick, fate, tuple(received), tuple(damaged)))
+            outcome = "damaged"
+        flights.append(Flight(sender, receiver, tick, outcome, tuple(received), tuple(damaged)))
     return tuple(flights)

@@ -15,7 +15,7 @@ CLAIM_P_VALUE = 1e-3
 """The p-value below which a robot does not claim a pose, but measures more ranges."""
 
 EARLY_CLAIM_P_VALUE = 1e-2
-"""The same bound while a robot has fewer than twice the mutual ranges that a claim requires."""
+"""The CLAIM_P_VALUE of a robot with fewer than twice the mutual ranges that a claim requires."""
 
 INCONSISTENT_P_VALUE = 2e-4
 """The p-value below which a search counts towards INCONSISTENT_SEARCHES.

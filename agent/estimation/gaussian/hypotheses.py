@@ -19,7 +19,7 @@ from agent.estimation.gaussian.odometry_noise import Array, Places, Track
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, Ranges, placed
 from protocol.noise import Noise
 
-ODDS_KEPT = 1e-7
+NEGLIGIBLE_PROBABILITY = 1e-7
 """The probability, relative to the likeliest hypothesis, below which a hypothesis is dropped."""
 
 SAME_SIGMAS = 1.0
@@ -63,7 +63,7 @@ def with_probability(fits: Sequence[tuple[Fit, float]]) -> tuple[ScoredHypothesi
     scored.sort(key=lambda one: -one[0])
     left: list[tuple[float, Fit, float]] = []
     for weight, one, silent in scored:
-        if scored[0][0] - weight > -math.log(ODDS_KEPT) or len(left) == MOST:
+        if scored[0][0] - weight > -math.log(NEGLIGIBLE_PROBABILITY) or len(left) == MOST:
             break
         if not any(_same(one, other) for _, other, _ in left):
             left.append((math.exp(weight - scored[0][0]), one, silent))

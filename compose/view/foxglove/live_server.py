@@ -22,7 +22,7 @@ from foxglove import Context
 from foxglove.websocket import Capability, ChannelView, Client, ServerListener, WebSocketServer
 
 from compose.launch.signals import stop_with_launcher
-from compose.recording.frames import Telling
+from compose.recording.frames import JournalDecoder
 from compose.recording.run import WORLD_JOURNAL, agent_journal
 from compose.view.cast import Stage
 from compose.view.foxglove.gate import GUESTS_FILES, Gate, private_host
@@ -59,7 +59,7 @@ class Live:
         self._folder = folder
         self._channels = channels
         self._journals = Journals(folder)
-        self._tails: dict[str, tuple[Tail, Telling]] = {}
+        self._tails: dict[str, tuple[Tail, JournalDecoder]] = {}
         self._views: Views | None = None
         self._next = 0
         """The next tick to show."""
@@ -100,9 +100,9 @@ class Live:
 
     def _publish_frames(self, stage: Stage) -> None:
         for name in (WORLD_JOURNAL, *map(agent_journal, stage.ids)):
-            tail, telling = self._tails.setdefault(name, (Tail(self._folder / name), Telling(name)))
+            tail, decoder = self._tails.setdefault(name, (Tail(self._folder / name), JournalDecoder(name)))
             with suppress(OSError, CorruptJournal):
-                for one in telling.of(tail.news()):
+                for one in decoder.of(tail.news()):
                     self._channels.frame(one, nanoseconds(stage, one.tick))
 
     def _ready(self, stage: Stage, now: float) -> list[Scene]:

@@ -73,7 +73,7 @@ class RefusedFrame(ValueError):
     """A frame that does not belong under its key; the text says why."""
 
 
-class Heard(Show):
+class ReceivedMission(Show):
     """A mission, built from the frames received from the network."""
 
     def __init__(self, run: str) -> None:
@@ -145,7 +145,7 @@ class Listener:
     def __init__(self, endpoints: Endpoints) -> None:
         self.endpoint = str(endpoints)
         self._endpoints = endpoints
-        self.shows: dict[str, Heard] = {}
+        self.shows: dict[str, ReceivedMission] = {}
         """The missions by run name, in the order in which they were found."""
         self.reached = False
         """True while connected to a router."""
@@ -183,7 +183,7 @@ class Listener:
         run = arrival.source.run
         appears = arrival.topic == "alive" and arrival.source.kind is keys.world_alive
         if appears and run not in self.shows and len(self.shows) < MOST_RUNS:
-            self.shows[run] = Heard(run)
+            self.shows[run] = ReceivedMission(run)
         if run not in self.shows:
             return
         if arrival.topic in ("alive", "gone"):

@@ -38,7 +38,7 @@ PAGE = Path(__file__).parent / "page"
 POLL_S = 0.05
 """The interval in s at which runs are polled and updates are sent to pages while a mission is live."""
 IDLE_S = 0.5
-"""The same interval while no mission is live."""
+"""The interval in s at which runs are polled and updates are sent to pages while no mission is live."""
 PLAYERS_AT_ONCE = 4000
 """The maximum number of robots times ticks in one answer: some megabytes and some 10 ms of work."""
 HEADERS = {
