@@ -13,6 +13,8 @@ import msgspec
 
 VERSION = 2
 """The version of the protocol."""
+RELEASES = {1: "0.1"}
+"""The minor version of Tandem that has each earlier version of the protocol."""
 MAX_SENT_BYTES = 1 << 15
 """The maximum size of a frame on the network. From about 48 kB on, a low-latency Zenoh link breaks."""
 MAX_REPORT_BYTES = 4096
@@ -50,6 +52,14 @@ def is_sound(frame: bytes) -> bool:
 def version_of(frame: bytes) -> int | None:
     """Return the protocol version of `frame`; None if it is too short to be a frame."""
     return frame[0] if len(frame) > _HEAD.size else None
+
+
+def other_version(frame: bytes) -> int | None:
+    """Return the protocol version of an undamaged `frame` of another version; None for any other frame."""
+    if len(frame) <= _HEAD.size:
+        return None
+    version, crc = _HEAD.unpack_from(frame)
+    return version if version != VERSION and crc == zlib.crc32(frame[_HEAD.size :]) else None
 
 
 @overload

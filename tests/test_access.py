@@ -225,7 +225,7 @@ def test_the_router_lets_pass_what_the_matrix_says_and_nothing_else(name: str, n
 
 
 @pytest.mark.parametrize("key", ["tandem/**", "**", "tandem/*/world/truth", "tandem/*/robot/*/observation"])
-def test_a_robot_that_listens_to_everything_hears_nothing_of_it(key: str, network: Network) -> None:
+def test_a_subscription_to_many_keys_receives_nothing(key: str, network: Network) -> None:
     robot = Participant(network, "agent-b")
     declared = robot.session.declare_subscriber(key)
     robot._settled()
@@ -236,7 +236,7 @@ def test_a_robot_that_listens_to_everything_hears_nothing_of_it(key: str, networ
 
 
 @pytest.mark.parametrize("key", ["tandem/r/robot/*/command", "tandem/r/robot/**", "tandem/**"])
-def test_a_robot_that_speaks_for_everybody_speaks_for_nobody(key: str, network: Network) -> None:
+def test_a_frame_under_a_wildcard_key_reaches_no_process(key: str, network: Network) -> None:
     robot = Participant(network, "agent-b")
     declared = network.world.declare_subscriber("tandem/r/**")
     robot._settled()
@@ -248,7 +248,7 @@ def test_a_robot_that_speaks_for_everybody_speaks_for_nobody(key: str, network: 
     assert came == set()
 
 
-def test_the_answer_of_a_robot_that_may_not_answer_is_not_asked_for(network: Network) -> None:
+def test_a_robot_without_the_right_to_answer_gets_no_query(network: Network) -> None:
     robot = Participant(network, "agent-b")
     declared: Any = robot.session.declare_queryable("tandem/r/world/config/**", partial(answer, "agent-b"))
     robot._settled()

@@ -310,7 +310,7 @@ def test_the_last_error_is_that_of_the_claim(name: str, recordings: Path) -> Non
     assert bool(found(figure, "position-sigma-a")) == (name == "noisy")
 
 
-def test_in_grey_no_line_of_errors_looks_like_one_of_the_other_robot_or_of_something_else(
+def test_all_error_lines_differ_in_grey(
     recordings: Path,
 ) -> None:
     figure = drawn(over_time.errors(pair(recorded("noisy", recordings))))
@@ -321,7 +321,7 @@ def test_in_grey_no_line_of_errors_looks_like_one_of_the_other_robot_or_of_somet
     assert len(set(dashes.values())) == len(dashes) == 6
 
 
-def test_under_noise_a_panel_has_each_hypothesis_that_the_journal_tells_of(recordings: Path) -> None:
+def test_a_panel_has_each_hypothesis_of_the_journal_under_noise(recordings: Path) -> None:
     folder = recorded("noisy", recordings)
     told = pair(folder)
     figure = drawn(decisions.draw(told))
@@ -344,7 +344,7 @@ def test_under_noise_a_panel_has_each_hypothesis_that_the_journal_tells_of(recor
                 assert line(figure, f"chosen-{tick}-{role}") == [(goal.x, goal.y)]
 
 
-def test_the_letters_plan_under_noise_is_drawn_in_bs_own_frame(recordings: Path) -> None:
+def test_a_noisy_plan_of_the_paper_planner_is_drawn_in_bs_frame(recordings: Path) -> None:
     told = pair(recorded("letter", recordings))
     ((_, plan),) = manoeuvre.planned(told, "b")
     (figure,) = [drawn(one) for one in manoeuvre.draw(told).values()]
@@ -358,7 +358,7 @@ ABSENT = {"undecided": {"phase-1-a", "plan-a-b", "encounter-a-b"}}
 
 
 @pytest.mark.parametrize("name", ["assured", "faulty", "noisy", "letter", "undecided"])
-def test_each_kind_is_drawn_of_each_run_or_says_why_not(
+def test_each_kind_of_figure_is_drawn_or_the_reason_is_printed(
     name: str, recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     told = pair(recorded(name, recordings))
@@ -388,7 +388,9 @@ def test_every_pair_has_figures_of_its_own(recordings: Path) -> None:
 
 
 @pytest.mark.parametrize("ticks", [0, 1, 30, 47])
-def test_a_torn_record_is_drawn_to_the_tear(ticks: int, recordings: Path, tmp_path: Path) -> None:
+def test_a_truncated_recording_is_drawn_up_to_the_truncation(
+    ticks: int, recordings: Path, tmp_path: Path
+) -> None:
     folder = copied(recorded("paper-1", recordings), tmp_path)
     cut(folder / "world.journal", 2 + 2 * ticks)
     cut(folder / "agent-b.journal", 2 + 3 * min(ticks, 20))
@@ -420,7 +422,7 @@ def test_a_journal_of_another_version_is_followed_to_where_it_decides_otherwise(
     )
 
 
-def test_no_plan_is_said_to_be_none_where_only_a_journal_is_missing(recordings: Path, tmp_path: Path) -> None:
+def test_a_missing_journal_is_not_mistaken_for_a_missing_plan(recordings: Path, tmp_path: Path) -> None:
     for name, whole in (
         ("paper-1", "no last manoeuvre was planned"),
         ("noisy", "no robot scored hypotheses"),
@@ -448,7 +450,7 @@ def _turned(frame: bytes, tick: int) -> bytes:
 
 
 @pytest.mark.long
-def test_the_same_record_gives_the_same_bytes_in_each_format(recordings: Path, tmp_path: Path) -> None:
+def test_a_recording_always_gives_the_same_bytes_in_each_format(recordings: Path, tmp_path: Path) -> None:
     folder = copied(recorded("paper-1", recordings), tmp_path)
     runs: list[dict[str, bytes]] = []
     for _ in range(2):
@@ -489,7 +491,7 @@ def test_a_terminal_shows_how_far_it_is_and_each_file_on_a_line_of_its_own(
 
 
 @pytest.mark.parametrize(("journal", "torn"), [("world.journal", "the world"), ("agent-b.journal", "b")])
-def test_of_a_record_that_breaks_off_nothing_is_said_to_be_absent(
+def test_no_part_of_a_truncated_recording_is_reported_as_absent(
     paper_1: Path, journal: str, torn: str, tmp_path: Path
 ) -> None:
     copied(paper_1, tmp_path)

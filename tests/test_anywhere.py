@@ -129,7 +129,7 @@ def test_the_paper_is_never_wrong_either() -> None:
         (Mission(100.0, 1.0, 1.0, 0.02), 0.1),
     ],
 )
-def test_what_double_precision_does_not_allow_is_in_the_way(mission: Mission, distance: float) -> None:
+def test_a_mission_beyond_double_precision_is_infeasible(mission: Mission, distance: float) -> None:
     why = infeasibility(mission, distance)
     assert why is not None
     assert "to a micrometre in double precision" in why
@@ -138,7 +138,7 @@ def test_what_double_precision_does_not_allow_is_in_the_way(mission: Mission, di
 @pytest.mark.parametrize(
     ("reach", "distance"), [(1e4, 1e4), (300.0, 600.0), (0.01, 1e-5), (0.01, 0.3), (3.0, 10.0)]
 )
-def test_what_double_precision_allows_is_not(reach: float, distance: float) -> None:
+def test_a_mission_within_double_precision_is_feasible(reach: float, distance: float) -> None:
     assert infeasibility(Mission(reach, 1.0, 0.9 * reach, 3.0), distance) is None
 
 

@@ -75,7 +75,7 @@ def spoilt(key: str) -> Iterator[str]:
 
 
 @by_kind
-def test_a_wildcard_and_a_key_with_too_few_or_many_chunks_are_none_of_ours(kind: Callable[..., str]) -> None:
+def test_a_wildcard_or_a_wrong_number_of_chunks_is_not_a_key_of_tandem(kind: Callable[..., str]) -> None:
     named = {name: NAMED[name] for name in inspect.signature(kind).parameters}
     for key in spoilt(kind(**named)):
         assert keys.parse(key) is None, key
@@ -90,7 +90,7 @@ def test_a_wildcard_and_a_key_with_too_few_or_many_chunks_are_none_of_ours(kind:
 )
 @example("**")
 @example("tandem/**")
-def test_any_text_is_a_key_of_ours_or_none(text: str) -> None:
+def test_any_text_is_either_a_key_of_tandem_or_rejected(text: str) -> None:
     found = keys.parse(text)
     if found is not None:
         assert found.kind is not None
@@ -177,7 +177,7 @@ def test_wildcards_odd_keys_and_deletions_end_no_process_and_change_nothing(tmp_
     assert (out / "ticks.csv").read_bytes() == (alone / "ticks.csv").read_bytes()
 
 
-def test_an_answer_of_a_stranger_under_a_wildcard_is_no_briefing() -> None:
+def test_an_answer_under_a_wildcard_key_is_not_accepted_as_a_configuration() -> None:
     config = load("paper-1").config("a")
     with session.open_router(listening("tcp/127.0.0.1:0")) as link:
         declared: list[Any] = []
@@ -197,7 +197,7 @@ def test_an_answer_of_a_stranger_under_a_wildcard_is_no_briefing() -> None:
         assert len(refusal) <= 300
 
 
-def test_a_flood_of_keys_that_are_none_is_counted_and_told_of_a_bounded_number(
+def test_a_flood_of_invalid_keys_is_counted_and_reported_a_bounded_number_of_times(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     inbox = Inbox("test")
@@ -210,7 +210,7 @@ def test_a_flood_of_keys_that_are_none_is_counted_and_told_of_a_bounded_number(
     assert max(map(len, said)) < 500
 
 
-def test_what_comes_under_a_wildcard_is_delivered_to_nobody(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_frame_under_a_wildcard_key_is_not_delivered(capsys: pytest.CaptureFixture[str]) -> None:
     inbox = Inbox("test")
     with session.open_router(listening("tcp/127.0.0.1:0")) as link:
         session.subscribe(link, keys.command(RUN, "*"), inbox, "command")

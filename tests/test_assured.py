@@ -177,7 +177,7 @@ def test_phase_3_begins_in_the_first_tick_of_contact_in_which_both_know_their_an
 
 
 @pytest.mark.parametrize("setting", [CLOSE, CLOSE._replace(turn_rate=0.2), WIDE])
-def test_who_is_done_with_phase_1_stands_still_while_a_peer_in_range_is_not(setting: Setting) -> None:
+def test_a_robot_that_has_ended_phase_1_waits_for_a_peer_in_range(setting: Setting) -> None:
     waited = 0
     for seed in range(100):
         recording = drawn(setting, seed)
@@ -218,7 +218,7 @@ def test_once_both_orbit_phase_3_begins_within_the_bound(setting: Setting) -> No
 
 
 @pytest.mark.parametrize(("reach", "a_ranges"), [(3.0, 1), (6.0, 400)])
-def test_however_long_b_has_waited_the_first_report_tells_the_whole_way(
+def test_the_first_report_has_the_whole_path_however_long_b_has_waited(
     reach: float, a_ranges: int, tmp_path: Path
 ) -> None:
     """Also if one report cannot contain all ranges: a's, when it is always within 6 m of M1."""
@@ -250,7 +250,7 @@ def encounter(recording: Recording) -> list[TickRecord]:
     return list(moments[: end + 1])
 
 
-def test_silence_before_phase_3_rules_placements_out() -> None:
+def test_no_detection_before_phase_3_rules_out_placements() -> None:
     """Only missions without a tick of no detection in phase 3 are counted."""
     fewer = 0
     for seed in range(150):
@@ -278,7 +278,7 @@ def test_ranges_before_phase_3_make_a_last_manoeuvre_needless() -> None:
     assert spared >= 15
 
 
-def test_without_what_was_sensed_before_phase_3_more_placements_would_be_left(tmp_path: Path) -> None:
+def test_observations_before_phase_3_rule_out_further_placements(tmp_path: Path) -> None:
     more = 0
     for seed in range(60):
         claim = next(step for step in steps_of(tmp_path, CLOSE, seed) if step.commands["b"].verdict)
@@ -306,7 +306,7 @@ def places(moment: TickRecord) -> tuple[float, ...]:
 
 
 @pytest.mark.parametrize("setting", [SECTION_IV, CLOSE, WIDE, SLOW])
-def test_nobody_claims_before_ranges_from_three_different_places(setting: Setting) -> None:
+def test_no_robot_claims_before_ranges_from_three_different_places(setting: Setting) -> None:
     single = 0
     for seed in range(100):
         recording = drawn(setting, seed)
@@ -331,7 +331,7 @@ def sought(recording: Recording, robot: str, phase: int) -> list[str]:
 
 
 @pytest.mark.parametrize("setting", [SECTION_IV, SLOW, WIDE, SHORTENED])
-def test_who_leaves_the_range_straight_ahead_looks_behind_before_it_circles(setting: Setting) -> None:
+def test_a_robot_that_drives_straight_out_of_range_drives_back_before_it_circles(setting: Setting) -> None:
     ways = set()
     for seed in range(100):
         recording = drawn(setting, seed)
@@ -347,7 +347,7 @@ def test_who_leaves_the_range_straight_ahead_looks_behind_before_it_circles(sett
     assert (1, *whole) in ways or setting not in (SECTION_IV, SLOW)
 
 
-def test_the_letter_never_looks_behind() -> None:
+def test_the_paper_planner_never_drives_back() -> None:
     for seed in range(100):
         recording = drawn(SECTION_IV, seed, "paper")
         assert all(
@@ -361,7 +361,7 @@ def known(recording: Recording, robot: str) -> int:
 
 
 @pytest.mark.parametrize("reach", [1.0, 3.0, 5.0])
-def test_to_look_behind_is_never_slower_than_to_circle_for_who_turns_slowly_and_finds_the_anchor_there(
+def test_driving_back_is_never_slower_than_circling_for_a_slow_turner(
     reach: float,
 ) -> None:
     setting = Setting(reach=reach, turn_rate=0.2)
@@ -412,7 +412,9 @@ def test_the_last_manoeuvre_leaves_no_more_placements_out_of_range_than_it_must(
 
 
 @pytest.mark.parametrize("seed", [64, 78, 83])
-def test_silence_names_the_placement_left_out_and_b_drives_back_to_tell(seed: int, tmp_path: Path) -> None:
+def test_no_detection_selects_the_placement_out_of_range_and_b_drives_back_to_report(
+    seed: int, tmp_path: Path
+) -> None:
     moments = list(steps_of(tmp_path, SLOW, seed))
     doing = [moment.commands["b"].state for moment in moments]
     out = doing.index("returning")
@@ -436,7 +438,7 @@ def places_of(moment: Step) -> list[tuple[float, float]]:
 
 
 @pytest.mark.parametrize("setting", [SECTION_IV, CLOSE, SHORTENED, Setting(speed=5.0)])
-def test_b_sets_out_only_once_a_stands(setting: Setting) -> None:
+def test_b_begins_to_move_only_after_a_has_stopped(setting: Setting) -> None:
     for seed in range(100):
         for moment in drawn(setting, seed).ticks:
             if moment.commands["b"].state == "last-manoeuvre":
@@ -465,7 +467,7 @@ def ranges_of(
 
 
 @given(st.floats(1.0, 40.0), angles, angles, st.lists(st.tuples(poses, poses), min_size=2, max_size=5))
-def test_turn_error_is_how_far_least_squares_would_turn_a_robot_at_the_worst(
+def test_turn_error_is_the_largest_rotation_error_of_least_squares(
     distance: float, phi: float, psi: float, pairs: list[tuple[Pose, Pose]]
 ) -> None:
     placement = Placement(phi, distance * math.cos(psi), distance * math.sin(psi))
@@ -524,18 +526,18 @@ def seen_at(
 
 
 @pytest.mark.parametrize("case", OPEN)
-def test_ranges_that_leave_a_turn_open_pin_nothing_down(case: str) -> None:
+def test_ranges_that_leave_a_rotation_free_determine_no_placement(case: str) -> None:
     placement, places = OPEN[case]
     pair_observations = seen_at(placement, *places)
     assert turn_error(placement, pair_observations, 1e-12, 1e-12) == math.inf
 
 
-def test_ranges_from_where_nothing_is_special_pin_a_placement_down() -> None:
+def test_ranges_in_general_position_determine_a_placement() -> None:
     pair_observations = seen_at(GENERAL, ((8.0, 3.0), (0.3, 0.2)), ((7.5, 4.0), (0.3, 0.2)))
     assert turn_error(GENERAL, pair_observations, 1e-12, 1e-12) < 1e-10
 
 
-def test_one_more_range_from_elsewhere_pins_a_double_root_down() -> None:
+def test_one_more_range_from_another_place_determines_a_double_root() -> None:
     placement, places = OPEN["b between the anchors"]
     assert turn_error(placement, seen_at(placement, *places, ((5.0, 2.0), (8.0, 1.0))), 1e-12, 1e-12) < 1e-10
 
@@ -619,13 +621,13 @@ def hard(setting: Setting) -> Iterator[tuple[float, float]]:
 
 
 @pytest.mark.parametrize("setting", HARD)
-def test_b_localises_from_starts_at_the_edge_of_what_can_be_told(setting: Setting) -> None:
+def test_b_localises_from_nearly_indistinguishable_starts(setting: Setting) -> None:
     for rho0, heading in hard(setting):
         assert_localised(released(setting, None, Pose(setting.distance + rho0, 0.0, heading)))
 
 
 @pytest.mark.parametrize("setting", HARD)
-def test_both_localise_from_mirrored_starts_at_the_edge_of_what_can_be_told(setting: Setting) -> None:
+def test_both_localise_from_nearly_mirrored_starts(setting: Setting) -> None:
     for rho0, heading in hard(setting):
         a = Pose(rho0, 0.0, heading)
         if not in_line(a):
@@ -639,7 +641,7 @@ def in_line(a: Pose) -> bool:
 
 @pytest.mark.parametrize("heading_a", [0.0, math.pi])
 @pytest.mark.parametrize("heading_b", [0.0, math.pi])
-def test_two_on_their_anchors_who_head_along_the_line_between_these_localise(
+def test_two_robots_on_their_anchors_that_face_along_the_line_between_them_localise(
     heading_a: float, heading_b: float
 ) -> None:
     """The robots then never leave this line, on which ranges contain no information about rotations."""
@@ -647,7 +649,7 @@ def test_two_on_their_anchors_who_head_along_the_line_between_these_localise(
 
 
 @pytest.mark.parametrize("rho0", [1.1e-9, 2e-9, 5e-9, 1e-8, 1e-7])
-def test_who_turns_slowly_gets_through_phase_1_from_next_to_its_anchor(rho0: float) -> None:
+def test_a_slow_turner_completes_phase_1_next_to_its_anchor(rho0: float) -> None:
     setting = Setting(reach=1.0, period=0.05, turn_rate=0.2)
     for heading in (*RADIAL_AND_TANGENT, 1.0, 4.0):
         text = text_of(setting, Pose(rho0, 0.0, heading), None, max_ticks=200)
@@ -658,7 +660,7 @@ def test_who_turns_slowly_gets_through_phase_1_from_next_to_its_anchor(rho0: flo
 
 
 @given(st.floats(0.1, 1.5), st.floats(0.05, 1.0), st.floats(0.2, math.pi))
-def test_nothing_is_in_the_way_of_ordinary_missions(ratio: float, period: float, turn_rate: float) -> None:
+def test_ordinary_missions_are_feasible(ratio: float, period: float, turn_rate: float) -> None:
     assert infeasibility(Mission(10.0 * ratio, period, 1.0, turn_rate), 10.0) is None
 
 
@@ -670,7 +672,7 @@ def test_nothing_is_in_the_way_of_ordinary_missions(ratio: float, period: float,
         (Mission(3.0, 1.0, 9.9e-5, 1.0), 10.0, "9.9e-05 m"),
     ],
 )
-def test_ticks_that_move_a_robot_too_little_are_in_the_way(
+def test_a_mission_whose_ticks_are_too_short_is_infeasible(
     mission: Mission, distance: float, step: str
 ) -> None:
     why = infeasibility(mission, distance)
@@ -688,7 +690,7 @@ def test_ticks_that_move_a_robot_too_little_are_in_the_way(
         (Mission(300.0, 1.0, 0.3, 1.0), 10.0, ("10 m", "300 m", "0.3 m")),
     ],
 )
-def test_distances_too_large_for_the_manoeuvres_are_in_the_way(
+def test_a_mission_with_too_large_a_distance_is_infeasible(
     mission: Mission, distance: float, named: tuple[str, str, str]
 ) -> None:
     why = infeasibility(mission, distance)

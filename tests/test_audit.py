@@ -117,11 +117,11 @@ def checks(findings: Findings) -> dict[str, int]:
         pytest.param(parse(several_pairs(3), "pairs"), id="three-pairs"),
     ],
 )
-def test_an_honest_run_keeps_every_rule(scenario: Scenario) -> None:
+def test_an_honest_run_violates_no_rule(scenario: Scenario) -> None:
     journals = kept(scenario)
     findings = audit_world_run(journals)
     assert findings.violations == ()
-    made, ticks, robots = checks(findings), findings.ticks, len(scenario.robots)
+    made, ticks, robots = checks(findings), findings.ticks + 1, len(scenario.robots)
     assert list(made) == [rule.__name__ for rule in RULES]
     assert made["config"] == robots
     assert made["observation"] == robots * ticks
@@ -141,19 +141,19 @@ def test_journals_in_memory_are_those_on_disk(tmp_path: Path) -> None:
     assert audit(tmp_path) == audit_world_run(journals)
 
 
-def test_a_run_as_processes_keeps_every_rule_and_the_command_says_so(tmp_path: Path) -> None:
+def test_a_run_as_processes_violates_no_rule_and_the_command_reports_it(tmp_path: Path) -> None:
     assert tandem("run", "noisy", "--out", tmp_path / "out", "-q").status == 0
     ended = tandem("audit", tmp_path / "out")
     assert (ended.status, ended.err) == (0, "")
     lines = ended.out.splitlines()
-    ticks = len(read(tmp_path / "out").ticks)
-    assert lines[:3] == [f"noisy: no violations in {ticks} ticks", "", "rule        checks  violations"]
+    last = read(tmp_path / "out").ticks[-1].truth.tick
+    assert lines[:3] == [f"noisy: no violations over {last} ticks", "", "rule        checks  violations"]
     assert [line.split()[0] for line in lines[3:]] == [rule.__name__ for rule in RULES]
     assert [line.split()[2] for line in lines[3:]] == ["0"] * len(RULES)
-    assert lines[6].split() == ["observation", str(2 * ticks), "0"]
+    assert lines[6].split() == ["observation", str(2 * (last + 1)), "0"]
 
 
-def test_a_run_in_real_time_in_which_drives_were_missed_keeps_every_rule(tmp_path: Path) -> None:
+def test_a_run_in_real_time_with_missed_commands_violates_no_rule(tmp_path: Path) -> None:
     out = tmp_path / "out"
     (tmp_path / "assured.toml").write_text(REAL_TIME)
     with TandemProcess("run", tmp_path / "assured.toml", "--rate", "20", "--out", out, "-q") as run:
@@ -168,7 +168,7 @@ def test_a_run_in_real_time_in_which_drives_were_missed_keeps_every_rule(tmp_pat
     assert all(made for rule, made in checks(findings).items() if rule not in ("faults", "claim"))
 
 
-def test_a_run_that_failed_was_failed_by_nobody_on_record() -> None:
+def test_a_failed_run_violates_no_rule() -> None:
     """The world ends a run without answers; a robot that did answer also answers the MissionEnd."""
     scenario = load("paper-1")
     books = {name: MemoryJournal() for name in in_process.journals(scenario)}
@@ -288,7 +288,7 @@ def what(findings: Findings, rule: str) -> list[str]:
     return [one.what for one in findings.violations if one.rule == rule]
 
 
-def test_drives_in_another_order_are_found_and_what_follows_is_not_read(folder: Path) -> None:
+def test_commands_in_another_order_are_found_and_later_frames_are_not_read(folder: Path) -> None:
     told = messages(folder / WORLD_JOURNAL)
     a, b = (i for i, one in enumerate(told) if isinstance(one, Command) and one.tick == 12)
     told[a], told[b] = told[b], told[a]
@@ -297,7 +297,7 @@ def test_drives_in_another_order_are_found_and_what_follows_is_not_read(folder: 
     assert [one.line for one in findings.violations] == [
         "tick 12, the world, order: a Command of b of tick 12 is out of order"
     ]
-    assert findings.ticks == 12
+    assert findings.ticks == 11
 
 
 @pytest.mark.parametrize("kind", [Observation, Command, Estimate])
@@ -315,7 +315,7 @@ def test_a_tick_that_an_agent_has_left_out_is_missed(folder: Path) -> None:
     ]
 
 
-def test_a_drive_that_the_world_was_not_given_is_found(folder: Path) -> None:
+def test_a_command_that_the_world_did_not_receive_is_found(folder: Path) -> None:
     plant(folder / A, (of(Command, 12), to(omega=0.25)))
     findings = audit(folder)
     assert found(findings) == [(12, "a", "order"), (12, "a", "decision")]
@@ -325,7 +325,7 @@ def test_a_drive_that_the_world_was_not_given_is_found(folder: Path) -> None:
     assert what(findings, "decision") == ["in its Command, omega is 0.25, expected 0.15384615384615385"]
 
 
-def test_a_drive_that_the_world_has_changed_is_found_and_leads_elsewhere(folder: Path) -> None:
+def test_a_command_that_the_world_has_changed_is_found(folder: Path) -> None:
     plant(folder / WORLD_JOURNAL, (of(Command, 40, "b"), to(v=0.5)))
     findings = audit(folder)
     assert found(findings)[:2] == [(40, "b", "order"), (41, "b", "observation")]
@@ -335,13 +335,13 @@ def test_a_drive_that_the_world_has_changed_is_found_and_leads_elsewhere(folder:
     }  # fmt: skip
 
 
-def test_a_drive_that_was_missed_in_lockstep_is_found(folder: Path) -> None:
+def test_a_command_that_is_missing_in_lockstep_is_found(folder: Path) -> None:
     plant(folder / WORLD_JOURNAL, (of(Command, LAST, "a"), lambda _: DeadlineMissed(LAST, "a")))
     assert (LAST, "a", "order") in found(audit(folder))
     assert "the world continued without its Command, expected it to wait" in what(audit(folder), "order")
 
 
-def test_a_report_that_was_missed_in_lockstep_is_found(folder: Path) -> None:
+def test_a_report_that_is_missing_in_lockstep_is_found(folder: Path) -> None:
     plant(folder / A, (of(Report, LAST, "b"), lambda _: DeadlineMissed(LAST, "b")))
     findings = audit(folder)
     assert (LAST, "a", "order") in found(findings)
@@ -350,7 +350,7 @@ def test_a_report_that_was_missed_in_lockstep_is_found(folder: Path) -> None:
     assert {(tick, robot) for tick, robot, _ in found(findings)} == {(LAST, "a")}
 
 
-def test_an_end_and_a_farewell_that_are_told_otherwise_are_found(folder: Path) -> None:
+def test_a_changed_mission_end_or_final_report_is_found(folder: Path) -> None:
     plant(folder / A, (of(MissionEnd), to(reason="none")), (of(FinalReport), to(reports_heard=2)))
     findings = audit(folder)
     assert found(findings) == [(LAST, "a", "order")] * 2 + [(LAST, "a", "decision")]
@@ -359,14 +359,14 @@ def test_an_end_and_a_farewell_that_are_told_otherwise_are_found(folder: Path) -
 
 
 @pytest.mark.parametrize("lacking", ["a", "b"])
-def test_a_farewell_that_the_world_has_not_got_is_missed(lacking: str, folder: Path) -> None:
+def test_a_final_report_that_the_world_lacks_is_found(lacking: str, folder: Path) -> None:
     plant(folder / WORLD_JOURNAL, (of(FinalReport, robot=lacking), nothing))
     assert [one.line for one in audit(folder).violations] == [
         f"tick 48, {lacking}, order: the world has no FinalReport from it"
     ]
 
 
-def test_farewells_in_another_order_are_found(folder: Path) -> None:
+def test_final_reports_in_another_order_are_found(folder: Path) -> None:
     told = messages(folder / WORLD_JOURNAL)
     written(folder / WORLD_JOURNAL, [*told[:-2], told[-1], told[-2]])
     assert found(audit(folder)) == [(None, None, "order"), (LAST, "a", "order")]
@@ -385,7 +385,7 @@ def test_an_agent_that_ended_before_the_world_did_is_found(folder: Path) -> None
     assert {rule for _, _, rule in found(findings)} == {"order", "report", "decision"}
 
 
-def test_a_briefing_that_is_not_the_scenarios_is_found(folder: Path) -> None:
+def test_a_robot_config_that_differs_from_the_scenario_is_found(folder: Path) -> None:
     plant(
         folder / B, (of(RobotConfig), lambda told: replace(told, mission=replace(told.mission, accuracy=0.2)))
     )
@@ -394,13 +394,13 @@ def test_a_briefing_that_is_not_the_scenarios_is_found(folder: Path) -> None:
     assert findings.violations[0].line.startswith("no tick, b, config: mission is ")
 
 
-def test_how_long_a_tick_lasts_is_not_the_scenarios_to_say(folder: Path) -> None:
+def test_the_duration_of_a_tick_is_not_part_of_the_scenario(folder: Path) -> None:
     for name in (A, B):
         plant(folder / name, (of(RobotConfig), to(tick_s=0.5)))
     assert found(audit(folder)) == []
 
 
-def test_robots_that_were_told_different_durations_of_a_tick_are_found(folder: Path) -> None:
+def test_different_tick_durations_of_two_robots_are_found(folder: Path) -> None:
     plant(folder / B, (of(RobotConfig), to(tick_s=0.5)))
     assert found(audit(folder)) == [(None, "b", "config")]
 
@@ -467,7 +467,7 @@ def test_a_scenario_that_no_run_accepts_is_found(
     assert any(one.startswith(said) or said in one for one in what(audit(folder), "scenario"))
 
 
-def test_a_sense_that_is_off_in_its_last_bit_is_found(folder: Path) -> None:
+def test_an_observation_that_differs_in_its_last_bit_is_found(folder: Path) -> None:
     (sensed,) = [one for one in messages(folder / A) if of(Observation, 47)(one)]
     measured = sensed.contacts[0].range
     off = math.nextafter(measured, 0.0)
@@ -479,7 +479,7 @@ def test_a_sense_that_is_off_in_its_last_bit_is_found(folder: Path) -> None:
     ]
 
 
-def test_a_sense_that_tells_of_another_manoeuvre_is_found(folder: Path) -> None:
+def test_an_observation_of_another_manoeuvre_is_found(folder: Path) -> None:
     sensed = messages(folder / A)
     (before,) = [one for one in sensed if of(Observation, 30)(one)]
     plant(folder / A, (of(Observation, 30), to(executed=replace(before.executed, v=-0.0, omega=0.0))))
@@ -502,7 +502,7 @@ def test_a_report_that_was_sent_out_of_contact_is_found(folder: Path) -> None:
     assert what(findings, "contact") == ["it sent a report, expected none: out of contact"]
 
 
-def test_a_report_that_was_heard_out_of_contact_is_found(folder: Path) -> None:
+def test_a_report_that_was_received_out_of_contact_is_found(folder: Path) -> None:
     plant(folder / A, (of(Observation, 20), lambda observation: [observation, FAR]))
     plant(folder / B, (of(Observation, 20), lambda observation: [observation, FAR]))
     findings = audit(folder)
@@ -535,7 +535,7 @@ def test_a_late_report_from_out_of_contact_is_found(folder: Path) -> None:
     assert (46, "b", "observation") in found(findings)
 
 
-def test_a_report_that_no_sense_has_listed_is_found(folder: Path) -> None:
+def test_a_report_that_no_observation_lists_is_found(folder: Path) -> None:
     plant(folder / A, (of(Report, 47, "b"), lambda report: [report, report]))
     findings = audit(folder)
     assert found(findings)[0] == (47, "a", "contact")
@@ -543,7 +543,7 @@ def test_a_report_that_no_sense_has_listed_is_found(folder: Path) -> None:
     assert {(robot, rule) for _, robot, rule in found(findings)[1:]} == {("a", "decision")}  # it counts them
 
 
-def test_a_report_that_was_listed_and_not_heard_is_found(folder: Path) -> None:
+def test_a_report_that_was_listed_but_not_received_is_found(folder: Path) -> None:
     plant(folder / B, (of(Report, LAST, "a"), nothing))
     findings = audit(folder)
     assert found(findings)[0] == (LAST, "b", "contact")
@@ -596,7 +596,7 @@ def test_a_planner_that_fails_on_its_inputs_is_a_violation_and_no_crash(
 
 
 @pytest.mark.parametrize("beyond", [{"v": 1.5}, {"v": -1.5}, {"omega": 3.2}])
-def test_a_drive_beyond_the_limits_is_found(beyond: dict[str, float], folder: Path) -> None:
+def test_a_command_beyond_the_limits_is_found(beyond: dict[str, float], folder: Path) -> None:
     for name in (A, WORLD_JOURNAL):
         plant(folder / name, (of(Command, LAST, "a"), to(**beyond)))
     findings = audit(folder)
@@ -622,7 +622,7 @@ def lied(folder: Path, change: Callable[[Report], Report]) -> Findings:
     return audit(folder)
 
 
-def test_a_manoeuvre_that_was_told_otherwise_is_found(folder: Path) -> None:
+def test_a_manoeuvre_that_was_reported_falsely_is_found(folder: Path) -> None:
     findings = lied(folder, to(runs=(Segment(1, 0.9, 0.0), Segment(1, 0.0, 0.0))))
     assert (LAST, "a", "log") in found(findings)
     assert what(findings, "log") == ["it reported (0.9, 0) until tick 47, expected [1.0,0.0]"]
@@ -630,7 +630,7 @@ def test_a_manoeuvre_that_was_told_otherwise_is_found(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("tick", [5, 7])
-def test_a_range_that_was_told_otherwise_is_found(tick: int, folder: Path) -> None:
+def test_a_range_that_was_reported_falsely_is_found(tick: int, folder: Path) -> None:
     """One range differs from the measured one, or belongs to a tick without a measurement."""
 
     def change(report: Report) -> Report:
@@ -650,7 +650,7 @@ def test_a_range_that_was_told_otherwise_is_found(tick: int, folder: Path) -> No
     assert {rule for _, _, rule in found(findings)} == {"log", "decision"}
 
 
-def test_a_log_that_makes_no_sense_is_found(folder: Path) -> None:
+def test_an_invalid_motion_log_is_found(folder: Path) -> None:
     findings = lied(folder, to(runs=(Segment(2**31, 0.0, 0.0),)))
     assert what(findings, "log") == ["it reported manoeuvres that do not fill [46, 48]"]
 
@@ -671,7 +671,7 @@ def test_a_claim_that_is_wrong_is_found_and_so_is_an_end_that_hides_it(folder: P
     ]
 
 
-def test_a_claim_that_is_less_accurate_than_was_asked_is_found(folder: Path) -> None:
+def test_a_claim_below_the_required_accuracy_is_found(folder: Path) -> None:
     pose = read(folder).ticks[LAST].truth.poses[0]
     vague = Covariance(1e15, 0.0, 0.0, 1e15, 0.0, 1e-4)
     for name in (A, WORLD_JOURNAL):
@@ -727,7 +727,7 @@ def test_a_claim_by_too_few_noisy_ranges_is_found(planner_name: str, says: str, 
     assert what(findings, "claim")[0].endswith(says)
 
 
-def test_an_end_that_is_not_the_referees_is_found(folder: Path) -> None:
+def test_a_mission_end_that_differs_from_the_referees_is_found(folder: Path) -> None:
     for name in (A, B, WORLD_JOURNAL):
         plant(folder / name, (of(MissionEnd), to(outcome="undecided", reason="a: tired")))
     assert [one.line for one in audit(folder).violations] == [
@@ -735,7 +735,7 @@ def test_an_end_that_is_not_the_referees_is_found(folder: Path) -> None:
     ]
 
 
-def test_a_run_that_ends_before_the_referee_says_so_is_found(folder: Path) -> None:
+def test_a_run_that_ends_before_the_referee_decides_is_found(folder: Path) -> None:
     for robot, name in (("a", A), ("b", B)):
         plant(folder / name, (of(Command, LAST), to(verdict=None)))
         plant(folder / WORLD_JOURNAL, (of(Command, LAST, robot), to(verdict=None)))
@@ -745,7 +745,7 @@ def test_a_run_that_ends_before_the_referee_says_so_is_found(folder: Path) -> No
     assert {rule for _, _, rule in found(findings)} == {"order", "decision"}
 
 
-def test_a_robot_that_gave_up_and_a_run_that_is_said_to_be_localised_are_found(folder: Path) -> None:
+def test_a_localised_run_with_a_robot_that_gave_up_is_found(folder: Path) -> None:
     for name in (A, WORLD_JOURNAL):
         plant(folder / name, (of(Command, LAST, "a"), to(verdict=Undecided("tired"))))
     findings = audit(folder)
@@ -762,13 +762,13 @@ def test_nothing_is_claimed_of_another_pair(tmp_path: Path) -> None:
 # --- the command -----------------------------------------------------------------------------------------
 
 
-def test_the_command_tells_the_first_twenty_and_how_many_more(folder: Path) -> None:
+def test_the_command_prints_the_first_twenty_violations_and_the_number_of_others(folder: Path) -> None:
     told = messages(folder / A)
     written(folder / A, [replace(one, localised=True) if isinstance(one, Estimate) else one for one in told])
     ended = tandem("audit", folder)
     assert (ended.status, ended.err) == (1, "")
     lines = ended.out.splitlines()
-    assert lines[0] == "paper-1: 48 violations in 49 ticks"
+    assert lines[0] == "paper-1: 48 violations over 48 ticks"
     assert re.fullmatch(r"decision +204 +48", lines[10])
     assert lines[14:16] == ["", "tick 0, a, decision: in its Estimate, localised is true, expected false"]
     assert len(lines[15:]) == 21
@@ -782,7 +782,7 @@ def refused(ended: Ended, words: str) -> None:
     assert words in ended.err
 
 
-def test_what_is_no_record_is_refused(tmp_path: Path) -> None:
+def test_a_folder_without_a_recording_is_refused(tmp_path: Path) -> None:
     file, empty = tmp_path / "file", tmp_path / "empty"
     file.write_text("")
     empty.mkdir()
@@ -829,7 +829,7 @@ def test_a_violation_is_one_line() -> None:
 # --- the radio -------------------------------------------------------------------------------------------
 
 
-def test_what_befell_the_reports_is_listed_and_another_plan_is_found(tmp_path: Path) -> None:
+def test_deliveries_of_reports_are_listed_and_another_fault_plan_is_found(tmp_path: Path) -> None:
     text = shipped()["random"].read_text()
     in_process.run_mission(
         parse(text, "random", faults=["b->a: loss=0.5, delay=0..2, corrupt=0.2"]), tmp_path
@@ -855,7 +855,7 @@ def test_what_befell_the_reports_is_listed_and_another_plan_is_found(tmp_path: P
     assert (lost.tick, "a", "faults") in found(audit(tmp_path))
 
 
-def test_a_liar_that_tells_what_it_was_told_to_tell_breaks_no_rule(tmp_path: Path) -> None:
+def test_an_attacker_that_follows_its_scenario_violates_no_rule(tmp_path: Path) -> None:
     text = (
         shipped()["random"].read_text().replace('id = "b"', 'id = "b"\nattack = {kind = "scale", size = 0.5}')
     )

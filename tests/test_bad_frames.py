@@ -156,7 +156,7 @@ def refused_on(key: str, command: TandemProcess, frames: Mapping[bytes, str]) ->
     assert len(told) == len(set(told))
 
 
-def test_nonsense_before_the_first_tick_is_refused_told_once_and_counted(tmp_path: Path) -> None:
+def test_invalid_frames_before_the_first_tick_are_refused_counted_and_reported_once(tmp_path: Path) -> None:
     """Robot d is absent, so the tick does not advance while every other process listens."""
     scenario, out, alone = tmp_path / "pairs.toml", tmp_path / "out", tmp_path / "alone"
     scenario.write_text(several_pairs(2))
@@ -196,7 +196,7 @@ def test_nonsense_before_the_first_tick_is_refused_told_once_and_counted(tmp_pat
     assert [robots[name]["frames_refused"] for name in "abcd"] == [observations + reports, 0, 0, 0]
 
 
-def test_a_mission_under_fire_goes_on_as_if_nothing_happened(tmp_path: Path) -> None:
+def test_a_mission_is_not_disturbed_by_invalid_frames(tmp_path: Path) -> None:
     scenario, out, alone = tmp_path / "long.toml", tmp_path / "out", tmp_path / "alone"
     scenario.write_text(LONG)
     nonsense = {key: bad_frames(topic) for topic, key in TRUSTED.items()}
@@ -234,7 +234,7 @@ def test_a_mission_under_fire_goes_on_as_if_nothing_happened(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("topic", GENUINE)
-def test_the_frame_that_the_nonsense_is_made_of_is_itself_understood(topic: str) -> None:
+def test_the_frame_that_is_mutated_is_itself_valid(topic: str) -> None:
     """Otherwise every frame would be refused for the same reason."""
     message, _ = GENUINE[topic]
     assert msgspec.msgpack.decode(encode(message)[5:], type=type(message)) == message
@@ -254,7 +254,7 @@ def test_a_storm_of_mutated_frames_on_every_key_disturbs_nothing(tmp_path: Path)
 # --- well-formed frames, with this test as the world and the peer ---------------------------------------
 
 
-def test_a_robot_refuses_what_is_out_of_step_and_hears_a_repeated_report_once(tmp_path: Path) -> None:
+def test_a_robot_refuses_frames_out_of_step_and_uses_a_repeated_report_once(tmp_path: Path) -> None:
     scenario, endpoint, said = load("paper-1"), free_endpoint(), Inbox("test")
 
     def told(tick: int, **otherwise: object) -> Report:
@@ -323,7 +323,7 @@ def flooded(topic: Topic, key: str, size: int) -> tuple[Inbox, int]:
 
 
 @pytest.mark.parametrize("size", [0, 100, 40_000])
-def test_what_floods_a_topic_is_bounded_counted_and_told_once(
+def test_a_flood_of_frames_is_bounded_counted_and_reported_once(
     size: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
     full, dropped = flooded("report", "some/key", size)
@@ -347,7 +347,7 @@ def test_a_flood_leaves_other_topics_their_room() -> None:
     assert came[-1] == Arrival("observation", "another", b"needed")
 
 
-def test_one_frame_larger_than_all_the_room_is_told_of() -> None:
+def test_a_frame_larger_than_the_inbox_is_reported() -> None:
     alone = Inbox("test")
     alone.put("observation", "key", bytes(inbox.ROOM_BYTES + 1))
     assert len(alone.next(0.0).frame) == inbox.ROOM_BYTES + 1

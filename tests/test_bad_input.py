@@ -16,6 +16,7 @@ LISTEN = ("--listen", "tcp/127.0.0.1:7447")
 CONNECT = ("--connect", "tcp/127.0.0.1:7447")
 GOOD = PAPER_1.replace("seed = 1", "seed = 1\nmax_ticks = 500")
 FOUR = several_pairs(2)
+SWEEP = 'name = "mine"\nscenario = "paper-1"\ntrials = 1\n'
 
 
 def refused(ended: Ended, *words: str) -> None:
@@ -100,7 +101,7 @@ def test_an_unknown_field_is_named(was: str, typo: str, field: str, tmp_path: Pa
         ),
     ],
 )
-def test_a_word_that_is_none_is_told_with_those_that_there_are(was: str, new: str, says: str) -> None:
+def test_an_unknown_word_is_refused_with_the_known_ones(was: str, new: str, says: str) -> None:
     with pytest.raises(BadScenario) as bad:
         parse(changed(GOOD, was, new), "mine.toml")
     assert str(bad.value).startswith(f"mine.toml: {says}")
@@ -163,7 +164,7 @@ def test_a_value_out_of_bounds_is_named(was: str, new: str, field: str, tmp_path
     ],
 )
 @pytest.mark.parametrize("planner_name", ["paper", "assured"])
-def test_a_setting_in_which_no_pose_could_be_sure_is_refused(
+def test_a_mission_in_which_no_robot_could_claim_is_refused(
     was: str, new: str, why: str, planner_name: str, tmp_path: Path
 ) -> None:
     text = changed(changed(GOOD, was, new), "start = [11.3, -0.4, 3.6]", "")
@@ -270,7 +271,7 @@ def test_noise_misspelt_is_named(field: str, says: str) -> None:
         ),
     ],
 )
-def test_noise_in_which_no_robot_could_be_sure_is_refused(field: str, value: str, says: str) -> None:
+def test_noise_with_which_no_robot_could_claim_is_refused(field: str, value: str, says: str) -> None:
     refused_text(with_noise(field, value), f"mission.{says}")
 
 
@@ -289,7 +290,7 @@ def test_a_mistake_about_noise_is_one_line_and_status_2(
     refused_scenario(with_noise(field, value), tmp_path, says)
 
 
-def test_noise_up_to_its_bounds_is_played() -> None:
+def test_a_mission_with_noise_at_its_bounds_runs() -> None:
     for noise in (
         "{anchor_sigma = 3.0, mutual_sigma = 3.0, outliers = 0.25, drop_outs = 0.5, outlier_bias = [1, 1]}",
         "{actuation = {v = 0.5, omega = 0.5, v_floor = 1.0, omega_floor = 3.1}, odometry = {omega = 0.5}}",
@@ -452,14 +453,14 @@ def test_an_agents_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> N
     ],
     ids=["run", "in-process", "world"],
 )
-def test_a_record_is_never_overwritten(command: tuple[str, ...], says: str, tmp_path: Path) -> None:
+def test_a_recording_is_never_overwritten(command: tuple[str, ...], says: str, tmp_path: Path) -> None:
     (tmp_path / "world.journal").write_text("precious")
     refused(tandem(*command, "--out", tmp_path), f"--out: {tmp_path}{says}", "; choose another folder")
     assert [path.name for path in tmp_path.iterdir()] == ["world.journal"]
     assert (tmp_path / "world.journal").read_text() == "precious"
 
 
-def test_an_agents_record_is_never_overwritten(tmp_path: Path) -> None:
+def test_an_agents_journal_is_never_overwritten(tmp_path: Path) -> None:
     (tmp_path / "agent-a.journal").write_text("precious")
     with world("paper-1") as (_, endpoint):
         ended = tandem("agent", "a", "--connect", endpoint, "--out", tmp_path)
@@ -485,7 +486,7 @@ def test_an_agents_record_is_never_overwritten(tmp_path: Path) -> None:
         ("robot robot2 --mission FILE --driver docs.rover:Rover", "; did you mean 'robot-2'?"),
     ],
 )
-def test_a_misspelt_name_is_told_with_the_one_that_is_near(words: str, said: str, tmp_path: Path) -> None:
+def test_a_misspelt_name_is_refused_with_the_nearest_one(words: str, said: str, tmp_path: Path) -> None:
     file = tmp_path / "named.toml"
     file.write_text(PAPER_1.replace('"a"', '"robot-1"').replace('"b"', '"robot-2"'))
     ended = tandem(*[word.replace("FILE", str(file)) for word in words.split()])
@@ -494,7 +495,25 @@ def test_a_misspelt_name_is_told_with_the_one_that_is_near(words: str, said: str
     assert ended.err.count("\n") == 1
 
 
-def test_an_agent_with_a_misspelt_name_is_told_the_one_that_is_near(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("command", "text", "kind", "runs_it"),
+    [
+        (("run",), SWEEP, "sweep", "sweep"),
+        (("world", *LISTEN), SWEEP, "sweep", "sweep"),
+        (("sweep",), PAPER_1, "scenario", "run"),
+    ],
+    ids=["run", "world", "sweep"],
+)
+def test_a_file_of_the_other_kind_is_refused_with_the_command_that_runs_it(
+    command: tuple[str, ...], text: str, kind: str, runs_it: str, tmp_path: Path
+) -> None:
+    (tmp_path / "my file.toml").write_text(text)
+    ended = tandem(*command[:1], "my file.toml", *command[1:], cwd=tmp_path)
+    said = f"my file.toml is a {kind}; run it with `tandem {runs_it} 'my file.toml'`"
+    assert ended == (2, "", f"tandem {command[0]}: {said}\n")
+
+
+def test_an_agent_with_a_misspelt_name_prints_the_nearest_one(tmp_path: Path) -> None:
     file = tmp_path / "named.toml"
     file.write_text(PAPER_1.replace('"a"', '"robot-1"').replace('"b"', '"robot-2"'))
     with world(file) as (_, endpoint):

@@ -107,7 +107,7 @@ def test_claims_are_as_wide_as_the_bound(noise: str) -> None:
         assert claimed == pytest.approx(bounds(recording), rel=0.3), seed
 
 
-def test_there_is_none_for_exact_sensors_nor_for_outliers() -> None:
+def test_exact_sensors_and_outliers_have_no_bound() -> None:
     recording = survey(SIGMA, 4)
     for noise in (Noise(), Noise(0.1, 0.1, outliers=0.05)):
         assert position_bounds(with_noise(recording, noise), PAIR, 10) is None

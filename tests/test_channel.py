@@ -85,7 +85,7 @@ def heard_at_once(plan: Sequence[Fault], ticks: int = N, seed: int = 1) -> list[
 
 
 @given(meetings, seeds)
-def test_without_a_fault_every_report_is_heard_in_its_tick(contact: list[bool], seed: int) -> None:
+def test_without_a_fault_every_report_is_received_in_its_tick(contact: list[bool], seed: int) -> None:
     for plan in ([], [Fault()], [Fault(), Fault(link=A_TO_B, ticks=(0, 9))]):
         airs = flown(plan, contact, seed)
         assert [air.heard for air in airs] == [
@@ -96,7 +96,9 @@ def test_without_a_fault_every_report_is_heard_in_its_tick(contact: list[bool], 
 
 @settings(max_examples=150)
 @given(plans, meetings, seeds)
-def test_nothing_is_sent_or_heard_out_of_contact(plan: list[Fault], contact: list[bool], seed: int) -> None:
+def test_no_report_is_sent_or_received_out_of_contact(
+    plan: list[Fault], contact: list[bool], seed: int
+) -> None:
     for now, tick, _ in came(flown(plan, contact, seed)):
         assert contact[now]
         assert contact[tick]
@@ -126,11 +128,13 @@ def test_a_report_comes_within_the_delays_of_the_faults_that_were_there_when_it_
 
 @settings(max_examples=150)
 @given(plans, meetings, seeds)
-def test_the_same_plan_and_seed_give_the_same_air(plan: list[Fault], contact: list[bool], seed: int) -> None:
+def test_a_fault_plan_and_a_seed_determine_all_deliveries(
+    plan: list[Fault], contact: list[bool], seed: int
+) -> None:
     assert flown(plan, contact, seed) == flown(plan, contact, seed)
 
 
-def test_the_latest_that_a_plan_allows_is_what_agents_are_told_to_keep() -> None:
+def test_agents_store_reports_for_the_longest_delay_of_the_fault_plan() -> None:
     most = [Fault(delay=(MAX_DELAY, MAX_DELAY), reorder=1.0), *[Fault(reorder=1.0)] * (MAX_FAULTS - 1)]
     lags = {now - tick for now, tick, _ in came(flown(most, [True] * 200))}
     assert lags == {LATEST}
@@ -140,7 +144,7 @@ def test_the_latest_that_a_plan_allows_is_what_agents_are_told_to_keep() -> None
 
 
 @pytest.mark.parametrize("loss", [0.05, 0.3, 0.9])
-def test_as_many_are_lost_as_the_plan_says_each_for_itself(loss: float) -> None:
+def test_reports_are_lost_independently_with_the_given_probability(loss: float) -> None:
     heard = heard_at_once([Fault(loss=loss)])
     assert has_share(heard.count(False), N, loss)
     both = sum([not one and not other for one, other in pairwise(heard)])
@@ -148,7 +152,7 @@ def test_as_many_are_lost_as_the_plan_says_each_for_itself(loss: float) -> None:
 
 
 @pytest.mark.parametrize("contact", [[True] * 2 * N, [True, False] * 2 * N], ids=["always", "every other"])
-def test_bursts_are_as_long_and_as_many_as_gilbert_and_elliott_say(contact: list[bool]) -> None:
+def test_bursts_have_the_length_and_frequency_of_the_gilbert_elliott_model(contact: list[bool]) -> None:
     start, end = 0.02, 0.1
     airs = flown([Fault(burst_start=start, burst_end=end)], contact)
     lost = [not air.heard for air, together in zip(airs, contact, strict=True) if together]
@@ -174,7 +178,7 @@ def test_a_burst_goes_on_while_the_two_are_out_of_contact() -> None:
         assert heard.count(True) in {0, 25}
 
 
-def test_in_a_burst_as_many_are_lost_as_the_plan_says() -> None:
+def test_reports_in_a_burst_are_lost_with_the_given_probability() -> None:
     always = Fault(burst_start=1.0, burst_end=1e-9, burst_loss=0.4)
     assert has_share(heard_at_once([always]).count(False), N, 0.4)
     both = Fault(loss=0.5, burst_start=1.0, burst_end=1e-9, burst_loss=0.4)
@@ -215,7 +219,7 @@ def test_a_reordered_report_comes_a_tick_later_behind_what_is_sent_then() -> Non
     assert airs[-1].flying or N - 1 not in late
 
 
-def test_a_damaged_report_comes_and_is_not_heard() -> None:
+def test_a_damaged_report_arrives_and_is_not_used() -> None:
     airs = flown([Fault(corrupt=0.2)], [True] * N)
     assert has_share(sum([len(air.damaged) for air in airs]), N, 0.2)
     assert all(sorted(air.heard + air.damaged) == [tick] for tick, air in enumerate(airs))
@@ -342,12 +346,12 @@ def test_what_is_not_in_contact_shifts_no_draw() -> None:
         Fault(reports_per_tick=3.0),
     ],
 )
-def test_the_share_that_gets_through_is_known(fault: Fault) -> None:
+def test_the_delivery_ratio_is_that_of_the_deliveries(fault: Fault) -> None:
     heard = heard_at_once([fault], ticks=2 * N)
     assert abs(sum(heard) / len(heard) - fault.let_through) < 0.03
 
 
-def test_a_wait_is_as_long_as_the_worst_of_what_lets_anything_through() -> None:
+def test_the_delivery_time_bound_is_that_of_the_slowest_fault() -> None:
     assert delivery_time_bound([Fault()]) == UNLUCKY
     assert delivery_time_bound([Fault(loss=0.9)]) == pytest.approx(10.0 * UNLUCKY, abs=1.0)
     assert delivery_time_bound([Fault(burst_start=0.001, burst_end=0.01)]) == 100.0 * UNLUCKY

@@ -15,7 +15,7 @@ MANOEUVRE_S = 0.1
 CONFIG = briefed(load("paper-1"), "a", MANOEUVRE_S)
 
 
-def test_the_example_keeps_the_contract() -> None:
+def test_the_example_fulfils_the_driver_contract() -> None:
     ended = tandem("check-driver", "tests.virtual_time:Rover", "--rate", "8")
     assert ended.status == 0, ended.out
     lines = [line for line in ended.out.splitlines() if "truly at" not in line]
@@ -41,7 +41,7 @@ def test_the_example_keeps_the_contract() -> None:
         ("WaitsForItsWheels", "of a manoeuvre, expected at most 0.05: it must not wait"),
     ],
 )
-def test_a_broken_driver_is_told_what_it_breaks(
+def test_a_broken_driver_is_reported_with_what_it_violates(
     broken: str, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = virtual_time.Clock()

@@ -130,7 +130,7 @@ def robots(recording: Recording, folder: Path) -> dict[str, dict[str, Any]]:
     return told
 
 
-def test_summary_says_what_was_claimed_and_what_it_was_worth(tmp_path: Path) -> None:
+def test_summary_has_the_claims_and_their_errors(tmp_path: Path) -> None:
     told = robots(claimed(NOISY, SURE), tmp_path)["a"]
     assert told["covariance"] == [
         [0.0009, 0.0002, -0.0001],
@@ -163,7 +163,7 @@ def test_what_does_not_apply_is_null(tmp_path: Path) -> None:
         assert told["b"][field] is None, field
 
 
-def test_the_papers_missions_leave_one_hypothesis_and_no_probability(tmp_path: Path) -> None:
+def test_a_mission_of_the_paper_ends_with_one_hypothesis_and_no_probability(tmp_path: Path) -> None:
     assert tandem("run", "paper-1", "--in-process", "-q", "--out", tmp_path / "out").status == 0
     told = json.loads((tmp_path / "out" / "summary.json").read_text())["robots"]
     for robot in ("a", "b"):
@@ -296,7 +296,7 @@ def missing_at(recording: Recording, robot: str, ticks: Container[int]) -> Recor
     return replace(recording, ticks=tuple(moments), final_reports=final_reports)
 
 
-def test_the_end_says_how_many_deadlines_each_robot_missed_and_suggests_a_lower_rate(
+def test_the_last_lines_have_the_missed_deadlines_of_each_robot_and_suggest_a_lower_rate(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     recording = missing_at(missing_at(PLAYED, "a", range(3, 10)), "b", [5])
@@ -317,7 +317,7 @@ def test_the_end_says_how_many_deadlines_each_robot_missed_and_suggests_a_lower_
         ((), "it did not answer the MissionEnd"),
     ],
 )
-def test_the_summary_says_why_a_robot_has_no_farewell(ticks: Container[int], why: str) -> None:
+def test_the_summary_has_the_reason_for_a_missing_final_report(ticks: Container[int], why: str) -> None:
     recording = missing_at(PLAYED, "a", ticks)
     told = summary(recording, "processes", 0.5)["robots"]
     assert told["a"]["no_farewell"] == why.replace("LAST", str(recording.ticks[-1].truth.tick))

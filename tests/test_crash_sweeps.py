@@ -74,7 +74,7 @@ def left(tmp_path: Path) -> list[int]:
 # --- trials -------------------------------------------------------------------------------------------
 
 
-def test_whoever_is_killed_the_record_is_that_of_the_same_without_kills(tmp_path: Path) -> None:
+def test_a_run_with_kills_has_the_recording_of_the_run_without_kills(tmp_path: Path) -> None:
     (tmp_path / "small.toml").write_text(SMALL)
     ended = tandem("sweep", "small.toml", "--out", "out", cwd=tmp_path)
     assert ended.status == 0, ended
@@ -87,7 +87,7 @@ def test_whoever_is_killed_the_record_is_that_of_the_same_without_kills(tmp_path
 
 
 @pytest.mark.parametrize("name", [WORLD_JOURNAL, agent_journal("a"), agent_journal("b"), "ticks.csv"])
-def test_a_trial_that_leaves_another_record_has_failed_and_says_where(
+def test_a_trial_with_a_different_recording_fails_and_names_the_difference(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real = in_process.played
@@ -135,7 +135,7 @@ def test_however_a_trial_ends_its_processes_end_with_it(how: str, tmp_path: Path
 # --- scenarios with kills -----------------------------------------------------------------------------
 
 
-def test_what_a_scenario_leaves_open_follows_from_the_seed() -> None:
+def test_open_fields_of_a_kill_follow_from_the_seed() -> None:
     setting = validate(table_in(PAPER_1 + DRAWN, "mine"), "mine")
     assert setting.kills(7) == setting.kills(7)
     found = [setting.kills(seed) for seed in range(200)]
@@ -147,7 +147,7 @@ def test_what_a_scenario_leaves_open_follows_from_the_seed() -> None:
     }
 
 
-def test_kills_are_no_part_of_what_the_world_is_told() -> None:
+def test_kills_are_not_part_of_the_worlds_scenario() -> None:
     assert parse(PAPER_1 + DRAWN, "mine") == parse(PAPER_1, "mine")
 
 
@@ -185,7 +185,7 @@ def test_a_kill_that_cannot_be_is_named_with_its_place(table: str, says: str) ->
     assert "\n" not in str(bad.value)
 
 
-def test_who_starts_nobody_again_refuses_a_scenario_with_kills(tmp_path: Path) -> None:
+def test_a_command_that_restarts_no_process_refuses_a_scenario_with_kills(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text(PAPER_1 + "[[kill]]\n")
     says = "mine.toml: kill: --in-process has no processes to kill"
     refused(tandem("run", "mine.toml", "--in-process", cwd=tmp_path), says)

@@ -66,7 +66,7 @@ def test_the_compose_file_is_valid_by_the_compose_specification(tmp_path: Path) 
     assert not valid(broken)
 
 
-def test_every_service_has_a_command_that_there_is_and_a_record_of_its_own() -> None:
+def test_every_service_has_an_existing_command_and_its_own_recording() -> None:
     recordings = []
     for name, service in ours().items():
         options = parse(service["command"])
@@ -78,7 +78,7 @@ def test_every_service_has_a_command_that_there_is_and_a_record_of_its_own() -> 
     assert recordings == ["world", "agent-a", "agent-b"]
 
 
-def test_who_connects_does_so_to_a_service_that_listens_on_that_port_in_the_same_network() -> None:
+def test_every_service_connects_to_one_that_listens_in_the_same_network() -> None:
     listening = {"zenoh": "7447"}
     for name, service in ours().items():
         for endpoint in getattr(parse(service["command"]), "listen", ()):
@@ -138,9 +138,7 @@ def test_what_the_wheel_is_made_of_goes_into_the_image() -> None:
 
 
 @pytest.mark.parametrize("killed", ["agent-a", "world"])
-def test_the_services_commands_play_a_mission_though_one_is_killed_and_started_again(
-    killed: str, tmp_path: Path
-) -> None:
+def test_the_commands_of_the_services_complete_a_mission_despite_a_kill(killed: str, tmp_path: Path) -> None:
     world, router = free_endpoint(), free_endpoint()
     places = {"tcp/world:7447": world, "tcp/0.0.0.0:7447": world, "tcp/zenoh:7447": router}
     commands = {}
@@ -191,7 +189,7 @@ def test_the_unit_hands_over_every_file_of_the_robots_keys(tmp_path: Path) -> No
     }
 
 
-def test_the_units_command_plays_a_robot_with_its_keys(tmp_path: Path) -> None:
+def test_the_command_of_the_unit_runs_a_robot_with_its_keys(tmp_path: Path) -> None:
     keys, endpoint = tmp_path / "keys", free_endpoint("tls")
     assert tandem("keys", keys, "--robots", "a,b").status == 0
     (start,) = unit()["ExecStart"]

@@ -57,7 +57,7 @@ def only_fix(ended: Ended, *words: str) -> None:
 # --- this machine ---------------------------------------------------------------------------------------
 
 
-def test_versions_are_told(tmp_path: Path) -> None:
+def test_versions_are_printed(tmp_path: Path) -> None:
     ended = tandem("doctor")
     (said,) = findings(ended, "ok")
     for name in ("python 3.", "eclipse-zenoh 1.", "numpy ", "scipy ", "msgpack ", "msgspec "):
@@ -98,7 +98,7 @@ def test_a_library_fits_within_its_bounds(version: str | None, fits: bool) -> No
     assert Library("eclipse-zenoh", version, "<2,>=1.10").fits is fits
 
 
-def test_a_port_that_is_free_is_told_and_one_that_is_taken_is_to_be_freed() -> None:
+def test_a_free_port_is_reported_and_a_port_in_use_is_a_problem() -> None:
     free, taken = free_endpoint(), free_endpoint()
     with session.open_router(listening(taken)):
         ended = tandem("doctor", *listen(free, taken))
@@ -188,7 +188,7 @@ def spoil(own: Path, _keys: Path) -> None:
         (spoil, ("certificate: ", "cert.pem: with key.pem and ca.pem it cannot be read")),
     ],
 )
-def test_a_key_that_is_not_well_is_told(
+def test_an_invalid_key_is_a_problem(
     damage: Callable[[Path, Path], None], words: tuple[str, ...], keys: Path, mine: Path
 ) -> None:
     assert findings(tandem("doctor", "--keys", mine), "fix") == []
@@ -196,13 +196,13 @@ def test_a_key_that_is_not_well_is_told(
     only_fix(tandem("doctor", "--keys", mine), *words)
 
 
-def test_the_folder_of_another_robot_is_told(keys: Path, tmp_path: Path) -> None:
+def test_the_folder_of_another_robot_is_a_problem(keys: Path, tmp_path: Path) -> None:
     wrong = shutil.copytree(keys / "agent-b", tmp_path / "agent-a")
     words = f"names: the folder {wrong} contains the keys of agent-b; copy the folder of agent-a"
     only_fix(tandem("doctor", "--keys", wrong), words)
 
 
-def test_a_certificate_that_does_not_name_where_its_owner_listens_is_told(keys: Path) -> None:
+def test_a_certificate_without_the_listen_address_is_a_problem(keys: Path) -> None:
     where = free_endpoint("tls")
     assert findings(tandem("doctor", "--keys", keys / "world", "--listen", where), "fix") == []
     where = where.replace("127.0.0.1", "127.0.0.2")
@@ -219,7 +219,7 @@ def test_a_certificate_is_not_valid_before_its_time(mine: Path) -> None:
 # --- the network ----------------------------------------------------------------------------------------
 
 
-def test_an_endpoint_where_nobody_is_is_told_with_what_to_check() -> None:
+def test_an_endpoint_without_a_listener_is_reported_with_a_remedy() -> None:
     nowhere = free_endpoint()
     with world("paper-1", "--run", "mine") as (_, endpoint):
         ended = tandem("doctor", *connect(nowhere, endpoint))
@@ -231,7 +231,7 @@ def test_an_endpoint_where_nobody_is_is_told_with_what_to_check() -> None:
     assert said[-1] == "alive: mine: its world, all with this protocol version; not alive: a, b"
 
 
-def test_who_is_refused_by_the_router_is_told_why_here_and_there(keys: Path, mine: Path) -> None:
+def test_a_refusal_by_the_router_is_explained(keys: Path, mine: Path) -> None:
     expire(mine, keys)
     with world_of(keys) as endpoint:
         own, link = findings(tandem("doctor", "--keys", mine, "--connect", endpoint), "fix")
@@ -240,7 +240,7 @@ def test_who_is_refused_by_the_router_is_told_why_here_and_there(keys: Path, min
 
 
 @pytest.mark.parametrize("command", ["doctor", "ps"])
-def test_who_listens_and_never_says_a_word_is_waited_for_within_bounds_and_until_the_user_says_stop(
+def test_the_wait_for_a_listener_that_sends_nothing_is_bounded_and_can_be_interrupted(
     command: str,
 ) -> None:
     with socket.create_server(("127.0.0.1", 0)) as mute:
@@ -254,7 +254,7 @@ def test_who_listens_and_never_says_a_word_is_waited_for_within_bounds_and_until
     assert f"no router at {endpoint}: {MUTE}" in ended.out + ended.err
 
 
-def test_a_network_without_missions_is_said_to_be_one() -> None:
+def test_a_network_without_missions_is_reported() -> None:
     endpoint = free_endpoint()
     with session.open_router(listening(endpoint)):
         ended = tandem("doctor", *connect(endpoint))
@@ -280,7 +280,7 @@ def of_another_version(keys: Path) -> Iterator[str]:
 
 
 @pytest.mark.parametrize("who", ["agent-a", "viewer"])
-def test_a_world_of_another_protocol_version_is_told(who: str, keys: Path) -> None:
+def test_a_world_of_another_protocol_version_is_reported(who: str, keys: Path) -> None:
     with of_another_version(keys) as endpoint:
         flags = ("--connect", endpoint, "--keys", keys / who, "--timeout", "0.2")
         only_fix(
@@ -289,7 +289,7 @@ def test_a_world_of_another_protocol_version_is_told(who: str, keys: Path) -> No
         )
 
 
-def test_a_robot_that_the_world_does_not_know_is_told(keys: Path, tmp_path: Path) -> None:
+def test_a_robot_that_the_world_does_not_know_is_reported(keys: Path, tmp_path: Path) -> None:
     everybody = shutil.copytree(keys, tmp_path / "keys")
     assert tandem("keys", everybody, "--robots", "c").status == 0
     endpoint = free_endpoint("tls")
@@ -311,7 +311,9 @@ def test_a_robot_that_the_world_does_not_know_is_told(keys: Path, tmp_path: Path
         (APART_S + 0.5, 1.0, "ok", "decisions do not depend on it"),
     ],
 )
-def test_clocks_are_compared_as_far_as_can_be_told(ahead: float, took: float, mark: str, words: str) -> None:
+def test_clock_offsets_are_measured_within_their_uncertainty(
+    ahead: float, took: float, mark: str, words: str
+) -> None:
     found = compared(ahead, took)
     assert found.mark == mark
     assert words in found.text
@@ -404,7 +406,7 @@ def test_rules_are_tried_while_a_mission_runs(
 
 
 @pytest.mark.parametrize(("change", "passes"), [(enforce, False), (enforce_nothing, True)])
-def test_a_page_that_could_speak_is_told(
+def test_a_page_with_the_right_to_publish_is_a_problem(
     change: Callable[[dict[str, Any]], None], passes: bool, keys: Path, tmp_path: Path
 ) -> None:
     with router_by(keys, change, tmp_path) as endpoint:
@@ -416,7 +418,7 @@ def test_a_page_that_could_speak_is_told(
         assert any("robot/a/command" in one and "cannot publish" in one for one in findings(ended, "ok"))
 
 
-def test_rules_that_do_not_name_the_robot_are_told(keys: Path, tmp_path: Path) -> None:
+def test_access_rules_without_the_robot_are_a_problem(keys: Path, tmp_path: Path) -> None:
     everybody = shutil.copytree(keys, tmp_path / "keys")
     assert tandem("keys", everybody, "--robots", "c").status == 0
     with router_by(keys, enforce, tmp_path) as endpoint:
@@ -424,9 +426,7 @@ def test_rules_that_do_not_name_the_robot_are_told(keys: Path, tmp_path: Path) -
     only_fix(ended, "rules: agent-c cannot publish Reports of c; the router must enforce the rules")
 
 
-def test_what_cannot_be_tried_without_a_mission_that_moves_is_not_said_to_be_well(
-    keys: Path, tmp_path: Path
-) -> None:
+def test_a_check_that_needs_a_running_mission_is_not_reported_as_passed(keys: Path, tmp_path: Path) -> None:
     with router_by(keys, enforce, tmp_path) as endpoint, ExitStack() as stack:
         flags = ("--connect", endpoint, "--keys", keys / "agent-a", "--timeout", "0.2")
         assert not any(
@@ -445,9 +445,7 @@ def test_what_cannot_be_tried_without_a_mission_that_moves_is_not_said_to_be_wel
 
 
 @pytest.mark.long
-def test_a_mission_beside_which_all_is_tried_leaves_the_record_of_one_alone(
-    keys: Path, tmp_path: Path
-) -> None:
+def test_the_doctor_does_not_change_the_recording_of_a_mission(keys: Path, tmp_path: Path) -> None:
     """No rule restricts the doctor here.
 
     It runs before b joins, while all robots move, and several times at once.

@@ -122,7 +122,7 @@ def played(stage: Stage) -> Play:
     return play
 
 
-def test_a_drive_in_time_is_driven_and_a_tick_is_a_manoeuvre_and_a_moment_to_think(played: Play) -> None:
+def test_a_command_in_time_is_executed_and_a_tick_lasts_a_manoeuvre_and_a_decision(played: Play) -> None:
     driver = Recorded()
     field, end, told = played(driver, lambda tick: [encode(command(tick))])
     assert (end.tick, end.outcome, field.missed) == (5, "undecided", 0)
@@ -148,7 +148,7 @@ NONSENSE: dict[str, Answer] = {
 
 
 @pytest.mark.parametrize("kind", NONSENSE)
-def test_a_robot_whose_agent_speaks_nonsense_stands_still(kind: str, played: Play) -> None:
+def test_a_robot_whose_agent_sends_invalid_frames_stands_still(kind: str, played: Play) -> None:
     driver = Recorded()
     field, end, _ = played(driver, NONSENSE[kind])
     assert driver.commands == []
@@ -156,13 +156,13 @@ def test_a_robot_whose_agent_speaks_nonsense_stands_still(kind: str, played: Pla
     assert end.outcome == "undecided"
 
 
-def test_nobody_drives_faster_than_the_mission_says(played: Play) -> None:
+def test_no_robot_drives_faster_than_the_mission_allows(played: Play) -> None:
     driver = Recorded()
     played(driver, lambda tick: [encode(Command(tick, "a", -7.0, 1e6, 1, "straight"))], ticks=1)
     assert driver.commands == [(-1.0, 3.141592653589793)] * 2
 
 
-def test_a_drive_that_comes_late_is_not_driven(played: Play) -> None:
+def test_a_late_command_is_not_executed(played: Play) -> None:
     driver = Recorded()
     late = THINKING * MANOEUVRE_S
     field, end, _ = played(driver, lambda tick: [encode(command(tick))], after=1.01 * late)
@@ -183,7 +183,7 @@ def test_a_drive_that_comes_late_is_not_driven(played: Play) -> None:
         (Recorded(reading="2.0"), "a's driver: sense(0): returns str, expected a Reading"),  # type: ignore[arg-type]
     ],
 )
-def test_a_driver_that_cannot_go_on_ends_the_mission_and_stands(
+def test_a_driver_that_fails_ends_the_mission_and_stops_the_robot(
     driver: Recorded, said: str, played: Play
 ) -> None:
     _, end, told = played(driver, lambda tick: [encode(command(tick))])
@@ -194,16 +194,14 @@ def test_a_driver_that_cannot_go_on_ends_the_mission_and_stands(
     assert told == [end]
 
 
-def test_an_agent_that_never_answers_ends_the_mission_after_the_patience(played: Play) -> None:
+def test_an_agent_that_never_answers_ends_the_mission_after_the_timeout(played: Play) -> None:
     _, end, _ = played(Recorded(), lambda _: [], ticks=1000, timeout=1.0)
     assert end.outcome == "failed"
     assert end.reason is not None
     assert end.reason.startswith("no answer from a's agent for 1.")
 
 
-def test_an_agent_that_only_appears_over_and_over_ends_the_mission_after_the_patience(
-    stage: Stage, played: Play
-) -> None:
+def test_an_agent_that_only_reconnects_ends_the_mission_after_the_timeout(stage: Stage, played: Play) -> None:
     """An agent that dies at once is restarted each time, and has sent no answer."""
     for second in range(1000):
         stage.comes("alive", keys.robot_alive("r", "a"), after=float(second))
@@ -253,7 +251,7 @@ LOCALISED = Localised(ORIGIN)
         (None, report(12, 11, LOCALISED), 25, "undecided", "max_ticks: a not localised by then"),
     ],
 )
-def test_it_is_over_when_each_knows_that_the_other_knows(
+def test_the_mission_ends_when_each_robot_knows_that_the_other_knows(
     own: Verdict | None, said: Report | None, tick: int, outcome: str, reason: str | None
 ) -> None:
     end = ended(own, said)
@@ -261,7 +259,7 @@ def test_it_is_over_when_each_knows_that_the_other_knows(
     assert (end.tick, end.outcome, end.reason) == (tick, outcome, reason)
 
 
-def test_it_is_over_when_the_peer_is_silent_for_too_long() -> None:
+def test_the_mission_ends_when_the_peer_sends_nothing_for_too_long() -> None:
     end = ended(LOCALISED, None, timeout=-1.0)
     assert end is not None
     assert (end.tick, end.outcome) == (10, "undecided")
@@ -373,7 +371,9 @@ def test_a_b_that_was_killed_before_tick_0_begins_though_a_waits_for_it(stage: S
     assert end.tick == 9
 
 
-def test_a_robot_says_why_there_is_no_farewell(stage: Stage, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_robot_prints_the_reason_for_a_missing_final_report(
+    stage: Stage, capsys: pytest.CaptureFixture[str]
+) -> None:
     stage.alive("a", "b")
     field = Field(Recorded(), CONFIG, "r", stage, max_ticks=2, manoeuvre_s=MANOEUVRE_S)
     field.attach(LINK)
@@ -399,7 +399,7 @@ def test_a_robot_that_was_killed_waits_for_its_agent_however_long_its_peer_is_th
     assert began == pytest.approx(3.0)
 
 
-def test_a_robot_whose_driver_takes_a_whole_tick_to_sense_hears_its_agent(stage: Stage) -> None:
+def test_a_robot_with_a_slow_driver_receives_the_commands_of_its_agent(stage: Stage) -> None:
     class Slow(Recorded):
         def sense(self, tick: int) -> Reading:
             stage.now += 2.0 * MANOEUVRE_S

@@ -96,7 +96,7 @@ def long(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("number", series([SIGINT, SIGTERM]), ids=["SIGINT", "SIGTERM"])
 @pytest.mark.parametrize("moment", series(MOMENTS, 9))
-def test_a_run_that_is_told_to_stop_says_so_and_leaves_no_process(
+def test_an_interrupted_run_reports_it_and_leaves_no_process(
     moment: str, number: signal.Signals, endless: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
@@ -110,7 +110,7 @@ def test_a_run_that_is_told_to_stop_says_so_and_leaves_no_process(
 
 @pytest.mark.parametrize("number", series([SIGINT, SIGTERM]), ids=["SIGINT", "SIGTERM"])
 @pytest.mark.parametrize("moment", LAST_MOMENTS)
-def test_a_run_that_is_told_to_stop_as_it_ends_says_either(
+def test_a_run_interrupted_as_it_ends_reports_the_outcome_or_the_interruption(
     moment: str, number: signal.Signals, long: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
@@ -127,7 +127,7 @@ def test_a_run_that_is_told_to_stop_as_it_ends_says_either(
 
 
 @pytest.mark.parametrize("delay", series([round(0.15 * draw(), 3) for _ in range(6)], 3))
-def test_a_run_that_is_told_to_stop_while_it_starts_leaves_no_process(
+def test_a_run_interrupted_while_it_starts_leaves_no_process(
     delay: float, endless: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
@@ -152,7 +152,7 @@ def test_a_second_ctrl_c_changes_nothing(endless: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", series([SIGINT, SIGTERM]), ids=["SIGINT", "SIGTERM"])
-def test_a_world_and_an_agent_that_are_told_to_stop_say_so(number: signal.Signals) -> None:
+def test_an_interrupted_world_and_agent_report_it(number: signal.Signals) -> None:
     with world("paper-1") as (clock, endpoint):
         with TandemProcess("agent", "a", "--connect", endpoint) as agent:
             agent.until_prints("a: in run")
@@ -162,7 +162,7 @@ def test_a_world_and_an_agent_that_are_told_to_stop_say_so(number: signal.Signal
         assert clock.ended(AT_ONCE_S)[::2] == (130, f"tandem world: stopped by {number.name}\n")
 
 
-def test_an_agent_that_looks_for_a_world_can_be_told_to_stop() -> None:
+def test_an_agent_that_searches_for_a_world_can_be_interrupted() -> None:
     with TandemProcess("agent", "a", "--connect", free_endpoint()) as agent:
         agent.until(lambda: agent.catches(SIGTERM), "it is ready")
         agent.tell(SIGINT)
@@ -189,7 +189,7 @@ def test_a_process_that_dies_ends_the_run_at_once_and_is_named(
     assert summary["ticks"] > 0
 
 
-def test_a_robot_that_falls_silent_fails_the_run_within_the_patience(endless: Path, tmp_path: Path) -> None:
+def test_a_robot_that_stops_sending_fails_the_run_within_the_timeout(endless: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with TandemProcess("run", endless, "--out", out, "--timeout", TIMEOUT, "-q") as run:
         run.until_written(out / "world.journal", 10_000)
@@ -201,7 +201,7 @@ def test_a_robot_that_falls_silent_fails_the_run_within_the_patience(endless: Pa
     assert not processes_of(out)
 
 
-def test_an_agent_whose_world_dies_ends_within_its_patience(tmp_path: Path) -> None:
+def test_an_agent_whose_world_dies_ends_within_its_timeout(tmp_path: Path) -> None:
     with world("paper-1", "--run", "mine") as (clock, endpoint):
         timeout = ("--timeout", TIMEOUT, "--out", tmp_path)
         with TandemProcess("agent", "a", "--connect", endpoint, *timeout) as agent:
@@ -216,7 +216,7 @@ def test_an_agent_whose_world_dies_ends_within_its_patience(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("comes", ["nobody", "a"])
-def test_a_world_whose_robot_never_comes_fails_and_says_who_was_missing(comes: str, tmp_path: Path) -> None:
+def test_a_world_whose_robot_never_connects_fails_and_names_it(comes: str, tmp_path: Path) -> None:
     missing = {"nobody": "a (not connected), b (not connected)", "a": "b (not connected)"}[comes]
     reason = f"no answer from {missing} at tick 0 for {TIMEOUT} s"
     endpoint = free_endpoint()

@@ -19,7 +19,7 @@ from protocol.journal import environment, journal_file
 from protocol.journal.journal_file import CorruptJournal
 from protocol.journal.resume import Retrace
 from protocol.messages import Command, Environment, Estimate
-from protocol.wire import MalformedFrame, decode, encode
+from protocol.wire import VERSION, MalformedFrame, decode, encode
 from tests.commands import Ended, tandem
 
 A, WORLD = "agent-a.journal", "world.journal"
@@ -96,7 +96,7 @@ def test_a_robot_names_the_instructions_that_numpy_and_linear_algebra_really_use
 
 
 @pytest.mark.parametrize("command", ["replay", "audit"])
-def test_last_bits_under_other_versions_are_told_as_such(command: str, recording: Path) -> None:
+def test_last_bits_that_differ_under_other_versions_are_explained(command: str, recording: Path) -> None:
     elsewhere(recording / A)
     changed(recording / A, Estimate, turned(1e-13), first=20)
     ended = tandem(command, recording)
@@ -135,7 +135,39 @@ def test_older_recordings_that_name_no_versions_are_read(command: str, recording
     assert ended.status == 0, ended
 
 
-def test_a_robot_goes_on_elsewhere_where_it_decides_the_same_and_says_why_where_not(recording: Path) -> None:
+def of_protocol(version: int, folder: Path) -> None:
+    """Rewrite the version byte of all frames of the recording, as another release has it."""
+    for path in folder.glob("*.journal"):
+        frames = [bytes([version]) + frame[1:] for frame in journal_file.read(path)]
+        path.write_bytes(journal_file.packed(frames))
+
+
+@pytest.mark.parametrize("command", ["replay", "audit", "figures", "export", "watch"])
+@pytest.mark.parametrize(
+    ("version", "reader"), [(1, "Tandem 0.1"), (VERSION + 1, "the release that wrote it")]
+)
+def test_a_recording_of_another_protocol_is_refused_once_with_the_remedy(
+    command: str, version: int, reader: str, recording: Path
+) -> None:
+    of_protocol(version, recording)
+    ended = tandem(command, recording)
+    assert (ended.status, ended.out, ended.err.count("\n")) == (2, "", 1)
+    said = (
+        f": protocol version {version}, this is version {VERSION}; run its scenario again, or read it with "
+    )
+    assert ended.err.endswith(f"{said}{reader}\n")
+    assert ended.err.count("protocol version") == 1
+
+
+def test_a_recording_of_another_protocol_is_not_resumed(recording: Path) -> None:
+    of_protocol(1, recording)
+    ended = tandem("world", "paper-1", "--listen", "tcp/127.0.0.1:7447", "--out", recording)
+    versions = f"protocol version 1, this is version {VERSION}"
+    said = f"tandem world: --out: {recording / WORLD}: {versions}; choose another folder\n"
+    assert ended == (2, "", said)
+
+
+def test_a_robot_resumes_on_another_machine_unless_its_decisions_differ(recording: Path) -> None:
     path = recording / A
     elsewhere(path)
     before = path.read_bytes()

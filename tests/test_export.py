@@ -222,7 +222,7 @@ def test_viewers_see_anchors_with_their_ranges_and_contact_while_there_is_any(pa
     assert linked[46:] == [True] * 3
 
 
-def test_viewers_see_what_a_robot_holds_possible_in_the_frame_that_it_knows(paper_1: Path) -> None:
+def test_viewers_see_the_hypotheses_of_a_robot_in_its_own_frame(paper_1: Path) -> None:
     held = estimates(paper_1, "a")
     shown = seen(paper_1 / "run.mcap", "/a/hypotheses")
     for one, poses in zip(held, shown, strict=True):
@@ -266,7 +266,7 @@ def test_viewers_read_what_happens(paper_1: Path) -> None:
     assert lines[-1] == "The mission ends: localised"
 
 
-def test_the_same_record_gives_the_same_bytes(paper_1: Path, tmp_path: Path) -> None:
+def test_a_recording_always_gives_the_same_bytes(paper_1: Path, tmp_path: Path) -> None:
     first = {name: (paper_1 / name).read_bytes() for name in FILES}
     ended = tandem("export", paper_1, "--out", tmp_path / "elsewhere")
     assert (ended.status, ended.err) == (0, "")
@@ -362,7 +362,7 @@ def test_a_robot_that_has_left_no_journal_is_named(paper_1: Path, tmp_path: Path
     assert len(seen(tmp_path / "run.mcap", "/b/pose")) == 49
 
 
-def test_what_is_no_record_and_what_cannot_be_written_are_refused(paper_1: Path, tmp_path: Path) -> None:
+def test_a_missing_recording_and_an_unwritable_folder_are_refused(paper_1: Path, tmp_path: Path) -> None:
     ended = tandem("export", tmp_path)
     assert (ended.status, ended.out) == (2, "")
     assert ended.err == f"tandem export: {tmp_path} contains no recording: there is no world.journal\n"
@@ -376,7 +376,7 @@ def test_what_is_no_record_and_what_cannot_be_written_are_refused(paper_1: Path,
 
 
 @pytest.mark.parametrize("mode", [[], ["--in-process"]])
-def test_a_run_exports_its_record_at_its_end(mode: list[str], paper_1: Path, tmp_path: Path) -> None:
+def test_a_run_exports_its_recording_at_its_end(mode: list[str], paper_1: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     ended = subprocess.run(
         [sys.executable, "-P", "-m", "compose.cli", "run", "paper-1", "-q", "--out", out, *mode],
@@ -397,7 +397,7 @@ def test_a_run_exports_its_record_at_its_end(mode: list[str], paper_1: Path, tmp
     assert tandem("run", "paper-1", "-q", "--export", *mode).status == 2
 
 
-def test_a_run_tells_its_outcome_though_it_cannot_export(
+def test_a_run_that_cannot_export_prints_its_outcome(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(export_bar, "MODULES", ("no_such_module",))
@@ -411,7 +411,7 @@ def test_a_run_tells_its_outcome_though_it_cannot_export(
         assert bool(told.err) == bool(said)
 
 
-def test_a_run_that_was_told_to_export_and_could_not_has_failed(tmp_path: Path) -> None:
+def test_a_run_that_cannot_export_has_failed(tmp_path: Path) -> None:
     (tmp_path / "out" / "run.mcap").mkdir(parents=True)  # a directory cannot be replaced by a file
     for told, status in (("--export", 3), ("--no-export", 0)):
         out = shutil.copytree(tmp_path / "out", tmp_path / told)
@@ -497,7 +497,7 @@ def log_message(channel: dict[str, Any], data: bytes) -> str:
     return str(decoder(data).message)
 
 
-def test_a_viewer_sees_a_run_while_it_is_played_and_to_its_end(tmp_path: Path) -> None:
+def test_a_viewer_sees_a_run_from_its_start_to_its_end(tmp_path: Path) -> None:
     port = int(free_endpoint().rsplit(":", 1)[1])
     out = tmp_path / "out"
     (tmp_path / "assured.toml").write_text(REAL_TIME)
@@ -518,7 +518,7 @@ def test_a_viewer_sees_a_run_while_it_is_played_and_to_its_end(tmp_path: Path) -
     assert again.differences == ()
 
 
-def test_who_comes_late_sees_what_stands_and_the_end() -> None:
+def test_a_viewer_that_connects_late_sees_the_static_scene_and_the_end() -> None:
     port = int(free_endpoint().rsplit(":", 1)[1])
     with TandemProcess("run", "paper-1", "-q", "--foxglove", str(port)) as played:
         played.until_prints("until Ctrl-C")
@@ -628,7 +628,7 @@ def test_a_page_s_origin_is_named_as_a_browser_sends_it() -> None:
         assert ended.err.startswith(f"tandem run: {complaint}")
 
 
-def test_a_port_that_is_taken_is_said_before_anything_moves(tmp_path: Path) -> None:
+def test_a_port_in_use_is_reported_before_the_mission_starts(tmp_path: Path) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

@@ -45,7 +45,7 @@ def there(scenario: Scenario) -> Fault:
     return fault
 
 
-def test_the_sweep_of_loss_loses_what_it_says() -> None:
+def test_the_sweep_of_loss_has_the_loss_of_its_labels() -> None:
     for (share, bursts), scenario in zip(product(LOSSES, (False, True)), scenarios("loss"), strict=True):
         fault = there(scenario)
         assert fault.let_through == pytest.approx(1.0 - share)
@@ -53,7 +53,7 @@ def test_the_sweep_of_loss_loses_what_it_says() -> None:
             assert (fault.loss, 1.0 / fault.burst_end) == (0.0, 20.0)
 
 
-def test_the_sweep_of_delay_delays_by_what_it_says() -> None:
+def test_the_sweep_of_delay_has_the_delays_of_its_labels() -> None:
     for (ticks, how), scenario in zip(product(TICKS, range(3)), scenarios("delay"), strict=True):
         fault = there(scenario)
         assert fault.delay == (ticks if how == 0 else 0, ticks)
@@ -62,7 +62,7 @@ def test_the_sweep_of_delay_delays_by_what_it_says() -> None:
         assert fault.bursty == pytest.approx(0.9 if how == 2 else 0.0)
 
 
-def test_the_sweep_of_partitions_cuts_when_and_which_way_it_says() -> None:
+def test_the_sweep_of_partitions_has_the_windows_and_directions_of_its_labels() -> None:
     ways = ("a->b", "b->a", "a<->b")
     for (ticks, begin, way), scenario in zip(
         product(WINDOWS, (0, 2), ways), scenarios("partition"), strict=True

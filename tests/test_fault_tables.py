@@ -43,7 +43,7 @@ RANDOM = PAPER_1.replace("start", "# start").replace('"paper"', '"assured"')
 """A scenario with random starts."""
 
 
-def test_a_file_and_the_command_line_say_the_same(tmp_path: Path) -> None:
+def test_a_file_and_the_command_line_give_the_same_faults(tmp_path: Path) -> None:
     written, said = parse(RANDOM + ROUGH, "mine.toml"), parse(RANDOM, "mine.toml", faults=ROUGH_OPTIONS)
     assert written == said
     assert written.faults == (
@@ -75,7 +75,7 @@ def test_a_file_and_the_command_line_say_the_same(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("said", ["partition", "partition=true"])
-def test_a_partition_is_said_with_or_without_true(said: str) -> None:
+def test_a_partition_may_be_written_with_or_without_true(said: str) -> None:
     assert parse(RANDOM, "mine.toml", faults=[said]).faults == (Fault(partition=True),)
     assert parse(RANDOM, "mine.toml", faults=["partition=false"]).faults == (Fault(),)
 
@@ -85,7 +85,7 @@ def test_the_command_lines_faults_come_after_those_of_the_file() -> None:
     assert [fault.loss for fault in found.faults] == [0.1, 0.2, 0.3]
 
 
-def test_a_seed_draws_other_accidents_of_the_same_plan() -> None:
+def test_another_seed_draws_other_deliveries_of_the_same_plan() -> None:
     one, other = (parse(RANDOM, "mine.toml", seed=seed, faults=["loss=0.5"]) for seed in (1, 2))
     assert one.faults == other.faults
     assert (one.seed, other.seed) == (1, 2)
@@ -191,7 +191,7 @@ INVALID_FAULTS = [
 
 
 @pytest.mark.parametrize(("said", "says"), INVALID_FAULTS)
-def test_a_fault_said_badly_is_repeated_with_what_is_wrong(said: str, says: str) -> None:
+def test_an_invalid_fault_is_quoted_with_its_error(said: str, says: str) -> None:
     with pytest.raises(BadScenario) as bad:
         parse(RANDOM, "mine.toml", faults=["loss=0.1", said])
     assert str(bad.value).startswith(f"--fault '{said}': ")

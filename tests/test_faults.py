@@ -65,7 +65,7 @@ def localises(recording: Recording) -> bool:
 
 @pytest.mark.parametrize("seed", series([1, 2, 3, 4]))
 @pytest.mark.parametrize("plan", PLANS)
-def test_a_mission_localises_whatever_befalls_its_reports(plan: str, seed: int) -> None:
+def test_a_mission_localises_under_every_fault_of_its_reports(plan: str, seed: int) -> None:
     assert localises(in_process.run_mission(load("random", seed=seed, faults=PLANS[plan])))
 
 
@@ -73,13 +73,13 @@ def test_a_mission_localises_whatever_befalls_its_reports(plan: str, seed: int) 
 @pytest.mark.parametrize(
     "plan", series(["all together", "loss", "bursts", "delays", "damage", "a partition in the middle"], 2)
 )
-def test_under_noise_too(plan: str, seed: int) -> None:
+def test_a_mission_with_noise_localises_under_faults(plan: str, seed: int) -> None:
     quiet = scenario_of(NOISE, seed)
     faults = load("random", faults=PLANS[plan]).faults
     assert localises(in_process.run_mission(replace(quiet, faults=faults, max_ticks=3000)))
 
 
-def test_what_is_lost_costs_ticks() -> None:
+def test_lost_reports_cost_ticks() -> None:
     ticks = []
     for faults in ([], PLANS["loss"], ["loss=0.98"]):
         found = [in_process.run_mission(load("random", seed=seed, faults=faults)).end for seed in range(8)]
@@ -89,7 +89,7 @@ def test_what_is_lost_costs_ticks() -> None:
 
 @pytest.mark.parametrize("way", ["a->b", "b->a", "a<->b"])
 @pytest.mark.parametrize("begin", [0, 2])
-def test_a_partition_costs_what_it_lasts_since_nobody_goes_on_unanswered(begin: int, way: str) -> None:
+def test_a_partition_costs_its_duration_because_robots_wait_for_reports(begin: int, way: str) -> None:
     cut = 30
     for seed in range(1, 9):
         whole, parted = (
@@ -112,7 +112,7 @@ def test_a_delay_costs_three_times_what_it_lasts(delay: int) -> None:
         assert late.ticks[-1].truth.tick == prompt.ticks[-1].truth.tick + 3 * delay
 
 
-def test_under_noise_a_robot_that_has_not_been_answered_stands_and_listens() -> None:
+def test_a_robot_without_acknowledgement_stands_still_under_noise() -> None:
     quiet = scenario_of(NOISE, 1)
     recording = in_process.run_mission(
         replace(quiet, faults=load("random", faults=["delay=6"]).faults, max_ticks=3000)
@@ -124,7 +124,7 @@ def test_under_noise_a_robot_that_has_not_been_answered_stands_and_listens() -> 
     assert all((command.phase, command.v, command.omega) == (3, 0.0, 0.0) for command in listening)
 
 
-def test_two_that_never_hear_each_other_claim_nothing() -> None:
+def test_two_robots_that_receive_no_reports_claim_nothing() -> None:
     scenario = load("random", faults=["partition"])
     recording = in_process.run_mission(replace(scenario, max_ticks=300))
     assert recording.end is not None
@@ -134,7 +134,7 @@ def test_two_that_never_hear_each_other_claim_nothing() -> None:
     assert all(robot["reports_lost"] == robot["reports_sent"] > 200 for robot in told.values())
 
 
-def test_one_that_is_never_heard_keeps_both_from_a_claim() -> None:
+def test_neither_robot_claims_if_the_reports_of_one_are_all_lost() -> None:
     scenario = load("random", faults=["a->b: partition"])
     recording = in_process.run_mission(replace(scenario, max_ticks=300))
     assert recording.end is not None
@@ -144,9 +144,7 @@ def test_one_that_is_never_heard_keeps_both_from_a_claim() -> None:
 
 
 @pytest.mark.parametrize("plan", ["a delay", "all together", "duplication", "damage"])
-def test_what_was_heard_refused_and_lost_adds_up_to_what_the_world_let_through(
-    plan: str, tmp_path: Path
-) -> None:
+def test_received_refused_and_lost_reports_add_up_to_those_sent(plan: str, tmp_path: Path) -> None:
     recording = in_process.run_mission(load("random", seed=3, faults=PLANS[plan]), tmp_path)
     for robot, peer in (("a", "b"), ("b", "a")):
         contacts = [
@@ -215,7 +213,7 @@ def test_the_journals_are_the_same_bytes(both: Played) -> None:
 
 
 @pytest.mark.parametrize("base", ["random", "paper-1", "noise"])
-def test_a_plan_in_which_nothing_happens_is_no_plan_to_the_byte(base: str, tmp_path: Path) -> None:
+def test_a_fault_plan_without_effect_gives_the_same_bytes_as_none(base: str, tmp_path: Path) -> None:
     scenario = scenario_of(NOISE, 1) if base == "noise" else load(base)
     nothing = load("random", faults=["loss=0", "a->b: delay=0..0, duplicate=0", "partition, ticks=7..7"])
     for folder, faults in (("without", ()), ("with", nothing.faults)):

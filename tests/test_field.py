@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import socket
 import subprocess
@@ -94,10 +95,12 @@ def both_have_ended(out: Path, robots: dict[str, TandemProcess]) -> None:
         assert not (out / name / "world.journal").exists()
         replayed = tandem("replay", out / name)
         assert replayed.status == 0, replayed.out
-        assert f"{name}, hardware mode: as recorded, to the bit" in replayed.out
+        assert f"{name}, hardware mode: as recorded, to the bit, over" in replayed.out
+        (ticks,) = re.findall(r"(?:localised|undecided) after (\d+) ticks", ended.out)
+        assert f" over {ticks} ticks " in replayed.out
 
 
-def test_two_robots_find_out_where_they_are_without_a_world(tmp_path: Path) -> None:
+def test_two_robots_localise_in_hardware_mode(tmp_path: Path) -> None:
     with pair(tmp_path) as robots:
         both_have_ended(tmp_path, robots)
     a, b = told(tmp_path, "a"), told(tmp_path, "b")
@@ -121,14 +124,14 @@ def test_two_robots_find_out_where_they_are_without_a_world(tmp_path: Path) -> N
 
 
 @pytest.mark.long
-def test_they_do_so_over_links_that_are_encrypted(tmp_path: Path) -> None:
+def test_two_robots_localise_over_encrypted_links_in_hardware_mode(tmp_path: Path) -> None:
     assert tandem("keys", tmp_path / "keys", "--robots", "a,b").status == 0
     with pair(tmp_path, "--keys", tmp_path / "keys" / "world", protocol="tls") as robots:
         both_have_ended(tmp_path, robots)
 
 
 @pytest.mark.long
-def test_a_decision_that_does_not_follow_is_found_without_a_world(tmp_path: Path) -> None:
+def test_a_wrong_decision_in_hardware_mode_is_found(tmp_path: Path) -> None:
     with pair(tmp_path) as robots:
         both_have_ended(tmp_path, robots)
     path = tmp_path / "a" / "agent-a.journal"
@@ -150,9 +153,7 @@ def test_a_decision_that_does_not_follow_is_found_without_a_world(tmp_path: Path
 
 @pytest.mark.parametrize("killed", series(["b", "a"]))
 @pytest.mark.long
-def test_a_robot_whose_agent_is_killed_stands_still_and_goes_on_from_its_record(
-    tmp_path: Path, killed: str
-) -> None:
+def test_a_robot_whose_agent_is_killed_stands_still_and_resumes(tmp_path: Path, killed: str) -> None:
     with pair(tmp_path) as robots:
         path = tmp_path / killed / f"agent-{killed}.journal"
         robots[killed].until_written(path, 2500)
@@ -170,7 +171,7 @@ def test_a_robot_whose_agent_is_killed_stands_still_and_goes_on_from_its_record(
     )
 
 
-def test_a_robot_whose_agent_is_stopped_stands_still_within_a_period_and_the_mission_goes_on(
+def test_a_robot_whose_agent_is_suspended_stands_still_within_a_period_and_resumes(
     tmp_path: Path,
 ) -> None:
     with pair(tmp_path) as robots:
@@ -188,7 +189,7 @@ def test_a_robot_whose_agent_is_stopped_stands_still_within_a_period_and_the_mis
     assert all(step.observation.executed == REST for step in steps[before + 2 : before + 6])
 
 
-def test_ctrl_c_ends_a_robot_and_leaves_nobody_behind(tmp_path: Path) -> None:
+def test_ctrl_c_ends_a_robot_and_leaves_no_process(tmp_path: Path) -> None:
     with pair(tmp_path) as robots:
         robots["a"].until_written(tmp_path / "a" / "agent-a.journal", 1500)
         for robot in robots.values():

@@ -94,7 +94,7 @@ def all_is_well(out: Path, pair: Pair) -> None:
 
 
 @pytest.mark.parametrize("killed", series(["a", "b"]))
-def test_a_robot_that_is_killed_goes_on_from_its_record(pair: Pair, killed: str, tmp_path: Path) -> None:
+def test_a_killed_robot_resumes_from_its_journal(pair: Pair, killed: str, tmp_path: Path) -> None:
     pair.robots[killed].until_written(pair.path(killed), 2500)
     pair.kill(killed)
     before = len(told(tmp_path, killed).steps)
@@ -105,9 +105,7 @@ def test_a_robot_that_is_killed_goes_on_from_its_record(pair: Pair, killed: str,
 
 
 @pytest.mark.long
-def test_both_robots_that_lose_power_at_once_go_on_from_what_is_left_of_their_records(
-    pair: Pair, tmp_path: Path
-) -> None:
+def test_two_robots_that_lose_power_at_once_resume_from_their_journals(pair: Pair, tmp_path: Path) -> None:
     """The last write of each journal is torn. The driver's Observation was never sent."""
     for name in "ab":
         pair.robots[name].until_written(pair.path(name), 3000)
@@ -170,7 +168,7 @@ def test_a_recording_that_a_power_cut_may_have_shortened_is_refused(
 
 
 @pytest.mark.long
-def test_a_robot_that_has_ended_says_so_again(pair: Pair, tmp_path: Path) -> None:
+def test_a_robot_that_has_ended_prints_its_outcome_again(pair: Pair, tmp_path: Path) -> None:
     all_is_well(tmp_path, pair)
     before = {path.name: path.read_bytes() for path in (tmp_path / "a").iterdir()}
     outcome = pair.robots["a"].out.splitlines()[-1]
@@ -189,9 +187,7 @@ def test_a_robot_that_is_killed_before_it_knows_its_mission_begins_it(pair: Pair
 
 
 @pytest.mark.long
-def test_what_a_robot_drives_as_it_goes_down_is_told_and_no_more_than_was_asked_for(
-    pair: Pair, tmp_path: Path
-) -> None:
+def test_a_motion_during_a_crash_is_reported_and_within_its_command(pair: Pair, tmp_path: Path) -> None:
     """The robot at most completes the current manoeuvre, and then rests."""
     pair.robots["a"].until_written(pair.path("a"), 2500)
     pair.kill("a")
@@ -205,7 +201,7 @@ def test_what_a_robot_drives_as_it_goes_down_is_told_and_no_more_than_was_asked_
         assert abs(step.observation.executed.omega) <= abs(before.command.omega) + 1e-12
 
 
-def test_a_record_of_another_mission_is_refused(pair: Pair, tmp_path: Path) -> None:
+def test_a_recording_of_another_mission_is_refused(pair: Pair, tmp_path: Path) -> None:
     pair.robots["a"].until_written(pair.path("a"), 1500)
     pair.kill("a", "b")
     other = tandem(

@@ -121,9 +121,7 @@ def test_a_run_draws_nothing_by_itself(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("place", [0, 1])
-def test_a_picture_says_what_the_robot_claimed_and_how_far_off_it_was(
-    place: int, noisy: Path, drawn: Path
-) -> None:
+def test_a_figure_has_the_claim_of_the_robot_and_its_error(place: int, noisy: Path, drawn: Path) -> None:
     recording = read(noisy)
     claim = first_claim(recording, place)
     assert claim is not None
@@ -139,7 +137,7 @@ def test_a_picture_says_what_the_robot_claimed_and_how_far_off_it_was(
     )
 
 
-def test_a_picture_names_its_axes_with_units_and_what_was_asked_for(drawn: Path) -> None:
+def test_a_figure_names_its_axes_with_units_and_the_required_accuracy(drawn: Path) -> None:
     words = texts(drawn / "robot-a.svg")
     assert {"x [m]", "y [m]", "position error [m]", "probability of a hypothesis"} <= words
     assert {"required sigma: 0.1 m", "required: 99.99 %", "sensing range, 3 m"} <= words
@@ -160,7 +158,7 @@ def test_each_part_of_a_noisy_mission_is_in_its_picture(noisy: Path, drawn: Path
     assert ellipses <= {one.tick for one in held}
 
 
-def test_what_is_drawn_over_time_is_what_the_robot_said_held_against_the_truth(noisy: Path) -> None:
+def test_the_error_over_time_is_that_of_the_estimates_against_the_truth(noisy: Path) -> None:
     story = Story(read(noisy), 0, estimates(noisy, "a"))
     truth = [moment.truth.poses[0] for moment in story.recording.ticks]
     said = [one for one in story.held if one.world]
@@ -200,7 +198,7 @@ def test_an_ellipse_holds_what_is_within_3_sigma(noisy: Path) -> None:
 
 
 @pytest.mark.long
-def test_the_same_record_gives_the_same_picture(noisy: Path, drawn: Path, tmp_path: Path) -> None:
+def test_a_recording_always_gives_the_same_figure(noisy: Path, drawn: Path, tmp_path: Path) -> None:
     again = copied(noisy, tmp_path)
     for _ in range(2):  # the second time, over existing files
         svg = picture(again, "b")
@@ -219,7 +217,7 @@ def test_where_panels_stand_does_not_depend_on_the_last_bits_of_their_layout(
     assert np.array_equal(corners, corners.round(PLACES))
 
 
-def test_an_exact_record_has_counts_for_odds_and_no_ellipse(tmp_path: Path) -> None:
+def test_an_exact_recording_has_counts_for_probabilities_and_no_ellipse(tmp_path: Path) -> None:
     svg = picture(recorded(load("paper-1"), tmp_path), "a")
     words, found = texts(svg), ids(svg)
     assert {"possible poses", "one pose", "tolerance: 1e-6 m"} <= words
@@ -238,7 +236,7 @@ def test_seconds_stand_below_the_ticks_where_a_tick_is_no_second(tmp_path: Path)
 @pytest.mark.parametrize(
     ("probability", "said"), [(0.5, "50 %"), (0.9999, "99.99 %"), (0.999999, "99.9999 %"), (1e-4, "0.01 %")]
 )
-def test_odds_are_said_in_as_many_digits_as_they_have(probability: float, said: str) -> None:
+def test_probabilities_are_shown_with_their_significant_digits(probability: float, said: str) -> None:
     assert belief.percent(probability) == said
 
 
@@ -261,7 +259,7 @@ def test_a_mission_that_ends_undecided_is_drawn(noise: str, planner_name: str, t
 
 @pytest.mark.parametrize("ticks", series([17, 0, 1]))
 @pytest.mark.long
-def test_a_record_that_breaks_off_is_drawn_as_far_as_it_goes(ticks: int, noisy: Path, tmp_path: Path) -> None:
+def test_a_truncated_recording_is_drawn_as_far_as_it_goes(ticks: int, noisy: Path, tmp_path: Path) -> None:
     folder = copied(noisy, tmp_path)
     cut(folder / "world.journal", 2 + 2 * ticks)
     cut(folder / "agent-b.journal", 2 + ticks)
@@ -272,7 +270,7 @@ def test_a_record_that_breaks_off_is_drawn_as_far_as_it_goes(ticks: int, noisy: 
         assert {"anchor of a", "anchor of b", "start"} <= words
 
 
-def test_an_agent_killed_before_its_briefing_has_a_picture_without_estimates(
+def test_an_agent_killed_before_its_configuration_has_a_figure_without_estimates(
     noisy: Path, tmp_path: Path
 ) -> None:
     folder = copied(noisy, tmp_path)
@@ -280,7 +278,7 @@ def test_an_agent_killed_before_its_briefing_has_a_picture_without_estimates(
     assert "nothing-near" in ids(picture(folder, "a"))
 
 
-def test_a_robot_of_which_nothing_is_on_record_is_drawn_without_a_warning(tmp_path: Path) -> None:
+def test_a_robot_with_an_empty_journal_is_drawn_without_a_warning(tmp_path: Path) -> None:
     run_mission(load("paper-1"), tmp_path)
     (tmp_path / "agent-a.journal").write_bytes(b"")
     ended = draw(tmp_path)
@@ -309,7 +307,7 @@ def refused(ended: Ended, words: str) -> None:
     assert words in ended.err
 
 
-def test_what_is_no_record_is_refused(tmp_path: Path) -> None:
+def test_a_folder_without_a_recording_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.write_text("")
     empty = tmp_path / "empty"
@@ -371,7 +369,7 @@ def test_the_journal_of_another_robot_is_not_taken_for_its_own(noisy: Path, tmp_
         estimates(folder, "z")
 
 
-def test_a_journal_of_another_run_is_no_record_of_this_one(noisy: Path, tmp_path: Path) -> None:
+def test_a_journal_of_another_run_is_not_used(noisy: Path, tmp_path: Path) -> None:
     folder, other = copied(noisy, tmp_path), tmp_path / "other"
     run_mission(load("paper-1"), other)
     shutil.copyfile(other / "agent-a.journal", folder / "agent-a.journal")

@@ -109,7 +109,7 @@ def test_a_viewer_takes_what_a_key_carries(received: ReceivedMission) -> None:
     assert received.known.end == FORGED["the end"]
 
 
-def test_a_tick_is_none_before_the_world_has_said_it(received: ReceivedMission) -> None:
+def test_the_tick_is_unknown_before_the_first_message_of_the_world(received: ReceivedMission) -> None:
     """Messages of a robot may overtake those of the world a little, but the world does not skip ticks."""
     unheard, own, observation = ReceivedMission(RUN), OF_A[0], Key(keys.observation, RUN, "a")
     unheard.take(own, encode(command(LAST, "a")))

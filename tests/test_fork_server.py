@@ -96,7 +96,7 @@ def test_each_has_its_own_session_and_group_and_is_named_in_ps(endless: Path, tm
     assert not processes_of(out)
 
 
-def test_its_status_and_what_it_says_are_its_own(tmp_path: Path) -> None:
+def test_each_forked_process_has_its_own_status_and_output(tmp_path: Path) -> None:
     server = ForkServer("compose.cli.warm_up:missions")
     try:
         ended = []
@@ -146,7 +146,7 @@ def test_it_ends_with_its_standard_input() -> None:
 # --- no process is left running -------------------------------------------------------------------------
 
 
-def test_a_run_whose_fork_server_is_killed_says_so_and_leaves_no_process(
+def test_a_run_whose_fork_server_is_killed_reports_it_and_leaves_no_process(
     endless: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
@@ -238,7 +238,7 @@ def test_no_fork_server_outlasts_a_run() -> None:
         assert all(map(gone, servers))
 
 
-def test_a_fork_server_that_cannot_start_says_why_in_one_line() -> None:
+def test_a_fork_server_that_cannot_start_prints_the_reason_in_one_line() -> None:
     server = ForkServer("nowhere:nothing")
     with open(os.devnull, "wb") as nowhere:
         process = server.start("compose.cli.main:main", "tandem", errors=nowhere.fileno())
@@ -299,7 +299,7 @@ def test_as_many_robots_as_you_like_localise_as_processes_as_they_do_in_one(
     assert journals(tmp_path / "processes") == journals(tmp_path / "one")
 
 
-def test_who_has_answered_is_not_told_again_as_often_as_who_has_not(tmp_path: Path) -> None:
+def test_a_robot_that_has_answered_gets_fewer_repetitions(tmp_path: Path) -> None:
     path = tmp_path / "pairs.toml"
     path.write_text(several_pairs(2))
     heard: Counter[str] = Counter()

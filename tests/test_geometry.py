@@ -231,7 +231,7 @@ def test_a_third_range_leaves_the_true_branch_as_it_was(rho0: float, alpha: floa
 
 
 @given(st.floats(0.5, 3.0), st.floats(0.3, 2.8), st.sampled_from([1.0, -1.0]), st.floats(0.3, 2.0))
-def test_silence_where_a_branch_would_have_been_heard_rules_it_out(
+def test_no_detection_where_a_branch_predicts_one_rules_it_out(
     rho0: float, angle: float, side: float, omega: float
 ) -> None:
     """There is no detection, and R is between the two ranges that the branches predict."""
@@ -508,7 +508,7 @@ def test_a_third_range_drops_the_placements_that_predict_another(
 
 
 @given(encounters(), st.floats(0.5, 2.0), angles)
-def test_silence_drops_the_placements_that_would_have_been_heard(
+def test_no_detection_rules_out_the_placements_that_predict_one(
     encounter: Encounter, way: float, course: float
 ) -> None:
     assume(encounter.is_tame)

@@ -41,7 +41,7 @@ def with_start(rho0: float, heading: float) -> Scenario:
 
 @pytest.mark.parametrize("direction", HEADINGS)
 @pytest.mark.parametrize("rho0", RADII)
-def test_starts_at_the_edge_of_what_can_be_told_localise(rho0: float, direction: str) -> None:
+def test_nearly_indistinguishable_starts_localise(rho0: float, direction: str) -> None:
     for offset in OFFSETS:
         assert_localised(with_start(rho0, HEADINGS[direction] + offset))
 

@@ -242,7 +242,7 @@ def test_the_same_values_give_the_same_step_and_are_left_as_they_were(name: str)
         assert frozen((world, commands)) == was
 
 
-def test_a_mind_and_a_world_cannot_be_changed() -> None:
+def test_robot_states_and_worlds_are_immutable() -> None:
     scenario = load("paper-1")
     state, world = RobotState(scenario.config("a")), release(scenario)
     for value in (

@@ -46,7 +46,7 @@ margins = st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=8)
 
 
 @given(margins, st.floats(0.05, 1.0), st.sampled_from([0.0, 0.01, 0.1, 0.5]))
-def test_silence_is_the_mean_over_what_all_predictions_have_in_common(
+def test_the_likelihood_of_no_detection_is_a_mean_over_the_common_error(
     beyond: list[float], sigma: float, drop_outs: float
 ) -> None:
     mean = by_quadrature(beyond, sigma, drop_outs)
@@ -55,13 +55,13 @@ def test_silence_is_the_mean_over_what_all_predictions_have_in_common(
     )
 
 
-def test_no_silence_says_nothing_and_what_is_far_out_of_range_is_silent_for_sure() -> None:
+def test_no_detection_far_out_of_range_has_probability_one() -> None:
     assert no_detection_log_likelihood(np.array([]), 0.1, 0.1) == 0.0
     assert no_detection_log_likelihood(np.array([5.0, 7.0]), 0.1, 0.0) == pytest.approx(0.0, abs=1e-12)
     assert no_detection_log_likelihood(np.array([5.0, 7.0]), 0.1, 0.1) == pytest.approx(0.0, abs=1e-12)
 
 
-def test_silence_in_range_is_the_chance_of_that_many_drop_outs_and_without_them_no_chance_at_all() -> None:
+def test_no_detection_in_range_has_the_probability_of_its_drop_outs() -> None:
     assert no_detection_log_likelihood(np.array([-1.0, -2.0, 3.0]), 0.1, 0.1) == pytest.approx(
         2.0 * math.log(0.1)
     )
@@ -93,7 +93,7 @@ def alone(
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_mirror_images_are_as_likely_until_a_range_tells(seed: int) -> None:
+def test_mirror_images_are_equally_likely_until_a_range_differs(seed: int) -> None:
     """On a straight path, a robot cannot distinguish the sides of its anchor."""
     anchor = (1.2, 0.9)
     straight = [(0.5, 0.0)] * 4
@@ -177,7 +177,7 @@ def sigmas(one: ScoredHypothesis, other: Array) -> float:
     [RANGES, Noise(0.1, 0.1), Noise(0.02, 0.02, odometry=VelocityNoise(0.01, 0.01))],
     ids=["fine", "coarse", "odometry"],
 )
-def test_the_truth_is_among_the_hypotheses_and_their_odds_are_a_distribution(noise: Noise) -> None:
+def test_the_truth_is_a_hypothesis_and_the_probabilities_sum_to_one(noise: Noise) -> None:
     """The fit that starts at the truth is also found without it, and is usually the first."""
     tried, first = 0, 0
     for seed in range(24):
@@ -208,7 +208,7 @@ def test_where_ranges_are_fine_the_truth_is_as_near_as_the_covariance_says() -> 
     assert float(np.mean(np.square(off))) == pytest.approx(6.0, abs=3.5), "a chi-square of 6 degrees"
 
 
-def test_a_range_that_is_too_long_to_be_one_has_no_say() -> None:
+def test_a_range_that_is_too_long_is_ignored() -> None:
     rho = REACH + 6.0 * SIGMA
     few, many = [(0, 1.0), (1, 1.5)], [(2, 2.0)]
     without = Ranges.of_lists(few, many, many, RANGES)
@@ -265,7 +265,7 @@ def seen(one: Pose, other: Pose) -> Placement:
 
 @pytest.mark.parametrize("corner", [False, True], ids=["straight", "corner"])
 @pytest.mark.parametrize("turn", [0.0, 1.0, -2.5])
-def test_in_the_limit_of_exact_ranges_what_is_found_is_what_eq_7_leaves(corner: bool, turn: float) -> None:
+def test_nearly_exact_ranges_give_the_placements_of_eq_7(corner: bool, turn: float) -> None:
     start = Pose(0.3, -0.6, 0.1 - math.pi / 2)
     c, s = math.cos(turn), math.sin(turn)
     pair, exact = met(corner, start, Pose(9.2 - c + 0.5 * s, 1.3 - s - 0.5 * c, turn))

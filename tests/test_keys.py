@@ -73,7 +73,7 @@ def test_only_its_owner_reads_a_private_key(keys: Path) -> None:
     assert {path.stat().st_mode & 0o777 for path in private} == {0o600}
 
 
-def test_who_is_there_keeps_the_keys_and_learns_of_who_comes_later(tmp_path: Path) -> None:
+def test_existing_keys_stay_and_new_robots_are_added_to_the_rules(tmp_path: Path) -> None:
     folder = tmp_path / "keys"
     assert tandem("keys", folder, "--robots", "a,b", "--days", "3").status == 0
     before = contents(folder)
@@ -120,7 +120,9 @@ def test_a_folder_that_is_removed_is_made_anew_by_the_same_authority(tmp_path: P
         ((), "--robots"),
     ],
 )
-def test_what_no_keys_can_be_made_of_is_told(arguments: tuple[str, ...], words: str, tmp_path: Path) -> None:
+def test_invalid_input_of_the_keys_command_is_one_line(
+    arguments: tuple[str, ...], words: str, tmp_path: Path
+) -> None:
     mistaken(tandem("keys", tmp_path / "keys", *arguments), words)
     assert not (tmp_path / "keys").exists()
 
@@ -171,7 +173,7 @@ def test_a_folder_that_is_damaged_is_left_as_it_is(
 # --- a mission over TLS ---------------------------------------------------------------------------------
 
 
-def test_a_secured_mission_leaves_the_record_of_an_open_one(tmp_path: Path) -> None:
+def test_a_mission_with_tls_has_the_recording_of_one_without(tmp_path: Path) -> None:
     assert tandem("run", "paper-1", "-q", "--out", tmp_path / "open").status == 0
     ended = tandem("run", "paper-1", "-q", "--secure", "--out", tmp_path / "secured")
     assert ended == (0, "localised after 48 ticks\n", "")
@@ -252,7 +254,7 @@ def take_away(own: Path, _keys: Path) -> None:
         (take_away, "it requires a certificate, and there is none; check the certificate"),
     ],
 )
-def test_who_has_no_good_certificate_is_not_let_in_and_told_why(
+def test_an_invalid_certificate_is_refused_with_the_reason(
     spoil: Callable[[Path, Path], None], words: str, keys: Path, mine: Path
 ) -> None:
     spoil(mine, keys)
@@ -261,7 +263,7 @@ def test_who_has_no_good_certificate_is_not_let_in_and_told_why(
     assert ended == (3, "", f"tandem agent a: no world at {endpoint}; gave up after 2 s: {words}\n")
 
 
-def test_a_world_of_another_authority_is_not_believed(mine: Path, tmp_path: Path) -> None:
+def test_a_world_of_another_authority_is_refused(mine: Path, tmp_path: Path) -> None:
     other = tmp_path / "others"
     assert tandem("keys", other, "--robots", "a,b").status == 0
     with world_of(other) as endpoint:
@@ -270,9 +272,7 @@ def test_a_world_of_another_authority_is_not_believed(mine: Path, tmp_path: Path
     assert "its certificate is not valid here: unable to get local issuer certificate" in ended.err
 
 
-def test_a_world_whose_certificate_has_expired_is_not_believed(
-    keys: Path, mine: Path, tmp_path: Path
-) -> None:
+def test_a_world_with_an_expired_certificate_is_refused(keys: Path, mine: Path, tmp_path: Path) -> None:
     shutil.copytree(keys / "world", tmp_path / "old" / "world")
     expire(tmp_path / "old" / "world", keys)
     with world_of(tmp_path / "old") as endpoint:
@@ -281,7 +281,7 @@ def test_a_world_whose_certificate_has_expired_is_not_believed(
     assert "its certificate is not valid here: certificate has expired" in ended.err
 
 
-def test_a_world_by_another_name_than_its_certificates_is_not_believed(keys: Path, mine: Path) -> None:
+def test_a_world_whose_name_is_not_in_its_certificate_is_refused(keys: Path, mine: Path) -> None:
     with world_of(keys) as endpoint:
         elsewhere = endpoint.replace("127.0.0.1", "127.0.0.2")
         with session.open_router(configured(keys / "world" / KEYED, listen=[elsewhere])):
@@ -290,7 +290,7 @@ def test_a_world_by_another_name_than_its_certificates_is_not_believed(keys: Pat
     assert "its certificate is not valid here: IP address mismatch" in ended.err
 
 
-def test_a_robot_that_the_rules_do_not_name_is_told_to_check_them(keys: Path, tmp_path: Path) -> None:
+def test_a_robot_without_access_rules_is_advised_to_check_them(keys: Path, tmp_path: Path) -> None:
     shutil.copytree(keys, tmp_path / "keys")
     assert tandem("keys", tmp_path / "keys", "--robots", "c").status == 0
     with world_of(keys) as endpoint:
@@ -302,7 +302,7 @@ def test_a_robot_that_the_rules_do_not_name_is_told_to_check_them(keys: Path, tm
     )
 
 
-def test_who_speaks_without_tls_is_told_to(keys: Path) -> None:
+def test_a_process_without_tls_is_advised_to_use_it(keys: Path) -> None:
     with world_of(keys) as endpoint:
         plain = endpoint.replace("tls/", "tcp/")
         ended = tandem("agent", "a", "--connect", plain, "--connect-timeout", "2")
@@ -311,7 +311,7 @@ def test_who_speaks_without_tls_is_told_to(keys: Path) -> None:
 
 
 @pytest.mark.long
-def test_who_speaks_tls_where_nobody_does_is_told_so(mine: Path) -> None:
+def test_tls_at_a_plain_endpoint_is_advised_to_be_checked(mine: Path) -> None:
     endpoint = free_endpoint()
     with session.open_router(listening(endpoint)):
         secured = endpoint.replace("tcp/", "tls/")
@@ -321,7 +321,7 @@ def test_who_speaks_tls_where_nobody_does_is_told_so(mine: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_wrong_password_is_told_to_be_checked(tmp_path: Path) -> None:
+def test_a_wrong_password_is_reported(tmp_path: Path) -> None:
     (tmp_path / "users").write_text("a:secret\n")
     accounts = {"auth": {"usrpwd": {"user": "r", "password": "r", "dictionary_file": "users"}}}
     (tmp_path / "router.json5").write_text(json.dumps({"transport": accounts}))
@@ -338,7 +338,7 @@ def test_a_wrong_password_is_told_to_be_checked(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_page_whose_certificate_is_refused_says_so(keys: Path, tmp_path: Path) -> None:
+def test_a_page_whose_certificate_is_refused_reports_it(keys: Path, tmp_path: Path) -> None:
     own = shutil.copytree(keys / "viewer", tmp_path / "viewer")
     take_away(own, keys)
     with world_of(keys) as endpoint, TandemProcess("watch", "--connect", endpoint, "--keys", own) as page:
@@ -384,7 +384,7 @@ def test_a_command_refuses_a_wrong_configuration(part: tuple[str, ...], tmp_path
     mistaken(ended, f"--config: {file}: mode: 'peer', but a process that only connects is a client here")
 
 
-def test_a_configuration_may_say_where_to_connect(tmp_path: Path) -> None:
+def test_a_configuration_may_name_the_endpoint(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     (tmp_path / "world.json5").write_text(
         f"{{mode: 'router', listen: {{endpoints: ['{endpoint}']}}}} // mine"
@@ -430,14 +430,16 @@ def test_a_configuration_may_say_where_to_connect(tmp_path: Path) -> None:
         (("watch", ".", "--keys", "{keys}/viewer"), "--keys: a recording needs no network"),
     ],
 )
-def test_flags_that_do_not_go_together_are_told(arguments: tuple[str, ...], words: str, keys: Path) -> None:
+def test_flags_that_exclude_each_other_are_refused(
+    arguments: tuple[str, ...], words: str, keys: Path
+) -> None:
     mistaken(tandem(*(one.format(keys=keys) for one in arguments)), words)
 
 
 # --- warnings -------------------------------------------------------------------------------------------
 
 
-def test_who_listens_beyond_this_machine_without_keys_is_warned(keys: Path) -> None:
+def test_listening_beyond_this_machine_without_keys_is_warned_about(keys: Path) -> None:
     where = free_endpoint().replace("127.0.0.1", "0.0.0.0")
     warning = f"listening without --keys at {where}: every machine that reaches it"
     with TandemProcess("world", "paper-1", "--listen", where) as world:
@@ -471,7 +473,7 @@ def test_loopback_is_what_no_other_machine_reaches(endpoint: str, exposed: bool)
     assert (endpoint in Endpoints(listen=(endpoint,)).exposed) is exposed
 
 
-def test_a_folder_that_cannot_be_looked_into_is_told() -> None:
+def test_an_unreadable_folder_is_reported() -> None:
     folder = "k" * 300
     ended = tandem("agent", "a", "--connect", "tls/127.0.0.1:7447", "--keys", folder)
     mistaken(ended, f"--keys: {folder}: cannot be read: File name too long")

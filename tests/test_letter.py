@@ -18,18 +18,18 @@ ITS_OWN = {
 
 
 @pytest.mark.parametrize("noise", [FINE, SIGMA], ids=["fine", "coarse"])
-def test_the_letter_drives_its_own_manoeuvres_only(noise: str) -> None:
+def test_the_paper_planner_drives_only_the_papers_manoeuvres(noise: str) -> None:
     for seed in SEEDS:
         recording = survey(noise, seed, "paper")
         assert {*states(recording, "a"), *states(recording, "b")} <= ITS_OWN
 
 
-def test_with_fine_ranges_the_letter_mostly_localises() -> None:
+def test_the_paper_planner_mostly_localises_with_fine_ranges() -> None:
     outcomes = [summary(survey(FINE, seed, "paper"), "in-process", None)["outcome"] for seed in SEEDS]
     assert outcomes.count("localised") > 0.7 * len(SEEDS)
 
 
-def test_with_coarse_ranges_the_letter_is_undecided_and_says_what_is_missing() -> None:
+def test_the_paper_planner_is_undecided_with_coarse_ranges_and_names_the_reason() -> None:
     reasons = []
     for seed in SEEDS:
         said = summary(survey(SIGMA, seed, "paper"), "in-process", None)
@@ -42,7 +42,7 @@ def test_with_coarse_ranges_the_letter_is_undecided_and_says_what_is_missing() -
 
 
 @pytest.mark.parametrize("noise", [FINE, SIGMA], ids=["fine", "coarse"])
-def test_the_letter_claims_nothing_that_is_wrong(noise: str) -> None:
+def test_the_paper_planner_makes_no_wrong_claim(noise: str) -> None:
     claims = 0
     for seed in SEEDS:
         said = summary(survey(noise, seed, "paper"), "in-process", None)
@@ -65,7 +65,7 @@ def test_the_letter_claims_nothing_that_is_wrong(noise: str) -> None:
         (0.0, 6948019990109848974),  # a fit does not converge, and its chi-square is negative
     ],
 )
-def test_where_there_are_outliers_the_letters_ranges_are_never_enough(sigma: float, seed: int) -> None:
+def test_the_ranges_of_the_paper_planner_never_suffice_with_outliers(sigma: float, seed: int) -> None:
     noise = f"anchor_sigma = {sigma}\nmutual_sigma = {sigma}\noutliers = 0.05"
     recording = run_mission(scenario_of(noise, seed, planner_name="paper", accuracy=0.03))
     said = summary(recording, "in-process", None)

@@ -51,7 +51,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> execution.Results:
     )
 
 
-def test_the_sweep_that_ships_tells_the_lies_of_its_labels() -> None:
+def test_the_shipped_sweep_has_the_attacks_of_its_labels() -> None:
     sweep = spec.load("attacks")
     seen: dict[str, Attack | None] = {}
     for cell in cells(sweep):
@@ -68,7 +68,7 @@ def test_the_sweep_that_ships_tells_the_lies_of_its_labels() -> None:
         assert attack.size == pytest.approx(math.radians(float(size)) if "deg" in label else float(size))
 
 
-def test_honest_missions_localise_and_lies_are_alarms(results: execution.Results) -> None:
+def test_honest_missions_localise_and_attacks_are_inconsistent(results: execution.Results) -> None:
     outcomes: dict[tuple[int, ...], set[str]] = {cell.place: set() for cell in results.cells}
     places = {cell.index: cell.place for cell in results.cells}
     for row in results.table.to_pylist():
@@ -77,7 +77,7 @@ def test_honest_missions_localise_and_lies_are_alarms(results: execution.Results
 
 
 @pytest.mark.long
-def test_the_pictures_show_what_became_of_each_lie(results: execution.Results, tmp_path: Path) -> None:
+def test_the_figures_show_the_outcomes_of_each_attack(results: execution.Results, tmp_path: Path) -> None:
     axis_figures.draw(results, tmp_path)
     assert {f"{name}.{kind}" for name in ("attacks", "roc") for kind in ("svg", "pdf", "png")} <= {
         path.name for path in tmp_path.iterdir()
@@ -95,7 +95,7 @@ def test_the_pictures_show_what_became_of_each_lie(results: execution.Results, t
     assert all(np.all(line.get_ydata() == 1.0) for line in panel.lines), "every lie before any honest one"
 
 
-def test_a_sweep_without_lies_has_no_such_pictures(tmp_path: Path) -> None:
+def test_a_sweep_without_attacks_has_no_figures_of_attacks(tmp_path: Path) -> None:
     (tmp_path / "few.toml").write_text('name = "few"\nscenario = "random"\ntrials = 2\nseed = 1\n')
     progress = execution.Progress(say=lambda _: None, begin=lambda *_: None, done=lambda _: None)
     sweep = spec.load(str(tmp_path / "few.toml"))

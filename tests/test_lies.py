@@ -53,7 +53,7 @@ def outcome(recording: Recording) -> str:
 @pytest.mark.parametrize(
     "attack", [*OF_DRIVES, *OF_STARTS], ids=lambda attack: f"{attack.kind}-{attack.part}-{attack.size:.2g}"
 )
-def test_every_lie_about_a_drive_or_a_start_is_an_alarm(attack: Attack, attacker: str) -> None:
+def test_every_false_manoeuvre_or_start_is_inconsistent(attack: Attack, attacker: str) -> None:
     for seed in range(6):
         recording = mission(seed, {attacker: attack})
         if not _is_falsified(recording, attacker, attack):
@@ -75,14 +75,14 @@ def _is_falsified(recording: Recording, attacker: str, attack: Attack) -> bool:
     )
 
 
-def test_turning_its_whole_story_about_its_anchor_tells_nothing_false() -> None:
+def test_a_rotation_of_the_whole_path_about_the_anchor_is_harmless() -> None:
     """An anchor frame has no direction of its own, so this cannot be detected, and misleads no robot."""
     for seed in range(6):
         for attacker in ("a", "b"):
             assert outcome(mission(seed, {attacker: Attack("reframe", 1.0)})) == "localised"
 
 
-def test_two_liars_are_no_more_believed_than_one() -> None:
+def test_two_attackers_are_detected_like_one() -> None:
     for seed in range(6):
         assert (
             outcome(mission(seed, {"a": Attack("heading", 0.1), "b": Attack("radius", 0.2)}))
@@ -90,7 +90,7 @@ def test_two_liars_are_no_more_believed_than_one() -> None:
         )
 
 
-def test_the_liar_hears_that_it_is_not_believed_and_gives_up() -> None:
+def test_an_attacker_gives_up_when_its_peer_is_inconsistent() -> None:
     recording = mission(0, {"a": Attack("scale", 0.5)})
     last = recording.ticks[-1].commands
     assert isinstance(last["b"].verdict, Inconsistent)
@@ -112,7 +112,7 @@ def test_the_liar_hears_that_it_is_not_believed_and_gives_up() -> None:
     ],
     ids=lambda attack: f"{attack.kind}-{attack.part}",
 )
-def test_under_noise_a_lie_that_is_large_beside_it_is_an_alarm(attack: Attack) -> None:
+def test_an_attack_larger_than_the_noise_is_inconsistent(attack: Attack) -> None:
     """Robot a is the attacker: no anchor range depends on its path from the anchor to the encounter."""
     for seed in range(3):
         recording = mission(seed, {"a": attack}, FINE)
@@ -129,11 +129,11 @@ def test_under_noise_a_lie_that_is_large_beside_it_is_an_alarm(attack: Attack) -
 
 
 @pytest.mark.parametrize("seed", [30, 49, 109])
-def test_who_plans_by_a_lie_and_loses_its_peer_finds_other_places_to_range_from(seed: int) -> None:
+def test_a_robot_misled_by_false_data_finds_other_places_to_range_from(seed: int) -> None:
     assert outcome(mission(seed, {"a": Attack("scale", 0.5, "phase-1")}, FINE)) == "inconsistent"
 
 
-def test_under_noise_the_honest_are_believed() -> None:
+def test_honest_robots_are_consistent_under_noise() -> None:
     for seed in range(8):
         assert outcome(mission(seed, {}, FINE)) == "localised", seed
 
@@ -157,13 +157,13 @@ def objection(step: Step, *reports: Report) -> Inconsistent | None:
     )
 
 
-def test_what_an_honest_peer_tells_is_believed_and_so_is_what_it_tells_again() -> None:
+def test_reports_of_an_honest_peer_are_accepted_when_repeated_too() -> None:
     step, report = told_to_a(2)
     assert objection(step, report) is None
     assert objection(step, report, report) is None
 
 
-def test_a_second_story_is_held_against_the_first() -> None:
+def test_a_report_that_contradicts_an_earlier_one_is_inconsistent() -> None:
     step, report = told_to_a(2)
     last = report.runs[-1]
     slower = replace(report, runs=(*report.runs[:-1], Segment(last.ticks, 0.5 * last.v, last.omega)))
@@ -175,7 +175,7 @@ def test_a_second_story_is_held_against_the_first() -> None:
     assert "a start" in _claim(objection(step, report, elsewhere))
 
 
-def test_a_drive_beyond_v_max_or_omega_max_is_not_believed() -> None:
+def test_a_reported_manoeuvre_beyond_v_max_or_omega_max_is_inconsistent() -> None:
     step, report = told_to_a(2)
     first = report.runs[0]
     for run in (Segment(first.ticks, 1.001, first.omega), Segment(first.ticks, first.v, -3.15)):
@@ -183,7 +183,7 @@ def test_a_drive_beyond_v_max_or_omega_max_is_not_believed() -> None:
         assert ", limit " in _claim(alarm)
 
 
-def test_ranges_to_its_anchor_have_to_be_of_the_path_it_tells() -> None:
+def test_reported_anchor_ranges_must_agree_with_the_reported_path() -> None:
     step, report = told_to_a(2)
     one = report.ranges[1]
     ranges = (report.ranges[0], Ranged(one.tick, one.range + 1e-4), *report.ranges[2:])
@@ -193,7 +193,7 @@ def test_ranges_to_its_anchor_have_to_be_of_the_path_it_tells() -> None:
     assert alarm.residual == pytest.approx(1e-4)
 
 
-def test_who_says_that_it_orbits_is_on_its_orbit_and_heads_along_it() -> None:
+def test_a_robot_that_reports_orbiting_must_be_on_its_orbit_and_head_along_it() -> None:
     step, report = told_to_a(2)
     assert report.state == "orbiting"
     last = report.runs[-1]
@@ -219,7 +219,7 @@ ticks = st.none() | st.integers(0, 40)
 
 @settings(max_examples=100)
 @given(logs, st.sampled_from([*OF_DRIVES, *OF_STARTS]), ticks, ticks, st.integers(1, 40))
-def test_a_liar_tells_the_same_story_as_it_grows(
+def test_the_false_log_of_an_attacker_only_grows(
     log: MotionLog, attack: Attack, parted: int | None, later: int | None, seen: int
 ) -> None:
     """The reported first ticks stay the same when the log grows."""
@@ -260,7 +260,7 @@ def test_a_false_radius_goes_with_false_ranges_and_moves_the_start_only() -> Non
 # --- the scenario -------------------------------------------------------------------------------------
 
 
-def test_a_scenario_says_who_lies_and_how() -> None:
+def test_a_scenario_names_the_attackers_and_their_attacks() -> None:
     text = (
         shipped()["paper-1"]
         .read_text()
@@ -280,7 +280,7 @@ def test_a_scenario_says_who_lies_and_how() -> None:
         ('{kind = "shift", size = 1.0, part = "lunch"}', ("robot[1].attack.part", "lunch")),
     ],
 )
-def test_a_lie_that_cannot_be_told_is_refused_by_its_field(attack: str, words: tuple[str, ...]) -> None:
+def test_an_invalid_attack_is_refused_with_its_field(attack: str, words: tuple[str, ...]) -> None:
     text = shipped()["paper-1"].read_text().replace('id = "b"', f'id = "b"\nattack = {attack}')
     with pytest.raises(BadScenario) as error:
         parse(text, "mine")

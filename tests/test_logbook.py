@@ -120,7 +120,7 @@ class Side:
 @given(
     ticks, ticks, st.lists(st.sampled_from(["heard", "lost", "late", "late ones too", "twice"]), min_size=1)
 )
-def test_what_is_acknowledged_is_known_and_what_is_lost_is_told_again(
+def test_acknowledged_entries_are_known_and_lost_entries_are_sent_again(
     a_drove: list[Tick], b_drove: list[Tick], deliveries_of_reports: list[str]
 ) -> None:
     length = min(len(a_drove), len(b_drove))
@@ -155,7 +155,7 @@ def test_an_overtaken_report_does_not_bring_back_an_old_state() -> None:
 @given(ticks)
 @example([(1.0, 0.0, 1.5)] * 300)
 @example([(1.0, 0.0, None), (0.5, 0.0, None)] * 150)
-def test_a_report_fits_its_frame_and_tells_as_much_as_fits(driven: list[Tick]) -> None:
+def test_a_report_has_as_many_entries_as_fit_its_frame(driven: list[Tick]) -> None:
     book = prefixes(driven)[-1]
     report = told(book, PeerState())
     frame = encode(report)
@@ -276,7 +276,7 @@ def test_a_sound_report_contradicts_nothing() -> None:
         ({"ranges": (Ranged(3, 1.0), Ranged(3, 2.0))}, "range of tick 3 outside"),
     ],
 )
-def test_a_report_that_no_log_could_say_is_named(change: dict[str, object], named: str) -> None:
+def test_an_impossible_report_is_explained(change: dict[str, object], named: str) -> None:
     found = contradiction(replace(SOUND, **change))
     assert found is not None
     assert named in found

@@ -226,7 +226,7 @@ def test_a_robot_released_on_its_anchor_knows_its_branch_at_once() -> None:
     assert recording.end.outcome == "localised"
 
 
-def test_nobody_claims_before_a_third_mutual_range() -> None:
+def test_no_robot_claims_before_a_third_mutual_range() -> None:
     for seed in range(40):
         recording = run_mission(load("random", seed=seed))
         assert recording.end is not None
@@ -292,7 +292,7 @@ def grid() -> list[float]:
 
 @settings(max_examples=25)
 @given(last_points())
-def test_the_letters_last_manoeuvre_maximises_eq_8_at_full_speed(
+def test_the_last_manoeuvre_of_the_paper_planner_maximises_eq_8_at_full_speed(
     case: tuple[Pose, Pose, list[Placement]],
 ) -> None:
     b, a, found = case

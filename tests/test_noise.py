@@ -209,7 +209,7 @@ def test_other_robots_shift_no_draw() -> None:
         assert [ours] == mutual_ranges(at_tick(two, tick), two, two.pairs())
 
 
-def test_a_mutual_range_is_measured_once_and_told_to_both() -> None:
+def test_a_mutual_range_is_measured_once_and_sent_to_both() -> None:
     scenario = near("mutual_sigma = 0.1\noutliers = 0.2\ndrop_outs = 0.2")
     world = release(scenario)
     told = set()
@@ -226,7 +226,7 @@ def test_a_mutual_range_is_measured_once_and_told_to_both() -> None:
 # --- ranges -------------------------------------------------------------------------------------------
 
 
-def test_ranges_are_gaussian_with_the_sigmas_they_are_told() -> None:
+def test_ranges_are_gaussian_with_the_given_sigmas() -> None:
     ranges = all_ranges(near("anchor_sigma = 0.05\nmutual_sigma = 0.2"))
     errors = [known(told) - rho for told, rho in zip(ranges, (RHO_A, 2.0, APART), strict=True)]
     for error, sigma in zip(errors, (0.05, 0.05, 0.2), strict=True):
@@ -309,7 +309,7 @@ def test_a_range_that_is_dropped_leaves_the_contact() -> None:
     assert 50 < dropped < 150
 
 
-def test_reports_are_heard_where_the_range_was_dropped(tmp_path: Path) -> None:
+def test_reports_are_received_despite_a_drop_out(tmp_path: Path) -> None:
     """The seed drops every mutual range of the mission."""
     dropping = next(
         seed for seed in range(1000) if mutual(near("drop_outs = 0.5", seed=seed), 4) == [None] * 4
@@ -364,7 +364,7 @@ def test_actuation_noise_moves_the_robot_and_an_exact_odometry_says_how() -> Non
     assert onward.truth.local[0] != step(world.truth.local[0], asked.v, asked.omega, period)
 
 
-def test_odometry_noise_moves_nobody() -> None:
+def test_odometry_noise_moves_no_robot() -> None:
     world = release(near(f"odometry = {DRIFT}"))
     onward = advance(world, {"a": sent(1.0, 0.5)})
     assert isinstance(onward, World)
@@ -423,7 +423,7 @@ def test_wheels_saturate_before_they_err() -> None:
     assert onward.executed[0] == executed(Controls(1.0, -math.pi), scenario, "a", 0)
 
 
-def test_the_fastest_robot_with_the_worst_wheels_can_be_told_what_it_did() -> None:
+def test_the_largest_noisy_motion_fits_an_observation() -> None:
     drift = VelocityNoise(0.5, 0.5, 1e4, 1e4)
     noise = Noise(outliers=0.5, outlier_bias=(0.0, 1e6), actuation=drift, odometry=drift)
     exact = near()
@@ -451,7 +451,7 @@ def moved_on(world: World, commands: dict[str, Command]) -> World:
     return onward
 
 
-def test_a_claim_is_held_against_where_the_robot_was_when_it_claimed() -> None:
+def test_a_claim_is_compared_with_the_true_pose_at_its_tick() -> None:
     """Actuation noise with a floor moves it on while it waits for the verdict of its peer."""
     at_first = release(near("actuation = {v_floor = 0.1}"))
     a, b = at_first.truth.poses
@@ -466,7 +466,7 @@ def test_a_claim_is_held_against_where_the_robot_was_when_it_claimed() -> None:
     assert advance(later, {"b": gives_up}) == MissionOutcome("undecided", "b: no way")
 
 
-def test_a_claim_is_wrong_beyond_five_of_its_sigmas_and_the_reason_says_of_which() -> None:
+def test_a_claim_is_wrong_beyond_five_of_its_sigmas_and_the_reason_names_them() -> None:
     world = release(near("anchor_sigma = 0.01"))
     a, b = world.truth.poses
     sure = Covariance(0.0009, 0.0, 0.0, 0.0016, 0.0, 0.0004)  # 0.05 m, 0.02 rad
@@ -540,14 +540,14 @@ def driven(scenario: Scenario, folder: Path, ticks: int) -> tuple[list[Truth], l
 
 
 @by_noise
-def test_the_record_folds_to_the_same_truth(noise: str, tmp_path: Path) -> None:
+def test_a_recording_gives_the_same_truth_again(noise: str, tmp_path: Path) -> None:
     truths, _ = driven(near(noise), tmp_path, 60)
     assert [moment.truth for moment in read(tmp_path).ticks] == truths
 
 
 @by_noise
 @pytest.mark.parametrize("seed", [2, 10, 11])
-def test_the_record_of_a_mission_is_read_as_it_was_played(noise: str, seed: int, tmp_path: Path) -> None:
+def test_the_recording_of_a_mission_is_read_as_it_ran(noise: str, seed: int, tmp_path: Path) -> None:
     played = in_process.run_mission(load(str(noisy(noise, tmp_path)), seed=seed), tmp_path)
     assert read(tmp_path) == played
 
@@ -575,7 +575,7 @@ def shortest(value: float | None) -> str:
     return "" if value is None else repr(value)
 
 
-def test_ticks_gives_what_a_robot_did_of_which_no_drive_came() -> None:
+def test_ticks_has_the_motion_of_a_robot_without_a_command() -> None:
     """In real time, a robot with a late Command is stopped, but a noise floor still moves it."""
     scenario = near("actuation = {v_floor = 0.1}", max_ticks=1)
     world = release(scenario)

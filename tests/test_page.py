@@ -36,7 +36,7 @@ def frames_to(path: Path, tick: int, first: type[Observation | Command] = Observ
 
 
 @pytest.mark.long
-def test_what_becomes_known_of_a_tick_later_is_on_the_time_line_and_in_the_log(
+def test_late_data_of_a_tick_appears_on_the_time_line_and_in_the_log(
     opened: Open, paper_1: Path, tmp_path: Path
 ) -> None:
     whole = {path.name: list(journal_file.read(path)) for path in paper_1.glob("*.journal")}
@@ -141,7 +141,7 @@ CENTRE = """() => {
 }"""
 
 
-def test_what_a_robot_believes_moves_between_ticks_as_it_does(opened: Open, address: str) -> None:
+def test_an_estimate_moves_between_ticks_like_its_robot(opened: Open, address: str) -> None:
     page = opened(f"{address}#tick=20&truth=0&robot=a")
     until_shown(page, 20)
     page.locator("#speed").select_option("0.5")
@@ -189,7 +189,7 @@ def test_a_hypothesis_that_goes_on_moves_to_where_it_is_next_and_others_as_drive
 
 
 @pytest.mark.parametrize("dark", [False, True])
-def test_without_the_truth_the_page_opens_with_what_the_robots_believe(
+def test_without_the_truth_the_page_opens_with_the_estimates(
     dark: bool, opened: Open, paper_1: Path, tmp_path: Path
 ) -> None:
     for path in paper_1.glob("agent-*.journal"):
@@ -214,7 +214,7 @@ def test_without_the_truth_the_page_opens_with_what_the_robots_believe(
 
 
 @pytest.mark.long
-def test_an_error_is_told_of_a_pose_that_leads_and_else_as_a_range(
+def test_the_error_is_that_of_the_likeliest_pose_or_else_a_range(
     opened: Open, paper_1: Path, address: str
 ) -> None:
     page = opened(f"{address}#tick=47", height=720)

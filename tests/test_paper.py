@@ -137,7 +137,7 @@ ROWS = (
 
 
 @pytest.mark.parametrize("row", ROWS, ids=[f"{row.scenario}-{row.robot}" for row in ROWS])
-def test_phases_1_and_2_go_as_the_table_says(row: Row) -> None:
+def test_phases_1_and_2_are_those_of_the_table(row: Row) -> None:
     recording = played(row.scenario)
     final_report = recording.final_reports[row.robot]
     reference = SIMULATIONS[row.scenario]
@@ -199,7 +199,7 @@ def test_a_takes_its_second_mutual_range_while_b_stands(
         ("paper-2", (4, 2), +0.1484, 0.95768, 110),
     ],
 )
-def test_b_chooses_the_last_manoeuvre_that_the_table_says(
+def test_b_chooses_the_last_manoeuvre_of_the_table(
     name: str, solutions: tuple[int, int], omega: float, separation: float, last: int
 ) -> None:
     recording = played(name)

@@ -129,7 +129,7 @@ def test_compose_has_at_most_twelve_packages_and_three_modules_of_its_own() -> N
     assert modules == {"errors", "extras", "network"}
 
 
-def test_the_words_are_found_where_they_are() -> None:
+def test_private_words_are_found() -> None:
     """The checks above find a word at the start and inside of a text, and do not find it in another word."""
     assert private_words("The campaigns go on.") == {"campaign"}
     assert private_words("It is on record.") == {"on record"}

@@ -52,7 +52,7 @@ def test_a_mission_is_a_line_and_so_is_each_robot_there_or_not(tmp_path: Path) -
         ]
 
 
-def test_a_mission_that_runs_is_told_to_a_program_with_all_that_is_known(tmp_path: Path) -> None:
+def test_a_running_mission_is_listed_as_json_with_all_known_values(tmp_path: Path) -> None:
     (tmp_path / "endless.toml").write_text(ENDLESS)
     with world(tmp_path / "endless.toml", "--run", "mine") as (_, endpoint), ExitStack() as stack:
         for robot in "ab":
@@ -103,14 +103,14 @@ def test_robots_whose_world_has_gone_are_listed_and_it_is_missing(tmp_path: Path
         ]
 
 
-def test_where_there_is_no_mission_that_is_said() -> None:
+def test_a_network_without_a_mission_is_reported() -> None:
     endpoint = free_endpoint()
     with session.open_router(listening(endpoint)):
         assert listed(endpoint) == [f"no mission at {endpoint}"]
         assert told(endpoint) == []
 
 
-def test_an_endpoint_that_does_not_answer_is_told_beside_one_that_does() -> None:
+def test_an_endpoint_without_an_answer_is_reported_next_to_one_with_an_answer() -> None:
     nowhere = free_endpoint()
     with world("paper-1", "--run", "mine") as (_, endpoint):
         ended = tandem("ps", "--connect", nowhere, "--connect", endpoint)
@@ -221,7 +221,7 @@ def foreign(mission: Played) -> None:
         ),
     ],
 )
-def test_what_is_said_is_told_and_what_is_not_is_said_so(
+def test_published_values_are_listed_and_others_are_reported_as_unknown(
     start: Callable[[Played], None], lines: list[str]
 ) -> None:
     with played(start) as (_, endpoint):
@@ -231,7 +231,7 @@ def test_what_is_said_is_told_and_what_is_not_is_said_so(
         ]
 
 
-def test_a_peer_of_whom_nothing_is_heard_is_missing() -> None:
+def test_a_peer_that_sends_nothing_is_missing() -> None:
     with played(driven) as (_, endpoint):
         assert listed(endpoint) == [
             f"r at {endpoint}, tick 7, missing: b",
@@ -240,7 +240,7 @@ def test_a_peer_of_whom_nothing_is_heard_is_missing() -> None:
         ]
 
 
-def test_nobody_is_made_to_tell_the_truth_or_an_estimate() -> None:
+def test_ps_does_not_subscribe_to_the_truth_or_to_estimates() -> None:
     with played(running) as (mission, endpoint):
         assert "tick 7" in listed(endpoint)[0]
         assert not mission.wanted.is_set()

@@ -73,7 +73,7 @@ def robots_at(endpoint: str, answers: Callable[[Observation], bool]) -> Iterator
         assert tokens
 
 
-def test_a_tick_may_last_longer_than_the_patience(tmp_path: Path) -> None:
+def test_a_tick_may_last_longer_than_the_timeout(tmp_path: Path) -> None:
     scenario = tmp_path / "slow.toml"
     scenario.write_text("max_ticks = 2\n" + PAPER_1)
     with (
@@ -86,14 +86,14 @@ def test_a_tick_may_last_longer_than_the_patience(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("rate", "lasts"), [("1e-8", "1e+08"), ("1e8", "1e-08")])
-def test_a_rate_beyond_all_sense_is_refused(rate: str, lasts: str) -> None:
+def test_a_rate_out_of_bounds_is_refused(rate: str, lasts: str) -> None:
     ended = tandem("run", "paper-1", "--rate", rate)
     assert ended.status == 2
     assert ended.err.startswith(f"tandem run: --rate: {float(rate):g} makes a tick of 1 s last {lasts} s")
     assert ended.err.count("\n") == 1
 
 
-def test_a_robot_whose_agent_is_stopped_stands_still_and_the_mission_goes_on(tmp_path: Path) -> None:
+def test_a_robot_whose_agent_is_suspended_stands_still_and_the_mission_continues(tmp_path: Path) -> None:
     out = tmp_path / "out"
     (tmp_path / "assured.toml").write_text(REAL_TIME)
     with TandemProcess("run", tmp_path / "assured.toml", "--rate", "20", "--out", out) as run:
@@ -114,7 +114,7 @@ def test_a_robot_whose_agent_is_stopped_stands_still_and_the_mission_goes_on(tmp
     assert {(row["v"], row["omega"]) for row in rows} == {("0.0", "0.0")}
 
 
-def test_a_world_says_why_there_is_no_farewell_of_a_robot(tmp_path: Path) -> None:
+def test_a_world_prints_the_reason_for_a_missing_final_report(tmp_path: Path) -> None:
     """Both answer only the first tick; then b ends."""
     out = tmp_path / "out"
     (tmp_path / "short.toml").write_text("max_ticks = 9\n" + ASSURED.partition("\n")[2])

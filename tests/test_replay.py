@@ -48,20 +48,28 @@ def paper_1() -> dict[str, list[bytes]]:
         ],
     ],
 )
-def test_what_was_played_in_one_process_is_replayed_to_the_bit(played: Scenario) -> None:
+def test_a_run_in_one_process_is_replayed_bit_by_bit(played: Scenario) -> None:
     again = replayed(kept(played))
     assert (again.differences, again.tears) == ((), ())
     assert again.checks > 2 * len(played.robots) * again.ticks > 0
 
 
-def test_what_was_played_as_processes_is_replayed_to_the_bit(tmp_path: Path) -> None:
+def test_a_run_as_processes_is_replayed_bit_by_bit(tmp_path: Path) -> None:
     out = tmp_path / "out"
     assert tandem("run", "random", "--fault", "loss=0.3, delay=0..2", "-q", "--out", out).status == 0
     before = journals(out)
     ended = tandem("replay", out)
     assert (ended.status, ended.err) == (0, "")
-    assert ended.out.startswith("random: as recorded, to the bit, in ")
+    assert ended.out.startswith("random: as recorded, to the bit, over ")
     assert journals(out) == before
+
+
+def test_run_replay_and_audit_count_the_same_ticks(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    ran = tandem("run", "paper-1", "--in-process", "--no-export", "-q", "--out", out).out
+    assert ran == "localised after 48 ticks\n"
+    assert "as recorded, to the bit, over 48 ticks" in tandem("replay", out).out
+    assert "no violations over 48 ticks" in tandem("audit", out).out
 
 
 # --- one bit --------------------------------------------------------------------------------------------
@@ -149,7 +157,7 @@ def test_a_value_is_shown_however_deep_it_stands(recording: Path) -> None:
     )
 
 
-def test_a_record_whose_drives_the_world_has_otherwise_is_found_there(recording: Path) -> None:
+def test_a_command_that_differs_in_the_worlds_journal_is_found(recording: Path) -> None:
     frames = list(journal_file.read(recording / WORLD_JOURNAL))
     command = decode(frames[2 + 2 * 20 + 1], Command)
     assert (command.robot, command.tick) == ("b", 20)
@@ -167,14 +175,14 @@ def changed(recording: dict[str, list[bytes]], name: str, was: Any, **fields: An
     return recording | {name: frames}
 
 
-def test_a_report_that_is_heard_otherwise_than_it_was_told_is_found(paper_1: dict[str, list[bytes]]) -> None:
+def test_a_report_that_was_received_differently_than_sent_is_found(paper_1: dict[str, list[bytes]]) -> None:
     heard = [decode(frame, KINDS, MAX_FRAME_BYTES) for frame in paper_1[B]]
     told = next(one for one in heard if isinstance(one, Report) and one.robot == "a")
     first, *_ = replayed(changed(paper_1, B, told, state="listening")).differences
     assert (first.rule, first.robot) == ("report", "b")
 
 
-def test_a_report_that_is_heard_and_that_no_sense_lists_is_found(paper_1: dict[str, list[bytes]]) -> None:
+def test_a_received_report_that_no_observation_lists_is_found(paper_1: dict[str, list[bytes]]) -> None:
     frames = list(paper_1[B])
     heard = [decode(frame, KINDS, MAX_FRAME_BYTES) for frame in frames]
     place = next(i for i, one in enumerate(heard) if isinstance(one, Report) and one.robot == "a")
@@ -182,7 +190,7 @@ def test_a_report_that_is_heard_and_that_no_sense_lists_is_found(paper_1: dict[s
     assert "contact" in {one.rule for one in replayed(paper_1 | {B: frames}).differences}
 
 
-def test_an_end_that_does_not_follow_is_found_though_all_say_the_same(
+def test_a_wrong_mission_end_is_found_though_all_journals_agree(
     paper_1: dict[str, list[bytes]],
 ) -> None:
     end = next(
@@ -204,7 +212,7 @@ def cut(path: Path, size: int) -> int:
 
 
 @pytest.mark.parametrize("name", [WORLD_JOURNAL, A, B])
-def test_a_record_that_is_torn_anywhere_is_replayed_to_the_tear(
+def test_a_truncated_recording_is_replayed_up_to_the_truncation(
     name: str, paper_1: dict[str, list[bytes]]
 ) -> None:
     for count in range(2, len(paper_1[name]), 3):  # after the versions and the scenario, or a RobotConfig
@@ -213,14 +221,14 @@ def test_a_record_that_is_torn_anywhere_is_replayed_to_the_tear(
         assert again.tears
 
 
-def test_where_it_tears_is_told(recording: Path) -> None:
+def test_the_place_of_a_truncation_is_reported(recording: Path) -> None:
     rest = cut(recording / A, 4000)
     last = [decode(frame, KINDS, MAX_FRAME_BYTES) for frame in journal_file.read(recording / A)][-1]
     (recording / B).unlink()
     ended = tandem("replay", recording)
     assert (ended.status, ended.err) == (0, "")
     as_recorded, *tears = ended.out.splitlines()
-    assert as_recorded.startswith("paper-1: as recorded, to the bit, in 49 ticks ")
+    assert as_recorded.startswith("paper-1: as recorded, to the bit, over 48 ticks ")
     assert rest > 0
     assert tears == [
         "no tick, b: its journal is missing",
@@ -229,7 +237,7 @@ def test_where_it_tears_is_told(recording: Path) -> None:
     ]
 
 
-def test_a_frame_of_a_wrong_length_is_no_tear(recording: Path) -> None:
+def test_a_frame_of_a_wrong_length_is_not_a_truncation(recording: Path) -> None:
     frames = list(journal_file.read(recording / A))
     data = bytearray((recording / A).read_bytes())
     data[len(journal_file.packed(frames[:20])) + 1] = 0xFF
@@ -239,7 +247,7 @@ def test_a_frame_of_a_wrong_length_is_no_tear(recording: Path) -> None:
     assert ended.err.startswith(f"tandem replay: {recording / A}: damaged at byte ")
 
 
-def test_what_is_no_record_is_refused(tmp_path: Path) -> None:
+def test_a_folder_without_a_recording_is_refused(tmp_path: Path) -> None:
     ended = tandem("replay", tmp_path)
     assert (ended.status, ended.out) == (2, "")
     assert ended.err == f"tandem replay: {tmp_path} contains no recording: there is no world.journal\n"

@@ -97,7 +97,7 @@ def options(kills: str) -> list[str]:
         "a@48:journal b@48:command world@48:command",
     ],
 )
-def test_a_run_whose_processes_are_killed_ends_with_the_same_record(
+def test_a_run_whose_processes_are_killed_ends_with_the_same_recording(
     kills: str, undisturbed: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
@@ -121,7 +121,7 @@ def test_a_robot_that_comes_back_later_is_waited_for_even_after_the_last_tick(
     same(tmp_path / "out", undisturbed)
 
 
-def test_a_point_that_never_comes_is_told(undisturbed: Path, tmp_path: Path) -> None:
+def test_a_kill_point_that_is_never_reached_is_reported(undisturbed: Path, tmp_path: Path) -> None:
     kills = options("b@900 a@3:report world@49:command+never")
     ended = tandem("run", "paper-1", "-q", "--out", tmp_path / "out", *kills)
     assert ended[:2] == (0, LOCALISED)
@@ -142,14 +142,14 @@ def test_a_process_that_is_never_started_again_ends_the_run_at_once(who: str, tm
 
 
 @pytest.mark.long
-def test_a_robot_that_comes_back_too_late_fails_the_run_by_the_patience(tmp_path: Path) -> None:
+def test_a_robot_that_returns_after_the_timeout_fails_the_run(tmp_path: Path) -> None:
     kill = ("--kill", "a@17+600s", "--timeout", "5")
     ended = tandem("run", "paper-1", "-q", "--out", tmp_path / "out", *kill)
     assert ended[:2] == (3, "failed after 16 ticks (no answer from a (not connected) at tick 17 for 5 s)\n")
     assert not processes_of(tmp_path / "out")
 
 
-def test_in_real_time_whoever_is_away_stands_still_and_is_told_what_it_missed(tmp_path: Path) -> None:
+def test_an_absent_robot_stands_still_in_real_time_and_learns_what_it_missed(tmp_path: Path) -> None:
     out = tmp_path / "out"
     (tmp_path / "assured.toml").write_text(REAL_TIME)
     kills = options("a@20+0.5s world@60:report")  # ten periods: a process is back in less than one
@@ -301,7 +301,7 @@ def at_tick(frames: list[bytes], tick: int) -> int:
 
 
 @pytest.mark.parametrize("tick", [20, 47])
-def test_torn_tails_are_cut_off_told_and_survived(tick: int, undisturbed: Path, tmp_path: Path) -> None:
+def test_a_truncated_tail_is_removed_and_reported(tick: int, undisturbed: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()
     for name, more in zip(PARTS, (61, 9, 30), strict=True):
@@ -343,7 +343,7 @@ def test_a_world_and_an_agent_that_are_killed_go_on_by_the_same_commands(
     same(tmp_path, undisturbed)
 
 
-def test_who_has_ended_says_so_again(undisturbed: Path, tmp_path: Path) -> None:
+def test_a_process_that_has_ended_prints_its_outcome_again(undisturbed: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()
     for name, data in journals(undisturbed).items():
@@ -356,7 +356,7 @@ def test_who_has_ended_says_so_again(undisturbed: Path, tmp_path: Path) -> None:
     same(out, undisturbed)
 
 
-def test_a_world_that_is_killed_after_its_end_collects_the_farewells(
+def test_a_world_killed_after_its_mission_end_collects_the_final_reports(
     undisturbed: Path, tmp_path: Path
 ) -> None:
     for name, data in journals(undisturbed).items():
@@ -371,7 +371,7 @@ def test_a_world_that_is_killed_after_its_end_collects_the_farewells(
     same(tmp_path, undisturbed)
 
 
-def test_an_agent_says_farewell_until_a_world_has_it_on_record(tmp_path: Path) -> None:
+def test_an_agent_repeats_its_final_report_until_a_world_has_recorded_it(tmp_path: Path) -> None:
     scenario, endpoint, run = load("paper-1"), free_endpoint(), "mine"
     there = Inbox("test")
 
@@ -407,7 +407,7 @@ def test_an_agent_says_farewell_until_a_world_has_it_on_record(tmp_path: Path) -
 # --- repeated messages --------------------------------------------------------------------------------
 
 
-def test_a_repeated_sense_makes_an_agent_say_all_its_latest_reports_again(tmp_path: Path) -> None:
+def test_a_repeated_observation_makes_an_agent_repeat_its_latest_reports(tmp_path: Path) -> None:
     scenario, endpoint, run = load("paper-1"), free_endpoint(), "mine"
     reports: SimpleQueue[int] = SimpleQueue()
     there = Inbox("test")
@@ -518,12 +518,12 @@ def _remembered(path: Path) -> None:
         remember(old)
 
 
-def test_the_worlds_record_of_another_scenario_is_refused(recording: Path) -> None:
+def test_a_worlds_journal_of_another_scenario_is_refused(recording: Path) -> None:
     says = f"{recording / 'world.journal'}: a recording of another scenario, paper-1"
     refuses(recording, "world", "paper-2", "--listen", free_endpoint(), says=says)
 
 
-def test_an_agents_record_of_another_briefing_is_refused(recording: Path, tmp_path: Path) -> None:
+def test_an_agents_journal_of_another_configuration_is_refused(recording: Path, tmp_path: Path) -> None:
     scenario = tmp_path / "farther.toml"
     scenario.write_text(PAPER_1.replace("anchor = [10.0", "anchor = [10.5"))
     path = recording / "agent-a.journal"
@@ -532,7 +532,7 @@ def test_an_agents_record_of_another_briefing_is_refused(recording: Path, tmp_pa
         refuses(recording, "agent", "a", "--connect", endpoint, says=says)
 
 
-def test_an_agents_record_in_which_it_sensed_otherwise_is_no_use(recording: Path, paper_2: str) -> None:
+def test_an_agents_journal_with_another_observation_is_refused(recording: Path, paper_2: str) -> None:
     path = recording / "agent-a.journal"
     path.write_bytes(journal_file.packed(list(journal_file.read(path))[:4]))
     with TandemProcess("agent", "b", "--connect", paper_2):  # its RobotConfigs are those of paper-1
@@ -541,7 +541,7 @@ def test_an_agents_record_in_which_it_sensed_otherwise_is_no_use(recording: Path
     assert (ended.status, ended.err) == (3, f"tandem agent a: {said}\n")
 
 
-def test_a_record_on_which_it_decided_otherwise_is_refused(recording: Path) -> None:
+def test_a_journal_with_another_decision_is_refused(recording: Path) -> None:
     path = recording / "agent-a.journal"
     frames = list(journal_file.read(path))
     place = next(i for i, frame in enumerate(frames) if frame[5:].find(b"command\x0c") > 0)
@@ -571,7 +571,7 @@ def test_a_journal_is_locked_as_long_as_it_is_open(tmp_path: Path) -> None:
     Retrace(path).close()
 
 
-def test_a_world_that_has_lost_its_record_is_told_so(recording: Path, paper_1: str) -> None:
+def test_an_agent_refuses_a_world_that_has_lost_its_journal(recording: Path, paper_1: str) -> None:
     with TandemProcess("agent", "b", "--connect", paper_1):
         ended = tandem("agent", "a", "--connect", paper_1, "--out", recording)
     tick = past(journal_file.read(recording / "agent-a.journal"), "a").steps[-1].observation.tick
@@ -612,7 +612,7 @@ def test_a_mission_under_noise_is_folded_to_the_bit(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_who_has_ended_waits_for_no_world_that_has_gone_however_patient(
+def test_an_agent_that_has_ended_does_not_wait_for_a_world_that_has_gone(
     undisturbed: Path, tmp_path: Path
 ) -> None:
     shutil.copy(undisturbed / "agent-a.journal", tmp_path)

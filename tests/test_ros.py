@@ -104,7 +104,7 @@ def test_what_was_executed_leads_from_one_pose_to_the_next(
     assert done.v == pytest.approx(v, abs=1e-6)
 
 
-def test_standing_is_rest_to_the_bit() -> None:
+def test_equal_poses_are_exactly_zero_motion() -> None:
     pose = Pose(3.0, -4.0, 0.8)
     assert ros2.executed(pose, pose, 1.0) == Controls(0.0, 0.0)
 
@@ -131,7 +131,7 @@ anchor = [10.0, 0.0]
 
 
 @pytest.mark.long
-def test_a_base_behind_a_bridge_keeps_the_contract(tmp_path: Path) -> None:
+def test_a_base_behind_a_bridge_fulfils_the_driver_contract(tmp_path: Path) -> None:
     """The base uses another CDR library, has its own watchdog, and its headings wrap."""
     (tmp_path / "ros.toml").write_text(SCENARIO)
     endpoint = free_endpoint()

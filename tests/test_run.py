@@ -59,7 +59,7 @@ def played(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 # --- files ------------------------------------------------------------------------------------------
 
 
-def test_the_papers_missions_localise_at_their_tick_and_leave_the_whole_record(
+def test_the_missions_of_the_paper_localise_at_their_tick_with_a_complete_recording(
     played: tuple[str, Path],
 ) -> None:
     name, out = played
@@ -71,7 +71,7 @@ def test_the_papers_missions_localise_at_their_tick_and_leave_the_whole_record(
         assert robot["heading_error_rad"] < 1e-9
 
 
-def test_summary_says_everything_that_is_promised_of_a_run(played: tuple[str, Path]) -> None:
+def test_summary_has_every_documented_value_of_a_run(played: tuple[str, Path]) -> None:
     name, out = played
     told = summary(out)
     assert list(told) == [
@@ -127,7 +127,7 @@ PAPER_ROBOTS: dict[tuple[str, str], dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("robot", ["a", "b"])
-def test_summary_says_everything_that_is_promised_of_a_robot(played: tuple[str, Path], robot: str) -> None:
+def test_summary_has_every_documented_value_of_a_robot(played: tuple[str, Path], robot: str) -> None:
     name, out = played
     told = summary(out)["robots"][robot]
     assert set(told) >= {
@@ -256,7 +256,7 @@ def test_without_out_nothing_is_left(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_table_at_the_end_says_how_each_robot_fared() -> None:
+def test_the_table_at_the_end_has_the_result_of_each_robot() -> None:
     ended = tandem("run", "paper-1", "--in-process")
     assert "localised after 48 ticks" in ended.out
     rows = {words[0]: words[1:] for line in ended.out.splitlines() if (words := line.strip(" │┃").split())}
@@ -265,7 +265,7 @@ def test_the_table_at_the_end_says_how_each_robot_fared() -> None:
             assert sum(figure in word for word in rows[robot]) == 2, ended.out
 
 
-def test_output_that_nobody_takes_is_one_line_and_no_traceback() -> None:
+def test_a_closed_output_is_one_line_and_no_traceback() -> None:
     with (
         Path("/dev/full").open("wb") as full,
         TandemProcess("run", "paper-1", "-q", terminal=full.fileno()) as run,
@@ -275,7 +275,7 @@ def test_output_that_nobody_takes_is_one_line_and_no_traceback() -> None:
     assert ended.err == "tandem run: cannot continue: No space left on device\n"
 
 
-def test_a_world_whose_output_nobody_takes_does_not_blame_its_record(tmp_path: Path) -> None:
+def test_a_world_with_a_closed_output_does_not_blame_its_journal(tmp_path: Path) -> None:
     options = ("--listen", free_endpoint(), "--out", tmp_path / "out")
     with (
         Path("/dev/full").open("wb") as full,
@@ -294,7 +294,9 @@ def test_a_terminal_shows_each_robots_phase_and_state_while_it_runs() -> None:
 
 
 @pytest.mark.parametrize("mode", [[], ["--in-process"]], ids=["processes", "in-process"])
-def test_a_mission_that_runs_out_of_ticks_is_undecided_and_says_so(mode: list[str], tmp_path: Path) -> None:
+def test_a_mission_that_reaches_max_ticks_is_undecided_and_reports_it(
+    mode: list[str], tmp_path: Path
+) -> None:
     short = tmp_path / "short.toml"
     short.write_text(PAPER_1.replace("seed = 1", "seed = 1\nmax_ticks = 5"))
     ended = tandem("run", short, "--out", tmp_path / "out", "-q", *mode)
@@ -312,7 +314,7 @@ def test_a_mission_that_runs_out_of_ticks_is_undecided_and_says_so(mode: list[st
     assert told["first_contact_tick"] is None
 
 
-def test_rate_plays_in_real_time(tmp_path: Path) -> None:
+def test_rate_runs_in_real_time(tmp_path: Path) -> None:
     ended = tandem("run", "random", "--seed", "3", "--rate", "20", "-q", "--out", tmp_path / "out")
     assert ended.status in OVER, ended
     told = summary(tmp_path / "out")

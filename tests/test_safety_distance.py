@@ -39,7 +39,7 @@ places = st.floats(-2.0, 2.0)
 
 
 @given(speeds, turns, turns, places, places)
-def test_how_near_an_arc_comes_is_never_told_too_far_and_hardly_too_near(
+def test_the_bound_on_the_distance_of_an_arc_is_safe_and_tight(
     v: float, omega: float, heading: float, x: float, y: float
 ) -> None:
     pose = Pose(0.3, -0.2, heading)
@@ -122,7 +122,7 @@ def test_robots_that_begin_in_range_of_each_other_come_no_nearer_than_that(seed:
     assert found >= min(SAFE, math.hypot(a.x - b.x, a.y - b.y)) - 1e-9
 
 
-def test_the_letter_keeps_it_too_or_gives_up() -> None:
+def test_the_paper_planner_keeps_the_safety_distance_or_gives_up() -> None:
     outcomes = set()
     for seed in range(1, 40):
         recording = run_mission(replace(safe(seed), planner_name="paper"))
@@ -134,7 +134,7 @@ def test_the_letter_keeps_it_too_or_gives_up() -> None:
     assert "localised" in outcomes
 
 
-def test_a_distance_of_which_nobody_would_be_warned_is_refused(tmp_path: Path) -> None:
+def test_a_safety_distance_above_that_at_first_contact_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "safe.toml"
     text = (Path("compose/scenario/shipped") / "random.toml").read_text()
     file.write_text(text.replace("[mission]", "[mission]\nsafety_distance = 1.01"))

@@ -46,7 +46,7 @@ def test_a_scene_shows_where_everyone_is_and_what_everyone_does(paper_1: Path) -
             assert (player.command.v, player.command.state) == (command.v, command.state)
 
 
-def test_the_first_contact_of_paper_1_is_told_at_tick_46(paper_1: Path) -> None:
+def test_the_first_contact_of_paper_1_is_shown_at_tick_46(paper_1: Path) -> None:
     shown = read(paper_1)
     assert said(shown, "contact") == [(46, "a and b are in range of each other: 2.95 m")]
     assert said(shown, "anchor")[0] == (0, "a is in its anchor's range: 2.68 m")
@@ -66,7 +66,9 @@ def test_local_poses_stand_where_the_robot_is_in_the_frame_that_the_stage_gives(
         assert (place.x, place.y) == pytest.approx((player.pose.x, player.pose.y), abs=1e-9)
 
 
-def test_without_the_world_s_journal_the_robots_tell_what_they_know(paper_1: Path, tmp_path: Path) -> None:
+def test_without_the_worlds_journal_the_scene_has_the_data_of_the_robots(
+    paper_1: Path, tmp_path: Path
+) -> None:
     for path in paper_1.glob("agent-*.journal"):
         (tmp_path / path.name).write_bytes(path.read_bytes())
     shown, whole = read(tmp_path), read(paper_1)
@@ -90,7 +92,9 @@ def test_without_a_robot_s_journal_what_it_sensed_follows_from_the_world_s(
 
 
 @pytest.mark.parametrize("share", [0.02, 0.3, 0.77])
-def test_a_torn_record_is_shown_up_to_the_tear(paper_1: Path, tmp_path: Path, share: float) -> None:
+def test_a_truncated_recording_is_shown_up_to_the_truncation(
+    paper_1: Path, tmp_path: Path, share: float
+) -> None:
     for path in paper_1.glob("*.journal"):
         data = path.read_bytes()
         (tmp_path / path.name).write_bytes(data[: 1500 + int(share * (len(data) - 1500))])
@@ -110,7 +114,7 @@ def test_a_folder_without_a_journal_holds_nothing_to_see(tmp_path: Path) -> None
         read(tmp_path)
 
 
-def test_what_becomes_of_every_report_is_what_the_air_made_of_it(tmp_path: Path) -> None:
+def test_the_deliveries_in_a_scene_are_those_of_the_simulation(tmp_path: Path) -> None:
     faults = ["loss=0.3, delay=0..3, corrupt=0.2, duplicate=0.3, reorder=0.2", "a->b: reports_per_tick=0.7"]
     scenario = load("random", seed=3, faults=faults)
     in_process.run_mission(scenario, tmp_path)
@@ -133,7 +137,7 @@ def test_what_becomes_of_every_report_is_what_the_air_made_of_it(tmp_path: Path)
     assert ever == {"sent", "heard", "damaged", "lost", "late"}
 
 
-def test_every_report_has_the_fate_that_the_air_gave_it(tmp_path: Path) -> None:
+def test_every_report_has_the_outcome_of_its_deliveries(tmp_path: Path) -> None:
     faults = ["loss=0.3, delay=0..3, corrupt=0.2, duplicate=0.3, reorder=0.2", "a->b: reports_per_tick=0.7"]
     scenario = load("random", seed=3, faults=faults)
     in_process.run_mission(scenario, tmp_path)
@@ -160,7 +164,7 @@ def test_every_report_has_the_fate_that_the_air_gave_it(tmp_path: Path) -> None:
         assert came or under_way or (flight.sender, flight.tick) in lost
 
 
-def test_whose_process_is_gone_is_down_in_every_tick_until_it_is_back(paper_1: Path) -> None:
+def test_a_robot_is_shown_as_down_in_every_tick_without_its_process(paper_1: Path) -> None:
     journals = Journals(paper_1)
     journals.read()
     known, stage = Gathering(), journals.stage

@@ -375,7 +375,7 @@ def test_the_covariance_of_both_poses_is_that_of_all_unknowns_at_once(seed: int,
 
 @few
 @given(seeds)
-def test_without_drift_the_covariance_is_the_inverse_of_the_ranges_information(seed: int) -> None:
+def test_without_odometry_noise_the_covariance_is_the_inverse_of_the_ranges_information(seed: int) -> None:
     one = told(seed, Noise(0.01, 0.03))
     assume(clear(one))
     found = fitted(one, one.guess)

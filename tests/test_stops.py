@@ -111,7 +111,9 @@ def given_up(bystander: Inbox) -> bool:
 # --- lockstep -----------------------------------------------------------------------------------------
 
 
-def test_stopped_for_a_moment_each_in_turn_a_run_goes_on(undisturbed: Path, tmp_path: Path) -> None:
+def test_a_run_continues_after_each_process_is_suspended_for_a_moment(
+    undisturbed: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "out"
     with TandemProcess("run", undisturbed, "--out", out, "-q") as run:
         for turn in range(9):
@@ -127,7 +129,7 @@ def test_stopped_for_a_moment_each_in_turn_a_run_goes_on(undisturbed: Path, tmp_
 
 
 @pytest.mark.parametrize("name", series(NAMES))
-def test_stopped_until_its_link_is_given_up_a_process_goes_on(
+def test_a_process_suspended_until_its_link_times_out_continues(
     name: str, undisturbed: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
@@ -148,7 +150,7 @@ def test_stopped_until_its_link_is_given_up_a_process_goes_on(
 
 @pytest.mark.parametrize("name", series(NAMES))
 @pytest.mark.long
-def test_stopped_for_longer_than_the_patience_a_process_fails_the_run(
+def test_a_process_suspended_for_longer_than_the_timeout_fails_the_run(
     name: str, undisturbed: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
@@ -238,7 +240,7 @@ def test_a_world_s_session_that_receives_and_cannot_send_is_lost(monkeypatch: py
 
 
 @pytest.mark.long
-def test_in_real_time_who_is_stopped_stands_still_from_the_next_period_on(
+def test_a_suspended_robot_stands_still_from_the_next_period_in_real_time(
     assured: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"

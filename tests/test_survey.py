@@ -73,7 +73,7 @@ def apart(one: Pose, other: Pose) -> float:
 
 
 @by_noise
-def test_both_localise_in_the_same_tick_as_well_as_was_asked_for(noise: str) -> None:
+def test_both_localise_in_the_same_tick_to_the_required_accuracy(noise: str) -> None:
     for seed in SEEDS:
         assert_localised(survey(noise, seed))
 
@@ -93,7 +93,7 @@ def test_both_localise_in_other_settings(scenario: Callable[[int], Scenario]) ->
 
 
 @pytest.mark.long
-def test_who_asks_for_more_waits_longer_and_gets_it() -> None:
+def test_a_higher_required_accuracy_takes_longer_and_is_reached() -> None:
     """This holds in the mean, because the required accuracy also changes the path."""
     waited = {0.1: 0, 0.04: 0}
     for seed in range(4, 9):
@@ -105,7 +105,7 @@ def test_who_asks_for_more_waits_longer_and_gets_it() -> None:
     assert waited[0.04] > 1.2 * waited[0.1]
 
 
-def test_a_mission_that_is_cut_short_is_undecided_and_says_what_was_left() -> None:
+def test_a_mission_that_is_cut_short_is_undecided_and_names_the_reason() -> None:
     whole = survey(SIGMA, 4)
     met = next(tick for tick, contact in enumerate(in_contact(whole)) if contact)
     left = []
@@ -159,7 +159,7 @@ def test_a_lost_contact_is_found_again() -> None:
     assert lost
 
 
-def test_who_hears_nothing_where_its_anchor_should_be_goes_back() -> None:
+def test_a_robot_without_detection_where_its_anchor_should_be_drives_back() -> None:
     """A scan of seeds found seed 4 for the drop-outs."""
     recording = survey(NOISES["drop-outs"], 4)
     homing = [robot for robot in ("a", "b") if "homing" in states(recording, robot)]
@@ -188,7 +188,7 @@ def first_too_long(count: int) -> list[int]:
     return [next(found) for _ in range(count)]
 
 
-def test_who_begins_with_outliers_localises_all_the_same() -> None:
+def test_a_robot_whose_first_ranges_are_outliers_localises() -> None:
     for seed in first_too_long(3):
         assert_localised(survey(MANY, seed))
 
@@ -226,7 +226,7 @@ def ticks(scenario: Scenario) -> Iterator[tuple[World, dict[str, RobotState], di
 
 
 @pytest.mark.long
-def test_the_same_mind_takes_the_same_step_and_is_left_as_it_was() -> None:
+def test_a_decision_depends_only_on_the_state_and_leaves_it_unchanged() -> None:
     for world, before, observed in ticks(scenario_of(NOISES["everything"], SHORT)):
         told = {robot: planner.report(state) for robot, state in observed.items()}
         for observation in observations(world):
@@ -246,7 +246,7 @@ def test_the_same_mind_takes_the_same_step_and_is_left_as_it_was() -> None:
                 assert encode(say(decided)) == encode(say(anew))
 
 
-def test_both_hold_the_same_of_each_other_while_they_hear_each_other() -> None:
+def test_both_robots_have_the_same_hypotheses_while_reports_arrive() -> None:
     """Both use the same logs and arithmetic, so neither waits for a claim of the other."""
     held = 0
     for _, current, _ in ticks(scenario_of(SIGMA, 4)):
@@ -278,7 +278,7 @@ def first_impossible(count: int) -> list[int]:
     return [next(found) for _ in range(count)]
 
 
-def test_who_begins_with_a_range_that_cannot_be_localises_all_the_same() -> None:
+def test_a_robot_whose_first_range_is_impossible_localises() -> None:
     for seed in first_impossible(4):
         assert_localised(survey(MANY, seed))
 

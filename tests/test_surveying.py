@@ -78,7 +78,7 @@ def test_a_manoeuvre_leads_where_the_motion_model_says(mission: Mission, way: in
 
 
 @given(st.floats(0.3, 1.0), angles, angles, st.floats(0.4, 3.0))
-def test_alone_a_robot_stays_as_near_its_anchor_as_it_is_told(
+def test_a_robot_alone_stays_within_the_given_distance_of_its_anchor(
     part: float, bearing: float, heading: float, within: float
 ) -> None:
     rho = part * within
@@ -183,7 +183,7 @@ def test_exact_sensors_need_no_clearance_and_the_plan_is_as_it_was() -> None:
     assert rendezvous(exact, 10.0, "assured") == rendezvous(careless, 10.0, "assured")
 
 
-def test_what_is_not_known_makes_the_way_round_longer() -> None:
+def test_uncertainty_makes_the_detour_longer() -> None:
     exact, coarse = replace(MISSION, noise=Noise()), MISSION
     drifting = replace(MISSION, noise=Noise(SIGMA, SIGMA, odometry=VelocityNoise(0.02, 0.02)))
     assert 0.0 < clearance(coarse, 10.0) < clearance(drifting, 10.0) < 0.5 * REACH

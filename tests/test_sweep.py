@@ -218,7 +218,7 @@ def test_a_scheduler_that_is_not_there_is_one_line(folder: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_scheduler_that_accepts_and_says_nothing_is_waited_for_with_a_bound(folder: Path) -> None:
+def test_the_wait_for_a_scheduler_that_sends_nothing_is_bounded(folder: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as mute:
         address = f"tcp://127.0.0.1:{mute.getsockname()[1]}"
         ended = sweep(folder, "both.toml", "out", "--scheduler", address)
@@ -318,7 +318,7 @@ def test_a_sweep_whose_trials_hang_can_be_stopped(folder: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_stopped_sweep_says_so_in_one_line_and_goes_on(folder: Path) -> None:
+def test_an_interrupted_sweep_reports_it_in_one_line_and_resumes(folder: Path) -> None:
     with TandemProcess("sweep", "lengthy.toml", "--out", "out", "--workers", "1", cwd=folder) as command:
         command.until(lambda: parts(folder / "out"), "a chunk is done")
         command.tell(SIGINT)
@@ -439,7 +439,7 @@ def test_results_are_left_in_a_folder_named_for_the_sweep(folder: Path) -> None:
 
 
 @pytest.mark.long
-def test_the_command_that_the_table_prints_plays_the_trial_again(folder: Path) -> None:
+def test_the_printed_command_of_a_trial_runs_it_again(folder: Path) -> None:
     ended = sweep(folder, "both.toml", "out")
     command = shlex.split(next(line for line in ended.out.splitlines() if line.startswith("  tandem run ")))
     assert command[0] == "tandem"
@@ -503,8 +503,20 @@ def test_a_trial_that_breaks_a_rule_fails_the_sweep_and_is_named(
     assert line[heading.index("clean")] == "3"
 
 
+def test_the_command_that_runs_a_trial_again_records_to_a_new_folder(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    results = played(folder, "both.toml", "out", trials=4, play="tests.misbehaving:boastful")
+    monkeypatch.chdir(folder)
+    for name in ("recording-both-0-2", "recording-both-0-2-2", "recording-both-0-2-3"):
+        report.show(results, Path("out"), quiet=False)
+        (line,) = [one for one in capsys.readouterr().out.splitlines() if one.startswith("  tandem run ")]
+        assert line.endswith(f" --out {name}")
+        Path(name).mkdir()
+
+
 @pytest.mark.long
-def test_a_sweep_without_audit_says_nothing_of_it(folder: Path) -> None:
+def test_a_sweep_without_audit_does_not_mention_it(folder: Path) -> None:
     ended = sweep(folder, "both.toml", "out", "--trials", "1", "--no-audit")
     assert "audited" not in ended.out
     assert {(row["violations"], row["first_violation"]) for row in rows(folder / "out")} == {(None, None)}
@@ -514,7 +526,7 @@ def test_a_sweep_without_audit_says_nothing_of_it(folder: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_setting_in_which_nobody_can_meet_is_a_refused_cell(folder: Path) -> None:
+def test_a_cell_in_which_no_robots_can_meet_is_refused(folder: Path) -> None:
     slow = '[[axis]]\nname = "pace"\nfields = ["mission.max_speed", "mission.period"]\nvalues = '
     start = 'name = "slow"\nscenario = "base.toml"\ntrials = 2\n' + slow
     (folder / "slow.toml").write_text(start + "[[1.0, 1.0], [1e-6, 1e-3]]")
@@ -539,7 +551,7 @@ def test_a_sweep_in_which_none_localises_has_its_figures(folder: Path) -> None:
     assert (folder / "out" / "figures" / "ticks-max_ticks.svg").exists()
 
 
-def test_what_the_system_refuses_dask_is_told_as_such() -> None:
+def test_a_resource_that_the_system_refuses_to_dask_is_reported() -> None:
     said = RuntimeError("Cluster failed to start")
     said.__cause__ = OSError(errno.ENOSPC, "No space left on device")
     with pytest.raises(OSError, match="No space left"), cluster._system_errors():
@@ -583,7 +595,7 @@ def test_a_base_scenario_whose_table_is_none_is_one_line(noise: str, folder: Pat
     )
 
 
-def test_a_figure_tells_every_choice_of_the_other_axes_apart_while_they_are_few(
+def test_a_figure_distinguishes_the_values_of_the_other_axes_while_they_are_few(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drawn: dict[str, Figure] = {}
@@ -605,7 +617,7 @@ def test_a_figure_tells_every_choice_of_the_other_axes_apart_while_they_are_few(
 
 
 @pytest.mark.parametrize("name", sorted(spec.shipped()))
-def test_a_sweep_that_ships_can_be_played(name: str) -> None:
+def test_every_shipped_sweep_runs(name: str) -> None:
     sweep = spec.load(name)
     execution.check_columns(sweep, schema_of(sweep, list(cells(sweep))))
     for cell in cells(sweep):
@@ -614,7 +626,7 @@ def test_a_sweep_that_ships_can_be_played(name: str) -> None:
     assert f"{name:10} " in tandem("scenarios").out
 
 
-def test_the_sweep_of_noise_plays_the_same_starts_in_every_cell() -> None:
+def test_the_sweep_of_noise_has_the_same_starts_in_every_cell() -> None:
     sweep = spec.load("noise")
     settings = [setting_of(sweep, cell) for cell in cells(sweep)]
     assert {cell.key for cell in cells(sweep)} == {"{}"}

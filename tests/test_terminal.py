@@ -91,14 +91,14 @@ def test_what_a_terminal_cannot_show_is_escaped(encoding: str, monkeypatch: pyte
     assert shown[1] == "\\x1b[2J"
 
 
-def test_a_table_shows_markup_as_it_was_said() -> None:
+def test_a_table_shows_markup_literally() -> None:
     page = console(file=io.StringIO(), width=80)
     with page.capture() as capture:
         page.print("[red]said[/red] :smile:")
     assert capture.get() == "[red]said[/red] :smile:\n"
 
 
-def test_what_a_robot_says_is_escaped_by_world_agent_audit_and_replay(tmp_path: Path) -> None:
+def test_text_of_a_robot_is_escaped_by_world_agent_audit_and_replay(tmp_path: Path) -> None:
     scenario, out = tmp_path / "paper.toml", tmp_path / "out"
     scenario.write_text(PAPER_1)
     with (
@@ -118,7 +118,7 @@ def test_what_a_robot_says_is_escaped_by_world_agent_audit_and_replay(tmp_path: 
 
 
 @pytest.mark.long
-def test_what_a_robot_says_is_escaped_by_ps_and_is_json_where_that_is_asked_for(tmp_path: Path) -> None:
+def test_text_of_a_robot_is_escaped_by_ps_and_in_its_json(tmp_path: Path) -> None:
     scenario, found = tmp_path / "paper.toml", list[Ended]()
     scenario.write_text(PAPER_1)
     with (
@@ -140,7 +140,7 @@ def test_what_a_robot_says_is_escaped_by_ps_and_is_json_where_that_is_asked_for(
     assert one_line(STATE) in listed.out or b["state"] is None
 
 
-def test_a_live_table_and_an_outcome_on_a_terminal_show_what_a_robot_says_escaped(tmp_path: Path) -> None:
+def test_text_of_a_robot_is_escaped_in_the_live_table_and_the_outcome(tmp_path: Path) -> None:
     scenario, endpoint, shown = tmp_path / "paper.toml", free_endpoint(), b""
     scenario.write_text(PAPER_1)
     ours, theirs = pty.openpty()

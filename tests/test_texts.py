@@ -188,7 +188,7 @@ def test_an_agent_that_gives_up_at_length_leaves_a_journal_that_is_read(tmp_path
         decode(frame, OfRobot, MAX_FRAME_BYTES)
 
 
-def test_a_verdict_of_as_many_words_as_there_may_be_ends_a_run_whose_record_is_read(tmp_path: Path) -> None:
+def test_a_run_that_ends_with_the_longest_verdict_is_read(tmp_path: Path) -> None:
     """The test replaces both robots, which give up at once."""
     scenario, out = tmp_path / "paper.toml", tmp_path / "out"
     scenario.write_text(PAPER_1)

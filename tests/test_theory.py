@@ -241,7 +241,7 @@ def test_two_points_or_collinear_ones_leave_the_mirror_image_too_and_nothing_els
 @pytest.mark.parametrize(
     ("half_turns", "classes"), [(0, 2), (1, 1), (2, 2), (3, 1), (4, 2), (-1, 1), (-2, 2)]
 )
-def test_a_third_range_tells_the_branches_apart_unless_omega_1_makes_full_turns(
+def test_a_third_range_distinguishes_the_branches_unless_omega_1_makes_full_turns(
     half_turns: int, classes: int
 ) -> None:
     """Below eq. (3) the paper excludes omega_1 = j pi. Only omega_1 T_s = 2 j pi keeps q_2 on the line.

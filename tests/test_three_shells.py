@@ -37,7 +37,7 @@ def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("order", series(permutations(["world", "a", "b"]), 2), ids="-".join)
-def test_any_order_of_starting_gives_the_same_record(
+def test_any_order_of_starting_gives_the_same_recording(
     order: tuple[str, ...], paper_1: Path, tmp_path: Path
 ) -> None:
     endpoint, out = free_endpoint(), tmp_path / "out"
@@ -66,7 +66,7 @@ def test_any_order_of_starting_gives_the_same_record(
     assert not processes_of(endpoint)
 
 
-def test_each_shell_may_keep_its_record_in_a_folder_of_its_own(paper_1: Path, tmp_path: Path) -> None:
+def test_each_shell_may_write_its_journal_to_its_own_folder(paper_1: Path, tmp_path: Path) -> None:
     with world("paper-1", "--out", tmp_path / "world") as (clock, endpoint), ExitStack() as shells:
         for robot in ("a", "b"):
             agent = TandemProcess("agent", robot, "--connect", endpoint, "--out", tmp_path / robot)
@@ -97,7 +97,7 @@ def test_several_pairs_localise_side_by_side_in_one_world(pairs: int, tmp_path: 
 # --- no world -----------------------------------------------------------------------------------------
 
 
-def test_an_agent_without_a_world_says_so_and_gives_up(tmp_path: Path) -> None:
+def test_an_agent_without_a_world_reports_it_and_gives_up(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     ended = tandem("agent", "a", "--connect", endpoint, "--connect-timeout", "6", "--out", tmp_path / "out")
     assert ended.status == 3
@@ -130,7 +130,7 @@ def waiting(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         yield endpoint
 
 
-def test_an_unknown_robot_is_refused_with_those_that_there_are(waiting: str) -> None:
+def test_an_unknown_robot_is_refused_with_the_known_ones(waiting: str) -> None:
     ended = tandem("agent", "z", "--connect", waiting)
     assert ended == (2, "", "tandem agent: this world has no robot 'z'; it has a, b\n")
 
@@ -141,7 +141,7 @@ def test_a_second_agent_of_the_same_robot_is_refused(waiting: str) -> None:
 
 
 @pytest.mark.long
-def test_an_agent_that_is_refused_leaves_the_mission_alone(paper_1: Path, tmp_path: Path) -> None:
+def test_an_agent_that_is_refused_does_not_disturb_the_mission(paper_1: Path, tmp_path: Path) -> None:
     with world("paper-1", "--out", tmp_path) as (clock, endpoint):
         with TandemProcess("agent", "a", "--connect", endpoint, "--out", tmp_path) as a:
             a.until_answered("a", tmp_path)
@@ -175,7 +175,7 @@ def test_whatever_a_stranger_answers_an_agent_finds_its_world(stranger: str) -> 
             agent.until_prints("a: in run mine, with b")
 
 
-def test_an_agent_that_is_answered_nonsense_alone_looks_on_and_says_why() -> None:
+def test_an_agent_that_gets_only_invalid_answers_keeps_searching_and_prints_the_reason() -> None:
     with session.open_router(listening(endpoint := free_endpoint())) as link:
         _token = session.show_alive(link, keys.world_alive("mine"))
         link.declare_queryable(keys.config("mine", "*"), lambda query: query.reply(query.key_expr, b"junk"))
@@ -184,7 +184,7 @@ def test_an_agent_that_is_answered_nonsense_alone_looks_on_and_says_why() -> Non
     assert "gave up after 1 s: the world's RobotConfig cannot be decoded: 4 bytes" in ended.err
 
 
-def test_an_agent_that_meets_several_runs_must_be_told_which() -> None:
+def test_an_agent_that_finds_several_runs_requires_the_run_flag() -> None:
     with (
         world("paper-1", "--run", "mine") as (_, endpoint),
         session.open_client(at(endpoint), unanswered) as link,

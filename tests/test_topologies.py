@@ -104,7 +104,7 @@ TOPOLOGIES = (
 
 
 @pytest.mark.parametrize("topology", series(TOPOLOGIES, 2))
-def test_a_mission_through_routers_leaves_the_record_of_one_without_network(
+def test_a_mission_through_routers_has_the_recording_of_one_without_a_network(
     topology: str, tmp_path: Path
 ) -> None:
     expected, out = record_of(PAPER_1, tmp_path), tmp_path / "out"
@@ -141,7 +141,7 @@ def test_a_mission_through_routers_leaves_the_record_of_one_without_network(
 @pytest.mark.parametrize(
     "topology", series(["a router between", "a router on each robot, by the robot's keys"])
 )
-def test_a_mission_through_routers_that_enforce_the_rules_leaves_the_same_record(
+def test_a_mission_through_routers_with_access_rules_has_the_same_recording(
     topology: str, tmp_path: Path
 ) -> None:
     expected, out, keys = record_of(PAPER_1, tmp_path), tmp_path / "out", tmp_path / "keys"
@@ -186,14 +186,14 @@ def test_a_router_may_come_last(tmp_path: Path) -> None:
         same(mission, out, expected)
 
 
-def test_an_agent_that_is_a_router_says_where_it_cannot_listen() -> None:
+def test_an_agent_that_is_a_router_names_the_endpoint_it_cannot_listen_on() -> None:
     x = free_endpoint()
     with session.open_router(listening(x)):
         ended = tandem("agent", "a", *listen(x), *connect(free_endpoint()))
     assert ended == (2, "", f"tandem agent: --listen: {x}: already in use\n")
 
 
-def test_a_world_whose_router_is_not_there_says_what_to_check_and_gives_up(tmp_path: Path) -> None:
+def test_a_world_without_its_router_prints_what_to_check_and_gives_up(tmp_path: Path) -> None:
     x = free_endpoint()
     ended = tandem("world", "paper-1", "--connect", x, "--timeout", "1", "--out", tmp_path / "out")
     what = "nothing listens there; check the address, and that the router runs"
@@ -201,7 +201,7 @@ def test_a_world_whose_router_is_not_there_says_what_to_check_and_gives_up(tmp_p
     assert not (tmp_path / "out").exists()
 
 
-def test_a_world_that_listens_says_what_to_check_of_a_router_that_is_not_there_and_plays(
+def test_a_world_that_listens_reports_a_missing_router_and_runs(
     tmp_path: Path,
 ) -> None:
     x, y = free_endpoint(), free_endpoint()

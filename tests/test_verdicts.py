@@ -36,7 +36,7 @@ def test_a_robot_whose_peer_has_given_up_gives_up_too() -> None:
     assert verdict == Undecided(f"b reports: {GAVE_UP.reason}")
 
 
-def test_a_reason_handed_on_stays_within_what_a_message_can_hold() -> None:
+def test_a_forwarded_reason_fits_a_message() -> None:
     met = next(step for step in steps("paper-1") if step.heard["a"])
     told = [replace(report, verdict=Undecided("x" * 300)) for report in met.heard["a"]]
     verdict = planner.decide(met.observed["a"], told).verdict
@@ -56,7 +56,7 @@ def test_a_wrong_claim_cannot_be_taken_back() -> None:
     assert mission_outcome.outcome == "wrong"
 
 
-def test_the_letter_gives_up_where_the_third_mutual_range_settles_nothing(
+def test_the_paper_planner_gives_up_if_the_third_mutual_range_selects_no_placement(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """b has driven its last manoeuvre, and a stops, as in the paper. No placement is well determined here."""
@@ -102,7 +102,7 @@ def after_claims(text: str, a: Covariance | None, *, off: float = 0.0) -> Missio
         (3e7, 3e7, "a claims a position known to 3e+07 m, required 0.1"),
     ],
 )
-def test_a_robot_that_knows_its_pose_less_well_than_was_asked_is_not_localised(
+def test_a_claim_below_the_required_accuracy_is_not_localised(
     position: float, heading: float, what: str | None
 ) -> None:
     expected = MissionOutcome("localised") if what is None else MissionOutcome("undecided", what)
@@ -120,7 +120,7 @@ def test_no_sigma_excuses_a_claim_that_is_farther_off_than_the_accuracy_allows()
 
 
 @pytest.mark.parametrize("whose", ["its own", "its peer's"])
-def test_without_a_world_a_claim_less_accurate_than_was_asked_does_not_end_localised(whose: str) -> None:
+def test_a_claim_below_the_required_accuracy_is_not_localised_in_hardware_mode(whose: str) -> None:
     config = parse(NOISY, "noisy", seed=1).config("a")
     good, vague = (Localised(ORIGIN, covariance(sigma, 0.01)) for sigma in (0.05, 4.5e7))
     own, peers = (vague, good) if whose == "its own" else (good, vague)
@@ -153,7 +153,7 @@ def honest_claims(
 
 
 @pytest.mark.parametrize("planner_name", ["paper", "assured"])
-def test_every_claim_of_an_honest_robot_is_as_accurate_as_was_asked(planner_name: str) -> None:
+def test_every_claim_of_an_honest_robot_has_the_required_accuracy(planner_name: str) -> None:
     assert honest_claims(planner_name, [0.001, 0.05], range(3)) > 0
 
 
@@ -161,7 +161,7 @@ def test_every_claim_of_an_honest_robot_is_as_accurate_as_was_asked(planner_name
 @pytest.mark.parametrize("sigma", [0.001, 0.01, 0.05, 0.1])
 @pytest.mark.parametrize("outliers", [0.0, 0.05])
 @pytest.mark.parametrize("planner_name", ["paper", "assured"])
-def test_every_claim_of_many_noisy_missions_is_as_accurate_as_was_asked(
+def test_every_claim_of_many_noisy_missions_has_the_required_accuracy(
     planner_name: str, outliers: float, sigma: float
 ) -> None:
     found = honest_claims(planner_name, [sigma], range(25), outliers)

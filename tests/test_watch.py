@@ -51,7 +51,7 @@ WITH_TIMEOUT = ("--timeout", "600")
 # --- a recording ---------------------------------------------------------------------------------------
 
 
-def test_a_record_scrubbed_to_tick_46_shows_the_first_contact(opened: Open, address: str) -> None:
+def test_a_recording_at_tick_46_shows_the_first_contact(opened: Open, address: str) -> None:
     page = opened(f"{address}#tick=45")
     until_shown(page, 45)
     expect(page.locator(".card[data-robot=a] dd").first).to_contain_text("b is not in range")
@@ -100,7 +100,7 @@ def test_the_plane_is_drawn_in_the_colours_of_what_happens(opened: Open, address
 
 
 @pytest.mark.long
-def test_what_becomes_of_reports_is_drawn_on_their_way(opened: Open, tmp_path: Path) -> None:
+def test_the_deliveries_of_reports_are_drawn_between_the_robots(opened: Open, tmp_path: Path) -> None:
     seen = {}
     for fault in ("loss=0", "loss=1", "corrupt=1"):
         recording = tmp_path / fault
@@ -114,7 +114,7 @@ def test_what_becomes_of_reports_is_drawn_on_their_way(opened: Open, tmp_path: P
 
 
 @pytest.mark.long
-def test_with_the_truth_hidden_only_what_a_robot_knows_is_there(opened: Open, address: str) -> None:
+def test_with_the_truth_hidden_the_page_shows_only_estimates(opened: Open, address: str) -> None:
     page = opened(f"{address}#tick=20")
     until_shown(page, 20)
     plane, truth = page.locator("#canvas"), picture(page)
@@ -137,7 +137,7 @@ def test_with_the_truth_hidden_only_what_a_robot_knows_is_there(opened: Open, ad
     shot(page, "truth-shown")
 
 
-def test_all_of_it_goes_by_keyboard_alone(opened: Open, address: str) -> None:
+def test_the_page_can_be_used_by_keyboard_alone(opened: Open, address: str) -> None:
     page = opened(f"{address}#tick=0")
     until_shown(page, 0)
     press = page.keyboard.press
@@ -184,7 +184,7 @@ def test_all_of_it_goes_by_keyboard_alone(opened: Open, address: str) -> None:
     assert focused in {"A", "INPUT", "BUTTON", "SELECT"}
 
 
-def test_robots_without_a_world_are_shown_by_what_they_know(
+def test_robots_in_hardware_mode_are_shown_by_their_estimates(
     opened: Open, paper_1: Path, tmp_path: Path
 ) -> None:
     for path in paper_1.glob("agent-*.journal"):
@@ -211,7 +211,7 @@ def as_a_driver_tells(message: Message) -> Message:
 
 
 @pytest.mark.long
-def test_it_can_be_read_on_360_pixels(opened: Open, address: str) -> None:
+def test_the_page_is_legible_at_360_pixels(opened: Open, address: str) -> None:
     page = opened(f"{address}#tick=48", width=360, height=740)
     until_shown(page, 48)
     assert page.evaluate("document.documentElement.scrollWidth") <= 360
@@ -223,7 +223,7 @@ def test_it_can_be_read_on_360_pixels(opened: Open, address: str) -> None:
 
 
 @pytest.mark.long
-def test_it_is_dark_where_the_system_is(opened: Open, address: str) -> None:
+def test_the_page_is_dark_if_the_system_is(opened: Open, address: str) -> None:
     page = opened(f"{address}#tick=47", dark=True)
     until_shown(page, 47)
     shot(page, "dark")
@@ -260,7 +260,7 @@ def test_fifty_robots_are_shown(opened: Open, tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_lost_late_and_damaged_reports_are_told(opened: Open, tmp_path: Path) -> None:
+def test_lost_late_and_damaged_reports_are_shown(opened: Open, tmp_path: Path) -> None:
     recording = tmp_path / "record"
     recording.mkdir()
     in_process.run_mission(
@@ -279,7 +279,7 @@ def test_lost_late_and_damaged_reports_are_told(opened: Open, tmp_path: Path) ->
 
 
 @pytest.mark.long
-def test_the_records_in_a_folder_are_listed(opened: Open, paper_1: Path, tmp_path: Path) -> None:
+def test_the_recordings_in_a_folder_are_listed(opened: Open, paper_1: Path, tmp_path: Path) -> None:
     shutil.copytree(paper_1, tmp_path / "whole")
     shutil.copytree(paper_1, tmp_path / "torn")
     for torn in (tmp_path / "torn").glob("*.journal"):
@@ -373,7 +373,7 @@ def test_a_page_keeps_up_with_a_mission_as_fast_as_it_goes(opened: Open, tmp_pat
         assert run.ended().status == 130
 
 
-def test_run_watch_stays_until_ctrl_c_and_leaves_the_record_that_it_would_have_left(
+def test_run_watch_serves_until_ctrl_c_and_writes_the_usual_recording(
     opened: Open, paper_1: Path, tmp_path: Path
 ) -> None:
     with TandemProcess("run", "paper-1", "--watch", "--out", tmp_path / "record", "-q") as run:
@@ -453,7 +453,7 @@ def test_the_server_answers_its_own_page_only_and_seals_what_it_sends(address: s
         assert asked(path).status == 404
 
 
-def test_ctrl_c_ends_the_page_with_somebody_watching(paper_1: Path) -> None:
+def test_ctrl_c_ends_a_page_that_is_open_in_a_browser(paper_1: Path) -> None:
     with watching(paper_1) as (command, where):
         host = where.removeprefix("http://").rstrip("/")
         connection = http.client.HTTPConnection(host, timeout=BOUND_S)
@@ -499,7 +499,7 @@ def test_a_port_that_is_taken_is_one_line(paper_1: Path) -> None:
             assert ended.err == said
 
 
-def test_a_page_on_every_address_is_told_of_and_answers_to_addresses_and_to_no_names(paper_1: Path) -> None:
+def test_a_page_on_every_address_answers_to_addresses_and_to_no_names(paper_1: Path) -> None:
     with TandemProcess("watch", paper_1, "--address", "0.0.0.0") as command:
         command.until_prints("until Ctrl-C")
         assert "tandem watch: --address: every machine that reaches 0.0.0.0 can watch\n" in command.err
@@ -524,7 +524,7 @@ def test_a_page_on_an_address_of_this_machine_answers_to_it(paper_1: Path) -> No
             assert answer.status == 200
 
 
-def test_an_address_that_cannot_be_had_is_one_line(paper_1: Path) -> None:
+def test_an_unavailable_address_is_one_line(paper_1: Path) -> None:
     for address, said in {
         "192.0.2.1": "--address: 192.0.2.1 cannot be used: Cannot assign requested address",
         "robot": "argument --address: 'robot' is not an IP address such as 127.0.0.1 or 0.0.0.0",

@@ -57,7 +57,9 @@ def table(folder: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_an_export_has_what_was_measured_and_believed_and_no_truth(folders: tuple[Path, Path]) -> None:
+def test_an_export_of_hardware_mode_has_measurements_and_estimates_and_no_truth(
+    folders: tuple[Path, Path],
+) -> None:
     whole, alone = folders
     for folder in folders:
         ended = tandem("export", folder)
@@ -98,7 +100,7 @@ def test_paths_are_the_odometry_laid_through_the_claim(folders: tuple[Path, Path
     assert line(figure, "path-a") == [(p.x, p.y) for p in told.a.path]
 
 
-def test_what_needs_no_truth_is_drawn_as_with_a_world(folders: tuple[Path, Path]) -> None:
+def test_figures_without_the_truth_are_drawn_as_in_simulation(folders: tuple[Path, Path]) -> None:
     whole, alone = folders
     known, told = pair_of(whole), alone_of(alone)
     assert told.mutual == known.mutual
@@ -122,7 +124,7 @@ def test_what_needs_no_truth_is_drawn_as_with_a_world(folders: tuple[Path, Path]
     assert "true separation" not in labels
 
 
-def test_the_command_draws_what_can_be_known_and_says_what_cannot(folders: tuple[Path, Path]) -> None:
+def test_the_command_draws_what_it_can_and_reports_the_rest(folders: tuple[Path, Path]) -> None:
     _, alone = folders
     ended = tandem("figures", alone, "--format", "png")
     assert ended.status == 0, ended.err
@@ -136,7 +138,9 @@ def test_the_command_draws_what_can_be_known_and_says_what_cannot(folders: tuple
     assert [text for text in lines if "no robot-b: a recording in hardware mode has no ground truth" in text]
 
 
-def test_of_one_robot_there_is_what_it_alone_knows(folders: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_single_journal_shows_the_estimates_of_one_robot(
+    folders: tuple[Path, Path], tmp_path: Path
+) -> None:
     _, alone = folders
     (tmp_path / "agent-b.journal").write_bytes((alone / "agent-b.journal").read_bytes())
     told = alone_of(tmp_path, "b")
@@ -155,7 +159,7 @@ def test_of_one_robot_there_is_what_it_alone_knows(folders: tuple[Path, Path], t
     assert {row["robot"] for row in table(tmp_path)} == {"b"}
 
 
-def test_a_robot_that_was_never_briefed_is_passed_over(folders: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_robot_without_a_configuration_is_skipped(folders: tuple[Path, Path], tmp_path: Path) -> None:
     _, alone = folders
     (tmp_path / "agent-a.journal").write_bytes((alone / "agent-a.journal").read_bytes())
     (tmp_path / "agent-b.journal").touch()
@@ -172,7 +176,7 @@ def test_a_robot_that_was_never_briefed_is_passed_over(folders: tuple[Path, Path
     assert ended.err.endswith("there is no world.journal, and no robot's journal has a configuration\n")
 
 
-def test_whose_journal_is_shorter_takes_nothing_from_its_peer(
+def test_a_shorter_journal_does_not_shorten_that_of_the_peer(
     folders: tuple[Path, Path], tmp_path: Path
 ) -> None:
     whole, alone = folders
@@ -209,7 +213,7 @@ def test_each_pair_has_pictures_of_its_own(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["figures", "export", "audit", "replay"])
-def test_journals_of_two_runs_are_no_record(command: str, folders: tuple[Path, Path], tmp_path: Path) -> None:
+def test_journals_of_two_runs_are_refused(command: str, folders: tuple[Path, Path], tmp_path: Path) -> None:
     _, alone = folders
     (tmp_path / "agent-b.journal").write_bytes((alone / "agent-b.journal").read_bytes())
     (tmp_path / "other").mkdir()
@@ -222,7 +226,7 @@ def test_journals_of_two_runs_are_no_record(command: str, folders: tuple[Path, P
     )
 
 
-def test_a_tick_that_is_left_out_is_no_record(folders: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_journal_without_one_of_its_ticks_is_refused(folders: tuple[Path, Path], tmp_path: Path) -> None:
     _, alone = folders
     frames = [
         frame
@@ -235,7 +239,7 @@ def test_a_tick_that_is_left_out_is_no_record(folders: tuple[Path, Path], tmp_pa
     assert ended.err.endswith("agent-a.journal: an Observation of tick 6 is out of order\n")
 
 
-def test_the_audit_holds_robots_to_their_limits_and_to_what_they_sensed(folders: tuple[Path, Path]) -> None:
+def test_the_audit_checks_the_limits_of_robots_and_their_observations(folders: tuple[Path, Path]) -> None:
     _, alone = folders
     ended = tandem("audit", alone)
     assert ended.status == 0, ended.out
@@ -257,7 +261,7 @@ def another_range(message: Message) -> Message:
 @pytest.mark.parametrize(
     ("spoilt", "rules"), [(too_fast, {"limits", "decision"}), (another_range, {"log", "report", "decision"})]
 )
-def test_without_a_world_the_audit_finds_what_breaks_a_rule(
+def test_the_audit_finds_violations_in_hardware_mode(
     spoilt: Callable[[Message], Message], rules: set[str], folders: tuple[Path, Path]
 ) -> None:
     _, alone = folders

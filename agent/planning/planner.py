@@ -47,7 +47,7 @@ from protocol.messages import (
     Report,
     Undecided,
 )
-from protocol.mission import RANGE_MARGIN
+from protocol.mission import RANGE_MARGIN, Mission, PlannerName
 from protocol.motion import ORIGIN, REST, Controls, Pose, step
 from protocol.rounding import SAME
 
@@ -129,7 +129,7 @@ def decide(state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
             return state
     if not state.in_contact:
         return state
-    if _uses_active_sensing(state):
+    if uses_active_sensing(state.config.planner_name, state.config.mission):
         return assured.after_reports(state)
     match state.mode:
         case Aligning() | Radial() | Tangent() | Orbiting() if encounter.can_begin_phase3(state):
@@ -207,7 +207,8 @@ def _with_reports(state: RobotState, reports: Sequence[Report]) -> RobotState:
 
 def _advance_mode(state: RobotState, anchor_range: float | None) -> RobotState:
     """Return `state` with the mode that follows from the robot's own sensors."""
-    if _uses_active_sensing(state) and not isinstance(state.mode, Asleep):
+    config = state.config
+    if uses_active_sensing(config.planner_name, config.mission) and not isinstance(state.mode, Asleep):
         return assured.after_observation(state, anchor_range)
     match state.mode:
         case Orbiting(None) | Standing() | Waiting() | Done():
@@ -239,9 +240,9 @@ def _advance_mode(state: RobotState, anchor_range: float | None) -> RobotState:
             return state
 
 
-def _uses_active_sensing(state: RobotState) -> bool:
-    """Return whether the robot uses active sensing: planner `assured` with noisy sensors."""
-    return state.config.planner_name == "assured" and not state.config.mission.noise.exact
+def uses_active_sensing(planner_name: PlannerName, mission: Mission) -> bool:
+    """Return whether robots choose each manoeuvre by its information: `assured` with noisy sensors."""
+    return planner_name == "assured" and not mission.noise.exact
 
 
 def _repeats_last_range(state: RobotState, observation: Observation) -> bool:

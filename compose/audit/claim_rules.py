@@ -9,6 +9,7 @@ from msgspec.structs import astuple
 from agent.planning.assured import CHECKED, CHECKED_WITH_OUTLIERS
 from agent.planning.paper import CHECKED as CHECKED_BY_LETTER
 from agent.planning.phase3_last_manoeuvre import ELSEWHERE
+from agent.planning.planner import uses_active_sensing
 from agent.planning.range_seeking import travelled
 from agent.process.agent_journal import Past
 from compose.audit.evidence import Evidence
@@ -64,7 +65,8 @@ def _redundant(evidence: Evidence, placed: RobotSpec, past: Past, tick: int) -> 
     if noise.exact:
         places = _places(evidence, placed, mutual)
         return _too_few(tick, placed, "relative placements with a mutual range", places, PLACES)
-    least = CHECKED if scenario.planner_name == "assured" else CHECKED_BY_LETTER
+    active = uses_active_sensing(scenario.planner_name, scenario.mission)
+    least = CHECKED if active else CHECKED_BY_LETTER
     if noise.outliers:
         least = CHECKED_WITH_OUTLIERS
     return _too_few(tick, placed, "mutual ranges", len(mutual), least)

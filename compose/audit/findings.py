@@ -87,7 +87,7 @@ class Findings(msgspec.Struct, frozen=True):
     scenario: str
     """Name of the scenario; in hardware mode, the names of the robots."""
     ticks: int
-    """Number of ticks in the recording."""
+    """Number of elapsed ticks, which is the last recorded tick: ticks are counted from 0."""
     counts: tuple[Count, ...]
     """Counts of each rule."""
     violations: tuple[Violation, ...]

@@ -69,5 +69,5 @@ def audit_hardware_run(
         evidence,
         other_versions(evidence.pasts),
         scenario=f"{' and '.join(testimonies)}, hardware mode",
-        ticks=max([len(past.steps) for past in evidence.pasts.values()], default=0),
+        ticks=max([0, *[past.steps[-1].observation.tick for past in evidence.pasts.values() if past.steps]]),
     )

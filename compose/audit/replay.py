@@ -42,6 +42,7 @@ class Replay(msgspec.Struct, frozen=True):
 
     scenario: str
     ticks: int
+    """Number of elapsed ticks, as in `Findings`."""
     checks: int
     """Number of compared messages."""
     differences: tuple[Violation, ...]

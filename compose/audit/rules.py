@@ -75,6 +75,6 @@ def audit_world_run(
         evidence,
         otherwise(run.environment, of_world()) or other_versions(evidence.pasts),
         scenario=run.scenario.name,
-        ticks=len(run.ticks),
+        ticks=run.ticks[-1].world.truth.tick if run.ticks else 0,
         links=link_statistics(evidence),
     )

@@ -3,37 +3,33 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from agent.process.discovery import NoWorld, Search, Unwelcome
 from agent.process.node import AgentProcess, run_agent
 from agent.process.recovery import Memory, remember
 from agent.process.robot import Robot
-from compose.cli.arguments import (
-    add_closing,
-    add_connect_timeout,
-    add_connection,
-    add_fsync,
+from compose.cli.arguments import add_closing, add_connect_timeout, name
+from compose.cli.participant import (
     add_launched,
-    add_listen,
-    add_running,
-    kill,
-    name,
+    add_participation,
+    endpoints_of,
+    old_journal,
+    participate,
+    warn_beyond,
 )
-from compose.errors import ENDED, FAILED, STOPPED, UserError, status_of
-from compose.launch.signals import stop_by_signal, stop_with_launcher
-from compose.network import beyond, reach
+from compose.errors import ENDED, UserError, status_of
+from compose.recording.run import agent_journal
 from compose.recording.summary_json import ended
 from compose.scenario import kills
 from compose.terminal.outcome import reopened
-from protocol.journal.journal_file import CannotRecord, CorruptJournal, Journal
+from protocol.journal.journal_file import CorruptJournal, Journal
 from protocol.journal.resume import Retrace
 from protocol.messages import MissionEnd, RobotConfig
 from protocol.network import session
-from protocol.network.endpoints import Endpoints
-from protocol.network.inbox import Inbox, Interrupted
+from protocol.network.inbox import Inbox
 from protocol.output import say
 
+MISSING = "--connect ENDPOINT is required, such as tcp/127.0.0.1:7447"
 ENDED_SEARCH_S = 3.0
 """s for which an agent that resumes after its MissionEnd looks for a world that may lack its FinalReport."""
 ENDED_TIMEOUT_S = 10.0
@@ -43,52 +39,32 @@ ENDED_TIMEOUT_S = 10.0
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `tandem agent`."""
     parser.add_argument("id", type=name, metavar="ID", help="id of the robot in the scenario")
-    add_running(parser)
-    parser.add_argument(
-        "--run", type=name, metavar="NAME", help="name of the run [default: the only one that is running]"
-    )
+    add_participation(parser, "the only one that is running")
     add_connect_timeout(parser, "a world")
-    add_connection(parser)
-    add_listen(parser, "endpoint on which this process is a Zenoh router")
-    add_fsync(parser)
     add_launched(parser)
-    parser.add_argument("--kill", type=kill, action="append", default=[], help=argparse.SUPPRESS)
     add_closing(parser, "tandem agent a --connect tcp/127.0.0.1:7447 --out recording-a", "docs/network.md")
 
 
 def main(options: argparse.Namespace) -> int:
     """Run the agent to the end of its mission, and return the exit status of the outcome."""
-    inbox = Inbox(f"tandem agent {options.id}")
-    if options.launched:
-        stop_with_launcher(inbox)
-    stop_by_signal(inbox)
-    try:
-        end = _run(options, inbox)
-    except session.CannotListen as error:
-        raise UserError(f"--listen: {error}") from None
-    except CannotRecord as error:
-        raise UserError(f"--out: {error}") from None
-    except CorruptJournal as error:
-        raise UserError(f"--out: {error}; choose another folder") from None
-    except Unwelcome as error:
-        raise UserError(str(error)) from None
-    except NoWorld as error:
-        inbox.say(str(error))
-        return FAILED
-    except Interrupted as signal_name:
-        inbox.say(f"stopped by {signal_name}")
-        return STOPPED
-    if options.launched:
-        return ENDED
-    say(f"{options.id}: {ended(end.outcome, end.tick, end.reason)}")
-    return status_of(end.outcome)
+
+    def take_part(inbox: Inbox) -> int:
+        try:
+            end = _run(options, inbox)
+        except Unwelcome as error:
+            raise UserError(str(error)) from None
+        if options.launched:
+            return ENDED
+        say(f"{options.id}: {ended(end.outcome, end.tick, end.reason)}")
+        return status_of(end.outcome)
+
+    return participate(f"tandem agent {options.id}", take_part, (NoWorld,), launched=options.launched)
 
 
 def _run(options: argparse.Namespace, inbox: Inbox) -> MissionEnd:
     """Run the agent, resumed from its journal if there is one, and return the MissionEnd."""
-    endpoints = _endpoints(options)
-    path: Path | None = options.out / f"agent-{options.id}.journal" if options.out is not None else None
-    old = Retrace(path, fsync=options.fsync) if path is not None and path.exists() else None
+    endpoints = endpoints_of(options, f"agent-{options.id}", MISSING)
+    old = old_journal(options, agent_journal(options.id))
     memory = remember(old) if old is not None else None
     end = memory.end if memory is not None else None
     which = f"world of run '{options.run}'" if options.run else "world"
@@ -102,10 +78,6 @@ def _run(options: argparse.Namespace, inbox: Inbox) -> MissionEnd:
             )
         ready = _ready(options, config, old, memory, inbox)
         return AgentProcess(ready, run, inbox, timeout=timeout, on_kill_point=kills.taker(options.kill))
-
-    def warn() -> None:
-        if (warning := beyond(endpoints)) is not None:
-            inbox.say(warning)
 
     def announce(run: str, config: RobotConfig) -> None:
         if not (options.quiet or options.launched):
@@ -125,19 +97,11 @@ def _run(options: argparse.Namespace, inbox: Inbox) -> MissionEnd:
         endpoints,
         Search(which, endpoints, wait, inbox),
         start=start,
-        on_first_link=warn,
+        on_first_link=lambda: warn_beyond(endpoints, inbox),
         on_joined=announce,
         on_end=leave,
         end=end,
     )
-
-
-def _endpoints(options: argparse.Namespace) -> Endpoints:
-    """Return the endpoints of the flags. Raises UserError if there are none."""
-    found = reach(options, f"agent-{options.id}")
-    if not found.connect and not found.listen:
-        raise UserError("--connect ENDPOINT is required, such as tcp/127.0.0.1:7447")
-    return found
 
 
 def _ready(
@@ -152,7 +116,7 @@ def _ready(
     if old is not None:
         journal = reopened(old, inbox)
     elif options.out is not None:
-        journal = Journal(options.out / f"agent-{options.id}.journal", fsync=options.fsync)
+        journal = Journal(options.out / agent_journal(options.id), fsync=options.fsync)
     if memory is None:
         return Memory(config, Robot(config, journal))
     memory.robot.keep(journal)

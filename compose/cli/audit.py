@@ -33,7 +33,7 @@ def main(options: argparse.Namespace) -> int:
 
 
 def _show(findings: Findings) -> None:
-    say(f"{findings.scenario}: {_count(len(findings.violations))} in {findings.ticks} ticks", "")
+    say(f"{findings.scenario}: {_count(len(findings.violations))} over {findings.ticks} ticks", "")
     say(f"{'rule':10}{'checks':>8}{'violations':>12}")
     for one in findings.counts:
         say(f"{one.rule:10}{one.checks:>8}{one.violations:>12}")

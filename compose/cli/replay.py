@@ -32,13 +32,13 @@ def main(options: argparse.Namespace) -> int:
             say(f"{replayed.versions}: that alone can lead to other decisions")
     elif replayed.rounding:
         say(
-            f"{replayed.scenario}: as recorded but for the last bits, in {replayed.ticks} ticks: "
+            f"{replayed.scenario}: as recorded but for the last bits, over {replayed.ticks} ticks: "
             f"{replayed.rounding} of {replayed.checks} checks differ by rounding alone"
         )
         say(str(replayed.versions))
     else:
         counts = f"{replayed.ticks} ticks ({replayed.checks} checks)"
-        say(f"{replayed.scenario}: as recorded, to the bit, in {counts}")
+        say(f"{replayed.scenario}: as recorded, to the bit, over {counts}")
     for tear in replayed.tears:
         say(f"{_where(tear)}: {tear.what}")
     for name, size in torn.items():

@@ -7,36 +7,24 @@ import time
 from contextlib import closing
 from pathlib import Path
 
-from compose.cli.arguments import (
-    add_closing,
-    add_connect_timeout,
-    add_connection,
-    add_driver_options,
-    add_fsync,
-    add_listen,
-    add_running,
-    name,
-)
-from compose.errors import ENDED, FAILED, STOPPED, UserError, status_of
+from compose.cli.arguments import add_closing, add_connect_timeout, add_driver_options, name
+from compose.cli.participant import RELISTEN_S, add_participation, participate, warn_beyond
+from compose.errors import ENDED, status_of
 from compose.hardware.driver_recording import recorded
 from compose.launch.driver_loader import briefed, driver_class, made, mission, options_of
 from compose.launch.processes import STOP_S, ChildFailed, MissionProcess, free_endpoint
-from compose.launch.signals import stop_by_signal
-from compose.network import beyond, reach
+from compose.network import reach
 from compose.recording.run import folder_for
 from compose.recording.summary_json import ended
 from compose.scenario.scenario_file import check_rate
-from protocol.journal.journal_file import CannotRecord, CorruptJournal
 from protocol.messages import Localised, MissionEnd
 from protocol.motion import wrap
 from protocol.network import access_control, session
 from protocol.network.endpoints import Endpoints
-from protocol.network.inbox import Inbox, Interrupted
+from protocol.network.inbox import Inbox
 from protocol.output import say
 from world.hardware.bridge import Field, NoStart
 
-RELISTEN_S = 5.0
-"""s to wait for the port of a robot that has just been killed to become free."""
 LEAST_S = 0.1
 """The least time between two starts of an agent (s): one that ends at once must not load the machine."""
 
@@ -93,13 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="scenario of the mission: a name or a TOML file; start poses are not used",
     )
     add_driver_options(parser)
-    add_running(parser)
-    add_connection(parser)
-    add_listen(parser, "endpoint on which the peer can reach this robot")
-    parser.add_argument(
-        "--run", type=name, metavar="NAME", help="name of the run [default: the scenario's name]"
-    )
-    add_fsync(parser)
+    add_participation(parser, "the scenario's name", "endpoint on which the peer can reach this robot")
     add_connect_timeout(parser, "the peer")
     add_closing(
         parser,
@@ -117,11 +99,9 @@ def main(options: argparse.Namespace) -> int:
     config = briefed(scenario, options.id, manoeuvre_s)
     maker, given = driver_class(options.driver), options_of(options.option)
     reached = reach(options, "world")
-    inbox = Inbox(f"tandem robot {options.id}")
-    stop_by_signal(inbox)
-    if (warning := beyond(reached)) is not None:
-        inbox.say(warning)
-    try:
+
+    def take_part(inbox: Inbox) -> int:
+        warn_beyond(reached, inbox)
         with (
             folder_for(options.out) as folder,
             recorded(folder, config, inbox, fsync=options.fsync) as recording,
@@ -139,27 +119,17 @@ def main(options: argparse.Namespace) -> int:
             )
             recording.take_up(driver, options.driver, field)
             end = _run(options, field, reached, folder, inbox)
-    except session.CannotListen as error:
-        raise UserError(f"--listen: {error}") from None
-    except CannotRecord as error:
-        raise UserError(f"--out: {error}") from None
-    except CorruptJournal as error:
-        raise UserError(f"--out: {error}; choose another folder") from None
-    except (NoStart, ChildFailed) as error:
-        inbox.say(str(error))
-        return FAILED
-    except Interrupted as signal_name:
-        inbox.say(f"stopped by {signal_name}")
-        return STOPPED
-    if not options.quiet and isinstance(field.verdict, Localised):
-        pose = field.verdict.pose
-        say(f"{options.id}: claims {pose.x:.9f} {pose.y:.9f} {wrap(pose.heading):+.9f} (m, m, rad)")
-    if not options.quiet:
-        advice = f"; a lower --rate, such as {rate / 2:g}, leaves more time" if field.missed else ""
-        missed = f"missed the deadline in {field.missed} of {end.tick + 1} ticks"
-        say(f"{options.id}: {missed}{advice}")
-    say(f"{options.id}: {ended(end.outcome, end.tick, end.reason)}")
-    return status_of(end.outcome)
+        if not options.quiet and isinstance(field.verdict, Localised):
+            pose = field.verdict.pose
+            say(f"{options.id}: claims {pose.x:.9f} {pose.y:.9f} {wrap(pose.heading):+.9f} (m, m, rad)")
+        if not options.quiet:
+            advice = f"; a lower --rate, such as {rate / 2:g}, leaves more time" if field.missed else ""
+            missed = f"missed the deadline in {field.missed} of {end.tick + 1} ticks"
+            say(f"{options.id}: {missed}{advice}")
+        say(f"{options.id}: {ended(end.outcome, end.tick, end.reason)}")
+        return status_of(end.outcome)
+
+    return participate(f"tandem robot {options.id}", take_part, (NoStart, ChildFailed))
 
 
 def _run(

@@ -7,6 +7,7 @@ import math
 import platform
 import random
 import secrets
+import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from importlib import resources
@@ -147,6 +148,8 @@ def shipped(package: str = "scenario") -> dict[str, Path]:
 
 SHIPPED = {"scenario": ("scenario", "run"), "sweep": ("sweep", "sweep")}
 """The kind of file in each package, and the command that runs it."""
+MARKS = {"scenario": {"mission", "robot"}, "sweep": {"scenario", "trials"}}
+"""The required fields of the files in each package that files of the other kind cannot have."""
 
 
 def unknown(source: str, folder: str) -> str:
@@ -154,10 +157,26 @@ def unknown(source: str, folder: str) -> str:
     names = {one: shipped(one) for one in SHIPPED}
     for other, (kind, command) in SHIPPED.items():
         if other != folder and source in names[other]:
-            return f"{source} is a {kind}; run it with `tandem {command} {source}`"
+            return _other_kind(source, kind, command)
     near = did_you_mean(source, [name for found in names.values() for name in found])
     ships = ", ".join(names[folder])
     return f"{source}: neither a file nor a shipped {SHIPPED[folder][0]} ({ships}){near}"
+
+
+def misplaced(source: str, table: Mapping[str, Any], folder: str) -> str | None:
+    """Return an error message if the file `source`, whose content is `table`, is not of the kind in `folder`.
+
+    Return None if `table` has a field that marks the kind of file in `folder`, or no mark at all.
+    """
+    if MARKS[folder].isdisjoint(table):
+        for other, (kind, command) in SHIPPED.items():
+            if not MARKS[other].isdisjoint(table):
+                return _other_kind(source, kind, command)
+    return None
+
+
+def _other_kind(source: str, kind: str, command: str) -> str:
+    return f"{source} is a {kind}; run it with `tandem {command} {shlex.quote(source)}`"
 
 
 def run_name(scenario: Scenario, out: Path | None = None) -> str:
@@ -202,7 +221,10 @@ def setting(source: str, faults: Sequence[str] = ()) -> ScenarioTemplate:
         raise BadScenario(unknown(source, "scenario")) from None
     except ValueError as error:
         raise BadScenario(f"{source}: {error}") from None
-    return validate(table_in(text, source), source, faults)
+    table = table_in(text, source)
+    if (why := misplaced(source, table, "scenario")) is not None:
+        raise BadScenario(why)
+    return validate(table, source, faults)
 
 
 def parse(text: str, source: str, *, seed: int | None = None, faults: Sequence[str] = ()) -> Scenario:

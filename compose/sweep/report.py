@@ -107,8 +107,18 @@ def show(results: Results, out: Path, *, quiet: bool) -> None:
             source = shlex.quote(results.sweep.source)
             say(f"  tandem sweep {source} --print-trial {note.cell}:{note.trial} > trial.toml")
             file = "trial.toml"
-        say(f"  tandem run {file} --seed {note.seed} --out recording")
+        recording = _new_folder(f"recording-{results.sweep.name}-{note.cell}-{note.trial}")
+        say(f"  tandem run {file} --seed {note.seed} --out {recording}")
     say(f"results: {out}")
+
+
+def _new_folder(name: str) -> Path:
+    """Return the path `name`; if it exists, with the first number from 2 on that makes it new."""
+    path, number = Path(name), 1
+    while path.exists():
+        number += 1
+        path = Path(f"{name}-{number}")
+    return path
 
 
 def _audited(results: Results) -> str:

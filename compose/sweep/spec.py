@@ -127,6 +127,8 @@ def load(source: str, *, trials: int | None = None, seed: int | None = None) -> 
     path = shipped().get(source, Path(source))
     try:
         table = table_in(read_text(path), source)
+        if (why := scenario_file.misplaced(source, table, "sweep")) is not None:
+            raise BadSpec(why)
         spec = msgspec.convert(table, SpecFile)
     except FileNotFoundError:
         raise BadSpec(scenario_file.unknown(source, "sweep")) from None

@@ -13,7 +13,7 @@ from compose.view.facts import Gathering
 from compose.view.scene import Scene, scene
 from protocol import files
 from protocol.journal.environment import is_blank
-from protocol.journal.journal_file import CorruptJournal, Tail
+from protocol.journal.journal_file import CorruptJournal, OtherVersion, Tail
 from protocol.messages import FinalReport, MissionEnd, OfRobot
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 from world.tick import World, observations
@@ -85,6 +85,8 @@ class Journals:
                     self._fold_world(frames, path)
                 else:
                     self._fold_agent(frames, path)
+            except OtherVersion as error:
+                self._note(f"{self.folder}: {error.versions}; {error.remedy}")  # the same in all journals
             except (CorruptJournal, MalformedFrame) as error:
                 text = str(error)
                 self._note(text if text.startswith(str(path)) else f"{path}: {text}")

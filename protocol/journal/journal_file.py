@@ -19,7 +19,7 @@ from typing import Protocol
 import msgpack
 
 from protocol.files import open_file
-from protocol.wire import MAX_FRAME_BYTES, is_sound
+from protocol.wire import MAX_FRAME_BYTES, RELEASES, VERSION, is_sound, other_version
 
 _packer = msgpack.Packer()
 _LONGEST = b"\xc6" + MAX_FRAME_BYTES.to_bytes(4, "big")
@@ -38,6 +38,19 @@ class RecordExists(CannotRecord):
 
 class CorruptJournal(ValueError):
     """A journal is damaged before its end, or its content is not valid."""
+
+
+class OtherVersion(CorruptJournal):
+    """A journal has another version of the protocol. The text of the error names both, and the remedy."""
+
+    def __init__(self, path: Path, version: int) -> None:
+        self.path = path
+        self.versions = f"protocol version {version}, this is version {VERSION}"
+        """Text that names both versions."""
+        release = f"Tandem {RELEASES[version]}" if version in RELEASES else "the release that wrote it"
+        self.remedy = f"run its scenario again, or read it with {release}"
+        """Text for the user who wants to read the recording."""
+        super().__init__(f"{path}: {self.versions}; {self.remedy}")
 
 
 class Sink(Protocol):
@@ -186,7 +199,8 @@ class Tail:
     def news(self) -> list[bytes]:
         """Return the frames that have been added since the last call. An incomplete frame is read later.
 
-        Raises OSError if it cannot be read, CorruptJournal if it contains anything but frames.
+        Raises OSError if it cannot be read, CorruptJournal if it contains anything but frames, OtherVersion
+        if its first frame has another version.
         """
         with open_file(self.path) as file:
             file.seek(self.whole)
@@ -207,5 +221,7 @@ class Tail:
                 raise ValueError("a frame of impossible length")
         except (ValueError, msgpack.UnpackException) as error:
             raise CorruptJournal(f"{self.path}: damaged at byte {self.whole + whole}: {error}") from None
+        if self.whole == 0 and frames and (version := other_version(frames[0])) is not None:
+            raise OtherVersion(self.path, version)
         self.whole += whole
         return frames

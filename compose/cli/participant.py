@@ -1,0 +1,96 @@
+"""The part that the participants of a mission share: `tandem world`, `tandem agent` and `tandem robot`."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+from compose.cli import arguments
+from compose.errors import FAILED, STOPPED, UserError
+from compose.launch.signals import stop_by_signal, stop_with_launcher
+from compose.network import beyond, reach
+from protocol.journal.journal_file import CannotRecord, CorruptJournal, OtherVersion
+from protocol.journal.resume import Retrace
+from protocol.network import session
+from protocol.network.endpoints import Endpoints
+from protocol.network.inbox import Inbox, Interrupted
+
+ROUTER = "endpoint on which this process is a Zenoh router"
+"""The purpose of `--listen` of a world and an agent."""
+RELISTEN_S = 5.0
+"""s to wait for the port of a participant that has just been killed to become free."""
+
+
+def add_participation(parser: argparse.ArgumentParser, default_run: str, listen: str = ROUTER) -> None:
+    """Add the flags of every participant; `default_run` and `listen` describe `--run` and `--listen`."""
+    arguments.add_running(parser)
+    parser.add_argument(
+        "--run", type=arguments.name, metavar="NAME", help=f"name of the run [default: {default_run}]"
+    )
+    arguments.add_connection(parser)
+    arguments.add_listen(parser, listen)
+    arguments.add_fsync(parser)
+
+
+def add_launched(parser: argparse.ArgumentParser) -> None:
+    """Add the hidden flags of participants that another command launches."""
+    arguments.add_launched(parser)
+    parser.add_argument("--kill", type=arguments.kill, action="append", default=[], help=argparse.SUPPRESS)
+
+
+def participate(
+    owner: str,
+    body: Callable[[Inbox], int],
+    failures: tuple[type[Exception], ...],
+    *,
+    launched: bool = False,
+) -> int:
+    """Return the exit status of `body`, which gets an inbox that signals reach; `owner` begins its messages.
+
+    A process that is `launched` also stops with its launcher. An exception of `failures` is printed, and the
+    status is FAILED; after a signal it is STOPPED. Raises UserError if a flag cannot be followed.
+    """
+    inbox = Inbox(owner)
+    if launched:
+        stop_with_launcher(inbox)
+    stop_by_signal(inbox)
+    try:
+        return body(inbox)
+    except session.CannotListen as error:
+        raise UserError(f"--listen: {error}") from None
+    except CannotRecord as error:
+        raise UserError(f"--out: {error}") from None
+    except OtherVersion as error:
+        raise UserError(f"--out: {error.path}: {error.versions}; choose another folder") from None
+    except CorruptJournal as error:
+        raise UserError(f"--out: {error}; choose another folder") from None
+    except Interrupted as signal_name:
+        inbox.say(f"stopped by {signal_name}")
+        return STOPPED
+    except failures as error:
+        inbox.say(str(error))
+        return FAILED
+
+
+def endpoints_of(options: argparse.Namespace, keys: str, missing: str) -> Endpoints:
+    """Return the endpoints of the flags, with the certificates of `keys`. Raises UserError if there are none.
+
+    `missing` is the text of that error.
+    """
+    found = reach(options, keys)
+    if not found.connect and not found.listen:
+        raise UserError(missing)
+    return found
+
+
+def warn_beyond(endpoints: Endpoints, inbox: Inbox) -> None:
+    """Print a warning if other machines can connect to `endpoints` without authentication."""
+    if (warning := beyond(endpoints)) is not None:
+        inbox.say(warning)
+
+
+def old_journal(options: argparse.Namespace, name: str) -> Retrace | None:
+    """Return the journal `name` of an earlier process in --out, if there is one."""
+    path: Path | None = options.out / name if options.out is not None else None
+    return Retrace(path, fsync=options.fsync) if path is not None and path.exists() else None
