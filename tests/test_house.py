@@ -13,11 +13,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from agent.planning import planner
 from agent.planning.state import RobotState
 from compose.scenario.scenario_file import load
 from protocol.wire import encode
-from tests.steps import steps
+from tests.steps import planner_of, steps
 from world.tick import advance, observations, release
 
 HOUSE = Path(__file__).parents[1]
@@ -213,6 +212,7 @@ def frozen(value: object) -> bytes:
 def test_the_same_values_give_the_same_step_and_are_left_as_they_were(name: str) -> None:
     for world, sensed, before, observed, reports, commands in steps(name):
         for observation in sensed:
+            planner = planner_of(before[observation.robot])
             state, heard = before[observation.robot], reports[observation.robot]
             was = frozen((state, observation))
             once, again = (
@@ -224,7 +224,8 @@ def test_the_same_values_give_the_same_step_and_are_left_as_they_were(name: str)
             assert frozen((state, observation)) == was
 
             was = frozen((once, heard))
-            decided, anew = planner.decide(once, heard), planner.decide(copy.deepcopy(once), list(heard))
+            decided = planner.decide(once, heard)
+            anew = planner.decide(copy.deepcopy(once), list(heard))
             assert decided == anew
             assert frozen(decided) == frozen(anew)
             assert (
@@ -279,7 +280,7 @@ def loaded_by(module: str) -> set[str]:
         ("world.hardware.bridge", {"numpy", "scipy", "rich", "agent", "compose", "rosbags"}),
         ("compose.cli.robot", {"numpy", "scipy", "rich", "agent", "rosbags"}),
         ("world.process", {"numpy", "scipy", "rich", "agent", "compose"}),
-        ("agent.planning.planner", {"zenoh", "scipy", "rich", "world", "compose"}),
+        ("agent.planning.assured", {"zenoh", "scipy", "rich", "world", "compose"}),
         ("compose.launch.in_process", {"zenoh", "rich"}),
         ("compose.sweep.worker", {"zenoh", "rich", "distributed", "dask", "pyarrow", "matplotlib"}),
         ("compose.cli.audit", {"zenoh", "rich", "distributed", "matplotlib", "pyarrow"}),

@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager
 
 from matplotlib.figure import Figure
 
-from agent.planning.planner import uses_active_sensing
+from agent.planning.registry import planner
 from compose.figures import decisions, manoeuvre, one_robot, over_time, phase_one, steps, trajectory
 from compose.figures.pair import PairRecord
 from compose.figures.sheet import NO_TRUTH, Absent
@@ -41,7 +41,7 @@ def _phase_one(pair: PairRecord) -> Iterator[Picture]:
 
 def _plan(pair: PairRecord) -> Iterator[Picture]:
     """Yield the planned manoeuvres; with active sensing, the hypotheses at its decisions."""
-    if pair.readable and uses_active_sensing(pair.planner_name, pair.mission):
+    if pair.readable and planner(pair.planner_name).uses_active_sensing(pair.mission):
         yield f"plan-{pair.name}", decisions.draw(pair)
     elif pair.readable:
         for name, figure in manoeuvre.draw(pair).items():

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from agent.estimation.closed_forms import Placement
 from agent.planning.phase3_last_manoeuvre import Array, Compared, LastManoeuvre, Plan, compared
+from agent.planning.registry import planner
 from compose.figures.pair import ROLES, PairRecord
 from compose.figures.sheet import ANCHORS, NO_ENCOUNTER, ROW, SMALL, Absent, Sheet, circle, equal
 from compose.figures.style import COLOURS, INK, MARKS, PALE, PALER
@@ -43,8 +44,8 @@ def planned(pair: PairRecord, role: Role) -> Iterator[Planned]:
     """Yield every last manoeuvre of one robot, in order."""
     before = None
     for state in pair.states(role):
-        if state.belief.plan is not before and isinstance(state.mode, LastManoeuvre):
-            before = state.belief.plan
+        if state.plan is not before and isinstance(state.mode, LastManoeuvre):
+            before = state.plan
             assert before is not None
             yield Planned(state.tick, before)
 
@@ -98,7 +99,7 @@ def _inverse(placement: Placement) -> Pose:
 
 def _figure(pair: PairRecord, one: Planned) -> Figure:
     seen, plan, mission = scene(one.plan), one.plan, pair.mission
-    ways = compared(plan.question, mission, pair.planner_name)
+    ways = compared(plan.question, mission, planner(pair.planner_name).MANOEUVRES)
     below = 0.5 + ROW * math.ceil((SIGNS + len(seen.others)) / COLUMNS) + 0.05
     sheet = Sheet(0.6 + PLANE + 0.75 + COST + 0.2, below + PLANE + 0.08, [pair.title, _title(pair, one)])
     axes = sheet.panel(0.6, below, PLANE, PLANE)

@@ -10,14 +10,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from agent.estimation.exact import Branch
-from agent.planning.range_seeking import travelled
 from agent.planning.state import RobotState
 from compose.figures.pair import PairRecord
 from compose.figures.sheet import ANCHORS, Absent, Sheet, around, circle, equal, fitted
 from compose.figures.style import COLOURS, INK, MARKS, PALE, PALER
 from protocol.messages import BranchKind
 from protocol.mission import Role
-from protocol.motion import Pose, compose
+from protocol.motion import Pose, compose, travelled
 
 WIDTH, BESIDE, TALLEST = 4.3, 2.5, 4.6
 FEW = 4
