@@ -588,8 +588,8 @@ def test_a_planner_that_fails_on_its_inputs_is_a_violation_and_no_crash(
             raise ZeroDivisionError("12")
         return command(state)
 
-    command = planner("assured").command
-    monkeypatch.setattr(planner("assured"), "command", fails)
+    command = planner("paper").command
+    monkeypatch.setattr(planner("paper"), "command", fails)
     assert [one.line for one in audit(folder).violations] == [
         "tick 12, a, decision: the planner fails on its inputs: ZeroDivisionError: 12"
     ]
