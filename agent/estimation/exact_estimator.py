@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import msgspec
 from msgspec.structs import replace
@@ -22,22 +23,14 @@ from protocol.messages import Inconsistent, Localised, Observation, Verdict
 from protocol.motion import ORIGIN, REST
 from protocol.rounding import SAME
 
-REPORT_TOLERANCE = 1e-6
-"""The tolerance in m and rad within which the data of one tick agree."""
-
 
 class ExactEstimator(msgspec.Struct, frozen=True):
     """The closed forms of Section III. A candidate that contradicts any measurement is ruled out."""
 
-    @property
-    def has_covariances(self) -> bool:
-        """Return False: what remains is certain up to rounding."""
-        return False
-
-    @property
-    def report_tolerance(self) -> float:
-        """Return the rounding error of a report, with a margin."""
-        return REPORT_TOLERANCE
+    has_covariances: ClassVar[bool] = False
+    """What remains is certain up to rounding."""
+    report_tolerance: ClassVar[float] = 1e-6
+    """The rounding error of a report with a margin, in m and rad."""
 
     def is_informative(self, knowledge: Knowledge, observation: Observation) -> bool:
         """Return False for a range that repeats the last one of a robot that has not moved since.

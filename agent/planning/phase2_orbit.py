@@ -81,12 +81,12 @@ def left_to_orbit(odometry: Pose, start: Pose, orbit: Orbit) -> float:
 def controls(mode: Phase2Mode, odometry: Pose, start: Pose, orbit: Orbit, mission: Mission) -> Controls:
     """Return the controls of `mode` at the pose `odometry`."""
     match mode:
+        case Orbiting(command):
+            return command or Controls(orbit.v, orbit.omega)
         case Aligning(heading) | Tangent(heading):
             return turn(odometry, heading, mission)
         case Radial():
             return straight(left_to_orbit(odometry, start, orbit), mission)
-        case Orbiting(command):
-            return command or Controls(orbit.v, orbit.omega)
 
 
 def pursuit(local: Pose, orbit: Orbit, mission: Mission) -> Controls:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cache
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -254,9 +255,7 @@ def _best(value: Array) -> tuple[int, int]:
 
 def reachable(pose: Pose, mission: Mission, speeds: Sequence[float] | None) -> Reach:
     """Return the manoeuvres that are compared, from `pose`, at `speeds` in A_0 / T_s (None: at v_max)."""
-    omega = np.linspace(-mission.max_turn_rate, mission.max_turn_rate, TURN_RATES)
-    half = 0.5 * mission.period * omega
-    unit = mission.period * np.sinc(half / math.pi)
+    omega, half, unit = _arcs(mission)
     if speeds is None:
         speed = np.array([[mission.max_speed]])
     else:
@@ -264,6 +263,14 @@ def reachable(pose: Pose, mission: Mission, speeds: Sequence[float] | None) -> R
     course = pose.heading + half
     x, y = pose.x + speed * unit * np.cos(course), pose.y + speed * unit * np.sin(course)
     return Reach(speed, omega, x, y)
+
+
+@cache
+def _arcs(mission: Mission) -> tuple[Array, Array, Array]:
+    """Return each turn rate in rad/s, half the turn of a tick in rad, and the chord in s per unit speed."""
+    omega = np.linspace(-mission.max_turn_rate, mission.max_turn_rate, TURN_RATES)
+    half = 0.5 * mission.period * omega
+    return omega, half, mission.period * np.sinc(half / math.pi)
 
 
 def _positions_in_b(

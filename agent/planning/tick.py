@@ -135,8 +135,9 @@ def _safe(state: RobotState, controls: Controls) -> Controls:
     on the way back into range.
     """
     mission = state.config.mission
-    plans_alone = state.phase < 3 or isinstance(state.mode, Retreating)
-    if not (mission.safety_distance and state.in_contact and plans_alone):
+    if not (mission.safety_distance and state.in_contact):
+        return controls
+    if state.phase == 3 and not isinstance(state.mode, Retreating):
         return controls
     if not state.mutual or state.mutual[-1].tick != state.tick:  # the range was not measured
         return REST

@@ -177,9 +177,7 @@ def last_manoeuvre(state: RobotState, found: PairEstimate, manoeuvres: Manoeuvre
 def controls(state: RobotState) -> Controls:
     """Return the controls of the current mode."""
     match state.mode:
-        case Orbiting(command):
-            return command or Controls(state.orbit.v, state.orbit.omega)
-        case Aligning() | Radial() | Tangent():
+        case Aligning() | Radial() | Tangent() | Orbiting():
             return phase2_orbit.controls(
                 state.mode, state.odometry, state.start, state.orbit, state.config.mission
             )

@@ -99,7 +99,8 @@ class Robot:
         `missed` names the peers whose reports did not arrive in time.
         """
         self.state = self.planner.decide(self.state, [framed.report for framed in heard])
-        self.unheard.difference_update([framed.report.tick for framed in heard])
+        if heard:
+            self.unheard.difference_update([framed.report.tick for framed in heard])
         self.command = self.planner.command(self.state)
         if self._journal is not None:
             frames = [framed.frame for framed in heard]

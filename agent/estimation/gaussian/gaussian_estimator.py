@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 import msgspec
 
@@ -27,15 +28,9 @@ FEWEST_MUTUAL_RANGES = 2
 class GaussianEstimator(msgspec.Struct, frozen=True):
     """The hypotheses of the Gaussian fits. None is certain, and no single measurement excludes one."""
 
-    @property
-    def has_covariances(self) -> bool:
-        """Return True."""
-        return True
-
-    @property
-    def report_tolerance(self) -> float:
-        """Return infinity: noise explains every difference, and the consistency tests decide."""
-        return math.inf
+    has_covariances: ClassVar[bool] = True
+    report_tolerance: ClassVar[float] = math.inf
+    """Noise explains every difference, and the consistency tests decide."""
 
     def is_informative(self, knowledge: Knowledge, observation: Observation) -> bool:
         """Return True: each range has an error of its own."""
