@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, reduce
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -178,12 +178,15 @@ def compared(question: Question, mission: Mission, manoeuvres: Manoeuvres) -> Co
     if len(squared) == 1:
         gap = travelled(b, candidates[0].place(a)) ** 2 - squared[0]
     else:
-        gap = np.min([abs(one - other) for i, one in enumerate(squared) for other in squared[:i]], axis=0)
+        gaps = [np.abs(one - other) for i, one in enumerate(squared) for other in squared[:i]]
+        gap = reduce(np.minimum, gaps)
     apart = _keeps_apart(question, reach, mission)
-    value = np.where(apart, gap, -np.inf)
+    value = np.where(apart, gap, -np.inf) if mission.safety_distance else gap
     if manoeuvres.fewest_out_of_range:
         rim = (mission.sensing_range - RANGE_MARGIN) ** 2
-        outside = np.sum([distance > rim for distance in squared], axis=0)
+        outside = np.zeros(gap.shape, np.int8)
+        for distance in squared:
+            outside += distance > rim
         fewest = np.min(outside, where=apart, initial=len(squared))
         value = np.where(outside == fewest, value, -np.inf)
     return Compared(reach, gap, value)

@@ -106,15 +106,15 @@ class RobotState(Knowledge, frozen=True):
     @property
     def mode_name(self) -> str:
         """Return the name of the mode that reports, commands and recordings use."""
-        match self.mode:
-            case Done(_, Localised()):
+        if not isinstance(self.mode, Done):
+            return MODE_NAMES[type(self.mode)]
+        match self.mode.verdict:
+            case Localised():
                 return "localised"
-            case Done(_, Inconsistent()):
+            case Inconsistent():
                 return "inconsistent"
-            case Done(_, Undecided()):
+            case Undecided():
                 return "undecided"
-            case mode:
-                return MODE_NAMES[type(mode)]
 
     @property
     def verdict(self) -> messages.Verdict | None:

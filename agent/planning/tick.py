@@ -116,7 +116,8 @@ def with_reports(state: RobotState, reports: Sequence[Report]) -> RobotState:
 
 def command(state: RobotState, controls: Controls) -> Command:
     """Return the command with `controls`, limited by the safety distance, the mode and the verdict."""
-    controls = _safe(state, controls)
+    if state.in_contact and state.config.mission.safety_distance:
+        controls = _safe(state, controls)
     return Command(
         state.tick,
         state.config.robot,
@@ -131,12 +132,10 @@ def command(state: RobotState, controls: Controls) -> Command:
 def _safe(state: RobotState, controls: Controls) -> Controls:
     """Return `controls` for the next tick, limited so that the safety distance is kept.
 
-    The limit applies in contact while the robot does not plan with the peer's position: before phase 3, and
-    on the way back into range.
+    The peer is in contact. The limit applies while the robot does not plan with the peer's position: before
+    phase 3, and on the way back into range.
     """
     mission = state.config.mission
-    if not (mission.safety_distance and state.in_contact):
-        return controls
     if state.phase == 3 and not isinstance(state.mode, Retreating):
         return controls
     if not state.mutual or state.mutual[-1].tick != state.tick:  # the range was not measured
