@@ -262,6 +262,26 @@ def test_robot_states_and_worlds_are_immutable() -> None:
             setattr(value, field, None)
 
 
+# --- contracts instead of questions -------------------------------------------------------------------
+
+ASKED_IN = {
+    "planner_name": {"agent.process.robot"},
+    "exact": {"agent.planning.state", "agent.planning.range_seeking", "agent.planning.transitions"},
+}
+"""The modules of the agent that read these fields: they select a planner, an estimator, a tolerance."""
+
+
+@pytest.mark.parametrize("field", ASKED_IN)
+def test_no_planner_asks_for_its_name_or_for_exact_sensors(field: str) -> None:
+    asking = {
+        module
+        for module in modules("agent")
+        for node in ast.walk(tree(module))
+        if isinstance(node, ast.Attribute) and node.attr == field
+    }
+    assert asking == ASKED_IN[field]
+
+
 # --- processes load only what they use ----------------------------------------------------------------
 
 
