@@ -166,7 +166,7 @@ def polished(branch: Branch, ranged: Sequence[tuple[Pose, float]]) -> Branch:
     return Branch(wrap(branch.alpha + fitted - branch.start.heading), Pose(rho0, 0.0, fitted))
 
 
-class PairObservation(msgspec.Struct, frozen=True):
+class PairObservation(msgspec.Struct, frozen=True, gc=False):
     """One tick of an encounter: each pose in the frame of the robot's anchor, and the mutual range (m)."""
 
     tick: int

@@ -14,10 +14,8 @@ from msgspec.structs import replace
 from agent.planning import accuracy_seeking, phase3_last_manoeuvre, tick, transitions
 from agent.planning.accuracy_seeking import required_mutual_ranges
 from agent.planning.manoeuvres import Manoeuvres
-from agent.planning.phase1_anchor import ThirdPoint
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent
-from agent.planning.phase3_last_manoeuvre import SPEEDS, LastManoeuvre, Returning, Standing, Waiting
-from agent.planning.range_seeking import Backing, Circling, Straight, Turning, moved
+from agent.planning.phase3_last_manoeuvre import SPEEDS, Standing, Waiting
 from agent.planning.state import MODE_NAMES, Asleep, Done, RobotState, estimator_for
 from agent.planning.tick import estimate, report
 from protocol.messages import Command, Localised, Observation, Report, RobotConfig
@@ -56,27 +54,9 @@ def start(config: RobotConfig) -> RobotState:
 def observe(state: RobotState, observation: Observation) -> RobotState:
     """Return `state` with the sensor data of one tick, and with the mode that follows from them."""
     state = tick.observed(state, observation)
-    if isinstance(state.mode, Asleep):
-        return transitions.start_phase1(state, observation.anchor_range)
-    if state.estimator.has_covariances:
+    if state.estimator.has_covariances and not isinstance(state.mode, Asleep):
         return accuracy_seeking.after_observation(state, observation.anchor_range, MANOEUVRES)
-    match state.mode:
-        case Orbiting(None) | Standing() | Waiting() | Done():
-            return state
-        case Aligning() | Radial() | Tangent() | Orbiting():
-            return transitions.continue_phase2(state, state.mode)
-        case Straight(beacon) | Backing(beacon) | Turning(beacon) | Circling(beacon):
-            measured = state.in_contact if beacon == "peer" else observation.anchor_range is not None
-            seeking = transitions.sought(state, state.mode, measured, MANOEUVRES)
-            if seeking is not None:
-                return seeking
-            return replace(state, mode=Waiting()) if beacon == "peer" else _after_range(state)
-        case ThirdPoint(_, origin) if moved(origin, state.odometry):
-            return _after_range(state)
-        case LastManoeuvre(_, origin) | Returning(_, origin) if moved(origin, state.odometry):
-            return transitions.after_last_manoeuvre(state, state.mode)
-        case _:
-            return state
+    return transitions.after_observation(state, observation.anchor_range, MANOEUVRES, _after_range)
 
 
 def decide(state: RobotState, reports: Sequence[Report] = ()) -> RobotState:

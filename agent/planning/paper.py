@@ -15,10 +15,9 @@ from agent.planning import tick, transitions
 from agent.planning.accuracy_seeking import CHECKED_WITH_OUTLIERS
 from agent.planning.manoeuvres import Manoeuvres
 from agent.planning.phase1_anchor import ThirdPoint
-from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent
-from agent.planning.phase3_last_manoeuvre import LastManoeuvre, Returning, Standing, Waiting
-from agent.planning.range_seeking import Backing, Circling, Straight, Turning, moved
-from agent.planning.state import MODE_NAMES, Asleep, Done, RobotState
+from agent.planning.phase2_orbit import Orbiting
+from agent.planning.phase3_last_manoeuvre import Standing, Waiting
+from agent.planning.state import MODE_NAMES, RobotState
 from agent.planning.tick import estimate, report
 from protocol.messages import Command, Observation, Report, RobotConfig
 from protocol.mission import Mission
@@ -50,25 +49,7 @@ def start(config: RobotConfig) -> RobotState:
 def observe(state: RobotState, observation: Observation) -> RobotState:
     """Return `state` with the sensor data of one tick, and with the mode that follows from them."""
     state = tick.observed(state, observation)
-    match state.mode:
-        case Orbiting(None) | Standing() | Waiting() | Done():
-            return state
-        case Aligning() | Radial() | Tangent() | Orbiting():
-            return transitions.continue_phase2(state, state.mode)
-        case Straight(beacon) | Backing(beacon) | Turning(beacon) | Circling(beacon):
-            measured = state.in_contact if beacon == "peer" else observation.anchor_range is not None
-            seeking = transitions.sought(state, state.mode, measured, MANOEUVRES)
-            if seeking is not None:
-                return seeking
-            return replace(state, mode=Waiting()) if beacon == "peer" else _after_range(state)
-        case ThirdPoint(_, origin) if moved(origin, state.odometry):
-            return _after_range(state)
-        case LastManoeuvre(_, origin) | Returning(_, origin) if moved(origin, state.odometry):
-            return transitions.after_last_manoeuvre(state, state.mode)
-        case Asleep():
-            return transitions.start_phase1(state, observation.anchor_range)
-        case _:
-            return state
+    return transitions.after_observation(state, observation.anchor_range, MANOEUVRES, _after_range)
 
 
 def decide(state: RobotState, reports: Sequence[Report] = ()) -> RobotState:

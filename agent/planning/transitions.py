@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from msgspec.structs import replace
 
 from agent.estimation.estimator import AnchorEstimate, FittedBranch, PairEstimate
@@ -11,11 +13,54 @@ from agent.planning.manoeuvres import Manoeuvres
 from agent.planning.phase1_anchor import ThirdPoint
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent
 from agent.planning.phase3_last_manoeuvre import LastManoeuvre, Returning, Standing, Waiting
-from agent.planning.range_seeking import Backing, Circling, Homing, Seeking, Straight, Turning, step_length
-from agent.planning.state import Done, RobotState
+from agent.planning.range_seeking import (
+    Backing,
+    Circling,
+    Homing,
+    Seeking,
+    Straight,
+    Turning,
+    moved,
+    step_length,
+)
+from agent.planning.state import Asleep, Done, RobotState
 from protocol.messages import BranchKind
 from protocol.mission import SHORTEST_STEP
 from protocol.motion import REST, Controls
+
+# --- the robot's own sensors --------------------------------------------------------------------------
+
+
+def after_observation(
+    state: RobotState,
+    anchor_range: float | None,
+    manoeuvres: Manoeuvres,
+    after_range: Callable[[RobotState], RobotState],
+) -> RobotState:
+    """Return `state` with the mode that follows from the robot's own sensors, on the paper's way.
+
+    `after_range` continues phase 1 once a second or a further anchor range is measured.
+    """
+    match state.mode:
+        case Orbiting(None) | Standing() | Waiting() | Done():
+            return state
+        case Aligning() | Radial() | Tangent() | Orbiting():
+            return continue_phase2(state, state.mode)
+        case Straight(beacon) | Backing(beacon) | Turning(beacon) | Circling(beacon):
+            measured = state.in_contact if beacon == "peer" else anchor_range is not None
+            seeking = sought(state, state.mode, measured, manoeuvres)
+            if seeking is not None:
+                return seeking
+            return replace(state, mode=Waiting()) if beacon == "peer" else after_range(state)
+        case ThirdPoint(_, origin) if moved(origin, state.odometry):
+            return after_range(state)
+        case LastManoeuvre(_, origin) | Returning(_, origin) if moved(origin, state.odometry):
+            return after_last_manoeuvre(state, state.mode)
+        case Asleep():
+            return start_phase1(state, anchor_range)
+        case _:
+            return state
+
 
 # --- phase 1 ------------------------------------------------------------------------------------------
 
