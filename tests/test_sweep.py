@@ -444,7 +444,8 @@ def test_the_printed_command_of_a_trial_runs_it_again(folder: Path) -> None:
     command = shlex.split(next(line for line in ended.out.splitlines() if line.startswith("  tandem run ")))
     assert command[0] == "tandem"
     tandem(*command[1:], cwd=folder)
-    summary = json.loads((folder / "recording" / "summary.json").read_text())
+    recording = folder / command[command.index("--out") + 1]
+    summary = json.loads((recording / "summary.json").read_text())
     cell = int(Path(command[2]).stem)
     row = next(row for row in rows(folder / "out") if (row["cell"], row["seed"]) == (cell, summary["seed"]))
     for name in ("outcome", "reason", "ticks", "first_contact_tick", "t_max_s"):
