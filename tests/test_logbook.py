@@ -12,8 +12,8 @@ from msgspec.structs import replace
 
 from agent.peer.motion_log import MotionLog
 from agent.peer.peer_state import PeerState, contradiction, with_report
+from agent.planning.exchange import report as report_of
 from agent.planning.state import Done, RobotState
-from agent.planning.tick import report as report_of
 from compose.scenario.scenario_file import load
 from protocol.messages import MAX_REPORT_RANGES, MAX_REPORT_RUNS, Localised, Ranged, Report, Undecided
 from protocol.motion import ORIGIN, Pose, Segment, step

@@ -11,13 +11,13 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from agent.planning import accuracy_seeking, phase3_last_manoeuvre, tick, transitions
+from agent.planning import accuracy_seeking, exchange, phase3_last_manoeuvre, transitions
 from agent.planning.accuracy_seeking import required_mutual_ranges
+from agent.planning.exchange import estimate, report
 from agent.planning.manoeuvres import Manoeuvres
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent
 from agent.planning.phase3_last_manoeuvre import SPEEDS, Standing, Waiting
 from agent.planning.state import MODE_NAMES, Asleep, Done, RobotState, estimator_for
-from agent.planning.tick import estimate, report
 from protocol.messages import Command, Localised, Observation, Report, RobotConfig
 from protocol.mission import Mission
 from protocol.motion import REST
@@ -53,7 +53,7 @@ def start(config: RobotConfig) -> RobotState:
 
 def observe(state: RobotState, observation: Observation) -> RobotState:
     """Return `state` with the sensor data of one tick, and with the mode that follows from them."""
-    state = tick.observed(state, observation)
+    state = exchange.observed(state, observation)
     if state.estimator.has_covariances and not isinstance(state.mode, Asleep):
         return accuracy_seeking.after_observation(state, observation.anchor_range, MANOEUVRES)
     return transitions.after_observation(state, observation.anchor_range, MANOEUVRES, _after_range)
@@ -65,7 +65,7 @@ def decide(state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
     Phase 3 begins as soon as the peer's phase 1 has ended and b is far enough from its anchor.
     """
     if reports:
-        state = tick.with_reports(state, reports)
+        state = exchange.with_reports(state, reports)
     if not state.in_contact or isinstance(state.mode, Done):
         return state
     if state.estimator.has_covariances:
@@ -83,7 +83,7 @@ def decide(state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
 
 def command(state: RobotState) -> Command:
     """Return the command for the next tick, with the phase, the mode and the verdict."""
-    return tick.command(state, REST if _must_wait(state) else transitions.controls(state))
+    return exchange.command(state, REST if _must_wait(state) else transitions.controls(state))
 
 
 def uses_active_sensing(mission: Mission) -> bool:

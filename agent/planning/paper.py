@@ -11,14 +11,14 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from agent.planning import tick, transitions
+from agent.planning import exchange, transitions
 from agent.planning.accuracy_seeking import CHECKED_WITH_OUTLIERS
+from agent.planning.exchange import estimate, report
 from agent.planning.manoeuvres import Manoeuvres
 from agent.planning.phase1_anchor import ThirdPoint
 from agent.planning.phase2_orbit import Orbiting
 from agent.planning.phase3_last_manoeuvre import Standing, Waiting
 from agent.planning.state import MODE_NAMES, RobotState
-from agent.planning.tick import estimate, report
 from protocol.messages import Command, Observation, Report, RobotConfig
 from protocol.mission import Mission
 
@@ -48,7 +48,7 @@ def start(config: RobotConfig) -> RobotState:
 
 def observe(state: RobotState, observation: Observation) -> RobotState:
     """Return `state` with the sensor data of one tick, and with the mode that follows from them."""
-    state = tick.observed(state, observation)
+    state = exchange.observed(state, observation)
     return transitions.after_observation(state, observation.anchor_range, MANOEUVRES, _after_range)
 
 
@@ -58,7 +58,7 @@ def decide(state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
     Phase 3 begins when both robots are on their orbits.
     """
     if reports:
-        state = tick.with_reports(state, reports)
+        state = exchange.with_reports(state, reports)
     if not state.in_contact:
         return state
     match state.mode:
@@ -72,7 +72,7 @@ def decide(state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
 
 def command(state: RobotState) -> Command:
     """Return the command for the next tick, with the phase, the mode and the verdict."""
-    return tick.command(state, transitions.controls(state))
+    return exchange.command(state, transitions.controls(state))
 
 
 def required_mutual_ranges(mission: Mission) -> int:

@@ -1,4 +1,4 @@
-"""The parts of a tick that planners share: sensor data, reports, the command and the estimate."""
+"""The exchange of a tick: sensor data and reports come in; a report, a command and an estimate go out."""
 
 from __future__ import annotations
 
