@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from importlib import metadata
 from importlib.util import find_spec
@@ -13,9 +12,6 @@ from compose.errors import UserError
 PACKAGE = "tandem-ranging"
 """The name of the distribution."""
 
-_REQUIREMENT = re.compile(r"(?P<name>[\w.-]+)\s*(?P<bounds>[^;]*)(?P<extra>;.*)?")
-_BOUND = re.compile(r"(?P<way>>=|<)(?P<version>[0-9.]+)")
-
 
 class Library(NamedTuple):
     """One dependency of Tandem."""
@@ -25,15 +21,14 @@ class Library(NamedTuple):
     version: str | None
     """The installed version; None if it is missing."""
     bounds: str
-    """The versions that Tandem requires, such as ">=2.2,<3"; only ">=" and "<" occur."""
+    """The versions that Tandem requires, such as "<3,>=2.2"."""
 
     @property
     def fits(self) -> bool:
         """True if it is installed in a version within the bounds."""
-        return self.version is not None and all(
-            (_numbers(self.version) >= _numbers(bound["version"])) == (bound["way"] == ">=")
-            for bound in _BOUND.finditer(self.bounds)
-        )
+        from packaging.specifiers import SpecifierSet  # noqa: PLC0415  # few commands need it
+
+        return self.version is not None and SpecifierSet(self.bounds).contains(self.version, prereleases=True)
 
 
 def version(package: str = PACKAGE) -> str | None:
@@ -46,18 +41,15 @@ def version(package: str = PACKAGE) -> str | None:
 
 def libraries() -> Iterator[Library]:
     """Yield the dependencies without extras; none if Tandem itself is not installed."""
+    from packaging.requirements import Requirement  # noqa: PLC0415  # few commands need it
+
     try:
         required = metadata.requires(PACKAGE) or []
     except metadata.PackageNotFoundError:
         return
-    for text in required:
-        requirement = _REQUIREMENT.fullmatch(text)
-        if requirement is not None and requirement["extra"] is None:
-            yield Library(requirement["name"], version(requirement["name"]), requirement["bounds"])
-
-
-def _numbers(text: str) -> tuple[int, ...]:
-    return tuple(int(number) for number in re.findall(r"\d+", text)[:3])
+    for requirement in map(Requirement, required):
+        if requirement.marker is None:
+            yield Library(requirement.name, version(requirement.name), str(requirement.specifier))
 
 
 def need(*modules: str, extra: str = "lab") -> None:

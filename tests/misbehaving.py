@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 import tempfile
 import threading
@@ -72,6 +73,13 @@ def endless(one: trial.Trial) -> trial.TrialRow:
     Path(tempfile.gettempdir(), "playing").touch()
     threading.Event().wait()
     return trial.run_trial(one)
+
+
+def stubborn() -> None:
+    """Ignore SIGTERM, say so on standard output, and never end."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    os.write(1, b"ready")
+    signal.pause()
 
 
 def main(function: str, source: str, out: str) -> None:

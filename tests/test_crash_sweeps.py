@@ -17,7 +17,7 @@ from msgspec.structs import replace
 
 from compose.errors import BadScenario
 from compose.launch import in_process
-from compose.launch.processes import ChildFailed
+from compose.launch.supervisor import ChildFailed
 from compose.recording.run import WORLD_JOURNAL, Recording, agent_journal
 from compose.scenario.kills import POINTS, WORLD, KillTable, drawn
 from compose.scenario.scenario_file import load, parse, validate

@@ -7,8 +7,6 @@ import os
 import re
 import signal
 import socket
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -19,7 +17,8 @@ from signal import SIGINT, SIGKILL, SIGSTOP, SIGTERM
 import pytest
 
 from compose.launch.processes import free_endpoint
-from compose.launch.viewers import Beside, stay
+from compose.launch.supervisor import Supervisor
+from compose.launch.viewers import Viewer, stay
 from protocol.network.diagnosis import MUTE
 from protocol.network.inbox import Arrival, Inbox
 from tests.commands import (
@@ -267,22 +266,20 @@ def test_processes_end_when_their_launcher_is_killed(endless: Path, tmp_path: Pa
 
 
 def test_a_page_that_stays_is_not_ended_by_another_process_that_ends_late() -> None:
-    """A second byte ends it, which is sent after the end of a late agent has been taken from the inbox."""
-    script = "import sys; sys.stdin.buffer.read(2)"
-    with subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE) as process:
+    """It is killed after the end of a late agent has been taken from the inbox."""
+    taken = []
 
-        class Watched(Inbox):
-            taken = 0
+    class Watched(Inbox):
+        def next(self, timeout: float | None) -> Arrival:
+            taken.append(child.running)
+            if len(taken) == 2:
+                child.kill()
+            return super().next(timeout)
 
-            def next(self, timeout: float | None) -> Arrival:
-                self.taken += 1
-                if self.taken == 2 and process.stdin is not None:
-                    process.stdin.write(b".")
-                    process.stdin.flush()
-                return super().next(timeout)
-
-        inbox = Watched("test")
-        inbox.put("ended", "agent a")
-        stay([Beside("the page", process, "here")], inbox)
-        assert inbox.taken == 2
-        assert process.poll() == 0
+    inbox = Watched("test")
+    inbox.put("ended", "agent a")
+    children = Supervisor(inbox)
+    child = children.start("the page", main="signal:pause", answers=True)
+    stay([Viewer("the page", child, "here")], inbox)
+    children.stop()
+    assert taken == [True, True]

@@ -20,6 +20,7 @@ from protocol.network import keys, session
 from protocol.network.endpoints import at, listening
 from protocol.network.inbox import Inbox
 from tests.commands import (
+    BOUND_S,
     ENDLESS,
     OVER,
     TandemProcess,
@@ -121,10 +122,10 @@ def test_each_forked_process_has_its_own_status_and_output(tmp_path: Path) -> No
                 ),
                 errors=second.fileno(),
             )
-            assert wrong.status == 2
+            assert wrong.wait(BOUND_S)
             until(lambda: ended, "its end is told")
             mute.signal(SIGKILL)
-            assert mute.status == -SIGKILL
+            assert mute.wait(BOUND_S)
             assert not mute.running
             assert (tmp_path / "first").read_text().startswith("tandem agent: argument ID: '?'")
             assert (tmp_path / "second").read_text() == ""
@@ -139,6 +140,7 @@ def test_it_ends_with_its_standard_input() -> None:
         words = ("tandem", "agent", "a", "--connect", free_endpoint(), "--launched")
         agent = server.start("compose.cli.main:main", *words, errors=nowhere.fileno())
     agent.hang_up()
+    assert agent.wait(BOUND_S)
     assert agent.status == 130
     server.close()
 
@@ -242,6 +244,7 @@ def test_a_fork_server_that_cannot_start_prints_the_reason_in_one_line() -> None
     server = ForkServer("nowhere:nothing")
     with open(os.devnull, "wb") as nowhere:
         process = server.start("compose.cli.main:main", "tandem", errors=nowhere.fileno())
+        assert process.wait(BOUND_S)
         assert process.status == -SIGKILL
     assert server.gone
     assert server.why_gone() == (

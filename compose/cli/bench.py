@@ -27,8 +27,8 @@ from compose.cli.arguments import add_closing, count
 from compose.errors import LOCALISED
 from compose.extras import need
 from compose.launch import in_process, processes, zenoh_baseline
-from compose.launch.viewers import beside
-from compose.launch.viewers import page as page_on
+from compose.launch.supervisor import COMMAND, STOP_S, Supervisor
+from compose.launch.viewers import page, viewing
 from compose.network import KEYED
 from compose.recording import run
 from compose.scenario import scenario_file
@@ -146,21 +146,22 @@ def _frame_sizes(scenario: Scenario) -> tuple[int, int]:
 
 
 @contextmanager
-def _processes(arguments: Sequence[Sequence[str]], *, until_ended: bool = False) -> Iterator[None]:
-    """Run processes of Python, each `python -m` with its arguments, and kill them at the end.
+def _processes(
+    commands: Sequence[Sequence[str]], *, main: str = COMMAND, until_ended: bool = False
+) -> Iterator[None]:
+    """Run a process that calls `main`, a module:function, with each of `commands`, and stop them at the end.
 
-    With `until_ended`, wait at most STOP_S for each to end first.
+    With `until_ended`, wait at most STOP_S for all to end first.
     """
-    command = [sys.executable, "-P", "-m"]
-    children = [subprocess.Popen([*command, *one], stdout=subprocess.DEVNULL) for one in arguments]
+    children = Supervisor(Inbox("tandem bench"))
     try:
+        for number, arguments in enumerate(commands):
+            children.start(str(number), *arguments, main=main)
         yield
-        for child in children if until_ended else ():
-            child.wait(processes.STOP_S)
+        if until_ended:
+            children.wait(STOP_S)
     finally:
-        for child in children:
-            child.kill()
-            child.wait()
+        children.stop()
 
 
 def _mission_rate(
@@ -175,12 +176,12 @@ def _mission_rate(
         folder = stack.enter_context(tempfile.TemporaryDirectory())
         clients = []
         if watched:
-            page = stack.enter_context(beside(*page_on(Path(folder), 0)))
-            clients.append(["compose.view.web.page_client", page.address])
+            (viewer,) = stack.enter_context(viewing([page(Path(folder), 0)], Inbox("tandem bench")))
+            clients.append([viewer.address])
         common = ["--connect", str(endpoints), "--quiet", *(["--out", folder] if journals else [])]
-        robots = [["compose.cli", "agent", robot.id, *keyed(robot.id), *common] for robot in scenario.robots]
+        robots = [["agent", robot.id, *keyed(robot.id), *common] for robot in scenario.robots]
         with (
-            _processes(clients),
+            _processes(clients, main="compose.view.web.page_client:main"),
             _processes(robots, until_ended=True),
             session.open_router(endpoints) as link,
             Journal(Path(folder) / run.WORLD_JOURNAL) if journals else nullcontext() as journal,
@@ -209,10 +210,11 @@ def _barrier_rate(scenario: Scenario, sizes: tuple[int, int]) -> float:
     """Return the ticks per second of the baseline, with frames of `sizes` bytes."""
     endpoint = processes.free_endpoint()
     ids = [robot.id for robot in scenario.robots]
-    robots = [
-        ["compose.launch.zenoh_baseline", endpoint, one, str(sizes[1]), str(BARRIER_TICKS)] for one in ids
-    ]
-    with session.open_router(listening(endpoint)) as link, _processes(robots, until_ended=True):
+    robots = [[endpoint, one, str(sizes[1]), str(BARRIER_TICKS)] for one in ids]
+    with (
+        session.open_router(listening(endpoint)) as link,
+        _processes(robots, main="compose.launch.zenoh_baseline:main", until_ended=True),
+    ):
         return BARRIER_TICKS / zenoh_baseline.world(link, ids, sizes[0], BARRIER_TICKS)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -12,7 +13,8 @@ from compose.cli.participant import RELISTEN_S, add_participation, participate, 
 from compose.errors import ENDED, status_of
 from compose.hardware.driver_recording import recorded
 from compose.launch.driver_loader import briefed, driver_class, made, mission, options_of
-from compose.launch.processes import STOP_S, ChildFailed, MissionProcess, free_endpoint
+from compose.launch.processes import free_endpoint
+from compose.launch.supervisor import STOP_S, ChildFailed, Supervisor
 from compose.network import reach
 from compose.recording.run import folder_for
 from compose.recording.summary_json import ended
@@ -27,45 +29,6 @@ from world.hardware.bridge import Field, NoStart
 
 LEAST_S = 0.1
 """The least time between two starts of an agent (s): one that ends at once must not load the machine."""
-
-
-class Agent:
-    """The process of the robot's agent, which is restarted when a signal has killed it."""
-
-    def __init__(self, arguments: list[str], inbox: Inbox) -> None:
-        """Start `tandem` with `arguments`; `inbox` prints messages."""
-        self._arguments = arguments
-        self._inbox = inbox
-        self._child = self._start()
-
-    def _start(self) -> MissionProcess:
-        self._started, self._output_printed = time.monotonic(), False
-        return MissionProcess(f"agent {self._arguments[1]}", self._arguments, self._inbox, ())
-
-    def restart(self) -> None:
-        """Restart the agent after a signal has killed it; it resumes from its journal.
-
-        Raises ChildFailed if it ended with an error.
-        """
-        status = self._child.status
-        if status == ENDED:
-            return
-        if status > 0:
-            raise ChildFailed(f"{self._child.name} {self._child.how_ended()}")
-        self._inbox.say(f"{self._child.name} was killed by signal {-status} and is restarted")
-        self.end()
-        time.sleep(max(0.0, self._started + LEAST_S - time.monotonic()))
-        self._child = self._start()
-
-    def end(self, within: float = 0.0) -> None:
-        """Wait `within` seconds for the agent to end, then stop it, and print its last output."""
-        if self._child.running and not within:
-            self._child.stop()
-        self._child.end(within or STOP_S)
-        if not self._output_printed and self._child.status == ENDED and (output := self._child.stderr_text()):
-            say(*output.splitlines(), error=True)
-        self._output_printed = True
-        self._child.forget()
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -144,21 +107,39 @@ def _run(
     own = free_endpoint("tls" if keys else "tcp")
     endpoints = Endpoints(reached.connect, (own, *reached.listen), reached.settings, reached.folder)
     with session.open_router(endpoints, RELISTEN_S) as link:
-        agent = Agent(
-            [
-                *("agent", options.id, "--connect", own, "--launched", "--run", field.run, *keys),
-                *("--out", str(folder.resolve()), "--timeout", str(options.timeout)),
-                *(["--fsync"] if options.fsync else []),
-            ],
-            inbox,
-        )
+        children = Supervisor(inbox)
+        agent = f"agent {options.id}"
+        arguments = [
+            *("agent", options.id, "--connect", own, "--launched", "--run", field.run, *keys),
+            *("--out", str(folder.resolve()), "--timeout", str(options.timeout)),
+            *(["--fsync"] if options.fsync else []),
+        ]
+        children.start(agent, *arguments)
         try:
             field.attach(link)
             if not options.quiet:
                 where = f", resumed at tick {field.tick}" if field.tick >= 0 else ", waiting for its peer"
                 say(f"{options.id}: in run {field.run}{where}")
-            end = field.run_mission(options.connect_timeout, agent.restart)
-            agent.end(STOP_S)
+            end = field.run_mission(
+                options.connect_timeout, lambda: _restart(children, agent, arguments, inbox)
+            )
+            children.wait(STOP_S)
         finally:
-            agent.end()
+            children.stop()
+            children.say_errors()
         return end
+
+
+def _restart(children: Supervisor, agent: str, arguments: Sequence[str], inbox: Inbox) -> None:
+    """Restart the agent if a signal has killed it; it resumes from its journal.
+
+    Raises ChildFailed if it ended with an error.
+    """
+    status = children[agent].status
+    if status == ENDED:
+        return
+    if status is None or status > 0:
+        raise children.failure(agent)
+    inbox.say(f"{agent} was killed by signal {-status} and is restarted")
+    time.sleep(max(0.0, children[agent].started + LEAST_S - time.monotonic()))
+    children.start(agent, *arguments)

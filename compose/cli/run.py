@@ -7,15 +7,15 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 from compose.cli import arguments, export_bar
 from compose.errors import FAILED, STOPPED, UserError
 from compose.extras import need
-from compose.launch import processes
+from compose.launch import processes, supervisor
 from compose.launch.signals import stop_by_signal
-from compose.launch.viewers import Beside, beside, page, stay, viewers
+from compose.launch.viewers import Viewer, foxglove_server, page, stay, viewing
 from compose.recording.run import folder_for, read
 from compose.scenario.kills import WORLD, Kill
 from compose.scenario.scenario_file import ScenarioTemplate, check_rate, run_name, setting
@@ -77,7 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(options: argparse.Namespace) -> int:
     """Run the mission, as processes or in this one, and return the exit status of its outcome."""
     if not options.in_process:
-        processes.fork_server()  # it imports modules while this process does
+        supervisor.fork_server()  # it imports modules while this process does
     found = setting(options.scenario, options.fault)
     scenario = found.seeded(options.seed)
     if options.out is not None and any(options.out.glob("*.journal")):
@@ -132,16 +132,16 @@ def _in_process(options: argparse.Namespace, scenario: Scenario, kills: tuple[Ki
     began = time.perf_counter()
     if options.out is None and not options.watch:
         return conclude(options, in_process.run_mission(scenario), None, "in-process", began)
-    with folder_for(options.out) as folder, _viewers(options, scenario, folder) as viewing:
+    inbox = Inbox("tandem run")
+    with folder_for(options.out) as folder, _viewers(options, scenario, folder, inbox) as viewers:
         began = time.perf_counter()
         try:
             finished = in_process.run_mission(scenario, folder)
         except CannotRecord as error:
             raise UserError(f"--out: {error}") from None
         status = conclude(options, finished, folder, "in-process", began)
-        inbox = Inbox("tandem run")
         stop_by_signal(inbox)
-        return _after_outcome(options, folder, viewing, inbox, status)
+        return _after_outcome(options, folder, viewers, inbox, status)
 
 
 def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[Kill, ...]) -> int:
@@ -151,7 +151,7 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[
     with (
         folder_for(options.out) as folder,
         _keys(options, scenario) as keys,
-        _viewers(options, scenario, folder) as viewing,
+        _viewers(options, scenario, folder, inbox) as viewers,
     ):
         began = time.perf_counter()
         try:
@@ -165,9 +165,9 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[
                     timeout=options.timeout,
                     kills=kills,
                     keys=keys,
-                    agents_journal=bool(options.out is not None or kills or viewing),
+                    agents_journal=bool(options.out is not None or kills or viewers),
                 )
-        except processes.ChildFailed as failure:
+        except supervisor.ChildFailed as failure:
             inbox.say(f"failed: {failure}")
             break_off(options, folder, str(failure), began)
             return FAILED
@@ -178,7 +178,7 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[
         for kill in spared:
             inbox.say(f"--kill {kill.text}: not reached")
         status = conclude(options, read(folder), folder, "processes", began)
-        return _after_outcome(options, folder, viewing, inbox, status)
+        return _after_outcome(options, folder, viewers, inbox, status)
 
 
 @contextmanager
@@ -195,21 +195,22 @@ def _keys(options: argparse.Namespace, scenario: Scenario) -> Iterator[Path | No
 
 
 @contextmanager
-def _viewers(options: argparse.Namespace, scenario: Scenario, folder: Path) -> Iterator[list[Beside]]:
+def _viewers(
+    options: argparse.Namespace, scenario: Scenario, folder: Path, inbox: Inbox
+) -> Iterator[list[Viewer]]:
     """Start the viewers of the mission recorded in `folder`, print their addresses, and yield them."""
     wanted = [page(folder, options.port or 0)] if options.watch else []
     if options.foxglove is not None:
         ids = [robot.id for robot in scenario.robots]
-        wanted.append(viewers(folder, options.foxglove, options.foxglove_origin, ids))
-    with ExitStack() as stack:
-        started = [stack.enter_context(beside(*one)) for one in wanted]
+        wanted.append(foxglove_server(folder, options.foxglove, options.foxglove_origin, ids))
+    with viewing(wanted, inbox) as started:
         for viewer in started:
             viewer.announce()
         yield started
 
 
 def _after_outcome(
-    options: argparse.Namespace, folder: Path, viewing: Sequence[Beside], inbox: Inbox, status: int
+    options: argparse.Namespace, folder: Path, viewers: Sequence[Viewer], inbox: Inbox, status: int
 ) -> int:
     """Export the recording, serve the viewers until they are stopped, and return the exit status.
 
@@ -220,7 +221,7 @@ def _after_outcome(
     except Interrupted as signal_name:
         inbox.say(f"stopped by {signal_name} before the export was complete")
         return STOPPED
-    stay(viewing, inbox)
+    stay(viewers, inbox)
     return FAILED if options.export and not exported else status
 
 

@@ -21,7 +21,7 @@ from importlib import import_module
 import msgspec
 from setproctitle import setproctitle
 
-from compose.launch.forked import LENGTH_BYTES, STREAMS, Ended, ForkRequest, Signal
+from compose.launch.forked import REQUEST_BYTES, STREAMS, Ended, ForkRequest, Signal
 from protocol.output import one_line
 
 NOT_FORKED = 71
@@ -66,17 +66,8 @@ class _RequestLoop:
             time.sleep(POLL_S)
 
     def _request(self) -> tuple[ForkRequest | Signal, list[int]] | None:
-        head, streams, _, _ = socket.recv_fds(self._launcher, LENGTH_BYTES, STREAMS)
-        if not head:
-            return None
-        body = self._read(int.from_bytes(head + self._read(LENGTH_BYTES - len(head)), "big"))
-        return self._decoder.decode(body), streams
-
-    def _read(self, size: int) -> bytes:
-        body = b""
-        while len(body) < size:
-            body += self._launcher.recv(size - len(body)) or sys.exit(0)
-        return body
+        request, streams, _, _ = socket.recv_fds(self._launcher, REQUEST_BYTES, STREAMS)
+        return (self._decoder.decode(request), streams) if request else None
 
     def _fork(self, start: ForkRequest, streams: list[int]) -> bool:
         """Fork a process, and return whether this is the child."""
@@ -112,7 +103,7 @@ class _RequestLoop:
 
     def _report(self, end: Ended) -> None:
         with suppress(OSError):  # the launcher has ended
-            self._launcher.sendall(end.frame())
+            self._launcher.send(msgspec.msgpack.encode(end))
 
 
 def _become(start: ForkRequest, streams: list[int], parent: int) -> None:

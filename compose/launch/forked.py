@@ -20,13 +20,15 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from itertools import count
-from typing import NamedTuple
 
 import msgspec
 
-LENGTH_BYTES = 4
-"""The size of the length that precedes each request."""
+from compose.launch.child import KILL_S, ChildProcess, ending
+
+REQUEST_BYTES = 1 << 18
+"""The largest size of a request, which is more than a socket takes by default."""
 STREAMS = 3
 """The number of descriptors sent with a request for a process: its standard input, output and error."""
 
@@ -50,107 +52,20 @@ class Signal(msgspec.Struct, frozen=True, tag=True):
     signal: int
 
 
-KILL_S = 5.0
-"""Time in s that a killed process has to end; then its fork server is considered hung, and is killed."""
 TAKE_S = 60.0
-"""Time in s for retries while too many descriptors are in flight: the fork server may still import."""
+"""Time in s for retries of a request to fork: the fork server may still import."""
 LOOK_S = 1.0
 """The interval in s at which processes are checked while the fork server reports nothing."""
-TRY_AGAIN_S = 0.01
+TRY_AGAIN_S = 0.001
 """The interval in s between these retries."""
-ENDED_BYTES = 8
-"""The size of a report that a process has ended."""
 
 
-class Ended(NamedTuple):
+class Ended(msgspec.Struct, frozen=True):
     """The report to the launcher that a process has ended."""
 
     number: int
     status: int
     """Exit status; negative is the signal that killed it."""
-
-    def frame(self) -> bytes:
-        """Return the report as ENDED_BYTES bytes."""
-        return self.number.to_bytes(4, "big") + self.status.to_bytes(4, "big", signed=True)
-
-    @classmethod
-    def read(cls, frame: bytes) -> Ended:
-        """Return the report that `frame` encodes."""
-        return cls(int.from_bytes(frame[:4], "big"), int.from_bytes(frame[4:], "big", signed=True))
-
-
-class Process:
-    """A forked process. It ends when its standard input is closed, which its launcher holds open."""
-
-    def __init__(
-        self, server: ForkServer, number: int, stdin: int, stdout: int | None, on_end: Callable[[], None]
-    ) -> None:
-        self._stdin = stdin
-        self.stdout = stdout
-        """Descriptor from which its standard output is read; None if it is discarded."""
-        self._streams = [stream for stream in (stdin, stdout) if stream is not None]
-        """Descriptors of the launcher, closed once the process has ended."""
-        self._server = server
-        self._number = number
-        self._on_end = on_end
-        self._over = threading.Event()
-        self._status = 0
-
-    @property
-    def running(self) -> bool:
-        """True if the process has not ended yet."""
-        return not self._over.is_set()
-
-    @property
-    def status(self) -> int:
-        """Wait for the process to end, and return its exit status; negative is the signal that killed it."""
-        self._over.wait()
-        return self._status
-
-    @property
-    def hung_up(self) -> bool:
-        """True if it has closed its standard input, as it does by ending."""
-        poll = select.poll()
-        poll.register(self._stdin, 0)
-        return not self.running or bool(poll.poll(0))
-
-    def wait(self, timeout: float) -> bool:
-        """Wait at most `timeout` seconds, and return whether the process has ended."""
-        return self._over.wait(max(timeout, 0.0))
-
-    def signal(self, number: int) -> None:
-        """Send a signal to the process and its group, unless it has ended."""
-        if self.running:
-            self._server.signal(self._number, number)
-
-    def end(self, timeout: float = 0.0) -> int:
-        """Wait `timeout` seconds, then kill the process; return its exit status."""
-        if not self.wait(timeout):
-            self.signal(signal.SIGKILL)
-            if not self.wait(KILL_S):
-                self._server.kill()
-        status = self.status
-        self.hang_up()
-        return status
-
-    def hang_up(self) -> None:
-        """Close the launcher's ends of the process's streams."""
-        streams, self._streams = self._streams, []
-        for stream in streams:
-            os.close(stream)
-
-    def send(self, data: bytes) -> None:
-        """Write `data` to the standard input of the process, unless it has ended."""
-        rest = memoryview(data)
-        with suppress(BrokenPipeError):
-            while rest:
-                rest = rest[os.write(self._stdin, rest) :]
-
-    def ended(self, status: int) -> None:
-        """Store the exit status; called by the server when the process has ended."""
-        self._status = status
-        self._over.set()
-        self._on_end()
 
 
 class ForkServer:
@@ -158,7 +73,7 @@ class ForkServer:
 
     def __init__(self, warm_up: str) -> None:
         """Start the server; it first calls `warm_up`, a module:function."""
-        self._socket, its = socket.socketpair()
+        self._socket, its = socket.socketpair(type=socket.SOCK_SEQPACKET)
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # closed with the server
         # -P: the working directory may contain a folder named world or agent
         self._process = subprocess.Popen(
@@ -171,7 +86,7 @@ class ForkServer:
         its.close()
         self.pid = self._process.pid
         self._numbers = count()
-        self._running: dict[int, Process] = {}
+        self._running: dict[int, ChildProcess] = {}
         self._lock = threading.Lock()
         self.gone = False
         """True once the server, and with it all its processes, has ended."""
@@ -183,20 +98,27 @@ class ForkServer:
         main: str,
         title: str,
         *arguments: str,
-        errors: int,
+        errors: int | None = None,
         answers: bool = False,
         on_end: Callable[[], None] = lambda: None,
-    ) -> Process:
+    ) -> ChildProcess:
         """Fork a process that calls `main`, a module:function, with `arguments` in sys.argv.
 
-        Its standard error goes to the descriptor `errors`. Its standard output goes to a pipe if `answers`
-        is set, otherwise to /dev/null. `on_end` is called in another thread when the process has ended.
+        Its standard error goes to the descriptor `errors`, otherwise to a file that the result reads. Its
+        standard output goes to a pipe if `answers` is set, otherwise to /dev/null. `on_end` is called in
+        another thread when the process has ended.
         """
         its_input, our_input = os.pipe()
         our_output, its_output = os.pipe() if answers else (None, os.open(os.devnull, os.O_WRONLY))
+        file = None
+        if errors is None:
+            file = tempfile.TemporaryFile()  # noqa: SIM115  # closed by the process
+            errors = file.fileno()
         with self._lock:
             number = next(self._numbers)
-            process = self._running[number] = Process(self, number, our_input, our_output, on_end)
+            process = self._running[number] = ChildProcess(
+                (our_input, our_output), file, partial(self.signal, number), self.kill, on_end
+            )
             self._ask(ForkRequest(number, main, title, arguments), [its_input, its_output, errors])
         os.close(its_input)
         os.close(its_output)
@@ -210,58 +132,61 @@ class ForkServer:
             self._ask(Signal(process, number), [])
 
     def why_gone(self) -> str:
-        """Wait for the server to end, and return how it did, in a line."""
-        status = self._process.wait()
+        """Return how the server ended, in a line; it is waited for, and then killed, if it has not ended."""
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(KILL_S)
+        status = self.kill()
         self._errors.seek(0)
         errors = self._errors.read().decode(errors="replace").strip().splitlines()
-        how = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
-        return f"the fork server {how}{f': {errors[-1]}' if errors else ''}"
+        return f"the fork server {ending(status)}{f': {errors[-1]}' if errors else ''}"
 
-    def kill(self) -> None:
-        """Kill the server and all its processes."""
+    def kill(self) -> int:
+        """Kill the server and all its processes, and return the server's exit status."""
         self._process.kill()
-        self._process.wait()
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(KILL_S)
+        status = self._process.poll()
+        return -signal.SIGKILL if status is None else status
 
     def close(self) -> None:
         """Kill the server and its processes, and free its thread, socket and file in the launcher."""
         self.kill()
-        self._listener.join()
+        self._listener.join(KILL_S)
         self._socket.close()
         self._errors.close()
 
     def _ask(self, request: ForkRequest | Signal, streams: list[int]) -> None:
-        body = msgspec.msgpack.encode(request)
-        frame = len(body).to_bytes(LENGTH_BYTES, "big") + body
         try:
-            sent = self._send_streams(frame, streams) if streams else 0
-            self._socket.sendall(frame[sent:])
+            self._send(msgspec.msgpack.encode(request), streams)
         except OSError:  # a request must not be lost unnoticed: `_listen` sees that the server has ended
             self._process.kill()
 
-    def _send_streams(self, frame: bytes, streams: list[int]) -> int:
-        """Send `streams` with the beginning of `frame`, and return how many bytes of it were sent.
+    def _send(self, frame: bytes, streams: list[int]) -> None:
+        """Send `frame` with `streams`.
 
-        The kernel limits the descriptors in flight of all processes of a user to the number that one process
-        may have open (ETOOMANYREFS). Sending is therefore retried for TAKE_S, until the server has received
-        those of earlier requests. Raises OSError.
+        A server that is suspended, or still imports, takes few requests (EAGAIN), and the kernel limits the
+        descriptors in flight of all processes of a user to the number that one process may have open
+        (ETOOMANYREFS). Sending is therefore retried, for TAKE_S, and without `streams` for KILL_S.
+
+        Raises OSError.
         """
-        give_up = time.monotonic() + TAKE_S
+        give_up = time.monotonic() + (TAKE_S if streams else KILL_S)
         while True:
             try:
-                return socket.send_fds(self._socket, [frame], streams)
+                socket.send_fds(self._socket, [frame], streams, socket.MSG_DONTWAIT)
             except OSError as error:
-                if error.errno != errno.ETOOMANYREFS or time.monotonic() >= give_up:
+                if error.errno not in (errno.EAGAIN, errno.ETOOMANYREFS) or time.monotonic() >= give_up:
                     raise
+            else:
+                return
             time.sleep(TRY_AGAIN_S)
 
     def _listen(self) -> None:
-        news = b""
+        decoder = msgspec.msgpack.Decoder(Ended)
         with suppress(OSError):
             while received := self._received():
-                news += received
-                while len(news) >= ENDED_BYTES:
-                    one, news = Ended.read(news[:ENDED_BYTES]), news[ENDED_BYTES:]
-                    self._running.pop(one.number).ended(one.status)
+                one = decoder.decode(received)
+                self._running.pop(one.number).ended(one.status)
         self.gone = True
         self._end_all()
 
@@ -289,7 +214,7 @@ class ForkServer:
         with self._lock:
             ended, self._running = self._running, {}
         for process in ended.values():
-            process.ended(-signal.SIGKILL)
+            process.ended(-signal.SIGKILL, f"was killed: {self.why_gone()}")
 
 
 _servers: dict[str, ForkServer] = {}

@@ -6,25 +6,19 @@ import random
 import signal
 import socket
 import sys
-import tempfile
-import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from compose.errors import ENDED
-from compose.launch import forked
-from compose.launch.forked import ForkServer
+from compose.launch.supervisor import ChildFailed, Supervisor
 from compose.scenario.kills import WORLD, Kill, taken
 from protocol import limits
 from protocol.network.inbox import Inbox
-from protocol.output import say
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from world.scenario import Scenario
 
 FOLLOW_S = 2.0
 """Time in s that the agents have to end after the world has ended."""
-STOP_S = 3.0
-"""Time in s that a process has to end after SIGTERM; then it is killed."""
 JOIN_S = 60.0
 """The connection timeout of an agent in s, before JOIN_EACH_S is added."""
 JOIN_EACH_S = 0.5
@@ -33,10 +27,6 @@ CHILD_FILES, SPARE_FILES = 2, 12
 """The number of descriptors that the launcher needs for each process of a run, and for starting one."""
 LISTENING_PORTS = range(20_000, 32_000)
 """The ports for `free_endpoint`. They are below the ephemeral ports, which outgoing connections may take."""
-
-
-class ChildFailed(RuntimeError):
-    """A process ended before the run did; the text says which one, and how."""
 
 
 def free_endpoint(protocol: str = "tcp") -> str:
@@ -50,71 +40,6 @@ def free_endpoint(protocol: str = "tcp") -> str:
             except OSError:
                 continue
         return f"{protocol}/127.0.0.1:{port}"
-
-
-def fork_server() -> ForkServer:
-    """Return the fork server of this process's worlds and agents."""
-    return forked.fork_server("compose.cli.warm_up:missions")
-
-
-class MissionProcess:
-    """A process of the run. It has its own session, so Ctrl-C reaches it only through the launcher."""
-
-    def __init__(self, name: str, arguments: list[str], inbox: Inbox, kills: Sequence[Kill]) -> None:
-        self.name = name
-        self.kills = list(kills)
-        """Scheduled kills that have not happened yet."""
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # closed by `forget`
-        self._server = fork_server()
-        self._process = self._server.start(
-            "compose.cli.main:main",
-            "tandem",
-            *arguments,
-            *[word for kill in kills for word in ("--kill", kill.text)],
-            errors=self._errors.fileno(),
-            on_end=lambda: inbox.put("ended", name),
-        )
-
-    @property
-    def running(self) -> bool:
-        """True if the process has not ended yet."""
-        return self._process.running
-
-    @property
-    def status(self) -> int:
-        """Wait for the process to end, and return its exit status; negative is the signal that killed it."""
-        return self._process.status
-
-    def stderr_text(self) -> str:
-        """Return what the process has written to its standard error."""
-        self._errors.seek(0)
-        return self._errors.read().decode(errors="replace").strip()
-
-    def how_ended(self) -> str:
-        """Return how the process ended, as part of an error message."""
-        if self._server.gone:
-            return f"was killed: {self._server.why_gone()}"
-        ending = (
-            f"was killed by signal {-self.status}" if self.status < 0 else f"ended with status {self.status}"
-        )
-        return f"{ending}: {'; '.join(errors.splitlines())}" if (errors := self.stderr_text()) else ending
-
-    def send(self, frame: bytes) -> None:
-        """Send `frame`, preceded by its length, to the standard input of the process."""
-        self._process.send(len(frame).to_bytes(4, "big") + frame)
-
-    def stop(self) -> None:
-        """Send SIGTERM, and SIGCONT in case the process is suspended."""
-        self._process.signal(signal.SIGTERM)
-        self._process.signal(signal.SIGCONT)
-
-    def end(self, timeout: float) -> None:
-        """Wait `timeout` seconds for the process to end, then kill it."""
-        self._process.end(timeout)
-
-    def forget(self) -> None:
-        """Close the file that stores its standard error."""
-        self._errors.close()
 
 
 def scenario_from_launcher() -> Scenario:
@@ -149,14 +74,13 @@ def run_mission(
     """
     limits.need_files(CHILD_FILES * (1 + len(scenario.robots)) + SPARE_FILES, "a run as processes")
     arguments = _arguments(scenario, out, run, rate, timeout, keys, agents_journal=agents_journal)
-    launched = _Run(scenario, inbox, arguments)
+    mission = _Mission(scenario, arguments, kills, inbox)
     try:
-        for name in launched.names:
-            launched.start(name, [kill for kill in kills if kill.process == name])
-        launched.watch()
+        mission.run()
     finally:
-        launched.stop()
-    return [kill for child in launched.children.values() for kill in child.kills]
+        mission.children.stop()
+        mission.children.say_errors()
+    return [kill for left in mission.kills.values() for kill in left]
 
 
 def _arguments(
@@ -192,84 +116,57 @@ def _arguments(
     }
 
 
-class _Run:
-    """The processes of one run, by name, and when to restart those that were killed."""
+class _Mission:
+    """The world and the agents of one run, restarted when they were killed."""
 
-    def __init__(self, scenario: Scenario, inbox: Inbox, arguments: Mapping[str, list[str]]) -> None:
+    def __init__(
+        self, scenario: Scenario, arguments: Mapping[str, list[str]], kills: Sequence[Kill], inbox: Inbox
+    ) -> None:
         """`arguments` are the command lines, by process name."""
-        self._scenario = scenario
-        self._inbox = inbox
+        self._scenario = encode(scenario)
         self._arguments = arguments
-        self.names = list(arguments)
-        self.children: dict[str, MissionProcess] = {}
-        self._due: dict[str, float] = {}
-        """Monotonic time in s at which a killed process is restarted, by name."""
+        self._inbox = inbox
+        self.children = Supervisor(inbox)
+        self.kills = {name: [kill for kill in kills if kill.process == name] for name in arguments}
+        """Kills that have not happened yet, by process name."""
 
-    def start(self, name: str, kills: Sequence[Kill]) -> None:
-        """Start or restart the process `name`, which will be killed at `kills`."""
-        if name in self.children:
-            self.children[name].forget()
-        self.children[name] = MissionProcess(name, self._arguments[name], self._inbox, kills)
-        if name == WORLD:
-            self.children[name].send(encode(self._scenario))
-
-    def watch(self) -> None:
-        """Wait until all processes have ended, the agents at most FOLLOW_S after the world.
+    def run(self) -> None:
+        """Start all processes, and wait until they have ended, the agents at most FOLLOW_S after the world.
 
         Raises ChildFailed.
         """
-        running = set(self.names)
+        for name in self._arguments:
+            self._start(name)
+        running = set(self._arguments)
         while running:
-            arrival = self._inbox.next(self._timeout(WORLD in running))
-            if arrival.topic == "nothing" and not self._due:
+            ended = self.children.next_end(None if WORLD in running else FOLLOW_S)
+            if ended is None:
                 return
-            if arrival.topic == "ended":
-                child = self.children[arrival.key]
-                if child.status != ENDED:
-                    self._schedule_restart(child)
-                    continue
-                running.discard(child.name)
-                if child.name == WORLD:
-                    self._due.clear()
-            for name in [name for name, due in self._due.items() if time.monotonic() >= due]:
-                del self._due[name]
-                self.start(name, self.children[name].kills)
+            if self.children[ended].status != ENDED:
+                self._restart(ended)
+                continue
+            running.discard(ended)
+            if ended == WORLD:
+                self.children.cancel_starts()
 
-    def _timeout(self, world_runs: bool) -> float | None:
-        """Return the timeout in s for the next message of the inbox; None is no timeout."""
-        if self._due:
-            return min(self._due.values()) - time.monotonic()
-        return None if world_runs else FOLLOW_S
+    def _start(self, name: str) -> None:
+        kills = [word for kill in self.kills[name] for word in ("--kill", kill.text)]
+        child = self.children.start(name, *self._arguments[name], *kills)
+        if name == WORLD:
+            child.send(len(self._scenario).to_bytes(4, "big") + self._scenario)
 
-    def _schedule_restart(self, child: MissionProcess) -> None:
-        """Schedule the restart of a killed child.
+    def _restart(self, name: str) -> None:
+        """Restart a child that was killed.
 
         Raises ChildFailed if the child did not end by one of its kills, or by a kill without a restart.
         """
-        kill = taken(child.kills, child.stderr_text()) if child.status == -signal.SIGKILL else None
+        child = self.children[name]
+        kill = taken(self.kills[name], child.stderr_text()) if child.status == -signal.SIGKILL else None
         if kill is None:
-            raise ChildFailed(f"{child.name} {child.how_ended()}")
+            raise self.children.failure(name)
         if kill.after is None:
-            raise ChildFailed(f"{child.name} was killed at tick {kill.tick} (--kill {kill.text})")
-        child.kills.remove(kill)
-        child.end(0.0)
+            raise ChildFailed(f"{name} was killed at tick {kill.tick} (--kill {kill.text})")
+        self.kills[name].remove(kill)
         when = f" in {kill.after:g} s" if kill.after else ""
-        self._inbox.say(f"{child.name} was killed at tick {kill.tick}, and is restarted{when}")
-        self._due[child.name] = time.monotonic() + kill.after
-
-    def stop(self) -> None:
-        """End all processes, and print what those that ended well wrote to standard error."""
-        _stop(self.children.values())
-        for child in self.children.values():
-            if child.status == ENDED and (errors := child.stderr_text()):
-                say(*errors.splitlines(), error=True)
-            child.forget()
-
-
-def _stop(children: Iterable[MissionProcess]) -> None:
-    for child in children:
-        if child.running:
-            child.stop()
-    give_up = time.monotonic() + STOP_S
-    for child in children:
-        child.end(give_up - time.monotonic())
+        self._inbox.say(f"{name} was killed at tick {kill.tick}, and is restarted{when}")
+        self.children.start_later(kill.after, lambda: self._start(name))

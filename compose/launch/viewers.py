@@ -1,20 +1,19 @@
 """Viewers of a mission: processes that read the growing journals, and their launcher's side.
 
-A viewer writes its address to standard output when it is ready. It ends when its standard input is closed.
+A viewer writes its address to standard output when it is ready. It ends on SIGTERM, and with its launcher.
 """
 
 from __future__ import annotations
 
-import subprocess
-import sys
-import tempfile
-import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import NamedTuple
 
 from compose.errors import UserError
-from compose.launch.processes import STOP_S
+from compose.launch.child import ChildProcess
+from compose.launch.supervisor import COMMAND, Supervisor
 from protocol.network.inbox import Inbox, Interrupted
 from protocol.output import say
 
@@ -24,14 +23,33 @@ READY_S = 30.0
 """Time in s that a viewer has to be ready."""
 
 
-class Beside:
+def warm_up() -> None:
+    """Prepare a fork server for viewers, which share few modules. Importing this module does all of it."""
+
+
+class ViewerCommand(NamedTuple):
+    """The command line of a viewer."""
+
+    what: str
+    """Name of the viewer in messages."""
+    main: str
+    """Function that it calls, as module:function."""
+    arguments: tuple[str, ...]
+
+
+class Viewer:
     """A running viewer process."""
 
-    def __init__(self, what: str, process: subprocess.Popen[bytes], address: str) -> None:
+    def __init__(self, what: str, child: ChildProcess, address: str) -> None:
         """`what` is the name of the viewer in messages."""
         self.address = address
         self._what = what
-        self._process = process
+        self._child = child
+
+    @property
+    def running(self) -> bool:
+        """True if it has not ended yet."""
+        return self._child.running
 
     def announce(self) -> None:
         """Print the address."""
@@ -39,99 +57,62 @@ class Beside:
 
     def conclude(self) -> None:
         """Tell the viewer that the mission has ended, and print that it keeps running."""
-        assert self._process.stdin is not None
-        with suppress(BrokenPipeError):
-            self._process.stdin.write(OVER)
-            self._process.stdin.flush()
+        self._child.send(OVER)
         say(f"{self._what} remains at {self.address} until Ctrl-C")
 
-    def put_end(self, inbox: Inbox) -> None:
-        """Put "ended" with the address into `inbox` once the process has ended."""
 
-        def wait() -> None:
-            self._process.wait()
-            inbox.put("ended", self.address)
-
-        threading.Thread(target=wait, daemon=True).start()
-
-
-def stay(shows: Sequence[Beside], inbox: Inbox) -> None:
-    """Wait, after the mission, for Ctrl-C or for the end of all viewers in `shows`.
+def stay(viewers: Sequence[Viewer], inbox: Inbox) -> None:
+    """Wait, after the mission, for Ctrl-C or for the end of all `viewers`, which `inbox` receives.
 
     Processes of the mission that end later are ignored.
     """
-    for show in shows:
-        show.conclude()
-        show.put_end(inbox)
-    running = {show.address for show in shows}
+    for viewer in viewers:
+        viewer.conclude()
     with suppress(Interrupted):
-        while running:
-            arrival = inbox.next(None)
-            if arrival.topic == "ended":
-                running.discard(arrival.key)
+        while any(viewer.running for viewer in viewers):
+            inbox.next(None)
 
 
 @contextmanager
-def beside(what: str, module: str, *arguments: str) -> Iterator[Beside]:
-    """Run the viewer `python -m module arguments` in this context.
+def viewing(wanted: Sequence[ViewerCommand], inbox: Inbox) -> Iterator[list[Viewer]]:
+    """Run the `wanted` viewers in this context; `inbox` receives their ends.
 
-    Raises UserError, with the last line of its standard error, if it is not ready within READY_S.
+    Raises UserError, with the last line of its standard error, if one is not ready within READY_S.
     """
-    with tempfile.TemporaryFile() as errors:
-        process = subprocess.Popen(
-            [sys.executable, "-P", "-m", module, *arguments],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=errors,
-            start_new_session=True,
-        )
-        try:
-            address = _address(process)
-            if address is None:
-                process.kill()
-                process.wait()
-                errors.seek(0)
-                output = errors.read().decode(errors="replace").strip().splitlines()
-                raise UserError(
-                    output[-1].removeprefix("tandem watch: ")
-                    if output
-                    else f"{what}: not ready within {READY_S:g} s"
-                )
-            yield Beside(what, process, address)
-        finally:
-            _end(process)
-
-
-def page(folder: Path, port: int) -> tuple[str, ...]:
-    """Return the arguments of `beside` for the page of the recording in `folder`."""
-    return ("the page", "compose.cli", "watch", str(folder), "--launched", "--port", str(port))
-
-
-def viewers(folder: Path, port: int, origins: Sequence[str], robots: Sequence[str]) -> tuple[str, ...]:
-    """Return the arguments of `beside` to serve a run to Foxglove, and to web pages of `origins`."""
-    words = (str(port), ",".join(origins), str(folder), *robots)
-    return ("the Foxglove server", "compose.view.foxglove.live_server", *words)
-
-
-def _address(process: subprocess.Popen[bytes]) -> str | None:
-    """Return the address that the viewer writes when it is ready; None if it is not ready within READY_S."""
-    lines: list[bytes] = []
-    out = process.stdout
-    assert out is not None
-    reader = threading.Thread(target=lambda: lines.append(out.readline()), daemon=True)
-    reader.start()
-    reader.join(READY_S)
-    return lines[0].decode().strip() or None if lines else None
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """Close the streams of the viewer, which ends it; kill it if it has not ended after STOP_S."""
-    for pipe in (process.stdin, process.stdout):
-        if pipe is not None:
-            with suppress(OSError):
-                pipe.close()
+    children = Supervisor(inbox, "compose.launch.viewers:warm_up")
     try:
-        process.wait(STOP_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
+        yield [_started(children, command) for command in wanted]
+    finally:
+        children.stop()
+
+
+def _started(children: Supervisor, command: ViewerCommand) -> Viewer:
+    """Return a viewer that has become ready. Raises UserError."""
+    child = children.start(command.what, *command.arguments, main=command.main, answers=True)
+    address = _address(child)
+    if address is None:
+        child.end()
+        errors = child.stderr_text().splitlines()
+        late = f"{command.what}: not ready within {READY_S:g} s"
+        raise UserError(errors[-1].removeprefix("tandem watch: ") if errors else late)
+    return Viewer(command.what, child, address)
+
+
+def page(folder: Path, port: int) -> ViewerCommand:
+    """Return the viewer that serves the page of the recording in `folder`."""
+    return ViewerCommand("the page", COMMAND, ("watch", str(folder), "--launched", "--port", str(port)))
+
+
+def foxglove_server(folder: Path, port: int, origins: Sequence[str], robots: Sequence[str]) -> ViewerCommand:
+    """Return the viewer that serves a run to Foxglove, and to web pages of `origins`."""
+    arguments = (str(port), ",".join(origins), str(folder), *robots)
+    return ViewerCommand("the Foxglove server", "compose.view.foxglove.live_server:main", arguments)
+
+
+def _address(child: ChildProcess) -> str | None:
+    """Return the address that the viewer writes when it is ready; None if it is not ready within READY_S."""
+    line, give_up = b"", time.monotonic() + READY_S
+    with suppress(TimeoutError):
+        while not line.endswith(b"\n") and (news := child.receive(give_up - time.monotonic())):
+            line += news
+    return line.decode().strip() or None if line.endswith(b"\n") else None

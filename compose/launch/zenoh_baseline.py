@@ -6,7 +6,6 @@ frame to each robot and waits for a frame from each. Nothing is encoded, checked
 
 from __future__ import annotations
 
-import signal
 import sys
 import time
 from collections.abc import Sequence
@@ -70,6 +69,6 @@ def robot(endpoint: str, name: str, size: int, ticks: int) -> None:
             publisher.put(frame)
 
 
-if __name__ == "__main__":
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+def main() -> None:
+    """Run the robot that sys.argv describes."""
     robot(sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4]))

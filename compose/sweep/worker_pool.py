@@ -6,8 +6,6 @@ a new process runs the remaining trials. Dask therefore sees only completed chun
 
 from __future__ import annotations
 
-import os
-import select
 import signal
 import tempfile
 import threading
@@ -22,8 +20,6 @@ from protocol.output import one_line
 
 START_S = 60.0
 """The time in s within which a new process must have imported its modules."""
-READ_BYTES = 1 << 16
-"""The largest number of bytes in one read from a process."""
 
 
 class Died(Exception):
@@ -38,32 +34,24 @@ class WorkerProcess:
     """A process in which trials run. It has its own session, so Ctrl-C reaches only its owner."""
 
     def __init__(self) -> None:
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # closed by `close`
         self._folder = tempfile.TemporaryDirectory(prefix="tandem-trials-", ignore_cleanup_errors=True)
-        self._process = fork_server("compose.sweep.worker:warm_up").start(
-            "compose.sweep.worker:main",
-            "tandem sweep worker",
-            self._folder.name,
-            errors=self._errors.fileno(),
-            answers=True,
+        self._child = fork_server("compose.sweep.worker:warm_up").start(
+            "compose.sweep.worker:main", "tandem sweep worker", self._folder.name, answers=True
         )
-        assert self._process.stdout is not None
-        self._output = self._process.stdout
-        self._poll = select.poll()
-        self._poll.register(self._output, select.POLLIN)
         self._read = b""
 
     def ask(self, chunk: Chunk) -> None:
         """Send the trials of `chunk` to the process, which runs them."""
-        self._process.send(framed(msgspec.msgpack.encode(chunk)))
+        self._child.send(framed(msgspec.msgpack.encode(chunk)))
 
     def answer(self, timeout: float) -> bytes:
         """Return the next frame. Raises Hung after `timeout` seconds, and Died if the process has ended."""
         give_up = time.monotonic() + timeout
         while (body := self._frame()) is None:
-            if not self._poll.poll(max(0.0, 1e3 * (give_up - time.monotonic()))):
-                raise Hung
-            news = os.read(self._output, READ_BYTES)
+            try:
+                news = self._child.receive(give_up - time.monotonic())
+            except TimeoutError:
+                raise Hung from None
             if not news:
                 raise Died(self._how())
             self._read += news
@@ -79,92 +67,88 @@ class WorkerProcess:
 
     def _how(self) -> str:
         """Return how the process ended, with the last line of its standard error."""
-        if not self._process.wait(1.0):  # its standard output is closed, but it still runs
+        if not self._child.wait(1.0):  # its standard output is closed, but it still runs
             self.kill()
             return "it closed its standard output"
-        status = self._process.status
-        size = os.fstat(self._errors.fileno()).st_size
-        errors = os.pread(self._errors.fileno(), MAX_ERROR, max(0, size - MAX_ERROR)).decode(errors="replace")
-        last = one_line(errors.strip().splitlines()[-1]) if errors.strip() else ""
+        status = self._child.status or 0
+        errors = self._child.stderr_text()[-MAX_ERROR:].splitlines()
         how = f"killed by {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
-        return f"{how}: {last}" if last else how
+        return f"{how}: {one_line(errors[-1])}" if errors else how
 
     def kill(self) -> None:
         """Kill the process. Processes that its trials started end with it."""
-        self._process.signal(signal.SIGKILL)
+        self._child.kill()
 
     def close(self) -> None:
         """Kill the process, and remove its files."""
-        self._process.end()
-        self._errors.close()
+        self._child.end()
         self._folder.cleanup()
 
 
 class _Children:
-    """The processes of this pool, by sweep and thread."""
+    """The processes of one sweep in this pool."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._working: dict[tuple[str, int], WorkerProcess] = {}
-        self._resting: dict[tuple[str, int], WorkerProcess] = {}
-        self._over: set[str] = set()
+        self._working: set[WorkerProcess] = set()
+        self._resting: list[WorkerProcess] = []
+        self._over = False
 
-    def take(self, sweep: str) -> tuple[WorkerProcess, bool] | None:
-        """Return this thread's process and whether it is reused; None if the sweep is over.
+    def take(self) -> tuple[WorkerProcess, bool] | None:
+        """Return a process for this thread, and whether it is reused; None if the sweep is over.
 
         Raises Died or Hung if a new process does not become ready.
         """
-        key = sweep, threading.get_ident()
         with self._lock:
-            if sweep in self._over:
+            if self._over:
                 return None
-            reused = self._resting.pop(key, None)
-            child = self._working[key] = reused or WorkerProcess()
-        if reused is None:
+            reused = bool(self._resting)
+            child = self._resting.pop() if reused else WorkerProcess()
+            self._working.add(child)
+        if not reused:
             try:
                 ready = child.answer(START_S)
                 assert ready == READY
             except (Died, Hung):
-                self.drop(sweep)
+                self.drop(child)
                 raise
-        return child, reused is not None
+        return child, reused
 
-    def keep(self, sweep: str) -> None:
-        """Store this thread's process for its next chunk; close it if the sweep is over."""
-        key = sweep, threading.get_ident()
+    def keep(self, child: WorkerProcess) -> None:
+        """Store the process for another chunk; close it if the sweep is over."""
         with self._lock:
-            child = self._working.pop(key)
-            if sweep not in self._over:
-                self._resting[key] = child
+            self._working.remove(child)
+            if not self._over:
+                self._resting.append(child)
                 return
         child.close()
 
-    def drop(self, sweep: str) -> bool:
-        """Close this thread's process, and return whether the sweep is still running."""
+    def drop(self, child: WorkerProcess) -> bool:
+        """Close the process, and return whether the sweep is still running."""
         with self._lock:
-            child = self._working.pop((sweep, threading.get_ident()))
-            still_running = sweep not in self._over
+            self._working.remove(child)
+            running = not self._over
         child.close()
-        return still_running
+        return running
 
-    def dismiss(self, sweep: str) -> None:
-        """End all processes of the sweep, and start no more of them."""
+    def dismiss(self) -> None:
+        """End all processes, and start no more of them."""
         with self._lock:
-            self._over.add(sweep)
-            for key, child in self._working.items():
-                if key[0] == sweep:
-                    child.kill()  # its thread sees that it has ended, and closes it
-            idle = [self._resting.pop(key) for key in list(self._resting) if key[0] == sweep]
+            self._over = True
+            for child in self._working:
+                child.kill()  # its thread sees that it has ended, and closes it
+            idle, self._resting = self._resting, []
         for child in idle:
             child.close()
 
 
-_children = _Children()
+_children: dict[str, _Children] = {}
+"""The processes in this pool, by sweep."""
 
 
 def dismiss(sweep: str) -> None:
     """End all processes of the sweep in this pool, and start no more of them."""
-    _children.dismiss(sweep)
+    _children.setdefault(sweep, _Children()).dismiss()
 
 
 def run(sweep: str, encoded: bytes) -> list[bytes]:
@@ -173,8 +157,9 @@ def run(sweep: str, encoded: bytes) -> list[bytes]:
     Raises Died or Hung if no new process for trials becomes ready.
     """
     chunk = msgspec.msgpack.decode(encoded, type=Chunk)
+    children = _children.setdefault(sweep, _Children())
     rows: list[bytes] = []
-    while len(rows) < len(chunk.trials) and (taken := _children.take(sweep)) is not None:
+    while len(rows) < len(chunk.trials) and (taken := children.take()) is not None:
         child, reused = taken
         asked = len(rows)
         began = time.perf_counter()
@@ -187,13 +172,13 @@ def run(sweep: str, encoded: bytes) -> list[bytes]:
             error = f"hung: no answer within {chunk.timeout:g} s"
         except Died as death:
             if reused and len(rows) == asked:  # a reused process may have ended earlier: try a new one
-                _children.drop(sweep)
+                children.drop(child)
                 continue
             error = f"died: {death}"
         else:
-            _children.keep(sweep)
+            children.keep(child)
             break
-        if not _children.drop(sweep):
+        if not children.drop(child):
             break
         i = len(rows)
         took_s = time.perf_counter() - began

@@ -9,19 +9,19 @@ behind: of a backlog it shows the latest tick. It ends when its standard input i
 from __future__ import annotations
 
 import os
-import signal
 import socket
 import sys
 import time
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import NoReturn
 
 import foxglove
 from foxglove import Context
 from foxglove.websocket import Capability, ChannelView, Client, ServerListener, WebSocketServer
 
-from compose.launch.signals import stop_with_launcher
+from compose.launch.signals import stop_by_signal, stop_with_launcher
 from compose.recording.frames import JournalDecoder
 from compose.recording.run import WORLD_JOURNAL, agent_journal
 from compose.view.cast import Stage
@@ -136,16 +136,22 @@ class _Listener(ServerListener):
         self._live.subscribed = True
 
 
-def main(port: int, origins: Sequence[str], folder: Path, robots: Sequence[str]) -> int:
-    """Serve until standard input ends. Return the exit status, which is 1 if the port is not available.
+def main() -> NoReturn:
+    """Serve the run that sys.argv names, and end the process with an exit status."""
+    _, port, pages, recording, *ids = sys.argv
+    sys.exit(serve(int(port), [one for one in pages.split(",") if one], Path(recording), ids))
+
+
+def serve(port: int, origins: Sequence[str], folder: Path, robots: Sequence[str]) -> int:
+    """Serve until a signal, or the end of the launcher. Return 1 if the port is not available, else 0.
 
     Web pages of `origins` are allowed to connect, in addition to Foxglove's app. All channels are created
     before a viewer can connect, because under load the SDK rejects subscriptions to new channels.
     """
     os.nice(NICE)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the launcher handles it
     inbox = Inbox("tandem run --foxglove")
     stop_with_launcher(inbox)
+    stop_by_signal(inbox)
     context = Context()
     channels = Channels(context)
     channels.open(robots)
@@ -185,8 +191,3 @@ def _serve(live: Live, server: WebSocketServer, inbox: Inbox) -> None:
         at = live.look(time.monotonic())
         if at is not None:
             server.broadcast_time(at)
-
-
-if __name__ == "__main__":
-    _, port, pages, recording, *ids = sys.argv
-    sys.exit(main(int(port), [one for one in pages.split(",") if one], Path(recording), ids))

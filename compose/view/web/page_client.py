@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import http.client
 import json
-import signal
 import sys
 import time
 from contextlib import suppress
@@ -38,7 +37,7 @@ def visit(address: str) -> None:
         time.sleep(BETWEEN_S)
 
 
-if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+def main() -> None:
+    """Visit the page at the address in sys.argv."""
     with suppress(OSError, http.client.HTTPException):  # the server has ended
         visit(sys.argv[1])
