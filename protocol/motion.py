@@ -137,6 +137,11 @@ def inverse(pose: Pose) -> Pose:
     return Pose(-c * pose.x - s * pose.y, s * pose.x - c * pose.y, -pose.heading)
 
 
+def travelled(origin: Pose, pose: Pose) -> float:
+    """Return the distance in m between two poses."""
+    return math.hypot(pose.x - origin.x, pose.y - origin.y)
+
+
 def wrap(angle: float) -> float:
     """Return `angle`, in rad, wrapped to (-pi, pi]."""
     wrapped = math.remainder(angle, TAU)

@@ -9,6 +9,7 @@ its anchor, and 5 % faster.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import cache
 
 import msgspec
@@ -58,12 +59,6 @@ class Rendezvous(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fi
     def of(self, role: Role) -> Orbit:
         """Return the orbit of the robot with this role."""
         return self.a if role == "a" else self.b
-
-
-@cache
-def rendezvous(mission: Mission, distance: float, planner_name: PlannerName) -> Rendezvous:
-    """Return the orbits of the planner for anchors `distance` m (D) apart."""
-    return orbiting(mission, distance) if planner_name == "paper" else searching(mission, distance)
 
 
 def tick_budget(mission: Mission, plan: Rendezvous) -> int:
@@ -159,3 +154,18 @@ def half_passage(apart: float, radius: float, reach: float) -> float:
     """
     cosine = (apart * apart + radius * radius - reach * reach) / (2.0 * apart * radius)
     return math.acos(min(1.0, max(-1.0, cosine)))
+
+
+# --- the orbits of each planner -----------------------------------------------------------------------
+
+RENDEZVOUS: dict[PlannerName, Callable[[Mission, float], Rendezvous]] = {
+    "paper": orbiting,
+    "assured": searching,
+}
+"""The orbits of each planner, for a mission and the distance D in m between the anchors."""
+
+
+@cache
+def rendezvous(mission: Mission, distance: float, planner_name: PlannerName) -> Rendezvous:
+    """Return the orbits of the planner for anchors `distance` m (D) apart."""
+    return RENDEZVOUS[planner_name](mission, distance)

@@ -12,7 +12,6 @@ from unittest.mock import patch
 
 from msgspec.structs import replace
 
-from agent.planning import planner
 from agent.process.robot import Robot
 from compose.launch import in_process
 from compose.launch.signals import stop_by_signal
@@ -63,7 +62,7 @@ class Boaster(Robot):
 
     def estimate(self) -> bytes:
         """Return and journal an estimate that reports the robot as localised."""
-        frame = encode(replace(planner.estimate(self.state), localised=True))
+        frame = encode(replace(self.planner.estimate(self.state), localised=True))
         assert self._journal is not None
         self._journal.write(frame)
         return frame

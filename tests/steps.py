@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from agent.planning import planner
+from agent.planning.planner import Planner
+from agent.planning.registry import planner
 from agent.planning.state import RobotState
 from compose.scenario.scenario_file import load
 from protocol.messages import Command, Observation, Report
@@ -23,25 +24,30 @@ class Step(NamedTuple):
     commands: dict[str, Command]
 
 
+def planner_of(state: RobotState) -> Planner:
+    """Return the planner of the robot with this state."""
+    return planner(state.config.planner_name)
+
+
 def steps(name: str) -> Iterator[Step]:
     """Yield the ticks of the scenario `name`, and check that it ends localised."""
     world = release(load(name))
-    states = {robot.id: RobotState(world.scenario.config(robot.id)) for robot in world.scenario.robots}
+    play = planner(world.scenario.planner_name)
+    states = {robot.id: play.start(world.scenario.config(robot.id)) for robot in world.scenario.robots}
     while True:
         sensed = observations(world)
         observed = {
-            observation.robot: planner.observe(states[observation.robot], observation)
-            for observation in sensed
+            observation.robot: play.observe(states[observation.robot], observation) for observation in sensed
         }
         heard = {
-            observation.robot: [planner.report(observed[contact.peer]) for contact in observation.contacts]
+            observation.robot: [play.report(observed[contact.peer]) for contact in observation.contacts]
             for observation in sensed
         }
         before, states = (
             states,
-            {robot: planner.decide(state, heard[robot]) for robot, state in observed.items()},
+            {robot: play.decide(state, heard[robot]) for robot, state in observed.items()},
         )
-        commands = {robot: planner.command(state) for robot, state in states.items()}
+        commands = {robot: play.command(state) for robot, state in states.items()}
         yield Step(world, sensed, before, observed, heard, commands)
         onward = advance(world, commands)
         if not isinstance(onward, World):

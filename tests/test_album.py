@@ -23,6 +23,7 @@ from matplotlib.patches import Circle
 from matplotlib.text import Annotation
 from msgspec.structs import replace
 
+from agent.planning import assured
 from agent.planning.active_sensing import stride
 from agent.planning.phase3_last_manoeuvre import compared
 from compose.cli.figures import draw as draw_all
@@ -169,7 +170,7 @@ def test_a_plan_shows_each_candidate_and_the_axis_of_each_two_and_the_choice(
 def test_what_is_compared_is_what_was_chosen_from(recordings: Path) -> None:
     told = pair(recorded("assured", recordings))
     (one,) = [one for role in ("b", "a") for one in manoeuvre.planned(told, role)][:1]
-    ways = compared(one.plan.question, told.mission, "assured")
+    ways = compared(one.plan.question, told.mission, assured.MANOEUVRES)
     row, column = np.unravel_index(np.argmax(ways.value), ways.value.shape)
     assert (ways.reach.v[row, 0], ways.reach.omega[column]) == (one.plan.command.v, one.plan.command.omega)
     command = told.command(one.plan.question.mover, one.tick)

@@ -18,10 +18,11 @@ import pytest
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
+from agent.estimation.gaussian import inference
 from agent.estimation.gaussian.hypotheses import ScoredHypothesis, search
 from agent.estimation.gaussian.least_squares import Fit, poses
 from agent.estimation.gaussian.range_model import PairRanges
-from agent.planning import inference, planner
+from agent.planning import assured
 from agent.planning.state import Done, RobotState
 from compose.launch.in_process import run_mission
 from compose.scenario.scenario_file import parse
@@ -160,16 +161,16 @@ def remembered(folder: Path, robot: str) -> tuple[RobotState, Localised]:
     The state has a result from the start, so it makes no decisions, and is computed quickly.
     """
     config = decode(list(journal_file.read(folder / f"agent-{robot}.journal"))[1], RobotConfig)
-    state = RobotState(config, Done(1, Undecided("was not asked")))
+    state = RobotState(config, mode=Done(1, Undecided("was not asked")))
     heard: list[Report] = []
     for message in said(folder, robot):
         match message:
             case Observation():
-                state, heard = planner.observe(state, message), []
+                state, heard = assured.observe(state, message), []
             case Report() if message.robot != robot:
                 heard.append(message)
             case Command(verdict=verdict):
-                state = planner.decide(state, heard)
+                state = assured.decide(state, heard)
                 if isinstance(verdict, Localised):
                     return state, verdict
             case _:

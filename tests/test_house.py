@@ -13,11 +13,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from agent.planning import planner
 from agent.planning.state import RobotState
 from compose.scenario.scenario_file import load
 from protocol.wire import encode
-from tests.steps import steps
+from tests.steps import planner_of, steps
 from world.tick import advance, observations, release
 
 HOUSE = Path(__file__).parents[1]
@@ -213,6 +212,7 @@ def frozen(value: object) -> bytes:
 def test_the_same_values_give_the_same_step_and_are_left_as_they_were(name: str) -> None:
     for world, sensed, before, observed, reports, commands in steps(name):
         for observation in sensed:
+            planner = planner_of(before[observation.robot])
             state, heard = before[observation.robot], reports[observation.robot]
             was = frozen((state, observation))
             once, again = (
@@ -224,7 +224,8 @@ def test_the_same_values_give_the_same_step_and_are_left_as_they_were(name: str)
             assert frozen((state, observation)) == was
 
             was = frozen((once, heard))
-            decided, anew = planner.decide(once, heard), planner.decide(copy.deepcopy(once), list(heard))
+            decided = planner.decide(once, heard)
+            anew = planner.decide(copy.deepcopy(once), list(heard))
             assert decided == anew
             assert frozen(decided) == frozen(anew)
             assert (
@@ -261,6 +262,26 @@ def test_robot_states_and_worlds_are_immutable() -> None:
             setattr(value, field, None)
 
 
+# --- contracts instead of questions -------------------------------------------------------------------
+
+ASKED_IN = {
+    "planner_name": {"agent.process.robot"},
+    "exact": {"agent.planning.state", "agent.planning.range_seeking", "agent.planning.transitions"},
+}
+"""The modules of the agent that read these fields: they select a planner, an estimator, a tolerance."""
+
+
+@pytest.mark.parametrize("field", ASKED_IN)
+def test_no_planner_asks_for_its_name_or_for_exact_sensors(field: str) -> None:
+    asking = {
+        module
+        for module in modules("agent")
+        for node in ast.walk(tree(module))
+        if isinstance(node, ast.Attribute) and node.attr == field
+    }
+    assert asking == ASKED_IN[field]
+
+
 # --- processes load only what they use ----------------------------------------------------------------
 
 
@@ -279,7 +300,7 @@ def loaded_by(module: str) -> set[str]:
         ("world.hardware.bridge", {"numpy", "scipy", "rich", "agent", "compose", "rosbags"}),
         ("compose.cli.robot", {"numpy", "scipy", "rich", "agent", "rosbags"}),
         ("world.process", {"numpy", "scipy", "rich", "agent", "compose"}),
-        ("agent.planning.planner", {"zenoh", "scipy", "rich", "world", "compose"}),
+        ("agent.planning.assured", {"zenoh", "scipy", "rich", "world", "compose"}),
         ("compose.launch.in_process", {"zenoh", "rich"}),
         ("compose.sweep.worker", {"zenoh", "rich", "distributed", "dask", "pyarrow", "matplotlib"}),
         ("compose.cli.audit", {"zenoh", "rich", "distributed", "matplotlib", "pyarrow"}),

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from agent.peer import false_reports, peer_state
 from agent.peer.motion_log import MotionLog
-from agent.planning import planner, plausibility
+from agent.planning import plausibility
 from compose.errors import BadScenario
 from compose.launch.in_process import run_mission
 from compose.recording.run import Run
@@ -20,7 +20,7 @@ from compose.scenario.scenario_file import parse, shipped
 from protocol.attack import Attack, Kind, Part
 from protocol.messages import Inconsistent, Ranged, Report, Undecided
 from protocol.motion import ORIGIN, Pose, Segment, follow
-from tests.steps import Step, steps
+from tests.steps import Step, planner_of, steps
 
 DEGREE = math.pi / 180.0
 PARTS: tuple[Part, ...] = ("phase-1", "orbit", "encounter", "all")
@@ -96,7 +96,7 @@ def test_an_attacker_gives_up_when_its_peer_is_inconsistent() -> None:
     assert isinstance(last["b"].verdict, Inconsistent)
     met = next(step for step in steps("paper-1") if step.heard["a"])
     told = [replace(report, verdict=Inconsistent("a tall story")) for report in met.heard["a"]]
-    verdict = planner.decide(met.observed["a"], told).verdict
+    verdict = planner_of(met.observed["a"]).decide(met.observed["a"], told).verdict
     assert verdict == Undecided("b found a contradiction: a tall story")
 
 
@@ -153,7 +153,11 @@ def objection(step: Step, *reports: Report) -> Inconsistent | None:
     for report in reports[:-1]:
         state = replace(state, peer_state=peer_state.with_report(state.peer_state, report))
     return plausibility.objection(
-        state.peer_state, peer_state.with_report(state.peer_state, reports[-1]), reports[-1], state.config
+        state.peer_state,
+        peer_state.with_report(state.peer_state, reports[-1]),
+        reports[-1],
+        state.config,
+        1e-6,
     )
 
 

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from agent.peer.motion_log import MotionLog
 from agent.peer.peer_state import PeerState, contradiction, with_report
-from agent.planning import planner
+from agent.planning.exchange import report as report_of
 from agent.planning.state import Done, RobotState
 from compose.scenario.scenario_file import load
 from protocol.messages import MAX_REPORT_RANGES, MAX_REPORT_RUNS, Localised, Ranged, Report, Undecided
@@ -51,7 +51,7 @@ def prefixes(driven: list[Tick]) -> list[MotionLog]:
 
 def told(book: MotionLog, radio: PeerState) -> Report:
     """Return the Report of a planner with this log and this state of the peer."""
-    return planner.report(replace(STATE, log=book, peer_state=radio, tick=book.through))
+    return report_of(replace(STATE, log=book, peer_state=radio, tick=book.through))
 
 
 @st.composite
@@ -202,7 +202,7 @@ def test_the_longest_report_that_there_is_fits_its_frame(begin: int, verdict: st
         tick=book.through,
         peer_state=PeerState(acknowledged=begin),
     )
-    report = planner.report(state)
+    report = report_of(state)
     assert report.runs
     size = len(encode(report))
     assert size <= MAX_REPORT_BYTES

@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from agent.estimation.closed_forms import Placement
-from agent.planning import planner
+from agent.planning import assured, paper
 from agent.planning.phase1_anchor import third_point
 from agent.planning.phase3_last_manoeuvre import SPEEDS, TURN_RATES, last_manoeuvre
+from agent.planning.registry import planner
 from compose.launch.in_process import run_mission
 from compose.recording.run import Run
 from compose.scenario.scenario_file import load, parse
@@ -22,7 +23,7 @@ from protocol.mission import OPTIMAL_TURN, Mission, PlannerName, third_point_tur
 from protocol.motion import Pose, compose, step
 from protocol.orbits import rendezvous, tick_budget
 from tests.missions import mission_of
-from tests.steps import steps
+from tests.steps import planner_of, steps
 from world.sensors import anchor_ranges, mutual_ranges
 from world.truth import Truth
 from world.world_journal import Tick
@@ -109,7 +110,7 @@ def test_eq_5_keeps_the_nearer_branch_in_range(
     case: tuple[Mission, list[Pose]], planner_name: PlannerName
 ) -> None:
     mission, places = case
-    controls = third_point(places, mission, planner_name)
+    controls = third_point(places, mission, planner(planner_name).MANOEUVRES)
     if controls is None:
         assert planner_name == "paper"
         return
@@ -126,7 +127,7 @@ def test_where_there_is_room_the_third_point_is_the_best_of_eq_4(
 ) -> None:
     mission = Mission(20.0, period, 2.0, turn_rate)
     places = [step(Pose(rho0, 0.0, side * alpha), 2.0, 0.0, period) for side in (1.0, -1.0)]
-    controls = third_point(places, mission, "paper")
+    controls = third_point(places, mission, paper.MANOEUVRES)
     assert controls is not None
     assert controls.v == mission.max_speed
     assert controls.omega == third_point_turn_rate(mission)
@@ -141,7 +142,7 @@ def test_a_branch_on_the_circle_of_range_is_put_inside_it_by_the_margin() -> Non
     """Eq. (5) puts it exactly on R, where rounding would decide if a range is measured."""
     place = step(Pose(1.8337195113037719, 0.0, 0.31233737057044775), 1.0, 0.0, 1.0)
     mirrored = Pose(place.x, -place.y, -place.heading)
-    controls = third_point([place, mirrored], SECTION_IV, "paper")
+    controls = third_point([place, mirrored], SECTION_IV, paper.MANOEUVRES)
     assert controls is not None
     assert controls.v < 1.0
     nearer = min(after(one, controls.v, controls.omega, SECTION_IV) for one in (place, mirrored))
@@ -151,7 +152,7 @@ def test_a_branch_on_the_circle_of_range_is_put_inside_it_by_the_margin() -> Non
 def test_branches_that_mirror_across_the_heading_are_told_apart_straight_ahead() -> None:
     """After a circle, one branch can be in front of the anchor and one behind; no turn distinguishes them."""
     places = [Pose(0.5, 1.0, math.pi / 2), Pose(0.5, -1.0, math.pi / 2)]
-    controls = third_point(places, SECTION_IV, "paper")
+    controls = third_point(places, SECTION_IV, paper.MANOEUVRES)
     assert controls is not None
     assert (controls.v, controls.omega) == (1.0, 0.0)
 
@@ -248,13 +249,13 @@ def test_a_single_candidate_is_checked_before_it_is_claimed() -> None:
     """Two mutual ranges and D have no redundancy, so b makes a manoeuvre even with one placement left."""
     second = next(step for step in steps("paper-1") if step.commands["b"].state == "last-manoeuvre")
     state, heard = second.observed["b"], second.heard["b"]
-    possible = planner.decide(state, heard).belief.placements
+    possible = planner_of(state).decide(state, heard).belief.placements
     assert len(possible) == 4
     for placement in possible:
         findings = replace(state.belief, placements=(placement,), candidates=(4, 1))
-        decided = planner.decide(replace(state, belief=findings), heard)
+        decided = planner_of(state).decide(replace(state, belief=findings), heard)
         assert decided.verdict is None
-        assert planner.command(decided).v == 1.0
+        assert planner_of(decided).command(decided).v == 1.0
 
 
 # --- eq. (8) ------------------------------------------------------------------------------------------
@@ -297,7 +298,7 @@ def test_the_last_manoeuvre_of_the_paper_planner_maximises_eq_8_at_full_speed(
     case: tuple[Pose, Pose, list[Placement]],
 ) -> None:
     b, a, found = case
-    plan = last_manoeuvre("b", a, b, found, SECTION_IV, "paper")
+    plan = last_manoeuvre("b", a, b, found, SECTION_IV, paper.MANOEUVRES)
     assert plan is not None
     best = max(least(predicted(b, a, found, 1.0, omega)) for omega in grid())
     assert plan.command.v == 1.0
@@ -314,7 +315,7 @@ def test_the_assured_last_manoeuvre_keeps_as_many_candidates_in_range_as_it_can(
     """Among manoeuvres with as many candidates in range, it is the optimum of eq. (8)."""
     b, a, found = case
     rim = SECTION_IV.sensing_range - 1e-6
-    plan = last_manoeuvre("b", a, b, found, SECTION_IV, "assured")
+    plan = last_manoeuvre("b", a, b, found, SECTION_IV, assured.MANOEUVRES)
     assert plan is not None
 
     def value(v: float, omega: float) -> tuple[int, float]:
@@ -331,7 +332,7 @@ def test_the_assured_last_manoeuvre_keeps_as_many_candidates_in_range_as_it_can(
 def test_a_single_candidate_is_checked_from_where_its_range_changes_most() -> None:
     b, a = Pose(0.0, 0.0, 0.0), Pose(6.5, 0.0, 0.0)
     ahead = Placement(0.0, -4.5, 0.0)
-    plan = last_manoeuvre("b", a, b, [ahead], SECTION_IV, "assured")
+    plan = last_manoeuvre("b", a, b, [ahead], SECTION_IV, assured.MANOEUVRES)
     assert plan is not None
     assert plan.command.v == 1.0
     assert plan.command.omega == pytest.approx(0.0, abs=1e-9)

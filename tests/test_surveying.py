@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from agent.estimation.gaussian.inference import PlanningHypothesis
 from agent.estimation.gaussian.odometry_noise import Array
-from agent.planning.active_sensing import AHEAD, PlanningHypothesis, choice, plan_alone, plan_together, stride
+from agent.planning.active_sensing import AHEAD, choice, plan_alone, plan_together, stride
 from agent.planning.phase2_orbit import pursuit
 from agent.planning.range_seeking import Homing, arrival_tolerances, homing_controls
 from protocol.mission import Mission

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import pytest
 from msgspec.structs import replace
 
-from agent.planning import planner, precision
+from agent.estimation import precision
 from compose.launch.in_process import run_mission
 from compose.scenario.scenario_file import parse, shipped
 from protocol.messages import Command, Localised, Report, Undecided
 from protocol.motion import ORIGIN, Covariance
-from tests.steps import steps
+from tests.steps import planner_of, steps
 from tests.surveys import scenario_of
 from tests.test_claims import EXACT, NOISY
 from world.hardware.termination import LAST_WORDS, Ending
@@ -32,14 +32,14 @@ def test_the_mission_ends_when_one_of_a_pair_has_given_up() -> None:
 def test_a_robot_whose_peer_has_given_up_gives_up_too() -> None:
     met = next(step for step in steps("paper-1") if step.heard["a"])
     told = [replace(report, verdict=GAVE_UP) for report in met.heard["a"]]
-    verdict = planner.decide(met.observed["a"], told).verdict
+    verdict = planner_of(met.observed["a"]).decide(met.observed["a"], told).verdict
     assert verdict == Undecided(f"b reports: {GAVE_UP.reason}")
 
 
 def test_a_forwarded_reason_fits_a_message() -> None:
     met = next(step for step in steps("paper-1") if step.heard["a"])
     told = [replace(report, verdict=Undecided("x" * 300)) for report in met.heard["a"]]
-    verdict = planner.decide(met.observed["a"], told).verdict
+    verdict = planner_of(met.observed["a"]).decide(met.observed["a"], told).verdict
     assert isinstance(verdict, Undecided)
     assert len(verdict.reason) == 300
 

@@ -90,8 +90,8 @@ def weigh_branches(
     for candidate in candidates:
         branch = polished(candidate, ranged)
         if (
-            all(_meets(branch.distance(pose), rho, branch.start.x, floor) for pose, rho in ranged)
-            and all(branch.distance(pose) > sensing_range - 0.5 * margin for pose in silent)
+            _branch_meets(branch, ranged, floor)
+            and _branch_misses(branch, silent, sensing_range - 0.5 * margin)
             and not any(math.dist(branch.anchor, other.anchor) < SAME * floor for other in left)
         ):
             left.append(branch)
@@ -118,9 +118,26 @@ def anchor_error(start: Pose, ranged: Sequence[tuple[Pose, float, float]]) -> fl
     return (1.0 + SAME) * ranged[-1][2] + min(2.0 * rho0, turned)
 
 
-def _meets(predicted: float, rho: float, rho0: float, floor: float) -> bool:
-    """Return whether `rho` agrees with `predicted`. Ranges below rho_0 are compared in squares, as fitted."""
-    return abs(predicted - rho) * (predicted + rho) <= 2.0 * floor * max(rho, rho0)
+def _branch_meets(branch: Branch, ranged: Iterable[tuple[Pose, float]], floor: float) -> bool:
+    """Return whether `branch` predicts all ranges. Those below rho_0 are compared in squares, as fitted."""
+    rho0 = branch.start.x
+    c, s = math.cos(branch.start.heading), math.sin(branch.start.heading)
+    for pose, rho in ranged:
+        predicted = math.hypot(rho0 + c * pose.x - s * pose.y, s * pose.x + c * pose.y)
+        if abs(predicted - rho) * (predicted + rho) > 2.0 * floor * max(rho, rho0):
+            return False
+    return True
+
+
+def _branch_misses(branch: Branch, silent: Iterable[Pose], reach: float) -> bool:
+    """Return whether `branch` is farther than `reach` m from the anchor at each pose of `silent`."""
+    rho0 = branch.start.x
+    c, s = math.cos(branch.start.heading), math.sin(branch.start.heading)
+    for pose in silent:
+        x, y = rho0 + c * pose.x - s * pose.y, s * pose.x + c * pose.y
+        if math.hypot(x, y) <= reach:
+            return False
+    return True
 
 
 def polished(branch: Branch, ranged: Sequence[tuple[Pose, float]]) -> Branch:
@@ -149,7 +166,7 @@ def polished(branch: Branch, ranged: Sequence[tuple[Pose, float]]) -> Branch:
     return Branch(wrap(branch.alpha + fitted - branch.start.heading), Pose(rho0, 0.0, fitted))
 
 
-class PairObservation(msgspec.Struct, frozen=True):
+class PairObservation(msgspec.Struct, frozen=True, gc=False):
     """One tick of an encounter: each pose in the frame of the robot's anchor, and the mutual range (m)."""
 
     tick: int

@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.estimation.gaussian.inference import PlanningHypothesis
 from agent.estimation.gaussian.odometry_noise import Array, Places
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR
 from agent.planning import separation
@@ -124,16 +125,6 @@ def choice(mission: Mission) -> Choice:
         way * np.cos(share),
         way * np.sin(share),
     )
-
-
-class PlanningHypothesis(NamedTuple):
-    """A hypothesis in the form that planning needs."""
-
-    probability: float
-    poses: Array
-    """The poses in m and rad: (3,) of one robot relative to its anchor, or (6,) of a and b relative to M1."""
-    covariance: Array
-    """The covariance of the anchor's position, (2, 2), or of both poses, (6, 6)."""
 
 
 def plan_alone(

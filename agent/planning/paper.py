@@ -1,99 +1,131 @@
-"""The `paper` planner with noisy sensors: the paper's manoeuvres, evaluated by likelihood.
+"""The `paper` planner: the algorithm as published, with exact and with noisy sensors.
 
-The planner continues with the most probable branch and claims a pose only if it meets the mission's
-requirements. The few ranges that the paper's manoeuvres collect are mostly not enough, and never with
-outliers. The verdict Undecided then states what is missing.
+With noisy sensors, the planner continues with the most probable branch and claims a pose only if it meets the
+mission's requirements. The few ranges that the paper's manoeuvres collect are mostly not enough, and never
+with outliers. The verdict Undecided then states what is missing.
 """
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from agent.estimation.closed_forms import Placement
-from agent.estimation.exact import Branch
-from agent.estimation.gaussian.hypotheses import search
-from agent.planning import inference, phase3_last_manoeuvre
-from agent.planning.active_sensing import PlanningHypothesis
-from agent.planning.assured import CHECKED_WITH_OUTLIERS, claim_pose
-from agent.planning.phase3_last_manoeuvre import LastManoeuvre, Standing, Waiting
+from agent.planning import exchange, transitions
+from agent.planning.accuracy_seeking import CHECKED_WITH_OUTLIERS
+from agent.planning.exchange import estimate, report
+from agent.planning.manoeuvres import Manoeuvres
+from agent.planning.phase1_anchor import ThirdPoint
+from agent.planning.phase2_orbit import Orbiting
+from agent.planning.phase3_last_manoeuvre import Standing, Waiting
 from agent.planning.state import MODE_NAMES, RobotState
-from protocol.motion import ORIGIN, wrap
+from protocol.messages import Command, Observation, Report, RobotConfig
+from protocol.mission import Mission
+
+__all__ = (
+    "MANOEUVRES",
+    "command",
+    "decide",
+    "estimate",
+    "observe",
+    "report",
+    "required_mutual_ranges",
+    "start",
+    "uses_active_sensing",
+)
+
+MANOEUVRES = Manoeuvres(directions=(1.0,), sides=(1.0,), last_speeds=None, fewest_out_of_range=False)
+"""Forward, to the left in phase 1, and at v_max."""
 
 CHECKED = 3
-"""The minimum number of mutual ranges before a claim, without outliers.
-
-With outliers, the minimum is that of the `assured` planner, which the paper's manoeuvres do not reach.
-"""
-
-LIKELY = 0.05
-"""The probability from which on a branch takes part in the planning of a manoeuvre."""
+"""The minimum number of mutual ranges before a claim with noisy sensors, without outliers."""
 
 
-def with_branches(state: RobotState) -> tuple[RobotState, tuple[Branch, ...]]:
-    """Return `state` with the most probable branch, and all branches of at least the probability LIKELY.
+def start(config: RobotConfig) -> RobotState:
+    """Return the state of a robot that has measured nothing yet."""
+    return RobotState(config)
 
-    The branches are sorted by probability, in descending order. The tuple is empty if there is no anchor
-    range.
+
+def observe(state: RobotState, observation: Observation) -> RobotState:
+    """Return `state` with the sensor data of one tick, and with the mode that follows from them."""
+    state = exchange.observed(state, observation)
+    return transitions.after_observation(state, observation.anchor_range, MANOEUVRES, _after_range)
+
+
+def decide(state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
+    """Return `state` with the peer's `reports` and with the mode that follows from them.
+
+    Phase 3 begins when both robots are on their orbits.
     """
-    scored = inference.own_anchor(state)
-    if not scored:
-        return state, ()
-    state = inference.with_own(state, scored)
-    likely = zip(state.belief.branches, state.belief.own, strict=True)
-    return state, tuple([branch for branch, one in likely if one.probability >= LIKELY])
+    if reports:
+        state = exchange.with_reports(state, reports)
+    if not state.in_contact:
+        return state
+    match state.mode:
+        case Orbiting() if state.peer_state.phase == 3 or state.peer_state.state == state.mode_name:
+            return transitions.begin_phase3(state)
+        case Standing() | Waiting():
+            return _decide_phase3(state)
+        case _:
+            return state
 
 
-def decide_phase3(state: RobotState) -> RobotState:
+def command(state: RobotState) -> Command:
+    """Return the command for the next tick, with the phase, the mode and the verdict."""
+    return exchange.command(state, transitions.controls(state))
+
+
+def required_mutual_ranges(mission: Mission) -> int:
+    """Return the minimum number of noisy mutual ranges before a claim.
+
+    With outliers, it is that of the `assured` planner, which the paper's manoeuvres do not reach.
+    """
+    return CHECKED_WITH_OUTLIERS if mission.noise.outliers else CHECKED
+
+
+def uses_active_sensing(mission: Mission) -> bool:
+    """Return False: the paper's manoeuvres distinguish hypotheses, and do not improve them."""
+    del mission
+    return False
+
+
+def _after_range(state: RobotState) -> RobotState:
+    """Continue phase 1 with the branches +alpha and -alpha that the ranges allow (eq. (2)).
+
+    The third range is the last one. It selects the most probable branch, if there is one.
+    """
+    kind, third = transitions.branch_kind(state), isinstance(state.mode, ThirdPoint)
+    found = transitions.anchor_estimate(state)
+    state = replace(state, belief=found.belief)
+    branch = found.best if third or len(found.branches) == 1 else None
+    if kind is not None and branch is not None:
+        return transitions.end_phase1(state, state.estimator.fitted(state, branch), kind)
+    if found.branches and third:
+        return state.undecided("the third range does not distinguish +alpha from -alpha")
+    return transitions.to_third_point(state, found, MANOEUVRES)
+
+
+def _decide_phase3(state: RobotState) -> RobotState:
     """Evaluate phase 3 after a's second mutual range, and again after b's last manoeuvre.
 
-    Return `state` with a claim, with the last manoeuvre of b, or with the verdict Undecided.
+    The mutual ranges count from the encounter on. Return `state` with a verdict, with b's last manoeuvre, or
+    with the same mode.
     """
-    pair = inference.pair_of(state)
-    mutual = pair.ranges.counts[2]
-    if inference.known_through(state) < state.tick or mutual < CHECKED - 1:
+    evaluated = transitions.with_new_ticks(state)
+    if evaluated is None:
         return state
-    scored = search(pair)
-    required_ranges = CHECKED_WITH_OUTLIERS if state.config.mission.noise.outliers else CHECKED
-    state = inference.with_convergence_check(
-        inference.with_pair(state, scored, pair, required_ranges), scored
+    first_tick, planned = state.belief.encounter_tick, state.plan is not None
+    assert first_tick is not None
+    a_waits = not isinstance(state.mode, Standing) or state.peer_state.state == MODE_NAMES[Waiting]
+    state, found = transitions.pair_estimate(
+        evaluated,
+        first_tick,
+        required_mutual_ranges(state.config.mission),
+        second_range=a_waits or planned,
     )
-    blocking_reason = state.belief.blocking_reason
-    if blocking_reason is None:
-        return claim_pose(state)
-    if state.belief.plan is not None or not scored:
-        return state.undecided(f"the paper's manoeuvres give no further ranges: {blocking_reason}")
-    if state.config.role == "a":
+    if found is None or state.verdict is not None or state.config.role == "a":
         return state
-    placements = [
-        _pose_in_b_frame(planning_hypothesis)
-        for planning_hypothesis in inference.pair_planning_hypotheses(scored, pair)
-    ]
-    plan = phase3_last_manoeuvre.last_manoeuvre(
-        "b", ORIGIN, ORIGIN, placements, state.config.mission, "paper"
-    )
-    if plan is None:
-        return state.undecided("no manoeuvre keeps the safety distance")
-    return replace(
-        state,
-        mode=LastManoeuvre(plan.command, state.odometry),
-        belief=replace(state.belief, plan=plan),
-    )
-
-
-def awaits_second_range(state: RobotState) -> bool:
-    """Return whether b has not yet received the report that a has its second mutual range."""
-    return (
-        isinstance(state.mode, Standing)
-        and state.belief.plan is None
-        and state.peer_state.state != MODE_NAMES[Waiting]
-    )
-
-
-def _pose_in_b_frame(planning_hypothesis: PlanningHypothesis) -> Placement:
-    """Return the pose of a in the frame of b's current pose."""
-    ax, ay, a_heading, bx, by, b_heading = planning_hypothesis.poses.tolist()
-    c, s = math.cos(b_heading), math.sin(b_heading)
-    dx, dy = ax - bx, ay - by
-    return Placement(wrap(a_heading - b_heading), c * dx + s * dy, c * dy - s * dx)
+    if planned:
+        return state.undecided(found.failure)
+    moving = transitions.last_manoeuvre(state, found, MANOEUVRES)
+    return moving if moving is not None else state.undecided("no manoeuvre keeps the safety distance")

@@ -9,8 +9,9 @@ from itertools import combinations
 import msgspec
 
 from agent.estimation.exact import Branch
+from agent.planning.manoeuvres import Manoeuvres
 from agent.planning.range_seeking import ARRIVED
-from protocol.mission import RANGE_MARGIN, Mission, PlannerName, third_point_turn_rate
+from protocol.mission import RANGE_MARGIN, Mission, third_point_turn_rate
 from protocol.motion import Controls, Pose, chord, compose
 
 PREFERENCE = 1e-9
@@ -32,7 +33,7 @@ class ThirdPoint(msgspec.Struct, frozen=True):
 def third_point(
     places: Sequence[Pose],
     mission: Mission,
-    planner_name: PlannerName,
+    manoeuvres: Manoeuvres,
     *,
     margin: float = RANGE_MARGIN,
     pinning: bool = False,
@@ -41,8 +42,7 @@ def third_point(
 
     If the branches mirror each other along the heading, eq. (4) gives the best turn rate. If they mirror each
     other across it, as after a circle, driving straight is best. Both are compared, each with the longest
-    chord that keeps at least one branch in range (eq. (5)). `paper` drives forward only, `assured` also
-    backward.
+    chord that keeps at least one branch in range (eq. (5)), in the directions of `manoeuvres`.
 
     `margin` is the distance inside R, in m, at which a point is certainly in range. With `pinning`, one
     branch is left, but the ranges do not determine its heading accurately enough. The best end point is then
@@ -56,7 +56,7 @@ def third_point(
     shortest = ARRIVED * mission.first_straight
     rim = mission.sensing_range - max(margin, SIGMAS * mission.noise.anchor_sigma)
     turn_rate = third_point_turn_rate(mission)
-    turn_rates = [turn_rate] if planner_name == "paper" else [turn_rate, -turn_rate]
+    turn_rates = [side * turn_rate for side in manoeuvres.sides]
     # A single branch was found on a radius. A straight manoeuvre along that radius would check nothing.
     if len(places) > 1 or pinning:
         turn_rates.append(0.0)
@@ -64,7 +64,7 @@ def third_point(
         unit = chord(1.0, omega, mission.period)
         longest = mission.max_speed * unit
         half = 0.5 * mission.period * omega
-        for forward in (1.0,) if planner_name == "paper" else (1.0, -1.0):
+        for forward in manoeuvres.directions:
             outward = [_outward(place, half, forward) for place in places]
             reach = max(_reach(along, across, rim) for along, across in outward)
             length = min(longest, reach)

@@ -78,24 +78,15 @@ def left_to_orbit(odometry: Pose, start: Pose, orbit: Orbit) -> float:
     return orbit.radius - math.hypot(local.x, local.y)
 
 
-def off_anchor(local: Pose, orbit: Orbit) -> bool:
-    """Return whether robot b, at `local` in its anchor's frame, is far enough from its anchor for phase 3.
-
-    If b is on its anchor, the mutual ranges do not depend on its heading, and eq. (7) has a continuum of
-    solutions. Half the distance to its waiting place is far enough.
-    """
-    return math.hypot(local.x, local.y) >= 0.5 * orbit.radius
-
-
 def controls(mode: Phase2Mode, odometry: Pose, start: Pose, orbit: Orbit, mission: Mission) -> Controls:
     """Return the controls of `mode` at the pose `odometry`."""
     match mode:
+        case Orbiting(command):
+            return command or Controls(orbit.v, orbit.omega)
         case Aligning(heading) | Tangent(heading):
             return turn(odometry, heading, mission)
         case Radial():
             return straight(left_to_orbit(odometry, start, orbit), mission)
-        case Orbiting(command):
-            return command or Controls(orbit.v, orbit.omega)
 
 
 def pursuit(local: Pose, orbit: Orbit, mission: Mission) -> Controls:

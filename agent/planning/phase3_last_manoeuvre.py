@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cache, reduce
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -11,12 +12,13 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.closed_forms import Placement, placements
+from agent.estimation.closed_forms import Placement
 from agent.estimation.exact import PairObservation, information
-from agent.planning.range_seeking import travelled
+from agent.estimation.mutual_ranges import ELSEWHERE
+from agent.planning.manoeuvres import Manoeuvres
 from agent.planning.separation import nearest
-from protocol.mission import RANGE_MARGIN, Mission, PlannerName, Role
-from protocol.motion import Controls, Pose
+from protocol.mission import RANGE_MARGIN, Mission, Role
+from protocol.motion import Controls, Pose, travelled
 
 Array = NDArray[np.float64]
 Point = float | Array
@@ -29,15 +31,6 @@ With the parameters of Section IV, there is one every half degree.
 
 SPEEDS = (1.0, -1.0, 0.75, -0.75, 0.5, -0.5, 0.25, -0.25, 0.1, -0.1)
 """The values of v_2 compared, in units of A_0 / T_s: v_max, or less if one tick would come near R."""
-
-ELSEWHERE = 1e-6
-"""The distance in m within which two measurement points count as one, so the second range adds nothing."""
-
-B_ON_M1 = 1e-6
-"""The ratio of a distance to a's path between two ranges, below which b may be on M1.
-
-Eq. (7) then determines a's rotation about M1 no better than 1e-16 divided by this ratio.
-"""
 
 REGULARISATION = 1e-8
 """The regularisation of the information matrix: a fraction of (D + R)^2 for phi and of D^2 for psi.
@@ -124,62 +117,6 @@ class Compared(NamedTuple):
     """`gap` of the manoeuvres that are allowed, and -inf for the others; (S, W)."""
 
 
-def base(
-    pair_observations: Sequence[PairObservation], floor: float
-) -> tuple[PairObservation, PairObservation] | None:
-    """Return the two ranges for which eq. (7) is solved: the first two between which only a has moved.
-
-    Robot b has not moved if its two positions are within `floor` m, the rounding error of both odometries.
-    Pairs of ranges at which b may be on M1 are skipped: every rotation of a about M1 would solve eq. (7). The
-    result is None if there is no such pair.
-    """
-    ranged: list[PairObservation] = []
-    for pair_observation in pair_observations:
-        if pair_observation.range is not None and not (
-            ranged
-            and (ranged[-1].a, ranged[-1].b)
-            == (pair_observation.a, pair_observation.b)  # neither robot has moved in between
-        ):
-            ranged.append(pair_observation)
-    for first in ranged:
-        for second in ranged:
-            stood, moved = travelled(first.b, second.b) <= floor, travelled(first.a, second.a) > ELSEWHERE
-            if first.tick < second.tick and stood and moved:
-                near = B_ON_M1 * travelled(first.a, second.a)
-                if not (_b_may_be_on_m1(first, near) and _b_may_be_on_m1(second, near)):
-                    return first, second
-    return None
-
-
-def _b_may_be_on_m1(pair_observation: PairObservation, near: float) -> bool:
-    """Return whether a is as far from its own anchor as from b, to `near` m, so that b may be on M1."""
-    assert pair_observation.range is not None
-    return abs(math.hypot(pair_observation.a.x, pair_observation.a.y) - pair_observation.range) <= near
-
-
-def solve(distance: float, base: tuple[PairObservation, PairObservation]) -> list[Placement]:
-    """Return the solutions of eq. (7) for the two ranges `base`; `distance` is D in m."""
-    first, second = base
-    assert first.range is not None
-    assert second.range is not None
-    return placements(distance, first.b, first.a, second.a, first.range, second.range)
-
-
-def redundant(
-    pair_observations: Sequence[PairObservation], base: tuple[PairObservation, PairObservation]
-) -> bool:
-    """Return whether there is a range from another place than the two ranges of `base`."""
-    return any(
-        pair_observation.range is not None
-        and all(
-            travelled(pair_observation.a, used.a) > ELSEWHERE
-            or travelled(pair_observation.b, used.b) > ELSEWHERE
-            for used in base
-        )
-        for pair_observation in pair_observations
-    )
-
-
 def turn(pair_observations: Sequence[PairObservation]) -> Role:
     """Return the robot that moves next: the one that did not move last. Robot b moves first."""
     for before, now in pairwise(reversed(pair_observations)):
@@ -208,22 +145,21 @@ def last_manoeuvre(
     b: Pose,
     candidates: Sequence[Placement],
     mission: Mission,
-    planner_name: PlannerName,
+    manoeuvres: Manoeuvres,
 ) -> Plan | None:
     """Return the manoeuvre that best distinguishes `candidates` by the range after it (eq. (8)).
 
     It maximises the smallest difference of the predicted ranges, in squares.
 
     `mover` is the robot that moves, in the paper always b. `a` is given in <a(M1)> and `b` in <b(M2)>. The
-    maximum is found by enumeration. `paper` drives at v_max. `assured` compares several speeds, and only
-    manoeuvres that leave the fewest candidates out of range: no detection selects those candidates.
+    maximum is found by enumeration of `manoeuvres`.
 
     With one candidate, the manoeuvre is a check: it approaches the candidate so that the squared range
     decreases most, since no detection would check nothing. The result is None if every manoeuvre violates the
     safety distance.
     """
     question = Question(mover, a, b, tuple(candidates))
-    reach, gap, value = compared(question, mission, planner_name)
+    reach, gap, value = compared(question, mission, manoeuvres)
     row, column = _best(value)
     if value[row, column] == -np.inf:
         return None
@@ -231,10 +167,10 @@ def last_manoeuvre(
     return Plan(command, float(gap[row, column]) if len(candidates) > 1 else None, question)
 
 
-def compared(question: Question, mission: Mission, planner_name: PlannerName) -> Compared:
+def compared(question: Question, mission: Mission, manoeuvres: Manoeuvres) -> Compared:
     """Return all manoeuvres with their values. `last_manoeuvre` takes the largest value."""
     mover, a, b, candidates = question
-    reach = reachable(a if mover == "a" else b, mission, planner_name)
+    reach = reachable(a if mover == "a" else b, mission, manoeuvres.last_speeds)
     squared: list[Array] = []
     for candidate in candidates:
         (ax, ay), (bx, by) = _positions_in_b(mover, a, b, candidate, reach.x, reach.y)
@@ -242,12 +178,15 @@ def compared(question: Question, mission: Mission, planner_name: PlannerName) ->
     if len(squared) == 1:
         gap = travelled(b, candidates[0].place(a)) ** 2 - squared[0]
     else:
-        gap = np.min([abs(one - other) for i, one in enumerate(squared) for other in squared[:i]], axis=0)
+        gaps = [np.abs(one - other) for i, one in enumerate(squared) for other in squared[:i]]
+        gap = reduce(np.minimum, gaps)
     apart = _keeps_apart(question, reach, mission)
-    value = np.where(apart, gap, -np.inf)
-    if planner_name == "assured":
+    value = np.where(apart, gap, -np.inf) if mission.safety_distance else gap
+    if manoeuvres.fewest_out_of_range:
         rim = (mission.sensing_range - RANGE_MARGIN) ** 2
-        outside = np.sum([distance > rim for distance in squared], axis=0)
+        outside = np.zeros(gap.shape, np.int8)
+        for distance in squared:
+            outside += distance > rim
         fewest = np.min(outside, where=apart, initial=len(squared))
         value = np.where(outside == fewest, value, -np.inf)
     return Compared(reach, gap, value)
@@ -268,7 +207,7 @@ def most_informative_manoeuvre(
     matrix. Both robots have to move to raise it.
     """
     question = Question(mover, a, b, (placement,))
-    reach = reachable(a if mover == "a" else b, mission, "assured")
+    reach = reachable(a if mover == "a" else b, mission, SPEEDS)
     (ax, ay), (bx, by) = _positions_in_b(mover, a, b, placement, reach.x, reach.y)
     dx, dy = ax - bx, ay - by
     apart = np.maximum(np.hypot(dx, dy), ELSEWHERE)
@@ -317,18 +256,24 @@ def _best(value: Array) -> tuple[int, int]:
     return int(row), int(column)
 
 
-def reachable(pose: Pose, mission: Mission, planner_name: PlannerName) -> Reach:
-    """Return the manoeuvres that are compared, from `pose`."""
-    omega = np.linspace(-mission.max_turn_rate, mission.max_turn_rate, TURN_RATES)
-    half = 0.5 * mission.period * omega
-    unit = mission.period * np.sinc(half / math.pi)
-    if planner_name == "paper":
+def reachable(pose: Pose, mission: Mission, speeds: Sequence[float] | None) -> Reach:
+    """Return the manoeuvres that are compared, from `pose`, at `speeds` in A_0 / T_s (None: at v_max)."""
+    omega, half, unit = _arcs(mission)
+    if speeds is None:
         speed = np.array([[mission.max_speed]])
     else:
-        speed = mission.first_straight / mission.period * np.array(SPEEDS)[:, None]
+        speed = mission.first_straight / mission.period * np.array(speeds)[:, None]
     course = pose.heading + half
     x, y = pose.x + speed * unit * np.cos(course), pose.y + speed * unit * np.sin(course)
     return Reach(speed, omega, x, y)
+
+
+@cache
+def _arcs(mission: Mission) -> tuple[Array, Array, Array]:
+    """Return each turn rate in rad/s, half the turn of a tick in rad, and the chord in s per unit speed."""
+    omega = np.linspace(-mission.max_turn_rate, mission.max_turn_rate, TURN_RATES)
+    half = 0.5 * mission.period * omega
+    return omega, half, mission.period * np.sinc(half / math.pi)
 
 
 def _positions_in_b(

@@ -1,6 +1,6 @@
 """Plausibility checks of a peer's reports: against its earlier reports, its limits and its own measurements.
 
-The mutual ranges are evaluated elsewhere: in `encounter`, and with noisy sensors in `inference`.
+The mutual ranges are evaluated elsewhere: by the estimator (`Estimator.pair`).
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ SLACK = 1e-9
 NOISY = 6.0
 """The largest plausible noise of actuation and odometry, in standard deviations."""
 
-EXACT = 1e-6
-"""The tolerance in m and rad within which the data of one tick agree, with exact sensors."""
-
 
 def objection(
-    before: PeerState, after: PeerState, report: Report, config: RobotConfig
+    before: PeerState, after: PeerState, report: Report, config: RobotConfig, tolerance: float
 ) -> Inconsistent | None:
     """Return the first contradiction in `report`, which changed the peer's state from `before` to `after`.
 
-    The result is None if the report is plausible.
+    `tolerance` is `Estimator.report_tolerance`. If it is infinite, what noise may explain is not checked. The
+    result is None if the report is plausible.
     """
+    without_noise = math.isfinite(tolerance)
     return (
-        _changed_report(before, report, config.mission)
+        _changed_log(before, report)
+        or (_changed_start(before, report) if without_noise else None)
         or _exceeded_limit(report, config.mission)
-        or (_ranges_off_path(before, after, config.mission) if config.mission.noise.exact else None)
-        or (_off_orbit(after, report, config) if config.mission.noise.exact else None)
+        or (_ranges_off_path(before, after, config.mission, tolerance) if without_noise else None)
+        or (_off_orbit(after, report, config, tolerance) if without_noise else None)
     )
 
 
-def _changed_report(before: PeerState, report: Report, mission: Mission) -> Inconsistent | None:
+def _changed_log(before: PeerState, report: Report) -> Inconsistent | None:
     """Return a contradiction if the report differs from an earlier report about the same ticks."""
     last = min(report.through, before.peer.through)
     if report.since < last:
@@ -50,7 +50,12 @@ def _changed_report(before: PeerState, report: Report, mission: Mission) -> Inco
     known = before.peer.ranges[report.ranges_since :][: len(report.ranges)]
     if known != report.ranges[: len(known)]:
         return Inconsistent("ranges to its anchor that contradict an earlier report")
-    if mission.noise.exact and before.start is not None and report.start not in (None, before.start):
+    return None
+
+
+def _changed_start(before: PeerState, report: Report) -> Inconsistent | None:
+    """Return a contradiction if the report has another start than an earlier report."""
+    if before.start is not None and report.start not in (None, before.start):
         return Inconsistent("a start that contradicts an earlier report")
     return None
 
@@ -76,7 +81,9 @@ def _largest_measurement(limit: float, actuation: float, odometry: float, floor:
     return limit * (1.0 + SLACK + NOISY * math.hypot(actuation, odometry)) + floor
 
 
-def _ranges_off_path(before: PeerState, after: PeerState, mission: Mission) -> Inconsistent | None:
+def _ranges_off_path(
+    before: PeerState, after: PeerState, mission: Mission, tolerance: float
+) -> Inconsistent | None:
     """Return a contradiction if a range to the peer's anchor does not agree with the reported path.
 
     Only ranges that could not be checked before are checked.
@@ -90,14 +97,16 @@ def _ranges_off_path(before: PeerState, after: PeerState, mission: Mission) -> I
             continue
         pose = log.pose(start, ranged.tick, mission.period)
         residual = abs(math.hypot(pose.x, pose.y) - ranged.range)
-        if residual > EXACT * max(1.0, ranged.range):
+        if residual > tolerance * max(1.0, ranged.range):
             return Inconsistent(
                 f"a range to its anchor at tick {ranged.tick} that contradicts its path", residual
             )
     return None
 
 
-def _off_orbit(after: PeerState, report: Report, config: RobotConfig) -> Inconsistent | None:
+def _off_orbit(
+    after: PeerState, report: Report, config: RobotConfig, tolerance: float
+) -> Inconsistent | None:
     """Return a contradiction if an orbiting peer is off its orbit, or does not head along it."""
     plan = config.rendezvous
     orbit = plan.b if config.role == "a" else plan.a
@@ -105,10 +114,10 @@ def _off_orbit(after: PeerState, report: Report, config: RobotConfig) -> Inconsi
         return None
     pose = after.peer.pose(after.start, report.tick, config.mission.period)
     residual = abs(math.hypot(pose.x, pose.y) - orbit.radius)
-    if residual > EXACT * max(1.0, orbit.radius):
+    if residual > tolerance * max(1.0, orbit.radius):
         return Inconsistent(f"a position off its orbit at tick {report.tick}", residual)
     tangent = math.copysign(0.5 * math.pi, orbit.omega)
     heading_residual = abs(wrap(pose.heading - math.atan2(pose.y, pose.x) - tangent))
-    if orbit.v != 0.0 and heading_residual > EXACT:
+    if orbit.v != 0.0 and heading_residual > tolerance:
         return Inconsistent(f"a heading off the tangent of its orbit at tick {report.tick}", heading_residual)
     return None

@@ -1,8 +1,8 @@
 """The search for a second range to a beacon (Section III.A.2): straight ahead, else on a circle.
 
 The beacon is the anchor in phase 1, and robot b in phase 3, where robot a takes its second mutual range.
-After the straight, `assured` also tries the point straight behind before the circle: it is reached sooner
-than a point of the circle, and is mostly in range.
+After the straight, a planner that drives backward also tries the point straight behind before the circle: it
+is reached sooner than a point of the circle, and is mostly in range.
 """
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ from typing import Literal
 
 import msgspec
 
+from agent.planning.manoeuvres import Manoeuvres
 from agent.planning.separation import leeway
-from protocol.mission import Mission, PlannerName
-from protocol.motion import REST, TAU, Controls, Pose, wrap
+from protocol.mission import Mission
+from protocol.motion import REST, TAU, Controls, Pose, travelled, wrap
 
 ARRIVED = 1e-9
 """The tolerance in rad, and relative to A_0, at which a target is reached. The odometry is exact."""
@@ -83,11 +84,6 @@ def arrival_tolerances(mission: Mission) -> tuple[float, float]:
     return share * mission.first_straight, share
 
 
-def travelled(origin: Pose, pose: Pose) -> float:
-    """Return the distance in m between two poses."""
-    return math.hypot(pose.x - origin.x, pose.y - origin.y)
-
-
 def moved(origin: Pose, pose: Pose) -> bool:
     """Return whether the manoeuvre that began at `origin` was executed; in real time it may not be."""
     return pose != origin
@@ -99,7 +95,7 @@ def distance_ahead(origin: Pose, pose: Pose) -> float:
 
 
 def onward(
-    state: Seeking, pose: Pose, measured: bool, mission: Mission, planner_name: PlannerName
+    state: Seeking, pose: Pose, measured: bool, mission: Mission, manoeuvres: Manoeuvres
 ) -> Seeking | None:
     """Return the mode after a tick that led to `pose`, or None once the second range is measured."""
     distance_tolerance, angle_tolerance = arrival_tolerances(mission)
@@ -110,7 +106,7 @@ def onward(
                 return state
             if measured:
                 return None
-            if planner_name == "assured":
+            if manoeuvres.backward:
                 return Backing(beacon, origin, rho0)
             return Turning(beacon, origin, rho0, pose.heading + math.pi / 2)
         case Backing(beacon, origin, rho0):

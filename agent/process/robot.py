@@ -7,8 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from agent.planning import planner
-from agent.planning.state import RobotState
+from agent.planning.registry import planner
 from agent.process.agent_journal import FramedReport
 from protocol.journal import environment
 from protocol.journal.journal_file import Sink
@@ -27,7 +26,8 @@ class Robot:
     """The state of one robot, and the journal of its inputs and outputs."""
 
     def __init__(self, config: RobotConfig, journal: Sink | None = None) -> None:
-        self.state = RobotState(config)
+        self.planner = planner(config.planner_name)
+        self.state = self.planner.start(config)
         self.report: FramedReport | None = None
         """The report of this tick; None if no peer is in contact."""
         self.command: Command | None = None
@@ -67,14 +67,14 @@ class Robot:
 
         `frame` is the encoded Observation, if it was received as one.
         """
-        self.state = planner.observe(self.state, observation)
+        self.state = self.planner.observe(self.state, observation)
         self.report = self.command = self._command_frame = None
         for contact in observation.contacts:
             self.unheard.add(observation.tick)
             self.unheard.difference_update(contact.heard or (), contact.damaged)
             self.damaged += len(contact.damaged)
         if observation.contacts:
-            report = planner.report(self.state)
+            report = self.planner.report(self.state)
             self.report = FramedReport(report, encode(report))
             self.reports_sent += 1
             self.bytes_sent += len(self.report.frame)
@@ -89,9 +89,10 @@ class Robot:
 
         `missed` names the peers whose reports did not arrive in time.
         """
-        self.state = planner.decide(self.state, [framed.report for framed in heard])
-        self.unheard.difference_update([framed.report.tick for framed in heard])
-        self.command = planner.command(self.state)
+        self.state = self.planner.decide(self.state, [framed.report for framed in heard])
+        if heard:
+            self.unheard.difference_update([framed.report.tick for framed in heard])
+        self.command = self.planner.command(self.state)
         if self._journal is not None:
             frames = [framed.frame for framed in heard]
             frames += [encode(DeadlineMissed(self.state.tick, peer)) for peer in missed]
@@ -106,7 +107,7 @@ class Robot:
 
         No process waits for an Estimate, so it is computed and journaled after the Command has been sent.
         """
-        frame = encode(planner.estimate(self.state))
+        frame = encode(self.planner.estimate(self.state))
         if self._journal is not None:
             self._journal.write(frame)
         return frame
@@ -119,7 +120,7 @@ class Robot:
         The arguments count the frames that the transport refused and the reports that no Observation listed.
         """
         state, belief = self.state, self.state.belief
-        plan = belief.plan
+        plan = state.plan
         final_report = FinalReport(
             robot=state.config.robot,
             anchor_ranges=len(state.log.ranges),

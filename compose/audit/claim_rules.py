@@ -6,16 +6,13 @@ from collections.abc import Sequence
 
 from msgspec.structs import astuple
 
-from agent.planning.assured import CHECKED, CHECKED_WITH_OUTLIERS
-from agent.planning.paper import CHECKED as CHECKED_BY_LETTER
-from agent.planning.phase3_last_manoeuvre import ELSEWHERE
-from agent.planning.planner import uses_active_sensing
-from agent.planning.range_seeking import travelled
+from agent.estimation.mutual_ranges import ELSEWHERE
+from agent.planning.registry import planner
 from agent.process.agent_journal import Past
 from compose.audit.findings import Checks, Violation, between
 from compose.recording.run import Run
 from protocol.messages import Localised, MissionEnd
-from protocol.motion import Pose
+from protocol.motion import Pose, travelled
 from world.referee import inaccuracy, mistake
 from world.scenario import RobotSpec
 
@@ -65,10 +62,7 @@ def _redundant(run: Run, placed: RobotSpec, past: Past, tick: int) -> Violation 
     if noise.exact:
         places = _places(run, placed, mutual)
         return _too_few(tick, placed, "relative placements with a mutual range", places, PLACES)
-    active = uses_active_sensing(scenario.planner_name, scenario.mission)
-    least = CHECKED if active else CHECKED_BY_LETTER
-    if noise.outliers:
-        least = CHECKED_WITH_OUTLIERS
+    least = planner(scenario.planner_name).required_mutual_ranges(scenario.mission)
     return _too_few(tick, placed, "mutual ranges", len(mutual), least)
 
 

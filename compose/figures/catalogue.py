@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 from matplotlib.figure import Figure
 
-from agent.planning.planner import uses_active_sensing
+from agent.planning.registry import planner
 from compose.figures import decisions, manoeuvre, one_robot, over_time, phase_one, steps, trajectory
 from compose.figures.pair import PairRecord
 from compose.figures.sheet import Absent
@@ -34,7 +34,7 @@ def _phase_one(pair: PairRecord, medium: Medium) -> Iterator[Picture]:
 
 def _plan(pair: PairRecord, medium: Medium) -> Iterator[Picture]:
     """Yield the planned manoeuvres; with active sensing, the hypotheses at its decisions."""
-    if pair.readable and uses_active_sensing(pair.planner_name, pair.mission):
+    if pair.readable and planner(pair.planner_name).uses_active_sensing(pair.mission):
         yield f"plan-{pair.name}", decisions.draw(pair, medium)
     elif pair.readable:
         for name, figure in manoeuvre.draw(pair, medium).items():

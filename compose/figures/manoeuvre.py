@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from agent.estimation.closed_forms import Placement
 from agent.planning.phase3_last_manoeuvre import Array, Compared, LastManoeuvre, Plan, compared
+from agent.planning.registry import planner
 from compose.figures.pair import ROLES, PairRecord
 from compose.figures.sheet import (
     ANCHORS,
@@ -54,8 +55,8 @@ def planned(pair: PairRecord, role: Role) -> Iterator[Planned]:
     """Yield every last manoeuvre of one robot, in order."""
     before = None
     for state in pair.states(role):
-        if state.belief.plan is not before and isinstance(state.mode, LastManoeuvre):
-            before = state.belief.plan
+        if state.plan is not before and isinstance(state.mode, LastManoeuvre):
+            before = state.plan
             assert before is not None
             yield Planned(state.tick, before)
 
@@ -109,7 +110,7 @@ def _inverse(placement: Placement) -> Pose:
 
 def _figure(pair: PairRecord, one: Planned, medium: Medium) -> Figure:
     seen, plan, mission = scene(one.plan), one.plan, pair.mission
-    ways = compared(plan.question, mission, pair.planner_name)
+    ways = compared(plan.question, mission, planner(pair.planner_name).MANOEUVRES)
     sheet = Sheet(medium, False, [pair.title, _title(pair, one)])
     axes, value = sheet.panel(), sheet.panel()
     half = AROUND * max(

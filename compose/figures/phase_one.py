@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from agent.estimation.exact import Branch
-from agent.planning.range_seeking import travelled
 from agent.planning.state import RobotState
 from compose.figures.pair import PairRecord
 from compose.figures.sheet import ANCHORS, LABEL, Absent, Sheet, around, circle
@@ -18,7 +17,7 @@ from compose.figures.style import INK, MARKS, PALE, PALER, SCREEN, Medium
 from compose.view.colours import COLOURS
 from protocol.messages import BranchKind
 from protocol.mission import Role
-from protocol.motion import Pose, compose
+from protocol.motion import Pose, compose, travelled
 
 TALLEST = 4.2
 """The maximum height of the plane, in inches."""

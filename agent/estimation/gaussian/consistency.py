@@ -72,7 +72,7 @@ def _normal(chi2: float, free: int) -> float:
     """Return a chi-square with `free` degrees of freedom as a standard normal variable (Wilson and Hilferty).
 
     Rounding may make the chi-square of a fit that has not reached its minimum negative (see
-    `inference.finished`).
+    FINISHED).
     """
     spread = 2.0 / (9.0 * free)
     return float(((max(chi2, 0.0) / free) ** (1.0 / 3.0) - (1.0 - spread)) / math.sqrt(spread))

@@ -13,21 +13,21 @@ from msgspec.structs import replace
 
 from agent.estimation.closed_forms import Placement
 from agent.estimation.exact import FITTED, Branch, PairObservation, anchor_error, polished, turn_error
+from agent.estimation.knowledge import Belief, Knowledge
 from agent.peer.motion_log import MotionLog
-from agent.planning.state import RobotState
 from protocol.mission import RANGE_MARGIN, Mission
 from protocol.motion import ORIGIN, Pose, Segment, follow
 from protocol.rounding import BETTER, OUT_AND_BACK, SAME, SURE, WELL, required_anchor_error, rounding
 
 
-def size(state: RobotState) -> float:
+def size(knowledge: Knowledge) -> float:
     """Return D + R in m: the largest coordinate in the computations of the robots and the world."""
-    return state.config.anchor_distance + state.config.mission.sensing_range
+    return knowledge.config.anchor_distance + knowledge.config.mission.sensing_range
 
 
-def range_rounding(state: RobotState, log: MotionLog, tick: int) -> float:
+def range_rounding(knowledge: Knowledge, log: MotionLog, tick: int) -> float:
     """Return the bound in m on the rounding error of a range at `tick`, from the odometry of `log`."""
-    return _path_rounding(size(state), log.until(tick), state.config.mission.period)
+    return _path_rounding(size(knowledge), log.until(tick), knowledge.config.mission.period)
 
 
 def _path_rounding(extent: float, runs: Sequence[Segment], period: float) -> float:
@@ -59,7 +59,7 @@ class Known(msgspec.Struct, frozen=True):
     """True if phase 1 may end."""
 
 
-def anchor(state: RobotState, start: Pose, log: MotionLog) -> Known:
+def anchor(knowledge: Knowledge, start: Pose, log: MotionLog) -> Known:
     """Return the smallest anchor error of the robot of `log`, whose branch begins at `start`.
 
     Phase 1 may end in three cases:
@@ -72,8 +72,8 @@ def anchor(state: RobotState, start: Pose, log: MotionLog) -> Known:
     Later ranges are ignored, so that both robots of a pair, which have the same ranges, compute the same
     result.
     """
-    mission, extent = state.config.mission, size(state)
-    enough = required_anchor_error(extent, state.config.anchor_distance, mission.sensing_range)
+    mission, extent = knowledge.config.mission, size(knowledge)
+    enough = required_anchor_error(extent, knowledge.config.anchor_distance, mission.sensing_range)
     known = least = error = math.inf
     ranges = 0
     ranged: list[tuple[Pose, float, float]] = []
@@ -104,48 +104,54 @@ Next to a double root, rounding may end the two fits on either side of it.
 """
 
 
-def merged(state: RobotState, branches: tuple[Branch, ...]) -> tuple[Branch, ...]:
+def merged(knowledge: Knowledge, branches: tuple[Branch, ...]) -> tuple[Branch, ...]:
     """Return `branches` without those that no range distinguishes from the first (see NEXT_TO)."""
-    if len(branches) < 2 or len(state.log.ranges) < FITTED:
+    if len(branches) < 2 or len(knowledge.log.ranges) < FITTED:
         return branches
     first = branches[0]
-    near = NEXT_TO * anchor(state, first.start, state.log).error
+    near = NEXT_TO * anchor(knowledge, first.start, knowledge.log).error
     return (first, *(other for other in branches[1:] if math.dist(other.anchor, first.anchor) >= near))
 
 
-def fitted(state: RobotState, branch: Branch) -> tuple[Branch, Known]:
+def fitted(knowledge: Knowledge, branch: Branch) -> tuple[Branch, Known]:
     """Return `branch` fitted to the ranges with the smallest anchor error, and that error."""
-    known = anchor(state, branch.start, state.log)
-    if known.ranges == len(state.log.ranges):
+    known = anchor(knowledge, branch.start, knowledge.log)
+    if known.ranges == len(knowledge.log.ranges):
         return branch, known
-    ranged = [(pose, rho) for pose, rho in state.seen() if rho is not None]
+    ranged = [(pose, rho) for pose, rho in knowledge.seen() if rho is not None]
     branch = polished(branch, ranged[: known.ranges])
-    return branch, replace(known, error=anchor(state, branch.start, state.log).error)
+    return branch, replace(known, error=anchor(knowledge, branch.start, knowledge.log).error)
 
 
-def peer_anchor(state: RobotState) -> float:
+def peer_anchor(knowledge: Knowledge) -> float:
     """Return the anchor error of the peer in m."""
-    assert state.peer_state.start is not None
-    return anchor(state, state.peer_state.start, state.peer_state.peer).error
+    assert knowledge.peer_state.start is not None
+    return anchor(knowledge, knowledge.peer_state.start, knowledge.peer_state.peer).error
 
 
-def odometry_rounding(state: RobotState, tick: int) -> float:
+def odometry_rounding(knowledge: Knowledge, tick: int) -> float:
     """Return the bound in m on the sum of both odometries' rounding errors until `tick`."""
-    return range_rounding(state, state.log, tick) + range_rounding(state, state.peer_state.peer, tick)
+    return range_rounding(knowledge, knowledge.log, tick) + range_rounding(
+        knowledge, knowledge.peer_state.peer, tick
+    )
 
 
-def combined_error(state: RobotState, rounding_error: float) -> float:
+def combined_error(belief: Belief, rounding_error: float) -> float:
     """Return the bound in m on both anchor errors and both odometries' rounding errors.
 
     `rounding_error` is `odometry_rounding`.
     """
-    own, peers = state.belief.own_anchor, state.belief.peer_anchor
+    own, peers = belief.own_anchor, belief.peer_anchor
     assert peers is not None
     return own + peers + rounding_error
 
 
 def pinned_down(
-    state: RobotState, placement: Placement, ranged: Sequence[PairObservation], error_bound: float
+    knowledge: Knowledge,
+    belief: Belief,
+    placement: Placement,
+    ranged: Sequence[PairObservation],
+    error_bound: float,
 ) -> bool:
     """Return whether the observations in `ranged` determine `placement` to SURE.
 
@@ -154,11 +160,11 @@ def pinned_down(
     does.
     """
     first, last = ranged[0].tick, ranged[-1].tick
-    period, extent = state.config.mission.period, size(state)
+    period, extent = knowledge.config.mission.period, size(knowledge)
     floor = 0.0
-    for log in (state.log, state.peer_state.peer):
+    for log in (knowledge.log, knowledge.peer_state.peer):
         floor += 0.5 * _path_rounding(extent, log.between(first, last), period)
     rotation_error = turn_error(
-        placement, ranged, floor, combined_error(state, odometry_rounding(state, first))
+        placement, ranged, floor, combined_error(belief, odometry_rounding(knowledge, first))
     )
     return error_bound + rotation_error * max(1.0, extent) <= SURE

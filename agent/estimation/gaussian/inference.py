@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from msgspec.structs import replace
@@ -14,11 +15,20 @@ from agent.estimation.gaussian.hypotheses import ScoredHypothesis, missing, of_a
 from agent.estimation.gaussian.least_squares import deviation, poses
 from agent.estimation.gaussian.odometry_noise import Array, Track, track
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, Ranges
+from agent.estimation.knowledge import Belief, Knowledge
 from agent.peer.motion_log import MotionLog
-from agent.planning.active_sensing import PlanningHypothesis
-from agent.planning.state import RobotState
 from protocol.mission import HEADING_ACCURACY, Mission
 from protocol.motion import Covariance, Pose, compose, inverse, wrap
+
+
+class PlanningHypothesis(NamedTuple):
+    """A hypothesis in the form that planning needs."""
+
+    probability: float
+    poses: Array
+    """The poses in m and rad: (3,) of one robot relative to its anchor, or (6,) of a and b relative to M1."""
+    covariance: Array
+    """The covariance of the anchor's position, (2, 2), or of both poses, (6, 6)."""
 
 
 def path_of(log: MotionLog, through: int, period: float) -> Track:
@@ -30,16 +40,16 @@ def path_of(log: MotionLog, through: int, period: float) -> Track:
     return track(v, omega, period)
 
 
-def own_anchor(state: RobotState) -> tuple[ScoredHypothesis, ...]:
+def own_anchor(knowledge: Knowledge) -> tuple[ScoredHypothesis, ...]:
     """Return the hypotheses about the anchor in the frame of the odometry, the most probable first."""
-    mission = state.config.mission
-    path = path_of(state.log, state.tick, mission.period)
-    ranges = Ranges.of_lists(_ranges_until(state.log, state.tick), (), (), mission.noise)
+    mission = knowledge.config.mission
+    path = path_of(knowledge.log, knowledge.tick, mission.period)
+    ranges = Ranges.of_lists(_ranges_until(knowledge.log, knowledge.tick), (), (), mission.noise)
     possible = ranges.within(mission.sensing_range)
     if not len(possible.rho):
         return ()
-    silent = missing(ranges.tick, state.tick + 1)
-    return of_anchor(state.belief.own, path, possible, silent, mission.sensing_range, mission.noise)
+    silent = missing(ranges.tick, knowledge.tick + 1)
+    return of_anchor(knowledge.belief.own, path, possible, silent, mission.sensing_range, mission.noise)
 
 
 def _ranges_until(log: MotionLog, through: int) -> list[tuple[int, float]]:
@@ -47,14 +57,14 @@ def _ranges_until(log: MotionLog, through: int) -> list[tuple[int, float]]:
     return [(ranged.tick, ranged.range) for ranged in log.ranges if ranged.tick <= through]
 
 
-def with_own(state: RobotState, scored: Sequence[ScoredHypothesis]) -> RobotState:
-    """Return `state` with the hypotheses `scored` about its anchor, and with the most probable branch."""
+def with_own(knowledge: Knowledge, scored: Sequence[ScoredHypothesis]) -> Belief:
+    """Return the belief with the hypotheses `scored` about its anchor, and with the most probable branch."""
     own = tuple([one.hypothesis for one in scored])
-    branches = tuple([branch_of(state, one) for one in scored])
-    return replace(state, belief=replace(state.belief, own=own, branches=branches, branch=branches[0]))
+    branches = tuple([branch_of(knowledge, one) for one in scored])
+    return replace(knowledge.belief, own=own, branches=branches, branch=branches[0])
 
 
-def branch_of(state: RobotState, scored: ScoredHypothesis) -> Branch:
+def branch_of(knowledge: Knowledge, scored: ScoredHypothesis) -> Branch:
     """Return the trajectory of `scored` as a branch, whose start and odometry lead to the present pose."""
     mx, my = scored.hypothesis.guess[:2]
     path = scored.fit.paths[0]
@@ -62,7 +72,7 @@ def branch_of(state: RobotState, scored: ScoredHypothesis) -> Branch:
     c, s = math.cos(frame), math.sin(frame)
     x, y = float(path.x[-1]) - mx, float(path.y[-1]) - my
     now = Pose(c * x + s * y, c * y - s * x, float(path.heading[-1]) - frame)
-    start = compose(now, inverse(state.odometry))
+    start = compose(now, inverse(knowledge.odometry))
     return Branch(wrap(-frame), start)
 
 
@@ -98,27 +108,27 @@ Two unknowns need two ranges. The others check them.
 """
 
 
-def known_through(state: RobotState) -> int:
+def known_through(knowledge: Knowledge) -> int:
     """Return the last tick that both logs cover."""
-    return min(state.tick, state.peer_state.peer.through, state.peer_state.ranges_through)
+    return min(knowledge.tick, knowledge.peer_state.peer.through, knowledge.peer_state.ranges_through)
 
 
-def peer_log_suffices(state: RobotState) -> bool:
+def peer_log_suffices(knowledge: Knowledge) -> bool:
     """Return whether the peer's log reaches the tick of this robot's last motion."""
-    return known_through(state) >= state.log.moved(state.config.mission.noise.standstill_bound)
+    return known_through(knowledge) >= knowledge.log.moved(knowledge.config.mission.noise.standstill_bound)
 
 
-def pair_of(state: RobotState) -> PairRanges:
+def pair_of(knowledge: Knowledge) -> PairRanges:
     """Return the ranges and odometry of both robots.
 
     The own data reach up to now, and the peer's up to the last tick that both logs cover.
     """
-    peer, config = state.peer_state.peer, state.config
-    mission, last = config.mission, known_through(state)
-    logs, ends = ((state.log, peer), (state.tick, last, last))
+    peer, config = knowledge.peer_state.peer, knowledge.config
+    mission, last = config.mission, known_through(knowledge)
+    logs, ends = ((knowledge.log, peer), (knowledge.tick, last, last))
     if config.role == "b":
-        logs, ends = ((peer, state.log), (last, state.tick, last))
-    mutual = [(ranged.tick, ranged.range) for ranged in state.mutual if ranged.tick <= last]
+        logs, ends = ((peer, knowledge.log), (last, knowledge.tick, last))
+    mutual = [(ranged.tick, ranged.range) for ranged in knowledge.mutual if ranged.tick <= last]
     lists = [_ranges_until(log, end) for log, end in zip(logs, ends, strict=False)]
     ranges = Ranges.of_lists(lists[0], lists[1], mutual, mission.noise)
     silent = [missing(ranges.tick[ranges.rows(kind)], ends[kind] + 1) for kind in range(3)]
@@ -171,34 +181,38 @@ def blocking_reason_for(
     return None
 
 
-def with_convergence_check(state: RobotState, scored: Sequence[ScoredHypothesis]) -> RobotState:
-    """Return `state` with a blocking reason if the fit of the most probable hypothesis has not converged."""
-    if state.belief.blocking_reason is not None or scored[0].fit.last_step <= FINISHED:
-        return state
+def with_convergence_check(belief: Belief, scored: Sequence[ScoredHypothesis]) -> Belief:
+    """Return `belief` with a blocking reason if the fit of the most probable hypothesis has not converged."""
+    if belief.blocking_reason is not None or scored[0].fit.last_step <= FINISHED:
+        return belief
     blocking_reason = (
         f"the fit of the most probable hypothesis has not converged: its last step is "
         f"{scored[0].fit.last_step:.3g} sigmas"
     )
-    return replace(state, belief=replace(state.belief, blocking_reason=blocking_reason))
+    return replace(belief, blocking_reason=blocking_reason)
 
 
 def with_pair(
-    state: RobotState, scored: Sequence[ScoredHypothesis], pair: PairRanges, mutual: int
-) -> RobotState:
-    """Return `state` with the hypotheses `scored` about both robots' poses in <W>.
+    knowledge: Knowledge,
+    scored: Sequence[ScoredHypothesis],
+    hypotheses: Sequence[PlanningHypothesis],
+    pair: PairRanges,
+    mutual: int,
+) -> Belief:
+    """Return the belief with the hypotheses `scored` about both robots' poses in <W>.
 
-    A claim needs `mutual` mutual ranges from different places.
+    `hypotheses` contains the same in the form that planning needs. A claim needs `mutual` mutual
+    ranges from different places.
     """
-    config = state.config
+    config = knowledge.config
     robot, m1 = (0, config.anchor) if config.role == "a" else (1, config.peer_anchor)
-    hypotheses = pair_planning_hypotheses(scored, pair)
     enough = len(pair.places) >= mutual
     inconsistency = consistency_test(scored[0].fit, pair) if enough and scored else None
     blocking_reason = blocking_reason_for(scored, hypotheses, inconsistency, pair, config.mission)
     claims = [claim(one, robot, pair) for one in hypotheses]
-    first, _ = state.belief.candidates or (len(scored), 0)
-    belief = replace(
-        state.belief,
+    first, _ = knowledge.belief.candidates or (len(scored), 0)
+    return replace(
+        knowledge.belief,
         pair=tuple(one.hypothesis for one in scored),
         poses=tuple(Pose(m1.x + pose.x, m1.y + pose.y, pose.heading) for pose, _ in claims),
         covariance=claims[0][1] if claims else None,
@@ -208,7 +222,6 @@ def with_pair(
         if enough
         else f"{len(pair.places)} of {mutual} required mutual ranges",
     )
-    return replace(state, belief=belief)
 
 
 def claim(hypothesis: PlanningHypothesis, robot: int, pair: PairRanges) -> tuple[Pose, Covariance]:

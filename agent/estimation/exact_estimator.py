@@ -1,0 +1,141 @@
+"""The estimator for exact sensors: closed forms, which all measurements test up to rounding."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import msgspec
+from msgspec.structs import replace
+
+from agent.estimation import precision
+from agent.estimation.estimator import AnchorEstimate, Estimator, FittedBranch, PairEstimate
+from agent.estimation.exact import (
+    Branch,
+    PairObservation,
+    branches,
+    weigh_branches,
+    weigh_placements,
+)
+from agent.estimation.knowledge import Belief, Knowledge, off_anchor
+from agent.estimation.mutual_ranges import base, redundant, solve
+from protocol.messages import Inconsistent, Localised, Observation, Verdict
+from protocol.motion import ORIGIN, REST
+from protocol.rounding import SAME
+
+
+class ExactEstimator(msgspec.Struct, frozen=True):
+    """The closed forms of Section III. A candidate that contradicts any measurement is ruled out."""
+
+    has_covariances: ClassVar[bool] = False
+    """What remains is certain up to rounding."""
+    report_tolerance: ClassVar[float] = 1e-6
+    """The rounding error of a report with a margin, in m and rad."""
+
+    def is_informative(self, knowledge: Knowledge, observation: Observation) -> bool:
+        """Return False for a range that repeats the last one of a robot that has not moved since.
+
+        It is dropped from the end of phase 1 on.
+        """
+        return not (
+            knowledge.belief.branch is not None
+            and observation.executed == REST
+            and observation.anchor_range == knowledge.log.ranges[-1].range
+        )
+
+    def on_anchor(self, knowledge: Knowledge, rho0: float) -> FittedBranch | None:
+        """Return the branch of a robot on its anchor: its heading is radial by definition."""
+        if rho0 > SAME * precision.range_rounding(knowledge, knowledge.log, knowledge.tick):
+            return None
+        known = precision.anchor(knowledge, ORIGIN, knowledge.log)
+        return FittedBranch(Branch(0.0, ORIGIN), known.error, known.enough)
+
+    def anchor(self, knowledge: Knowledge, candidates: tuple[Branch, ...]) -> AnchorEstimate:
+        """Return the branches +alpha and -alpha of eq. (2) that agree with every tick of phase 1."""
+        belief = knowledge.belief
+        if not candidates:
+            ranges = knowledge.log.ranges
+            candidates = branches(ranges[0].range, knowledge.odometry, ranges[-1].range)
+            belief = replace(belief, possible=candidates)
+        mission = knowledge.config.mission
+        floor = precision.range_rounding(knowledge, knowledge.log, knowledge.tick)
+        margin = precision.margin(mission, floor)
+        remaining = weigh_branches(candidates, knowledge.seen(), mission.sensing_range, floor, margin)
+        remaining = precision.merged(knowledge, remaining)
+        return AnchorEstimate(belief, remaining, remaining[0] if len(remaining) == 1 else None, margin)
+
+    def fitted(self, knowledge: Knowledge, branch: Branch) -> FittedBranch:
+        """Return `branch` fitted to the ranges with the smallest anchor error."""
+        branch, known = precision.fitted(knowledge, branch)
+        return FittedBranch(branch, known.error, known.enough)
+
+    def pair(
+        self, knowledge: Knowledge, first_tick: int, required_ranges: int, *, second_range: bool
+    ) -> PairEstimate | None:
+        """Return the placements of eq. (7) that agree with every tick from `first_tick` on.
+
+        The number of ranges does not matter: the claim needs a redundant one that confirms the placement. The
+        result is None until a has moved between two ranges while b stood still.
+        """
+        del required_ranges, second_range
+        observations = tuple(knowledge.pair_observations(first_tick))
+        ranged = [at for at in observations if at.range is not None]
+        away_from_m2 = [at for at in ranged if off_anchor(at.b, knowledge.config.rendezvous.b)]
+        through = min(knowledge.tick, knowledge.peer_state.peer.through)
+        odometry_rounding = precision.odometry_rounding(knowledge, through)
+        pair_base = base(away_from_m2, odometry_rounding)
+        if pair_base is None:
+            return None
+        belief = knowledge.belief
+        if belief.peer_anchor is None:
+            belief = replace(belief, peer_anchor=precision.peer_anchor(knowledge))
+        error_bound = precision.combined_error(belief, odometry_rounding)
+        belief = _with_placements(knowledge, belief, observations, pair_base, error_bound)
+        remaining = belief.placements
+        checked = redundant(ranged, pair_base)
+        verdict: Verdict | None = None
+        if not remaining:
+            verdict = Inconsistent("a path that contradicts the mutual ranges under every placement")
+        elif (
+            checked
+            and len(remaining) == 1
+            and precision.pinned_down(knowledge, belief, remaining[0], ranged, error_bound)
+        ):
+            verdict = Localised(knowledge.world_pose(remaining[0]))
+        failure = "does not select a placement" if checked else "could not be measured: b left a's range"
+        return PairEstimate(
+            belief,
+            verdict,
+            remaining,
+            observations[-1].a,
+            observations[-1].b,
+            checked,
+            observations,
+            f"the third mutual range {failure}",
+        )
+
+
+def _with_placements(
+    knowledge: Knowledge,
+    belief: Belief,
+    observations: Sequence[PairObservation],
+    pair_base: tuple[PairObservation, PairObservation],
+    floor: float,
+) -> Belief:
+    """Return `belief` with the solutions of eq. (7) that agree with every tick in `observations`.
+
+    A tick without a mutual range rules out the placements that predict both robots in range. `floor` is the
+    bound in m on the error of a predicted range.
+    """
+    reach, solutions = knowledge.config.mission.sensing_range, belief.placements
+    candidates = belief.candidates
+    if candidates is None:
+        solutions = tuple(solve(knowledge.config.anchor_distance, pair_base))
+        undetected = [at for at in observations if at.range is None]
+        possible = weigh_placements(solutions, undetected, reach, floor)
+        candidates = (len(solutions), len(possible))
+    remaining = weigh_placements(solutions, observations, reach, floor)
+    return replace(belief, placements=remaining, candidates=candidates)
+
+
+EXACT: Estimator = ExactEstimator()

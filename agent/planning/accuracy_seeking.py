@@ -1,0 +1,298 @@
+"""The `assured` planner where hypotheses have covariances: measure until the poses are accurate enough.
+
+The phases are those of the paper. In phase 1, a robot collects ranges to its anchor until a better estimate
+is not worth the time. In phase 3, both robots move, each to where its next ranges are expected to tell
+most (see `active_sensing`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from msgspec.structs import replace
+
+from agent.estimation.gaussian import inference
+from agent.estimation.gaussian.consistency import (
+    CLAIM_P_VALUE,
+    EARLY_CLAIM_P_VALUE,
+    INCONSISTENT_P_VALUE,
+    INCONSISTENT_SEARCHES,
+)
+from agent.estimation.gaussian.hypotheses import ScoredHypothesis, follow, search
+from agent.estimation.knowledge import Belief
+from agent.planning import active_sensing, phase2_orbit, range_seeking, transitions
+from agent.planning.active_sensing import Listening, Retreating, Surveying
+from agent.planning.manoeuvres import Manoeuvres
+from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent
+from agent.planning.range_seeking import Backing, Circling, Homing, Straight, Turning
+from agent.planning.state import Asleep, Done, RobotState
+from protocol.messages import BranchKind, Localised
+from protocol.mission import Mission
+from protocol.motion import ORIGIN, REST, Controls
+
+LOST_AFTER = 3
+"""The number of strides without an expected anchor detection after which the robot returns to its anchor."""
+
+LOST_AFTER_IN_PHASE_3 = 6
+"""The LOST_AFTER of b in phase 3, in which b may drive slightly out of its anchor's range."""
+
+MISLEADING = -8.0
+"""The smallest plausible log-likelihood of the ticks without detection.
+
+If it is smaller even for the most probable hypothesis, the ranges are misleading and not just unlucky.
+"""
+
+CHECKED, CHECKED_WITH_OUTLIERS = 8, 12
+"""The minimum number of mutual ranges before a claim, without and with outliers."""
+
+FEWEST_MUTUAL_RANGES = 3
+"""The minimum number of mutual ranges for hypotheses. With fewer, there are too many hypotheses."""
+
+OFF_RADIUS = 0.5
+"""The heading error in rad relative to the radius from which on the robot aligns again in phase 2."""
+
+DROP_OUT_SIGMAS = 3.0
+"""The margin for the number of drop-outs, in standard deviations."""
+
+SEARCH_AT = frozenset((FEWEST_MUTUAL_RANGES, *(CHECKED * 2**n for n in range(12))))
+"""The numbers of mutual ranges at which the whole plane is searched again for hypotheses."""
+
+MANY_MUTUAL_RANGES = 60
+"""The number of mutual ranges after which a lack of accuracy is due to too few ranges to the anchor."""
+
+
+def required_mutual_ranges(mission: Mission) -> int:
+    """Return the minimum number of mutual ranges before a claim."""
+    return CHECKED_WITH_OUTLIERS if mission.noise.outliers else CHECKED
+
+
+def after_observation(state: RobotState, anchor_range: float | None, manoeuvres: Manoeuvres) -> RobotState:
+    """Return `state` with the mode that follows from the robot's own sensors."""
+    match state.mode:
+        case Straight("anchor") | Backing("anchor") | Turning("anchor") | Circling("anchor"):
+            seeking = transitions.sought(state, state.mode, anchor_range is not None, manoeuvres)
+            return seeking if seeking is not None else _continue_phase1(state)
+        case Surveying("anchor"):
+            return _continue_phase1(state) if is_planning_tick(state) else state
+        case Homing():
+            if anchor_range is not None:
+                return _continue_phase1(state)
+            arrived = range_seeking.homing_controls(state.mode, state.odometry, state.config.mission) is None
+            return replace(state, mode=Straight("anchor", state.odometry, 0.0)) if arrived else state
+        case Aligning() | Radial() | Tangent() | Orbiting():
+            return _continue_phase2(state, anchor_range is not None)
+        case Surveying("peer") | Listening() | Retreating():
+            return _continue_phase3(state)
+        case _:
+            return state
+
+
+def is_planning_tick(state: RobotState) -> bool:
+    """Return whether the robot plans a manoeuvre in this tick. Both robots plan in the same ticks."""
+    return state.tick % active_sensing.stride(state.config.mission) == 0
+
+
+def _continue_phase1(state: RobotState) -> RobotState:
+    """Continue phase 1: update the hypotheses about the anchor, and end phase 1 if they are accurate enough.
+
+    If no hypothesis explains the ticks without detection, the ranges are misleading. The robot then takes
+    further ranges around the place of the last one, as at the start.
+    """
+    ranged = state.log.ranges[-1].tick == state.tick
+    scored = inference.own_anchor(state)
+    if scored:
+        state = replace(state, belief=inference.with_own(state, scored))
+    if _ticks_without_range(state) >= LOST_AFTER * active_sensing.stride(state.config.mission):
+        return _return_to_anchor(state)
+    if not scored or scored[0].detection_log_likelihood < MISLEADING + _drop_out_log_likelihood(state):
+        if not ranged:
+            return _return_to_anchor(state)
+        return replace(state, mode=Straight("anchor", state.odometry, state.log.ranges[-1].range))
+    mission = state.config.mission
+    if inference.is_anchor_known(scored, mission):
+        kind: BranchKind = "circle" if len(state.log.ranges) == 2 else "three-ranges"
+        phase1_done_tick = (
+            state.tick if state.belief.phase1_done_tick is None else state.belief.phase1_done_tick
+        )
+        state = replace(
+            state, belief=replace(state.belief, branch_kind=kind, phase1_done_tick=phase1_done_tick)
+        )
+        return _start_phase2(state)
+    command = active_sensing.plan_alone(inference.anchor_planning_hypotheses(scored), mission)
+    return replace(state, mode=Surveying("anchor", command))
+
+
+def _drop_out_log_likelihood(state: RobotState) -> float:
+    """Return the log-likelihood of the largest number of drop-outs to be expected so far."""
+    p = state.config.mission.noise.drop_outs
+    expected = p * (state.tick + 1)
+    return (expected + DROP_OUT_SIGMAS * math.sqrt(expected)) * math.log(p) if p else 0.0
+
+
+def _ticks_without_range(state: RobotState) -> int:
+    """Return the number of ticks since the last anchor range."""
+    return state.tick - state.log.ranges[-1].tick
+
+
+def _return_to_anchor(state: RobotState) -> RobotState:
+    """Drive back to the place of the last anchor range, and discard all hypotheses."""
+    last_range_tick = state.log.ranges[-1].tick
+    place = state.log.pose(ORIGIN, last_range_tick, state.config.mission.period)
+    belief = replace(state.belief, own=(), encounter_tick=None, pair=(), returns=state.belief.returns + 1)
+    return replace(state, mode=Homing(place), belief=belief)
+
+
+def _start_phase2(state: RobotState) -> RobotState:
+    """Start phase 2, for the first time or again."""
+    mu = phase2_orbit.orientation(state.local_pose)
+    return _continue_phase2(replace(state, mode=Aligning(state.odometry.heading - mu)), False)
+
+
+def _continue_phase2(state: RobotState, ranged: bool) -> RobotState:
+    """Continue phase 2 with the latest anchor range, if `ranged`. Robot b takes ranges while it waits."""
+    mission = state.config.mission
+    scored: Sequence[ScoredHypothesis] = ()
+    if ranged and is_planning_tick(state) and (scored := inference.own_anchor(state)):
+        state = replace(state, belief=inference.with_own(state, scored))
+        if isinstance(state.mode, Radial) and abs(phase2_orbit.orientation(state.local_pose)) > OFF_RADIUS:
+            return _start_phase2(state)
+    assert isinstance(state.mode, Aligning | Radial | Tangent | Orbiting)
+    mode = phase2_orbit.onward(state.mode, state.odometry, state.start, state.orbit, mission)
+    timeout: float = LOST_AFTER * active_sensing.stride(mission)
+    if (
+        state.orbit.v == 0.0
+        and isinstance(mode, Radial | Orbiting)
+        and _ticks_without_range(state) >= timeout
+    ):
+        return _return_to_anchor(state)
+    if isinstance(mode, Orbiting):
+        since = mode.since or state.tick
+        timeout += state.config.rendezvous.bound / mission.period
+        if state.orbit.v != 0.0 and state.tick - since > timeout and not state.in_contact:
+            return _return_to_anchor(state)
+        if state.orbit.v != 0.0:
+            command = phase2_orbit.pursuit(state.local_pose, state.orbit, mission)
+        elif scored:
+            command = active_sensing.plan_alone(
+                inference.anchor_planning_hypotheses(scored), mission, state.orbit.radius
+            )
+        else:
+            command = REST if is_planning_tick(state) else mode.command or REST
+        mode = Orbiting(command, since)
+    return replace(state, mode=mode)
+
+
+# --- in contact with the peer -------------------------------------------------------------------------
+
+
+def _continue_phase3(state: RobotState) -> RobotState:
+    """Continue phase 3 depending on whether the peer, and for b also its anchor, are in range."""
+    stride = active_sensing.stride(state.config.mission)
+    match state.mode:
+        case Retreating(_, since) if state.tick - since < 2 * stride:
+            return state
+        case Retreating():
+            return replace(state, mode=Surveying("peer")) if state.in_contact else _start_phase2(state)
+        case _ if state.config.role == "b" and _ticks_without_range(state) >= LOST_AFTER_IN_PHASE_3 * stride:
+            return _return_to_anchor(state)
+        case Surveying(_, command) | Listening(command) if not state.in_contact:
+            return replace(state, mode=Retreating(Controls(0.0 - command.v, 0.0 - command.omega), state.tick))
+        case _:
+            return state
+
+
+def after_reports(state: RobotState) -> RobotState:
+    """Return `state` with the mode that follows from the reports of a peer in range."""
+    match state.mode:
+        case Done() | Asleep():
+            return state
+        case Surveying("anchor") | Straight() | Backing() | Turning() | Circling() | Homing():
+            return state
+        case _ if state.peer_state.start is None:
+            return state
+        case Retreating():
+            return state
+        case Surveying("peer") | Listening() if not is_planning_tick(state):
+            return state
+        case _ if not inference.peer_log_suffices(state):
+            return replace(state, mode=Listening())
+        case _:
+            return _decide_phase3(state)
+
+
+def _decide_phase3(state: RobotState) -> RobotState:
+    """Evaluate both logs in phase 3: update the hypotheses, then claim a pose or plan the manoeuvres.
+
+    Both robots compute the same pair of manoeuvres from the same logs, and each executes its own.
+    """
+    mission, role = state.config.mission, state.config.role
+    if state.belief.encounter_tick is None:
+        state = replace(state, belief=replace(state.belief, encounter_tick=state.tick))
+    pair = inference.pair_of(state)
+    mutual = pair.ranges.counts[2]
+    if mutual < FEWEST_MUTUAL_RANGES:
+        return _drive_without_hypotheses(state)
+    known = state.belief.pair
+    searched = not known or any(state.belief.ranges_at_last_search < count <= mutual for count in SEARCH_AT)
+    scored = search(pair) if searched else follow(known, pair)
+    if searched:
+        state = replace(state, belief=replace(state.belief, ranges_at_last_search=mutual))
+    required_ranges = required_mutual_ranges(mission)
+    hypotheses = inference.pair_planning_hypotheses(scored, pair)
+    belief = inference.with_pair(state, scored, hypotheses, pair, required_ranges)
+    if (belief.blocking_reason is None or _p_value_below(belief, CLAIM_P_VALUE)) and not searched:
+        scored, searched = search(pair), True
+        hypotheses = inference.pair_planning_hypotheses(scored, pair)
+        belief = inference.with_pair(state, scored, hypotheses, pair, required_ranges)
+    tested = replace(state, belief=inference.with_convergence_check(belief, scored))
+    if searched:
+        tested = _with_consistency_test(tested)
+    if tested.verdict is not None:
+        return tested
+    few_ranges = len(pair.places) < 2 * required_ranges
+    if tested.belief.blocking_reason is None and not (
+        few_ranges and _p_value_below(tested.belief, EARLY_CLAIM_P_VALUE)
+    ):
+        return replace(tested, mode=Done(3, Localised(tested.belief.poses[0], tested.belief.covariance)))
+    if role == "a" and len(pair.places) >= MANY_MUTUAL_RANGES * (1 + state.belief.returns):
+        return _return_to_anchor(tested)
+    if not scored:
+        return _drive_without_hypotheses(tested)
+    a, b = active_sensing.plan_together(hypotheses, pair.apart, state.mutual[-1].range, mission)
+    return replace(tested, mode=Surveying("peer", a if role == "a" else b))
+
+
+def _p_value_below(belief: Belief, bound: float) -> bool:
+    """Return whether the p-value of the consistency test is below `bound`; False without a test."""
+    inconsistency = belief.inconsistency
+    return inconsistency is not None and inconsistency.p_value < bound
+
+
+def _with_consistency_test(state: RobotState) -> RobotState:
+    """Return `state` with the consistency test of a search, and with the verdict if too many tests failed.
+
+    A test fails if its p-value is below INCONSISTENT_P_VALUE. The verdict is Inconsistent after
+    INCONSISTENT_SEARCHES consecutive failures.
+    """
+    belief = state.belief
+    inconsistency = belief.inconsistency
+    if inconsistency is None:
+        return state
+    least = min(inconsistency.p_value, belief.p_value if belief.p_value is not None else 1.0)
+    inconsistent_searches = (
+        belief.inconsistent_searches + 1 if inconsistency.p_value < INCONSISTENT_P_VALUE else 0
+    )
+    state = replace(state, belief=replace(belief, inconsistent_searches=inconsistent_searches, p_value=least))
+    return (
+        state.inconsistent(inconsistency.verdict) if inconsistent_searches >= INCONSISTENT_SEARCHES else state
+    )
+
+
+def _drive_without_hypotheses(state: RobotState) -> RobotState:
+    """Drive without hypotheses about the poses: b stands, a drives straight on (Section III.C.a)."""
+    mission = state.config.mission
+    if state.config.role == "b" or not state.mutual:
+        return replace(state, mode=Surveying("peer"))
+    step = range_seeking.step_length("peer", state.mutual[-1].range, mission)
+    return replace(state, mode=Surveying("peer", Controls(step / mission.period, 0.0)))

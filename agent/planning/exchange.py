@@ -1,0 +1,169 @@
+"""The exchange of a tick: sensor data and reports come in; a report, a command and an estimate go out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from msgspec.structs import replace
+
+from agent.peer import false_reports, peer_state
+from agent.planning import phase1_anchor, plausibility, separation
+from agent.planning.active_sensing import Retreating
+from agent.planning.phase1_anchor import ThirdPoint
+from agent.planning.state import RobotState
+from protocol.messages import (
+    Command,
+    Estimate,
+    Inconsistent,
+    Localised,
+    Observation,
+    Ranged,
+    Report,
+    Undecided,
+)
+from protocol.motion import REST, Controls, Pose, step
+
+
+def observed(state: RobotState, observation: Observation) -> RobotState:
+    """Return `state` with the sensor data of one tick: odometry, anchor range, contact and mutual range."""
+    log, odometry, leg = state.log, state.odometry, state.leg
+    if observation.executed is not None:
+        v, omega = observation.executed.v, observation.executed.omega
+        log = log.drove(v, omega)
+        ticks = log.runs[-1].ticks
+        if ticks == 1:
+            leg = odometry
+        odometry = step(leg, v, omega, ticks * state.config.mission.period)
+    if observation.anchor_range is not None and state.estimator.is_informative(state, observation):
+        log = log.ranged(observation.anchor_range)
+    mutual, in_contact = state.mutual, False
+    for contact in observation.contacts:
+        if contact.peer == state.config.peer:
+            in_contact = True
+            if contact.range is not None:
+                mutual = (*mutual, Ranged(observation.tick, contact.range))
+    return RobotState(
+        state.config,
+        observation.tick,
+        odometry,
+        log,
+        mutual,
+        state.belief,
+        state.peer_state,
+        state.mode,
+        in_contact,
+        leg,
+        state.plan,
+    )
+
+
+def report(state: RobotState) -> Report:
+    """Return the report of this tick: the part of the log that the peer has not acknowledged.
+
+    If the configuration contains an attack, the report holds the falsified log (see `protocol.attack`).
+    """
+    since, ranges_since = state.peer_state.acknowledged, state.peer_state.ranges_acknowledged
+    log, start = state.log, state.belief.branch.start if state.belief.branch and state.phase > 1 else None
+    if (attack := state.config.attack) is not None:
+        belief = state.belief
+        log = false_reports.falsified_log(
+            log, attack, belief.phase1_done_tick, belief.encounter_tick, state.config.mission.period
+        )
+        start = false_reports.start(start, attack) if start is not None else None
+    unacknowledged = log.after(since, ranges_since)
+    return Report(
+        tick=state.tick,
+        robot=state.config.robot,
+        phase=state.phase,
+        state=state.mode_name,
+        start=start,
+        since=since,
+        through=unacknowledged.through,
+        runs=unacknowledged.runs,
+        ranges_since=ranges_since,
+        ranges=unacknowledged.ranges,
+        heard=state.peer_state.peer.through,
+        ranges_heard=len(state.peer_state.peer.ranges),
+        verdict=state.verdict,
+    )
+
+
+def with_reports(state: RobotState, reports: Sequence[Report]) -> RobotState:
+    """Return `state` with the data of `reports`, and with a verdict if a report gives reason for one.
+
+    The verdict is Inconsistent if a report is implausible, and Undecided if the peer has given up.
+    """
+    for received in reports:
+        updated = peer_state.with_report(state.peer_state, received)
+        objection = (
+            plausibility.objection(
+                state.peer_state, updated, received, state.config, state.estimator.report_tolerance
+            )
+            if state.verdict is None
+            else None
+        )
+        state = replace(state, peer_state=updated)
+        if objection is not None:
+            return state.inconsistent(objection)
+    if state.verdict is None:
+        match state.peer_state.verdict:
+            case Undecided(reason):
+                return state.undecided(f"{state.config.peer} reports: {reason}")
+            case Inconsistent(contradiction):
+                return state.undecided(f"{state.config.peer} found a contradiction: {contradiction}")
+    return state
+
+
+def command(state: RobotState, controls: Controls) -> Command:
+    """Return the command with `controls`, limited by the safety distance, the mode and the verdict."""
+    if state.in_contact and state.config.mission.safety_distance:
+        controls = _safe(state, controls)
+    return Command(
+        state.tick,
+        state.config.robot,
+        controls.v,
+        controls.omega,
+        state.phase,
+        state.mode_name,
+        state.verdict,
+    )
+
+
+def _safe(state: RobotState, controls: Controls) -> Controls:
+    """Return `controls` for the next tick, limited so that the safety distance is kept.
+
+    The peer is in contact. The limit applies while the robot does not plan with the peer's position: before
+    phase 3, and on the way back into range.
+    """
+    mission = state.config.mission
+    if state.phase == 3 and not isinstance(state.mode, Retreating):
+        return controls
+    if not state.mutual or state.mutual[-1].tick != state.tick:  # the range was not measured
+        return REST
+    return separation.slowed(
+        controls, separation.SHARE_OF_EACH * separation.leeway(state.mutual[-1].range, mission), mission
+    )
+
+
+def estimate(state: RobotState) -> Estimate:
+    """Return all poses that the robot considers possible in its anchor's frame and in <W>."""
+    branches_left = state.belief.branches
+    if not branches_left and state.belief.branch is not None:
+        branches_left = (state.belief.branch,)
+    elif not branches_left and isinstance(state.mode, ThirdPoint):
+        branches_left = state.mode.branches
+    if state.belief.poses:
+        world: tuple[Pose, ...] = state.belief.poses
+    elif isinstance(state.verdict, Localised):
+        world = (state.verdict.pose,)
+    else:
+        world = tuple(state.world_pose(placement) for placement in state.belief.placements)
+    return Estimate(
+        tick=state.tick,
+        robot=state.config.robot,
+        local=tuple(phase1_anchor.local(branches_left, state.odometry)),
+        world=world,
+        localised=isinstance(state.verdict, Localised),
+        probabilities=tuple(one.probability for one in state.belief.pair or state.belief.own),
+        covariance=state.belief.covariance,
+    )

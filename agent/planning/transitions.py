@@ -1,0 +1,238 @@
+"""The transitions between modes that planners share, and the controls of each mode."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from msgspec.structs import replace
+
+from agent.estimation.estimator import AnchorEstimate, FittedBranch, PairEstimate
+from agent.planning import phase1_anchor, phase2_orbit, phase3_last_manoeuvre, range_seeking
+from agent.planning.active_sensing import Retreating, Surveying
+from agent.planning.manoeuvres import Manoeuvres
+from agent.planning.phase1_anchor import ThirdPoint
+from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent
+from agent.planning.phase3_last_manoeuvre import LastManoeuvre, Returning, Standing, Waiting
+from agent.planning.range_seeking import (
+    Backing,
+    Circling,
+    Homing,
+    Seeking,
+    Straight,
+    Turning,
+    moved,
+    step_length,
+)
+from agent.planning.state import Asleep, Done, RobotState
+from protocol.messages import BranchKind
+from protocol.mission import SHORTEST_STEP
+from protocol.motion import REST, Controls
+
+# --- the robot's own sensors --------------------------------------------------------------------------
+
+
+def after_observation(
+    state: RobotState,
+    anchor_range: float | None,
+    manoeuvres: Manoeuvres,
+    after_range: Callable[[RobotState], RobotState],
+) -> RobotState:
+    """Return `state` with the mode that follows from the robot's own sensors, on the paper's way.
+
+    `after_range` continues phase 1 once a second or a further anchor range is measured.
+    """
+    match state.mode:
+        case Orbiting(None) | Standing() | Waiting() | Done():
+            return state
+        case Aligning() | Radial() | Tangent() | Orbiting():
+            return continue_phase2(state, state.mode)
+        case Straight(beacon) | Backing(beacon) | Turning(beacon) | Circling(beacon):
+            measured = state.in_contact if beacon == "peer" else anchor_range is not None
+            seeking = sought(state, state.mode, measured, manoeuvres)
+            if seeking is not None:
+                return seeking
+            return replace(state, mode=Waiting()) if beacon == "peer" else after_range(state)
+        case ThirdPoint(_, origin) if moved(origin, state.odometry):
+            return after_range(state)
+        case LastManoeuvre(_, origin) | Returning(_, origin) if moved(origin, state.odometry):
+            return after_last_manoeuvre(state, state.mode)
+        case Asleep():
+            return start_phase1(state, anchor_range)
+        case _:
+            return state
+
+
+# --- phase 1 ------------------------------------------------------------------------------------------
+
+
+def start_phase1(state: RobotState, rho0: float | None) -> RobotState:
+    """Start phase 1 with the first anchor range `rho0` in m; None if the anchor was not detected."""
+    if rho0 is None and state.config.mission.noise.drop_outs:
+        return state  # the robot waits for its first range
+    if rho0 is None:
+        return state.undecided("the anchor is out of range at the start")
+    known = state.estimator.on_anchor(state, rho0)
+    if known is not None:
+        return end_phase1(state, known, "on-anchor")
+    return replace(state, mode=Straight("anchor", state.odometry, rho0))
+
+
+def sought(state: RobotState, mode: Seeking, measured: bool, manoeuvres: Manoeuvres) -> RobotState | None:
+    """Return `state` after a tick of the search `mode`; None once the second range is measured."""
+    mission = state.config.mission
+    next_mode = range_seeking.onward(mode, state.odometry, measured, mission, manoeuvres)
+    if next_mode is None:
+        return None
+    return state if next_mode is mode else replace(state, mode=next_mode)
+
+
+def anchor_estimate(state: RobotState) -> AnchorEstimate:
+    """Return the branches that the anchor ranges allow, after the second or a further one."""
+    mode = state.mode
+    return state.estimator.anchor(state, mode.branches if isinstance(mode, ThirdPoint) else ())
+
+
+def branch_kind(state: RobotState) -> BranchKind | None:
+    """Return how phase 1 ends if one branch is left; None if a further range has to check it.
+
+    A third range that is missing is the paper's virtual measurement.
+    """
+    match state.mode:
+        case ThirdPoint():
+            measured = state.log.ranges[-1].tick == state.tick
+            return "three-ranges" if measured else "three-ranges-virtual"
+        case Circling():
+            return "circle"
+        case _:
+            return None
+
+
+def to_third_point(
+    state: RobotState, found: AnchorEstimate, manoeuvres: Manoeuvres, *, pinning: bool = False
+) -> RobotState:
+    """Plan the manoeuvre to the next measurement point of phase 1 (see `phase1_anchor.third_point`)."""
+    if not found.branches:
+        return state.undecided("no pose explains the anchor ranges")
+    places = phase1_anchor.local(found.branches, state.odometry)
+    command = phase1_anchor.third_point(
+        places, state.config.mission, manoeuvres, margin=found.margin, pinning=pinning
+    )
+    if command is None:
+        return state.undecided("eq. (5) allows no manoeuvre to a third range")
+    return replace(state, mode=ThirdPoint(found.branches, state.odometry, command))
+
+
+def end_phase1(state: RobotState, known: FittedBranch, kind: BranchKind) -> RobotState:
+    """End phase 1: store the branch and the anchor error of `known`, and start phase 2."""
+    belief = replace(
+        state.belief,
+        branch=known.branch,
+        branch_kind=kind,
+        phase1_done_tick=state.tick,
+        own_anchor=known.anchor_error,
+    )
+    state = replace(state, belief=belief)
+    mu = phase2_orbit.orientation(state.local_pose)
+    return continue_phase2(state, Aligning(state.odometry.heading - mu))
+
+
+def continue_phase2(state: RobotState, mode: phase2_orbit.Phase2Mode) -> RobotState:
+    """Continue phase 2 from `mode`. With noisy sensors, the robot follows its orbit by pure pursuit."""
+    next_mode = phase2_orbit.onward(mode, state.odometry, state.start, state.orbit, state.config.mission)
+    if isinstance(next_mode, Orbiting) and not state.config.mission.noise.exact:
+        next_mode = Orbiting(phase2_orbit.pursuit(state.local_pose, state.orbit, state.config.mission))
+    return state if next_mode is state.mode else replace(state, mode=next_mode)
+
+
+# --- phase 3 ------------------------------------------------------------------------------------------
+
+
+def begin_phase3(state: RobotState) -> RobotState:
+    """Begin phase 3: b stops, a drives straight on (Section III.C.a).
+
+    With a safety distance, a begins only when it knows that b stands far enough away.
+    """
+    belief = replace(state.belief, encounter_tick=state.tick)
+    if state.config.role == "b":
+        return replace(state, mode=Standing(), belief=belief)
+    # In contact without a range (a drop-out), the peer is only known to be within R.
+    rho = state.mutual[-1].range if state.mutual else state.config.mission.sensing_range
+    if state.config.mission.safety_distance and not _may_drive_straight(state):
+        return state
+    straight = Straight("peer", state.odometry, rho)
+    return replace(state, mode=straight, belief=belief)
+
+
+def _may_drive_straight(state: RobotState) -> bool:
+    """Return whether a knows that b stands, and is far enough from b to drive straight on."""
+    now = bool(state.mutual) and state.mutual[-1].tick == state.tick == state.peer_state.peer.through
+    return now and step_length("peer", state.mutual[-1].range, state.config.mission) >= SHORTEST_STEP
+
+
+def after_last_manoeuvre(state: RobotState, mode: LastManoeuvre | Returning) -> RobotState:
+    """Return `state` after a tick of a last manoeuvre: at rest, or on the way back into the peer's range."""
+    rest = Standing() if state.config.role == "b" else Waiting()
+    return replace(state, mode=phase3_last_manoeuvre.advanced(mode, state.odometry, state.in_contact, rest))
+
+
+def with_new_ticks(state: RobotState) -> RobotState | None:
+    """Return `state` with the last tick that both logs cover marked as evaluated; None if it was before.
+
+    The result is also None until the peer's log covers every tick up to the one in which this robot stopped.
+    """
+    assert isinstance(state.mode, Standing | Waiting)
+    last = min(state.tick, state.peer_state.peer.through)
+    if last < state.log.moved() or last == state.mode.through:
+        return None
+    return replace(state, mode=replace(state.mode, through=last))
+
+
+def pair_estimate(
+    state: RobotState, first_tick: int, required_ranges: int, *, second_range: bool
+) -> tuple[RobotState, PairEstimate | None]:
+    """Return `state` with the belief and the verdict of the estimate of both poses, and the estimate.
+
+    The arguments are those of `Estimator.pair`. The estimate is None if the measurements do not suffice yet.
+    """
+    found = state.estimator.pair(state, first_tick, required_ranges, second_range=second_range)
+    if found is None:
+        return state, None
+    mode = state.mode if found.verdict is None else Done(3, found.verdict)
+    return replace(state, belief=found.belief, mode=mode), found
+
+
+def last_manoeuvre(state: RobotState, found: PairEstimate, manoeuvres: Manoeuvres) -> RobotState | None:
+    """Return `state` on its last manoeuvre; None if every manoeuvre violates the safety distance."""
+    mover, mission = state.config.role, state.config.mission
+    a, b, placements = found.a, found.b, found.placements
+    if found.checked and len(placements) == 1:
+        plan = phase3_last_manoeuvre.most_informative_manoeuvre(
+            mover, a, b, placements[0], found.observations, mission
+        )
+    else:
+        plan = phase3_last_manoeuvre.last_manoeuvre(mover, a, b, placements, mission, manoeuvres)
+    if plan is None:
+        return None
+    return replace(state, mode=LastManoeuvre(plan.command, state.odometry), plan=plan)
+
+
+# --- commands -----------------------------------------------------------------------------------------
+
+
+def controls(state: RobotState) -> Controls:
+    """Return the controls of the current mode."""
+    match state.mode:
+        case Aligning() | Radial() | Tangent() | Orbiting():
+            return phase2_orbit.controls(
+                state.mode, state.odometry, state.start, state.orbit, state.config.mission
+            )
+        case Straight() | Backing() | Turning() | Circling():
+            return range_seeking.controls(state.mode, state.odometry, state.config.mission)
+        case ThirdPoint(command=planned) | LastManoeuvre(planned) | Returning(planned):
+            return planned
+        case Surveying(command=planned) | Retreating(planned):
+            return planned
+        case Homing():
+            return range_seeking.homing_controls(state.mode, state.odometry, state.config.mission) or REST
+        case _:
+            return REST
