@@ -12,18 +12,20 @@ from msgspec.structs import replace
 from agent.planning.state import MODE_NAMES
 from compose.launch import in_process
 from compose.recording.cast import Stage, of_scenario
+from compose.recording.run import WORLD_JOURNAL
 from compose.recording.run import read as read_record
 from compose.scenario.scenario_file import load
 from compose.view.facts import Gathering
 from compose.view.recorded import Journals, scenes, scenes_of
 from compose.view.report_outcomes import flights_of
 from compose.view.scene import Scene
-from compose.view.web.sources import writers_of
+from compose.view.web.sources import Recorded, writers_of
 from compose.view.words import DOING, SEEKING, doing
 from protocol.journal import journal_file
 from protocol.journal.journal_file import Journal
 from protocol.messages import MissionEnd
 from protocol.motion import compose, wrap
+from protocol.wire import decode
 from world.world_journal import history
 
 
@@ -236,6 +238,29 @@ def test_a_robot_is_shown_as_down_in_every_tick_without_its_process(paper_1: Pat
         (2, "back", "a"),
         (3, "down", "b"),
         (3, "back", "b"),
+    ]
+
+
+def test_the_end_is_shown_though_it_comes_after_a_page_has_seen_the_last_tick(
+    paper_1: Path, tmp_path: Path
+) -> None:
+    frames = list(journal_file.read(paper_1 / WORLD_JOURNAL))
+    before = len(frames) - 1 - len(read_record(paper_1).final_reports)
+    assert isinstance(decode(frames[before], MissionEnd), MissionEnd)
+    journal = tmp_path / WORLD_JOURNAL
+    journal.write_bytes(journal_file.packed(frames[:before]))
+    show = Recorded("growing", tmp_path, expected=True)
+    show.poll()
+    seen, last = show.version, show.known.last
+    with journal.open("ab") as file:
+        file.write(journal_file.packed(frames[before : before + 1]))
+    show.poll()
+    assert show.known.end is not None
+    assert show.since(seen) == show.known.end.tick == last
+    assert show.stage is not None
+    changed = scenes(show.stage, show.known, last)
+    assert [event.text for event in changed[0].events if event.kind == "end"] == [
+        "The mission ends: localised"
     ]
 
 

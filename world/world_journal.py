@@ -65,7 +65,7 @@ def history(frames: Iterable[bytes], source: object) -> History:
 
     Raises CorruptJournal, with `source` as the journal's name.
     """
-    reading = JournalReading()
+    reading = WorldJournalReading()
     try:
         for frame in frames:
             if not reading.take(frame):
@@ -78,7 +78,7 @@ def history(frames: Iterable[bytes], source: object) -> History:
     return content
 
 
-class JournalReading:
+class WorldJournalReading:
     """A reader of a world's journal, frame by frame. The journal may still be growing."""
 
     def __init__(self) -> None:

@@ -98,7 +98,7 @@ class Past(msgspec.Struct, frozen=True):
         return tuple([compose(frame, pose) for pose in odometry])
 
 
-class JournalReading:
+class AgentJournalReading:
     """A reader of an agent's journal, frame by frame."""
 
     def __init__(self) -> None:
@@ -203,7 +203,7 @@ def past(frames: Iterable[bytes], source: object) -> Past:
 
     Raises CorruptJournal, with a text that begins with `source`.
     """
-    reading = JournalReading()
+    reading = AgentJournalReading()
     try:
         for frame in frames:
             if not reading.take(frame):

@@ -10,7 +10,7 @@ from collections import deque
 import msgspec
 
 from agent.process.agent_journal import FramedReport, past
-from agent.process.replay import Replay
+from agent.process.planner_replay import PlannerReplay
 from agent.process.robot import Robot
 from protocol.journal import environment
 from protocol.journal.journal_file import CorruptJournal
@@ -53,7 +53,7 @@ def remember(recording: Retrace) -> Memory | None:
     journal = past(recording.frames, recording.path)
     head = (journal.environment, journal.config)
     recording.write(*[encode(one) for one in head if one is not None])
-    replay = Replay(journal, recording)
+    replay = PlannerReplay(journal, recording)
     robot = replay.robot
     own_reports: deque[FramedReport] = deque(maxlen=OWN_REPORTS_KEPT)
     try:

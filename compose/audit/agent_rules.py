@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from agent.peer import peer_state
 from agent.process.agent_journal import Step
-from agent.process.replay import Replay
+from agent.process.planner_replay import PlannerReplay
 from agent.process.robot import Robot
 from compose.audit.findings import Checks, Violation, between, difference, quoted
 from compose.recording.run import Run
@@ -25,7 +25,7 @@ def decision(run: Run) -> Checks:
     The frames are compared to the bit.
     """
     for robot, past in run.pasts.items():
-        replay = Replay(past)
+        replay = PlannerReplay(past)
         try:
             for step in replay:
                 yield from _answers(

@@ -6,7 +6,7 @@ import msgspec
 
 from agent.planning.state import RobotState
 from agent.process.agent_journal import Past
-from agent.process.replay import Replay
+from agent.process.planner_replay import PlannerReplay
 from compose.recording.run import Run
 from protocol.messages import Estimate
 
@@ -39,7 +39,7 @@ def account(run: Run, robot: str) -> Account:
 
 def _recomputed(past: Past) -> Account:
     """Repeat every decision. Stops at the first that differs from the recording."""
-    replay = Replay(past)
+    replay = PlannerReplay(past)
     states: list[RobotState] = []
     try:
         for step in replay:

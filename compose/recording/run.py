@@ -384,7 +384,7 @@ def of_journals(journals: Mapping[str, JournalFile], source: object) -> Run:
 
 
 def _world(journal: JournalFile, source: str) -> tuple[JournalFile, History]:
-    reading = world_journal.JournalReading()
+    reading = world_journal.WorldJournalReading()
     problem = _take(reading, journal.frames, source)
     content = reading.content()
     if problem is not None:
@@ -397,7 +397,7 @@ def _world(journal: JournalFile, source: str) -> tuple[JournalFile, History]:
 def _agent(journal: JournalFile, robot: str, source: str) -> tuple[JournalFile, Past | None]:
     from agent.process import agent_journal as of_agent  # noqa: PLC0415  # a launcher has no such journal
 
-    reading = of_agent.JournalReading()
+    reading = of_agent.AgentJournalReading()
     problem = journal.problem or _take(reading, journal.frames, source)
     past = reading.content()
     if past is not None and past.config.robot != robot:
@@ -406,7 +406,9 @@ def _agent(journal: JournalFile, robot: str, source: str) -> tuple[JournalFile, 
 
 
 def _take(
-    reading: of_agent.JournalReading | world_journal.JournalReading, frames: Iterable[bytes], source: str
+    reading: of_agent.AgentJournalReading | world_journal.WorldJournalReading,
+    frames: Iterable[bytes],
+    source: str,
 ) -> CorruptJournal | None:
     """Give `frames` to `reading`, up to the first out of order; return the error of one that is damaged."""
     try:

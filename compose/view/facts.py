@@ -78,12 +78,21 @@ class Gathering:
         """Return the facts of `tick` for modification, created if needed; marks the tick as changed."""
         down = self.gone if tick > self.last else ()
         self.last = max(self.last, tick)
-        if self.touched is None or tick < self.touched:
-            self.touched = tick
+        self._touch(tick)
         known = self.ticks.get(tick)
         if known is None:
             known = self.ticks[tick] = Facts(tick, down=set(down))
         return known
+
+    def _touch(self, tick: int) -> None:
+        self.touched = tick if self.touched is None else min(tick, self.touched)
+
+    def conclude(self, end: MissionEnd) -> None:
+        """Set the end of the mission, which changes its last tick, unless it is known already."""
+        if self.end is None:
+            self.end = end
+            if end.tick in self.ticks:
+                self._touch(end.tick)
 
     def take_world(self, world: World) -> None:
         """Add the ground truth and the reports in flight of the world's current tick."""
@@ -162,4 +171,4 @@ class Gathering:
             case FinalReport(robot):
                 self.final_reports.setdefault(robot, message)
             case MissionEnd():
-                self.end = self.end or message
+                self.conclude(message)

@@ -15,7 +15,7 @@ from protocol import files
 from protocol.journal.journal_file import CorruptJournal, OtherVersion, Tail
 from protocol.messages import OfRobot
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
-from world.world_journal import JournalReading
+from world.world_journal import WorldJournalReading
 
 
 def gathered(run: Run) -> Gathering:
@@ -32,7 +32,8 @@ def gathered(run: Run) -> Gathering:
                 known.take(message, len(frame), robot_of(name))
     if run.world is not None:
         known.take_observations(run.world.worlds)
-    known.end = run.end
+    if run.end is not None:
+        known.conclude(run.end)
     known.final_reports = dict(run.final_reports)
     return known
 
@@ -66,7 +67,7 @@ class Journals:
         self.notes: list[str] = []
         """One line per damaged journal. Its frames after the damage are ignored."""
         self._tails: dict[str, Tail] = {}
-        self._world = JournalReading()
+        self._world = WorldJournalReading()
 
     def read(self) -> None:
         """Read the frames appended since the last call. Raises OSError."""
@@ -125,7 +126,8 @@ class Journals:
             self.known.take_tick(tick)
         if reading.mission_outcome is None:
             self.known.take_world(reading.world)
-        self.known.end = reading.end or self.known.end
+        if reading.end is not None:
+            self.known.conclude(reading.end)
         self.known.final_reports.update(reading.final_reports)
 
     def _mode(self) -> str | None:

@@ -9,8 +9,8 @@ from collections import Counter
 from queue import Empty, SimpleQueue
 from typing import Literal, NamedTuple, Protocol
 
-from protocol.network.alarm import Alarm
 from protocol.network.keys import NOWHERE, Key
+from protocol.network.timer import Timer
 from protocol.output import say
 
 Topic = Literal["observation", "command", "report", "tick-start", "alive", "gone", "ended", "stop", "nothing"]
@@ -56,12 +56,12 @@ class Line(Protocol):
     """The contract of a subscription from which the thread that empties the inbox takes frames itself."""
 
     def receive(self, *, wait: bool) -> Arrival | None:
-        """Return the next frame; None after a call of `ring`, without a frame, or if the frame is refused.
+        """Return the next frame; None after a call of `wake`, without a frame, or if the frame is refused.
 
         Raises LineClosed.
         """
 
-    def ring(self) -> None:
+    def wake(self) -> None:
         """End a wait in `receive`. This may be called from any thread and from a signal handler."""
 
 
@@ -93,7 +93,7 @@ class Inbox:
         self._line: Line | None = None
         self._line_is_next = True
         """Whether the next event is taken from the line, if both have one. A flood of one waits for both."""
-        self._alarm = Alarm(self._ring)
+        self._timer = Timer(self._wake)
 
     def take_from(self, line: Line) -> None:
         """Take frames from `line`, too, until its session is closed. It replaces an earlier line."""
@@ -109,12 +109,12 @@ class Inbox:
                 return
             self._waiting[topic] = waiting + _size(arrival)
         self._queue.put(arrival)
-        self._ring()
+        self._wake()
 
-    def _ring(self) -> None:
+    def _wake(self) -> None:
         line = self._line  # another thread may be the one that drops it
         if line is not None:
-            line.ring()
+            line.wake()
 
     def turn_away(self, topic: Topic, key: str, why: str) -> None:
         """Refuse a frame without queueing it, from any thread. `next` then counts and prints it."""
@@ -152,7 +152,7 @@ class Inbox:
                 self._line_is_next = False
                 wait = idle and time.monotonic() < until
                 if wait:
-                    self._alarm.set(until)
+                    self._timer.set(until)
                 try:
                     arrival = line.receive(wait=wait)
                 except LineClosed:

@@ -36,7 +36,7 @@ LISTEN_AGAIN_S = 0.1
 
 LINE_FRAMES = 1 << 10
 """The number of messages that a Line stores; the next one replaces the oldest. A frame has at most 64 kB."""
-RING = b"ring"
+WAKE = b"wake"
 """The attachment of the message that ends a wait. From another process, it has no effect."""
 NO_KEY = "not a key of one mission and robot"
 """The reason for refusing a message on a wildcard or an unknown key."""
@@ -163,7 +163,7 @@ def subscribe_directly(session: zenoh.Session, key: str, inbox: Inbox, topic: To
 class _Subscription(Line):
     """A subscription to `key`, with room for the latest LINE_FRAMES messages.
 
-    Zenoh's channels have no timeout, but one wakes for every message. `ring` therefore sends one that only
+    Zenoh's channels have no timeout, but one wakes for every message. `wake` therefore sends one that only
     this session receives.
     """
 
@@ -179,14 +179,14 @@ class _Subscription(Line):
             sample = self._subscriber.recv() if wait else self._subscriber.try_recv()
         except zenoh.ZError:
             raise LineClosed from None
-        if sample is None or (sample.attachment is not None and sample.attachment.to_bytes() == RING):
+        if sample is None or (sample.attachment is not None and sample.attachment.to_bytes() == WAKE):
             return None
         return _arrival(sample, self._inbox, self._topic)
 
-    def ring(self) -> None:
+    def wake(self) -> None:
         with suppress(zenoh.ZError):  # the session is closed
             self._session.put(
-                self._key, b"", attachment=RING, allowed_destination=zenoh.Locality.SESSION_LOCAL
+                self._key, b"", attachment=WAKE, allowed_destination=zenoh.Locality.SESSION_LOCAL
             )
 
 

@@ -1,4 +1,4 @@
-"""An alarm that ends a wait of another thread, for waits that have no timeout of their own."""
+"""A timer that ends a wait of another thread, for waits that have no timeout of their own."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import time
 from collections.abc import Callable
 
 
-class Alarm:
-    """A clock that calls `ring` in a thread of its own, once the time that was set last is reached.
+class Timer:
+    """A clock that calls `wake` in a thread of its own, once the time that was set last is reached.
 
     Setting it is cheap, because the thread only wakes at once if the new time is earlier than the one for
     which it sleeps. Otherwise it sees the new time when it wakes.
     """
 
-    def __init__(self, ring: Callable[[], None]) -> None:
-        self._ring = ring
+    def __init__(self, wake: Callable[[], None]) -> None:
+        self._wake = wake
         self._at = math.inf
         """The time of the monotonic clock that was set last; infinite for none."""
         self._asleep_until = math.inf
@@ -24,7 +24,7 @@ class Alarm:
         self._thread: threading.Thread | None = None
 
     def set(self, at: float) -> None:
-        """Ring once, when the monotonic clock reaches `at`, instead of at the time that was set before."""
+        """Expire once, when the monotonic clock reaches `at`, instead of at the time that was set before."""
         self._at = at
         if at < self._asleep_until:
             self._earlier.set()
@@ -33,15 +33,15 @@ class Alarm:
                 self._thread.start()
 
     def _run(self) -> None:
-        rung_at: float | None = None
+        expired_at: float | None = None
         while True:
             self._asleep_until = math.inf  # from here on, `set` wakes this thread
             self._earlier.clear()
             at = self._at
-            if at != rung_at and at <= time.monotonic():
-                rung_at = at
-                self._ring()
-            elif at in (rung_at, math.inf):
+            if at != expired_at and at <= time.monotonic():
+                expired_at = at
+                self._wake()
+            elif at in (expired_at, math.inf):
                 self._earlier.wait()
             else:
                 self._asleep_until = at

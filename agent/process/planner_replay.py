@@ -9,7 +9,7 @@ from agent.process.robot import Robot
 from protocol.journal.journal_file import Sink
 
 
-class Replay:
+class PlannerReplay:
     """The planner of one robot, run again tick by tick on the inputs in its journal.
 
     Iterate over it once. After each step, `robot` has the recomputed state and frames of that tick. An error
