@@ -33,7 +33,8 @@ from compose.figures.pair import PairRecord, pair_of
 from compose.figures.sheet import Absent
 from compose.figures.style import SCREEN, look
 from compose.launch.in_process import run_mission
-from compose.recording.run import agent_journal, read
+from compose.recording.recording_files import agent_journal
+from compose.recording.run import read
 from compose.scenario.scenario_file import load, parse
 from protocol.journal.journal_file import read as frames
 from protocol.messages import Command

@@ -16,7 +16,8 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from compose.launch import in_process
-from compose.recording.run import WORLD_JOURNAL, Run, read
+from compose.recording.recording_files import WORLD_JOURNAL
+from compose.recording.run import Run, read
 from compose.recording.ticks_csv import ticks_csv
 from compose.scenario.scenario_file import load, parse
 from protocol.journal import journal_file

@@ -13,7 +13,8 @@ from signal import SIGKILL
 import pytest
 from playwright.sync_api import Page, expect
 
-from compose.recording.run import WORLD_JOURNAL, read
+from compose.recording.recording_files import WORLD_JOURNAL
+from compose.recording.run import read
 from protocol.journal import journal_file
 from protocol.journal.journal_file import Journal
 from protocol.messages import Command, Observation

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from agent.planning.state import MODE_NAMES
 from compose.launch import in_process
 from compose.recording.cast import Stage, of_scenario
-from compose.recording.run import WORLD_JOURNAL
+from compose.recording.recording_files import WORLD_JOURNAL
 from compose.recording.run import read as read_record
 from compose.scenario.scenario_file import load
 from compose.view.facts import Gathering

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from agent.process.agent_journal import Past, Step
 from compose.audit.findings import Checks, Violation, between, difference
-from compose.recording.run import Run, agent_journal
+from compose.recording.recording_files import agent_journal
+from compose.recording.run import Run
 from protocol.messages import MissionEnd
 from protocol.wire import encode
 from world.world_journal import History

@@ -11,7 +11,8 @@ from compose.cli.arguments import add_closing, add_recording
 from compose.errors import ENDED, FAILED, UserError
 from compose.extras import need
 from compose.figures import FORMATS, PICTURES
-from compose.recording.run import Run, agent_journal, read, user_errors
+from compose.recording.recording_files import agent_journal, user_errors
+from compose.recording.run import Run, read
 from compose.terminal.outcome import counting
 from protocol.journal.journal_file import CorruptJournal
 from protocol.output import say

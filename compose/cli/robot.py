@@ -16,7 +16,8 @@ from compose.launch.driver_loader import briefed, driver_class, made, mission, o
 from compose.launch.processes import free_endpoint
 from compose.launch.supervisor import STOP_S, ChildFailed, Supervisor
 from compose.network import reach
-from compose.recording.run import ended, folder_for
+from compose.recording.recording_files import folder_for
+from compose.recording.run import ended
 from compose.scenario.scenario_file import check_rate
 from protocol.messages import Localised, MissionEnd
 from protocol.motion import wrap

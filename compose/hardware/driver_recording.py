@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 
 from compose.launch.driver_loader import resume_driver
-from compose.recording.run import agent_journal
+from compose.recording.recording_files import agent_journal
 from compose.terminal.outcome import reopened
 from protocol.journal.journal_file import CannotRecord, CorruptJournal, Journal
 from protocol.journal.resume import Retrace

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from agent.process.agent_journal import FramedReport
 from agent.process.robot import Robot
-from compose.recording.run import WORLD_JOURNAL, Run, agent_journal
+from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
+from compose.recording.run import Run
 from protocol.journal import environment
 from protocol.journal.journal_file import Journal, Sink
 from protocol.messages import Command, FinalReport, MissionEnd

@@ -1,21 +1,25 @@
-"""The recording of a run: its folder, its journals and their content."""
+"""The one model of a run, read from its journals. The ground truth is optional."""
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import msgspec
 from msgspec.structs import replace
 
-from compose.errors import UserError
 from compose.recording.cast import Stage, of_configs, of_scenario
 from compose.recording.claim import Claim, claim
-from protocol.journal import journal_file
+from compose.recording.recording_files import (
+    WORLD_JOURNAL,
+    JournalFile,
+    agent_journal,
+    journals_in,
+    opened,
+    robot_of,
+)
 from protocol.journal.journal_file import CorruptJournal
 from protocol.messages import (
     Command,
@@ -39,62 +43,6 @@ from world.world_journal import History, Tick
 if TYPE_CHECKING:
     from agent.process import agent_journal as of_agent
     from agent.process.agent_journal import Past
-WORLD_JOURNAL = "world.journal"
-
-
-def agent_journal(robot: str) -> str:
-    """Return the file name of the journal of the agent of `robot`."""
-    return f"agent-{robot}.journal"
-
-
-def robot_of(name: str) -> str:
-    """Return the robot of an agent's journal, from its file name."""
-    return name.removeprefix("agent-").removesuffix(".journal")
-
-
-def journals_in(folder: Path) -> list[Path]:
-    """Return the paths of the journals in `folder`, the world's first."""
-    world = folder / WORLD_JOURNAL
-    return [*([world] if world.exists() else []), *sorted(folder.glob(agent_journal("*")))]
-
-
-@contextmanager
-def folder_for(out: Path | None) -> Iterator[Path]:
-    """Yield the folder of a recording: `out`, created if necessary, or a temporary one. Raises UserError."""
-    if out is None:
-        with tempfile.TemporaryDirectory(prefix="tandem-") as folder:
-            yield Path(folder)
-        return
-    make(out)
-    yield out
-
-
-def make(out: Path) -> None:
-    """Create the folder `out` and check that it is writable. Raises UserError if it is not."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=out):
-            pass
-    except OSError as error:
-        raise UserError(cannot_write(out, error)) from None
-
-
-def cannot_write(out: Path, error: OSError) -> str:
-    """Return the message for the user that `out` cannot be written."""
-    return f"--out: {out} cannot be written: {error.strerror or error}"
-
-
-class JournalFile(msgspec.Struct, frozen=True):
-    """A journal on disk."""
-
-    frames: list[bytes]
-    """The complete frames."""
-    torn: int = 0
-    """The number of bytes of a torn write at the end."""
-    messages: list[Any] = []
-    """The messages in `frames`, up to the first that is damaged or out of order."""
-    problem: OSError | CorruptJournal | None = None
-    """The error because of which not all of it can be read; None for a frame out of order."""
 
 
 class Run(msgspec.Struct, frozen=True, dict=True):
@@ -341,19 +289,10 @@ def read(folder: Path, *, audited: bool = False) -> Run:
     CorruptJournal also if there is no such journal and two peers' journals are of different runs.
     """
     paths = journals_in(folder) or [folder / WORLD_JOURNAL]
-    run = of_journals({path.name: _opened(path) for path in paths}, folder)
+    run = of_journals({path.name: opened(path) for path in paths}, folder)
     if not audited and run.world is not None and run.world.disorder is not None:
         raise CorruptJournal(f"{folder / WORLD_JOURNAL}: {run.world.disorder.what}")
     return run
-
-
-def _opened(path: Path) -> JournalFile:
-    try:
-        return JournalFile(*journal_file.torn(path))
-    except (OSError, CorruptJournal) as error:
-        if path.name == WORLD_JOURNAL or isinstance(error, journal_file.OtherVersion):
-            raise
-        return JournalFile([], problem=error)
 
 
 def of_frames(journals: Mapping[str, Iterable[bytes]], source: object = "the recording") -> Run:
@@ -444,16 +383,3 @@ def _shared(config: RobotConfig, robot: str) -> tuple[object, ...]:
         config.rendezvous,
         config.tick_s,
     )
-
-
-@contextmanager
-def user_errors(folder: Path) -> Iterator[None]:
-    """Raise UserError, with one line, for every error that prevents reading the recording in `folder`."""
-    try:
-        yield
-    except FileNotFoundError:
-        raise UserError(f"{folder} contains no recording: there is no {WORLD_JOURNAL}") from None
-    except OSError as error:
-        raise UserError(f"{folder} cannot be read: {error.strerror or error}") from None
-    except CorruptJournal as error:
-        raise UserError(str(error)) from None

@@ -7,7 +7,8 @@ from pathlib import Path
 import msgspec
 
 from compose.recording.cast import Stage, of_configs, of_scenario
-from compose.recording.run import WORLD_JOURNAL, Run, agent_journal, journals_in, robot_of
+from compose.recording.recording_files import WORLD_JOURNAL, agent_journal, journals_in, robot_of
+from compose.recording.run import Run
 from compose.recording.summary_json import SUMMARY
 from compose.view.facts import Gathering
 from compose.view.scene import Scene, scene

@@ -10,7 +10,8 @@ import msgspec
 from compose.errors import UserError
 from compose.recording.cast import Stage
 from compose.recording.frames import in_time
-from compose.recording.run import WORLD_JOURNAL, Run, agent_journal, cannot_write, make
+from compose.recording.recording_files import WORLD_JOURNAL, agent_journal, cannot_write, make_folder
+from compose.recording.run import Run
 from compose.recording.ticks_csv import rows, table
 from compose.view.export.parquet import frames_csv, write_ticks
 from compose.view.foxglove.mcap import TooLong, write_mcap
@@ -50,7 +51,7 @@ def export(
     frames = in_time(run)
     ticks = list(rows(run))
     check()
-    make(out)
+    make_folder(out)
     paths = tuple([out / name for name in FILES])
     writers: Sequence[Callable[[Path], object]] = (
         lambda path: write_mcap(stage, frames, scenes_of(run), path, check),

@@ -24,7 +24,7 @@ from foxglove.websocket import Capability, ChannelView, Client, ServerListener, 
 from compose.launch.signals import stop_by_signal, stop_with_launcher
 from compose.recording.cast import Stage
 from compose.recording.frames import JournalDecoder
-from compose.recording.run import WORLD_JOURNAL, agent_journal
+from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
 from compose.view.foxglove.gate import GUESTS_FILES, Gate, private_host
 from compose.view.foxglove.mcap import Channels
 from compose.view.foxglove.views import Views, nanoseconds

@@ -18,7 +18,7 @@ from foxglove.mcap import MCAPWriteOptions
 
 from compose.recording.cast import Stage
 from compose.recording.frames import Journaled, OfWorld, kind_of
-from compose.recording.run import WORLD_JOURNAL, agent_journal
+from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
 from compose.view.foxglove.schemas import schema
 from compose.view.foxglove.views import Views, nanoseconds, topics
 from compose.view.scene import Scene

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from compose.errors import UserError
-from compose.recording.run import journals_in
+from compose.recording.recording_files import journals_in
 from compose.view.web import sweep_page
 from compose.view.web.live import Listener
 from compose.view.web.sources import Recorded, Show

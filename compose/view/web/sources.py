@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from compose.recording.cast import Stage
-from compose.recording.run import WORLD_JOURNAL, agent_journal, journals_in
+from compose.recording.recording_files import WORLD_JOURNAL, agent_journal, journals_in
 from compose.view.facts import Gathering
 from compose.view.recorded import Journals
 
