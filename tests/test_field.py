@@ -17,7 +17,7 @@ from signal import SIGCONT, SIGINT, SIGKILL, SIGSTOP
 import pytest
 from msgspec.structs import replace
 
-from agent.process.agent_journal import Past, past
+from agent.process.agent_journal import AgentHistory, agent_history
 from compose.launch.processes import free_endpoint
 from compose.scenario.scenario_file import load
 from docs.rover import Rover
@@ -65,9 +65,9 @@ def pair(out: Path, *more: str | Path, protocol: str = "tcp") -> Iterator[dict[s
             yield {"a": a, "b": b}
 
 
-def told(out: Path, robot: str) -> Past:
+def told(out: Path, robot: str) -> AgentHistory:
     path = out / robot / f"agent-{robot}.journal"
-    return past(journal_file.read(path), path)
+    return agent_history(journal_file.read(path), path)
 
 
 def messages(frames: list[bytes]) -> list[object]:

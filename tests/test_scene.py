@@ -26,7 +26,7 @@ from protocol.journal.journal_file import Journal
 from protocol.messages import MissionEnd
 from protocol.motion import compose, wrap
 from protocol.wire import decode
-from world.world_journal import history
+from world.world_journal import world_history
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +146,7 @@ def test_the_deliveries_in_a_scene_are_those_of_the_simulation(tmp_path: Path) -
     faults = ["loss=0.3, delay=0..3, corrupt=0.2, duplicate=0.3, reorder=0.2", "a->b: reports_per_tick=0.7"]
     scenario = load("random", seed=3, faults=faults)
     in_process.run_mission(scenario, tmp_path)
-    told = history(journal_file.read(tmp_path / "world.journal"), tmp_path)
+    told = world_history(journal_file.read(tmp_path / "world.journal"), tmp_path)
     shown = {one.tick: one.passages for one in read(tmp_path).scenes}
     ever: set[str] = set()
     for place, sender in enumerate(("a", "b")):
@@ -172,7 +172,7 @@ def test_every_report_has_the_outcome_of_its_deliveries(tmp_path: Path) -> None:
     shown = read(tmp_path)
     flights = flights_of(shown.scenes, over=True)
     assert {flight.outcome for flight in flights} == {"heard", "late", "damaged", "lost"}
-    told = history(journal_file.read(tmp_path / "world.journal"), tmp_path)
+    told = world_history(journal_file.read(tmp_path / "world.journal"), tmp_path)
     airs = {
         sender: [tick.world.links[place] for tick in told.ticks] for place, sender in enumerate(("a", "b"))
     }

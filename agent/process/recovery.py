@@ -9,7 +9,7 @@ from collections import deque
 
 import msgspec
 
-from agent.process.agent_journal import FramedReport, past
+from agent.process.agent_journal import FramedReport, agent_history
 from agent.process.planner_replay import PlannerReplay
 from agent.process.robot import Robot
 from protocol.journal import environment
@@ -50,7 +50,7 @@ def remember(recording: Retrace) -> Memory | None:
     """
     if environment.is_blank(recording.frames):
         return None
-    journal = past(recording.frames, recording.path)
+    journal = agent_history(recording.frames, recording.path)
     head = (journal.environment, journal.config)
     recording.write(*[encode(one) for one in head if one is not None])
     replay = PlannerReplay(journal, recording)

@@ -75,5 +75,5 @@ def _other_versions(run: Run) -> str | None:
 
     The result is None if no robot has other versions.
     """
-    differences = [otherwise(past.environment, of_robot()) for past in run.pasts.values()]
+    differences = [otherwise(agent.environment, of_robot()) for agent in run.agents.values()]
     return next((one for one in differences if one is not None), None)

@@ -69,7 +69,7 @@ def main(options: argparse.Namespace) -> int:
                 if account is None or account.broken is not None:
                     status = FAILED
                 done()
-            torn = [name for name, one in accounts.items() if one.past is not None and one.past.end is None]
+            torn = [name for name, one in accounts.items() if one.agent is not None and one.agent.end is None]
             torn += ["the world"] if run.world is not None and run.world.end is None else []
             if torn:
                 _say(f"the recording of {' and '.join(torn)} ends before the mission does")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from agent.planning.state import RobotState
-from agent.process.agent_journal import Past
+from agent.process.agent_journal import AgentHistory
 from agent.process.planner_replay import PlannerReplay
 from compose.recording.run import Run
 from protocol.messages import Estimate
@@ -14,7 +14,7 @@ from protocol.messages import Estimate
 class Account(msgspec.Struct, frozen=True):
     """The journal of one robot, with the recomputed planner states."""
 
-    past: Past | None
+    agent: AgentHistory | None
     """The journal's content; None if the robot was killed before it received its configuration."""
     states: tuple[RobotState, ...] = ()
     """The state after each tick in which the robot decided, starting at tick 0."""
@@ -24,7 +24,7 @@ class Account(msgspec.Struct, frozen=True):
     @property
     def held(self) -> tuple[Estimate, ...]:
         """The journaled estimates."""
-        return self.past.estimates if self.past is not None else ()
+        return self.agent.estimates if self.agent is not None else ()
 
 
 def account(run: Run, robot: str) -> Account:
@@ -33,13 +33,13 @@ def account(run: Run, robot: str) -> Account:
     Raises OSError if there is no journal, CorruptJournal if it is damaged before its end or belongs to
     another robot or run.
     """
-    past = run.past(robot)
-    return _recomputed(past) if past is not None else Account(None)
+    agent = run.agent(robot)
+    return _recomputed(agent) if agent is not None else Account(None)
 
 
-def _recomputed(past: Past) -> Account:
+def _recomputed(agent: AgentHistory) -> Account:
     """Repeat every decision. Stops at the first that differs from the recording."""
-    replay = PlannerReplay(past)
+    replay = PlannerReplay(agent)
     states: list[RobotState] = []
     try:
         for step in replay:
@@ -49,9 +49,9 @@ def _recomputed(past: Past) -> Account:
                 why = (
                     f"the recorded decision at tick {replay.tick} differs: another version wrote the journal"
                 )
-                return Account(past, tuple(states), why)
+                return Account(agent, tuple(states), why)
             states.append(replay.robot.state)
     except Exception as error:  # noqa: BLE001  # recorded inputs may raise any error in the planner
         why = f"the planner fails on its inputs of tick {replay.tick}: {type(error).__name__}: {error}"
-        return Account(past, tuple(states), why)
-    return Account(past, tuple(states))
+        return Account(agent, tuple(states), why)
+    return Account(agent, tuple(states))

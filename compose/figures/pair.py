@@ -201,14 +201,14 @@ def pair_of(run: Run, robots: Sequence[str], accounts: Mapping[str, Account]) ->
 
     `accounts` holds the readable journals by robot id.
     """
-    pasts = {one: accounts[one].past for one in robots if one in accounts}
-    known = {robot: past for robot, past in pasts.items() if past is not None}
+    agents = {one: accounts[one].agent for one in robots if one in accounts}
+    known = {robot: agent for robot, agent in agents.items() if agent is not None}
     if run.world is not None:
         config = run.scenario.config(robots[0])
         ticks = dict.fromkeys(robots, run.length)
     elif known:
         config = next(iter(known.values())).config
-        ticks = {robot: len(past.steps) for robot, past in known.items()}
+        ticks = {robot: len(agent.steps) for robot, agent in known.items()}
     else:
         return None
     mutual: list[tuple[bool, float | None]] = []

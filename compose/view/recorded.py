@@ -114,11 +114,11 @@ class Journals:
         reading = self._world
         first_new = len(reading.ticks)
         for frame in frames:
-            if reading.disorder is not None:
+            if reading.unexpected is not None:
                 break
             if not reading.take(frame):
-                assert reading.disorder is not None
-                self._note(f"{path}: {reading.disorder.what}; all later frames are ignored")
+                assert reading.unexpected is not None
+                self._note(f"{path}: {reading.unexpected.what}; all later frames are ignored")
         if reading.world is None:
             return
         if self.stage is None or self.stage.seed is None:

@@ -82,7 +82,7 @@ def _checked(run: Run) -> tuple[Sequence[str], Stage]:
     run.readable(*run.journals)
     for robot in run.robots:
         if agent_journal(robot) in run.journals:
-            run.past(robot)
+            run.agent(robot)
     stage = run.stage
     if stage is None:
         raise UserError(
