@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import msgspec
 from msgspec.structs import replace
 
-from compose.recording.cast import Stage, of_configs, of_scenario
 from compose.recording.claim import Claim, claim
 from compose.recording.recording_files import (
     WORLD_JOURNAL,
@@ -20,6 +19,7 @@ from compose.recording.recording_files import (
     opened,
     robot_of,
 )
+from compose.recording.run_setup import RunSetup, of_configs, of_scenario
 from protocol.journal.journal_file import CorruptJournal
 from protocol.messages import (
     Command,
@@ -97,7 +97,7 @@ class Run(msgspec.Struct, frozen=True, dict=True):
         return (*dict.fromkeys(pairs), *[(robot,) for robot in self.robots if robot not in paired])
 
     @cached_property
-    def stage(self) -> Stage | None:
+    def setup(self) -> RunSetup | None:
         """The robots and the parameters of the mission; None if no journal contains them."""
         if self.world is not None:
             return of_scenario(self.world.scenario)
