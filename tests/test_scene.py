@@ -25,7 +25,7 @@ from protocol.journal.journal_file import Journal
 from protocol.messages import MissionEnd
 from protocol.motion import compose, wrap
 from protocol.wire import decode
-from compose.view.report_outcomes import flights_of
+from tests.report_outcomes import flights_of
 from world.world_journal import world_history
 
 
