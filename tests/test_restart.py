@@ -249,13 +249,13 @@ def test_an_agents_journal_torn_anywhere_is_finished_with_the_same_bytes(
         assert torn.stat().st_size >= cut - lost
         with book:
             body = Robot(whole.config, book) if memory is None else memory.robot
-            body.keep(book)
+            body.append_to(book)
             known = memory.observation.tick if memory is not None and memory.observation is not None else -1
             for step in whole.steps[max(known, 0) :]:
                 if step.observation.tick > known:
                     body.observation(step.observation, step.frame)
                 if body.command is None:
-                    body.decide(step.heard)
+                    body.decide(step.received)
                     body.estimate()
             if memory is None or memory.final_report is None:
                 body.final_report(whole.end)

@@ -41,7 +41,7 @@ class Step(msgspec.Struct, frozen=True):
     """The frame of the Observation."""
     report: FramedReport | None = None
     """The robot's report to its peer; None without contact."""
-    heard: tuple[FramedReport, ...] = ()
+    received: tuple[FramedReport, ...] = ()
     missed: tuple[str, ...] = ()
     """The peers whose report did not arrive in time."""
     command: Command | None = None
@@ -162,7 +162,7 @@ class AgentJournalReading:
         is_open = "command" not in step
         if isinstance(message, Report) and message.robot != self.config.robot:
             if is_open:
-                step["heard"] = (*step.get("heard", ()), FramedReport(message, frame))
+                step["received"] = (*step.get("received", ()), FramedReport(message, frame))
             return is_open
         match message:
             case _ if message.tick != step["observation"].tick:

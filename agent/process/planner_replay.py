@@ -19,7 +19,7 @@ class PlannerReplay:
     def __init__(self, history: AgentHistory, journal: Sink | None = None) -> None:
         """Prepare the replay of `history`. Everything that the robot recomputes is written to `journal`."""
         self.robot = Robot(history.config)
-        self.robot.keep(journal)
+        self.robot.append_to(journal)
         self.tick: int | None = None
         """The tick of the current step; None before the first."""
         self._steps = history.steps
@@ -30,5 +30,5 @@ class PlannerReplay:
             self.tick = step.observation.tick
             self.robot.observation(step.observation, step.frame)
             if step.command is not None:
-                self.robot.decide(step.heard, step.missed)
+                self.robot.decide(step.received, step.missed)
             yield step

@@ -36,7 +36,7 @@ class Memory(msgspec.Struct, frozen=True):
     """The latest Observation."""
     own_reports: tuple[FramedReport, ...] = ()
     """The robot's own latest reports."""
-    heard: tuple[FramedReport, ...] = ()
+    received: tuple[FramedReport, ...] = ()
     """The latest reports received from the peer."""
     end: MissionEnd | None = None
     final_report: FinalReport | None = None
@@ -80,7 +80,9 @@ def remember(recording: Retrace) -> Memory | None:
         robot=robot,
         observation=observation,
         own_reports=tuple(own_reports),
-        heard=tuple([one for step in latest for one in step.heard if now - one.report.tick <= REPORTS_KEPT]),
+        received=tuple(
+            [one for step in latest for one in step.received if now - one.report.tick <= REPORTS_KEPT]
+        ),
         end=journal.end if journal.final_report is not None else None,
         final_report=journal.final_report,
     )

@@ -56,7 +56,7 @@ def _redundant(run: Run, placed: RobotSpec, agent: AgentHistory, tick: int) -> V
     """
     scenario = run.scenario
     noise = scenario.mission.noise
-    ends = [framed.report.through for step in agent.steps[: tick + 1] for framed in step.heard]
+    ends = [framed.report.through for step in agent.steps[: tick + 1] for framed in step.received]
     through = min(max(ends, default=-1), tick)
     mutual = _ranged(agent, through)
     if noise.exact:

@@ -33,7 +33,7 @@ def contact(run: Run) -> Checks:
                 yield _sent(run, robot, step)
             if step.command is not None:
                 yield _listed(robot, step)
-            for framed in step.heard:
+            for framed in step.received:
                 yield _received(run, robot, step, framed)
 
 
@@ -47,7 +47,7 @@ def _sent(run: Run, robot: str, step: Step) -> Violation | None:
 
 def _listed(robot: str, step: Step) -> Violation | None:
     listed = [tick for contact in step.observation.contacts for tick in contact.heard or ()]
-    received = [framed.report.tick for framed in step.heard]
+    received = [framed.report.tick for framed in step.received]
     if len(received) + len(step.missed) == len(listed) and _is_subsequence(received, listed):
         return None
     missed = f" and missed {len(step.missed)}" if step.missed else ""
@@ -79,7 +79,7 @@ def report(run: Run) -> Checks:
         if peer is None:
             continue
         for step in agent.steps:
-            for framed in step.heard:
+            for framed in step.received:
                 if framed.report.tick < _complete_until(peer):
                     yield _as_sent(robot, step, framed, peer)
 

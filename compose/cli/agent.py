@@ -119,5 +119,5 @@ def _ready(
         journal = Journal(options.out / agent_journal(options.id), fsync=options.fsync)
     if memory is None:
         return Memory(config, Robot(config, journal))
-    memory.robot.keep(journal)
+    memory.robot.append_to(journal)
     return memory

@@ -96,6 +96,6 @@ def mission(source: str, robot: str) -> Scenario:
     return scenario
 
 
-def briefed(scenario: Scenario, robot: str, manoeuvre_s: float) -> RobotConfig:
+def config_of(scenario: Scenario, robot: str, manoeuvre_s: float) -> RobotConfig:
     """Return the configuration of `robot`; a tick lasts a manoeuvre and the part THINKING of one at rest."""
     return scenario.config(robot, (1.0 + THINKING) * manoeuvre_s)
