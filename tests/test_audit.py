@@ -22,7 +22,8 @@ from compose.audit.findings import Findings, Violation
 from compose.audit.rules import RULES, audit, audit_run
 from compose.launch import in_process
 from compose.recording.frames import KINDS
-from compose.recording.run import WORLD_JOURNAL, agent_journal, of_frames, read
+from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
+from compose.recording.run import of_frames, read
 from compose.scenario.scenario_file import load, parse, shipped
 from protocol.attack import Attack
 from protocol.journal import journal_file

@@ -31,7 +31,7 @@ from tests.commands import BOUND_S, TandemProcess, processes_of, size, tandem, u
 from tests.series import series
 from tests.test_field import ASSURED, STARTS, beacon, both_have_ended, told
 from world.hardware import driver_journal
-from world.hardware.driver_journal import DriverPast
+from world.hardware.driver_journal import DriverHistory
 
 
 class Pair:
@@ -149,14 +149,14 @@ def test_a_recording_that_a_power_cut_may_have_shortened_is_refused(
     driver: Any = SimpleNamespace(stop=lambda: None, resume=lambda *_: None)
     field: Any = SimpleNamespace(resume=lambda *_: None)
 
-    def taken_up() -> DriverPast:
+    def taken_up() -> DriverHistory:
         with recorded(tmp_path, config, inbox, fsync=fsync) as recording:
             recording.take_up(driver, "any", field)
             observation = Observation(
-                recording.past.tick + 1, "a", REST if recording.again else None, 1.0, ()
+                recording.history.tick + 1, "a", REST if recording.again else None, 1.0, ()
             )
             recording.journal.write(encode(observation))
-            return recording.past
+            return recording.history
 
     assert [taken_up().tick for _ in range(3)] == [-1, 0, 1]
     monkeypatch.setattr(driver_journal, "BOOT", tmp_path / "boot")
