@@ -412,7 +412,7 @@ def plant_scenario(folder: Path, change: Callable[[Scenario], Scenario]) -> None
     plant(folder / WORLD_JOURNAL, (of(Scenario), change))
     (told,) = [one for one in messages(folder / WORLD_JOURNAL) if isinstance(one, Scenario)]
     for name in (A, B):
-        plant(folder / name, (of(RobotConfig), lambda briefed: told.config(briefed.robot)))
+        plant(folder / name, (of(RobotConfig), lambda config: told.config(config.robot)))
 
 
 def with_robots(**fields: Any) -> Callable[[Scenario], Scenario]:

@@ -186,7 +186,7 @@ class Run(msgspec.Struct, frozen=True, dict=True):
     def _place(self) -> dict[str, int]:
         return {robot: place for place, robot in enumerate(self.robots)}
 
-    # --- what the robots found ---
+    # --- the agents and their claims ---
 
     def agent(self, robot: str) -> AgentHistory | None:
         """Return the content of the journal of `robot`; None if it has no RobotConfig.

@@ -12,7 +12,7 @@ import zenoh
 
 from compose.recording.run_setup import of_configs
 from compose.view.run_data import RunData
-from compose.view.web.sources import UNANSWERED, Show
+from compose.view.web.sources import UNANSWERED, WatchedRun
 from protocol.messages import (
     Command,
     Estimate,
@@ -73,7 +73,7 @@ class RefusedFrame(ValueError):
     """A frame that does not belong under its key; the text says why."""
 
 
-class ReceivedMission(Show):
+class ReceivedMission(WatchedRun):
     """A mission, built from the frames received from the network."""
 
     def __init__(self, run: str) -> None:

@@ -31,7 +31,7 @@ from compose.view.recorded import scenes
 from compose.view.web import sweep_page
 from compose.view.web.origin import refusal
 from compose.view.web.site import Site
-from compose.view.web.sources import Show
+from compose.view.web.sources import WatchedRun
 
 LOOPBACK = "127.0.0.1"
 PAGE = Path(__file__).parent / "page"
@@ -162,7 +162,7 @@ def _json(value: object, status: int = 200) -> Response:
     return Response(msgspec.json.encode(value), status, media_type="application/json")
 
 
-def _state(show: Show) -> dict[str, Any]:
+def _state(show: WatchedRun) -> dict[str, Any]:
     return {
         "last": show.head,
         "first": next(iter(show.known.ticks), 0),

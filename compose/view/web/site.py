@@ -11,7 +11,7 @@ from compose.errors import UserError
 from compose.recording.recording_files import journals_in
 from compose.view.web import sweep_page
 from compose.view.web.live import Listener
-from compose.view.web.sources import Recorded, Show
+from compose.view.web.sources import Recorded, WatchedRun
 from protocol.network.endpoints import Endpoints
 
 
@@ -32,9 +32,9 @@ class Site:
         """True once the server is stopping."""
 
     @property
-    def shows(self) -> dict[str, Show]:
+    def shows(self) -> dict[str, WatchedRun]:
         """The runs whose static data is known, by name."""
-        found: dict[str, Show] = {show.name: show for show in self.recorded}
+        found: dict[str, WatchedRun] = {show.name: show for show in self.recorded}
         for i, listener in enumerate(self.listeners):
             for run, show in listener.shows.items():
                 found[run if run not in found else f"{run}.{i}"] = show

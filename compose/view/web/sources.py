@@ -19,7 +19,7 @@ UNANSWERED = 5
 """The maximum number of ticks by which the head goes back to a tick with all commands."""
 
 
-class Show(ABC):
+class WatchedRun(ABC):
     """A run that pages can watch."""
 
     live: bool
@@ -73,7 +73,7 @@ class Show(ABC):
         return last
 
 
-class Recorded(Show):
+class Recorded(WatchedRun):
     """The recording in a folder."""
 
     def __init__(self, name: str, folder: Path, *, expected: bool = False) -> None:
