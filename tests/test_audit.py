@@ -779,7 +779,7 @@ def test_the_command_prints_the_first_twenty_violations_and_the_number_of_others
 def refused(ended: Ended, words: str) -> None:
     assert ended.status == 2, ended
     assert ended.out == ""
-    assert re.fullmatch(r"tandem audit: [^\n]+\n", ended.err), ended.err
+    assert re.fullmatch(r"tandem \w+: [^\n]+\n", ended.err), ended.err
     assert words in ended.err
 
 
@@ -807,6 +807,20 @@ def spoilt(folder: Path, name: str, frames: Sequence[bytes]) -> str:
     with pytest.raises(CorruptJournal) as error:
         audit(folder)
     return str(error.value)
+
+
+@pytest.mark.parametrize("command", ["audit", "replay", "figures", "export"])
+@pytest.mark.parametrize(
+    ("target", "why"),
+    [("nowhere", "No such file or directory"), (WORLD_JOURNAL, "Too many levels of symbolic links")],
+    ids=["to nothing", "to itself"],
+)
+def test_a_link_in_place_of_the_worlds_journal_is_not_taken_for_hardware_mode(
+    target: str, why: str, command: str, folder: Path
+) -> None:
+    (folder / WORLD_JOURNAL).unlink()
+    (folder / WORLD_JOURNAL).symlink_to(target)
+    refused(tandem(command, folder), f"{WORLD_JOURNAL} cannot be read: {why}")
 
 
 def test_journals_that_are_none_are_refused(honest: Path, folder: Path) -> None:

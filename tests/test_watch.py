@@ -22,9 +22,11 @@ import pytest
 from msgspec.structs import replace
 from playwright.sync_api import expect
 
+from compose.errors import UserError
 from compose.launch import in_process
 from compose.recording.run import read
 from compose.scenario.scenario_file import load
+from compose.view.web.site import of_folder
 from protocol.journal import journal_file
 from protocol.messages import Message, Observation, OfRobot
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
@@ -486,6 +488,20 @@ def test_ctrl_c_ends_a_page_that_is_open_in_a_browser(paper_1: Path) -> None:
 def test_a_mistake_is_one_line(arguments: list[str], complaint: str, tmp_path: Path) -> None:
     ended = tandem("watch", *arguments, cwd=tmp_path)
     assert (ended.status, ended.out, ended.err) == (2, "", f"tandem watch: {complaint}\n")
+
+
+def test_a_journal_that_cannot_be_read_does_not_hide_other_recordings(paper_1: Path, tmp_path: Path) -> None:
+    shutil.copytree(paper_1, tmp_path / "good")
+    bad = tmp_path / "bad" / "agent-a.journal"
+    shutil.copytree(paper_1, bad.parent)
+    bad.unlink()
+    os.mkfifo(bad)
+    why = f"{bad} cannot be read: it is not a regular file"
+    shown = of_folder(tmp_path)
+    assert [*shown.shows] == ["good"]
+    assert shown.notes == [why]
+    with pytest.raises(UserError, match=re.escape(why)):
+        of_folder(bad.parent)
 
 
 def test_a_port_that_is_taken_is_one_line(paper_1: Path) -> None:

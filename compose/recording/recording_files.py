@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -28,9 +29,9 @@ def robot_of(name: str) -> str:
 
 
 def journals_in(folder: Path) -> list[Path]:
-    """Return the paths of the journals in `folder`, the world's first."""
+    """Return the paths of the journals in `folder`, the world's first, and of links to missing journals."""
     world = folder / WORLD_JOURNAL
-    return [*([world] if world.exists() else []), *sorted(folder.glob(agent_journal("*")))]
+    return [*([world] if os.path.lexists(world) else []), *sorted(folder.glob(agent_journal("*")))]
 
 
 @contextmanager
@@ -91,9 +92,11 @@ def user_errors(folder: Path) -> Iterator[None]:
     """Raise UserError, with one line, for every error that prevents reading the recording in `folder`."""
     try:
         yield
-    except FileNotFoundError:
-        raise UserError(f"{folder} contains no recording: there is no {WORLD_JOURNAL}") from None
     except OSError as error:
-        raise UserError(f"{folder} cannot be read: {error.strerror or error}") from None
+        journals = journals_in(folder)
+        if isinstance(error, FileNotFoundError) and folder / WORLD_JOURNAL not in journals:
+            raise UserError(f"{folder} contains no recording: there is no {WORLD_JOURNAL}") from None
+        where = (error.filename if journals else None) or folder
+        raise UserError(f"{where} cannot be read: {error.strerror or error}") from None
     except CorruptJournal as error:
         raise UserError(str(error)) from None

@@ -118,10 +118,14 @@ def of_folder(folder: Path) -> Site:
         if not any(journals_in(folder)):
             folders = sorted(one for one in folder.iterdir() if one.is_dir() and any(journals_in(one)))
         shows = [Recorded(one.resolve().name, one) for one in folders]
-        for show in shows:
-            show.poll()
     except OSError as error:
         raise UserError(f"{folder} cannot be read: {error.strerror or error}") from None
+    for show in shows:
+        try:
+            show.poll()
+        except OSError as error:
+            show.live = False
+            show.notes.append(f"{error.filename or show.folder} cannot be read: {error.strerror or error}")
     if not shows:
         raise UserError(f"{folder} contains no recording, no sweep, and no folders with recordings")
     if not any(show.live or show.setup is not None for show in shows):
