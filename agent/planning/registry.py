@@ -1,22 +1,14 @@
-"""The planners by name. A planner is imported when it is asked for."""
+"""The planners by name."""
 
 from __future__ import annotations
 
-from functools import cache
-
+from agent.planning import assured, paper
 from agent.planning.planner import Planner
 from protocol.mission import PlannerName
 
+PLANNERS: dict[PlannerName, Planner] = {"assured": assured, "paper": paper}
 
-@cache
+
 def planner(name: PlannerName) -> Planner:
     """Return the planner `name`."""
-    match name:
-        case "paper":
-            from agent.planning import paper  # noqa: PLC0415  # a robot has one planner
-
-            return paper
-        case "assured":
-            from agent.planning import assured  # noqa: PLC0415
-
-            return assured
+    return PLANNERS[name]
