@@ -89,8 +89,10 @@ class Robot:
 
         `missed` names the peers whose reports did not arrive in time.
         """
-        self.state = self.planner.decide(self.state, [framed.report for framed in heard])
-        if heard:
+        if not heard:
+            self.state = self.planner.decide(self.state)
+        else:
+            self.state = self.planner.decide(self.state, [framed.report for framed in heard])
             self.unheard.difference_update([framed.report.tick for framed in heard])
         self.command = self.planner.command(self.state)
         if self._journal is not None:
