@@ -80,11 +80,11 @@ def left_to_orbit(odometry: Pose, start: Pose, orbit: Orbit) -> float:
     return orbit.radius - math.hypot(local.x, local.y)
 
 
-def controls(mode: Phase2Mode, odometry: Pose, start: Pose, orbit: Orbit, mission: Mission) -> Controls:
-    """Return the controls of `mode` at the pose `odometry`."""
+def controls(
+    mode: Aligning | Radial | Tangent, odometry: Pose, start: Pose, orbit: Orbit, mission: Mission
+) -> Controls:
+    """Return the controls of `mode`, on the way to the orbit, at the pose `odometry`."""
     match mode:
-        case Orbiting(command):
-            return command or Controls(orbit.v, orbit.omega)
         case Aligning(heading) | Tangent(heading):
             return turn(odometry, heading, mission)
         case Radial():

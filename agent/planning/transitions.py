@@ -234,7 +234,9 @@ def homing_controls(state: RobotState) -> Controls | None:
 def controls(state: RobotState) -> Controls:
     """Return the controls of the current mode."""
     match state.mode:
-        case Aligning() | Radial() | Tangent() | Orbiting():
+        case Orbiting(command):
+            return command or state.orbit.controls
+        case Aligning() | Radial() | Tangent():
             return phase2_orbit.controls(
                 state.mode, state.odometry, state.start, state.orbit, state.config.mission
             )
