@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from compose.figures import PICTURES, catalogue
-from compose.figures.account import account
+from compose.figures.agent_replay import agent_replay
 from compose.figures.pair import pair_of
 from compose.figures.sheet import Absent
 from compose.figures.style import SCREEN, look, save
@@ -46,7 +46,7 @@ def draw(name: str, shown: Mapping[str, str], folder: Path) -> None:
     """Run the scenario in `folder`, and copy those of its figures to docs/ that `shown` names."""
     in_process.run_mission(scenario_file.load(name), folder)
     run = read(folder)
-    pair = pair_of(run, run.pairs[0], {robot: account(run, robot) for robot in run.robots})
+    pair = pair_of(run, run.pairs[0], {robot: agent_replay(run, robot) for robot in run.robots})
     assert pair is not None
     for kind in PICTURES:
         with look(SCREEN):

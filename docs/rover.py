@@ -67,6 +67,8 @@ class Rover:
         self._executed = REST
         """The motion that the last reading reported."""
         self._tick = 0
+        self._has_sensed = False
+        """True once this process has taken a reading."""
         self._give_up_s = float(timeout)
         self._state = Path(state) if state else None
         self._found = self._state is not None and self._state.exists()
@@ -83,7 +85,7 @@ class Rover:
         """Return the motion since the last reading, and the ranges at the pose now."""
         self._settle()
         executed, self._driven = self._driven, REST
-        self._tick, self._executed = tick, executed
+        self._tick, self._executed, self._has_sensed = tick, executed, True
         self._save()
         anchor, reach = self._config.anchor, self._config.mission.sensing_range
         rho = math.hypot(self.pose.x - anchor.x, self.pose.y - anchor.y)
@@ -106,12 +108,16 @@ class Rover:
             self._controls, self._done = REST, 1.0  # the beacon has the pose of that reading already
 
     def stop(self) -> None:
-        """Stop, and stay available for the peer's mutual ranges."""
+        """Stop, and stay available for the peer's mutual ranges once the mission has ended.
+
+        After a restart the peer has to wait instead: it must not pass ticks in which this robot moves on.
+        """
         self._settle()
         if self._done < 1.0:
             self._controls, self._done = REST, 1.0
         self._save()
-        self._send(self._tick, parked=True)
+        if self._has_sensed:
+            self._send(self._tick, parked=True)
 
     def close(self) -> None:
         """Print the true pose, which no other process knows."""

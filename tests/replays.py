@@ -25,7 +25,8 @@ import msgpack
 from mcap.reader import make_reader
 
 from compose.audit.replay import Replay, replay
-from compose.recording.run import WORLD_JOURNAL, agent_journal, read
+from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
+from compose.recording.run import read
 from compose.view.export.folder import export
 from protocol.journal import journal_file
 from tests.commands import LONG, TandemProcess, journals, process_of, processes_of, tandem, until

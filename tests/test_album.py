@@ -28,12 +28,13 @@ from agent.planning.active_sensing import stride
 from agent.planning.phase3_last_manoeuvre import compared
 from compose.cli.figures import draw as draw_all
 from compose.figures import PICTURES, catalogue, decisions, manoeuvre, over_time, phase_one, steps, trajectory
-from compose.figures.account import account
+from compose.figures.agent_replay import agent_replay
 from compose.figures.pair import PairRecord, pair_of
 from compose.figures.sheet import Absent
 from compose.figures.style import SCREEN, look
 from compose.launch.in_process import run_mission
-from compose.recording.run import agent_journal, read
+from compose.recording.recording_files import agent_journal
+from compose.recording.run import read
 from compose.scenario.scenario_file import load, parse
 from protocol.journal.journal_file import read as frames
 from protocol.messages import Command
@@ -96,7 +97,7 @@ def pair(folder: Path, number: int = 0) -> PairRecord:
     run = read(folder)
     robots = run.pairs[number]
     known = [robot for robot in robots if (folder / agent_journal(robot)).exists()]
-    found = pair_of(run, robots, {robot: account(run, robot) for robot in known})
+    found = pair_of(run, robots, {robot: agent_replay(run, robot) for robot in known})
     assert found is not None
     return found
 

@@ -22,7 +22,8 @@ from compose.audit.findings import Findings, Violation
 from compose.audit.rules import RULES, audit, audit_run
 from compose.launch import in_process
 from compose.recording.frames import KINDS
-from compose.recording.run import WORLD_JOURNAL, agent_journal, of_frames, read
+from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
+from compose.recording.run import of_frames, read
 from compose.scenario.scenario_file import load, parse, shipped
 from protocol.attack import Attack
 from protocol.journal import journal_file
@@ -411,7 +412,7 @@ def plant_scenario(folder: Path, change: Callable[[Scenario], Scenario]) -> None
     plant(folder / WORLD_JOURNAL, (of(Scenario), change))
     (told,) = [one for one in messages(folder / WORLD_JOURNAL) if isinstance(one, Scenario)]
     for name in (A, B):
-        plant(folder / name, (of(RobotConfig), lambda briefed: told.config(briefed.robot)))
+        plant(folder / name, (of(RobotConfig), lambda config: told.config(config.robot)))
 
 
 def with_robots(**fields: Any) -> Callable[[Scenario], Scenario]:

@@ -6,13 +6,13 @@ import pytest
 
 from compose.hardware.conformance import check_results
 from compose.hardware.exercise import ExerciseRun
-from compose.launch.driver_loader import briefed
+from compose.launch.driver_loader import config_of
 from compose.scenario.scenario_file import load
 from tests import broken_drivers, virtual_time
 from tests.commands import tandem
 
 MANOEUVRE_S = 0.1
-CONFIG = briefed(load("paper-1"), "a", MANOEUVRE_S)
+CONFIG = config_of(load("paper-1"), "a", MANOEUVRE_S)
 
 
 def test_the_example_fulfils_the_driver_contract() -> None:

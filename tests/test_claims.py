@@ -30,7 +30,7 @@ from protocol.motion import Covariance, Pose
 from tests.commands import SECTION_IV, tandem
 from world.referee import MissionOutcome
 from world.tick import World, advance, release
-from world.world_journal import History, Tick
+from world.world_journal import Tick, WorldHistory
 
 FLOOR = 1e-6
 """The least standard deviation in m and rad."""
@@ -78,7 +78,7 @@ def claimed(text: str, covariance: Covariance | None, *, by: float = 0.03) -> Ru
     mission_outcome = advance(onward, {})
     assert isinstance(mission_outcome, MissionOutcome)
     end = MissionEnd(1, mission_outcome.outcome, mission_outcome.reason)
-    return Run(History(scenario, (Tick(world, first), Tick(onward, {})), None, None, end, {}))
+    return Run(WorldHistory(scenario, (Tick(world, first), Tick(onward, {})), None, None, end, {}))
 
 
 # --- NEES ---------------------------------------------------------------------------------------------
@@ -256,7 +256,7 @@ def test_a_trial_with_two_claims_counts_once_in_the_mean_nees() -> None:
         for robot, pose, by in zip("ab", poses, (0.01, 0.05), strict=True)
     }
     row = row_of(
-        Run(History(scenario, (Tick(world, commands),), None, None, MissionEnd(0, "localised", None)))
+        Run(WorldHistory(scenario, (Tick(world, commands),), None, None, MissionEnd(0, "localised", None)))
     )
     each = [nees(off(pose, by), pose, SURE) for pose, by in zip(poses, (0.01, 0.05), strict=True)]
     assert row.claims == 2

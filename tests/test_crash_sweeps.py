@@ -18,7 +18,8 @@ from msgspec.structs import replace
 from compose.errors import BadScenario
 from compose.launch import in_process
 from compose.launch.supervisor import ChildFailed
-from compose.recording.run import WORLD_JOURNAL, Run, agent_journal
+from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
+from compose.recording.run import Run
 from compose.scenario.kills import POINTS, WORLD, KillTable, drawn
 from compose.scenario.scenario_file import load, parse, validate
 from compose.scenario.toml_file import table_in

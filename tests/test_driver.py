@@ -10,7 +10,7 @@ import pytest
 import zenoh
 from msgspec.structs import replace
 
-from compose.launch.driver_loader import briefed
+from compose.launch.driver_loader import config_of
 from compose.scenario.scenario_file import parse
 from protocol.messages import (
     Command,
@@ -32,7 +32,7 @@ from tests.commands import ASSURED, PAPER_1
 from tests.stage import Stage
 from world.hardware.bridge import UNHEARD, Field
 from world.hardware.driver import THINKING, Reading
-from world.hardware.driver_journal import DrivenTick, DriverPast
+from world.hardware.driver_journal import DrivenTick, DriverHistory
 from world.hardware.termination import LAST_WORDS, Ending
 
 Answer = Callable[[int], Iterable[bytes]]
@@ -41,7 +41,7 @@ LINK = cast(zenoh.Session, None)
 """A placeholder; a stage needs no session."""
 MANOEUVRE_S = 0.1
 SCENARIO = parse(PAPER_1, "paper-1")
-CONFIG = briefed(SCENARIO, "a", MANOEUVRE_S)
+CONFIG = config_of(SCENARIO, "a", MANOEUVRE_S)
 
 
 @pytest.fixture
@@ -272,7 +272,7 @@ def test_b_begins_when_a_does_and_counts_a_s_ticks(stage: Stage) -> None:
     """b is seven ticks late: it passes through these at once without moving, then drives in a's ticks."""
     driver = Recorded()
     driver.clock = stage.monotonic
-    config = briefed(parse(ASSURED, "assured"), "b", MANOEUVRE_S)
+    config = config_of(parse(ASSURED, "assured"), "b", MANOEUVRE_S)
     field = Field(driver, config, "r", stage, max_ticks=12, manoeuvre_s=MANOEUVRE_S)
 
     def answer(key: str, frame: bytes) -> None:
@@ -297,10 +297,10 @@ def test_b_begins_when_a_does_and_counts_a_s_ticks(stage: Stage) -> None:
     assert len(driver.commands) == 6
 
 
-def past_of(ticks: int, *, robot: str) -> DriverPast:
+def history_of(ticks: int, *, robot: str) -> DriverHistory:
     """Return the recording of a driver after `ticks` ticks, which drove in every second one."""
     observations = [Observation(tick, robot, REST if tick else None, 2.0) for tick in range(ticks)]
-    return DriverPast(
+    return DriverHistory(
         tuple(
             [
                 DrivenTick(one, encode(one), command(one.tick, robot) if one.tick % 2 == 0 else None)
@@ -315,9 +315,9 @@ def test_a_robot_that_was_down_catches_up_with_its_peer_standing(robot: str, pee
     """For any number of ticks without the process; it then continues in the ticks of the peer."""
     driver = Recorded()
     driver.clock = stage.monotonic
-    config = briefed(parse(ASSURED, "assured"), robot, MANOEUVRE_S)
+    config = config_of(parse(ASSURED, "assured"), robot, MANOEUVRE_S)
     field = Field(driver, config, "r", stage, max_ticks=305, manoeuvre_s=MANOEUVRE_S)
-    field.resume(past_of(20, robot=robot), known=17)
+    field.resume(history_of(20, robot=robot), known=17)
     sent: list[int] = []
 
     def answer(key: str, frame: bytes) -> None:
@@ -356,9 +356,9 @@ def test_a_b_that_was_killed_before_tick_0_begins_though_a_waits_for_it(stage: S
     """a is present, but sends nothing. When it does, it is behind, and b waits for it."""
     driver = Recorded()
     driver.clock = stage.monotonic
-    config = briefed(parse(ASSURED, "assured"), "b", MANOEUVRE_S)
+    config = config_of(parse(ASSURED, "assured"), "b", MANOEUVRE_S)
     field = Field(driver, config, "r", stage, max_ticks=9, manoeuvre_s=MANOEUVRE_S)
-    field.resume(DriverPast(), known=-1)
+    field.resume(DriverHistory(), known=-1)
     stage.alive("a", "b")
     tick_s = (1.0 + THINKING) * MANOEUVRE_S
     stage.comes("tick-start", keys.tick_start("r", "a"), encode(TickStart(0, "a")), 9.5 * tick_s)
@@ -387,9 +387,9 @@ def test_a_robot_that_was_killed_waits_for_its_agent_however_long_its_peer_is_th
 ) -> None:
     driver = Recorded()
     driver.clock = stage.monotonic
-    config = briefed(parse(ASSURED, "assured"), robot, MANOEUVRE_S)
+    config = config_of(parse(ASSURED, "assured"), robot, MANOEUVRE_S)
     field = Field(driver, config, "r", stage, max_ticks=25, manoeuvre_s=MANOEUVRE_S)
-    field.resume(past_of(20, robot=robot), known=19)
+    field.resume(history_of(20, robot=robot), known=19)
     stage.alive("b" if robot == "a" else "a")
     stage.comes("alive", keys.robot_alive("r", robot), after=3.0)
     field.attach(LINK)

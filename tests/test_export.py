@@ -43,7 +43,8 @@ from compose.cli import export_bar, run
 from compose.cli.main import parse
 from compose.launch import in_process
 from compose.launch.processes import free_endpoint
-from compose.recording.run import WORLD_JOURNAL, Run, agent_journal, read
+from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
+from compose.recording.run import Run, read
 from compose.scenario.scenario_file import load
 from compose.view.export.folder import export
 from compose.view.foxglove.gate import GUESTS, GUESTS_FILES

@@ -17,7 +17,7 @@ from signal import SIGCONT, SIGINT, SIGKILL, SIGSTOP
 import pytest
 from msgspec.structs import replace
 
-from agent.process.agent_journal import Past, past
+from agent.process.agent_journal import AgentHistory, agent_history
 from compose.launch.processes import free_endpoint
 from compose.scenario.scenario_file import load
 from docs.rover import Rover
@@ -65,9 +65,9 @@ def pair(out: Path, *more: str | Path, protocol: str = "tcp") -> Iterator[dict[s
             yield {"a": a, "b": b}
 
 
-def told(out: Path, robot: str) -> Past:
+def told(out: Path, robot: str) -> AgentHistory:
     path = out / robot / f"agent-{robot}.journal"
-    return past(journal_file.read(path), path)
+    return agent_history(journal_file.read(path), path)
 
 
 def messages(frames: list[bytes]) -> list[object]:
@@ -106,12 +106,14 @@ def test_two_robots_localise_in_hardware_mode(tmp_path: Path) -> None:
     a, b = told(tmp_path, "a"), told(tmp_path, "b")
     for one, other in ((a, b), (b, a)):
         sent = {step.observation.tick for step in other.steps if step.report is not None}
-        heard = [report.report.tick for step in one.steps for report in step.heard]
+        heard = [report.report.tick for step in one.steps for report in step.received]
         assert heard
         assert len(heard) == len(set(heard))
         assert set(heard) <= sent
-        assert all(report.report.tick <= step.observation.tick for step in one.steps for report in step.heard)
-        assert all(step.observation.contacts for step in one.steps if step.heard)
+        assert all(
+            report.report.tick <= step.observation.tick for step in one.steps for report in step.received
+        )
+        assert all(step.observation.contacts for step in one.steps if step.received)
         assert one.final_report is not None
         assert one.final_report.reports_heard == len(heard)
         near = {step.observation.tick for step in one.steps if step.observation.contacts}

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import shutil
+import socket
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
@@ -24,11 +27,11 @@ from protocol.motion import REST
 from protocol.network.inbox import Inbox
 from protocol.wire import encode
 from tests.broken_drivers import LosesAReading
-from tests.commands import TandemProcess, processes_of, size, tandem, until
+from tests.commands import BOUND_S, TandemProcess, processes_of, size, tandem, until
 from tests.series import series
 from tests.test_field import ASSURED, STARTS, beacon, both_have_ended, told
 from world.hardware import driver_journal
-from world.hardware.driver_journal import DriverPast
+from world.hardware.driver_journal import DriverHistory
 
 
 class Pair:
@@ -146,14 +149,14 @@ def test_a_recording_that_a_power_cut_may_have_shortened_is_refused(
     driver: Any = SimpleNamespace(stop=lambda: None, resume=lambda *_: None)
     field: Any = SimpleNamespace(resume=lambda *_: None)
 
-    def taken_up() -> DriverPast:
+    def taken_up() -> DriverHistory:
         with recorded(tmp_path, config, inbox, fsync=fsync) as recording:
             recording.take_up(driver, "any", field)
             observation = Observation(
-                recording.past.tick + 1, "a", REST if recording.again else None, 1.0, ()
+                recording.history.tick + 1, "a", REST if recording.again else None, 1.0, ()
             )
             recording.journal.write(encode(observation))
-            return recording.past
+            return recording.history
 
     assert [taken_up().tick for _ in range(3)] == [-1, 0, 1]
     monkeypatch.setattr(driver_journal, "BOOT", tmp_path / "boot")
@@ -269,3 +272,20 @@ def test_a_rover_that_repeats_a_reading_is_where_it_was(tmp_path: Path) -> None:
     again.resume(0, ())
     assert again.sense(1) == first
     assert again.pose == place
+
+
+def test_a_rover_is_parked_for_its_peer_only_at_the_end_of_its_mission() -> None:
+    """A peer that was ranged to a restarted rover would pass ticks in which the rover still moves."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as air, ThreadPoolExecutor(1) as pool:
+        air.bind(("127.0.0.1", 0))
+        air.settimeout(BOUND_S)
+        rover = Rover(load("paper-1").config("a"), 1.0, beacon=f"127.0.0.1:{air.getsockname()[1]}")
+        rover.stop()  # as after a restart
+        reading = pool.submit(rover.sense, 0)
+        message, sender = air.recvfrom(1024)
+        assert not json.loads(message)["parked"]
+        air.sendto(json.dumps({"tick": 0, "range": None}).encode(), sender)
+        assert reading.result(BOUND_S).mutual_range is None
+        rover.stop()
+        until(lambda: json.loads(air.recv(1024))["parked"], "it is parked")
+        rover.close()

@@ -16,7 +16,8 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from compose.launch import in_process
-from compose.recording.run import WORLD_JOURNAL, Run, read
+from compose.recording.recording_files import WORLD_JOURNAL
+from compose.recording.run import Run, read
 from compose.recording.ticks_csv import ticks_csv
 from compose.scenario.scenario_file import load, parse
 from protocol.journal import journal_file
@@ -34,7 +35,7 @@ from world.sensors import Mutual, anchor_ranges, executed, mutual_ranges, odomet
 from world.simulation import Simulation
 from world.tick import World, advance, observations, release
 from world.truth import Truth
-from world.world_journal import History, Tick
+from world.world_journal import Tick, WorldHistory
 
 Floats = NDArray[np.float64]
 N = 20_000
@@ -581,7 +582,7 @@ def test_ticks_has_the_motion_of_a_robot_without_a_command() -> None:
     scenario = near("actuation = {v_floor = 0.1}", max_ticks=1)
     world = release(scenario)
     onward = moved_on(world, {})
-    recording = Run(History(scenario, (Tick(world, {}), Tick(onward, {})), None, None))
+    recording = Run(WorldHistory(scenario, (Tick(world, {}), Tick(onward, {})), None, None))
     first, *_, last = csv.DictReader(ticks_csv(recording).splitlines())
     assert onward.executed is not None
     assert float(first["v"]) == onward.executed[0].v != 0.0

@@ -13,7 +13,8 @@ from signal import SIGKILL
 import pytest
 from playwright.sync_api import Page, expect
 
-from compose.recording.run import WORLD_JOURNAL, read
+from compose.recording.recording_files import WORLD_JOURNAL
+from compose.recording.run import read
 from protocol.journal import journal_file
 from protocol.journal.journal_file import Journal
 from protocol.messages import Command, Observation
@@ -186,6 +187,33 @@ def test_a_hypothesis_that_goes_on_moves_to_where_it_is_next_and_others_as_drive
     assert found["covariance"] == [3, 0, 0, 3, 0, 0]
     far = {"world": [[1.5, 0, 0]], "executed": [1, 0]}
     assert page.evaluate(HELD, [now, far, 0.5])["poses"][0] == [0.5, 0, 0]  # it jumps at the tick
+
+
+JOINED = """async () => {
+  const { Timeline } = await import('/page/timeline.js');
+  const make = (name) => document.createElement(name);
+  const timeline = new Timeline(make('div'), make('canvas'), make('input'), () => {});
+  const player = (robot) => ({ robot, command: { phase: 2 }, contacts: [], down: false });
+  const robots = [{ id: 'a', role: 'a', peer: 'b' }];
+  const store = {
+    stage: { robots }, whole: 1, last: 0, live: true,
+    scene: () => ({ players: [player('a'), player('b')], events: [] }),
+  };
+  timeline.stage(store);
+  timeline.draw({ tick: 0, share: 0, focus: null, moving: false }, new Map());
+  const first = [...timeline.spans.keys()];
+  robots.push({ id: 'b', role: 'b', peer: 'a' });
+  timeline.stage(store);
+  timeline.draw({ tick: 0, share: 0, focus: null, moving: false }, new Map());
+  return [first, timeline.spans.get('b').length];
+}"""
+
+
+def test_a_robot_that_joins_is_on_the_timeline_once_the_page_has_its_setup(
+    opened: Open, address: str
+) -> None:
+    """A pushed scene may contain a robot before the page has read the setup of the mission again."""
+    assert opened(address).evaluate(JOINED) == [["a"], 1]
 
 
 @pytest.mark.parametrize("dark", [False, True])

@@ -17,7 +17,7 @@ import pytest
 import zenoh
 from msgspec.structs import replace
 
-from agent.process.agent_journal import past
+from agent.process.agent_journal import agent_history
 from agent.process.recovery import remember
 from agent.process.robot import Robot
 from compose.errors import BadKill
@@ -56,7 +56,7 @@ from tests.commands import (
 )
 from world.scenario import Scenario
 from world.simulation import Simulation, resumed
-from world.world_journal import history
+from world.world_journal import world_history
 
 PARTS = ("agent-a", "agent-b", "world")
 LOCALISED = "localised after 48 ticks\n"
@@ -163,7 +163,7 @@ def test_an_absent_robot_stands_still_in_real_time_and_learns_what_it_missed(tmp
     messages = [decode(frame, kinds, MAX_FRAME_BYTES) for frame in journal_file.read(out / "world.journal")]
     assert sum(isinstance(message, DeadlineMissed) for message in messages) == len(away)
     for robot in ("a", "b"):
-        lived = past(journal_file.read(out / f"agent-{robot}.journal"), robot)
+        lived = agent_history(journal_file.read(out / f"agent-{robot}.journal"), robot)
         assert [step.observation.tick for step in lived.steps] == list(range(len(lived.steps)))
 
 
@@ -237,7 +237,7 @@ def test_an_agents_journal_torn_anywhere_is_finished_with_the_same_bytes(
     robot: str, undisturbed: Path, tmp_path: Path
 ) -> None:
     data = (undisturbed / f"agent-{robot}.journal").read_bytes()
-    whole = past(journal_file.read(undisturbed / f"agent-{robot}.journal"), robot)
+    whole = agent_history(journal_file.read(undisturbed / f"agent-{robot}.journal"), robot)
     assert whole.end is not None
     torn = tmp_path / "torn.journal"
     for cut in cuts(data):
@@ -249,13 +249,13 @@ def test_an_agents_journal_torn_anywhere_is_finished_with_the_same_bytes(
         assert torn.stat().st_size >= cut - lost
         with book:
             body = Robot(whole.config, book) if memory is None else memory.robot
-            body.keep(book)
+            body.append_to(book)
             known = memory.observation.tick if memory is not None and memory.observation is not None else -1
             for step in whole.steps[max(known, 0) :]:
                 if step.observation.tick > known:
                     body.observation(step.observation, step.frame)
                 if body.command is None:
-                    body.decide(step.heard)
+                    body.decide(step.received)
                     body.estimate()
             if memory is None or memory.final_report is None:
                 body.final_report(whole.end)
@@ -266,7 +266,7 @@ def test_a_worlds_journal_torn_anywhere_is_finished_with_the_same_bytes(
     undisturbed: Path, tmp_path: Path
 ) -> None:
     data = (undisturbed / "world.journal").read_bytes()
-    whole = history(journal_file.read(undisturbed / "world.journal"), "world")
+    whole = world_history(journal_file.read(undisturbed / "world.journal"), "world")
     torn = tmp_path / "torn.journal"
     for cut in cuts(data):
         torn.write_bytes(data[:cut])
@@ -574,7 +574,7 @@ def test_a_journal_is_locked_as_long_as_it_is_open(tmp_path: Path) -> None:
 def test_an_agent_refuses_a_world_that_has_lost_its_journal(recording: Path, paper_1: str) -> None:
     with TandemProcess("agent", "b", "--connect", paper_1):
         ended = tandem("agent", "a", "--connect", paper_1, "--out", recording)
-    tick = past(journal_file.read(recording / "agent-a.journal"), "a").steps[-1].observation.tick
+    tick = agent_history(journal_file.read(recording / "agent-a.journal"), "a").steps[-1].observation.tick
     assert ended.status == 3
     said = f"the world was restarted without its recording: the world is at tick 0, a at tick {tick}"
     assert ended.err.splitlines()[-1] == f"tandem agent a: {said}"  # it may have told of a torn write before

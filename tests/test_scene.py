@@ -11,13 +11,12 @@ from msgspec.structs import replace
 
 from agent.planning.state import MODE_NAMES
 from compose.launch import in_process
-from compose.recording.cast import Stage, of_scenario
-from compose.recording.run import WORLD_JOURNAL
+from compose.recording.recording_files import WORLD_JOURNAL
 from compose.recording.run import read as read_record
+from compose.recording.run_setup import RunSetup, of_scenario
 from compose.scenario.scenario_file import load
-from compose.view.facts import Gathering
 from compose.view.recorded import Journals, scenes, scenes_of
-from compose.view.report_outcomes import flights_of
+from compose.view.run_data import RunData
 from compose.view.scene import Scene
 from compose.view.web.sources import Recorded, writers_of
 from compose.view.words import DOING, SEEKING, doing
@@ -26,7 +25,8 @@ from protocol.journal.journal_file import Journal
 from protocol.messages import MissionEnd
 from protocol.motion import compose, wrap
 from protocol.wire import decode
-from world.world_journal import history
+from tests.report_outcomes import flights_of
+from world.world_journal import world_history
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
 class Performance(NamedTuple):
     """A recorded run with all its scenes, and what a viewer notes about its journals."""
 
-    stage: Stage
+    setup: RunSetup
     scenes: tuple[Scene, ...]
     end: MissionEnd | None
     notes: tuple[str, ...]
@@ -50,13 +50,13 @@ def read(folder: Path) -> Performance:
     run, journals = read_record(folder), Journals(folder)
     journals.read()
     journals.fill()
-    assert journals.stage is not None
-    assert run.stage == journals.stage
-    shown = scenes(journals.stage, journals.known)
+    assert journals.setup is not None
+    assert run.setup == journals.setup
+    shown = scenes(journals.setup, journals.known)
     assert scenes_of(run) == shown
     assert run.end == journals.known.end
     assert run.final_reports == journals.known.final_reports
-    return Performance(journals.stage, shown, run.end, tuple(journals.notes))
+    return Performance(journals.setup, shown, run.end, tuple(journals.notes))
 
 
 def said(shown: Performance, kind: str) -> list[tuple[int, str]]:
@@ -86,7 +86,7 @@ def test_the_first_contact_of_paper_1_is_shown_at_tick_46(paper_1: Path) -> None
 def test_local_poses_stand_where_the_robot_is_in_the_frame_that_the_stage_gives(paper_1: Path) -> None:
     shown = read(paper_1)
     for player in shown.scenes[20].players:
-        frame = shown.stage.seat(player.robot).frame
+        frame = shown.setup.robot_setup(player.robot).frame
         assert frame is not None
         assert player.held is not None
         assert player.pose is not None
@@ -100,7 +100,7 @@ def test_without_the_worlds_journal_the_scene_has_the_data_of_the_robots(
     for path in paper_1.glob("agent-*.journal"):
         (tmp_path / path.name).write_bytes(path.read_bytes())
     shown, whole = read(tmp_path), read(paper_1)
-    assert [seat.id for seat in shown.stage.robots] == ["a", "b"]
+    assert [robot_setup.id for robot_setup in shown.setup.robots] == ["a", "b"]
     assert all(player.pose is None for one in shown.scenes for player in one.players)
     assert said(shown, "contact") == said(whole, "contact")
     assert shown.scenes[47].passages == whole.scenes[47].passages
@@ -146,7 +146,7 @@ def test_the_deliveries_in_a_scene_are_those_of_the_simulation(tmp_path: Path) -
     faults = ["loss=0.3, delay=0..3, corrupt=0.2, duplicate=0.3, reorder=0.2", "a->b: reports_per_tick=0.7"]
     scenario = load("random", seed=3, faults=faults)
     in_process.run_mission(scenario, tmp_path)
-    told = history(journal_file.read(tmp_path / "world.journal"), tmp_path)
+    told = world_history(journal_file.read(tmp_path / "world.journal"), tmp_path)
     shown = {one.tick: one.passages for one in read(tmp_path).scenes}
     ever: set[str] = set()
     for place, sender in enumerate(("a", "b")):
@@ -172,7 +172,7 @@ def test_every_report_has_the_outcome_of_its_deliveries(tmp_path: Path) -> None:
     shown = read(tmp_path)
     flights = flights_of(shown.scenes, over=True)
     assert {flight.outcome for flight in flights} == {"heard", "late", "damaged", "lost"}
-    told = history(journal_file.read(tmp_path / "world.journal"), tmp_path)
+    told = world_history(journal_file.read(tmp_path / "world.journal"), tmp_path)
     airs = {
         sender: [tick.world.links[place] for tick in told.ticks] for place, sender in enumerate(("a", "b"))
     }
@@ -195,12 +195,12 @@ def test_every_report_has_the_outcome_of_its_deliveries(tmp_path: Path) -> None:
 def test_a_robot_is_shown_as_down_in_every_tick_without_its_process(paper_1: Path) -> None:
     journals = Journals(paper_1)
     journals.read()
-    known, stage = Gathering(), journals.stage
-    assert stage is not None
+    known, setup = RunData(), journals.setup
+    assert setup is not None
 
     def begin(tick: int) -> None:
         for command in journals.known.ticks[tick].commands.values():
-            known.take(command, 0)
+            known.add(command, 0)
 
     def present(**there: bool) -> None:
         for robot, one in there.items():
@@ -221,9 +221,9 @@ def test_a_robot_is_shown_as_down_in_every_tick_without_its_process(paper_1: Pat
     begin(3)
     present(b=False)
     present(b=True)
-    known.take(journals.known.final_reports["a"], 0)
+    known.add(journals.known.final_reports["a"], 0)
     present(a=False)  # its part of the mission has ended
-    shown = scenes(stage, known)
+    shown = scenes(setup, known)
     assert [one.player("a").down for one in shown] == [False, True, False, False]
     assert shown[1].player("a").activity == "a is down: its process is gone"
     assert [
@@ -257,8 +257,8 @@ def test_the_end_is_shown_though_it_comes_after_a_page_has_seen_the_last_tick(
     show.poll()
     assert show.known.end is not None
     assert show.since(seen) == show.known.end.tick == last
-    assert show.stage is not None
-    changed = scenes(show.stage, show.known, last)
+    assert show.setup is not None
+    changed = scenes(show.setup, show.known, last)
     assert [event.text for event in changed[0].events if event.kind == "end"] == [
         "The mission ends: localised"
     ]
@@ -274,9 +274,9 @@ def test_the_process_that_writes_a_journal_is_known_by_its_lock(tmp_path: Path) 
 
 def test_every_state_has_its_sentence() -> None:
     assert set(MODE_NAMES.values()) | {"localised"} == {*DOING, *SEEKING}
-    seat = of_scenario(load("paper-1")).seat("b")
+    robot_setup = of_scenario(load("paper-1")).robot_setup("b")
     for phase in (1, 2, 3):
         for state in (*DOING, *SEEKING):
-            sentence = doing(seat, phase, state, None)
+            sentence = doing(robot_setup, phase, state, None)
             assert sentence.startswith("b ")
             assert "{" not in sentence

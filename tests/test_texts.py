@@ -13,7 +13,7 @@ from msgspec.inspect import StrType, StructType, type_info
 from msgspec.structs import replace
 
 from agent.planning.state import MODE_NAMES
-from agent.process.agent_journal import past
+from agent.process.agent_journal import agent_history
 from agent.process.robot import Robot
 from compose.scenario.scenario_file import load
 from protocol.journal.journal_file import Journal, read
@@ -39,7 +39,7 @@ from tests.examples import EXAMPLES
 from tests.test_wire import changed, framed, packed, parts, plain
 from world.referee import MissionOutcome
 from world.simulation import Simulation, resumed
-from world.world_journal import history
+from world.world_journal import world_history
 
 RUN = "mine"
 LONG_TEXTS = {
@@ -167,7 +167,7 @@ def test_a_world_whose_reason_is_too_long_leaves_a_journal_that_is_read_and_take
     scenario, path = load("paper-1"), tmp_path / "world.journal"
     with Journal(path) as journal:
         end = Simulation(scenario, journal).end(MissionOutcome("failed", "no answer from " + "robot, " * 200))
-    assert history(read(path), path).end == end
+    assert world_history(read(path), path).end == end
     recording = Retrace(path)
     assert resumed(scenario, recording).mission_end == end
     recording.close()
@@ -183,7 +183,7 @@ def test_an_agent_that_gives_up_at_length_leaves_a_journal_that_is_read(tmp_path
         robot.estimate()
         robot.final_report(MissionEnd(1, "undecided", f"a: {'x' * 1000}"))
     assert command.verdict == Undecided("\U0001f600" * MAX_TEXT)
-    assert past(read(path), path).final_report is not None
+    assert agent_history(read(path), path).final_report is not None
     for frame in read(path):
         decode(frame, OfRobot, MAX_FRAME_BYTES)
 
@@ -221,7 +221,7 @@ def test_a_run_that_ends_with_the_longest_verdict_is_read(tmp_path: Path) -> Non
                     parted.add(robot)
         assert clock.ended().status == 1, clock.err
         del tokens
-    assert history(read(out / "world.journal"), out).end is not None
+    assert world_history(read(out / "world.journal"), out).end is not None
     replayed, audited = tandem("replay", out), tandem("audit", out)
     assert (replayed.status, audited.status) == (0, 1), replayed.err + audited.err
     assert re.search(r"^claim +1 +0$", audited.out, re.MULTILINE), audited.out  # only journals are missing

@@ -158,11 +158,12 @@ def test_every_claim_of_an_honest_robot_has_the_required_accuracy(planner_name: 
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("first", range(0, 25, 5))
 @pytest.mark.parametrize("sigma", [0.001, 0.01, 0.05, 0.1])
 @pytest.mark.parametrize("outliers", [0.0, 0.05])
 @pytest.mark.parametrize("planner_name", ["paper", "assured"])
 def test_every_claim_of_many_noisy_missions_has_the_required_accuracy(
-    planner_name: str, outliers: float, sigma: float
+    planner_name: str, outliers: float, sigma: float, first: int
 ) -> None:
-    found = honest_claims(planner_name, [sigma], range(25), outliers)
+    found = honest_claims(planner_name, [sigma], range(first, first + 5), outliers)
     assert found > 0 or planner_name == "paper"

@@ -54,13 +54,13 @@ def test_an_export_of_hardware_mode_has_measurements_and_estimates_and_no_truth(
     for folder in folders:
         ended = tandem("export", folder)
         assert (ended.status, ended.err) == (0, "")
-    pasts = {robot: read(alone).past(robot) for robot in "ab"}
+    agents = {robot: read(alone).agent(robot) for robot in "ab"}
     for told, known in zip(table(alone), table(whole), strict=True):
         assert {told[name] for name in KNOWN_TO_A_WORLD} == {""}
         assert [told[name] for name in MEASURED] == [known[name] for name in MEASURED]
-        past, after = pasts[told["robot"]], int(told["tick"]) + 1
-        assert past is not None
-        driven = past.steps[after].observation.executed if after < len(past.steps) else None
+        agent, after = agents[told["robot"]], int(told["tick"]) + 1
+        assert agent is not None
+        driven = agent.steps[after].observation.executed if after < len(agent.steps) else None
         assert told["v"] == (
             "" if driven is None else repr(driven.v)
         )  # with a simulator, the executed motion is known

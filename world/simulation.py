@@ -12,7 +12,7 @@ from protocol.wire import encode
 from world.referee import MissionOutcome
 from world.scenario import Scenario
 from world.tick import advance, observations, release
-from world.world_journal import history
+from world.world_journal import world_history
 
 
 class Simulation:
@@ -125,9 +125,9 @@ def resumed(scenario: Scenario, recording: Retrace) -> Simulation:
 
 
 def _retrace(simulation: Simulation, recording: Retrace, named: Environment | None) -> None:
-    recorded = history(recording.frames, recording.path)
-    if recorded.disorder is not None:
-        raise CorruptJournal(f"{recording.path}: {recorded.disorder.what}")
+    recorded = world_history(recording.frames, recording.path)
+    if recorded.unexpected is not None:
+        raise CorruptJournal(f"{recording.path}: {recorded.unexpected.what}")
     if recorded.scenario != simulation.world.scenario:
         raise CorruptJournal(f"{recording.path}: a recording of another scenario, {recorded.scenario.name}")
     try:

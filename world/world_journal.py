@@ -34,7 +34,7 @@ class Tick(msgspec.Struct, frozen=True):
         return self.world.truth
 
 
-class History(msgspec.Struct, frozen=True):
+class WorldHistory(msgspec.Struct, frozen=True):
     """The content of a journal, complete or up to where it breaks off."""
 
     scenario: Scenario
@@ -49,7 +49,7 @@ class History(msgspec.Struct, frozen=True):
     """The recorded end; None if the journal breaks off before."""
     final_reports: dict[str, FinalReport] = {}
     """The recorded FinalReports, by robot."""
-    disorder: UnexpectedFrame | None = None
+    unexpected: UnexpectedFrame | None = None
     """The first frame out of order, if any."""
     environment: Environment | None = None
     """The environment of the world's process; None in an older recording."""
@@ -60,7 +60,7 @@ class History(msgspec.Struct, frozen=True):
         return (*[tick.world for tick in self.ticks], *([] if self.ahead is None else [self.ahead]))
 
 
-def history(frames: Iterable[bytes], source: object) -> History:
+def world_history(frames: Iterable[bytes], source: object) -> WorldHistory:
     """Return the content of the journal with these frames, with the true poses recomputed from the Commands.
 
     Raises CorruptJournal, with `source` as the journal's name.
@@ -98,7 +98,7 @@ class WorldJournalReading:
         """The recorded end."""
         self.final_reports: dict[str, FinalReport] = {}
         """The recorded FinalReports, by robot."""
-        self.disorder: UnexpectedFrame | None = None
+        self.unexpected: UnexpectedFrame | None = None
         """The first frame out of order."""
         self._ids: list[str] = []
         self._answers: dict[str, Command | DeadlineMissed] = {}
@@ -129,7 +129,7 @@ class WorldJournalReading:
             ):
                 self.final_reports[message.robot] = message
             case _:
-                self.disorder = UnexpectedFrame(getattr(message, "tick", None), _named(message))
+                self.unexpected = UnexpectedFrame(getattr(message, "tick", None), _named(message))
                 return False
         self.messages.append(message)
         return True
@@ -161,18 +161,18 @@ class WorldJournalReading:
         else:
             self.world = onward
 
-    def content(self) -> History | None:
+    def content(self) -> WorldHistory | None:
         """Return the content that has been read so far; None if there is no scenario."""
         if self.world is None:
             return None
-        return History(
+        return WorldHistory(
             self.world.scenario,
             tuple(self.ticks),
             self.world if self.mission_outcome is None else None,
             self.mission_outcome,
             self.end,
             dict(self.final_reports),
-            self.disorder,
+            self.unexpected,
             self.environment,
         )
 

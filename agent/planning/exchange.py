@@ -42,18 +42,14 @@ def observed(state: RobotState, observation: Observation) -> RobotState:
             in_contact = True
             if contact.range is not None:
                 mutual = (*mutual, Ranged(observation.tick, contact.range))
-    return RobotState(
-        state.config,
-        observation.tick,
-        odometry,
-        log,
-        mutual,
-        state.belief,
-        state.peer_state,
-        state.mode,
-        in_contact,
-        leg,
-        state.plan,
+    return replace(
+        state,
+        tick=observation.tick,
+        odometry=odometry,
+        log=log,
+        mutual=mutual,
+        in_contact=in_contact,
+        leg=leg,
     )
 
 

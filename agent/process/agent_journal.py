@@ -41,7 +41,7 @@ class Step(msgspec.Struct, frozen=True):
     """The frame of the Observation."""
     report: FramedReport | None = None
     """The robot's report to its peer; None without contact."""
-    heard: tuple[FramedReport, ...] = ()
+    received: tuple[FramedReport, ...] = ()
     missed: tuple[str, ...] = ()
     """The peers whose report did not arrive in time."""
     command: Command | None = None
@@ -50,7 +50,7 @@ class Step(msgspec.Struct, frozen=True):
     estimate_frame: bytes | None = None
 
 
-class Past(msgspec.Struct, frozen=True):
+class AgentHistory(msgspec.Struct, frozen=True):
     """The content of a journal, complete or up to the point where it ends."""
 
     config: RobotConfig
@@ -59,7 +59,7 @@ class Past(msgspec.Struct, frozen=True):
     final_report: FinalReport | None = None
     environment: Environment | None = None
     """The environment in which the journal was written; None for older recordings."""
-    disorder: UnexpectedFrame | None = None
+    unexpected: UnexpectedFrame | None = None
     """The first frame out of order, if any."""
 
     @property
@@ -107,7 +107,7 @@ class AgentJournalReading:
         """The configuration; None until it has been read."""
         self.messages: list[Any] = []
         """The messages that have been read, in order."""
-        self.disorder: UnexpectedFrame | None = None
+        self.unexpected: UnexpectedFrame | None = None
         """The first frame out of order."""
         self._steps: list[Step] = []
         self._step: dict[str, Any] = {}
@@ -126,7 +126,7 @@ class AgentJournalReading:
             at = f" of tick {tick}" if tick is not None else ""
             kind = type(message).__name__
             what = f"{'an' if kind[0] in 'AEIO' else 'a'} {kind}{at} is out of order"
-            self.disorder = UnexpectedFrame(tick, what)
+            self.unexpected = UnexpectedFrame(tick, what)
             return False
         self.messages.append(message)
         return True
@@ -162,7 +162,7 @@ class AgentJournalReading:
         is_open = "command" not in step
         if isinstance(message, Report) and message.robot != self.config.robot:
             if is_open:
-                step["heard"] = (*step.get("heard", ()), FramedReport(message, frame))
+                step["received"] = (*step.get("received", ()), FramedReport(message, frame))
             return is_open
         match message:
             case _ if message.tick != step["observation"].tick:
@@ -190,15 +190,17 @@ class AgentJournalReading:
                 raise MalformedFrame("an agent's journal must begin with a RobotConfig")
         return True
 
-    def content(self) -> Past | None:
+    def content(self) -> AgentHistory | None:
         """Return the content that has been read so far; None if there is no RobotConfig."""
         if self.config is None:
             return None
         steps = [*self._steps, Step(**self._step)] if self._step else self._steps
-        return Past(self.config, tuple(steps), self._end, self._final_report, self.environment, self.disorder)
+        return AgentHistory(
+            self.config, tuple(steps), self._end, self._final_report, self.environment, self.unexpected
+        )
 
 
-def past(frames: Iterable[bytes], source: object) -> Past:
+def agent_history(frames: Iterable[bytes], source: object) -> AgentHistory:
     """Return the content of a journal's `frames`.
 
     Raises CorruptJournal, with a text that begins with `source`.
@@ -210,8 +212,8 @@ def past(frames: Iterable[bytes], source: object) -> Past:
                 break
     except MalformedFrame as error:
         raise CorruptJournal(f"{source}: {error}") from None
-    if reading.disorder is not None:
-        raise CorruptJournal(f"{source}: {reading.disorder.what}")
+    if reading.unexpected is not None:
+        raise CorruptJournal(f"{source}: {reading.unexpected.what}")
     content = reading.content()
     if content is None:
         raise CorruptJournal(f"{source}: it contains no RobotConfig")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from agent.process.agent_journal import Past, Step
+from agent.process.agent_journal import AgentHistory, Step
 from agent.process.robot import Robot
 from protocol.journal.journal_file import Sink
 
@@ -16,13 +16,13 @@ class PlannerReplay:
     of the planner is raised as it is, and `tick` is then the tick in which it occurred.
     """
 
-    def __init__(self, past: Past, journal: Sink | None = None) -> None:
-        """Prepare the replay of `past`. Everything that the robot recomputes is written to `journal`."""
-        self.robot = Robot(past.config)
-        self.robot.keep(journal)
+    def __init__(self, history: AgentHistory, journal: Sink | None = None) -> None:
+        """Prepare the replay of `history`. Everything that the robot recomputes is written to `journal`."""
+        self.robot = Robot(history.config)
+        self.robot.append_to(journal)
         self.tick: int | None = None
         """The tick of the current step; None before the first."""
-        self._steps = past.steps
+        self._steps = history.steps
 
     def __iter__(self) -> Iterator[Step]:
         """Yield each step after the robot has observed it and, if its Command is recorded, has decided."""
@@ -30,5 +30,5 @@ class PlannerReplay:
             self.tick = step.observation.tick
             self.robot.observation(step.observation, step.frame)
             if step.command is not None:
-                self.robot.decide(step.heard, step.missed)
+                self.robot.decide(step.received, step.missed)
             yield step

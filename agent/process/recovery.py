@@ -9,7 +9,7 @@ from collections import deque
 
 import msgspec
 
-from agent.process.agent_journal import FramedReport, past
+from agent.process.agent_journal import FramedReport, agent_history
 from agent.process.planner_replay import PlannerReplay
 from agent.process.robot import Robot
 from protocol.journal import environment
@@ -36,7 +36,7 @@ class Memory(msgspec.Struct, frozen=True):
     """The latest Observation."""
     own_reports: tuple[FramedReport, ...] = ()
     """The robot's own latest reports."""
-    heard: tuple[FramedReport, ...] = ()
+    received: tuple[FramedReport, ...] = ()
     """The latest reports received from the peer."""
     end: MissionEnd | None = None
     final_report: FinalReport | None = None
@@ -50,7 +50,7 @@ def remember(recording: Retrace) -> Memory | None:
     """
     if environment.is_blank(recording.frames):
         return None
-    journal = past(recording.frames, recording.path)
+    journal = agent_history(recording.frames, recording.path)
     head = (journal.environment, journal.config)
     recording.write(*[encode(one) for one in head if one is not None])
     replay = PlannerReplay(journal, recording)
@@ -80,7 +80,9 @@ def remember(recording: Retrace) -> Memory | None:
         robot=robot,
         observation=observation,
         own_reports=tuple(own_reports),
-        heard=tuple([one for step in latest for one in step.heard if now - one.report.tick <= REPORTS_KEPT]),
+        received=tuple(
+            [one for step in latest for one in step.received if now - one.report.tick <= REPORTS_KEPT]
+        ),
         end=journal.end if journal.final_report is not None else None,
         final_report=journal.final_report,
     )

@@ -12,14 +12,14 @@ from protocol.network.inbox import Arrival, Inbox
 from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode
 
 
-class Post:
+class ReportBuffer:
     """The received reports, by tick."""
 
-    def __init__(self, inbox: Inbox, heard: Sequence[FramedReport], *, real_time: bool) -> None:
-        """Start with `heard`, the reports in the journal of a restarted process."""
+    def __init__(self, inbox: Inbox, received: Sequence[FramedReport], *, real_time: bool) -> None:
+        """Start with `received`, the reports in the journal of a restarted process."""
         self._inbox = inbox
         self._real_time = real_time
-        self._reports = {framed.report.tick: framed for framed in heard}
+        self._reports = {framed.report.tick: framed for framed in received}
         self._listed = set(self._reports)
         """The ticks of reports that an Observation has listed."""
         self.unheard = 0

@@ -45,8 +45,8 @@ class Robot:
         if journal is not None:
             journal.write(encode(environment.of_robot()), encode(config))
 
-    def keep(self, journal: Sink | None) -> None:
-        """Write to `journal` from now on."""
+    def append_to(self, journal: Sink | None) -> None:
+        """Write all frames from now on to `journal`."""
         self._journal = journal
 
     @property
@@ -84,19 +84,17 @@ class Robot:
             self._unwritten = frame or encode(observation)
         return self.report
 
-    def decide(self, heard: Sequence[FramedReport] = (), missed: Sequence[str] = ()) -> Command:
+    def decide(self, received: Sequence[FramedReport] = (), missed: Sequence[str] = ()) -> Command:
         """Update the state with the received reports, and return the Command of this tick.
 
         `missed` names the peers whose reports did not arrive in time.
         """
-        if not heard:
-            self.state = self.planner.decide(self.state)
-        else:
-            self.state = self.planner.decide(self.state, [framed.report for framed in heard])
-            self.unheard.difference_update([framed.report.tick for framed in heard])
+        self.state = self.planner.decide(self.state, [framed.report for framed in received])
+        if received:
+            self.unheard.difference_update([framed.report.tick for framed in received])
         self.command = self.planner.command(self.state)
         if self._journal is not None:
-            frames = [framed.frame for framed in heard]
+            frames = [framed.frame for framed in received]
             frames += [encode(DeadlineMissed(self.state.tick, peer)) for peer in missed]
             if self._unwritten is not None:
                 frames.insert(0, self._unwritten)

@@ -24,15 +24,15 @@ def decision(run: Run) -> Checks:
 
     The frames are compared to the bit.
     """
-    for robot, past in run.pasts.items():
-        replay = PlannerReplay(past)
+    for robot, agent in run.agents.items():
+        replay = PlannerReplay(agent)
         try:
             for step in replay:
                 yield from _answers(
-                    replay.robot, robot, step, cut=step is past.steps[-1] and past.end is None
+                    replay.robot, robot, step, cut=step is agent.steps[-1] and agent.end is None
                 )
-            if past.end is not None and past.final_report is not None:
-                yield _final_report(replay.robot, robot, past.end, past.final_report)
+            if agent.end is not None and agent.final_report is not None:
+                yield _final_report(replay.robot, robot, agent.end, agent.final_report)
         except Exception as error:  # noqa: BLE001  # an exception of the planner is a violation
             what = f"the planner fails on its inputs: {type(error).__name__}: {error}"
             yield Violation("decision", replay.tick, robot, what)
@@ -85,9 +85,9 @@ def limits(run: Run) -> Checks:
     With noise, only the commanded speeds are checked: the executed ones include wheel noise, and the
     Observation contains measurements of them.
     """
-    for robot, past in run.pasts.items():
-        mission = past.config.mission
-        for step in past.steps:
+    for robot, agent in run.agents.items():
+        mission = agent.config.mission
+        for step in agent.steps:
             tick, command, driven = step.observation.tick, step.command, step.observation.executed
             if command is not None:
                 yield _within(tick, robot, "commanded", Controls(command.v, command.omega), mission)
@@ -111,12 +111,12 @@ def log(run: Run) -> Checks:
 
     Attackers are skipped. `decision` checks their Reports, because the attack is part of the configuration.
     """
-    for robot, past in run.pasts.items():
-        if past.config.attack is not None:
+    for robot, agent in run.agents.items():
+        if agent.config.attack is not None:
             continue
-        driven = [step.observation.executed for step in past.steps]
-        ranged = [step.observation.anchor_range for step in past.steps]
-        for step in past.steps:
+        driven = [step.observation.executed for step in agent.steps]
+        ranged = [step.observation.anchor_range for step in agent.steps]
+        for step in agent.steps:
             if step.report is not None:
                 yield _log_violation(step.observation.tick, robot, step.report.report, driven, ranged)
 

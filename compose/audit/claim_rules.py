@@ -8,7 +8,7 @@ from msgspec.structs import astuple
 
 from agent.estimation.mutual_ranges import ELSEWHERE
 from agent.planning.registry import planner
-from agent.process.agent_journal import Past
+from agent.process.agent_journal import AgentHistory
 from compose.audit.findings import Checks, Violation, between
 from compose.recording.run import Run
 from protocol.messages import Localised, MissionEnd
@@ -34,9 +34,9 @@ def claim(run: Run) -> Checks:
         yield None if why is None else Violation("claim", tick, placed.id, f"it claims a pose that is {why}")
         vague = inaccuracy(made, mission)
         yield None if vague is None else Violation("claim", tick, placed.id, f"it {vague}")
-        past = run.pasts.get(placed.id)
-        if past is not None and tick < len(past.steps) and past.steps[tick].command is not None:
-            yield _redundant(run, placed, past, tick)
+        agent = run.agents.get(placed.id)
+        if agent is not None and tick < len(agent.steps) and agent.steps[tick].command is not None:
+            yield _redundant(run, placed, agent, tick)
     yield from outcome(run)
 
 
@@ -49,16 +49,16 @@ def _first_claim(run: Run, robot: str) -> tuple[int, Localised | None]:
     return 0, None
 
 
-def _redundant(run: Run, placed: RobotSpec, past: Past, tick: int) -> Violation | None:
+def _redundant(run: Run, placed: RobotSpec, agent: AgentHistory, tick: int) -> Violation | None:
     """Return a violation if the claim at `tick` is based on too few mutual ranges.
 
     Ranges count up to the latest tick for which the robot had received the peer's log.
     """
     scenario = run.scenario
     noise = scenario.mission.noise
-    ends = [framed.report.through for step in past.steps[: tick + 1] for framed in step.heard]
+    ends = [framed.report.through for step in agent.steps[: tick + 1] for framed in step.received]
     through = min(max(ends, default=-1), tick)
-    mutual = _ranged(past, through)
+    mutual = _ranged(agent, through)
     if noise.exact:
         places = _places(run, placed, mutual)
         return _too_few(tick, placed, "relative placements with a mutual range", places, PLACES)
@@ -72,11 +72,11 @@ def _too_few(tick: int, placed: RobotSpec, what: str, found: int, expected: int)
     return Violation("claim", tick, placed.id, f"it claims with {found} {what}, expected at least {expected}")
 
 
-def _ranged(past: Past, through: int) -> list[int]:
+def _ranged(agent: AgentHistory, through: int) -> list[int]:
     """Return the ticks of the mutual ranges up to the tick `through`."""
     return [
         step.observation.tick
-        for step in past.steps[: through + 1]
+        for step in agent.steps[: through + 1]
         if any(contact.range is not None for contact in step.observation.contacts)
     ]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from agent.process.agent_journal import FramedReport, Past, Step
+from agent.process.agent_journal import AgentHistory, FramedReport, Step
 from compose.audit.findings import Checks, Violation, between, difference, quoted
 from compose.recording.run import Run
 from protocol.wire import encode
@@ -13,8 +13,8 @@ from protocol.wire import encode
 
 def observation(run: Run) -> Checks:
     """Check that the sensor models give each Observation, to the bit, from the journaled Commands."""
-    for robot, past in run.pasts.items():
-        for step in past.steps[: len(run.observations)]:
+    for robot, agent in run.agents.items():
+        for step in agent.steps[: len(run.observations)]:
             expected = run.observations[step.observation.tick][robot]
             if step.frame == encode(expected):
                 yield None
@@ -27,13 +27,13 @@ def observation(run: Run) -> Checks:
 
 def contact(run: Run) -> Checks:
     """Check that Reports were sent and received only in contact, and that those received are listed."""
-    for robot, past in run.pasts.items():
-        for step in past.steps:
+    for robot, agent in run.agents.items():
+        for step in agent.steps:
             if step.report is not None and step.observation.tick < len(run.observations):
                 yield _sent(run, robot, step)
             if step.command is not None:
                 yield _listed(robot, step)
-            for framed in step.heard:
+            for framed in step.received:
                 yield _received(run, robot, step, framed)
 
 
@@ -47,7 +47,7 @@ def _sent(run: Run, robot: str, step: Step) -> Violation | None:
 
 def _listed(robot: str, step: Step) -> Violation | None:
     listed = [tick for contact in step.observation.contacts for tick in contact.heard or ()]
-    received = [framed.report.tick for framed in step.heard]
+    received = [framed.report.tick for framed in step.received]
     if len(received) + len(step.missed) == len(listed) and _is_subsequence(received, listed):
         return None
     missed = f" and missed {len(step.missed)}" if step.missed else ""
@@ -74,17 +74,17 @@ def _received(run: Run, robot: str, step: Step, framed: FramedReport) -> Violati
 
 def report(run: Run) -> Checks:
     """Check that each received Report is, to the byte, the one in the peer's journal."""
-    for robot, past in run.pasts.items():
-        peer = run.pasts.get(past.config.peer)
+    for robot, agent in run.agents.items():
+        peer = run.agents.get(agent.config.peer)
         if peer is None:
             continue
-        for step in past.steps:
-            for framed in step.heard:
+        for step in agent.steps:
+            for framed in step.received:
                 if framed.report.tick < _complete_until(peer):
                     yield _as_sent(robot, step, framed, peer)
 
 
-def _complete_until(peer: Past) -> float:
+def _complete_until(peer: AgentHistory) -> float:
     """Return the tick before which the peer's journal contains every Report that it sent."""
     if peer.final_report is not None:
         return math.inf
@@ -92,7 +92,7 @@ def _complete_until(peer: Past) -> float:
     return len(peer.steps) - 1 if cut else len(peer.steps)
 
 
-def _as_sent(robot: str, step: Step, framed: FramedReport, peer: Past) -> Violation | None:
+def _as_sent(robot: str, step: Step, framed: FramedReport, peer: AgentHistory) -> Violation | None:
     tick, steps = step.observation.tick, peer.steps
     sent = steps[framed.report.tick].report if framed.report.tick < len(steps) else None
     if sent is None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from agent.process.agent_journal import Past
+from agent.process.agent_journal import AgentHistory
 from compose.audit.findings import Checks, LinkStatistics, Violation, quoted
 from compose.recording.run import Run
 
@@ -11,8 +11,8 @@ def faults(run: Run) -> Checks:
     """Check that each Observation lists the received and damaged Reports that follow from the fault plan."""
     if not run.scenario.faults:
         return
-    for robot, past in run.pasts.items():
-        for step in past.steps[: len(run.observations)]:
+    for robot, agent in run.agents.items():
+        for step in agent.steps[: len(run.observations)]:
             expected = run.contact(robot, step.observation.tick)
             if expected is None:
                 continue
@@ -29,19 +29,19 @@ def link_statistics(run: Run) -> tuple[LinkStatistics, ...]:
     """Return the statistics of each link whose receiver has a journal; none without a fault plan."""
     if not run.scenario.faults:
         return ()
-    return tuple([_statistics(past) for past in run.pasts.values()])
+    return tuple([_statistics(agent) for agent in run.agents.values()])
 
 
-def _statistics(past: Past) -> LinkStatistics:
-    """Return the statistics of the link to the robot whose journal is `past`."""
+def _statistics(agent: AgentHistory) -> LinkStatistics:
+    """Return the statistics of the link to the robot whose journal is `agent`."""
     contacts = [
-        (step.observation.tick, contact) for step in past.steps for contact in step.observation.contacts
+        (step.observation.tick, contact) for step in agent.steps for contact in step.observation.contacts
     ]
     received = [(now, tick) for now, contact in contacts for tick in contact.heard or ()]
     damaged = [tick for _, contact in contacts for tick in contact.damaged]
     ticks = [tick for _, tick in received]
     return LinkStatistics(
-        link=f"{past.config.peer}->{past.config.robot}",
+        link=f"{agent.config.peer}->{agent.config.robot}",
         sent=len(contacts),
         heard=len(received),
         late=sum([tick < now for now, tick in received]),

@@ -13,7 +13,8 @@ from compose.audit.fault_rules import faults, link_statistics
 from compose.audit.findings import Checks, Findings, findings_of
 from compose.audit.journal_rules import config, order
 from compose.audit.scenario_rules import scenario
-from compose.recording.run import Run, agent_journal, read
+from compose.recording.recording_files import agent_journal
+from compose.recording.run import Run, read
 from protocol.journal.environment import of_robot, of_world, otherwise
 
 Rules = Sequence[Callable[[Run], Checks]]
@@ -74,5 +75,5 @@ def _other_versions(run: Run) -> str | None:
 
     The result is None if no robot has other versions.
     """
-    differences = [otherwise(past.environment, of_robot()) for past in run.pasts.values()]
+    differences = [otherwise(agent.environment, of_robot()) for agent in run.agents.values()]
     return next((one for one in differences if one is not None), None)

@@ -42,8 +42,8 @@ def config(run: Run) -> Checks:
 
     This is for hardware mode. Otherwise, `journal_rules.config` compares the RobotConfig with the scenario.
     """
-    for robot, past in run.pasts.items():
-        found = past.config
+    for robot, agent in run.agents.items():
+        found = agent.config
         why = _off_plan(found.rendezvous, found.mission, found.planner_name, found.anchor, found.peer_anchor)
         yield Violation("config", None, robot, why) if why is not None else None
 

@@ -18,7 +18,8 @@ from compose.cli.participant import (
     warn_beyond,
 )
 from compose.errors import ENDED, UserError, status_of
-from compose.recording.run import agent_journal, ended
+from compose.recording.recording_files import agent_journal
+from compose.recording.run import ended
 from compose.scenario import kills
 from compose.terminal.outcome import reopened
 from protocol.journal.journal_file import CorruptJournal, Journal
@@ -118,5 +119,5 @@ def _ready(
         journal = Journal(options.out / agent_journal(options.id), fsync=options.fsync)
     if memory is None:
         return Memory(config, Robot(config, journal))
-    memory.robot.keep(journal)
+    memory.robot.append_to(journal)
     return memory

@@ -10,7 +10,7 @@ from compose.audit.findings import Findings, LinkStatistics
 from compose.audit.rules import audit
 from compose.cli.arguments import add_closing, add_recording
 from compose.errors import CLEAN, VIOLATED
-from compose.recording.run import user_errors
+from compose.recording.recording_files import user_errors
 from compose.terminal import text_width
 from protocol.output import say
 

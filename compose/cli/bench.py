@@ -31,6 +31,7 @@ from compose.launch.supervisor import COMMAND, STOP_S, Supervisor
 from compose.launch.viewers import page, viewing
 from compose.network import KEYED
 from compose.recording import run
+from compose.recording.recording_files import WORLD_JOURNAL
 from compose.scenario import scenario_file
 from compose.sweep.trial_mission import run_in_process
 from compose.terminal.outcome import counting
@@ -184,7 +185,7 @@ def _mission_rate(
             _processes(clients, main="compose.view.web.page_client:main"),
             _processes(robots, until_ended=True),
             session.open_router(endpoints) as link,
-            Journal(Path(folder) / run.WORLD_JOURNAL) if journals else nullcontext() as journal,
+            Journal(Path(folder) / WORLD_JOURNAL) if journals else nullcontext() as journal,
         ):
             process = WorldProcess(Simulation(scenario, journal), "bench", Inbox("tandem bench"))
             process.attach(link)

@@ -9,7 +9,7 @@ from compose.cli.arguments import add_closing, add_driver_options, name
 from compose.errors import CLEAN, VIOLATED
 from compose.hardware.conformance import check_results
 from compose.hardware.exercise import Broken, ExerciseRun
-from compose.launch.driver_loader import briefed, driver_class, made, mission, options_of
+from compose.launch.driver_loader import config_of, driver_class, made, mission, options_of
 from compose.scenario.scenario_file import check_rate
 from compose.terminal import text_width
 from protocol.output import one_line, say
@@ -40,7 +40,7 @@ def main(options: argparse.Namespace) -> int:
     rate = options.rate or 1.0
     check_rate(scenario, rate)
     manoeuvre_s = scenario.mission.period / rate
-    config = briefed(scenario, options.robot, manoeuvre_s)
+    config = config_of(scenario, options.robot, manoeuvre_s)
     maker, given = driver_class(options.driver), options_of(options.option)
     with closing(made(maker, options.driver, config, manoeuvre_s, given)) as driver:
         trial = ExerciseRun(driver, config, manoeuvre_s)

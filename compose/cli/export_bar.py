@@ -6,7 +6,8 @@ import gc
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from compose.recording.run import Run, read, user_errors
+from compose.recording.recording_files import user_errors
+from compose.recording.run import Run, read
 from compose.terminal.outcome import counting
 from protocol.network.inbox import Inbox
 

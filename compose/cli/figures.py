@@ -11,13 +11,14 @@ from compose.cli.arguments import add_closing, add_recording
 from compose.errors import ENDED, FAILED, UserError
 from compose.extras import need
 from compose.figures import FORMATS, PICTURES
-from compose.recording.run import Run, agent_journal, read, user_errors
+from compose.recording.recording_files import agent_journal, user_errors
+from compose.recording.run import Run, read
 from compose.terminal.outcome import counting
 from protocol.journal.journal_file import CorruptJournal
 from protocol.output import say
 
 if TYPE_CHECKING:
-    from compose.figures.account import Account
+    from compose.figures.agent_replay import AgentReplay
     from compose.figures.pair import PairRecord
 
 
@@ -60,19 +61,21 @@ def main(options: argparse.Namespace) -> int:
     formats = [one for one in FORMATS if one in (options.format or FORMATS)]
     with counting("tandem figures", sum([len(robots) + len(kinds) for robots in run.pairs])) as done:
         for robots in run.pairs:
-            accounts = {}
+            replays = {}
             for robot in robots:
-                account = _account(run, robot)
-                if account is not None:
-                    accounts[robot] = account
-                if account is None or account.broken is not None:
+                replay = _replay(run, robot)
+                if replay is not None:
+                    replays[robot] = replay
+                if replay is None or replay.broken is not None:
                     status = FAILED
                 done()
-            torn = [name for name, one in accounts.items() if one.past is not None and one.past.end is None]
+            torn = [
+                name for name, one in replays.items() if one.history is not None and one.history.end is None
+            ]
             torn += ["the world"] if run.world is not None and run.world.end is None else []
             if torn:
                 _say(f"the recording of {' and '.join(torn)} ends before the mission does")
-            pair = pair_of(run, robots, accounts)
+            pair = pair_of(run, robots, replays)
             if pair is None:
                 _say(f"no figure of {' and '.join(robots)}: the recording has no data")
                 status = FAILED
@@ -117,12 +120,12 @@ def draw(
         done()
 
 
-def _account(run: Run, robot: str) -> Account | None:
-    """Return the account of a robot; print why and return None if its journal cannot be read."""
-    from compose.figures.account import account  # noqa: PLC0415
+def _replay(run: Run, robot: str) -> AgentReplay | None:
+    """Return the replay of a robot; print why and return None if its journal cannot be read."""
+    from compose.figures.agent_replay import agent_replay  # noqa: PLC0415
 
     try:
-        found = account(run, robot)
+        found = agent_replay(run, robot)
     except FileNotFoundError:
         why = f"{agent_journal(robot)} is missing"
     except OSError as error:

@@ -8,7 +8,7 @@ from compose.audit.findings import Violation
 from compose.audit.replay import replay
 from compose.cli.arguments import add_closing, add_recording
 from compose.errors import CLEAN, VIOLATED
-from compose.recording.run import user_errors
+from compose.recording.recording_files import user_errors
 from protocol.output import say
 
 

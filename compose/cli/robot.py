@@ -12,11 +12,12 @@ from compose.cli.arguments import add_closing, add_connect_timeout, add_driver_o
 from compose.cli.participant import RELISTEN_S, add_participation, participate, warn_beyond
 from compose.errors import ENDED, status_of
 from compose.hardware.driver_recording import recorded
-from compose.launch.driver_loader import briefed, driver_class, made, mission, options_of
+from compose.launch.driver_loader import config_of, driver_class, made, mission, options_of
 from compose.launch.processes import free_endpoint
 from compose.launch.supervisor import STOP_S, ChildFailed, Supervisor
 from compose.network import reach
-from compose.recording.run import ended, folder_for
+from compose.recording.recording_files import folder_for
+from compose.recording.run import ended
 from compose.scenario.scenario_file import check_rate
 from protocol.messages import Localised, MissionEnd
 from protocol.motion import wrap
@@ -58,7 +59,7 @@ def main(options: argparse.Namespace) -> int:
     rate = options.rate or 1.0
     check_rate(scenario, rate)
     manoeuvre_s = scenario.mission.period / rate
-    config = briefed(scenario, options.id, manoeuvre_s)
+    config = config_of(scenario, options.id, manoeuvre_s)
     maker, given = driver_class(options.driver), options_of(options.option)
     reached = reach(options, "world")
 

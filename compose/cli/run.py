@@ -16,7 +16,8 @@ from compose.extras import need
 from compose.launch import processes, supervisor
 from compose.launch.signals import stop_by_signal
 from compose.launch.viewers import Viewer, foxglove_server, page, stay, viewing
-from compose.recording.run import Run, folder_for, read
+from compose.recording.recording_files import folder_for
+from compose.recording.run import Run, read
 from compose.scenario.kills import WORLD, Kill
 from compose.scenario.scenario_file import ScenarioTemplate, check_rate, run_name, setting
 from compose.terminal.outcome import break_off, conclude, shown_live

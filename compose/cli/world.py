@@ -19,7 +19,8 @@ from compose.cli.participant import (
 )
 from compose.errors import ENDED, UserError
 from compose.launch.processes import scenario_from_launcher
-from compose.recording.run import WORLD_JOURNAL, folder_for, read
+from compose.recording.recording_files import WORLD_JOURNAL, folder_for
+from compose.recording.run import read
 from compose.scenario import kills
 from compose.scenario.scenario_file import check_rate, run_name, setting
 from compose.terminal.outcome import break_off, conclude, reopened, shown_live

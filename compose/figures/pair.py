@@ -11,7 +11,7 @@ import msgspec
 from msgspec.structs import replace
 
 from agent.planning.state import RobotState
-from compose.figures.account import Account
+from compose.figures.agent_replay import AgentReplay
 from compose.recording.claim import Claim
 from compose.recording.run import Run
 from protocol.messages import Command, Estimate
@@ -42,7 +42,7 @@ class Side(msgspec.Struct, frozen=True, dict=True):
     """The commands; None in ticks whose Command missed the deadline."""
     anchor_ranges: tuple[float | None, ...]
     """The measured ranges to the robot's anchor, in m; None out of range."""
-    account: Account | None
+    replay: AgentReplay | None
     """The recomputed planner states; None if the robot's journal cannot be read."""
     claim: Claim | None = None
     """The robot's first claim, compared with the ground truth; None in hardware mode."""
@@ -50,8 +50,8 @@ class Side(msgspec.Struct, frozen=True, dict=True):
     @cached_property
     def estimates(self) -> tuple[tuple[Estimate, Pose], ...]:
         """The journaled estimates, each with the pose of `path` in the same tick, where both are known."""
-        held = self.account.held if self.account is not None else ()
-        return tuple([(one, self.path[one.tick]) for one in held if one.tick < len(self.path)])
+        estimates = self.replay.estimates if self.replay is not None else ()
+        return tuple([(one, self.path[one.tick]) for one in estimates if one.tick < len(self.path)])
 
     @cached_property
     def placed(self) -> tuple[tuple[Estimate, Pose], ...]:
@@ -134,7 +134,7 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
         robots = [
             side.id
             for side in (self.a, self.b)
-            if side.account is None or side.account.broken is not None
+            if side.replay is None or side.replay.broken is not None
         ]  # fmt: skip
         if not robots:
             return None
@@ -143,12 +143,12 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
     @property
     def readable(self) -> list[Role]:
         """The roles of the robots whose journals can be read."""
-        return [role for role in ROLES if self.robot(role).account is not None]
+        return [role for role in ROLES if self.robot(role).replay is not None]
 
     def states(self, role: Role) -> tuple[RobotState, ...]:
         """Return the planner state after each tick, up to the last tick of the recording."""
-        account = self.robot(role).account
-        return account.states[: max(1, len(self.mutual))] if account is not None else ()
+        replay = self.robot(role).replay
+        return replay.states[: max(1, len(self.mutual))] if replay is not None else ()
 
     @cached_property
     def separations(self) -> list[float]:
@@ -196,19 +196,19 @@ def others(estimate: Estimate) -> tuple[Pose, ...]:
     return estimate.world[1:] if estimate.probabilities or len(estimate.world) == 1 else estimate.world
 
 
-def pair_of(run: Run, robots: Sequence[str], accounts: Mapping[str, Account]) -> PairRecord | None:
+def pair_of(run: Run, robots: Sequence[str], replays: Mapping[str, AgentReplay]) -> PairRecord | None:
     """Return the pair of `robots`, role a first; None in hardware mode if no journal has a configuration.
 
-    `accounts` holds the readable journals by robot id.
+    `replays` holds the readable journals by robot id.
     """
-    pasts = {one: accounts[one].past for one in robots if one in accounts}
-    known = {robot: past for robot, past in pasts.items() if past is not None}
+    histories = {one: replays[one].history for one in robots if one in replays}
+    known = {robot: history for robot, history in histories.items() if history is not None}
     if run.world is not None:
         config = run.scenario.config(robots[0])
         ticks = dict.fromkeys(robots, run.length)
     elif known:
         config = next(iter(known.values())).config
-        ticks = {robot: len(past.steps) for robot, past in known.items()}
+        ticks = {robot: len(history.steps) for robot, history in known.items()}
     else:
         return None
     mutual: list[tuple[bool, float | None]] = []
@@ -231,7 +231,7 @@ def pair_of(run: Run, robots: Sequence[str], accounts: Mapping[str, Account]) ->
             path=path,
             commands=tuple([run.command(robot, tick) for tick in seen]),
             anchor_ranges=tuple([run.observations[tick][robot].anchor_range for tick in seen]),
-            account=accounts.get(robot),
+            replay=replays.get(robot),
             claim=run.claim(robot),
         )
 

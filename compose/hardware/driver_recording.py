@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 
 from compose.launch.driver_loader import resume_driver
-from compose.recording.run import agent_journal
+from compose.recording.recording_files import agent_journal
 from compose.terminal.outcome import reopened
 from protocol.journal.journal_file import CannotRecord, CorruptJournal, Journal
 from protocol.journal.resume import Retrace
@@ -19,7 +19,7 @@ from protocol.network.inbox import Inbox
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode, encode
 from world.hardware.bridge import Field
 from world.hardware.driver import Driver
-from world.hardware.driver_journal import DriverPast, ProcessStart, boot, driver_journal, driver_past
+from world.hardware.driver_journal import DriverHistory, ProcessStart, boot, driver_history, driver_journal
 
 RELEASE_S = 10.0
 """Time in s that the agent of a killed launcher has to end, which unlocks its journal."""
@@ -32,7 +32,7 @@ class DriverRecord(msgspec.Struct, frozen=True):
 
     journal: Journal
     """Journal of the driver."""
-    past: DriverPast
+    history: DriverHistory
     """Content of the driver's journal when it was opened."""
     known: int
     """Latest tick in the agent's journal; -1 if there is none."""
@@ -43,11 +43,11 @@ class DriverRecord(msgspec.Struct, frozen=True):
 
     def take_up(self, driver: Driver, name: str, field: Field) -> None:
         """Resume the mission with `driver`, called `name` in errors. Raises UserError if it cannot."""
-        if self.past.ticks:
-            resume_driver(driver, name, self.past)
+        if self.history.ticks:
+            resume_driver(driver, name, self.history)
         if self.again:
-            field.resume(self.past, self.known)
-        if self.past.end is None and self.past.start != self.start:
+            field.resume(self.history, self.known)
+        if self.history.end is None and self.history.start != self.start:
             self.journal.write(encode(self.start))
 
 
@@ -66,23 +66,23 @@ def recorded(folder: Path, config: RobotConfig, inbox: Inbox, *, fsync: bool) ->
             raise CannotRecord(f"{agents} exists, and {path.name} does not; choose another folder")
         with Journal(path, fsync=fsync) as journal:
             journal.write(encode(config))
-            yield DriverRecord(journal, DriverPast(), -1, again=False, start=start)
+            yield DriverRecord(journal, DriverHistory(), -1, again=False, start=start)
         return
     old = Retrace(path, fsync=fsync)
     try:
-        past = driver_past(old.frames, config, path)
-        if past.may_lack:
+        history = driver_history(old.frames, config, path)
+        if history.may_lack:
             raise CorruptJournal(
                 f"{path} was written without --fsync, and this computer has restarted since: "
                 "Reports that the robot sent to its peer may be missing in it"
             )
-        known = _known(_frames(agents, inbox), past, agents)
+        known = _known(_frames(agents, inbox), history, agents)
         old.write(*(old.frames or [encode(config)]))
     except BaseException:
         old.close()
         raise
     with reopened(old, inbox) as journal:
-        yield DriverRecord(journal, past, known, again=True, start=start)
+        yield DriverRecord(journal, history, known, again=True, start=start)
 
 
 def _frames(path: Path, inbox: Inbox) -> list[bytes]:
@@ -101,7 +101,7 @@ def _frames(path: Path, inbox: Inbox) -> list[bytes]:
     return []
 
 
-def _known(frames: list[bytes], past: DriverPast, path: Path) -> int:
+def _known(frames: list[bytes], history: DriverHistory, path: Path) -> int:
     """Return the latest tick in the agent's `frames`, -1 if there is none.
 
     Raises CorruptJournal unless each Observation in them is that of the same tick in the driver's journal.
@@ -114,12 +114,12 @@ def _known(frames: list[bytes], past: DriverPast, path: Path) -> int:
             raise CorruptJournal(f"{path}: {error}") from None
         if isinstance(message, Observation):
             known += 1
-            if known > past.tick:
+            if known > history.tick:
                 raise CorruptJournal(
-                    f"{path} continues after tick {past.tick}, where the driver's journal ends; "
+                    f"{path} continues after tick {history.tick}, where the driver's journal ends; "
                     "only with --fsync do both survive a power cut"
                 )
-            if frame != past.ticks[known].frame:
+            if frame != history.ticks[known].frame:
                 raise CorruptJournal(
                     f"{path}: the Observation of tick {known} differs from the one in the driver's journal"
                 )

@@ -12,7 +12,7 @@ from compose.scenario.scenario_file import setting
 from protocol.messages import RobotConfig
 from protocol.spelling import did_you_mean
 from world.hardware.driver import THINKING, Driver
-from world.hardware.driver_journal import DriverPast
+from world.hardware.driver_journal import DriverHistory
 from world.scenario import Scenario
 
 METHODS = ("sense", "drive", "stop", "close")
@@ -57,8 +57,8 @@ def made(
         raise UserError(f"{name}: cannot be created: {type(error).__name__}: {error}") from None
 
 
-def resume_driver(driver: Driver, name: str, past: DriverPast) -> None:
-    """Stop the robot, and resume its driver at the end of `past`. Raises UserError."""
+def resume_driver(driver: Driver, name: str, history: DriverHistory) -> None:
+    """Stop the robot, and resume its driver at the end of `history`. Raises UserError."""
     resume = getattr(driver, "resume", None)
     if not callable(resume):
         raise UserError(
@@ -66,7 +66,7 @@ def resume_driver(driver: Driver, name: str, past: DriverPast) -> None:
         )
     try:
         driver.stop()
-        resume(past.tick, past.mark)
+        resume(history.tick, history.mark)
     except Exception as error:  # noqa: BLE001  # as above
         raise UserError(f"{name}: cannot resume: {type(error).__name__}: {error}") from None
 
@@ -96,6 +96,6 @@ def mission(source: str, robot: str) -> Scenario:
     return scenario
 
 
-def briefed(scenario: Scenario, robot: str, manoeuvre_s: float) -> RobotConfig:
+def config_of(scenario: Scenario, robot: str, manoeuvre_s: float) -> RobotConfig:
     """Return the configuration of `robot`; a tick lasts a manoeuvre and the part THINKING of one at rest."""
     return scenario.config(robot, (1.0 + THINKING) * manoeuvre_s)

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from agent.process.agent_journal import FramedReport
 from agent.process.robot import Robot
-from compose.recording.run import WORLD_JOURNAL, Run, agent_journal
+from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
+from compose.recording.run import Run
 from protocol.journal import environment
 from protocol.journal.journal_file import Journal, Sink
 from protocol.messages import Command, FinalReport, MissionEnd
@@ -16,7 +17,7 @@ from world.faults import LATEST
 from world.referee import MissionOutcome
 from world.scenario import Scenario
 from world.simulation import Simulation
-from world.world_journal import History, Tick
+from world.world_journal import Tick, WorldHistory
 
 
 def run_mission(scenario: Scenario, out: Path | None = None) -> Run:
@@ -68,7 +69,7 @@ def played(scenario: Scenario, sinks: Mapping[str, Sink]) -> Run:
     final_reports: dict[str, FinalReport] = {robot: robots[robot].final_report(end) for robot in ids}
     simulation.journal_final_reports(final_reports.values())
     mission_outcome = MissionOutcome(end.outcome, end.reason)
-    history = History(
+    history = WorldHistory(
         scenario, tuple(ticks), None, mission_outcome, end, final_reports, environment=environment.of_world()
     )
     return Run(history)

@@ -115,4 +115,6 @@ def _address(child: ChildProcess) -> str | None:
     with suppress(TimeoutError):
         while not line.endswith(b"\n") and (news := child.receive(give_up - time.monotonic())):
             line += news
-    return line.decode().strip() or None if line.endswith(b"\n") else None
+    if not line.endswith(b"\n"):
+        return None
+    return line.decode().strip() or None

@@ -1,21 +1,25 @@
-"""The recording of a run: its folder, its journals and their content."""
+"""The one model of a run, read from its journals. The ground truth is optional."""
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import msgspec
 from msgspec.structs import replace
 
-from compose.errors import UserError
-from compose.recording.cast import Stage, of_configs, of_scenario
 from compose.recording.claim import Claim, claim
-from protocol.journal import journal_file
+from compose.recording.recording_files import (
+    WORLD_JOURNAL,
+    JournalFile,
+    agent_journal,
+    journals_in,
+    opened,
+    robot_of,
+)
+from compose.recording.run_setup import RunSetup, of_configs, of_scenario
 from protocol.journal.journal_file import CorruptJournal
 from protocol.messages import (
     Command,
@@ -34,67 +38,11 @@ from protocol.wire import MalformedFrame
 from world import world_journal
 from world.scenario import Scenario
 from world.tick import observations
-from world.world_journal import History, Tick
+from world.world_journal import Tick, WorldHistory
 
 if TYPE_CHECKING:
     from agent.process import agent_journal as of_agent
-    from agent.process.agent_journal import Past
-WORLD_JOURNAL = "world.journal"
-
-
-def agent_journal(robot: str) -> str:
-    """Return the file name of the journal of the agent of `robot`."""
-    return f"agent-{robot}.journal"
-
-
-def robot_of(name: str) -> str:
-    """Return the robot of an agent's journal, from its file name."""
-    return name.removeprefix("agent-").removesuffix(".journal")
-
-
-def journals_in(folder: Path) -> list[Path]:
-    """Return the paths of the journals in `folder`, the world's first."""
-    world = folder / WORLD_JOURNAL
-    return [*([world] if world.exists() else []), *sorted(folder.glob(agent_journal("*")))]
-
-
-@contextmanager
-def folder_for(out: Path | None) -> Iterator[Path]:
-    """Yield the folder of a recording: `out`, created if necessary, or a temporary one. Raises UserError."""
-    if out is None:
-        with tempfile.TemporaryDirectory(prefix="tandem-") as folder:
-            yield Path(folder)
-        return
-    make(out)
-    yield out
-
-
-def make(out: Path) -> None:
-    """Create the folder `out` and check that it is writable. Raises UserError if it is not."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=out):
-            pass
-    except OSError as error:
-        raise UserError(cannot_write(out, error)) from None
-
-
-def cannot_write(out: Path, error: OSError) -> str:
-    """Return the message for the user that `out` cannot be written."""
-    return f"--out: {out} cannot be written: {error.strerror or error}"
-
-
-class JournalFile(msgspec.Struct, frozen=True):
-    """A journal on disk."""
-
-    frames: list[bytes]
-    """The complete frames."""
-    torn: int = 0
-    """The number of bytes of a torn write at the end."""
-    messages: list[Any] = []
-    """The messages in `frames`, up to the first that is damaged or out of order."""
-    problem: OSError | CorruptJournal | None = None
-    """The error because of which not all of it can be read; None for a frame out of order."""
+    from agent.process.agent_journal import AgentHistory
 
 
 class Run(msgspec.Struct, frozen=True, dict=True):
@@ -104,9 +52,9 @@ class Run(msgspec.Struct, frozen=True, dict=True):
     such robot.
     """
 
-    world: History | None
+    world: WorldHistory | None
     """The content of the world's journal; None in hardware mode, where there is no ground truth."""
-    pasts: dict[str, Past] = {}
+    agents: dict[str, AgentHistory] = {}
     """The content of each agent's journal, by robot, up to its first frame that is damaged or out of order.
 
     Robots without a RobotConfig are omitted.
@@ -119,7 +67,7 @@ class Run(msgspec.Struct, frozen=True, dict=True):
     # --- static data ---
 
     @property
-    def history(self) -> History:
+    def history(self) -> WorldHistory:
         """The content of the world's journal. Raises FileNotFoundError if there is none."""
         if self.world is None:
             raise FileNotFoundError(f"{self.source}: there is no {WORLD_JOURNAL}")
@@ -143,17 +91,17 @@ class Run(msgspec.Struct, frozen=True, dict=True):
         if self.world is not None:
             ids = self.robots
             return tuple([(ids[a], ids[b]) for a, b in self.world.scenario.pairs()])
-        configs = [past.config for past in self.pasts.values()]
+        configs = [agent.config for agent in self.agents.values()]
         pairs = [(one.robot, one.peer) if one.role == "a" else (one.peer, one.robot) for one in configs]
         paired = {robot for pair in pairs for robot in pair}
         return (*dict.fromkeys(pairs), *[(robot,) for robot in self.robots if robot not in paired])
 
     @cached_property
-    def stage(self) -> Stage | None:
+    def setup(self) -> RunSetup | None:
         """The robots and the parameters of the mission; None if no journal contains them."""
         if self.world is not None:
             return of_scenario(self.world.scenario)
-        configs = {robot: past.config for robot, past in self.pasts.items()}
+        configs = {robot: agent.config for robot, agent in self.agents.items()}
         return of_configs(Path(str(self.source)).name, configs) if configs else None
 
     # --- ticks ---
@@ -168,7 +116,7 @@ class Run(msgspec.Struct, frozen=True, dict=True):
         """The number of complete ticks of the world's journal; in hardware mode, of the longest journal."""
         if self.world is not None:
             return len(self.world.ticks)
-        return max([len(past.steps) for past in self.pasts.values()], default=0)
+        return max([len(agent.steps) for agent in self.agents.values()], default=0)
 
     @cached_property
     def observations(self) -> tuple[dict[str, Observation], ...]:
@@ -181,9 +129,9 @@ class Run(msgspec.Struct, frozen=True, dict=True):
         return tuple(
             [
                 {
-                    robot: past.steps[tick].observation
-                    for robot, past in self.pasts.items()
-                    if tick < len(past.steps)
+                    robot: agent.steps[tick].observation
+                    for robot, agent in self.agents.items()
+                    if tick < len(agent.steps)
                 }
                 for tick in range(self.length)
             ]
@@ -196,7 +144,7 @@ class Run(msgspec.Struct, frozen=True, dict=True):
         In hardware mode, it always may.
         """
         failed = self.world is None or (self.world.end is not None and self.world.end.outcome == "failed")
-        return failed or any(past.config.tick_s is not None for past in self.pasts.values())
+        return failed or any(agent.config.tick_s is not None for agent in self.agents.values())
 
     def contact(self, robot: str, tick: int) -> Contact | None:
         """Return the contact in the Observation of `robot` at `tick`; None if it is unknown."""
@@ -208,7 +156,7 @@ class Run(msgspec.Struct, frozen=True, dict=True):
         """Return the Command of `robot` at `tick`; None if it was late or is unknown."""
         if self.world is not None:
             return self.world.ticks[tick].commands.get(robot) if tick < len(self.world.ticks) else None
-        steps = self.pasts[robot].steps if robot in self.pasts else ()
+        steps = self.agents[robot].steps if robot in self.agents else ()
         return steps[tick].command if tick < len(steps) else None
 
     def driven(self, robot: str, tick: int) -> Controls | None:
@@ -217,7 +165,7 @@ class Run(msgspec.Struct, frozen=True, dict=True):
         None in the last tick.
         """
         if self.world is None:
-            steps = self.pasts[robot].steps
+            steps = self.agents[robot].steps
             return steps[tick + 1].observation.executed if tick + 1 < len(steps) else None
         if tick + 1 >= len(self.world.ticks):
             return None
@@ -238,9 +186,9 @@ class Run(msgspec.Struct, frozen=True, dict=True):
     def _place(self) -> dict[str, int]:
         return {robot: place for place, robot in enumerate(self.robots)}
 
-    # --- what the robots found ---
+    # --- the agents and their claims ---
 
-    def past(self, robot: str) -> Past | None:
+    def agent(self, robot: str) -> AgentHistory | None:
         """Return the content of the journal of `robot`; None if it has no RobotConfig.
 
         Raises FileNotFoundError if there is no journal and OSError if it cannot be read. Raises
@@ -251,13 +199,13 @@ class Run(msgspec.Struct, frozen=True, dict=True):
         if name not in self.journals:
             raise FileNotFoundError(f"{self.source}: there is no {name}")
         self.readable(name)
-        past = self.pasts.get(robot)
-        if past is not None and past.disorder is not None:
-            raise CorruptJournal(f"{self.source}/{name}: {past.disorder.what}")
-        if past is not None and self.world is not None and not self.world.scenario.is_of(past.config):
+        agent = self.agents.get(robot)
+        if agent is not None and agent.unexpected is not None:
+            raise CorruptJournal(f"{self.source}/{name}: {agent.unexpected.what}")
+        if agent is not None and self.world is not None and not self.world.scenario.is_of(agent.config):
             what = "belongs to another run: its configuration does not match the world's"
             raise CorruptJournal(f"{self.source}/{name}: {what}")
-        return past
+        return agent
 
     def readable(self, *names: str) -> None:
         """Raise the problem of the first of the journals `names` that has one: OSError or CorruptJournal."""
@@ -266,9 +214,9 @@ class Run(msgspec.Struct, frozen=True, dict=True):
                 raise problem
 
     def estimates(self, robot: str) -> tuple[Estimate, ...]:
-        """Return the Estimates in the journal of `robot`. Raises OSError and CorruptJournal like `past`."""
-        past = self.past(robot)
-        return past.estimates if past is not None else ()
+        """Return the Estimates in the journal of `robot`. Raises OSError and CorruptJournal like `agent`."""
+        agent = self.agent(robot)
+        return agent.estimates if agent is not None else ()
 
     def claim(self, robot: str) -> Claim | None:
         """Return the first claim of `robot`, with its errors; None if it made none, and in hardware mode."""
@@ -285,7 +233,7 @@ class Run(msgspec.Struct, frozen=True, dict=True):
         """The end of the mission; None if the recording breaks off."""
         if self.world is not None:
             return self.world.end
-        return next((past.end for past in self.pasts.values() if past.end is not None), None)
+        return next((agent.end for agent in self.agents.values() if agent.end is not None), None)
 
     @property
     def final_reports(self) -> dict[str, FinalReport]:
@@ -293,7 +241,9 @@ class Run(msgspec.Struct, frozen=True, dict=True):
         if self.world is not None:
             return self.world.final_reports
         return {
-            robot: past.final_report for robot, past in self.pasts.items() if past.final_report is not None
+            robot: agent.final_report
+            for robot, agent in self.agents.items()
+            if agent.final_report is not None
         }
 
     def title(self, pair: Sequence[str]) -> str:
@@ -305,18 +255,18 @@ class Run(msgspec.Struct, frozen=True, dict=True):
             one, last, end = self.world.scenario, len(self.world.ticks) - 1, self.world.end
             how = ended(end.outcome, last, end.reason) if end is not None else broken_off(last)
             return f"{one.name}, seed {one.seed}, {one.planner_name}: {how}"
-        pasts = {robot: self.pasts[robot] for robot in pair}
-        planner_name = next(iter(pasts.values())).config.planner_name
-        return f"{' and '.join(pasts)} in hardware mode, {planner_name}: {_outcome(pasts)}"
+        agents = {robot: self.agents[robot] for robot in pair}
+        planner_name = next(iter(agents.values())).config.planner_name
+        return f"{' and '.join(agents)} in hardware mode, {planner_name}: {_outcome(agents)}"
 
 
-def _outcome(pasts: Mapping[str, Past]) -> str:
+def _outcome(agents: Mapping[str, AgentHistory]) -> str:
     """Return the outcome that each robot recorded, in one line; if all agree, once."""
     ends = {
-        robot: ended(past.end.outcome, past.end.tick, past.end.reason)
-        if past.end is not None
-        else broken_off(len(past.steps) - 1)
-        for robot, past in pasts.items()
+        robot: ended(agent.end.outcome, agent.end.tick, agent.end.reason)
+        if agent.end is not None
+        else broken_off(len(agent.steps) - 1)
+        for robot, agent in agents.items()
     }
     if len(set(ends.values())) == 1:
         return next(iter(ends.values()))
@@ -341,19 +291,10 @@ def read(folder: Path, *, audited: bool = False) -> Run:
     CorruptJournal also if there is no such journal and two peers' journals are of different runs.
     """
     paths = journals_in(folder) or [folder / WORLD_JOURNAL]
-    run = of_journals({path.name: _opened(path) for path in paths}, folder)
-    if not audited and run.world is not None and run.world.disorder is not None:
-        raise CorruptJournal(f"{folder / WORLD_JOURNAL}: {run.world.disorder.what}")
+    run = of_journals({path.name: opened(path) for path in paths}, folder)
+    if not audited and run.world is not None and run.world.unexpected is not None:
+        raise CorruptJournal(f"{folder / WORLD_JOURNAL}: {run.world.unexpected.what}")
     return run
-
-
-def _opened(path: Path) -> JournalFile:
-    try:
-        return JournalFile(*journal_file.torn(path))
-    except (OSError, CorruptJournal) as error:
-        if path.name == WORLD_JOURNAL or isinstance(error, journal_file.OtherVersion):
-            raise
-        return JournalFile([], problem=error)
 
 
 def of_frames(journals: Mapping[str, Iterable[bytes]], source: object = "the recording") -> Run:
@@ -367,23 +308,23 @@ def of_frames(journals: Mapping[str, Iterable[bytes]], source: object = "the rec
 def of_journals(journals: Mapping[str, JournalFile], source: object) -> Run:
     """Return the run in `journals`, whose frames have not been decoded yet. Raises like `of_frames`."""
     decoded: dict[str, JournalFile] = {}
-    world: History | None = None
-    pasts: dict[str, Past] = {}
+    world: WorldHistory | None = None
+    agents: dict[str, AgentHistory] = {}
     for name, one in journals.items():
         if name == WORLD_JOURNAL:
             decoded[name], world = _world(one, f"{source}/{name}")
         else:
-            decoded[name], past = _agent(one, robot_of(name), f"{source}/{name}")
-            if past is not None:
-                pasts[robot_of(name)] = past
+            decoded[name], agent = _agent(one, robot_of(name), f"{source}/{name}")
+            if agent is not None:
+                agents[robot_of(name)] = agent
     if world is None:
-        _agree({robot: past.config for robot, past in pasts.items()}, source)
-        return Run(None, pasts, decoded, source)
+        _agree({robot: agent.config for robot, agent in agents.items()}, source)
+        return Run(None, agents, decoded, source)
     ids = [robot.id for robot in world.scenario.robots]
-    return Run(world, {robot: pasts[robot] for robot in ids if robot in pasts}, decoded, source)
+    return Run(world, {robot: agents[robot] for robot in ids if robot in agents}, decoded, source)
 
 
-def _world(journal: JournalFile, source: str) -> tuple[JournalFile, History]:
+def _world(journal: JournalFile, source: str) -> tuple[JournalFile, WorldHistory]:
     reading = world_journal.WorldJournalReading()
     problem = _take(reading, journal.frames, source)
     content = reading.content()
@@ -394,15 +335,15 @@ def _world(journal: JournalFile, source: str) -> tuple[JournalFile, History]:
     return replace(journal, messages=reading.messages), content
 
 
-def _agent(journal: JournalFile, robot: str, source: str) -> tuple[JournalFile, Past | None]:
+def _agent(journal: JournalFile, robot: str, source: str) -> tuple[JournalFile, AgentHistory | None]:
     from agent.process import agent_journal as of_agent  # noqa: PLC0415  # a launcher has no such journal
 
     reading = of_agent.AgentJournalReading()
     problem = journal.problem or _take(reading, journal.frames, source)
-    past = reading.content()
-    if past is not None and past.config.robot != robot:
-        problem, past = CorruptJournal(f"{source} is the journal of {past.config.robot}"), None
-    return replace(journal, messages=reading.messages, problem=problem), past
+    agent = reading.content()
+    if agent is not None and agent.config.robot != robot:
+        problem, agent = CorruptJournal(f"{source} is the journal of {agent.config.robot}"), None
+    return replace(journal, messages=reading.messages, problem=problem), agent
 
 
 def _take(
@@ -444,16 +385,3 @@ def _shared(config: RobotConfig, robot: str) -> tuple[object, ...]:
         config.rendezvous,
         config.tick_s,
     )
-
-
-@contextmanager
-def user_errors(folder: Path) -> Iterator[None]:
-    """Raise UserError, with one line, for every error that prevents reading the recording in `folder`."""
-    try:
-        yield
-    except FileNotFoundError:
-        raise UserError(f"{folder} contains no recording: there is no {WORLD_JOURNAL}") from None
-    except OSError as error:
-        raise UserError(f"{folder} cannot be read: {error.strerror or error}") from None
-    except CorruptJournal as error:
-        raise UserError(str(error)) from None

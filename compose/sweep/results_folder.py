@@ -19,7 +19,7 @@ import pyarrow as pa
 import tomli_w
 
 from compose.errors import UserError
-from compose.recording.run import make
+from compose.recording.recording_files import make_folder
 from compose.sweep.cells import Cell, cells, label
 from compose.sweep.field_paths import canonical
 from compose.sweep.spec import Sweep
@@ -131,7 +131,7 @@ def opened(path: Path, sweep: Sweep) -> Iterator[Folder]:
     still empty at the end is removed.
     """
     new = not path.exists()
-    make(path)
+    make_folder(path)
     lock = os.open(path, os.O_RDONLY)
     try:
         try:

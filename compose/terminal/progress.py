@@ -10,7 +10,7 @@ from typing import Any
 from rich.live import Live
 from rich.table import Table
 
-from compose.recording.run import WORLD_JOURNAL
+from compose.recording.recording_files import WORLD_JOURNAL
 from compose.recording.summary_json import outcome_line
 from compose.terminal import tables, text_width
 from protocol.journal.journal_file import Tail

@@ -7,8 +7,8 @@ from typing import Literal
 
 import msgspec
 
-from compose.recording.cast import Stage
-from compose.view.facts import Facts
+from compose.recording.run_setup import RunSetup
+from compose.view.run_data import TickData
 from protocol.messages import Contact
 
 Passing = Literal["sent", "heard", "damaged", "lost"]
@@ -25,17 +25,17 @@ class Passage(msgspec.Struct, frozen=True):
     """The kind of event. "lost" is known only from the world's journal."""
 
 
-def passages(stage: Stage, before: Facts | None, now: Facts) -> Iterator[Passage]:
+def passages(setup: RunSetup, before: TickData | None, now: TickData) -> Iterator[Passage]:
     """Yield the deliveries on every link in the tick of `now`, in the order of the senders.
 
     Each link yields the report sent, then those received, damaged and lost.
     """
-    for seat in stage.robots:
-        link = seat.id, seat.peer
-        sent = seat.id in now.reports or contact_of(now, seat.id, seat.peer) is not None
+    for robot_setup in setup.robots:
+        link = robot_setup.id, robot_setup.peer
+        sent = robot_setup.id in now.reports or contact_of(now, robot_setup.id, robot_setup.peer) is not None
         if sent:
             yield Passage(*link, now.tick, "sent")
-        contact = contact_of(now, seat.peer, seat.id)
+        contact = contact_of(now, robot_setup.peer, robot_setup.id)
         received, damaged = (contact.heard or (), contact.damaged) if contact is not None else ((), ())
         yield from [Passage(*link, tick, "heard") for tick in received]
         yield from [Passage(*link, tick, "damaged") for tick in damaged]
@@ -46,7 +46,7 @@ def passages(stage: Stage, before: Facts | None, now: Facts) -> Iterator[Passage
                 yield Passage(*link, tick, "lost")
 
 
-def contact_of(now: Facts, robot: str, peer: str) -> Contact | None:
+def contact_of(now: TickData, robot: str, peer: str) -> Contact | None:
     """Return the contact with `peer` in `robot`'s observation; None if there is none or it is unknown."""
     observation = now.observations.get(robot)
     return (

@@ -9,9 +9,9 @@ from typing import Literal
 
 import msgspec
 
-from compose.recording.cast import Seat, Stage
+from compose.recording.run_setup import RobotSetup, RunSetup
 from compose.view.deliveries import Passage, contact_of
-from compose.view.facts import Facts
+from compose.view.run_data import TickData
 from compose.view.words import doing
 from protocol.messages import Command, Inconsistent, Localised, MissionEnd
 from protocol.motion import wrap
@@ -35,25 +35,29 @@ class Event(msgspec.Struct, frozen=True):
 
 
 def events(
-    stage: Stage, before: Facts | None, now: Facts, passages: Sequence[Passage], end: MissionEnd | None
+    setup: RunSetup,
+    before: TickData | None,
+    now: TickData,
+    passages: Sequence[Passage],
+    end: MissionEnd | None,
 ) -> Iterator[Event]:
     """Yield the events of the tick of `now`: process events, then those of each robot, then of the radio.
 
     `before` is the previous tick, if it is known.
     """
-    for robot in (None, *stage.ids):
+    for robot in (None, *setup.ids):
         yield from _presence(robot, before, now)
-    for seat in stage.robots:
-        yield from _sensing(seat, before, now)
-        yield from _deciding(seat, before, now)
-        yield from _believing(seat, before, now)
+    for robot_setup in setup.robots:
+        yield from _sensing(robot_setup, before, now)
+        yield from _deciding(robot_setup, before, now)
+        yield from _believing(robot_setup, before, now)
     yield from _radio(now.tick, passages)
     if end is not None and end.tick == now.tick:
         why = f" ({end.reason})" if end.reason else ""
         yield Event(now.tick, "end", None, f"The mission ends: {end.outcome}{why}")
 
 
-def _presence(robot: str | None, before: Facts | None, now: Facts) -> Iterator[Event]:
+def _presence(robot: str | None, before: TickData | None, now: TickData) -> Iterator[Event]:
     name = robot or "The world"
     if robot in now.down and (before is None or robot not in before.down - before.back):
         yield Event(now.tick, "down", robot, f"{name} is down: its process is gone")
@@ -80,8 +84,8 @@ def _radio(tick: int, passages: Sequence[Passage]) -> Iterator[Event]:
             yield Event(tick, "report-doubled", receiver, text)
 
 
-def _sensing(seat: Seat, before: Facts | None, now: Facts) -> Iterator[Event]:
-    robot, peer, tick = seat.id, seat.peer, now.tick
+def _sensing(robot_setup: RobotSetup, before: TickData | None, now: TickData) -> Iterator[Event]:
+    robot, peer, tick = robot_setup.id, robot_setup.peer, now.tick
     observation = now.observations.get(robot)
     earlier = before.observations.get(robot) if before is not None else None
     if observation is None or (before is not None and earlier is None):
@@ -92,7 +96,9 @@ def _sensing(seat: Seat, before: Facts | None, now: Facts) -> Iterator[Event]:
         yield Event(tick, "anchor", robot, text)
     if was is not None and observation.anchor_range is None:
         yield Event(tick, "anchor-lost", robot, f"{robot} is out of its anchor's range")
-    if seat.role == "b" and peer in now.observations:  # the events of a pair are yielded once, for role a
+    if (
+        robot_setup.role == "b" and peer in now.observations
+    ):  # the events of a pair are yielded once, for role a
         return
     contact = contact_of(now, robot, peer)
     near = before is not None and contact_of(before, robot, peer) is not None
@@ -103,12 +109,12 @@ def _sensing(seat: Seat, before: Facts | None, now: Facts) -> Iterator[Event]:
         yield Event(tick, "contact-lost", robot, f"{robot} and {peer} have lost contact")
 
 
-def _deciding(seat: Seat, before: Facts | None, now: Facts) -> Iterator[Event]:
-    robot, tick = seat.id, now.tick
+def _deciding(robot_setup: RobotSetup, before: TickData | None, now: TickData) -> Iterator[Event]:
+    robot, tick = robot_setup.id, now.tick
     if robot in now.late:
         yield Event(tick, "late", robot, f"{robot} misses the deadline and stops for this tick")
     if robot in now.without:
-        text = f"{robot} decides without {seat.peer}'s report, which missed the deadline"
+        text = f"{robot} decides without {robot_setup.peer}'s report, which missed the deadline"
         yield Event(tick, "late", robot, text)
     command = now.commands.get(robot)
     earlier = before.commands.get(robot) if before is not None else None
@@ -117,13 +123,13 @@ def _deciding(seat: Seat, before: Facts | None, now: Facts) -> Iterator[Event]:
     if earlier is None or command.phase != earlier.phase:
         yield Event(tick, "phase", robot, f"{robot} begins phase {command.phase}: {PHASES[command.phase]}")
     if (earlier is None or command.state != earlier.state) and command.verdict is None:
-        yield Event(tick, "state", robot, doing(seat, command.phase, command.state, None))
+        yield Event(tick, "state", robot, doing(robot_setup, command.phase, command.state, None))
     if command.verdict is not None and (earlier is None or earlier.verdict is None):
-        yield _verdict(seat, command, now)
+        yield _verdict(robot_setup, command, now)
 
 
-def _verdict(seat: Seat, command: Command, now: Facts) -> Event:
-    robot = seat.id
+def _verdict(robot_setup: RobotSetup, command: Command, now: TickData) -> Event:
+    robot = robot_setup.id
     match command.verdict:
         case Localised(pose):
             x, y, heading = pose.x, pose.y, wrap(pose.heading)
@@ -134,15 +140,15 @@ def _verdict(seat: Seat, command: Command, now: Facts) -> Event:
             return Event(now.tick, "claim", robot, text)
         case verdict:
             kind: Kind = "inconsistent" if isinstance(verdict, Inconsistent) else "undecided"
-            return Event(now.tick, kind, robot, doing(seat, command.phase, command.state, verdict))
+            return Event(now.tick, kind, robot, doing(robot_setup, command.phase, command.state, verdict))
 
 
 PHASES = {1: "localisation relative to its anchor", 2: "search for its peer", 3: "encounter"}
 """The names of the paper's phases, by number."""
 
 
-def _believing(seat: Seat, before: Facts | None, now: Facts) -> Iterator[Event]:
-    robot, tick = seat.id, now.tick
+def _believing(robot_setup: RobotSetup, before: TickData | None, now: TickData) -> Iterator[Event]:
+    robot, tick = robot_setup.id, now.tick
     held = now.estimates.get(robot)
     earlier = before.estimates.get(robot) if before is not None else None
     if held is None or earlier is None:

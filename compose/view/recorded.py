@@ -6,10 +6,11 @@ from pathlib import Path
 
 import msgspec
 
-from compose.recording.cast import Stage, of_configs, of_scenario
-from compose.recording.run import WORLD_JOURNAL, Run, agent_journal, journals_in, robot_of
+from compose.recording.recording_files import WORLD_JOURNAL, agent_journal, journals_in, robot_of
+from compose.recording.run import Run
+from compose.recording.run_setup import RunSetup, of_configs, of_scenario
 from compose.recording.summary_json import SUMMARY
-from compose.view.facts import Gathering
+from compose.view.run_data import RunData
 from compose.view.scene import Scene, scene
 from protocol import files
 from protocol.journal.journal_file import CorruptJournal, OtherVersion, Tail
@@ -18,20 +19,20 @@ from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 from world.world_journal import WorldJournalReading
 
 
-def gathered(run: Run) -> Gathering:
-    """Return the facts of a recording. Those in the world's journal precede the same in an agent's."""
-    known = Gathering()
+def run_data(run: Run) -> RunData:
+    """Return the data of a recording. The world's journal takes precedence over those of the agents."""
+    known = RunData()
     if run.world is not None:
         for tick in run.world.ticks:
-            known.take_tick(tick)
+            known.add_tick(tick)
         if run.world.ahead is not None:
-            known.take_world(run.world.ahead)
+            known.add_world(run.world.ahead)
     for name, journal in run.journals.items():
         if name != WORLD_JOURNAL:
             for message, frame in zip(journal.messages, journal.frames, strict=False):
-                known.take(message, len(frame), robot_of(name))
+                known.add(message, len(frame), robot_of(name))
     if run.world is not None:
-        known.take_observations(run.world.worlds)
+        known.add_observations(run.world.worlds)
     if run.end is not None:
         known.conclude(run.end)
     known.final_reports = dict(run.final_reports)
@@ -40,10 +41,10 @@ def gathered(run: Run) -> Gathering:
 
 def scenes_of(run: Run) -> tuple[Scene, ...]:
     """Return the scenes of a recording; none if no journal has a configuration."""
-    return scenes(run.stage, gathered(run)) if run.stage is not None else ()
+    return scenes(run.setup, run_data(run)) if run.setup is not None else ()
 
 
-def scenes(stage: Stage, known: Gathering, first: int = 0, last: int | None = None) -> tuple[Scene, ...]:
+def scenes(setup: RunSetup, known: RunData, first: int = 0, last: int | None = None) -> tuple[Scene, ...]:
     """Return the scenes of the known ticks from `first` to `last`, inclusive."""
     last = known.last if last is None else min(last, known.last)
     before = known.ticks.get(first - 1)
@@ -51,7 +52,7 @@ def scenes(stage: Stage, known: Gathering, first: int = 0, last: int | None = No
     for tick in range(first, last + 1):
         now = known.ticks.get(tick)
         if now is not None:
-            shown.append(scene(stage, before, now, known.end))
+            shown.append(scene(setup, before, now, known.end))
         before = now
     return tuple(shown)
 
@@ -61,8 +62,8 @@ class Journals:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.known = Gathering()
-        self.stage: Stage | None = None
+        self.known = RunData()
+        self.setup: RunSetup | None = None
         """The static data of the run; None until a scenario or a configuration has been read."""
         self.notes: list[str] = []
         """One line per damaged journal. Its frames after the damage are ignored."""
@@ -91,14 +92,14 @@ class Journals:
             for robot in [robot for robot, one in configs.items() if not scenario.is_of(one)]:
                 path = self.folder / agent_journal(robot)
                 self._note(f"{path}: belongs to another run: its configuration does not match the world's")
-        if world is None and len(configs) > (len(self.stage.robots) if self.stage is not None else 0):
-            self.stage = of_configs(self.folder.name, configs)
+        if world is None and len(configs) > (len(self.setup.robots) if self.setup is not None else 0):
+            self.setup = of_configs(self.folder.name, configs)
 
     def fill(self) -> None:
         """Compute missing observations from the world's journal. Call once the journals are complete."""
         content = self._world.content()
         if content is not None:
-            self.known.take_observations(content.worlds)
+            self.known.add_observations(content.worlds)
 
     def _note(self, text: str) -> None:
         if text not in self.notes:
@@ -107,25 +108,25 @@ class Journals:
     def _fold_agent(self, frames: list[bytes], path: Path) -> None:
         robot = robot_of(path.name)
         for frame in frames:
-            self.known.take(decode(frame, OfRobot, MAX_FRAME_BYTES), len(frame), robot)
+            self.known.add(decode(frame, OfRobot, MAX_FRAME_BYTES), len(frame), robot)
 
     def _fold_world(self, frames: list[bytes], path: Path) -> None:
         reading = self._world
         first_new = len(reading.ticks)
         for frame in frames:
-            if reading.disorder is not None:
+            if reading.unexpected is not None:
                 break
             if not reading.take(frame):
-                assert reading.disorder is not None
-                self._note(f"{path}: {reading.disorder.what}; all later frames are ignored")
+                assert reading.unexpected is not None
+                self._note(f"{path}: {reading.unexpected.what}; all later frames are ignored")
         if reading.world is None:
             return
-        if self.stage is None or self.stage.seed is None:
-            self.stage = of_scenario(reading.world.scenario, self._mode())
+        if self.setup is None or self.setup.seed is None:
+            self.setup = of_scenario(reading.world.scenario, self._mode())
         for tick in reading.ticks[first_new:]:
-            self.known.take_tick(tick)
+            self.known.add_tick(tick)
         if reading.mission_outcome is None:
-            self.known.take_world(reading.world)
+            self.known.add_world(reading.world)
         if reading.end is not None:
             self.known.conclude(reading.end)
         self.known.final_reports.update(reading.final_reports)

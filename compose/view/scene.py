@@ -1,13 +1,13 @@
-"""A scene: the visible data of one tick, derived from the facts of that tick and of the previous one."""
+"""A scene: the visible data of one tick, derived from the data of that tick and of the previous one."""
 
 from __future__ import annotations
 
 import msgspec
 
-from compose.recording.cast import Seat, Stage
+from compose.recording.run_setup import RobotSetup, RunSetup
 from compose.view.deliveries import Passage, passages
 from compose.view.events import Event, events
-from compose.view.facts import Facts
+from compose.view.run_data import TickData
 from compose.view.words import doing
 from protocol.messages import Contact, MissionEnd, Phase, Probability, Verdict, Word
 from protocol.motion import Controls, Covariance, Pose, wrap
@@ -40,7 +40,7 @@ class HeldPoses(msgspec.Struct, frozen=True):
     """The poses that a robot considers possible."""
 
     local: tuple[Pose, ...]
-    """The poses in the frame of the robot's anchor; see `Seat.frame`."""
+    """The poses in the frame of the robot's anchor; see `RobotSetup.frame`."""
     world: tuple[Pose, ...]
     """The poses in the world frame; empty before the robot has placed its anchor frame in it."""
     probability: tuple[Probability, ...]
@@ -79,7 +79,7 @@ class Scene(msgspec.Struct, frozen=True):
 
     tick: int
     players: tuple[Player, ...]
-    """One entry per robot, in the order of `Stage.robots`."""
+    """One entry per robot, in the order of `RunSetup.robots`."""
     passages: tuple[Passage, ...]
     events: tuple[Event, ...]
 
@@ -91,15 +91,15 @@ class Scene(msgspec.Struct, frozen=True):
         raise KeyError(robot)
 
 
-def scene(stage: Stage, before: Facts | None, now: Facts, end: MissionEnd | None = None) -> Scene:
+def scene(setup: RunSetup, before: TickData | None, now: TickData, end: MissionEnd | None = None) -> Scene:
     """Return the scene of the tick of `now`; `before` is the previous tick, if it is known."""
-    players = tuple([_player(seat, now) for seat in stage.robots])
-    deliveries = tuple(passages(stage, before, now))
-    return Scene(now.tick, players, deliveries, tuple(events(stage, before, now, deliveries, end)))
+    players = tuple([_player(robot_setup, now) for robot_setup in setup.robots])
+    deliveries = tuple(passages(setup, before, now))
+    return Scene(now.tick, players, deliveries, tuple(events(setup, before, now, deliveries, end)))
 
 
-def _player(seat: Seat, now: Facts) -> Player:
-    robot = seat.id
+def _player(robot_setup: RobotSetup, now: TickData) -> Player:
+    robot = robot_setup.id
     pose, observation, sent = now.truth.get(robot), now.observations.get(robot), now.reports.get(robot)
     command, estimate = now.commands.get(robot), now.estimates.get(robot)
     sentence = f"{robot} has not answered"
@@ -107,7 +107,7 @@ def _player(seat: Seat, now: Facts) -> Player:
     if down:
         sentence = f"{robot} is down: its process is gone"
     elif command is not None:
-        sentence = doing(seat, command.phase, command.state, command.verdict)
+        sentence = doing(robot_setup, command.phase, command.state, command.verdict)
     elif robot in now.late:
         sentence = f"{robot} has missed the deadline and stands still"
     return Player(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from compose.recording.cast import Seat
+from compose.recording.run_setup import RobotSetup
 from protocol.messages import Inconsistent, Undecided, Verdict
 
 SEEKING = {
@@ -38,15 +38,15 @@ WAITING = "{robot} waits beside its anchor until {peer} comes into range"
 """The sentence of the state "orbiting" of a robot whose plan has no speed."""
 
 
-def doing(seat: Seat, phase: int, state: str, verdict: Verdict | None) -> str:
+def doing(robot_setup: RobotSetup, phase: int, state: str, verdict: Verdict | None) -> str:
     """Return a sentence for the phase, state and verdict of a robot's Command."""
-    beacon = seat.peer if phase == 3 else "its anchor"
+    beacon = robot_setup.peer if phase == 3 else "its anchor"
     match verdict:
         case Undecided(reason):
-            return f"{seat.id} is undecided: {reason}"
+            return f"{robot_setup.id} is undecided: {reason}"
         case Inconsistent(claim):
-            return f"{seat.id} found an inconsistency in the reports of {seat.peer}: {claim}"
+            return f"{robot_setup.id} found an inconsistency in the reports of {robot_setup.peer}: {claim}"
     sentence = SEEKING.get(state) or DOING.get(state) or "{robot}: " + state
-    if state == "orbiting" and seat.orbit.v == 0.0:
+    if state == "orbiting" and robot_setup.orbit.v == 0.0:
         sentence = WAITING
-    return sentence.format(robot=seat.id, peer=seat.peer, beacon=beacon)
+    return sentence.format(robot=robot_setup.id, peer=robot_setup.peer, beacon=beacon)

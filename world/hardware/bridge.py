@@ -36,7 +36,7 @@ from protocol.network import keys, session
 from protocol.network.inbox import NOTHING, Arrival, Inbox
 from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode, encode
 from world.hardware.driver import THINKING, Driver, Reading
-from world.hardware.driver_journal import DriverPast, Mark
+from world.hardware.driver_journal import DriverHistory, Mark
 from world.hardware.termination import Ending
 
 REPEAT_S = 0.25
@@ -120,20 +120,20 @@ class Field:
         self.missed = 0
         """The number of ticks in which the robot rested because a Command was missing."""
 
-    def resume(self, past: DriverPast, known: int) -> None:
+    def resume(self, history: DriverHistory, known: int) -> None:
         """Continue at the end of the driver's journal. `known` is the latest tick in the agent's journal.
 
         The robot rested while this process was down, so the peer may be any number of ticks ahead.
         """
         self._restarted = True
-        for one in past.ticks:
+        for one in history.ticks:
             for report in one.reports:
                 self._ending.receive(report)
             self._end = self._ending.after(one.observation.tick, one.command, peer_there=True)
             self.missed += one.command is None
-        self._end = past.end or self._end
-        self._tick, self._resumed, self._astray = past.tick, past.tick >= 0, self._max_ticks + 1
-        self._unanswered.extend((one.observation.tick, one.frame) for one in past.ticks[known + 1 :])
+        self._end = history.end or self._end
+        self._tick, self._resumed, self._astray = history.tick, history.tick >= 0, self._max_ticks + 1
+        self._unanswered.extend((one.observation.tick, one.frame) for one in history.ticks[known + 1 :])
 
     @property
     def tick(self) -> int:

@@ -68,7 +68,7 @@ class DrivenTick(msgspec.Struct, frozen=True):
     """The peer's Reports that affect when the mission ends."""
 
 
-class DriverPast(msgspec.Struct, frozen=True):
+class DriverHistory(msgspec.Struct, frozen=True):
     """The content of a driver's journal, complete or up to where it breaks off."""
 
     ticks: tuple[DrivenTick, ...] = ()
@@ -90,7 +90,7 @@ class DriverPast(msgspec.Struct, frozen=True):
         return self.end is None and start is not None and not start.synced and start.boot != boot()
 
 
-def driver_past(frames: Sequence[bytes], config: RobotConfig, path: Path) -> DriverPast:
+def driver_history(frames: Sequence[bytes], config: RobotConfig, path: Path) -> DriverHistory:
     """Return the content of the journal at `path` from its `frames`.
 
     Raises CorruptJournal if a frame is malformed or out of order, or if it is not the mission of `config`.
@@ -123,7 +123,7 @@ def driver_past(frames: Sequence[bytes], config: RobotConfig, path: Path) -> Dri
                 end = message
             case _:
                 raise CorruptJournal(f"{path}: frame {place + 1}, {type(message).__name__}, is out of order")
-    return DriverPast(tuple(ticks), mark, end, start)
+    return DriverHistory(tuple(ticks), mark, end, start)
 
 
 def _message(

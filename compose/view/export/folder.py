@@ -8,9 +8,10 @@ from pathlib import Path
 import msgspec
 
 from compose.errors import UserError
-from compose.recording.cast import Stage
 from compose.recording.frames import in_time
-from compose.recording.run import WORLD_JOURNAL, Run, agent_journal, cannot_write, make
+from compose.recording.recording_files import WORLD_JOURNAL, agent_journal, cannot_write, make_folder
+from compose.recording.run import Run
+from compose.recording.run_setup import RunSetup
 from compose.recording.ticks_csv import rows, table
 from compose.view.export.parquet import frames_csv, write_ticks
 from compose.view.foxglove.mcap import TooLong, write_mcap
@@ -45,18 +46,18 @@ def export(
     Raises OSError or CorruptJournal if a journal cannot be read to its end, UserError if there is no
     configuration, the run is too long for a format or `out` cannot be written.
     """
-    robots, stage = _checked(run)
+    robots, setup = _checked(run)
     check()
     frames = in_time(run)
     ticks = list(rows(run))
     check()
-    make(out)
+    make_folder(out)
     paths = tuple([out / name for name in FILES])
     writers: Sequence[Callable[[Path], object]] = (
-        lambda path: write_mcap(stage, frames, scenes_of(run), path, check),
+        lambda path: write_mcap(setup, frames, scenes_of(run), path, check),
         lambda path: path.write_text(frames_csv(frames, check), encoding="utf-8"),
         lambda path: path.write_text(table(ticks), encoding="utf-8"),
-        lambda path: write_ticks(run, ticks, stage.mission.period, path),
+        lambda path: write_ticks(run, ticks, setup.mission.period, path),
     )
     try:
         for path, write in zip(paths, writers, strict=True):
@@ -76,16 +77,16 @@ def export(
     )
 
 
-def _checked(run: Run) -> tuple[Sequence[str], Stage]:
+def _checked(run: Run) -> tuple[Sequence[str], RunSetup]:
     """Return all robots of `run`, also those without a journal, and its static data. Raises like `export`."""
     run.readable(*run.journals)
     for robot in run.robots:
         if agent_journal(robot) in run.journals:
-            run.past(robot)
-    stage = run.stage
-    if stage is None:
+            run.agent(robot)
+    setup = run.setup
+    if setup is None:
         raise UserError(
             f"{run.source}: there is no {WORLD_JOURNAL}, and no robot's journal has a configuration"
         )
-    peers = [] if run.world is not None else [seat.peer for seat in stage.robots]
-    return list(dict.fromkeys([*run.robots, *sorted(peers)])), stage
+    peers = [] if run.world is not None else [robot_setup.peer for robot_setup in setup.robots]
+    return list(dict.fromkeys([*run.robots, *sorted(peers)])), setup

@@ -49,7 +49,7 @@ def write_ticks(run: Run, rows: Iterable[TickRow], period: float, path: Path) ->
 
     `period` is T_s in s.
     """
-    estimates = {(robot, one.tick): one for robot, past in run.pasts.items() for one in past.estimates}
+    estimates = {(robot, one.tick): one for robot, agent in run.agents.items() for one in agent.estimates}
     lines = []
     for row in rows:
         command = run.command(row.robot, row.tick)

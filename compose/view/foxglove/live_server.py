@@ -22,9 +22,9 @@ from foxglove import Context
 from foxglove.websocket import Capability, ChannelView, Client, ServerListener, WebSocketServer
 
 from compose.launch.signals import stop_by_signal, stop_with_launcher
-from compose.recording.cast import Stage
 from compose.recording.frames import JournalDecoder
-from compose.recording.run import WORLD_JOURNAL, agent_journal
+from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
+from compose.recording.run_setup import RunSetup
 from compose.view.foxglove.gate import GUESTS_FILES, Gate, private_host
 from compose.view.foxglove.mcap import Channels
 from compose.view.foxglove.views import Views, nanoseconds
@@ -75,18 +75,18 @@ class Live:
         """
         with suppress(OSError):
             self._journals.read()
-        stage = self._journals.stage
-        if stage is None or stage.seed is None:  # the world's journal has no scenario yet
+        setup = self._journals.setup
+        if setup is None or setup.seed is None:  # the world's journal has no scenario yet
             return None
         if self._views is None:
-            self._views = Views(stage)
-        self._publish_frames(stage)
-        ready = self._ready(stage, now)
+            self._views = Views(setup)
+        self._publish_frames(setup)
+        ready = self._ready(setup, now)
         first_shown = ready[0 if len(ready) <= BACKLOG else -1].tick if ready else 0
         for scene in ready:
             visible = scene.tick >= first_shown and self._channels.watched
             for view in self._views.of(scene) if visible else self._views.passing(scene):
-                self._channels.view(*view, nanoseconds(stage, scene.tick))
+                self._channels.view(*view, nanoseconds(setup, scene.tick))
         if ready:
             self._next = ready[-1].tick + 1
         due = self._once_more is not None and now >= self._once_more
@@ -95,24 +95,24 @@ class Live:
             self.subscribed = False
             self._channels.republish()
             for view in (self._views.standing(), *self._views.latest()):
-                self._channels.view(*view, nanoseconds(stage, max(0, self._next - 1)))
-        return nanoseconds(stage, self._next)
+                self._channels.view(*view, nanoseconds(setup, max(0, self._next - 1)))
+        return nanoseconds(setup, self._next)
 
-    def _publish_frames(self, stage: Stage) -> None:
-        for name in (WORLD_JOURNAL, *map(agent_journal, stage.ids)):
+    def _publish_frames(self, setup: RunSetup) -> None:
+        for name in (WORLD_JOURNAL, *map(agent_journal, setup.ids)):
             tail, decoder = self._tails.setdefault(name, (Tail(self._folder / name), JournalDecoder(name)))
             with suppress(OSError, CorruptJournal):
                 for one in decoder.decoded(tail.news()):
-                    self._channels.frame(one, nanoseconds(stage, one.tick))
+                    self._channels.frame(one, nanoseconds(setup, one.tick))
 
-    def _ready(self, stage: Stage, now: float) -> list[Scene]:
+    def _ready(self, setup: RunSetup, now: float) -> list[Scene]:
         """Return the next scenes that are complete, or incomplete for longer than WAIT_S.
 
         The last tick is ready only after the mission's end, because its data may still be arriving.
         """
         known = self._journals.known
         last = known.last if known.end is not None else known.last - 1
-        there = scenes(stage, known, self._next, last)
+        there = scenes(setup, known, self._next, last)
         for scene in there:
             self._since.setdefault(scene.tick, now)
         found = []

@@ -16,9 +16,9 @@ import msgspec
 from foxglove import Channel, Context, Schema
 from foxglove.mcap import MCAPWriteOptions
 
-from compose.recording.cast import Stage
 from compose.recording.frames import Journaled, OfWorld, kind_of
-from compose.recording.run import WORLD_JOURNAL, agent_journal
+from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
+from compose.recording.run_setup import RunSetup
 from compose.view.foxglove.schemas import schema
 from compose.view.foxglove.views import Views, nanoseconds, topics
 from compose.view.scene import Scene
@@ -107,7 +107,7 @@ class Channels:
 
 
 def write_mcap(
-    stage: Stage,
+    setup: RunSetup,
     frames: Sequence[Journaled],
     scenes: Sequence[Scene],
     path: Path,
@@ -119,8 +119,8 @@ def write_mcap(
     run is too long.
     """
     last = max([scene.tick for scene in scenes], default=0)
-    if nanoseconds(stage, last) >= LONGEST_S * 1_000_000_000:
-        raise TooLong(f"the run lasts {last * stage.mission.period:g} s; MCAP can represent {LONGEST_S} s")
+    if nanoseconds(setup, last) >= LONGEST_S * 1_000_000_000:
+        raise TooLong(f"the run lasts {last * setup.mission.period:g} s; MCAP can represent {LONGEST_S} s")
     context = Context()
     channels = Channels(context)
     try:
@@ -128,27 +128,27 @@ def write_mcap(
             output = _Output(file)
             options = MCAPWriteOptions(chunk_size=CHUNK_BYTES, compression_threads=0)
             with foxglove.open_mcap(output, context=context, writer_options=options):
-                _publish(stage, frames, scenes, channels, [output.check, check])
+                _publish(setup, frames, scenes, channels, [output.check, check])
             output.check()
     finally:
         channels.close()
 
 
 def _publish(
-    stage: Stage,
+    setup: RunSetup,
     frames: Sequence[Journaled],
     scenes: Sequence[Scene],
     channels: Channels,
     checks: Sequence[Callable[[], object]],
 ) -> None:
     """Publish everything, tick by tick: the journaled frames, then the scene."""
-    views = Views(stage)
-    channels.open_views(stage.ids)
+    views = Views(setup)
+    channels.open_views(setup.ids)
     both: Iterable[Journaled | Scene] = (*frames, *scenes)
-    tick, at = 0, nanoseconds(stage, 0)
+    tick, at = 0, nanoseconds(setup, 0)
     for one in sorted(both, key=lambda one: one.tick):
         if one.tick != tick:
-            tick, at = one.tick, nanoseconds(stage, one.tick)
+            tick, at = one.tick, nanoseconds(setup, one.tick)
         if isinstance(one, Journaled):
             channels.frame(one, at)
             continue

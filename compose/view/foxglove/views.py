@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from foxglove import messages as fox
 
-from compose.recording.cast import Seat, Stage
+from compose.recording.run_setup import RobotSetup, RunSetup
 from compose.view import colours
 from compose.view.events import Event
 from compose.view.foxglove import shapes
@@ -64,9 +64,9 @@ def topics(robots: Iterable[str]) -> dict[str, Any]:
     return found
 
 
-def nanoseconds(stage: Stage, tick: int) -> int:
+def nanoseconds(setup: RunSetup, tick: int) -> int:
     """Return the simulated time of `tick` in ns."""
-    return round(tick * stage.mission.period * 1e9)
+    return round(tick * setup.mission.period * 1e9)
 
 
 class Trail:
@@ -105,15 +105,15 @@ def _poses(poses: Sequence[fox.Pose], at: fox.Timestamp | None = None) -> fox.Po
 class Views:
     """The messages of a run. Scenes must be passed in the order of their ticks."""
 
-    def __init__(self, stage: Stage) -> None:
-        self.stage = stage
-        self._unit = BODY * stage.mission.sensing_range
-        self._trails = {robot: Trail() for robot in stage.ids}
+    def __init__(self, setup: RunSetup) -> None:
+        self.setup = setup
+        self._unit = BODY * setup.mission.sensing_range
+        self._trails = {robot: Trail() for robot in setup.ids}
         self._latest: Scene | None = None
 
     def standing(self) -> Shown:
         """Return the static content: anchors, sensing ranges and orbits."""
-        entities = [self._anchor(seat) for seat in self.stage.robots]
+        entities = [self._anchor(robot_setup) for robot_setup in self.setup.robots]
         return Shown("/stage", fox.SceneUpdate(entities=entities))
 
     def of(self, scene: Scene) -> Iterator[Shown]:
@@ -136,12 +136,12 @@ class Views:
         yield from self._lines(scene)
 
     def _lines(self, scene: Scene) -> Iterator[Shown]:
-        at = shapes.timestamp(nanoseconds(self.stage, scene.tick))
+        at = shapes.timestamp(nanoseconds(self.setup, scene.tick))
         for event in scene.events:
             yield Shown("/log", _line(event, at))
 
     def _whole(self, scene: Scene) -> Iterator[Shown]:
-        at = shapes.timestamp(nanoseconds(self.stage, scene.tick))
+        at = shapes.timestamp(nanoseconds(self.setup, scene.tick))
         yield Shown("/tf", fox.FrameTransforms(transforms=list(self._transforms(scene, at))))
         for player in scene.players:
             yield from self._robot(player, at)
@@ -151,7 +151,7 @@ class Views:
 
     def _transforms(self, scene: Scene, at: fox.Timestamp) -> Iterator[fox.FrameTransform]:
         for player in scene.players:
-            frames = {f"{player.robot}/anchor": _frame(self.stage.seat(player.robot))}
+            frames = {f"{player.robot}/anchor": _frame(self.setup.robot_setup(player.robot))}
             if player.pose is not None:
                 frames[player.robot] = player.pose
             for child, pose in frames.items():
@@ -164,36 +164,37 @@ class Views:
                 )
 
     def _robot(self, player: Player, at: fox.Timestamp) -> Iterator[Shown]:
-        robot, seat = player.robot, self.stage.seat(player.robot)
+        robot, robot_setup = player.robot, self.setup.robot_setup(player.robot)
         if player.pose is not None:
             pose = fox.PoseInFrame(timestamp=at, frame_id=WORLD, pose=shapes.pose(player.pose))
             yield Shown(f"/{robot}/pose", pose)
             yield Shown(f"/{robot}/trail", self._trails[robot].message(at))
-            yield Shown(f"/{robot}/body", fox.SceneUpdate(entities=[self._body(seat, player, at)]))
+            yield Shown(f"/{robot}/body", fox.SceneUpdate(entities=[self._body(robot_setup, player, at)]))
         if player.held is not None:
             frame, hypotheses = _hypotheses(robot, player.held)
             poses = [shapes.pose(one) for one in hypotheses]
             yield Shown(f"/{robot}/hypotheses", fox.PosesInFrame(timestamp=at, frame_id=frame, poses=poses))
-            belief = self._belief(seat, frame, hypotheses, player.held, at)
+            belief = self._belief(robot_setup, frame, hypotheses, player.held, at)
             yield Shown(f"/{robot}/belief", fox.SceneUpdate(entities=[belief]))
 
-    def _body(self, seat: Seat, player: Player, at: fox.Timestamp) -> fox.SceneEntity:
+    def _body(self, robot_setup: RobotSetup, player: Player, at: fox.Timestamp) -> fox.SceneEntity:
         """Return the drawing of a robot with its activity, its trail, and its anchor range if it has one."""
         assert player.pose is not None
-        colour = shapes.colour(COLOURS[seat.role])
-        lines, texts = [], [shapes.words(f"{seat.id}: {player.activity}", player.pose, self._unit, colour)]
-        trail = self._trails[seat.id].points
+        colour = shapes.colour(COLOURS[robot_setup.role])
+        lines = []
+        texts = [shapes.words(f"{robot_setup.id}: {player.activity}", player.pose, self._unit, colour)]
+        trail = self._trails[robot_setup.id].points
         if len(trail) > 1:
             lines.append(shapes.line(trail, colour, 2.0))
         if player.anchor_range is not None:
-            ends = [(player.pose.x, player.pose.y), (seat.anchor.x, seat.anchor.y)]
-            lines.append(shapes.strip(ends, shapes.colour(COLOURS[seat.role], 0.5), 1.5))
+            ends = [(player.pose.x, player.pose.y), (robot_setup.anchor.x, robot_setup.anchor.y)]
+            lines.append(shapes.strip(ends, shapes.colour(COLOURS[robot_setup.role], 0.5), 1.5))
             middle = Pose((ends[0][0] + ends[1][0]) / 2, (ends[0][1] + ends[1][1]) / 2, 0.0)
             texts.append(shapes.words(f"{player.anchor_range:.3f} m", middle, self._unit, colour))
         return fox.SceneEntity(
             timestamp=at,
             frame_id=WORLD,
-            id=seat.id,
+            id=robot_setup.id,
             arrows=[shapes.arrow(player.pose, self._unit, colour)],
             lines=lines,
             texts=texts,
@@ -201,28 +202,28 @@ class Views:
 
     # --- anchors and contacts ---
 
-    def _anchor(self, seat: Seat) -> fox.SceneEntity:
-        colour = COLOURS[seat.role]
-        centre = (seat.anchor.x, seat.anchor.y)
+    def _anchor(self, robot_setup: RobotSetup) -> fox.SceneEntity:
+        colour = COLOURS[robot_setup.role]
+        centre = (robot_setup.anchor.x, robot_setup.anchor.y)
         here = Pose(*centre, 0.0)
         size = fox.Vector3(x=self._unit, y=self._unit, z=self._unit)
         return fox.SceneEntity(
             timestamp=shapes.timestamp(0),
             frame_id=WORLD,
-            id=f"{seat.id}/anchor",
+            id=f"{robot_setup.id}/anchor",
             cubes=[fox.CubePrimitive(pose=shapes.pose(here), size=size, color=shapes.colour(colour))],
             lines=[
                 shapes.strip(
-                    shapes.circle(centre, self.stage.mission.sensing_range), shapes.colour(colour, 0.6), 1.5
+                    shapes.circle(centre, self.setup.mission.sensing_range), shapes.colour(colour, 0.6), 1.5
                 ),
-                shapes.strip(shapes.circle(centre, seat.orbit.radius), shapes.colour(GREY, 0.5), 1.0),
+                shapes.strip(shapes.circle(centre, robot_setup.orbit.radius), shapes.colour(GREY, 0.5), 1.0),
             ],
-            texts=[shapes.words(f"{seat.id}'s anchor", here, self._unit, shapes.colour(colour))],
+            texts=[shapes.words(f"{robot_setup.id}'s anchor", here, self._unit, shapes.colour(colour))],
         )
 
     def _contacts(self, scene: Scene, at: fox.Timestamp) -> Iterator[fox.SceneEntity]:
         """Yield one entity per pair. In contact it shows the link, the range and deliveries of reports."""
-        for one, other in self.stage.pairs():
+        for one, other in self.setup.pairs():
             a, b = scene.player(one.id), scene.player(other.id)
             contact = next((contact for contact in a.contacts if contact.peer == other.id), None)
             lines, texts = [], []
@@ -244,10 +245,10 @@ class Views:
     # --- hypotheses ---
 
     def _belief(
-        self, seat: Seat, frame: str, poses: Sequence[Pose], held: HeldPoses, at: fox.Timestamp
+        self, robot_setup: RobotSetup, frame: str, poses: Sequence[Pose], held: HeldPoses, at: fox.Timestamp
     ) -> fox.SceneEntity:
         """Return an arrow for each hypothesis, paler if less probable, and the error ellipse of the first."""
-        colour = COLOURS[seat.role]
+        colour = COLOURS[robot_setup.role]
         probability = held.probability or (1.0 / max(1, len(poses)),) * len(poses)
         lines = []
         if held.covariance is not None and held.world:
@@ -263,7 +264,7 @@ class Views:
         return fox.SceneEntity(
             timestamp=at,
             frame_id=frame,
-            id=seat.id,
+            id=robot_setup.id,
             arrows=[
                 shapes.arrow(pose, self._unit, shade) for pose, shade in zip(poses, shades, strict=False)
             ],
@@ -277,9 +278,9 @@ def _hypotheses(robot: str, held: HeldPoses) -> tuple[str, tuple[Pose, ...]]:
     return (WORLD, held.world) if held.world else (f"{robot}/anchor", held.local)
 
 
-def _frame(seat: Seat) -> Pose:
+def _frame(robot_setup: RobotSetup) -> Pose:
     """Return the robot's anchor frame in the world frame, unrotated if its heading is unknown."""
-    return seat.frame or Pose(seat.anchor.x, seat.anchor.y, 0.0)
+    return robot_setup.frame or Pose(robot_setup.anchor.x, robot_setup.anchor.y, 0.0)
 
 
 def _line(event: Event, at: fox.Timestamp) -> fox.Log:

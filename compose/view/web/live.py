@@ -10,9 +10,9 @@ from typing import Any
 
 import zenoh
 
-from compose.recording.cast import of_configs
-from compose.view.facts import Gathering
-from compose.view.web.sources import UNANSWERED, Show
+from compose.recording.run_setup import of_configs
+from compose.view.run_data import RunData
+from compose.view.web.sources import UNANSWERED, WatchedRun
 from protocol.messages import (
     Command,
     Estimate,
@@ -73,12 +73,12 @@ class RefusedFrame(ValueError):
     """A frame that does not belong under its key; the text says why."""
 
 
-class ReceivedMission(Show):
+class ReceivedMission(WatchedRun):
     """A mission, built from the frames received from the network."""
 
     def __init__(self, run: str) -> None:
-        super().__init__(run, Gathering())
-        self.stage = None
+        super().__init__(run, RunData())
+        self.setup = None
         self.live = True
         self._tick: int | None = None
         """The latest tick in a frame of the world; None before the first."""
@@ -99,10 +99,10 @@ class ReceivedMission(Show):
         if tick is not None and not self._timely(tick, by_world=source.kind in OF_WORLD):
             return
         configured = len(self.known.configs)
-        self.known.take(message, len(frame))
+        self.known.add(message, len(frame))
         if len(self.known.configs) > configured:
             order = sorted(self.known.configs)
-            self.stage = of_configs(self.name, {robot: self.known.configs[robot] for robot in order})
+            self.setup = of_configs(self.name, {robot: self.known.configs[robot] for robot in order})
         if self.known.end is not None:
             self.live = False
 
@@ -120,7 +120,7 @@ class ReceivedMission(Show):
 
     def poll(self) -> None:
         """Drop the oldest ticks beyond TICKS_KEPT, and apply changes of liveliness tokens."""
-        robots = len(self.stage.robots) if self.stage is not None else 1
+        robots = len(self.setup.robots) if self.setup is not None else 1
         while len(self.known.ticks) * robots > TICKS_KEPT:
             del self.known.ticks[next(iter(self.known.ticks))]
         if not self.live:  # the world may be the router: without it, robots' tokens disappear as well

@@ -31,7 +31,7 @@ from compose.view.recorded import scenes
 from compose.view.web import sweep_page
 from compose.view.web.origin import refusal
 from compose.view.web.site import Site
-from compose.view.web.sources import Show
+from compose.view.web.sources import WatchedRun
 
 LOOPBACK = "127.0.0.1"
 PAGE = Path(__file__).parent / "page"
@@ -86,16 +86,16 @@ class _Answers:
         show = self._site.shows.get(request.path_params["name"])
         if show is None:
             return _json({"error": "there is no such mission"}, 404)
-        return _json({"stage": show.stage, **_state(show), "version": show.version})
+        return _json({"stage": show.setup, **_state(show), "version": show.version})
 
     async def scenes(self, request: Request) -> Response:
         show = self._site.shows.get(request.path_params["name"])
-        if show is None or show.stage is None:
+        if show is None or show.setup is None:
             return _json({"error": "there is no such mission"}, 404)
         first = _number(request, "from", 0)
-        most = max(1, PLAYERS_AT_ONCE // len(show.stage.robots))
+        most = max(1, PLAYERS_AT_ONCE // len(show.setup.robots))
         last = min(_number(request, "to", show.known.last), first + most - 1, show.known.last)
-        shown = scenes(show.stage, show.known, first, last)
+        shown = scenes(show.setup, show.known, first, last)
         return _json({"from": first, "to": last, "version": show.version, "scenes": shown})
 
     async def news(self, request: Request) -> Response:
@@ -162,7 +162,7 @@ def _json(value: object, status: int = 200) -> Response:
     return Response(msgspec.json.encode(value), status, media_type="application/json")
 
 
-def _state(show: Show) -> dict[str, Any]:
+def _state(show: WatchedRun) -> dict[str, Any]:
     return {
         "last": show.head,
         "first": next(iter(show.known.ticks), 0),
@@ -187,7 +187,7 @@ async def _news(site: Site, name: str | None, version: int) -> AsyncIterator[byt
         if now != listed:
             event["list"] = listed = now
         show = site.shows.get(name or "")
-        if show is not None and show.stage is not None:
+        if show is not None and show.setup is not None:
             since = show.since(version)
             version = show.version
             now = _state(show)
@@ -197,8 +197,8 @@ async def _news(site: Site, name: str | None, version: int) -> AsyncIterator[byt
                 event["show"] = {
                     **now,
                     "from": since,
-                    "robots": len(show.stage.robots),
-                    "scenes": scenes(show.stage, show.known, head, head) if show.live else (),
+                    "robots": len(show.setup.robots),
+                    "scenes": scenes(show.setup, show.known, head, head) if show.live else (),
                 }
         if event:
             yield b"data: " + msgspec.json.encode(event) + b"\n\n"

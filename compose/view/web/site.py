@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from compose.errors import UserError
-from compose.recording.run import journals_in
+from compose.recording.recording_files import journals_in
 from compose.view.web import sweep_page
 from compose.view.web.live import Listener
-from compose.view.web.sources import Recorded, Show
+from compose.view.web.sources import Recorded, WatchedRun
 from protocol.network.endpoints import Endpoints
 
 
@@ -32,13 +32,13 @@ class Site:
         """True once the server is stopping."""
 
     @property
-    def shows(self) -> dict[str, Show]:
+    def shows(self) -> dict[str, WatchedRun]:
         """The runs whose static data is known, by name."""
-        found: dict[str, Show] = {show.name: show for show in self.recorded}
+        found: dict[str, WatchedRun] = {show.name: show for show in self.recorded}
         for i, listener in enumerate(self.listeners):
             for run, show in listener.shows.items():
                 found[run if run not in found else f"{run}.{i}"] = show
-        return {name: show for name, show in found.items() if show.stage is not None}
+        return {name: show for name, show in found.items() if show.setup is not None}
 
     @property
     def waiting(self) -> bool:
@@ -82,8 +82,8 @@ class Site:
             "shows": [
                 {
                     "name": name,
-                    "title": show.stage.name if show.stage is not None else name,
-                    "robots": len(show.stage.robots) if show.stage is not None else 0,
+                    "title": show.setup.name if show.setup is not None else name,
+                    "robots": len(show.setup.robots) if show.setup is not None else 0,
                     "last": show.head,
                     "live": show.live,
                     "end": show.known.end,
@@ -124,7 +124,7 @@ def of_folder(folder: Path) -> Site:
         raise UserError(f"{folder} cannot be read: {error.strerror or error}") from None
     if not shows:
         raise UserError(f"{folder} contains no recording, no sweep, and no folders with recordings")
-    if not any(show.live or show.stage is not None for show in shows):
+    if not any(show.live or show.setup is not None for show in shows):
         why = "; ".join(note for show in shows for note in show.notes) or "its journals are empty"
         raise UserError(f"the recordings in {folder} cannot be shown: {why}")
     return Site(shows)

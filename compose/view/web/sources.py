@@ -8,10 +8,10 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
-from compose.recording.cast import Stage
-from compose.recording.run import WORLD_JOURNAL, agent_journal, journals_in
-from compose.view.facts import Gathering
+from compose.recording.recording_files import WORLD_JOURNAL, agent_journal, journals_in
+from compose.recording.run_setup import RunSetup
 from compose.view.recorded import Journals
+from compose.view.run_data import RunData
 
 REVISIONS_KEPT = 1000
 """The number of stored revisions. A page that has missed more reloads all scenes."""
@@ -19,15 +19,15 @@ UNANSWERED = 5
 """The maximum number of ticks by which the head goes back to a tick with all commands."""
 
 
-class Show(ABC):
+class WatchedRun(ABC):
     """A run that pages can watch."""
 
     live: bool
     """True if new data may arrive."""
-    stage: Stage | None
+    setup: RunSetup | None
     """The static data of the run; None until it is known."""
 
-    def __init__(self, name: str, known: Gathering) -> None:
+    def __init__(self, name: str, known: RunData) -> None:
         self.name = name
         """The name of the run, unique within one server and part of URLs."""
         self.known = known
@@ -41,7 +41,7 @@ class Show(ABC):
         """Read new data."""
 
     def revised(self) -> None:
-        """Record a revision if the facts have changed. Subclasses call this at the end of `poll`."""
+        """Record a revision if the data has changed. Subclasses call this at the end of `poll`."""
         if self.known.touched is not None:
             self.version += 1
             self._revisions.append((self.version, self.known.touched))
@@ -63,17 +63,17 @@ class Show(ABC):
         has answered. While a process is gone it is the last tick as well, because no answer is expected.
         """
         last = self.known.last
-        if not self.live or self.stage is None or self.known.gone:
+        if not self.live or self.setup is None or self.known.gone:
             return last
-        robots = len(self.stage.robots)
+        robots = len(self.setup.robots)
         for tick in range(last, max(last - UNANSWERED, -1), -1):
-            facts = self.known.ticks.get(tick)
-            if facts is not None and len(facts.commands) + len(facts.late) >= robots:
+            data = self.known.ticks.get(tick)
+            if data is not None and len(data.commands) + len(data.late) >= robots:
                 return tick
         return last
 
 
-class Recorded(Show):
+class Recorded(WatchedRun):
     """The recording in a folder."""
 
     def __init__(self, name: str, folder: Path, *, expected: bool = False) -> None:
@@ -82,7 +82,7 @@ class Recorded(Show):
         super().__init__(name, self._journals.known)
         self.notes = self._journals.notes
         self.folder = folder
-        self.stage = None
+        self.setup = None
         self.live = True
         self._expected = expected
         self._over = False
@@ -97,7 +97,7 @@ class Recorded(Show):
         if self._over and not written:
             return
         self._journals.read()
-        self.stage = self._journals.stage
+        self.setup = self._journals.setup
         if written:
             self._attend(writers)
         self.live = written and self.known.end is None
@@ -108,7 +108,7 @@ class Recorded(Show):
 
     def _attend(self, writers: dict[str, int]) -> None:
         """Record which processes have ended or have been replaced."""
-        robots = self.stage.ids if self.stage is not None else ()
+        robots = self.setup.ids if self.setup is not None else ()
         for robot, name in ((None, WORLD_JOURNAL), *((one, agent_journal(one)) for one in robots)):
             process = writers.get(name)
             if process != self._writers.get(name):

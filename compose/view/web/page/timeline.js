@@ -48,7 +48,9 @@ export class Timeline {
       const scene = store.scene(this.read);
       if (!scene) continue;
       for (const player of scene.players) {
-        const spans = this.spans.get(player.robot), phase = player.command?.phase ?? Math.abs(spans.at(-1)?.value ?? 1);
+        const spans = this.spans.get(player.robot);
+        if (!spans) continue; // a robot that has just joined: `stage` is called again when the mission has been read again
+        const phase = player.command?.phase ?? Math.abs(spans.at(-1)?.value ?? 1);
         lengthen(spans, this.read, player.down ? -phase : phase);
         if (player.contacts?.length) lengthen(this.contacts.get(player.robot), this.read, 1);
       }

@@ -1,4 +1,4 @@
-"""The messages of a run, gathered by tick from a recording or the network, in any order."""
+"""The messages of a run, collected by tick from a recording or the network, in any order."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class SizedReport(msgspec.Struct, frozen=True):
     """The size of the frame in bytes."""
 
 
-class Facts(msgspec.Struct, frozen=True):
-    """The known data of one tick. Missing data may be added later."""
+class TickData(msgspec.Struct, frozen=True):
+    """The data of one tick that is known so far."""
 
     tick: int
     truth: dict[str, Pose] = msgspec.field(default_factory=dict)
@@ -56,11 +56,11 @@ class Facts(msgspec.Struct, frozen=True):
     """Robots in `down` whose process was seen again in the same tick."""
 
 
-class Gathering:
-    """The facts of a run, collected while messages arrive."""
+class RunData:
+    """The data of a run, collected while messages arrive."""
 
     def __init__(self) -> None:
-        self.ticks: dict[int, Facts] = {}
+        self.ticks: dict[int, TickData] = {}
         self.configs: dict[str, RobotConfig] = {}
         self.final_reports: dict[str, FinalReport] = {}
         self.end: MissionEnd | None = None
@@ -74,14 +74,14 @@ class Gathering:
         self.touched: int | None = None
         """The earliest tick that has changed since the user of this object last set this to None."""
 
-    def at(self, tick: int) -> Facts:
-        """Return the facts of `tick` for modification, created if needed; marks the tick as changed."""
+    def at(self, tick: int) -> TickData:
+        """Return the data of `tick` for modification, created if needed; marks the tick as changed."""
         down = self.gone if tick > self.last else ()
         self.last = max(self.last, tick)
         self._touch(tick)
         known = self.ticks.get(tick)
         if known is None:
-            known = self.ticks[tick] = Facts(tick, down=set(down))
+            known = self.ticks[tick] = TickData(tick, down=set(down))
         return known
 
     def _touch(self, tick: int) -> None:
@@ -94,32 +94,32 @@ class Gathering:
             if end.tick in self.ticks:
                 self._touch(end.tick)
 
-    def take_world(self, world: World) -> None:
+    def add_world(self, world: World) -> None:
         """Add the ground truth and the reports in flight of the world's current tick."""
         ids = [robot.id for robot in world.scenario.robots]
-        facts = self.at(world.truth.tick)
-        facts.truth.update(zip(ids, world.truth.poses, strict=True))
+        data = self.at(world.truth.tick)
+        data.truth.update(zip(ids, world.truth.poses, strict=True))
         self.has_truth = True
         if world.links:
             links = [link for one, other in world.pairs for link in ((one, other), (other, one))]
             for (sender, receiver), air in zip(links, world.links, strict=True):
-                facts.under_way[ids[sender], ids[receiver]] = tuple([flying.tick for flying in air.flying])
+                data.under_way[ids[sender], ids[receiver]] = tuple([flying.tick for flying in air.flying])
 
-    def take_tick(self, tick: Tick) -> None:
+    def add_tick(self, tick: Tick) -> None:
         """Add a complete tick of the world's journal. A robot without a Command is late."""
-        self.take_world(tick.world)
-        facts = self.at(tick.truth.tick)
+        self.add_world(tick.world)
+        data = self.at(tick.truth.tick)
         for robot, command in tick.commands.items():
-            facts.commands.setdefault(robot, command)
-        facts.late.update({robot.id for robot in tick.world.scenario.robots} - tick.commands.keys())
+            data.commands.setdefault(robot, command)
+        data.late.update({robot.id for robot in tick.world.scenario.robots} - tick.commands.keys())
 
-    def take_observations(self, worlds: Iterable[World]) -> None:
+    def add_observations(self, worlds: Iterable[World]) -> None:
         """Add the Observations that are still missing in the ticks of `worlds`."""
         for world in worlds:
-            facts = self.at(world.truth.tick)
-            if len(facts.observations) < len(world.scenario.robots):
+            data = self.at(world.truth.tick)
+            if len(data.observations) < len(world.scenario.robots):
                 for observation in observations(world):
-                    facts.observations.setdefault(observation.robot, observation)
+                    data.observations.setdefault(observation.robot, observation)
 
     def present(self, robot: str | None, there: bool) -> None:
         """Record that the process of `robot`, or of the world if None, is present or absent now.
@@ -140,7 +140,7 @@ class Gathering:
             now.down.add(robot)
             now.back.discard(robot)
 
-    def take(self, message: Message, size: int, journal_owner: str | None = None) -> None:
+    def add(self, message: Message, size: int, journal_owner: str | None = None) -> None:
         """Add `message`, from a frame of `size` bytes. Data that is already known is not replaced.
 
         `journal_owner` is the robot whose journal holds the message; None for the world's journal and for
@@ -159,12 +159,12 @@ class Gathering:
                 self.at(tick).truth.update(poses)
                 self.has_truth = True
             case DeadlineMissed(tick, robot):
-                facts = self.at(tick)
-                (facts.late if journal_owner is None else facts.without).add(journal_owner or robot)
+                data = self.at(tick)
+                (data.late if journal_owner is None else data.without).add(journal_owner or robot)
             case _:
-                self._take_once(message)
+                self._add_once(message)
 
-    def _take_once(self, message: Message) -> None:
+    def _add_once(self, message: Message) -> None:
         match message:
             case RobotConfig(robot):
                 self.configs.setdefault(robot, message)

@@ -17,7 +17,7 @@ from world.faults import Fault
 from world.scenario import Scenario
 
 
-class Seat(msgspec.Struct, frozen=True):
+class RobotSetup(msgspec.Struct, frozen=True):
     """One robot: its role, peer, anchor and orbit."""
 
     id: RobotId
@@ -35,12 +35,12 @@ class Seat(msgspec.Struct, frozen=True):
     """
 
 
-class Stage(msgspec.Struct, frozen=True):
+class RunSetup(msgspec.Struct, frozen=True):
     """The static data of a run, known before its first tick."""
 
     name: str
     """The name of the scenario, or, in hardware mode, of the run."""
-    robots: tuple[Seat, ...]
+    robots: tuple[RobotSetup, ...]
     mission: Mission
     planner_name: PlannerName
     t_max_s: float
@@ -57,31 +57,31 @@ class Stage(msgspec.Struct, frozen=True):
     @property
     def ids(self) -> tuple[str, ...]:
         """The ids of the robots, in scenario order."""
-        return tuple([seat.id for seat in self.robots])
+        return tuple([robot.id for robot in self.robots])
 
-    def seat(self, robot: str) -> Seat:
-        """Return the seat of `robot`. Raises KeyError if there is no such robot."""
-        for seat in self.robots:
-            if seat.id == robot:
-                return seat
+    def robot_setup(self, robot: str) -> RobotSetup:
+        """Return the setup of `robot`. Raises KeyError if there is no such robot."""
+        for one in self.robots:
+            if one.id == robot:
+                return one
         raise KeyError(robot)
 
-    def pairs(self) -> tuple[tuple[Seat, Seat], ...]:
+    def pairs(self) -> tuple[tuple[RobotSetup, RobotSetup], ...]:
         """Return the pairs whose robots are both known, as (robot of role a, robot of role b)."""
-        known = {seat.id: seat for seat in self.robots}
+        known = {one.id: one for one in self.robots}
         return tuple([(one, known[one.peer]) for one in self.robots if one.role == "a" and one.peer in known])
 
 
-def of_scenario(scenario: Scenario, mode: str | None = None, tick_s: float | None = None) -> Stage:
+def of_scenario(scenario: Scenario, mode: str | None = None, tick_s: float | None = None) -> RunSetup:
     """Return the static data that the world's journal holds.
 
-    `mode` and `tick_s` are not part of the scenario; see the fields of Stage.
+    `mode` and `tick_s` are not part of the scenario; see the fields of RunSetup.
     """
-    return Stage(
+    return RunSetup(
         name=scenario.name,
         robots=tuple(
             [
-                Seat(
+                RobotSetup(
                     robot.id,
                     robot.peer,
                     robot.role,
@@ -104,17 +104,17 @@ def of_scenario(scenario: Scenario, mode: str | None = None, tick_s: float | Non
     )
 
 
-def of_configs(name: str, configs_by_robot: Mapping[str, RobotConfig]) -> Stage:
+def of_configs(name: str, configs_by_robot: Mapping[str, RobotConfig]) -> RunSetup:
     """Return the static data that the robots' configurations hold.
 
     `configs_by_robot` maps robot ids to configurations and must not be empty.
     """
     configs = list(configs_by_robot.values())
-    return Stage(
+    return RunSetup(
         name=name,
         robots=tuple(
             [
-                Seat(one.robot, one.peer, one.role, one.anchor, one.rendezvous.of(one.role), one.attack)
+                RobotSetup(one.robot, one.peer, one.role, one.anchor, one.rendezvous.of(one.role), one.attack)
                 for one in configs
             ]
         ),

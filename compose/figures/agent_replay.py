@@ -1,0 +1,55 @@
+"""The planner states of a robot, recomputed from the inputs in its journal."""
+
+from __future__ import annotations
+
+import msgspec
+
+from agent.planning.state import RobotState
+from agent.process.agent_journal import AgentHistory
+from agent.process.planner_replay import PlannerReplay
+from compose.recording.run import Run
+from protocol.messages import Estimate
+
+
+class AgentReplay(msgspec.Struct, frozen=True):
+    """The journal of one robot, with the recomputed planner states."""
+
+    history: AgentHistory | None
+    """The journal's content; None if the robot was killed before it received its configuration."""
+    states: tuple[RobotState, ...] = ()
+    """The state after each tick in which the robot decided, starting at tick 0."""
+    broken: str | None = None
+    """The reason why `states` ends before the recording does; None if it does not."""
+
+    @property
+    def estimates(self) -> tuple[Estimate, ...]:
+        """The journaled estimates."""
+        return self.history.estimates if self.history is not None else ()
+
+
+def agent_replay(run: Run, robot: str) -> AgentReplay:
+    """Return the journal of `robot` in `run`, with its planner run again on the journaled inputs.
+
+    Raises OSError if there is no journal, CorruptJournal if it is damaged before its end or belongs to
+    another robot or run.
+    """
+    history = run.agent(robot)
+    return _recomputed(history) if history is not None else AgentReplay(None)
+
+
+def _recomputed(history: AgentHistory) -> AgentReplay:
+    """Return the replay of `history`, which ends at the first decision that differs from the recording."""
+    again = PlannerReplay(history)
+    states: list[RobotState] = []
+    try:
+        for step in again:
+            if step.command is None:
+                break
+            if again.robot.command_frame != step.command_frame:
+                why = f"the recorded decision at tick {again.tick} differs: another version wrote the journal"
+                return AgentReplay(history, tuple(states), why)
+            states.append(again.robot.state)
+    except Exception as error:  # noqa: BLE001  # recorded inputs may raise any error in the planner
+        why = f"the planner fails on its inputs of tick {again.tick}: {type(error).__name__}: {error}"
+        return AgentReplay(history, tuple(states), why)
+    return AgentReplay(history, tuple(states))
