@@ -103,6 +103,11 @@ def arc(start: Pose, run: Segment, period: float) -> list[Pose]:
     v, omega = run.v, run.omega
     x, y, heading = start.x, start.y, start.heading
     sin, cos = math.sin, math.cos
+    if omega == 0.0:
+        ahead = heading + omega
+        c, s = cos(ahead), sin(ahead)
+        lengths = [v * (k * period) for k in range(1, run.ticks + 1)]
+        return [Pose(x + length * c, y + length * s, ahead) for length in lengths]
     poses: list[Pose] = []
     for k in range(1, run.ticks + 1):
         lasting = k * period

@@ -59,7 +59,7 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
         ranges = self.anchor_sigma or self.mutual_sigma or self.outliers or self.drop_outs
         return not ranges and self.actuation == self.odometry == VelocityNoise()
 
-    @property
+    @cached_property
     def standstill_bound(self) -> tuple[float, float]:
         """The bounds in m/s and rad/s that the odometry of a robot at rest hardly ever exceeds."""
         return (

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import cache
+from functools import cache, cached_property
 
 import msgspec
 
 from protocol.mission import RANGE_MARGIN, Mission, PlannerName, Role
-from protocol.motion import TAU
+from protocol.motion import TAU, Controls
 from protocol.units import AngularVelocity, Range, Time, Velocity
 
 WAITING_PLACE = 0.125
@@ -35,7 +35,7 @@ RADII = 400
 """The number of radii of a's orbit that are compared. Twice as many change no meeting by a tick."""
 
 
-class Orbit(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+class Orbit(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, dict=True):
     """A circle about the robot's own anchor; with speed 0, a position at this distance from the anchor."""
 
     radius: Range
@@ -44,6 +44,11 @@ class Orbit(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=
     """The forward velocity, in m/s; 0 to wait."""
     omega: AngularVelocity
     """The angular velocity, in rad/s; positive is counter-clockwise."""
+
+    @cached_property
+    def controls(self) -> Controls:
+        """The controls on the orbit (eq. (6)), or at rest."""
+        return Controls(self.v, self.omega)
 
 
 class Rendezvous(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):

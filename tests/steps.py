@@ -26,13 +26,13 @@ class Step(NamedTuple):
 
 def planner_of(state: RobotState) -> Planner:
     """Return the planner of the robot with this state."""
-    return planner(state.config.planner_name)
+    return planner(state.config.planner_name, state.config.mission)
 
 
 def steps(name: str) -> Iterator[Step]:
     """Yield the ticks of the scenario `name`, and check that it ends localised."""
     world = release(load(name))
-    play = planner(world.scenario.planner_name)
+    play = planner(world.scenario.planner_name, world.scenario.mission)
     states = {robot.id: play.start(world.scenario.config(robot.id)) for robot in world.scenario.robots}
     while True:
         sensed = observations(world)

@@ -15,7 +15,7 @@ import msgpack
 import pytest
 from msgspec.structs import replace
 
-from agent.planning.registry import planner
+from agent.planning import paper
 from agent.planning.state import RobotState
 from agent.process.robot import Robot
 from compose.audit.findings import Findings, Violation
@@ -590,8 +590,8 @@ def test_a_planner_that_fails_on_its_inputs_is_a_violation_and_no_crash(
             raise ZeroDivisionError("12")
         return command(state)
 
-    command = planner("paper").command
-    monkeypatch.setattr(planner("paper"), "command", fails)
+    command = paper.command
+    monkeypatch.setattr(paper, "command", fails)
     assert [one.line for one in audit(folder).violations] == [
         "tick 12, a, decision: the planner fails on its inputs: ZeroDivisionError: 12"
     ]

@@ -40,6 +40,26 @@ PR_CAPBSET_DROP = 24
 """<sys/prctl.h>"""
 FAR_PAIR = (("c", "d", 0.0), ("d", "c", 400.0))
 NAMES = ("world", "agent a", "agent b")
+IMPORTS = """
+import sys
+from msgspec.structs import replace
+from compose.cli import warm_up
+from compose.launch.in_process import run_mission
+from compose.scenario.scenario_file import load
+
+warm_up.missions()
+missions = [
+    replace(load(name), planner_name=planner)
+    for name in ("paper-1", "noisy")
+    for planner in ("paper", "assured")
+]
+imported = []
+sys.addaudithook(lambda event, values: imported.append(values[0]) if event == "import" else None)
+for mission in missions:
+    run_mission(mission)
+print([name for name in imported if name.startswith(("agent", "compose", "protocol", "world"))])
+"""
+"""The program that lists the modules that missions import after the warm-up of the fork server."""
 
 
 @pytest.fixture
@@ -143,6 +163,11 @@ def test_it_ends_with_its_standard_input() -> None:
     assert agent.wait(BOUND_S)
     assert agent.status == 130
     server.close()
+
+
+def test_a_forked_robot_imports_no_module_of_the_project() -> None:
+    listing = subprocess.run([sys.executable, "-c", IMPORTS], capture_output=True, text=True, check=True)
+    assert listing.stdout == "[]\n"
 
 
 # --- no process is left running -------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from agent.estimation.gaussian import inference
 from agent.estimation.gaussian.hypotheses import ScoredHypothesis, search
 from agent.estimation.gaussian.least_squares import Fit, poses
 from agent.estimation.gaussian.range_model import PairRanges
-from agent.planning import assured
+from agent.planning import accuracy_seeking
 from agent.planning.state import Done, RobotState
 from compose.launch.in_process import run_mission
 from compose.scenario.scenario_file import parse
@@ -166,11 +166,11 @@ def remembered(folder: Path, robot: str) -> tuple[RobotState, Localised]:
     for message in said(folder, robot):
         match message:
             case Observation():
-                state, heard = assured.observe(state, message), []
+                state, heard = accuracy_seeking.observe(state, message), []
             case Report() if message.robot != robot:
                 heard.append(message)
             case Command(verdict=verdict):
-                state = assured.decide(state, heard)
+                state = accuracy_seeking.decide(state, heard)
                 if isinstance(verdict, Localised):
                     return state, verdict
             case _:

@@ -266,9 +266,9 @@ def test_robot_states_and_worlds_are_immutable() -> None:
 
 ASKED_IN = {
     "planner_name": {"agent.process.robot"},
-    "exact": {"agent.planning.state", "agent.planning.range_seeking", "agent.planning.transitions"},
+    "exact": {"agent.planning.registry", "agent.planning.state"},
 }
-"""The modules of the agent that read these fields: they select a planner, an estimator, a tolerance."""
+"""The modules of the agent that read these fields: they select a planner and an estimator."""
 
 
 @pytest.mark.parametrize("field", ASKED_IN)

@@ -110,7 +110,7 @@ def test_eq_5_keeps_the_nearer_branch_in_range(
     case: tuple[Mission, list[Pose]], planner_name: PlannerName
 ) -> None:
     mission, places = case
-    controls = third_point(places, mission, planner(planner_name).MANOEUVRES)
+    controls = third_point(places, mission, planner(planner_name, mission).MANOEUVRES)
     if controls is None:
         assert planner_name == "paper"
         return

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from agent.estimation.gaussian.hypotheses import ScoredHypothesis, search
 from agent.estimation.gaussian.range_model import PairRanges
-from agent.planning import accuracy_seeking, assured
+from agent.planning import accuracy_seeking
 from agent.planning.accuracy_seeking import OFF_RADIUS
 from agent.planning.phase2_orbit import Aligning, Radial, orientation
 from agent.planning.state import RobotState
@@ -206,18 +206,18 @@ def ticks(scenario: Scenario) -> Iterator[tuple[World, dict[str, RobotState], di
     while isinstance(world, World):
         sensed = observations(world)
         observed = {
-            observation.robot: assured.observe(states[observation.robot], observation)
+            observation.robot: accuracy_seeking.observe(states[observation.robot], observation)
             for observation in sensed
         }
         yield world, states, observed
-        told = {robot: assured.report(state) for robot, state in observed.items()}
+        told = {robot: accuracy_seeking.report(state) for robot, state in observed.items()}
         states = {
-            observation.robot: assured.decide(
+            observation.robot: accuracy_seeking.decide(
                 observed[observation.robot], [told[one.peer] for one in observation.contacts]
             )
             for observation in sensed
         }
-        onward = advance(world, {robot: assured.command(state) for robot, state in states.items()})
+        onward = advance(world, {robot: accuracy_seeking.command(state) for robot, state in states.items()})
         if not isinstance(onward, World):
             assert onward.outcome == "localised"
             return
@@ -227,21 +227,24 @@ def ticks(scenario: Scenario) -> Iterator[tuple[World, dict[str, RobotState], di
 @pytest.mark.long
 def test_a_decision_depends_only_on_the_state_and_leaves_it_unchanged() -> None:
     for world, before, observed in ticks(scenario_of(NOISES["everything"], SHORT)):
-        told = {robot: assured.report(state) for robot, state in observed.items()}
+        told = {robot: accuracy_seeking.report(state) for robot, state in observed.items()}
         for observation in observations(world):
             state, once = before[observation.robot], observed[observation.robot]
             was = repr(state)
-            again = assured.observe(copy.deepcopy(state), observation)
+            again = accuracy_seeking.observe(copy.deepcopy(state), observation)
             assert once == again
             assert repr(once) == repr(again)
             assert repr(state) == was
             heard = [told[contact.peer] for contact in observation.contacts]
             was = repr(once)
-            decided, anew = assured.decide(once, heard), assured.decide(copy.deepcopy(again), list(heard))
+            decided, anew = (
+                accuracy_seeking.decide(once, heard),
+                accuracy_seeking.decide(copy.deepcopy(again), list(heard)),
+            )
             assert decided == anew
             assert repr(decided) == repr(anew)
             assert repr(once) == was
-            for say in (assured.command, assured.report, assured.estimate):
+            for say in (accuracy_seeking.command, accuracy_seeking.report, accuracy_seeking.estimate):
                 assert encode(say(decided)) == encode(say(anew))
 
 
@@ -261,8 +264,8 @@ def test_a_robot_whose_peer_gives_up_under_noise_gives_up_too() -> None:
     for world, _, observed in ticks(scenario_of(SIGMA, 4)):
         (by_a, _) = observations(world)
         if by_a.contacts:
-            told = replace(assured.report(observed["b"]), verdict=Undecided("no way"))
-            assert assured.decide(observed["a"], [told]).verdict == Undecided("b reports: no way")
+            told = replace(accuracy_seeking.report(observed["b"]), verdict=Undecided("no way"))
+            assert accuracy_seeking.decide(observed["a"], [told]).verdict == Undecided("b reports: no way")
             return
     pytest.fail("they never met")
 
@@ -296,17 +299,17 @@ def test_a_robot_that_turns_out_to_head_off_its_radius_turns_onto_it_again() -> 
     misled = False
     while isinstance(world, World):
         for observation in observations(world):
-            state = assured.observe(states[observation.robot], observation)
+            state = accuracy_seeking.observe(states[observation.robot], observation)
             if observation.robot == "b" and not misled and isinstance(state.mode, Aligning):
                 off = abs(orientation(state.local_pose))
                 assert off > 2.0 * OFF_RADIUS, "it has to turn, and is not let"
                 state, misled = replace(state, mode=Radial()), True
-            states[observation.robot] = assured.decide(state)
+            states[observation.robot] = accuracy_seeking.decide(state)
             if misled and observation.robot == "b":
                 assert isinstance(state.mode, Radial | Aligning), "neither lost nor on its circle"
                 if isinstance(state.mode, Aligning):
                     return
-        onward = advance(world, {robot: assured.command(state) for robot, state in states.items()})
+        onward = advance(world, {robot: accuracy_seeking.command(state) for robot, state in states.items()})
         assert isinstance(onward, World)
         world = onward
 

@@ -14,7 +14,8 @@ from agent.estimation.gaussian.inference import PlanningHypothesis
 from agent.estimation.gaussian.odometry_noise import Array
 from agent.planning.active_sensing import AHEAD, choice, plan_alone, plan_together, stride
 from agent.planning.phase2_orbit import pursuit
-from agent.planning.range_seeking import Homing, arrival_tolerances, homing_controls
+from agent.planning.range_seeking import Homing, homing_controls
+from agent.planning.state import estimator_for
 from protocol.mission import Mission
 from protocol.motion import REST, Controls, Pose, step
 from protocol.noise import Noise, VelocityNoise
@@ -161,17 +162,18 @@ def test_from_anywhere_a_robot_finds_home(
 ) -> None:
     if exact:
         mission = replace(mission, noise=Noise())
+    tolerance = estimator_for(mission).pose_tolerance
     pose, home = Pose(x, y, heading), Homing(Pose(1.0, -2.0, 0.5))
     far = math.hypot(x - 1.0, y + 2.0)
     legs = far / (mission.max_speed * mission.period) + math.pi / (mission.max_turn_rate * mission.period)
     for _ in range(math.ceil(1.2 * legs) + 10):
-        command = homing_controls(home, pose, mission)
+        command = homing_controls(home, pose, mission, tolerance)
         if command is None:
             break
         assert abs(command.v) <= mission.max_speed
         assert abs(command.omega) <= mission.max_turn_rate
         pose = step(pose, command.v, command.omega, mission.period)
-    assert math.hypot(pose.x - 1.0, pose.y + 2.0) <= arrival_tolerances(mission)[0]
+    assert math.hypot(pose.x - 1.0, pose.y + 2.0) <= tolerance * mission.first_straight
 
 
 # --- detours ------------------------------------------------------------------------------------------

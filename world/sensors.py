@@ -18,15 +18,17 @@ from world.truth import Truth
 
 def anchor_ranges(truth: Truth, scenario: Scenario) -> list[float | None]:
     """Return the measured range of each robot to its own anchor (eq. (1b)), in m; None if there is none."""
-    reach, sigma = scenario.mission.sensing_range, scenario.mission.noise.anchor_sigma
+    noise, reach = scenario.mission.noise, scenario.mission.sensing_range
     ranges: list[float | None] = []
     for pose, origin, robot in zip(truth.local, truth.origins, scenario.robots, strict=True):
         anchor = robot.anchor
         rho = math.hypot(pose.x - (anchor.x - origin.x), pose.y - (anchor.y - origin.y))
-        if rho <= reach:
-            ranges.append(measured(rho, sigma, scenario, "anchor", robot.id, truth.tick))
-        else:
+        if rho > reach:
             ranges.append(None)
+        elif noise.exact:
+            ranges.append(rho)
+        else:
+            ranges.append(measured(rho, noise.anchor_sigma, scenario, "anchor", robot.id, truth.tick))
     return ranges
 
 

@@ -1,7 +1,8 @@
 """The estimator contract: hypotheses about the poses of one robot or of both, from its measurements.
 
-`exact_estimator` and `gaussian.gaussian_estimator` implement it. Planners call it and do not ask which of the
-two they have: the mission's noise selects it, in `planning.state`.
+`exact_estimator` and `gaussian.gaussian_estimator` implement it. Planners do not ask which of the two they
+have: the mission's noise selects it, in `planning.state`. Only `planning.accuracy_seeking`, the planner for
+noisy sensors alone, plans with covariances, and takes them from `gaussian.inference`.
 """
 
 from __future__ import annotations
@@ -61,11 +62,15 @@ class Estimator(Protocol):
     """The inference of a robot from its own measurements and from its peer's reports."""
 
     @property
-    def has_covariances(self) -> bool:
-        """Return whether hypotheses come with covariances, by which a planner can value further ranges.
+    def pose_tolerance(self) -> float:
+        """Return the tolerance in rad, and relative to A_0, with which the robot's odometry is known.
 
-        Without them, each hypothesis is certain up to rounding or ruled out.
+        A manoeuvre has reached its target within it.
         """
+
+    @property
+    def corrects_poses(self) -> bool:
+        """Return whether later ranges correct the robot's pose, so that it leaves the path it was on."""
 
     @property
     def report_tolerance(self) -> float:

@@ -27,8 +27,10 @@ from protocol.rounding import SAME
 class ExactEstimator(msgspec.Struct, frozen=True):
     """The closed forms of Section III. A candidate that contradicts any measurement is ruled out."""
 
-    has_covariances: ClassVar[bool] = False
-    """What remains is certain up to rounding."""
+    pose_tolerance: ClassVar[float] = 1e-9
+    """The rounding error of the odometry."""
+    corrects_poses: ClassVar[bool] = False
+    """The pose follows from the end of phase 1 by dead reckoning."""
     report_tolerance: ClassVar[float] = 1e-6
     """The rounding error of a report with a margin, in m and rad."""
 

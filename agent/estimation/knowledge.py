@@ -121,10 +121,8 @@ class Knowledge(msgspec.Struct, frozen=True):
         peer = self.peer_state.peer.track(self.peer_state.start, first, last, period)
         a, b = (own, peer) if self.config.role == "a" else (peer, own)
         ranges = {ranged.tick: ranged.range for ranged in self.mutual}
-        return [
-            PairObservation(tick, at_a, at_b, ranges.get(tick))
-            for tick, at_a, at_b in zip(range(first, last + 1), a, b, strict=True)
-        ]
+        ticks = range(first, last + 1)
+        return list(map(PairObservation, ticks, a, b, map(ranges.get, ticks)))
 
     @property
     def off_anchor(self) -> bool:

@@ -64,12 +64,13 @@ def redundant(
     pair_observations: Sequence[PairObservation], base: tuple[PairObservation, PairObservation]
 ) -> bool:
     """Return whether there is a range from another place than the two ranges of `base`."""
-    return any(
-        pair_observation.range is not None
-        and all(
-            travelled(pair_observation.a, used.a) > ELSEWHERE
-            or travelled(pair_observation.b, used.b) > ELSEWHERE
-            for used in base
-        )
-        for pair_observation in pair_observations
-    )
+    first, second = base
+    for one in pair_observations:
+        if one.range is not None and _elsewhere(one, first) and _elsewhere(one, second):
+            return True
+    return False
+
+
+def _elsewhere(one: PairObservation, other: PairObservation) -> bool:
+    """Return whether a robot has moved between two observations."""
+    return travelled(one.a, other.a) > ELSEWHERE or travelled(one.b, other.b) > ELSEWHERE

@@ -82,9 +82,8 @@ class MotionLog(msgspec.Struct, frozen=True):
 
     def track(self, start: Pose, first: int, last: int, period: float) -> list[Pose]:
         """Return the poses at each tick in [first, last] for the pose `start` at tick 0."""
-        pose = self.pose(start, first, period)
-        track = [pose]
-        for run in _between(self.runs, first, last):
+        track = [self.pose(start, first, period) if first else start]
+        for run in _between(self.runs, first, last) if first else self.until(last):
             track += arc(track[-1], run, period)
         return track
 

@@ -1,4 +1,4 @@
-"""The `assured` planner where hypotheses have covariances: measure until the poses are accurate enough.
+"""The `assured` planner with noisy sensors: it measures until the poses are as accurate as the mission asks.
 
 The phases are those of the paper. In phase 1, a robot collects ranges to its anchor until a better estimate
 is not worth the time. In phase 3, both robots move, each to where its next ranges are expected to tell
@@ -21,15 +21,31 @@ from agent.estimation.gaussian.consistency import (
 )
 from agent.estimation.gaussian.hypotheses import ScoredHypothesis, follow, search
 from agent.estimation.knowledge import Belief
-from agent.planning import active_sensing, phase2_orbit, range_seeking, transitions
+from agent.planning import active_sensing, exchange, phase2_orbit, range_seeking, transitions
 from agent.planning.active_sensing import Listening, Retreating, Surveying
-from agent.planning.manoeuvres import Manoeuvres
+from agent.planning.assured import MANOEUVRES, command, start
+from agent.planning.exchange import estimate, report
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent
 from agent.planning.range_seeking import Backing, Circling, Homing, Straight, Turning
 from agent.planning.state import Asleep, Done, RobotState
-from protocol.messages import BranchKind, Localised
+from protocol.messages import BranchKind, Localised, Observation, Report
 from protocol.mission import Mission
 from protocol.motion import ORIGIN, REST, Controls
+
+__all__ = (
+    "ACTIVE_SENSING",
+    "MANOEUVRES",
+    "command",
+    "decide",
+    "estimate",
+    "observe",
+    "report",
+    "required_mutual_ranges",
+    "start",
+)
+
+ACTIVE_SENSING = True
+"""Each hypothesis has a covariance, from which the value of further ranges follows."""
 
 LOST_AFTER = 3
 """The number of strides without an expected anchor detection after which the robot returns to its anchor."""
@@ -67,18 +83,21 @@ def required_mutual_ranges(mission: Mission) -> int:
     return CHECKED_WITH_OUTLIERS if mission.noise.outliers else CHECKED
 
 
-def after_observation(state: RobotState, anchor_range: float | None, manoeuvres: Manoeuvres) -> RobotState:
-    """Return `state` with the mode that follows from the robot's own sensors."""
+def observe(state: RobotState, observation: Observation) -> RobotState:
+    """Return `state` with the sensor data of one tick, and with the mode that follows from them."""
+    state, anchor_range = exchange.observed(state, observation), observation.anchor_range
     match state.mode:
+        case Asleep():
+            return transitions.start_phase1(state, anchor_range)
         case Straight("anchor") | Backing("anchor") | Turning("anchor") | Circling("anchor"):
-            seeking = transitions.sought(state, state.mode, anchor_range is not None, manoeuvres)
+            seeking = transitions.sought(state, state.mode, anchor_range is not None, MANOEUVRES)
             return seeking if seeking is not None else _continue_phase1(state)
         case Surveying("anchor"):
             return _continue_phase1(state) if is_planning_tick(state) else state
         case Homing():
             if anchor_range is not None:
                 return _continue_phase1(state)
-            arrived = range_seeking.homing_controls(state.mode, state.odometry, state.config.mission) is None
+            arrived = transitions.homing_controls(state) is None
             return replace(state, mode=Straight("anchor", state.odometry, 0.0)) if arrived else state
         case Aligning() | Radial() | Tangent() | Orbiting():
             return _continue_phase2(state, anchor_range is not None)
@@ -158,7 +177,8 @@ def _continue_phase2(state: RobotState, ranged: bool) -> RobotState:
         if isinstance(state.mode, Radial) and abs(phase2_orbit.orientation(state.local_pose)) > OFF_RADIUS:
             return _start_phase2(state)
     assert isinstance(state.mode, Aligning | Radial | Tangent | Orbiting)
-    mode = phase2_orbit.onward(state.mode, state.odometry, state.start, state.orbit, mission)
+    tolerance = state.estimator.pose_tolerance
+    mode = phase2_orbit.onward(state.mode, state.odometry, state.start, state.orbit, mission, tolerance)
     timeout: float = LOST_AFTER * active_sensing.stride(mission)
     if (
         state.orbit.v == 0.0
@@ -202,8 +222,12 @@ def _continue_phase3(state: RobotState) -> RobotState:
             return state
 
 
-def after_reports(state: RobotState) -> RobotState:
-    """Return `state` with the mode that follows from the reports of a peer in range."""
+def decide(state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
+    """Return `state` with the peer's `reports` and with the mode that follows from them."""
+    if reports:
+        state = exchange.with_reports(state, reports)
+    if not state.in_contact:
+        return state
     match state.mode:
         case Done() | Asleep():
             return state

@@ -1,8 +1,7 @@
-"""The `assured` planner: it handles the failure cases of the paper, with exact and with noisy sensors.
+"""The `assured` planner with exact sensors: it handles the failure cases of the paper.
 
-Where hypotheses have covariances, it measures until the poses are as accurate as the mission asks (see
-`accuracy_seeking`). Otherwise, it follows the paper's phases with more manoeuvres to choose from, until one
-placement is left and a redundant range has confirmed it.
+It follows the paper's phases with more manoeuvres to choose from, until one placement is left and a redundant
+range has confirmed it. With noisy sensors, `accuracy_seeking` is the `assured` planner.
 """
 
 from __future__ import annotations
@@ -11,18 +10,18 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from agent.planning import accuracy_seeking, exchange, phase3_last_manoeuvre, transitions
-from agent.planning.accuracy_seeking import required_mutual_ranges
+from agent.planning import exchange, phase3_last_manoeuvre, transitions
 from agent.planning.exchange import estimate, report
 from agent.planning.manoeuvres import Manoeuvres
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent
 from agent.planning.phase3_last_manoeuvre import SPEEDS, Standing, Waiting
-from agent.planning.state import MODE_NAMES, Asleep, Done, RobotState, estimator_for
+from agent.planning.state import MODE_NAMES, Done, RobotState
 from protocol.messages import Command, Localised, Observation, Report, RobotConfig
 from protocol.mission import Mission
 from protocol.motion import REST
 
 __all__ = (
+    "ACTIVE_SENSING",
     "MANOEUVRES",
     "command",
     "decide",
@@ -31,13 +30,15 @@ __all__ = (
     "report",
     "required_mutual_ranges",
     "start",
-    "uses_active_sensing",
 )
 
 MANOEUVRES = Manoeuvres(
     directions=(1.0, -1.0), sides=(1.0, -1.0), last_speeds=SPEEDS, fewest_out_of_range=True
 )
 """Both ways, to both sides in phase 1, and at several speeds."""
+
+ACTIVE_SENSING = False
+"""The manoeuvres distinguish hypotheses. What remains is certain up to rounding."""
 
 PEER_RESTS = (MODE_NAMES[Standing], MODE_NAMES[Waiting])
 """The modes of the peer in which this robot may plan a manoeuvre.
@@ -54,8 +55,6 @@ def start(config: RobotConfig) -> RobotState:
 def observe(state: RobotState, observation: Observation) -> RobotState:
     """Return `state` with the sensor data of one tick, and with the mode that follows from them."""
     state = exchange.observed(state, observation)
-    if state.estimator.has_covariances and not isinstance(state.mode, Asleep):
-        return accuracy_seeking.after_observation(state, observation.anchor_range, MANOEUVRES)
     return transitions.after_observation(state, observation.anchor_range, MANOEUVRES, _after_range)
 
 
@@ -68,8 +67,6 @@ def decide(state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
         state = exchange.with_reports(state, reports)
     if not state.in_contact or isinstance(state.mode, Done):
         return state
-    if state.estimator.has_covariances:
-        return accuracy_seeking.after_reports(state)
     match state.mode:
         case Aligning() | Radial() | Tangent() | Orbiting():
             peer = state.peer_state
@@ -86,9 +83,10 @@ def command(state: RobotState) -> Command:
     return exchange.command(state, REST if _must_wait(state) else transitions.controls(state))
 
 
-def uses_active_sensing(mission: Mission) -> bool:
-    """Return whether robots choose each manoeuvre by the information of its next ranges."""
-    return estimator_for(mission).has_covariances
+def required_mutual_ranges(mission: Mission) -> int:
+    """Return 0: not the number of exact ranges counts, but a redundant one."""
+    del mission
+    return 0
 
 
 def _must_wait(state: RobotState) -> bool:

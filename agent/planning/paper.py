@@ -23,6 +23,7 @@ from protocol.messages import Command, Observation, Report, RobotConfig
 from protocol.mission import Mission
 
 __all__ = (
+    "ACTIVE_SENSING",
     "MANOEUVRES",
     "command",
     "decide",
@@ -31,11 +32,13 @@ __all__ = (
     "report",
     "required_mutual_ranges",
     "start",
-    "uses_active_sensing",
 )
 
 MANOEUVRES = Manoeuvres(directions=(1.0,), sides=(1.0,), last_speeds=None, fewest_out_of_range=False)
 """Forward, to the left in phase 1, and at v_max."""
+
+ACTIVE_SENSING = False
+"""The paper's manoeuvres distinguish hypotheses, and do not improve them."""
 
 CHECKED = 3
 """The minimum number of mutual ranges before a claim with noisy sensors, without outliers."""
@@ -81,12 +84,6 @@ def required_mutual_ranges(mission: Mission) -> int:
     With outliers, it is that of the `assured` planner, which the paper's manoeuvres do not reach.
     """
     return CHECKED_WITH_OUTLIERS if mission.noise.outliers else CHECKED
-
-
-def uses_active_sensing(mission: Mission) -> bool:
-    """Return False: the paper's manoeuvres distinguish hypotheses, and do not improve them."""
-    del mission
-    return False
 
 
 def _after_range(state: RobotState) -> RobotState:

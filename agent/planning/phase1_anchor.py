@@ -10,13 +10,14 @@ import msgspec
 
 from agent.estimation.exact import Branch
 from agent.planning.manoeuvres import Manoeuvres
-from agent.planning.range_seeking import ARRIVED
 from protocol.mission import RANGE_MARGIN, Mission, third_point_turn_rate
 from protocol.motion import Controls, Pose, chord, compose
 
 PREFERENCE = 1e-9
 """The relative improvement, above rounding errors, that a later candidate needs to replace an earlier one."""
 
+SHORTEST = 1e-9
+"""The length of a manoeuvre, relative to A_0, up to which it counts as none."""
 
 SIGMAS = 3.0
 """The distance inside R, in standard deviations of a range, at which a noisy point counts as in range."""
@@ -53,7 +54,7 @@ def third_point(
     """
     best: Controls | None = None
     best_value = 0.0
-    shortest = ARRIVED * mission.first_straight
+    shortest = SHORTEST * mission.first_straight
     rim = mission.sensing_range - max(margin, SIGMAS * mission.noise.anchor_sigma)
     turn_rate = third_point_turn_rate(mission)
     turn_rates = [side * turn_rate for side in manoeuvres.sides]

@@ -6,7 +6,7 @@ import math
 
 import msgspec
 
-from agent.planning.range_seeking import arrival_tolerances, straight, turn
+from agent.planning.range_seeking import straight, turn
 from protocol.mission import Mission
 from protocol.motion import Controls, Pose, compose, wrap
 from protocol.orbits import Orbit
@@ -52,21 +52,23 @@ def orientation(local: Pose) -> float:
     return wrap(local.heading - math.atan2(local.y, local.x))
 
 
-def onward(mode: Phase2Mode, odometry: Pose, start: Pose, orbit: Orbit, mission: Mission) -> Phase2Mode:
+def onward(
+    mode: Phase2Mode, odometry: Pose, start: Pose, orbit: Orbit, mission: Mission, tolerance: float
+) -> Phase2Mode:
     """Return the mode that follows `mode` at the pose `odometry`. Completed steps are skipped.
 
-    `start` is the pose of tick 0 in the anchor's frame.
+    `start` is the pose of tick 0 in the anchor's frame, and `tolerance` is `Estimator.pose_tolerance`.
     """
-    distance_tolerance, angle_tolerance = arrival_tolerances(mission)
+    distance_tolerance = tolerance * mission.first_straight
     while True:
         match mode:
-            case Aligning(heading) if abs(heading - odometry.heading) <= angle_tolerance:
+            case Aligning(heading) if abs(heading - odometry.heading) <= tolerance:
                 mode = Radial()
             case Radial() if abs(left_to_orbit(odometry, start, orbit)) <= distance_tolerance:
                 if orbit.v == 0.0:
                     return Orbiting()
                 mode = Tangent(odometry.heading + math.copysign(math.pi / 2, orbit.omega))
-            case Tangent(heading) if abs(heading - odometry.heading) <= angle_tolerance:
+            case Tangent(heading) if abs(heading - odometry.heading) <= tolerance:
                 return Orbiting()
             case _:
                 return mode
@@ -78,11 +80,11 @@ def left_to_orbit(odometry: Pose, start: Pose, orbit: Orbit) -> float:
     return orbit.radius - math.hypot(local.x, local.y)
 
 
-def controls(mode: Phase2Mode, odometry: Pose, start: Pose, orbit: Orbit, mission: Mission) -> Controls:
-    """Return the controls of `mode` at the pose `odometry`."""
+def controls(
+    mode: Aligning | Radial | Tangent, odometry: Pose, start: Pose, orbit: Orbit, mission: Mission
+) -> Controls:
+    """Return the controls of `mode`, on the way to the orbit, at the pose `odometry`."""
     match mode:
-        case Orbiting(command):
-            return command or Controls(orbit.v, orbit.omega)
         case Aligning(heading) | Tangent(heading):
             return turn(odometry, heading, mission)
         case Radial():

@@ -180,14 +180,16 @@ def compared(question: Question, mission: Mission, manoeuvres: Manoeuvres) -> Co
     else:
         gaps = [np.abs(one - other) for i, one in enumerate(squared) for other in squared[:i]]
         gap = reduce(np.minimum, gaps)
-    apart = _keeps_apart(question, reach, mission)
-    value = np.where(apart, gap, -np.inf) if mission.safety_distance else gap
+    value, apart = gap, None
+    if mission.safety_distance:
+        apart = _keeps_apart(question, reach, mission)
+        value = np.where(apart, gap, -np.inf)
     if manoeuvres.fewest_out_of_range:
         rim = (mission.sensing_range - RANGE_MARGIN) ** 2
         outside = np.zeros(gap.shape, np.int8)
         for distance in squared:
             outside += distance > rim
-        fewest = np.min(outside, where=apart, initial=len(squared))
+        fewest = np.min(outside if apart is None else outside[apart], initial=len(squared))
         value = np.where(outside == fewest, value, -np.inf)
     return Compared(reach, gap, value)
 
@@ -218,7 +220,8 @@ def most_informative_manoeuvre(
     ridge_p, ridge_q = REGULARISATION * (distance + mission.sensing_range) ** 2, REGULARISATION * distance**2
     value = (pp + by_phi**2 + ridge_p) * (qq + by_psi**2 + ridge_q) - (pq + by_phi * by_psi) ** 2
     value = np.where(apart <= mission.sensing_range - RANGE_MARGIN, value, -np.inf)
-    value = np.where(_keeps_apart(question, reach, mission), value, -np.inf)
+    if mission.safety_distance:
+        value = np.where(_keeps_apart(question, reach, mission), value, -np.inf)
     row, column = _best(value)
     if value[row, column] == -np.inf:
         return None
@@ -229,8 +232,6 @@ def _keeps_apart(question: Question, reach: Reach, mission: Mission) -> NDArray[
     """Return which manoeuvres keep the safety distance for every candidate; (S, W)."""
     mover, a, b, candidates = question
     v, omega = np.broadcast_arrays(reach.v, reach.omega)
-    if not mission.safety_distance:
-        return np.ones(v.shape, dtype=np.bool)
     here = a if mover == "a" else b
     least = [
         nearest(here, v, omega, _standing_position(mover, a, b, candidate), mission.period)
@@ -252,28 +253,27 @@ def _standing_position(mover: Role, a: Pose, b: Pose, placement: Placement) -> t
 
 def _best(value: Array) -> tuple[int, int]:
     """Return the row and the column of the largest value; the first one of several."""
-    row, column = np.unravel_index(np.argmax(value), value.shape)
-    return int(row), int(column)
+    row, column = divmod(int(np.argmax(value)), value.shape[1])
+    return row, column
 
 
-def reachable(pose: Pose, mission: Mission, speeds: Sequence[float] | None) -> Reach:
+def reachable(pose: Pose, mission: Mission, speeds: tuple[float, ...] | None) -> Reach:
     """Return the manoeuvres that are compared, from `pose`, at `speeds` in A_0 / T_s (None: at v_max)."""
-    omega, half, unit = _arcs(mission)
+    speed, omega, half, chords = _arcs(mission, speeds)
+    course = pose.heading + half
+    return Reach(speed, omega, pose.x + chords * np.cos(course), pose.y + chords * np.sin(course))
+
+
+@cache
+def _arcs(mission: Mission, speeds: tuple[float, ...] | None) -> tuple[Array, Array, Array, Array]:
+    """Return the speeds (S, 1), the turn rates (W,), half the turns of a tick (W,), and the chords (S, W)."""
     if speeds is None:
         speed = np.array([[mission.max_speed]])
     else:
         speed = mission.first_straight / mission.period * np.array(speeds)[:, None]
-    course = pose.heading + half
-    x, y = pose.x + speed * unit * np.cos(course), pose.y + speed * unit * np.sin(course)
-    return Reach(speed, omega, x, y)
-
-
-@cache
-def _arcs(mission: Mission) -> tuple[Array, Array, Array]:
-    """Return each turn rate in rad/s, half the turn of a tick in rad, and the chord in s per unit speed."""
     omega = np.linspace(-mission.max_turn_rate, mission.max_turn_rate, TURN_RATES)
     half = 0.5 * mission.period * omega
-    return omega, half, mission.period * np.sinc(half / math.pi)
+    return speed, omega, half, speed * (mission.period * np.sinc(half / math.pi))
 
 
 def _positions_in_b(

@@ -6,7 +6,7 @@ A tick has two halves, because two robots in contact exchange their new measurem
     decide(state, reports)      -> state    adds the peer's reports; `command(state)` is the motion command
 
 There is no I/O, no clock and no randomness, so simulation, network, replay and recovery make decisions that
-are identical to the bit. A module with these functions is a planner; `registry` maps names to planners.
+are identical to the bit. A module with these functions is a planner; `registry` selects it, once per robot.
 """
 
 from __future__ import annotations
@@ -26,6 +26,10 @@ class Planner(Protocol):
     @property
     def MANOEUVRES(self) -> Manoeuvres:  # noqa: N802  # a constant of the module that is the planner
         """The manoeuvres that the planner compares."""
+
+    @property
+    def ACTIVE_SENSING(self) -> bool:  # noqa: N802
+        """True if robots choose each manoeuvre by the information of its next ranges."""
 
     def start(self, config: RobotConfig) -> RobotState:
         """Return the state of a robot that has measured nothing yet."""
@@ -50,6 +54,3 @@ class Planner(Protocol):
 
     def required_mutual_ranges(self, mission: Mission) -> int:
         """Return the minimum number of noisy mutual ranges before a claim."""
-
-    def uses_active_sensing(self, mission: Mission) -> bool:
-        """Return whether robots choose each manoeuvre by the information of its next ranges."""

@@ -17,12 +17,6 @@ from agent.planning.separation import leeway
 from protocol.mission import Mission
 from protocol.motion import REST, TAU, Controls, Pose, travelled, wrap
 
-ARRIVED = 1e-9
-"""The tolerance in rad, and relative to A_0, at which a target is reached. The odometry is exact."""
-
-CLOSE = 0.05
-"""The tolerance in rad, and relative to A_0, at which a target is reached with noisy actuation or sensors."""
-
 Beacon = Literal["anchor", "peer"]
 
 
@@ -78,12 +72,6 @@ def step_length(beacon: Beacon, rho0: float, mission: Mission) -> float:
     return step if beacon == "anchor" else min(step, leeway(rho0, mission))
 
 
-def arrival_tolerances(mission: Mission) -> tuple[float, float]:
-    """Return the tolerances in m and rad within which a target is reached."""
-    share = ARRIVED if mission.noise.exact else CLOSE
-    return share * mission.first_straight, share
-
-
 def moved(origin: Pose, pose: Pose) -> bool:
     """Return whether the manoeuvre that began at `origin` was executed; in real time it may not be."""
     return pose != origin
@@ -95,10 +83,13 @@ def distance_ahead(origin: Pose, pose: Pose) -> float:
 
 
 def onward(
-    state: Seeking, pose: Pose, measured: bool, mission: Mission, manoeuvres: Manoeuvres
+    state: Seeking, pose: Pose, measured: bool, mission: Mission, manoeuvres: Manoeuvres, tolerance: float
 ) -> Seeking | None:
-    """Return the mode after a tick that led to `pose`, or None once the second range is measured."""
-    distance_tolerance, angle_tolerance = arrival_tolerances(mission)
+    """Return the mode after a tick that led to `pose`, or None once the second range is measured.
+
+    `tolerance` is `Estimator.pose_tolerance`.
+    """
+    distance_tolerance = tolerance * mission.first_straight
     step = step_length(state.beacon, state.rho0, mission)
     match state:
         case Straight(beacon, origin, rho0):
@@ -114,7 +105,7 @@ def onward(
                 return state
             return None if measured else Turning(beacon, origin, rho0, pose.heading - math.pi / 2)
         case Turning(beacon, origin, rho0, heading):
-            return state if abs(heading - pose.heading) > angle_tolerance else Circling(beacon, origin, rho0)
+            return state if abs(heading - pose.heading) > tolerance else Circling(beacon, origin, rho0)
         case Circling():
             return None if measured else state
 
@@ -138,19 +129,18 @@ def controls(state: Seeking, pose: Pose, mission: Mission) -> Controls:
             return Controls(omega * step, omega)
 
 
-def homing_controls(state: Homing, pose: Pose, mission: Mission) -> Controls | None:
+def homing_controls(state: Homing, pose: Pose, mission: Mission, tolerance: float) -> Controls | None:
     """Return the controls that lead to the place of `state`, or None once the robot is there.
 
-    The robot drives backward if that needs the smaller turn.
+    The robot drives backward if that needs the smaller turn. `tolerance` is `Estimator.pose_tolerance`.
     """
-    distance_tolerance, angle_tolerance = arrival_tolerances(mission)
     distance = travelled(pose, state.place)
-    if distance <= distance_tolerance:
+    if distance <= tolerance * mission.first_straight:
         return None
     bearing_error = wrap(math.atan2(state.place.y - pose.y, state.place.x - pose.x) - pose.heading)
     forward = abs(bearing_error) <= math.pi / 2
     remaining_turn = bearing_error if forward else wrap(bearing_error + math.pi)
-    if abs(remaining_turn) > angle_tolerance:
+    if abs(remaining_turn) > tolerance:
         return turn(pose, pose.heading + remaining_turn, mission)
     return straight(distance if forward else -distance, mission)
 

@@ -1,22 +1,16 @@
-"""The planners by name. A planner is imported when it is asked for."""
+"""The planners by name and, for `assured`, by the noise of the mission."""
 
 from __future__ import annotations
 
-from functools import cache
-
+from agent.planning import accuracy_seeking, assured, paper
 from agent.planning.planner import Planner
-from protocol.mission import PlannerName
+from protocol.mission import Mission, PlannerName
 
 
-@cache
-def planner(name: PlannerName) -> Planner:
-    """Return the planner `name`."""
+def planner(name: PlannerName, mission: Mission) -> Planner:
+    """Return the planner `name` for the noise of `mission`."""
     match name:
         case "paper":
-            from agent.planning import paper  # noqa: PLC0415  # a robot has one planner
-
             return paper
         case "assured":
-            from agent.planning import assured  # noqa: PLC0415
-
-            return assured
+            return assured if mission.noise.exact else accuracy_seeking

@@ -80,7 +80,9 @@ def start_phase1(state: RobotState, rho0: float | None) -> RobotState:
 def sought(state: RobotState, mode: Seeking, measured: bool, manoeuvres: Manoeuvres) -> RobotState | None:
     """Return `state` after a tick of the search `mode`; None once the second range is measured."""
     mission = state.config.mission
-    next_mode = range_seeking.onward(mode, state.odometry, measured, mission, manoeuvres)
+    next_mode = range_seeking.onward(
+        mode, state.odometry, measured, mission, manoeuvres, state.estimator.pose_tolerance
+    )
     if next_mode is None:
         return None
     return state if next_mode is mode else replace(state, mode=next_mode)
@@ -137,10 +139,13 @@ def end_phase1(state: RobotState, known: FittedBranch, kind: BranchKind) -> Robo
 
 
 def continue_phase2(state: RobotState, mode: phase2_orbit.Phase2Mode) -> RobotState:
-    """Continue phase 2 from `mode`. With noisy sensors, the robot follows its orbit by pure pursuit."""
-    next_mode = phase2_orbit.onward(mode, state.odometry, state.start, state.orbit, state.config.mission)
-    if isinstance(next_mode, Orbiting) and not state.config.mission.noise.exact:
-        next_mode = Orbiting(phase2_orbit.pursuit(state.local_pose, state.orbit, state.config.mission))
+    """Continue phase 2 from `mode`. A robot whose pose is corrected follows its orbit by pursuit."""
+    estimator, mission = state.estimator, state.config.mission
+    next_mode = phase2_orbit.onward(
+        mode, state.odometry, state.start, state.orbit, mission, estimator.pose_tolerance
+    )
+    if isinstance(next_mode, Orbiting) and estimator.corrects_poses:
+        next_mode = Orbiting(phase2_orbit.pursuit(state.local_pose, state.orbit, mission))
     return state if next_mode is state.mode else replace(state, mode=next_mode)
 
 
@@ -216,13 +221,22 @@ def last_manoeuvre(state: RobotState, found: PairEstimate, manoeuvres: Manoeuvre
     return replace(state, mode=LastManoeuvre(plan.command, state.odometry), plan=plan)
 
 
+def homing_controls(state: RobotState) -> Controls | None:
+    """Return the controls on the way back to the anchor's range; None once the robot is there."""
+    assert isinstance(state.mode, Homing)
+    tolerance = state.estimator.pose_tolerance
+    return range_seeking.homing_controls(state.mode, state.odometry, state.config.mission, tolerance)
+
+
 # --- commands -----------------------------------------------------------------------------------------
 
 
 def controls(state: RobotState) -> Controls:
     """Return the controls of the current mode."""
     match state.mode:
-        case Aligning() | Radial() | Tangent() | Orbiting():
+        case Orbiting(command):
+            return command or state.orbit.controls
+        case Aligning() | Radial() | Tangent():
             return phase2_orbit.controls(
                 state.mode, state.odometry, state.start, state.orbit, state.config.mission
             )
@@ -233,6 +247,6 @@ def controls(state: RobotState) -> Controls:
         case Surveying(command=planned) | Retreating(planned):
             return planned
         case Homing():
-            return range_seeking.homing_controls(state.mode, state.odometry, state.config.mission) or REST
+            return homing_controls(state) or REST
         case _:
             return REST

@@ -26,7 +26,7 @@ class Robot:
     """The state of one robot, and the journal of its inputs and outputs."""
 
     def __init__(self, config: RobotConfig, journal: Sink | None = None) -> None:
-        self.planner = planner(config.planner_name)
+        self.planner = planner(config.planner_name, config.mission)
         self.state = self.planner.start(config)
         self.report: FramedReport | None = None
         """The report of this tick; None if no peer is in contact."""

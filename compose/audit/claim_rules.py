@@ -62,7 +62,7 @@ def _redundant(run: Run, placed: RobotSpec, agent: AgentHistory, tick: int) -> V
     if noise.exact:
         places = _places(run, placed, mutual)
         return _too_few(tick, placed, "relative placements with a mutual range", places, PLACES)
-    least = planner(scenario.planner_name).required_mutual_ranges(scenario.mission)
+    least = planner(scenario.planner_name, scenario.mission).required_mutual_ranges(scenario.mission)
     return _too_few(tick, placed, "mutual ranges", len(mutual), least)
 
 

@@ -34,7 +34,7 @@ def _phase_one(pair: PairRecord, medium: Medium) -> Iterator[Picture]:
 
 def _plan(pair: PairRecord, medium: Medium) -> Iterator[Picture]:
     """Yield the planned manoeuvres; with active sensing, the hypotheses at its decisions."""
-    if pair.readable and planner(pair.planner_name).uses_active_sensing(pair.mission):
+    if pair.readable and planner(pair.planner_name, pair.mission).ACTIVE_SENSING:
         yield f"plan-{pair.name}", decisions.draw(pair, medium)
     elif pair.readable:
         for name, figure in manoeuvre.draw(pair, medium).items():

@@ -110,7 +110,7 @@ def _inverse(placement: Placement) -> Pose:
 
 def _figure(pair: PairRecord, one: Planned, medium: Medium) -> Figure:
     seen, plan, mission = scene(one.plan), one.plan, pair.mission
-    ways = compared(plan.question, mission, planner(pair.planner_name).MANOEUVRES)
+    ways = compared(plan.question, mission, planner(pair.planner_name, mission).MANOEUVRES)
     sheet = Sheet(medium, False, [pair.title, _title(pair, one)])
     axes, value = sheet.panel(), sheet.panel()
     half = AROUND * max(

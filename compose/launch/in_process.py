@@ -57,9 +57,10 @@ def played(scenario: Scenario, sinks: Mapping[str, Sink]) -> Run:
             received = [
                 sent[contact.peer, tick] for contact in observation.contacts for tick in contact.heard or ()
             ]
-            commands[observation.robot] = robots[observation.robot].decide(received)
-            if robots[observation.robot].journaled:
-                robots[observation.robot].estimate()
+            agent = robots[observation.robot]
+            commands[observation.robot] = agent.decide(received)
+            if agent.journaled:
+                agent.estimate()
         if sent:
             for robot in ids:  # it can no longer be received
                 sent.pop((robot, simulation.tick - LATEST), None)

@@ -28,7 +28,10 @@ FEWEST_MUTUAL_RANGES = 2
 class GaussianEstimator(msgspec.Struct, frozen=True):
     """The hypotheses of the Gaussian fits. None is certain, and no single measurement excludes one."""
 
-    has_covariances: ClassVar[bool] = True
+    pose_tolerance: ClassVar[float] = 0.05
+    """The noise of actuation moves a robot past its target."""
+    corrects_poses: ClassVar[bool] = True
+    """Each range to the anchor corrects the pose."""
     report_tolerance: ClassVar[float] = math.inf
     """Noise explains every difference, and the consistency tests decide."""
 

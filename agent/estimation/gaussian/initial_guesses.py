@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from msgspec.structs import replace
 
-from agent.estimation.gaussian.odometry_noise import Array, Track, wander
+from agent.estimation.gaussian.odometry_noise import Array, Places, Track, wander
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, Ranges, mixture, placed
 from protocol.noise import Noise, VelocityNoise
 
@@ -84,6 +84,13 @@ def _odometry_variance(path: Track, ranges: Ranges, noise: Noise) -> Array:
     return along
 
 
+def _spread(count: int) -> Places:
+    """Return at most SEED_RANGES of the indices below `count`, evenly spaced."""
+    # numpy.unique would import numpy.ma in the first search of a mission
+    spread = np.linspace(0, count - 1, SEED_RANGES).round().astype(np.intp)
+    return spread[np.diff(spread, prepend=-1) > 0]
+
+
 def _crossings(path: Track, ranges: Ranges) -> Array:
     """Return the intersections (m) of each two range circles, in the frame of the odometry; shape (n, 2).
 
@@ -91,7 +98,7 @@ def _crossings(path: Track, ranges: Ranges) -> Array:
     """
     if len(ranges.rho) < 2:
         return np.empty((0, 2))
-    chosen = np.unique(np.linspace(0, len(ranges.rho) - 1, SEED_RANGES).round().astype(np.intp))
+    chosen = _spread(len(ranges.rho))
     i, j = np.triu_indices(len(chosen), 1)
     i, j = chosen[i], chosen[j]
     x, y, rho = path.x[ranges.tick], path.y[ranges.tick], ranges.rho
@@ -180,7 +187,7 @@ def placements(of_a: Array, of_b: Array, pair: PairRanges) -> list[tuple[float, 
     mutual = pair.ranges.rows(2)
     ticks, rho, sigma = pair.ranges.tick[mutual], pair.ranges.rho[mutual], pair.ranges.sigma[mutual]
     places = pair.places if len(pair.places) >= SEED_RANGES else np.arange(len(ticks))
-    some = places[np.unique(np.linspace(0, len(places) - 1, SEED_RANGES).round().astype(np.intp))]
+    some = places[_spread(len(places))]
     ticks, rho, sigma = ticks[some], rho[some], sigma[some]
     place = [
         placed(np.array([*one, 0.0]), path, ticks) for one, path in zip((of_a, of_b), pair.paths, strict=True)
