@@ -261,7 +261,7 @@ def test_a_robot_that_is_killed_at_any_moment_goes_on(
 
 
 def test_a_rover_that_repeats_a_reading_is_where_it_was(tmp_path: Path) -> None:
-    """Its wheels do not finish the manoeuvre meanwhile: its peer may have been ranged from there already."""
+    """The wheels do not finish the manoeuvre meanwhile: the peer may have been ranged from there already."""
     config, state = load("paper-1").config("a"), str(tmp_path / "body")
     rover = Rover(config, 1000.0, state=state)
     rover.sense(0)

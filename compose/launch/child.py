@@ -50,7 +50,7 @@ class ChildProcess:
         self._open = [stream for stream in streams if stream is not None]
         self._errors = errors
         self._stderr_text = ""
-        """Its standard error once the file is closed."""
+        """The text of standard error; set once the file is closed."""
         self._why = ""
         self._on_end = on_end
         self._over = threading.Event()

@@ -92,7 +92,7 @@ class Inbox:
         self._lock = threading.RLock()  # a signal handler may interrupt its holder
         self._line: Line | None = None
         self._line_is_next = True
-        """Whether the next event is taken from the line, if both have one. A flood of one waits for both."""
+        """True if the line comes first when both have an event, so that neither starves the other."""
         self._timer = Timer(self._wake)
 
     def take_from(self, line: Line) -> None:
