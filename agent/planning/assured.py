@@ -11,12 +11,12 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from agent.planning import exchange, phase3_last_manoeuvre, transitions
-from agent.planning.exchange import estimate, report
+from agent.planning.exchange import estimate, report, start
 from agent.planning.manoeuvres import Manoeuvres
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent
 from agent.planning.phase3_last_manoeuvre import SPEEDS, Standing, Waiting
 from agent.planning.state import MODE_NAMES, Done, RobotState
-from protocol.messages import Command, Localised, Observation, Report, RobotConfig
+from protocol.messages import Command, Localised, Observation, Report
 from protocol.mission import Mission
 from protocol.motion import REST
 
@@ -45,11 +45,6 @@ PEER_RESTS = (MODE_NAMES[Standing], MODE_NAMES[Waiting])
 
 If both moved at once, they might do so in mirror image, and the new range would not select a placement.
 """
-
-
-def start(config: RobotConfig) -> RobotState:
-    """Return the state of a robot that has measured nothing yet."""
-    return RobotState(config)
 
 
 def observe(state: RobotState, observation: Observation) -> RobotState:

@@ -19,9 +19,15 @@ from protocol.messages import (
     Observation,
     Ranged,
     Report,
+    RobotConfig,
     Undecided,
 )
 from protocol.motion import REST, Controls, Pose, step
+
+
+def start(config: RobotConfig) -> RobotState:
+    """Return the state of a robot that has measured nothing yet."""
+    return RobotState(config)
 
 
 def observed(state: RobotState, observation: Observation) -> RobotState:

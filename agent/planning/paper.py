@@ -13,13 +13,13 @@ from msgspec.structs import replace
 
 from agent.planning import exchange, transitions
 from agent.planning.accuracy_seeking import CHECKED_WITH_OUTLIERS
-from agent.planning.exchange import estimate, report
+from agent.planning.exchange import estimate, report, start
 from agent.planning.manoeuvres import Manoeuvres
 from agent.planning.phase1_anchor import ThirdPoint
 from agent.planning.phase2_orbit import Orbiting
 from agent.planning.phase3_last_manoeuvre import Standing, Waiting
 from agent.planning.state import MODE_NAMES, RobotState
-from protocol.messages import Command, Observation, Report, RobotConfig
+from protocol.messages import Command, Observation, Report
 from protocol.mission import Mission
 
 __all__ = (
@@ -42,11 +42,6 @@ ACTIVE_SENSING = False
 
 CHECKED = 3
 """The minimum number of mutual ranges before a claim with noisy sensors, without outliers."""
-
-
-def start(config: RobotConfig) -> RobotState:
-    """Return the state of a robot that has measured nothing yet."""
-    return RobotState(config)
 
 
 def observe(state: RobotState, observation: Observation) -> RobotState:
