@@ -6,16 +6,20 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from itertools import permutations
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zenoh
 
+from agent.process import discovery
+from agent.process.discovery import Search, join
 from compose.launch.processes import free_endpoint
 from compose.scenario.scenario_file import load
 from protocol.network import keys, session
 from protocol.network.endpoints import at, listening
+from protocol.network.inbox import Inbox
 from protocol.wire import encode
-from tests.commands import TandemProcess, journals, processes_of, several_pairs, tandem, world
+from tests.commands import BOUND_S, TandemProcess, journals, processes_of, several_pairs, tandem, until, world
 from tests.series import series
 
 NOBODY = "nothing listens there; check the address, and that the router runs"
@@ -133,6 +137,36 @@ def waiting(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 def test_an_unknown_robot_is_refused_with_the_known_ones(waiting: str) -> None:
     ended = tandem("agent", "z", "--connect", waiting)
     assert ended == (2, "", "tandem agent: this world has no robot 'z'; it has a, b\n")
+
+
+def test_an_agent_waits_until_the_robot_s_former_process_has_disappeared(
+    waiting: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It does so for longer than it searches through one session."""
+    monkeypatch.setattr(discovery, "SESSION_S", 0.1)
+    with (
+        session.open_client(at(waiting), unanswered) as former,
+        session.open_client(at(waiting), unanswered) as link,
+    ):
+        token: Any = session.show_alive(former, keys.robot_alive("mine", "b"))
+        until(
+            lambda: session.alive(link, keys.robot_alive("mine", "b"), BOUND_S), "the former process appears"
+        )
+
+        class LongSearch(Search):
+            pauses = 0
+
+            def pause(self) -> None:
+                super().pause()
+                self.pauses += 1
+                if self.pauses == 20:  # at ASK_AGAIN_S each
+                    token.undeclare()
+
+        search = LongSearch("world", at(waiting), BOUND_S, Inbox("agent"))
+        joined = join(link, "mine", "b", search)
+    assert joined is not None
+    assert (joined[0], joined[1].robot) == ("mine", "b")
+    assert search.pauses >= 20
 
 
 def test_a_second_agent_of_the_same_robot_is_refused(waiting: str) -> None:

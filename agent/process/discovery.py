@@ -18,10 +18,15 @@ from protocol.wire import MalformedFrame, decode
 QUERY_S = 2.0
 """The seconds to wait for the answer to one query."""
 SESSION_S = 3.0
-"""The seconds to search through one session, or to wait for a robot's former process to disappear."""
+"""The seconds to search through one session."""
+FORMER_S = 10.0
+"""The seconds to wait for a robot's former process to disappear.
+
+It may need five seconds to end after its launcher was killed, and two to close its session. Its link has a
+lease of two seconds.
+"""
 ASK_AGAIN_S = 0.05
 """The seconds between two searches for a world."""
-
 
 REFUSED_S = 1.0
 """The seconds for which a refusal must persist, without a RobotConfig from any world, to be accepted."""
@@ -90,16 +95,17 @@ class _Offers(NamedTuple):
 def join(link: zenoh.Session, run: str | None, robot: str, search: Search) -> tuple[str, RobotConfig] | None:
     """Return the run that `robot` belongs to, and its RobotConfig; None if none is found within SESSION_S.
 
-    `run` may name the run. A former process of the robot may have ended a moment ago and still appear alive.
-    Unknown processes may announce and answer anything, so a refusal is accepted only after REFUSED_S.
+    `run` may name the run. A former process of the robot may have ended a moment ago and still appear alive,
+    for up to FORMER_S. Unknown processes may announce and answer anything, so a refusal is accepted only
+    after REFUSED_S.
 
     Raises Unwelcome if there are several runs, if the world has no such robot, or if another process for this
     robot stays alive. Raises whatever `search` raises while there is no world.
     """
-    until = time.monotonic() + SESSION_S
+    began = time.monotonic()
     refused: float | None = None
     occupied: str | None = None
-    while time.monotonic() < until:
+    while time.monotonic() < began + (SESSION_S if occupied is None else FORMER_S):
         worlds = [key.run for key in session.alive(link, keys.world_alive(run or "*"), QUERY_S)]
         offers = _offers(link, worlds[:MOST_WORLDS], robot)
         if len(offers.configs) > 1:
