@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import socket
+import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
 from itertools import permutations
@@ -35,6 +37,16 @@ def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("paper-1") / "out"
     assert tandem("run", "paper-1", "--in-process", "-q", "--out", out).status == 0
     return out
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a reserved port could not be listened on elsewhere")
+def test_an_endpoint_is_not_given_to_two_even_if_nothing_listens_there_yet() -> None:
+    """A process that connects again after a crash would reach another run."""
+    endpoint = free_endpoint()
+    with socket.socket() as other, pytest.raises(OSError, match="in use"):
+        other.bind(("127.0.0.1", int(endpoint.rpartition(":")[2])))
+    with session.open_router(listening(endpoint)):  # the reservation does not prevent this
+        pass
 
 
 # --- any order ----------------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ import random
 import signal
 import socket
 import sys
+from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -27,18 +28,34 @@ CHILD_FILES, SPARE_FILES = 2, 12
 """The number of descriptors that the launcher needs for each process of a run, and for starting one."""
 LISTENING_PORTS = range(20_000, 32_000)
 """The ports for `free_endpoint`. They are below the ephemeral ports, which outgoing connections may take."""
+RESERVED = 64
+"""The number of latest ports that this process reserves, so that no other process is given one of them."""
+
+_reservations: deque[socket.socket] = deque()
 
 
 def free_endpoint(protocol: str = "tcp") -> str:
-    """Return a loopback endpoint on which no process listens."""
+    """Return a loopback endpoint on which no process listens, and that no other call returns meanwhile.
+
+    On Linux, the port stays reserved also while nothing listens there, as after a crash of its process. A
+    process that connects again would otherwise reach another run.
+    """
     ports = random.SystemRandom()
     while True:
         port = ports.choice(LISTENING_PORTS)
-        with socket.socket() as probe:
-            try:
-                probe.bind(("127.0.0.1", port))
-            except OSError:
-                continue
+        reservation = socket.socket()
+        try:
+            reservation.bind(("127.0.0.1", port))
+        except OSError:
+            reservation.close()
+            continue
+        if sys.platform == "linux":  # elsewhere, nobody could listen
+            reservation.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            _reservations.append(reservation)
+            if len(_reservations) > RESERVED:
+                _reservations.popleft().close()
+        else:
+            reservation.close()
         return f"{protocol}/127.0.0.1:{port}"
 
 
