@@ -40,7 +40,7 @@ from protocol.spelling import did_you_mean
 from protocol.units import NAME, RobotId
 from protocol.wire import MalformedFrame, decode, encode
 from world.faults import Fault, delivery_time_bound
-from world.scenario import RobotSpec, Scenario, ScenarioWithWorldNoise
+from world.scenario import RecordedScenario, RobotSpec, Scenario, ScenarioWithWorldNoise
 from world.world_noise import Distribution, WorldNoise, world_noise_infeasibility, world_noise_mistake
 
 MAX_TICKS = 10**9
@@ -128,7 +128,7 @@ class ScenarioTemplate(msgspec.Struct, frozen=True):
     """A validated scenario file with its scenario, from which scenarios of other seeds are drawn cheaply."""
 
     file: ScenarioFile
-    scenario: Scenario
+    scenario: RecordedScenario
     """Scenario with the seed of the file."""
 
     def seeded(self, seed: int | None) -> Scenario:
