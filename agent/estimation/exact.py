@@ -83,9 +83,13 @@ def weigh_branches(
     Two branches with the anchor at the same position are merged. This happens very close to the anchor, or if
     the motion is almost radial.
     """
-    seen = tuple(seen)
-    ranged = [(pose, rho) for pose, rho in seen if rho is not None]
-    silent = [pose for pose, rho in seen if rho is None]
+    ranged: list[tuple[Pose, float]] = []
+    silent: list[Pose] = []
+    for pose, rho in seen:
+        if rho is None:
+            silent.append(pose)
+        else:
+            ranged.append((pose, rho))
     left: list[Branch] = []
     for candidate in candidates:
         branch = polished(candidate, ranged)
@@ -148,13 +152,14 @@ def polished(branch: Branch, ranged: Sequence[tuple[Pose, float]]) -> Branch:
     if len(ranged) < FITTED:
         return branch
     rho0, heading = branch.start.x, branch.start.heading
+    measured = [(pose.x, pose.y, rho * rho) for pose, rho in ranged]
     best, fitted = math.inf, heading
     for _ in range(POLISHING_STEPS):
         c, s = math.cos(heading), math.sin(heading)
         cost = gradient = curvature = 0.0
-        for pose, rho in ranged:
-            x, y = rho0 + c * pose.x - s * pose.y, s * pose.x + c * pose.y
-            error = x * x + y * y - rho * rho
+        for pose_x, pose_y, squared in measured:
+            x, y = rho0 + c * pose_x - s * pose_y, s * pose_x + c * pose_y
+            error = x * x + y * y - squared
             slope = -2.0 * rho0 * y
             cost += error * error
             gradient += slope * error
@@ -210,9 +215,7 @@ def weigh_placements(
     return tuple(left)
 
 
-def _explains_ranges(
-    placement: Placement, ranged: Iterable[tuple[Positions, float]], floor: float
-) -> bool:
+def _explains_ranges(placement: Placement, ranged: Iterable[tuple[Positions, float]], floor: float) -> bool:
     x, y = placement.x, placement.y
     c, s = math.cos(placement.phi), math.sin(placement.phi)
     for (ax, ay, bx, by), rho in ranged:

@@ -40,8 +40,8 @@ class MotionLog(msgspec.Struct, frozen=True):
         if runs:
             last = runs[-1]
             if last.v == v and last.omega == omega:
-                runs, ticks_in_all = runs[:-1], last.ticks + ticks
-                return MotionLog(self.through + ticks, (*runs, Segment(ticks_in_all, v, omega)), self.ranges)
+                longer = Segment(last.ticks + ticks, v, omega)
+                return MotionLog(self.through + ticks, runs[:-1] + (longer,), self.ranges)
         return MotionLog(self.through + ticks, (*runs, Segment(ticks, v, omega)), self.ranges)
 
     def ranged(self, distance: float) -> MotionLog:

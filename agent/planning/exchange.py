@@ -149,23 +149,24 @@ def _safe(state: RobotState, controls: Controls) -> Controls:
 
 def estimate(state: RobotState) -> Estimate:
     """Return all poses that the robot considers possible in its anchor's frame and in <W>."""
-    branches_left = state.belief.branches
-    if not branches_left and state.belief.branch is not None:
-        branches_left = (state.belief.branch,)
+    belief, verdict = state.belief, state.verdict
+    branches_left = belief.branches
+    if not branches_left and belief.branch is not None:
+        branches_left = (belief.branch,)
     elif not branches_left and isinstance(state.mode, ThirdPoint):
         branches_left = state.mode.branches
-    if state.belief.poses:
-        world: tuple[Pose, ...] = state.belief.poses
-    elif isinstance(state.verdict, Localised):
-        world = (state.verdict.pose,)
+    if belief.poses:
+        world: tuple[Pose, ...] = belief.poses
+    elif isinstance(verdict, Localised):
+        world = (verdict.pose,)
     else:
-        world = tuple(state.world_pose(placement) for placement in state.belief.placements)
+        world = tuple([state.world_pose(placement) for placement in belief.placements])
     return Estimate(
         tick=state.tick,
         robot=state.config.robot,
         local=tuple(phase1_anchor.local(branches_left, state.odometry)),
         world=world,
-        localised=isinstance(state.verdict, Localised),
-        probabilities=tuple(one.probability for one in state.belief.pair or state.belief.own),
-        covariance=state.belief.covariance,
+        localised=isinstance(verdict, Localised),
+        probabilities=tuple([one.probability for one in belief.pair or belief.own]),
+        covariance=belief.covariance,
     )

@@ -84,7 +84,7 @@ class RobotState(Knowledge, frozen=True):
     @property
     def orbit(self) -> Orbit:
         """Return the orbit of this robot in phase 2."""
-        return self.config.rendezvous.of(self.config.role)
+        return self.config.orbit
 
     @property
     def phase(self) -> int:

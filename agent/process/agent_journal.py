@@ -101,7 +101,9 @@ class AgentHistory(msgspec.Struct, frozen=True):
 class AgentJournalReading:
     """A reader of an agent's journal, frame by frame."""
 
-    def __init__(self) -> None:
+    def __init__(self, shared: dict[bytes, Any] | None = None) -> None:
+        """`shared` are the Reports and Commands that readers of the same recording have decoded, by frame."""
+        self._shared = {} if shared is None else shared
         self.environment: Environment | None = None
         self.config: RobotConfig | None = None
         """The configuration; None until it has been read."""
@@ -120,7 +122,11 @@ class AgentJournalReading:
 
         Raises MalformedFrame, also if the first frame besides the environment is no RobotConfig.
         """
-        message = decode(frame, OfRobot, MAX_FRAME_BYTES)
+        message = self._shared.get(frame)
+        if message is None:
+            message = decode(frame, OfRobot, MAX_FRAME_BYTES)
+            if isinstance(message, Report | Command):
+                self._shared[frame] = message
         if not self._fits(message, frame):
             tick: int | None = getattr(message, "tick", None)
             at = f" of tick {tick}" if tick is not None else ""

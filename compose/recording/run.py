@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 from msgspec.structs import replace
@@ -310,11 +310,12 @@ def of_journals(journals: Mapping[str, JournalFile], source: object) -> Run:
     decoded: dict[str, JournalFile] = {}
     world: WorldHistory | None = None
     agents: dict[str, AgentHistory] = {}
+    shared: dict[bytes, Any] = {}  # the Reports and Commands: each is in two journals, and decoded once
     for name, one in journals.items():
         if name == WORLD_JOURNAL:
-            decoded[name], world = _world(one, f"{source}/{name}")
+            decoded[name], world = _world(one, f"{source}/{name}", shared)
         else:
-            decoded[name], agent = _agent(one, robot_of(name), f"{source}/{name}")
+            decoded[name], agent = _agent(one, robot_of(name), f"{source}/{name}", shared)
             if agent is not None:
                 agents[robot_of(name)] = agent
     if world is None:
@@ -324,8 +325,8 @@ def of_journals(journals: Mapping[str, JournalFile], source: object) -> Run:
     return Run(world, {robot: agents[robot] for robot in ids if robot in agents}, decoded, source)
 
 
-def _world(journal: JournalFile, source: str) -> tuple[JournalFile, WorldHistory]:
-    reading = world_journal.WorldJournalReading()
+def _world(journal: JournalFile, source: str, shared: dict[bytes, Any]) -> tuple[JournalFile, WorldHistory]:
+    reading = world_journal.WorldJournalReading(shared)
     problem = _take(reading, journal.frames, source)
     content = reading.content()
     if problem is not None:
@@ -335,10 +336,12 @@ def _world(journal: JournalFile, source: str) -> tuple[JournalFile, WorldHistory
     return replace(journal, messages=reading.messages), content
 
 
-def _agent(journal: JournalFile, robot: str, source: str) -> tuple[JournalFile, AgentHistory | None]:
+def _agent(
+    journal: JournalFile, robot: str, source: str, shared: dict[bytes, Any]
+) -> tuple[JournalFile, AgentHistory | None]:
     from agent.process import agent_journal as of_agent  # noqa: PLC0415  # a launcher has no such journal
 
-    reading = of_agent.AgentJournalReading()
+    reading = of_agent.AgentJournalReading(shared)
     problem = journal.problem or _take(reading, journal.frames, source)
     agent = reading.content()
     if agent is not None and agent.config.robot != robot:
