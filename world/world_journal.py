@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 
 from protocol.journal.environment import named_in
-from protocol.journal.journal_file import CorruptJournal, UnexpectedFrame
+from protocol.journal.journal_file import CorruptJournal, UnexpectedFrame, take_all
 from protocol.messages import Command, DeadlineMissed, Environment, FinalReport, MissionEnd
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 from world.referee import MissionOutcome
@@ -66,12 +66,9 @@ def world_history(frames: Iterable[bytes], source: object) -> WorldHistory:
     Raises CorruptJournal, with `source` as the journal's name.
     """
     reading = WorldJournalReading()
-    try:
-        for frame in frames:
-            if not reading.take(frame):
-                break
-    except MalformedFrame as error:
-        raise CorruptJournal(f"{source}: {error}") from None
+    problem = take_all(reading, frames, source)
+    if problem is not None:
+        raise problem
     content = reading.content()
     if content is None:
         raise CorruptJournal(f"{source}: it contains no scenario")

@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 
 from protocol import motion
-from protocol.journal.journal_file import CorruptJournal, UnexpectedFrame
+from protocol.journal.journal_file import CorruptJournal, UnexpectedFrame, take_all
 from protocol.messages import (
     Command,
     DeadlineMissed,
@@ -212,12 +212,9 @@ def agent_history(frames: Iterable[bytes], source: object) -> AgentHistory:
     Raises CorruptJournal, with a text that begins with `source`.
     """
     reading = AgentJournalReading()
-    try:
-        for frame in frames:
-            if not reading.take(frame):
-                break
-    except MalformedFrame as error:
-        raise CorruptJournal(f"{source}: {error}") from None
+    problem = take_all(reading, frames, source)
+    if problem is not None:
+        raise problem
     if reading.unexpected is not None:
         raise CorruptJournal(f"{source}: {reading.unexpected.what}")
     content = reading.content()

@@ -20,7 +20,7 @@ from compose.recording.recording_files import (
     robot_of,
 )
 from compose.recording.run_setup import RunSetup, of_configs, of_scenario
-from protocol.journal.journal_file import CorruptJournal
+from protocol.journal.journal_file import CorruptJournal, take_all
 from protocol.messages import (
     Command,
     Contact,
@@ -34,14 +34,12 @@ from protocol.messages import (
 )
 from protocol.motion import Controls, Pose
 from protocol.output import one_line
-from protocol.wire import MalformedFrame
 from world import world_journal
 from world.scenario import Scenario
 from world.tick import observations
 from world.world_journal import Tick, WorldHistory
 
 if TYPE_CHECKING:
-    from agent.process import agent_journal as of_agent
     from agent.process.agent_journal import AgentHistory
 
 
@@ -327,7 +325,7 @@ def of_journals(journals: Mapping[str, JournalFile], source: object) -> Run:
 
 def _world(journal: JournalFile, source: str, shared: dict[bytes, Any]) -> tuple[JournalFile, WorldHistory]:
     reading = world_journal.WorldJournalReading(shared)
-    problem = _take(reading, journal.frames, source)
+    problem = take_all(reading, journal.frames, source)
     content = reading.content()
     if problem is not None:
         raise problem
@@ -342,26 +340,11 @@ def _agent(
     from agent.process import agent_journal as of_agent  # noqa: PLC0415  # a launcher has no such journal
 
     reading = of_agent.AgentJournalReading(shared)
-    problem = journal.problem or _take(reading, journal.frames, source)
+    problem = journal.problem or take_all(reading, journal.frames, source)
     agent = reading.content()
     if agent is not None and agent.config.robot != robot:
         problem, agent = CorruptJournal(f"{source} is the journal of {agent.config.robot}"), None
     return replace(journal, messages=reading.messages, problem=problem), agent
-
-
-def _take(
-    reading: of_agent.AgentJournalReading | world_journal.WorldJournalReading,
-    frames: Iterable[bytes],
-    source: str,
-) -> CorruptJournal | None:
-    """Give `frames` to `reading`, up to the first out of order; return the error of one that is damaged."""
-    try:
-        for frame in frames:
-            if not reading.take(frame):
-                break
-    except MalformedFrame as error:
-        return CorruptJournal(f"{source}: {error}")
-    return None
 
 
 def _agree(configs: Mapping[str, RobotConfig], source: object) -> None:
