@@ -33,8 +33,9 @@ def start(config: RobotConfig) -> RobotState:
 def observed(state: RobotState, observation: Observation) -> RobotState:
     """Return `state` with the sensor data of one tick: odometry, anchor range, contact and mutual range."""
     log, odometry, leg = state.log, state.odometry, state.leg
-    if observation.executed is not None:
-        v, omega = observation.executed.v, observation.executed.omega
+    executed = observation.executed
+    if executed is not None:
+        v, omega = executed.v, executed.omega
         log = log.drove(v, omega)
         ticks = log.runs[-1].ticks
         if ticks == 1:
@@ -118,11 +119,12 @@ def with_reports(state: RobotState, reports: Sequence[Report]) -> RobotState:
 
 def command(state: RobotState, controls: Controls) -> Command:
     """Return the command with `controls`, limited by the safety distance, the mode and the verdict."""
-    if state.in_contact and state.config.mission.safety_distance:
+    config = state.config
+    if state.in_contact and config.mission.safety_distance:
         controls = _safe(state, controls)
     return Command(
         state.tick,
-        state.config.robot,
+        config.robot,
         controls.v,
         controls.omega,
         state.phase,

@@ -189,10 +189,8 @@ def compared(question: Question, mission: Mission, manoeuvres: Manoeuvres) -> Co
         value = np.where(apart, gap, -np.inf)
     if manoeuvres.fewest_out_of_range:
         rim = (mission.sensing_range - RANGE_MARGIN) ** 2
-        outside = np.zeros(gap.shape, np.int8)
-        for distance in squared:
-            outside += distance > rim
-        fewest = np.min(outside if apart is None else outside[apart], initial=len(squared))
+        outside = reduce(np.add, [(distance > rim).view(np.int8) for distance in squared])
+        fewest = (outside if apart is None else outside[apart]).min(initial=len(squared))
         value = np.where(outside == fewest, value, -np.inf)
     return Compared(reach, gap, value)
 
