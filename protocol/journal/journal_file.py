@@ -70,14 +70,14 @@ class Sink(Protocol):
         """Append all of `frames` in one operation."""
 
 
-class Reading(Protocol):
+class FrameReader(Protocol):
     """The contract of a reader of a journal's frames."""
 
     def take(self, frame: bytes) -> bool:
         """Add the next frame, and return whether it is in order. Raises MalformedFrame."""
 
 
-def take_all(reading: Reading, frames: Iterable[bytes], source: object) -> CorruptJournal | None:
+def take_all(reading: FrameReader, frames: Iterable[bytes], source: object) -> CorruptJournal | None:
     """Give `frames` to `reading`, up to the first out of order; return the error of one that is damaged.
 
     The text of the error begins with `source`.
