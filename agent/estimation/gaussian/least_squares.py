@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from agent.estimation.gaussian.odometry_noise import (
+    NO_ERRORS,
     Array,
     Errors,
     OdometryNoiseModel,
@@ -29,7 +30,7 @@ from agent.estimation.gaussian.odometry_noise import (
     spread,
     wander,
 )
-from agent.estimation.gaussian.range_model import Ranges, mixture, outliers, predict
+from agent.estimation.gaussian.range_model import Predicted, Ranges, mixture, outliers, predict
 from protocol.noise import Noise, VelocityNoise
 
 STEPS = 8
@@ -43,6 +44,13 @@ SETTLED = 1e-2
 
 LEAP = 1.0
 """The largest change of an unknown, in m and rad, in one step."""
+
+SHORTER_STEPS = (0.5, 0.25, 0.0625)
+"""The fractions of a step that are tried in turn while it does not descend; the last is taken in any case.
+
+Gauss-Newton with full steps may alternate between two guesses for ever. Where even a sixteenth of a step does
+not descend, the rest is rounding.
+"""
 
 RIDGE = 1e-12
 """The fraction of the information that is added to its diagonal, and an absolute part of the same size.
@@ -123,64 +131,125 @@ def fit(
     noise: Noise,
     apart: tuple[float, float] = (0.0, 0.0),
     steps: int = STEPS,
+    begun: Sequence[Errors] = (),
 ) -> Fit:
     """Return the Gauss-Newton fit that begins at `guess` (see `predict`).
 
-    The weights of outliers decrease during the iteration. `apart` is M2 - M1 (m) in <W>.
+    It begins on the paths with the odometry errors `begun`, by default on the measured paths. A step that
+    does not descend is halved, because Gauss-Newton with full steps may alternate between two guesses. The
+    weights of outliers decrease during the iteration. `apart` is M2 - M1 (m) in <W>.
     """
     free = slice(0, 2) if len(measured) == 1 else slice(0, 6)
-    paths: tuple[Track, ...] = tuple(measured)
+    noisy_odometry = noise.odometry != VelocityNoise()
     drifts: tuple[OdometryNoiseModel, ...] = ()
     errors: tuple[Errors, ...] = ()
-    guess, weights = guess.copy(), np.ones_like(ranges.rho)
-    noisy_odometry = noise.odometry != VelocityNoise()
+    if noisy_odometry:
+        errors = tuple([error.over(len(was.v)) for error, was in zip(begun, measured, strict=False)])
+    point = _point(guess.copy(), errors, measured, ranges, apart)
+    weights = np.ones_like(ranges.rho)
     for step in range(steps + 1):
-        predicted = predict(guess, paths, ranges, apart)
-        residuals = ranges.rho - predicted.distance
-        odometry, innovation = None, residuals
+        odometry, innovation = None, point.residuals
         if noisy_odometry:
-            seen = predicted.seen(paths, ranges)
+            seen = point.predicted.seen(point.paths, ranges)
             drifts = tuple(
-                [wander(path, noise.odometry, was) for path, was in zip(paths, measured, strict=True)]
+                [wander(path, noise.odometry, was) for path, was in zip(point.paths, measured, strict=True)]
             )
             odometry = _odometry_covariance(drifts, seen)
-            for model, rows, error in zip(drifts, seen, errors, strict=False):
+            for model, rows, error in zip(drifts, seen, point.errors, strict=False):
                 innovation = innovation + shifted(model, rows, error)
         if noise.outliers and step == 0:
-            loose = np.zeros_like(residuals) if odometry is None else np.diagonal(odometry)
-            weights = mixture(residuals, np.sqrt(np.square(ranges.sigma) + loose), noise)[1]
+            loose = np.zeros_like(innovation) if odometry is None else np.diagonal(odometry)
+            weights = mixture(point.residuals, np.sqrt(np.square(ranges.sigma) + loose), noise)[1]
         variance = _variance(ranges.sigma, weights)
-        system = _solved(predicted.jacobian[:, free], innovation, variance, odometry, bool(noise.outliers))
+        jacobian = point.predicted.jacobian[:, free]
+        system = _solved(jacobian, innovation, variance, odometry, bool(noise.outliers))
         updated = _inlier_probabilities(system, weights, ranges.sigma, noise) if noise.outliers else weights
         change = system.change
         last_step = math.sqrt(abs(float(change @ system.information @ change)))
         still = last_step < STILL and float(np.max(np.abs(updated - weights))) < SETTLED
-        if step == steps or (still and (errors or not noisy_odometry)):  # the path is corrected at least once
+        if step == steps or (still and (step or not noisy_odometry)):  # the path is corrected at least once
             break
         weights = updated
         change = change * min(1.0, LEAP / max(float(np.max(np.abs(change))), LEAP))
-        guess[free] += change
         if noisy_odometry:
             left = system.weighted[:, -1] - system.weighted[:, :-1] @ change
             errors = tuple([attributed(model, rows, left) for model, rows in zip(drifts, seen, strict=True)])
-            paths = tuple([error.corrected(was) for error, was in zip(errors, measured, strict=True)])
+        full_step = np.zeros_like(point.guess)
+        full_step[free] = change
+        point = _descended(point, full_step, errors, drifts, variance, measured, ranges, apart)
     chi2 = float(system.innovation @ system.multipliers)
     return Fit(
-        guess,
-        paths,
-        errors,
-        _log_likelihood(system, chi2, residuals, weights, ranges.sigma, noise),
-        residuals,
+        point.guess,
+        point.paths,
+        point.errors,
+        _log_likelihood(system, chi2, point.residuals, weights, ranges.sigma, noise),
+        point.residuals,
         weights,
         system.of_guess,
         system.information,
         chi2,
         last_step,
         ranges.tick,
-        predicted.directions,
+        point.predicted.directions,
         drifts,
         system,
     )
+
+
+class _Point(NamedTuple):
+    """A guess and odometry errors, with the ranges that they predict."""
+
+    guess: Array
+    errors: tuple[Errors, ...]
+    """The odometry errors of each path; empty if they are 0."""
+    paths: tuple[Track, ...]
+    predicted: Predicted
+    residuals: Array
+
+
+def _point(
+    guess: Array,
+    errors: tuple[Errors, ...],
+    measured: Sequence[Track],
+    ranges: Ranges,
+    apart: tuple[float, float],
+) -> _Point:
+    paths = tuple(measured)
+    if errors:
+        paths = tuple([error.corrected(was) for error, was in zip(errors, measured, strict=True)])
+    predicted = predict(guess, paths, ranges, apart)
+    return _Point(guess, errors, paths, predicted, ranges.rho - predicted.distance)
+
+
+def _descended(
+    point: _Point,
+    change: Array,
+    errors: tuple[Errors, ...],
+    drifts: Sequence[OdometryNoiseModel],
+    variance: Array,
+    measured: Sequence[Track],
+    ranges: Ranges,
+    apart: tuple[float, float],
+) -> _Point:
+    """Return the point after a step by `change` and to `errors`, or by that fraction of it that descends."""
+    most = _cost(point, drifts, variance)
+    following = _point(point.guess + change, errors, measured, ranges, apart)
+    for fraction in SHORTER_STEPS:
+        if _cost(following, drifts, variance) <= most:
+            break
+        begins = point.errors or [NO_ERRORS.over(len(was.v)) for was in measured]
+        nearer = [a.towards(b, fraction) for a, b in zip(begins, errors, strict=False)]
+        following = _point(point.guess + fraction * change, tuple(nearer), measured, ranges, apart)
+    return following
+
+
+def _cost(point: _Point, drifts: Sequence[OdometryNoiseModel], variance: Array) -> float:
+    """Return twice the negative log-density of the residuals and of the odometry errors, up to a constant."""
+    cost = float(np.sum(np.square(point.residuals) / variance))
+    for error, model in zip(point.errors, drifts, strict=False):
+        for one, q in zip(error, model.variances, strict=True):
+            cost += float(np.sum(np.square(one) / np.where(q > 0.0, q, np.inf)))
+    return cost
 
 
 def _odometry_covariance(drifts: Sequence[OdometryNoiseModel], seen: Sequence[Projection]) -> Array:

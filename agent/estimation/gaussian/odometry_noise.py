@@ -169,6 +169,23 @@ class Errors(NamedTuple):
         """Return the path with these errors added to the `measured` velocities."""
         return track(measured.v + self.v, measured.omega + self.omega, measured.period)
 
+    def over(self, ticks: int) -> Errors:
+        """Return these errors for so many ticks: 0 in those that have come since."""
+        v, omega = np.zeros(ticks), np.zeros(ticks)
+        known = min(ticks, len(self.v))
+        v[:known], omega[:known] = self.v[:known], self.omega[:known]
+        return Errors(v, omega)
+
+    def towards(self, other: Errors, fraction: float) -> Errors:
+        """Return the errors that lie this fraction of the way from these to `other`."""
+        return Errors(
+            self.v + fraction * (other.v - self.v), self.omega + fraction * (other.omega - self.omega)
+        )
+
+
+NO_ERRORS = Errors(np.zeros(0), np.zeros(0))
+"""The odometry errors of a fit before its first step."""
+
 
 def shifted(model: OdometryNoiseModel, rows: Projection, errors: Errors) -> Array:
     """Return by how much (m) `errors` change the value of each row, to first order; shape (N,)."""
