@@ -221,6 +221,10 @@ def _point(
     return _Point(guess, errors, paths, predicted, ranges.rho - predicted.distance)
 
 
+LEAST_VARIANCE = 1e-300
+"""The variance of odometry noise that counts as 0; the odometry error is then 0, too."""
+
+
 def _descended(
     point: _Point,
     change: Array,
@@ -245,10 +249,10 @@ def _descended(
 
 def _cost(point: _Point, drifts: Sequence[OdometryNoiseModel], variance: Array) -> float:
     """Return twice the negative log-density of the residuals and of the odometry errors, up to a constant."""
-    cost = float(np.sum(np.square(point.residuals) / variance))
+    cost = float(point.residuals @ (point.residuals / variance))
     for error, model in zip(point.errors, drifts, strict=False):
         for one, q in zip(error, model.variances, strict=True):
-            cost += float(np.sum(np.square(one) / np.where(q > 0.0, q, np.inf)))
+            cost += float(one @ (one / np.maximum(q, LEAST_VARIANCE)))
     return cost
 
 

@@ -81,6 +81,12 @@ class OdometryNoiseModel(NamedTuple):
     The terms are q_omega; the x and y of q_omega b; the xx, xy and yy of q_omega b b' + q_v shift shift'.
     """
 
+    def since(self, tick: int) -> OdometryNoiseModel:
+        """Return the model of a robot whose odometry was exact before `tick`."""
+        variances, sums = self.variances.copy(), self.sums - self.sums[:, tick : tick + 1]
+        variances[:, :tick] = sums[:, :tick] = 0.0
+        return self._replace(variances=variances, sums=sums)
+
 
 def wander(path: Track, noise: VelocityNoise, measured: Track) -> OdometryNoiseModel:
     """Return the prefix sums for the corrected `path`; the size of the noise follows from `measured`."""
@@ -150,7 +156,7 @@ class Projection(NamedTuple):
 def spread(model: OdometryNoiseModel, rows: Projection) -> Array:
     """Return the covariance (m^2) of N rows that is caused by odometry noise; shape (N, N)."""
     at = np.minimum(rows.tick[:, None], rows.tick)
-    c0, bx, by, xx, xy, yy = model.sums[:, at]
+    c0, bx, by, xx, xy, yy = np.take(model.sums, at, axis=1, mode="clip")
     (ux, uy), lever = rows.u, rows.lever
     column, left, above = lever[:, None], ux[:, None], uy[:, None]
     cross = column * (bx * ux + by * uy)
