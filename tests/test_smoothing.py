@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -397,6 +398,41 @@ def test_a_fit_that_begins_where_one_ended_ends_there_too() -> None:
     assert again.guess == pytest.approx(first.guess, abs=1e-9)
     assert again.paths[0].x[-1] == pytest.approx(first.paths[0].x[-1], abs=1e-9)
     assert first.paths[0].x[-1] == pytest.approx(driven.x[-1], abs=0.01)
+
+
+DRIFTING = Noise(0.05, 0.05, odometry=VelocityNoise(0.05, 0.05, 0.02, 0.05))
+
+
+def cost(told: Told, found: Fit) -> float:
+    """Return twice the negative log-density of the residuals and of the odometry errors."""
+    total = float(np.sum(np.square(found.residuals / told.ranges.sigma)))
+    for error, measured in zip(found.errors, told.measured, strict=False):
+        total += float(np.sum(np.square(np.concatenate(error)) / variances(told.noise.odometry, measured)))
+    return total
+
+
+@some
+@given(seeds, st.sampled_from([Noise(0.05, 0.05), DRIFTING]), st.floats(0.1, 2.0))
+def test_no_step_of_a_fit_climbs(seed: int, noise: Noise, by: float) -> None:
+    one = told(seed, noise)
+    guess = nudged(one, seed, by)
+    costs = [
+        cost(one, fit(guess, one.measured, one.ranges, noise, one.apart, steps=steps)) for steps in range(7)
+    ]
+    assert all(later <= earlier + 1e-5 for earlier, later in pairwise(costs)), costs
+
+
+@few
+@given(seeds)
+def test_a_fit_begins_on_the_path_that_it_is_given(seed: int) -> None:
+    one = told(seed, DRIFTING)
+    assume(clear(one))
+    first = fit(one.guess, one.measured, one.ranges, one.noise, one.apart, steps=30)
+    assume(first.last_step < STILL)
+    there = fit(first.guess, one.measured, one.ranges, one.noise, one.apart, steps=0, begun=first.errors)
+    assert there.last_step == pytest.approx(first.last_step, abs=1e-9)
+    assert [path.x[-1] for path in there.paths] == [path.x[-1] for path in first.paths]
+    assert cost(one, there) < cost(one, fit(first.guess, *one[:3], one.apart, steps=0))
 
 
 ROUGH = Noise(0.01, 0.01, outliers=0.05, outlier_bias=(0.3, 2.0), odometry=VelocityNoise(0.001, 0.001))

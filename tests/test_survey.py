@@ -126,6 +126,35 @@ def test_a_mission_that_is_cut_short_is_undecided_and_names_the_reason() -> None
     assert all((count == 1) == (probability == 1.0) for count, probability in many)
 
 
+GYRO = "anchor_sigma = 0.05\nmutual_sigma = 0.05\nodometry = {omega_floor = 0.02}"
+MANY_OUTLIERS = "anchor_sigma = 0.05\nmutual_sigma = 0.05\noutliers = 0.2\ndrop_outs = 0.3"
+
+
+@pytest.mark.parametrize(
+    ("noise", "accuracy", "seed"),
+    [
+        (GYRO, 0.3, 5048),
+        (GYRO, 0.3, 5115),
+        (GYRO, 0.3, 1549280107099476343),
+        (MANY_OUTLIERS, 0.1, 6293238656222347062),
+    ],
+)
+def test_a_mission_whose_search_once_missed_the_truth_is_not_wrong(
+    noise: str, accuracy: float, seed: int
+) -> None:
+    recording = run_mission(scenario_of(noise, seed, accuracy=accuracy))
+    assert summary(recording, "in-process", None)["outcome"] in ("localised", "undecided")
+    assert all(recording.truth_held(robot) is not False for robot in recording.robots)
+
+
+def test_nearly_exact_ranges_need_no_number_of_ranges() -> None:
+    """They need evidence against chance, and a few give it."""
+    for seed in range(4, 9):
+        recording = run_mission(scenario_of("anchor_sigma = 1e-9\nmutual_sigma = 1e-9", seed))
+        assert summary(recording, "in-process", None)["outcome"] == "localised"
+        assert recording.final_reports["a"].mutual_ranges < 8
+
+
 # --- paths ------------------------------------------------------------------------------------------
 
 

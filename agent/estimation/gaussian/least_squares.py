@@ -46,11 +46,13 @@ LEAP = 1.0
 """The largest change of an unknown, in m and rad, in one step."""
 
 SHORTER_STEPS = (0.5, 0.25, 0.0625)
-"""The fractions of a step that are tried in turn while it does not descend; the last is taken in any case.
+"""The fractions of a step that are tried in turn if it does not descend.
 
-Gauss-Newton with full steps may alternate between two guesses for ever. Where even a sixteenth of a step does
-not descend, the rest is rounding.
+Gauss-Newton with full steps may alternate between two guesses for ever.
 """
+
+DESCENT = 1e-6
+"""The increase of the cost, in units of chi-square, that is due to rounding."""
 
 RIDGE = 1e-12
 """The fraction of the information that is added to its diagonal, and an absolute part of the same size.
@@ -235,16 +237,21 @@ def _descended(
     ranges: Ranges,
     apart: tuple[float, float],
 ) -> _Point:
-    """Return the point after a step by `change` and to `errors`, or by that fraction of it that descends."""
-    most = _cost(point, drifts, variance)
+    """Return the point after a step by `change` and to `errors`, or by that fraction of it that descends.
+
+    If none does, the point stays.
+    """
+    most = _cost(point, drifts, variance) + DESCENT
     following = _point(point.guess + change, errors, measured, ranges, apart)
+    if _cost(following, drifts, variance) <= most:
+        return following
     for fraction in SHORTER_STEPS:
-        if _cost(following, drifts, variance) <= most:
-            break
         begins = point.errors or [NO_ERRORS.over(len(was.v)) for was in measured]
         nearer = [a.towards(b, fraction) for a, b in zip(begins, errors, strict=False)]
         following = _point(point.guess + fraction * change, tuple(nearer), measured, ranges, apart)
-    return following
+        if _cost(following, drifts, variance) <= most:
+            return following
+    return point
 
 
 def _cost(point: _Point, drifts: Sequence[OdometryNoiseModel], variance: Array) -> float:

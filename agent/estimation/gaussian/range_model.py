@@ -36,7 +36,7 @@ take longer, and with 1000, a search would take seconds.
 """
 
 MOST_RANGES_BY_EXACT_ODOMETRY = 2048
-"""The most ranges of a kind if odometry is exact. The cost is linear, and old ranges tell as much as new ones.
+"""The most ranges of a kind if odometry is exact. The cost is linear; old ranges tell as much as new ones.
 
 With it, a tick takes 10 ms. A mission that needs more ranges than that does not reach its accuracy.
 """
