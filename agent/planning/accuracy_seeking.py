@@ -100,8 +100,7 @@ little noise never come near it.
 
 def required_mutual_ranges(mission: Mission) -> int:
     """Return the minimum number of mutual ranges before a claim."""
-    del mission
-    return FEWEST_MUTUAL_RANGES
+    return inference.MUTUAL_RANGES_WITH_OUTLIERS if mission.noise.outliers else FEWEST_MUTUAL_RANGES
 
 
 def observe(state: RobotState, observation: Observation) -> RobotState:
@@ -282,7 +281,7 @@ def _decide_phase3(state: RobotState) -> RobotState:
     if searched:
         belief = replace(belief, ranges_at_last_search=mutual)
     tested = replace(state, belief=inference.with_convergence_check(belief, scored))
-    if searched:
+    if searched and len(pair.places) >= inference.sufficient_mutual_ranges(mission):
         tested = _with_consistency_test(tested)
     if tested.verdict is not None:
         return tested

@@ -101,20 +101,27 @@ def is_anchor_known(knowledge: Knowledge, scored: Sequence[ScoredHypothesis]) ->
         return False
     if deviation(float(np.trace(best.fit.covariance))) > mission.required_anchor_sigma:
         return False
-    if good >= (ANCHOR_RANGES_WITH_OUTLIERS if mission.noise.outliers else ANCHOR_RANGES):
-        return True
+    if mission.noise.outliers or good >= ANCHOR_RANGES:
+        return good >= (ANCHOR_RANGES_WITH_OUTLIERS if mission.noise.outliers else ANCHOR_RANGES)
     path = path_of(knowledge.log, knowledge.tick, mission.period)
     ranges = Ranges.of_lists(_ranges_until(knowledge.log, knowledge.tick), (), (), mission.noise)
     possible = ranges.within(mission.sensing_range)
     evidence = anchor_evidence(best.fit, path, possible, mission.sensing_range)
-    return evidence >= -math.log1p(-SURE_OF_BRANCH)
+    return evidence >= ANCHOR_EVIDENCE
 
 
 SURE_OF_BRANCH = 0.999
 """The probability from which on a robot accepts a branch and ends phase 1.
 
-With fewer than ANCHOR_RANGES, the evidence against ranges that agree by chance must be as strong. A wrong
-branch does not lead to a wrong claim: all branches take part in the search of phase 3.
+A wrong branch does not lead to a wrong claim: all branches take part in the search of phase 3.
+"""
+
+ANCHOR_EVIDENCE = 20.0
+"""The evidence against chance that ends phase 1 with fewer than ANCHOR_RANGES, without outliers.
+
+Set on sigmas of 1e-9 to 0.1 m. With 7, three ranges of sigma 0.001 m ended phase 1, and 1 of 12 missions took
+an honest peer for inconsistent: few ranges make every later test depend on the error of one. With more,
+exact ranges take as many as noisy ones.
 """
 
 LEAST_RANGES = 3
@@ -211,16 +218,24 @@ def blocking_reason_for(
     return None
 
 
+def sufficient_mutual_ranges(mission: Mission) -> int:
+    """Return the number of mutual ranges from different places from which on evidence is not required.
+
+    With fewer, no suspicion of the peer counts either: the tests of a few ranges repeat each other.
+    """
+    return MUTUAL_RANGES_WITH_OUTLIERS if mission.noise.outliers else MUTUAL_RANGES
+
+
 def with_evidence_check(
     belief: Belief, scored: Sequence[ScoredHypothesis], pair: PairRanges, mission: Mission
 ) -> Belief:
     """Return `belief` with a blocking reason if the mutual ranges may agree by chance.
 
     A few noisy ranges do; three exact ones do not. The probability that they do must be at most
-    1 - confidence, if both are equally probable before. MUTUAL_RANGES suffice in any case.
+    1 - confidence, if both are equally probable before. MUTUAL_RANGES suffice in any case. With outliers, a
+    claim needs that number: agreement of a few ranges among which one is an outlier is not chance.
     """
-    few = len(pair.places) < (MUTUAL_RANGES_WITH_OUTLIERS if mission.noise.outliers else MUTUAL_RANGES)
-    if belief.blocking_reason is not None or not few:
+    if belief.blocking_reason is not None or len(pair.places) >= sufficient_mutual_ranges(mission):
         return belief
     evidence, required = mutual_evidence(scored[0].fit, pair), -math.log1p(-mission.confidence)
     if evidence >= required:
