@@ -33,6 +33,7 @@ from protocol.mission import (
     safety_infeasibility,
 )
 from protocol.motion import TAU, Pose, wrap
+from protocol.noise import ProfileName, with_profile
 from protocol.orbits import Rendezvous, rendezvous, tick_budget
 from protocol.rounding import TOLERANCE
 from protocol.spelling import did_you_mean
@@ -61,6 +62,7 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "kind": get_args(Kind),
     "part": get_args(Part),
     "point": (*POINTS, DRAWN),
+    "profile": get_args(ProfileName),
 }
 """The permitted values of each field that takes one of a few words."""
 
@@ -241,7 +243,7 @@ def validate(table: Mapping[str, Any], source: str, faults: Sequence[str] = ()) 
     Raises BadScenario and Unworkable, whose texts begin with `source`.
     """
     try:
-        file = msgspec.convert(table, ScenarioFile)
+        file = msgspec.convert(_with_profile(table), ScenarioFile)
     except msgspec.ValidationError as error:
         raise BadScenario(f"{source}: {field_first(str(error), CHOICES)}") from None
     found = ScenarioTemplate(file, _validated(file, source, faults))
@@ -250,6 +252,14 @@ def validate(table: Mapping[str, Any], source: str, faults: Sequence[str] = ()) 
     except BadKill as error:
         raise BadScenario(f"{source}: {error}") from None
     return found
+
+
+def _with_profile(table: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the content of a scenario file with the values of the noise profile that it names."""
+    mission = table.get("mission")
+    if not isinstance(mission, Mapping) or "noise" not in mission:
+        return table
+    return {**table, "mission": {**mission, "noise": with_profile(mission["noise"])}}
 
 
 def _validated(file: ScenarioFile, source: str, options: Sequence[str]) -> Scenario:

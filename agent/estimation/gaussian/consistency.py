@@ -87,10 +87,7 @@ def _distance_score(fit: Fit, pair: PairRanges) -> float:
     by_distance = np.zeros(len(fit.residuals))
     by_distance[mutual] = -((c * ux - s * uy) * pair.apart[0] + (s * ux + c * uy) * pair.apart[1]) / length
     system = fit.system
-    if system.covariance.ndim == 2:
-        weighted = np.linalg.solve(system.covariance, by_distance)
-    else:
-        weighted = by_distance / system.covariance
+    weighted = system.covariance.solve(by_distance[:, None])[:, 0]
     explained = system.jacobian.T @ weighted
     information = float(by_distance @ weighted - explained @ system.of_guess @ explained)
     score = float(by_distance @ system.multipliers)

@@ -45,7 +45,7 @@ def own_anchor(knowledge: Knowledge) -> tuple[ScoredHypothesis, ...]:
     mission = knowledge.config.mission
     path = path_of(knowledge.log, knowledge.tick, mission.period)
     ranges = Ranges.of_lists(_ranges_until(knowledge.log, knowledge.tick), (), (), mission.noise)
-    possible = ranges.within(mission.sensing_range)
+    possible = ranges.within(mission.sensing_range, mission.noise.priors)
     if not len(possible.rho):
         return ()
     silent = missing(ranges.tick, knowledge.tick + 1)
@@ -132,7 +132,7 @@ def pair_of(knowledge: Knowledge) -> PairRanges:
     lists = [_ranges_until(log, end) for log, end in zip(logs, ends, strict=False)]
     ranges = Ranges.of_lists(lists[0], lists[1], mutual, mission.noise)
     silent = [missing(ranges.tick[ranges.rows(kind)], ends[kind] + 1) for kind in range(3)]
-    ranges = ranges.within(mission.sensing_range)
+    ranges = ranges.within(mission.sensing_range, mission.noise.priors)
     own, other = config.anchor, config.peer_anchor
     sign = 1.0 if config.role == "a" else -1.0
     return PairRanges(

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from msgspec.structs import replace
 
-from agent.estimation.gaussian.odometry_noise import Array, Places, Track, wander
+from agent.estimation.gaussian.odometry_noise import Array, Places, Track, constant_errors, is_noisy, wander
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, Ranges, mixture, placed
 from protocol.noise import Noise, VelocityNoise
 
@@ -69,17 +69,20 @@ def anchors(
     if not len(points):
         return points
     variance = np.square(ranges.sigma) + _odometry_variance(path, ranges, noise)
+    variance += ranges.loosened(noise.priors)
     return _polished(points, path, ranges, np.sqrt(variance), noise, sensing_range)
 
 
 def _odometry_variance(path: Track, ranges: Ranges, noise: Noise) -> Array:
     """Return the approximate variance (m^2) that odometry noise adds to each range, without correlations."""
-    if noise.odometry == VelocityNoise():
+    if not is_noisy(noise):
         return np.zeros_like(ranges.rho)
-    model = wander(path, noise.odometry, path)
+    model = wander(path, noise.odometry, path, constant_errors(path, noise))
     turn, bx, by, xx, _, yy = model.sums
     lever = path.period
     position = xx + yy + 2.0 * lever * (path.y * bx - path.x * by) + lever**2 * (path.x**2 + path.y**2) * turn
+    for turned, x, y in model.moves:
+        position = position + np.square(x - lever * path.y * turned) + np.square(y + lever * path.x * turned)
     along: Array = 0.5 * np.maximum(position, 0.0)[np.minimum(ranges.tick, len(path.v))]
     return along
 
@@ -163,7 +166,7 @@ UNLIKELY = 25.0
 
 def without_drift(pair: PairRanges) -> PairRanges:
     """Return `pair` with exact odometry, and with its noise added to the variances of the ranges."""
-    if pair.noise.odometry == VelocityNoise():
+    if not is_noisy(pair.noise):
         return pair
     variance = np.square(pair.ranges.sigma)
     for robot, path in enumerate(pair.paths):
@@ -171,7 +174,8 @@ def without_drift(pair: PairRanges) -> PairRanges:
         added[pair.ranges.rows(1 - robot)] = 0.0
         variance = variance + added
     ranges = pair.ranges._replace(sigma=np.sqrt(variance))
-    return pair._replace(ranges=ranges, noise=replace(pair.noise, odometry=VelocityNoise()))
+    exact = replace(pair.noise, odometry=VelocityNoise(), wheel_scale=0.0, gyro_bias=0.0)
+    return pair._replace(ranges=ranges, noise=exact)
 
 
 def placements(of_a: Array, of_b: Array, pair: PairRanges) -> list[tuple[float, float]]:
@@ -210,6 +214,7 @@ def placements(of_a: Array, of_b: Array, pair: PairRanges) -> list[tuple[float, 
     turns = np.concatenate(seeds)
     lever = np.array([max(float(np.mean(radii[robot])), SHORTEST) for robot in (near, far)])
     odometry = sum([_odometry_variance(path, pair.ranges, pair.noise)[mutual][some] for path in pair.paths])
+    odometry = odometry + pair.ranges.loosened(pair.noise.priors)[mutual][some]
     turns = _turned(
         turns, [place[near], place[far]], rho, np.sqrt(np.square(sigma) + odometry), (dx, dy), lever, pair
     )

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.noise import VelocityNoise
+from protocol.noise import Noise, VelocityNoise
 
 Array = NDArray[np.float64]
 Places = NDArray[np.intp]
@@ -80,10 +80,37 @@ class OdometryNoiseModel(NamedTuple):
 
     The terms are q_omega; the x and y of q_omega b; the xx, xy and yy of q_omega b b' + q_v shift shift'.
     """
+    patterns: Array
+    """The effect of each constant error, of one sigma, on v and omega at each tick; shape (m, 2, k)."""
+    moves: Array
+    """The prefix sums of these effects on heading, x and y; shape (m, 3, k + 1)."""
 
 
-def wander(path: Track, noise: VelocityNoise, measured: Track) -> OdometryNoiseModel:
-    """Return the prefix sums for the corrected `path`; the size of the noise follows from `measured`."""
+def constant_errors(measured: Track, noise: Noise) -> Array:
+    """Return the `patterns` of a robot: the scale errors of v and omega, and the bias of omega."""
+    k, priors = len(measured.v), noise.priors
+    at_rest = noise.standstill_bound
+    moving = (np.abs(measured.v) > at_rest[0]) | (np.abs(measured.omega) > at_rest[1])
+    patterns = np.zeros((3 * priors.of_odometry, 2, k))
+    if priors.of_odometry:
+        np.multiply(measured.v, priors.wheel_scale, out=patterns[0, 0])
+        np.multiply(measured.omega, priors.wheel_scale, out=patterns[1, 1])
+        np.multiply(moving, priors.gyro_bias, out=patterns[2, 1])
+    return patterns
+
+
+def is_noisy(noise: Noise) -> bool:
+    """Return whether odometry may differ from the executed motion."""
+    return noise.priors.of_odometry or noise.odometry != VelocityNoise()
+
+
+def wander(
+    path: Track, noise: VelocityNoise, measured: Track, patterns: Array | None = None
+) -> OdometryNoiseModel:
+    """Return the prefix sums for the corrected `path`; the size of the noise follows from `measured`.
+
+    `patterns` are the effects of constant errors; None if there are none.
+    """
     k, period = len(path.v), path.period
     variances = np.empty((2, k))
     variances[0] = np.square(noise.v * measured.v) + noise.v_floor**2
@@ -105,7 +132,14 @@ def wander(path: Track, noise: VelocityNoise, measured: Track) -> OdometryNoiseM
     terms[3] += along[0] * sx
     terms[4] += along[0] * sy
     terms[5] += along[1] * sy
-    return OdometryNoiseModel(variances, b, path.shift, _summed(terms))
+    if patterns is None or not len(patterns):
+        none = np.zeros((0, 3, k + 1))
+        return OdometryNoiseModel(variances, b, path.shift, _summed(terms), np.zeros((0, 2, k)), none)
+    moves = np.empty((len(patterns), 3, k))
+    moves[:, 0] = patterns[:, 1]
+    np.multiply(patterns[:, :1], path.shift, out=moves[:, 1:])
+    moves[:, 1:] -= patterns[:, 1:] * b
+    return OdometryNoiseModel(variances, b, path.shift, _summed(terms), patterns, _summed(moves))
 
 
 def _shortening(half: Array, period: float) -> Array:
@@ -147,8 +181,15 @@ class Projection(NamedTuple):
         )
 
 
+def constant_effects(model: OdometryNoiseModel, rows: Projection) -> Array:
+    """Return the effect (m) of one sigma of each constant error on N rows; shape (N, m)."""
+    turned, x, y = np.moveaxis(model.moves[:, :, rows.tick], 1, 0)
+    effects: Array = (rows.lever * turned + rows.u[0] * x + rows.u[1] * y).T
+    return effects
+
+
 def spread(model: OdometryNoiseModel, rows: Projection) -> Array:
-    """Return the covariance (m^2) of N rows that is caused by odometry noise; shape (N, N)."""
+    """Return the covariance (m^2) of N rows that is caused by white odometry noise; shape (N, N)."""
     at = np.minimum(rows.tick[:, None], rows.tick)
     c0, bx, by, xx, xy, yy = model.sums[:, at]
     (ux, uy), lever = rows.u, rows.lever
@@ -191,6 +232,9 @@ def attributed(model: OdometryNoiseModel, rows: Projection, residuals: Array) ->
         np.add.at(sums, rows.tick, residuals * weight)
     lever, x, y = np.cumsum(after[:, :0:-1], axis=1)[:, ::-1]
     q_v, q_omega = model.variances
-    return Errors(
-        q_v * (x * model.shift[0] + y * model.shift[1]), q_omega * (lever - x * model.b[0] - y * model.b[1])
-    )
+    v = q_v * (x * model.shift[0] + y * model.shift[1])
+    omega = q_omega * (lever - x * model.b[0] - y * model.b[1])
+    if len(model.patterns):
+        sizes = constant_effects(model, rows).T @ residuals
+        v, omega = np.tensordot(sizes, model.patterns, 1) + (v, omega)
+    return Errors(v, omega)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from agent.estimation.gaussian.odometry_noise import Array, Places, Projection, Track
-from protocol.noise import Noise
+from protocol.noise import Noise, Priors
 
 SIGMA_FLOOR = 1e-6
 """The least standard deviation (m) that is assumed for a range."""
@@ -65,9 +65,45 @@ class Ranges(NamedTuple):
         rows = self.rows(kind)
         return Ranges(self.rho[rows], self.tick[rows], self.sigma[rows], (self.counts[kind], 0, 0))
 
-    def within(self, sensing_range: float) -> Ranges:
+    def common_errors(self, priors: Priors) -> Array:
+        """Return the effect (m) of one sigma of each constant error on the ranges; shape (N, m).
+
+        The errors are a bias of all ranges, one of each pair of radios, and a scale. The scale multiplies the
+        measured ranges: then the effects are the same under each guess.
+        """
+        columns = []
+        if priors.range_bias:
+            columns.append(np.full(len(self.rho), priors.range_bias))
+        if priors.range_scale:
+            columns.append(priors.range_scale * self.rho)
+        if priors.pair_bias:
+            for kind in range(3):
+                if self.counts[kind]:
+                    column = np.zeros(len(self.rho))
+                    column[self.rows(kind)] = priors.pair_bias
+                    columns.append(column)
+        return np.stack(columns, 1) if columns else np.zeros((len(self.rho), 0))
+
+    def slow_errors(self, priors: Priors, period: float) -> Array | None:
+        """Return the covariance (m^2) of slowly varying errors, within each pair of radios; None without."""
+        if not priors.slow_sigma:
+            return None
+        covariance = np.zeros((len(self.rho), len(self.rho)))
+        for kind in range(3):
+            rows = self.rows(kind)
+            apart = np.abs(np.subtract.outer(self.tick[rows], self.tick[rows])) * (period / priors.slow_time)
+            covariance[rows, rows] = priors.slow_sigma**2 * np.exp(-apart)
+        return covariance
+
+    def loosened(self, priors: Priors) -> Array:
+        """Return the variance (m^2) that constant and slow errors add to each range; shape (N,)."""
+        variance: Array = np.sum(np.square(self.common_errors(priors)), 1) + priors.slow_sigma**2
+        return variance
+
+    def within(self, sensing_range: float, priors: Priors) -> Ranges:
         """Return the ranges without those that are too long to be anything but outliers."""
-        possible = self.rho <= sensing_range + IMPOSSIBLE * self.sigma
+        sigma = np.sqrt(np.square(self.sigma) + self.loosened(priors))
+        possible = self.rho <= sensing_range + IMPOSSIBLE * sigma
         if np.all(possible):
             return self
         first, second, mutual = (int(np.count_nonzero(possible[self.rows(kind)])) for kind in range(3))
@@ -172,7 +208,7 @@ def mixture(residuals: Array, sigma: Array, noise: Noise) -> tuple[Array, Array]
     The log-likelihood is summed over the last axis; the probabilities have the shape of the residuals.
     """
     good = inliers(residuals, sigma, noise)
-    if not noise.outliers:
+    if not (noise.outliers or noise.strays):
         return np.sum(good, -1), np.ones_like(residuals)
     both = np.logaddexp(good, outliers(residuals, sigma, noise))
     return np.sum(both, -1), np.exp(good - both)
@@ -181,15 +217,29 @@ def mixture(residuals: Array, sigma: Array, noise: Noise) -> tuple[Array, Array]
 def inliers(residuals: Array, sigma: Array, noise: Noise) -> Array:
     """Return the joint log-density of each residual and of its being an inlier."""
     density: Array = -0.5 * np.square(residuals / sigma) - np.log(sigma)
-    return density + (math.log1p(-noise.outliers) - 0.5 * math.log(2.0 * math.pi))
+    return density + (math.log1p(-noise.outliers - noise.strays) - 0.5 * math.log(2.0 * math.pi))
 
 
 def outliers(residuals: Array, sigma: Array, noise: Noise) -> Array:
-    """Return the joint log-density of each residual and of its being an outlier.
+    """Return the joint log-density of each residual and of its being an outlier or a stray.
 
-    The bias is uniform, and the ends of its density are smoothed by `sigma`.
+    The bias of an outlier is uniform, and the ends of its density are smoothed by `sigma`. A stray may be
+    anywhere (see STRAY_WIDTH).
     """
+    stray = None
+    if noise.strays:
+        stray = np.broadcast_to(math.log(noise.strays / STRAY_WIDTH) - np.log(sigma), residuals.shape)
+        if not noise.outliers:
+            return stray
     least, most = noise.outlier_bias
     beyond = np.maximum(np.maximum(least - residuals, residuals - most), 0.0)
     density: Array = -np.log(np.maximum(most - least, sigma)) - 0.5 * np.square(beyond / sigma)
-    return density + math.log(noise.outliers)
+    density += math.log(noise.outliers)
+    return density if stray is None else np.logaddexp(density, stray)
+
+
+STRAY_WIDTH = 100.0
+"""The width of the uniform density of strays, in sigmas of a range.
+
+With the default rate of strays, a range is more probably a stray than not from 4.6 sigmas on.
+"""
