@@ -28,12 +28,13 @@ from agent.estimation.gaussian.odometry_noise import (
     constant_effects,
     constant_errors,
     is_noisy,
+    no_errors,
     shifted,
     spread,
     wander,
 )
 from agent.estimation.gaussian.range_covariance import RangeCovariance, inverse_of, range_covariance
-from agent.estimation.gaussian.range_model import Ranges, mixture, outliers, predict
+from agent.estimation.gaussian.range_model import Predicted, Ranges, mixture, outliers, predict
 from protocol.noise import Noise, VelocityNoise
 
 STEPS = 8
@@ -47,6 +48,13 @@ SETTLED = 1e-2
 
 LEAP = 1.0
 """The largest change of an unknown, in m and rad, in one step."""
+
+SHORTER_STEPS = (0.5, 0.25, 0.0625)
+"""The fractions of a step that are tried in turn while it does not descend; the last is taken in any case.
+
+Gauss-Newton with full steps may alternate between two guesses for ever. Where even a sixteenth of a step does
+not descend, the rest is rounding.
+"""
 
 RIDGE = 1e-12
 """The fraction of the information that is added to its diagonal, and an absolute part of the same size.
@@ -125,46 +133,32 @@ def fit(
     noise: Noise,
     apart: tuple[float, float] = (0.0, 0.0),
     steps: int = STEPS,
+    begun: Sequence[Errors] = (),
 ) -> Fit:
     """Return the Gauss-Newton fit that begins at `guess` (see `predict`).
 
-    The weights of outliers decrease during the iteration. `apart` is M2 - M1 (m) in <W>.
+    It begins on the paths with the odometry errors `begun`, by default on the measured paths. A step that
+    does not descend is halved, because Gauss-Newton with full steps may alternate between two guesses. The
+    weights of outliers decrease during the iteration. `apart` is M2 - M1 (m) in <W>.
     """
     free = slice(0, 2) if len(measured) == 1 else slice(0, 6)
-    paths: tuple[Track, ...] = tuple(measured)
-    drifts: tuple[OdometryNoiseModel, ...] = ()
-    errors: tuple[Errors, ...] = ()
-    guess, weights, level = guess.copy(), np.ones_like(ranges.rho), 1.0
-    common = ranges.common_errors(noise.priors)
-    slow = ranges.slow_errors(noise.priors, measured[0].period)
+    problem = _problem(measured, ranges, noise, apart)
     noisy_odometry, robust = is_noisy(noise), bool(noise.outliers or noise.strays)
-    patterns = [constant_errors(path, noise) for path in measured] if noisy_odometry else []
+    errors: tuple[Errors, ...] = ()
+    if noisy_odometry:
+        errors = tuple([error.over(len(was.v)) for error, was in zip(begun, measured, strict=False)])
+    point = problem.point(guess.copy(), errors)
+    weights = np.ones_like(ranges.rho)
     for step in range(steps + 1):
-        predicted = predict(guess, paths, ranges, apart)
-        residuals = ranges.rho - predicted.distance
-        dense, columns, innovation = slow, common, residuals
-        if noisy_odometry:
-            seen = predicted.seen(paths, ranges)
-            drifts = tuple(
-                [
-                    wander(path, noise.odometry, was, pattern)
-                    for path, was, pattern in zip(paths, measured, patterns, strict=True)
-                ]
-            )
-            if noise.odometry != VelocityNoise():
-                dense = _odometry_covariance(drifts, seen)
-                if slow is not None:
-                    dense += slow
-            columns = np.concatenate((common, *map(constant_effects, drifts, seen)), 1)
-            for model, rows, error in zip(drifts, seen, errors, strict=False):
-                innovation = innovation + shifted(model, rows, error)
+        drifts, seen, dense, columns, innovation = problem.linearised(point)
         if robust and step == 0:
             loose = np.square(ranges.sigma) + np.sum(np.square(columns), 1)
             if dense is not None:
                 loose += np.diagonal(dense)
-            weights = _weights(residuals, np.sqrt(loose), noise)
-        covariance = range_covariance(_variance(ranges.sigma, weights), columns, dense)
-        system = _solved(predicted.jacobian[:, free], innovation, covariance)
+            weights = _weights(point.residuals, np.sqrt(loose), noise)
+        variance = _variance(ranges.sigma, weights)
+        covariance = range_covariance(variance, columns, dense)
+        system = _solved(point.predicted.jacobian[:, free], innovation, covariance)
         updated = _inlier_probabilities(system, weights, ranges.sigma, noise) if robust else weights
         change = system.change
         chi2 = max(float(system.innovation @ system.multipliers), 0.0)
@@ -172,21 +166,23 @@ def fit(
         level = noise_level(chi2, inliers - len(change), noise)
         last_step = math.sqrt(abs(float(change @ system.information @ change)) / level)
         still = last_step < STILL and float(np.max(np.abs(updated - weights))) < SETTLED
-        if step == steps or (still and (errors or not noisy_odometry)):  # the path is corrected at least once
+        if step == steps or (still and (step or not noisy_odometry)):  # the path is corrected at least once
             break
         weights = updated
         change = change * min(1.0, LEAP / max(float(np.max(np.abs(change))), LEAP))
-        guess[free] += change
         if noisy_odometry:
             left = system.weighted[:, -1] - system.weighted[:, :-1] @ change
             errors = tuple([attributed(model, rows, left) for model, rows in zip(drifts, seen, strict=True)])
-            paths = tuple([error.corrected(was) for error, was in zip(errors, measured, strict=True)])
+        full_step = np.zeros_like(point.guess)
+        full_step[free] = change
+        of_ranges = range_covariance(variance, problem.common, problem.slow)
+        point = _descended(problem, point, full_step, errors, drifts, of_ranges)
     return Fit(
-        guess,
-        paths,
-        errors,
-        _log_likelihood(system, chi2, residuals, weights, ranges.sigma, level, noise),
-        residuals,
+        point.guess,
+        point.paths,
+        point.errors,
+        _log_likelihood(system, chi2, point.residuals, weights, ranges.sigma, level, noise),
+        point.residuals,
         weights,
         level * system.of_guess,
         system.information / level,
@@ -194,11 +190,111 @@ def fit(
         inliers,
         last_step,
         ranges.tick,
-        predicted.directions,
+        point.predicted.directions,
         drifts,
         system,
         level,
     )
+
+
+class _Point(NamedTuple):
+    """A guess and odometry errors, with the ranges that they predict."""
+
+    guess: Array
+    errors: tuple[Errors, ...]
+    """The odometry errors of each path; empty if they are 0."""
+    paths: tuple[Track, ...]
+    predicted: Predicted
+    residuals: Array
+
+
+class _Linear(NamedTuple):
+    """The ranges as linear functions of the odometry errors, at a point."""
+
+    drifts: tuple[OdometryNoiseModel, ...]
+    seen: list[Projection]
+    dense: Array | None
+    """The covariance (m^2) from white odometry noise and slow errors, shape (N, N); None without them."""
+    columns: Array
+    """The effects (m) of all constant errors; shape (N, m)."""
+    innovation: Array
+
+
+class _Problem(NamedTuple):
+    """The measurements and the priors of a fit, which do not change during the iteration."""
+
+    measured: Sequence[Track]
+    ranges: Ranges
+    noise: Noise
+    apart: tuple[float, float]
+    patterns: Sequence[Array]
+    """The effects of the constant errors of each path; see `constant_errors`."""
+    common: Array
+    """The effects (m) of the constant errors of the ranges; shape (N, m)."""
+    slow: Array | None
+    """The covariance (m^2) of the slow errors of the ranges; None without them."""
+
+    def linearised(self, point: _Point) -> _Linear:
+        """Return the linear model of the ranges at `point`."""
+        if not is_noisy(self.noise):
+            return _Linear((), [], self.slow, self.common, point.residuals)
+        white, dense, innovation = self.noise.odometry, self.slow, point.residuals
+        seen = point.predicted.seen(point.paths, self.ranges)
+        models = zip(point.paths, self.measured, self.patterns, strict=True)
+        drifts = tuple([wander(path, white, was, pattern) for path, was, pattern in models])
+        if white != VelocityNoise():
+            dense = _odometry_covariance(drifts, seen)
+            dense += 0.0 if self.slow is None else self.slow
+        columns = np.concatenate((self.common, *map(constant_effects, drifts, seen)), 1)
+        for model, rows, error in zip(drifts, seen, point.errors, strict=False):
+            innovation = innovation + shifted(model, rows, error)
+        return _Linear(drifts, seen, dense, columns, innovation)
+
+    def point(self, guess: Array, errors: tuple[Errors, ...]) -> _Point:
+        """Return the point with `guess` and `errors`; the paths are the measured ones if they are empty."""
+        paths = tuple(self.measured)
+        if errors:
+            paths = tuple(
+                [
+                    error.corrected(was, pattern)
+                    for error, was, pattern in zip(errors, self.measured, self.patterns, strict=True)
+                ]
+            )
+        predicted = predict(guess, paths, self.ranges, self.apart)
+        return _Point(guess, errors, paths, predicted, self.ranges.rho - predicted.distance)
+
+
+def _descended(
+    problem: _Problem,
+    point: _Point,
+    change: Array,
+    errors: tuple[Errors, ...],
+    drifts: Sequence[OdometryNoiseModel],
+    of_ranges: RangeCovariance,
+) -> _Point:
+    """Return the point after a step by `change` and to `errors`, or by that fraction of it that descends."""
+    most = _cost(point, drifts, of_ranges)
+    following = problem.point(point.guess + change, errors)
+    for fraction in SHORTER_STEPS:
+        if _cost(following, drifts, of_ranges) <= most:
+            break
+        begins = point.errors or [no_errors(pattern) for pattern in problem.patterns]
+        nearer = [a.towards(b, fraction) for a, b in zip(begins, errors, strict=False)]
+        following = problem.point(point.guess + fraction * change, tuple(nearer))
+    return following
+
+
+def _cost(point: _Point, drifts: Sequence[OdometryNoiseModel], of_ranges: RangeCovariance) -> float:
+    """Return twice the negative log-density of the residuals and of the odometry errors, up to a constant.
+
+    `of_ranges` is the covariance of the ranges for a known path.
+    """
+    cost = float(point.residuals @ of_ranges.solve(point.residuals[:, None])[:, 0])
+    for error, model in zip(point.errors, drifts, strict=False):
+        cost += float(error.constant @ error.constant)
+        for one, q in zip((error.v, error.omega), model.variances, strict=True):
+            cost += float(np.sum(np.square(one) / np.where(q > 0.0, q, np.inf)))
+    return cost
 
 
 INLIER = 0.5
@@ -216,9 +312,16 @@ def noise_level(chi2: float, degrees: int, noise: Noise) -> float:
 CAUTION = 4.0
 """The factor of `sigma_degrees` for residuals that are smaller than told.
 
-A noise level that is too low ends phase 1 too early, and the robots miss each other. With 1, few ranges that
-agree by chance make missions at a sigma of 0.05 m last 15 % longer.
+A noise level that is too low makes claims too confident, one that is too high costs ranges. With 1, few
+ranges that agree by chance raised the mean NEES of 40 missions at a sigma of 0.05 m from 2.6 to 3.5.
 """
+
+
+def _problem(measured: Sequence[Track], ranges: Ranges, noise: Noise, apart: tuple[float, float]) -> _Problem:
+    patterns = [constant_errors(path, noise) for path in measured]
+    common = ranges.common_errors(noise.priors)
+    slow = ranges.slow_errors(noise.priors, measured[0].period)
+    return _Problem(measured, ranges, noise, apart, patterns, common, slow)
 
 
 def _odometry_covariance(drifts: Sequence[OdometryNoiseModel], seen: Sequence[Projection]) -> Array:
@@ -298,9 +401,7 @@ def _log_likelihood(
     if noise.outliers or noise.strays:
         log_likelihood += count * math.log1p(-noise.outliers - noise.strays)
         soft = SOFT * noise.outlier_bias[0] if noise.outliers else 0.0
-        log_likelihood += float(
-            np.sum(outliers(residuals[~good], np.maximum(sigma[~good], soft), noise))
-        )
+        log_likelihood += float(np.sum(outliers(residuals[~good], np.maximum(sigma[~good], soft), noise)))
     return log_likelihood
 
 

@@ -122,6 +122,17 @@ def wander(
     b = np.empty((2, k))
     b[0] = -period * path.y[1:] - (slope * sx - across * sy)
     b[1] = period * path.x[1:] - (slope * sy + across * sx)
+    moves = np.zeros((0, 3, k + 1))
+    if patterns is None:
+        patterns = np.zeros((0, 2, k))
+    elif len(patterns):
+        effects = np.empty((len(patterns), 3, k))
+        effects[:, 0] = patterns[:, 1]
+        np.multiply(patterns[:, :1], path.shift, out=effects[:, 1:])
+        effects[:, 1:] -= patterns[:, 1:] * b
+        moves = _summed(effects)
+    if noise == VelocityNoise():
+        return OdometryNoiseModel(variances, b, path.shift, np.zeros((6, k + 1)), patterns, moves)
     q_v, q_omega = variances
     terms = np.empty((6, k))
     terms[0] = q_omega
@@ -132,14 +143,7 @@ def wander(
     terms[3] += along[0] * sx
     terms[4] += along[0] * sy
     terms[5] += along[1] * sy
-    if patterns is None or not len(patterns):
-        none = np.zeros((0, 3, k + 1))
-        return OdometryNoiseModel(variances, b, path.shift, _summed(terms), np.zeros((0, 2, k)), none)
-    moves = np.empty((len(patterns), 3, k))
-    moves[:, 0] = patterns[:, 1]
-    np.multiply(patterns[:, :1], path.shift, out=moves[:, 1:])
-    moves[:, 1:] -= patterns[:, 1:] * b
-    return OdometryNoiseModel(variances, b, path.shift, _summed(terms), patterns, _summed(moves))
+    return OdometryNoiseModel(variances, b, path.shift, _summed(terms), patterns, moves)
 
 
 def _shortening(half: Array, period: float) -> Array:
@@ -201,14 +205,42 @@ def spread(model: OdometryNoiseModel, rows: Projection) -> Array:
 
 
 class Errors(NamedTuple):
-    """The odometry errors in v (m/s) and omega (rad/s) that a fit estimates; shapes (k,)."""
+    """The odometry errors that a fit estimates."""
 
     v: Array
+    """The white errors (m/s) of v at each tick; shape (k,)."""
     omega: Array
+    """The white errors (rad/s) of omega at each tick; shape (k,)."""
+    constant: Array
+    """The constant errors in their sigmas; shape (m,)."""
 
-    def corrected(self, measured: Track) -> Track:
+    def corrected(self, measured: Track, patterns: Array) -> Track:
         """Return the path with these errors added to the `measured` velocities."""
-        return track(measured.v + self.v, measured.omega + self.omega, measured.period)
+        v, omega = measured.v + self.v, measured.omega + self.omega
+        if len(patterns):
+            constant_v, constant_omega = np.tensordot(self.constant, patterns, 1)
+            v, omega = v + constant_v, omega + constant_omega
+        return track(v, omega, measured.period)
+
+    def over(self, ticks: int) -> Errors:
+        """Return these errors for so many ticks: white ones are 0 in those that have come since."""
+        v, omega = np.zeros(ticks), np.zeros(ticks)
+        known = min(ticks, len(self.v))
+        v[:known], omega[:known] = self.v[:known], self.omega[:known]
+        return Errors(v, omega, self.constant)
+
+    def towards(self, other: Errors, fraction: float) -> Errors:
+        """Return the errors that lie this fraction of the way from these to `other`."""
+        return Errors(
+            self.v + fraction * (other.v - self.v),
+            self.omega + fraction * (other.omega - self.omega),
+            self.constant + fraction * (other.constant - self.constant),
+        )
+
+
+def no_errors(patterns: Array) -> Errors:
+    """Return the odometry errors of a fit before its first step; their constant part has `patterns`."""
+    return Errors(np.zeros(patterns.shape[2]), np.zeros(patterns.shape[2]), np.zeros(len(patterns)))
 
 
 def shifted(model: OdometryNoiseModel, rows: Projection, errors: Errors) -> Array:
@@ -218,7 +250,7 @@ def shifted(model: OdometryNoiseModel, rows: Projection, errors: Errors) -> Arra
     moves[1:] = errors.v * model.shift - errors.omega * model.b
     turned, x, y = _summed(moves)[:, rows.tick]
     move: Array = rows.lever * turned + rows.u[0] * x + rows.u[1] * y
-    return move
+    return move + constant_effects(model, rows) @ errors.constant if len(model.patterns) else move
 
 
 def attributed(model: OdometryNoiseModel, rows: Projection, residuals: Array) -> Errors:
@@ -232,9 +264,8 @@ def attributed(model: OdometryNoiseModel, rows: Projection, residuals: Array) ->
         np.add.at(sums, rows.tick, residuals * weight)
     lever, x, y = np.cumsum(after[:, :0:-1], axis=1)[:, ::-1]
     q_v, q_omega = model.variances
-    v = q_v * (x * model.shift[0] + y * model.shift[1])
-    omega = q_omega * (lever - x * model.b[0] - y * model.b[1])
-    if len(model.patterns):
-        sizes = constant_effects(model, rows).T @ residuals
-        v, omega = np.tensordot(sizes, model.patterns, 1) + (v, omega)
-    return Errors(v, omega)
+    return Errors(
+        q_v * (x * model.shift[0] + y * model.shift[1]),
+        q_omega * (lever - x * model.b[0] - y * model.b[1]),
+        constant_effects(model, rows).T @ residuals,
+    )
