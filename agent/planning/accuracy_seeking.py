@@ -296,8 +296,8 @@ def _p_value_below(belief: Belief, bound: float) -> bool:
 def _with_consistency_test(state: RobotState) -> RobotState:
     """Return `state` with the consistency test of a search, and with the verdict if too many tests failed.
 
-    A test fails if its p-value is below INCONSISTENT_P_VALUE. The verdict is Inconsistent after
-    INCONSISTENT_SEARCHES consecutive failures.
+    A test fails if its p-value is below INCONSISTENT_P_VALUE. After INCONSISTENT_SEARCHES consecutive failures,
+    the verdict is Inconsistent, or Undecided if the robot's own sensors are not as it was told.
     """
     belief = state.belief
     inconsistency = belief.inconsistency
@@ -308,9 +308,10 @@ def _with_consistency_test(state: RobotState) -> RobotState:
         belief.inconsistent_searches + 1 if inconsistency.p_value < INCONSISTENT_P_VALUE else 0
     )
     state = replace(state, belief=replace(belief, inconsistent_searches=inconsistent_searches, p_value=least))
-    return (
-        state.inconsistent(inconsistency.verdict) if inconsistent_searches >= INCONSISTENT_SEARCHES else state
-    )
+    if inconsistent_searches < INCONSISTENT_SEARCHES:
+        return state
+    doubt = inference.own_doubt(state)
+    return state.inconsistent(inconsistency.verdict) if doubt is None else state.undecided(doubt.reason)
 
 
 def _drive_without_hypotheses(state: RobotState) -> RobotState:

@@ -14,6 +14,7 @@ from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, Incon
 from agent.estimation.gaussian.hypotheses import ScoredHypothesis, missing, of_anchor
 from agent.estimation.gaussian.least_squares import deviation, poses
 from agent.estimation.gaussian.odometry_noise import Array, Track, track
+from agent.estimation.gaussian.own_sensors import Doubt, doubt
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, Ranges
 from agent.estimation.knowledge import Belief, Knowledge
 from agent.peer.motion_log import MotionLog
@@ -55,6 +56,14 @@ def own_anchor(knowledge: Knowledge) -> tuple[ScoredHypothesis, ...]:
 def _ranges_until(log: MotionLog, through: int) -> list[tuple[int, float]]:
     """Return tick and range in m of each anchor range of `log` up to tick `through`."""
     return [(ranged.tick, ranged.range) for ranged in log.ranges if ranged.tick <= through]
+
+
+def own_doubt(knowledge: Knowledge) -> Doubt | None:
+    """Return the profile that explains the own measurements better than the noise that the robot was told."""
+    mission = knowledge.config.mission
+    path = path_of(knowledge.log, knowledge.tick, mission.period)
+    ranges = Ranges.of_lists(_ranges_until(knowledge.log, knowledge.tick), (), (), mission.noise)
+    return doubt(path, ranges, mission.sensing_range, mission.noise)
 
 
 def with_own(knowledge: Knowledge, scored: Sequence[ScoredHypothesis]) -> Belief:
@@ -207,7 +216,7 @@ def with_pair(
     config = knowledge.config
     robot, m1 = (0, config.anchor) if config.role == "a" else (1, config.peer_anchor)
     enough = len(pair.places) >= mutual
-    inconsistency = consistency_test(scored[0].fit, pair) if enough and scored else None
+    inconsistency = consistency_test(scored[0].fit, pair, robot) if enough and scored else None
     blocking_reason = blocking_reason_for(scored, hypotheses, inconsistency, pair, config.mission)
     claims = [claim(one, robot, pair) for one in hypotheses]
     first, _ = knowledge.belief.candidates or (len(scored), 0)
