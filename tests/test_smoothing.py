@@ -120,7 +120,7 @@ def test_noise_of_the_odometry_spreads_along_the_path(look: Looks, drift: Veloci
 @given(looks(), drifts, seeds)
 def test_errors_of_the_odometry_move_every_later_place(look: Looks, drift: VelocityNoise, seed: int) -> None:
     errors = np.random.default_rng(seed).normal(size=(2, len(look.path.v)))
-    move = shifted(wander(look.path, drift, look.path), look.rows, Errors(*errors))
+    move = shifted(wander(look.path, drift, look.path), look.rows, Errors(errors[0], errors[1], np.zeros(0)))
     assert move == near(look.by_noise @ errors.ravel())
 
 
@@ -132,7 +132,7 @@ def test_what_is_seen_off_its_place_is_attributed_to_the_noise_before(
     off = np.random.default_rng(seed).normal(size=len(look.rows.tick))
     errors = attributed(wander(look.path, drift, look.path), look.rows, off)
     expected = variances(drift, look.path) * (look.by_noise.T @ off)
-    assert np.concatenate(errors) == near(expected)
+    assert np.concatenate((errors.v, errors.omega)) == near(expected)
 
 
 @few
@@ -220,7 +220,7 @@ def clear(told: Told) -> bool:
     )
 
 
-EXACT = Noise()
+EXACT = Noise().as_told
 
 
 @few
@@ -268,6 +268,14 @@ noises = st.builds(
     odometry=st.builds(
         VelocityNoise, *[st.sampled_from((0.0, 1e-3, 1e-2))] * 2, *[st.sampled_from((0.0, 1e-3, 5e-3))] * 2
     ),
+    range_bias=st.sampled_from((0.0, 0.02, 0.4)),
+    pair_bias=st.sampled_from((0.0, 0.01, 0.1)),
+    range_scale=st.sampled_from((0.0, 0.005, 0.05)),
+    slow_sigma=st.sampled_from((0.0, 0.08)),
+    wheel_scale=st.sampled_from((0.0, 0.01)),
+    gyro_bias=st.sampled_from((0.0, 0.001)),
+    sigma_degrees=st.sampled_from((0.0, 4.0)),
+    strays=st.just(0.0),
 )
 
 
@@ -306,33 +314,68 @@ def test_one_robot_finds_its_anchor_and_leaves_the_heading_alone(seed: int) -> N
     assert found.covariance.shape == (2, 2)
 
 
+def patterns_of(told: Told) -> list[Array]:
+    """Return the effect of each constant error on v and omega, one sigma each, by its definition."""
+    priors = told.noise.priors
+    patterns = []
+    for path in told.measured:
+        still = np.zeros(K)
+        one_robot = [(priors.wheel_scale * path.v, still), (still, priors.wheel_scale * path.omega)]
+        patterns.append(np.array([*one_robot, (still, np.full(K, priors.gyro_bias))]))
+    return patterns
+
+
+def errors_of_ranges(told: Told) -> Array:
+    """Return the effect of one sigma of each bias, scale and slow error on each range; (N, unknowns)."""
+    priors, count = told.noise.priors, len(told.ranges.rho)
+    kinds = np.repeat(np.eye(3), told.ranges.counts, axis=0)
+    apart = np.abs(told.ranges.tick[:, None] - told.ranges.tick) * told.measured[0].period
+    together = (kinds @ kinds.T) * np.exp(-apart / priors.slow_time)
+    slow = priors.slow_sigma * np.linalg.cholesky(together + 1e-12 * np.eye(count))
+    common = np.full((count, 1), priors.range_bias)
+    return np.hstack((common, priors.range_scale * told.ranges.rho[:, None], priors.pair_bias * kinds, slow))
+
+
 def information_of(told: Told, found: Fit) -> tuple[Array, Array, Array]:
     """Return the Fisher information, the gradient of the log-posterior, and derivatives of the last poses.
 
-    All are numerical differences by the parameters and the noise. Noise without variance is not an unknown.
+    All are numerical differences by all unknowns: the parameters, the white noise of the odometry, and each
+    error that is constant or slow, in its sigmas. Noise without variance is not an unknown.
     """
     variance = np.concatenate([variances(told.noise.odometry, path) for path in told.measured])
     free = variance > 0.0
-    errors = [np.concatenate(error) for error in found.errors] or [np.zeros(2 * K)] * 2
-    noise = np.concatenate(errors)
+    patterns, of_ranges = patterns_of(told), errors_of_ranges(told)
+    white = [np.concatenate((error.v, error.omega)) for error in found.errors] or [np.zeros(2 * K)] * 2
+    noise = np.concatenate(white)
+    constant = [error.constant if len(error.constant) else np.zeros(3) for error in found.errors]
+    constants = np.concatenate(constant or [np.zeros(6)])
+    ends_of = np.cumsum((6, int(np.count_nonzero(free)), 6))
 
     def seen(unknowns: Array) -> Array:
+        guess, some, constants, sizes = np.split(unknowns, ends_of)
         moved = noise.copy()
-        moved[free] = unknowns[6:]
-        paths = [
-            track(path.v + by[:K], path.omega + by[K:], path.period)
-            for path, by in zip(told.measured, moved.reshape(2, 2 * K), strict=True)
-        ]
-        ranges = predict(unknowns[:6], paths, told.ranges, told.apart).distance
-        ends = [end_of(path, unknowns[i : i + 3]) for path, i in zip(paths, (0, 3), strict=True)]
+        moved[free] = some
+        paths = []
+        for path, by, pattern, size in zip(
+            told.measured, moved.reshape(2, 2 * K), patterns, constants.reshape(2, 3), strict=True
+        ):
+            v, omega = by.reshape(2, K) + np.tensordot(size, pattern, 1)
+            paths.append(track(path.v + v, path.omega + omega, path.period))
+        ranges = predict(guess, paths, told.ranges, told.apart).distance + of_ranges @ sizes
+        ends = [end_of(path, guess[i : i + 3]) for path, i in zip(paths, (0, 3), strict=True)]
         return np.concatenate((ranges, *ends))
 
-    at = np.concatenate((found.guess, noise[free]))
-    by_ranges, by_poses = np.split(derivative(seen, at), [len(told.ranges.rho)])
     weight = 1.0 / np.square(told.ranges.sigma)
-    prior = np.concatenate((np.zeros(6), 1.0 / variance[free]))
+    prior = np.concatenate((np.zeros(6), 1.0 / variance[free], np.ones(6 + of_ranges.shape[1])))
+    known = np.concatenate((found.guess, noise[free], constants))
+    at = np.concatenate((known, np.zeros(of_ranges.shape[1])))
     residuals = told.ranges.rho - seen(at)[: len(weight)]
-    gradient = by_ranges.T @ (weight * residuals) - prior * np.concatenate((np.zeros(6), noise[free]))
+    # the ranges are linear in their own errors, whose most probable values therefore have a closed form
+    inner = (of_ranges.T * weight) @ of_ranges + np.eye(of_ranges.shape[1])
+    at[len(known) :] = np.linalg.solve(inner, of_ranges.T @ (weight * residuals))
+    by_ranges, by_poses = np.split(derivative(seen, at), [len(told.ranges.rho)])
+    residuals = told.ranges.rho - seen(at)[: len(weight)]
+    gradient = by_ranges.T @ (weight * residuals) - prior * np.concatenate((np.zeros(6), at[6:]))
     return (by_ranges.T * weight) @ by_ranges + np.diag(prior), gradient, by_poses
 
 
@@ -365,7 +408,7 @@ def test_the_covariance_of_both_poses_is_that_of_all_unknowns_at_once(seed: int,
     found = fitted(one, one.guess)
     assume(converged(found))
     information, _, by_poses = information_of(one, found)
-    expected = by_poses @ np.linalg.solve(information, by_poses.T)
+    expected = found.level * by_poses @ np.linalg.solve(information, by_poses.T)
     sigmas = np.sqrt(np.diagonal(expected))
     _, covariance = poses(found, one.apart)
     assert covariance / np.outer(sigmas, sigmas) == pytest.approx(
@@ -376,7 +419,7 @@ def test_the_covariance_of_both_poses_is_that_of_all_unknowns_at_once(seed: int,
 @few
 @given(seeds)
 def test_without_odometry_noise_the_covariance_is_the_inverse_of_the_ranges_information(seed: int) -> None:
-    one = told(seed, Noise(0.01, 0.03))
+    one = told(seed, Noise(0.01, 0.03).as_told)
     assume(clear(one))
     found = fitted(one, one.guess)
     by_guess = derivative(lambda guess: distances(one, guess), found.guess)
@@ -390,7 +433,7 @@ def test_a_fit_that_begins_where_one_ended_ends_there_too() -> None:
     """On a path straight to the anchor the guess is right at once, but the path is still corrected."""
     measured, driven = (track(np.full(8, v), np.zeros(8), 1.0) for v in (1.0, 1.01))
     told = [(tick, 20.0 - x) for tick, x in enumerate(driven.x.tolist())]
-    noise = Noise(0.01, odometry=VelocityNoise(v=0.05))
+    noise = Noise(0.01, odometry=VelocityNoise(v=0.05)).as_told
     ranges = Ranges.of_lists(told, (), (), noise)
     first = fit(np.array((20.0, 0.0, 0.0)), [measured], ranges, noise)
     again = fit(first.guess, [measured], ranges, noise)
@@ -399,7 +442,9 @@ def test_a_fit_that_begins_where_one_ended_ends_there_too() -> None:
     assert first.paths[0].x[-1] == pytest.approx(driven.x[-1], abs=0.01)
 
 
-ROUGH = Noise(0.01, 0.01, outliers=0.05, outlier_bias=(0.3, 2.0), odometry=VelocityNoise(0.001, 0.001))
+ROUGH = Noise(
+    0.01, 0.01, outliers=0.05, outlier_bias=(0.3, 2.0), odometry=VelocityNoise(0.001, 0.001)
+).as_told
 
 
 @some
@@ -435,7 +480,7 @@ def test_exact_ranges_and_strides_of_a_kilometre_leave_a_covariance_that_can_be_
     anchor = np.array((400.0, 300.0, 0.0))
     rho = np.hypot(path.x - anchor[0], path.y - anchor[1])
     ranges = Ranges.of_lists(list(enumerate(rho.tolist())), (), (), EXACT)
-    found = fit(anchor + (1.0, -1.0, 0.0), [path], ranges, Noise(odometry=VelocityNoise(0.01, 0.01)))
+    found = fit(anchor + (1.0, -1.0, 0.0), [path], ranges, Noise(odometry=VelocityNoise(0.01, 0.01)).as_told)
     assert found.guess == pytest.approx(anchor, abs=1e-3)
     assert np.min(np.linalg.eigvalsh(found.covariance)) > 0.0
     assert found.last_step < STILL

@@ -296,8 +296,8 @@ def _p_value_below(belief: Belief, bound: float) -> bool:
 def _with_consistency_test(state: RobotState) -> RobotState:
     """Return `state` with the consistency test of a search, and with the verdict if too many tests failed.
 
-    A test fails if its p-value is below INCONSISTENT_P_VALUE. After INCONSISTENT_SEARCHES consecutive failures,
-    the verdict is Inconsistent, or Undecided if the robot's own sensors are not as it was told.
+    A test fails if its p-value is below INCONSISTENT_P_VALUE. After INCONSISTENT_SEARCHES consecutive
+    failures, the verdict is Inconsistent, or Undecided if the robot's own sensors are not as it was told.
     """
     belief = state.belief
     inconsistency = belief.inconsistency

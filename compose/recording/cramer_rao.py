@@ -49,7 +49,8 @@ def position_bounds(run: Run, pair: tuple[int, int], tick: int) -> tuple[float, 
         dx, dy = anchor.x - start.x, anchor.y - start.y
         guess += [c * dx + s * dy, c * dy - s * dx, start.heading]
     apart = (anchors[1].x - anchors[0].x, anchors[1].y - anchors[0].y)
-    at_truth = fit(np.array(guess), tracks, Ranges.of_lists(own[0], own[1], mutual, noise), noise, apart, 0)
+    exact = Ranges.of_lists(own[0], own[1], mutual, noise)
+    at_truth = fit(np.array(guess), tracks, exact, noise.as_told, apart, 0)
     covariance = poses(at_truth, apart)[1]
     a, b = (deviation(covariance[i, i] + covariance[i + 1, i + 1]) for i in (0, 3))
     return a, b

@@ -20,8 +20,8 @@ from protocol.noise import PROFILES, Noise, ProfileName
 DOUBTFUL = 3.0
 """The log evidence for another profile from which on a robot doubts what it was told of its own sensors.
 
-With 3, one honest robot in twenty would doubt its own sensors instead of a peer that attacks; with more, honest
-peers are suspected where both robots have a bias that nobody told.
+With less, robots doubt their own sensors where a peer attacks; with more, honest peers are suspected where
+both robots have a bias that nobody told.
 """
 
 FEWEST_RANGES = 4
