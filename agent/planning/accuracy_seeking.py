@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from msgspec.structs import replace
 
@@ -16,10 +17,13 @@ from agent.estimation.gaussian import inference
 from agent.estimation.gaussian.consistency import (
     CLAIM_P_VALUE,
     EARLY_CLAIM_P_VALUE,
+    FINISHED,
     INCONSISTENT_P_VALUE,
     INCONSISTENT_SEARCHES,
 )
 from agent.estimation.gaussian.hypotheses import ScoredHypothesis, follow, search
+from agent.estimation.gaussian.inference import PlanningHypothesis
+from agent.estimation.gaussian.range_model import PairRanges
 from agent.estimation.knowledge import Belief
 from agent.planning import active_sensing, exchange, phase2_orbit, range_seeking, transitions
 from agent.planning.active_sensing import Listening, Retreating, Surveying
@@ -59,11 +63,18 @@ MISLEADING = -8.0
 If it is smaller even for the most probable hypothesis, the ranges are misleading and not just unlucky.
 """
 
-CHECKED, CHECKED_WITH_OUTLIERS = 8, 12
-"""The minimum number of mutual ranges before a claim, without and with outliers."""
-
 FEWEST_MUTUAL_RANGES = 3
-"""The minimum number of mutual ranges for hypotheses. With fewer, there are too many hypotheses."""
+"""The minimum number of mutual ranges for hypotheses, and before a claim.
+
+With fewer, there are too many hypotheses, and no range checks them. How many more a claim needs depends on
+their evidence (`inference.with_evidence_check`).
+"""
+
+EARLY_RANGES = 16
+"""The number of mutual ranges below which EARLY_CLAIM_P_VALUE applies.
+
+Few ranges leave room for a wrong hypothesis that fits by chance. With more, only the p-value of the search
+counts. The bound delays one of a hundred right claims by a few ticks."""
 
 OFF_RADIUS = 0.5
 """The heading error in rad relative to the radius from which on the robot aligns again in phase 2."""
@@ -71,16 +82,26 @@ OFF_RADIUS = 0.5
 DROP_OUT_SIGMAS = 3.0
 """The margin for the number of drop-outs, in standard deviations."""
 
-SEARCH_AT = frozenset((FEWEST_MUTUAL_RANGES, *(CHECKED * 2**n for n in range(12))))
-"""The numbers of mutual ranges at which the whole plane is searched again for hypotheses."""
+SEARCH_AT = frozenset((FEWEST_MUTUAL_RANGES, *(8 * 2**n for n in range(12))))
+"""The numbers of mutual ranges at which the whole plane is searched again for hypotheses.
+
+They only bound how long a missed hypothesis stays missed: the plane is also searched before each claim, and
+whenever the best fit still moves. More searches cost time; with fewer, robots plan with too few hypotheses.
+"""
 
 MANY_MUTUAL_RANGES = 60
-"""The number of mutual ranges after which a lack of accuracy is due to too few ranges to the anchor."""
+"""The number of mutual ranges after which a lack of accuracy is due to too few ranges to the anchor.
+
+Set on the sweep `noise`, whose missions need 10 to 40. With fewer, robots that would have claimed a few ticks
+later drive back; with more, robots whose anchor is known too badly range in vain for longer. Missions with
+little noise never come near it.
+"""
 
 
 def required_mutual_ranges(mission: Mission) -> int:
     """Return the minimum number of mutual ranges before a claim."""
-    return CHECKED_WITH_OUTLIERS if mission.noise.outliers else CHECKED
+    del mission
+    return FEWEST_MUTUAL_RANGES
 
 
 def observe(state: RobotState, observation: Observation) -> RobotState:
@@ -129,7 +150,7 @@ def _continue_phase1(state: RobotState) -> RobotState:
             return _return_to_anchor(state)
         return replace(state, mode=Straight("anchor", state.odometry, state.log.ranges[-1].range))
     mission = state.config.mission
-    if inference.is_anchor_known(scored, mission):
+    if inference.is_anchor_known(state, scored):
         kind: BranchKind = "circle" if len(state.log.ranges) == 2 else "three-ranges"
         phase1_done_tick = (
             state.tick if state.belief.phase1_done_tick is None else state.belief.phase1_done_tick
@@ -257,24 +278,15 @@ def _decide_phase3(state: RobotState) -> RobotState:
     mutual = pair.ranges.counts[2]
     if mutual < FEWEST_MUTUAL_RANGES:
         return _drive_without_hypotheses(state)
-    known = state.belief.pair
-    searched = not known or any(state.belief.ranges_at_last_search < count <= mutual for count in SEARCH_AT)
-    scored = search(pair) if searched else follow(known, pair)
+    scored, hypotheses, belief, searched = _inferred(state, pair)
     if searched:
-        state = replace(state, belief=replace(state.belief, ranges_at_last_search=mutual))
-    required_ranges = required_mutual_ranges(mission)
-    hypotheses = inference.pair_planning_hypotheses(scored, pair)
-    belief = inference.with_pair(state, scored, hypotheses, pair, required_ranges)
-    if (belief.blocking_reason is None or _p_value_below(belief, CLAIM_P_VALUE)) and not searched:
-        scored, searched = search(pair), True
-        hypotheses = inference.pair_planning_hypotheses(scored, pair)
-        belief = inference.with_pair(state, scored, hypotheses, pair, required_ranges)
+        belief = replace(belief, ranges_at_last_search=mutual)
     tested = replace(state, belief=inference.with_convergence_check(belief, scored))
     if searched:
         tested = _with_consistency_test(tested)
     if tested.verdict is not None:
         return tested
-    few_ranges = len(pair.places) < 2 * required_ranges
+    few_ranges = len(pair.places) < EARLY_RANGES
     if tested.belief.blocking_reason is None and not (
         few_ranges and _p_value_below(tested.belief, EARLY_CLAIM_P_VALUE)
     ):
@@ -285,6 +297,47 @@ def _decide_phase3(state: RobotState) -> RobotState:
         return _drive_without_hypotheses(tested)
     a, b = active_sensing.plan_together(hypotheses, pair.apart, state.mutual[-1].range, mission)
     return replace(tested, mode=Surveying("peer", a if role == "a" else b))
+
+
+class _Inferred(NamedTuple):
+    """The hypotheses about both robots in one tick."""
+
+    scored: tuple[ScoredHypothesis, ...]
+    hypotheses: list[PlanningHypothesis]
+    belief: Belief
+    searched: bool
+    """True if the hypotheses are from a search of the whole plane."""
+
+
+def _inferred(state: RobotState, pair: PairRanges) -> _Inferred:
+    """Return the hypotheses about both robots, from those of the last tick or from a search.
+
+    The whole plane is searched if nothing is known, at the counts SEARCH_AT, if the best fit still moves,
+    because it may be on its way to another mode, and before a claim or a suspicion.
+    """
+    known, mutual = state.belief.pair, pair.ranges.counts[2]
+    if known and not any(state.belief.ranges_at_last_search < count <= mutual for count in SEARCH_AT):
+        scored = follow(known, pair)
+        if scored and scored[0].fit.last_step <= FINISHED:
+            followed = _weighed(state, pair, scored, searched=False)
+            if followed.belief.blocking_reason is not None and not _p_value_below(
+                followed.belief, CLAIM_P_VALUE
+            ):
+                return followed
+        known = tuple([one.hypothesis for one in scored])
+    return _weighed(state, pair, search(pair, known), searched=True)
+
+
+def _weighed(
+    state: RobotState, pair: PairRanges, scored: tuple[ScoredHypothesis, ...], *, searched: bool
+) -> _Inferred:
+    """Return the hypotheses `scored` with the belief that follows from them."""
+    mission = state.config.mission
+    hypotheses = inference.pair_planning_hypotheses(scored, pair)
+    belief = inference.with_pair(state, scored, hypotheses, pair, required_mutual_ranges(mission))
+    return _Inferred(
+        scored, hypotheses, inference.with_evidence_check(belief, scored, pair, mission), searched
+    )
 
 
 def _p_value_below(belief: Belief, bound: float) -> bool:

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from agent.planning import exchange, transitions
-from agent.planning.accuracy_seeking import CHECKED_WITH_OUTLIERS
 from agent.planning.exchange import estimate, report, start
 from agent.planning.manoeuvres import Manoeuvres
 from agent.planning.phase1_anchor import ThirdPoint
@@ -40,8 +39,11 @@ MANOEUVRES = Manoeuvres(directions=(1.0,), sides=(1.0,), last_speeds=None, fewes
 ACTIVE_SENSING = False
 """The paper's manoeuvres distinguish hypotheses, and do not improve them."""
 
-CHECKED = 3
-"""The minimum number of mutual ranges before a claim with noisy sensors, without outliers."""
+CHECKED, CHECKED_WITH_OUTLIERS = 3, 12
+"""The minimum number of mutual ranges before a claim with noisy sensors, without and with outliers.
+
+The paper's manoeuvres give three. With outliers, three do not say which of them is one, so `paper` does not
+claim."""
 
 
 def observe(state: RobotState, observation: Observation) -> RobotState:
@@ -74,10 +76,7 @@ def command(state: RobotState) -> Command:
 
 
 def required_mutual_ranges(mission: Mission) -> int:
-    """Return the minimum number of noisy mutual ranges before a claim.
-
-    With outliers, it is that of the `assured` planner, which the paper's manoeuvres do not reach.
-    """
+    """Return the minimum number of noisy mutual ranges before a claim."""
     return CHECKED_WITH_OUTLIERS if mission.noise.outliers else CHECKED
 
 

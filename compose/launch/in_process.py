@@ -12,7 +12,7 @@ from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
 from compose.recording.run import Run
 from protocol.journal import environment
 from protocol.journal.journal_file import Journal, Sink
-from protocol.messages import Command, FinalReport, MissionEnd
+from protocol.messages import Command, Estimate, FinalReport, Localised, MissionEnd
 from world.faults import LATEST
 from world.referee import MissionOutcome
 from world.scenario import Scenario
@@ -45,6 +45,7 @@ def played(scenario: Scenario, sinks: Mapping[str, Sink]) -> Run:
     robots = {robot: Robot(scenario.config(robot), sinks.get(agent_journal(robot))) for robot in ids}
     ticks: list[Tick] = []
     end: MissionEnd | None = None
+    claims: dict[str, Estimate] = {}
     sent: dict[tuple[str, int], FramedReport] = {}
     while end is None:
         observations = simulation.observations()
@@ -61,6 +62,13 @@ def played(scenario: Scenario, sinks: Mapping[str, Sink]) -> Run:
             commands[observation.robot] = agent.decide(received)
             if agent.journaled:
                 agent.estimate()
+            verdict = commands[observation.robot].verdict
+            if (
+                isinstance(verdict, Localised)
+                and verdict.covariance is not None
+                and observation.robot not in claims
+            ):
+                claims[observation.robot] = agent.planner.estimate(agent.state)
         if sent:
             for robot in ids:  # it can no longer be received
                 sent.pop((robot, simulation.tick - LATEST), None)
@@ -72,4 +80,4 @@ def played(scenario: Scenario, sinks: Mapping[str, Sink]) -> Run:
     history = WorldHistory(
         scenario, tuple(ticks), None, mission_outcome, end, final_reports, environment=environment.of_world()
     )
-    return Run(history)
+    return Run(history, claim_estimates=claims)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import msgspec
 from msgspec.structs import replace
 
-from compose.recording.claim import Claim, claim
+from compose.recording.claim import Claim, claim, truth_held
 from compose.recording.recording_files import (
     WORLD_JOURNAL,
     JournalFile,
@@ -63,6 +63,8 @@ class Run(msgspec.Struct, frozen=True, dict=True):
     """The journals, by file name, the world's first; empty for a run without journals."""
     source: object = "the recording"
     """The folder of the journals, for errors."""
+    claim_estimates: dict[str, Estimate] = {}
+    """The Estimate of each robot at its first claim, if the run took place in this process."""
 
     # --- static data ---
 
@@ -225,6 +227,21 @@ class Run(msgspec.Struct, frozen=True, dict=True):
             if command is not None and isinstance(command.verdict, Localised):
                 return claim(tick.truth.tick, command.verdict, tick.truth.poses[self._place[robot]])
         return None
+
+    def truth_held(self, robot: str) -> bool | None:
+        """Return whether `robot` held the true hypothesis at its first claim (see `claim.truth_held`).
+
+        None without a claim, with exact sensors, and if neither this process nor a journal has its Estimate.
+        """
+        one = self.claim(robot)
+        if one is None or one.covariance is None:
+            return None
+        estimate = self.claim_estimates.get(robot)
+        if estimate is None and robot in self.agents:
+            estimate = next((e for e in self.agents[robot].estimates if e.tick == one.tick), None)
+        if estimate is None:
+            return None
+        return truth_held(estimate, self.truth(robot)[one.tick], self.scenario.mission.accuracy)
 
     # --- the end ---
 

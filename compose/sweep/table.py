@@ -27,7 +27,7 @@ _KINDS: dict[str, pa.DataType] = {
     **dict.fromkeys(("hypotheses", "claims", "claims_within", "violations"), pa.int64()),
     **dict.fromkeys(("reports_sent", "reports_heard", "reports_refused"), pa.int64()),
     **dict.fromkeys(("reports_lost", "bytes_sent", "kills"), pa.int64()),
-    "same_record": pa.bool_(),
+    **dict.fromkeys(("same_record", "truth_held"), pa.bool_()),
     **dict.fromkeys(("period_s", "t_max_s", "wall_s", "position_error_m", "nearest_m"), pa.float64()),
     **dict.fromkeys(
         ("heading_error_rad", "alpha", "probability", "p_value", "position_sigma_m", "nees", "bound_m"),

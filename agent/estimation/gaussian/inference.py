@@ -11,7 +11,13 @@ from msgspec.structs import replace
 
 from agent.estimation.exact import Branch
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, Inconsistency, consistency_test
-from agent.estimation.gaussian.hypotheses import ScoredHypothesis, missing, of_anchor
+from agent.estimation.gaussian.hypotheses import (
+    ScoredHypothesis,
+    anchor_evidence,
+    missing,
+    mutual_evidence,
+    of_anchor,
+)
 from agent.estimation.gaussian.least_squares import deviation, poses
 from agent.estimation.gaussian.odometry_noise import Array, Track, track
 from agent.estimation.gaussian.own_sensors import Doubt, doubt
@@ -46,7 +52,7 @@ def own_anchor(knowledge: Knowledge) -> tuple[ScoredHypothesis, ...]:
     mission = knowledge.config.mission
     path = path_of(knowledge.log, knowledge.tick, mission.period)
     ranges = Ranges.of_lists(_ranges_until(knowledge.log, knowledge.tick), (), (), mission.noise)
-    possible = ranges.within(mission.sensing_range, mission.noise.priors)
+    possible = ranges.within(mission.sensing_range, mission.noise.priors).thinned(mission.noise)
     if not len(possible.rho):
         return ()
     silent = missing(ranges.tick, knowledge.tick + 1)
@@ -63,7 +69,7 @@ def own_doubt(knowledge: Knowledge) -> Doubt | None:
     mission = knowledge.config.mission
     path = path_of(knowledge.log, knowledge.tick, mission.period)
     ranges = Ranges.of_lists(_ranges_until(knowledge.log, knowledge.tick), (), (), mission.noise)
-    return doubt(path, ranges, mission.sensing_range, mission.noise)
+    return doubt(path, ranges.thinned(mission.noise), mission.sensing_range, mission.noise)
 
 
 def with_own(knowledge: Knowledge, scored: Sequence[ScoredHypothesis]) -> Belief:
@@ -96,24 +102,48 @@ def anchor_planning_hypotheses(scored: Sequence[ScoredHypothesis]) -> list[Plann
     return hypotheses
 
 
-def is_anchor_known(scored: Sequence[ScoredHypothesis], mission: Mission) -> bool:
+def is_anchor_known(knowledge: Knowledge, scored: Sequence[ScoredHypothesis]) -> bool:
     """Return whether the anchor's position is known well enough to end phase 1."""
-    best = scored[0]
-    required_ranges = ANCHOR_RANGES_WITH_OUTLIERS if mission.noise.outliers else ANCHOR_RANGES
-    return (
-        int(np.count_nonzero(best.fit.weights > 0.5)) >= required_ranges
-        and best.hypothesis.probability >= SURE_OF_BRANCH
-        and deviation(float(np.trace(best.fit.covariance))) <= mission.required_anchor_sigma
-    )
+    mission, best = knowledge.config.mission, scored[0]
+    good = int(np.count_nonzero(best.fit.weights > 0.5))
+    if good < LEAST_RANGES or best.hypothesis.probability < SURE_OF_BRANCH:
+        return False
+    if deviation(float(np.trace(best.fit.covariance))) > mission.required_anchor_sigma:
+        return False
+    if good >= (ANCHOR_RANGES_WITH_OUTLIERS if mission.noise.outliers else ANCHOR_RANGES):
+        return True
+    path = path_of(knowledge.log, knowledge.tick, mission.period)
+    ranges = Ranges.of_lists(_ranges_until(knowledge.log, knowledge.tick), (), (), mission.noise)
+    possible = ranges.within(mission.sensing_range, mission.noise.priors)
+    evidence = anchor_evidence(best.fit, path, possible, mission.sensing_range)
+    return evidence >= -math.log1p(-SURE_OF_BRANCH)
 
 
 SURE_OF_BRANCH = 0.999
-"""The probability from which on a robot accepts a branch and ends phase 1."""
+"""The probability from which on a robot accepts a branch and ends phase 1.
+
+With fewer than ANCHOR_RANGES, the evidence against ranges that agree by chance must be as strong. A wrong
+branch does not lead to a wrong claim: all branches take part in the search of phase 3.
+"""
+
+LEAST_RANGES = 3
+"""The least number of ranges to an anchor, or between the robots, that may be enough.
+
+Two have no redundancy. The third checks them, if it is accurate: by its evidence against chance.
+"""
 
 ANCHOR_RANGES, ANCHOR_RANGES_WITH_OUTLIERS = 5, 7
-"""The minimum number of anchor ranges before phase 1 ends, without and with outliers.
+"""The numbers of anchor ranges that end phase 1 without such evidence, without and with outliers.
 
-Two unknowns need two ranges. The others check them.
+Set on the sweep `noise`. With sigmas of R / 30 and more, ranges give little evidence: it would take twice as
+many of them. With fewer, wrong branches reach phase 3, which takes longer; with more, phase 1 takes longer.
+"""
+
+MUTUAL_RANGES, MUTUAL_RANGES_WITH_OUTLIERS = 8, 12
+"""The numbers of mutual ranges from different places with which a claim needs no evidence against chance.
+
+Set on the sweep `noise`, in which 1 of 30 000 missions was wrong. With sigmas of R / 30 and more, evidence
+would need 11. With fewer ranges, claims are too often wrong; with more, each mission takes longer.
 """
 
 
@@ -141,7 +171,7 @@ def pair_of(knowledge: Knowledge) -> PairRanges:
     lists = [_ranges_until(log, end) for log, end in zip(logs, ends, strict=False)]
     ranges = Ranges.of_lists(lists[0], lists[1], mutual, mission.noise)
     silent = [missing(ranges.tick[ranges.rows(kind)], ends[kind] + 1) for kind in range(3)]
-    ranges = ranges.within(mission.sensing_range, mission.noise.priors)
+    ranges = ranges.within(mission.sensing_range, mission.noise.priors).thinned(mission.noise)
     own, other = config.anchor, config.peer_anchor
     sign = 1.0 if config.role == "a" else -1.0
     return PairRanges(
@@ -188,6 +218,29 @@ def blocking_reason_for(
         if not heading <= HEADING_ACCURACY:
             return f"the sigma of {robot}'s heading is {heading:.3g} rad, required {HEADING_ACCURACY:g}"
     return None
+
+
+def with_evidence_check(
+    belief: Belief, scored: Sequence[ScoredHypothesis], pair: PairRanges, mission: Mission
+) -> Belief:
+    """Return `belief` with a blocking reason if the mutual ranges may agree by chance.
+
+    A few noisy ranges do; three exact ones do not. The probability that they do must be at most
+    1 - confidence, if both are equally probable before. MUTUAL_RANGES suffice in any case.
+    """
+    few = len(pair.places) < (MUTUAL_RANGES_WITH_OUTLIERS if mission.noise.outliers else MUTUAL_RANGES)
+    if belief.blocking_reason is not None or not few:
+        return belief
+    evidence, required = mutual_evidence(scored[0].fit, pair), -math.log1p(-mission.confidence)
+    if evidence >= required:
+        return belief
+    return replace(
+        belief,
+        blocking_reason=(
+            f"the mutual ranges may agree by chance: the log evidence against it is {evidence:.3g}, "
+            f"required {required:.3g}"
+        ),
+    )
 
 
 def with_convergence_check(belief: Belief, scored: Sequence[ScoredHypothesis]) -> Belief:

@@ -264,6 +264,10 @@ class _Problem(NamedTuple):
         return _Point(guess, errors, paths, predicted, self.ranges.rho - predicted.distance)
 
 
+LEAST_VARIANCE = 1e-300
+"""The variance of odometry noise that counts as 0; the odometry error is then 0, too."""
+
+
 def _descended(
     problem: _Problem,
     point: _Point,
@@ -293,7 +297,7 @@ def _cost(point: _Point, drifts: Sequence[OdometryNoiseModel], of_ranges: RangeC
     for error, model in zip(point.errors, drifts, strict=False):
         cost += float(error.constant @ error.constant)
         for one, q in zip((error.v, error.omega), model.variances, strict=True):
-            cost += float(np.sum(np.square(one) / np.where(q > 0.0, q, np.inf)))
+            cost += float(one @ (one / np.maximum(q, LEAST_VARIANCE)))
     return cost
 
 

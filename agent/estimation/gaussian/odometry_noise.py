@@ -85,6 +85,13 @@ class OdometryNoiseModel(NamedTuple):
     moves: Array
     """The prefix sums of these effects on heading, x and y; shape (m, 3, k + 1)."""
 
+    def since(self, tick: int) -> OdometryNoiseModel:
+        """Return the model of a robot whose odometry was exact before `tick`."""
+        variances, sums = self.variances.copy(), self.sums - self.sums[:, tick : tick + 1]
+        patterns, moves = self.patterns.copy(), self.moves - self.moves[:, :, tick : tick + 1]
+        variances[:, :tick] = sums[:, :tick] = patterns[:, :, :tick] = moves[:, :, :tick] = 0.0
+        return self._replace(variances=variances, sums=sums, patterns=patterns, moves=moves)
+
 
 def constant_errors(measured: Track, noise: Noise) -> Array:
     """Return the `patterns` of a robot: the scale errors of v and omega, and the bias of omega."""
@@ -195,7 +202,7 @@ def constant_effects(model: OdometryNoiseModel, rows: Projection) -> Array:
 def spread(model: OdometryNoiseModel, rows: Projection) -> Array:
     """Return the covariance (m^2) of N rows that is caused by white odometry noise; shape (N, N)."""
     at = np.minimum(rows.tick[:, None], rows.tick)
-    c0, bx, by, xx, xy, yy = model.sums[:, at]
+    c0, bx, by, xx, xy, yy = np.take(model.sums, at, axis=1, mode="clip")
     (ux, uy), lever = rows.u, rows.lever
     column, left, above = lever[:, None], ux[:, None], uy[:, None]
     cross = column * (bx * ux + by * uy)
