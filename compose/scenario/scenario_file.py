@@ -385,6 +385,13 @@ def _plan(file: ScenarioFile, first: int, second: int, source: str) -> Rendezvou
     why = infeasibility(file.mission, distance)
     if why is not None:
         raise Unworkable(f"{source}: mission: {why}")
+    if not file.mission.noise.exact:
+        # imports numpy, which scenarios with exact sensors do not need
+        from agent.estimation.gaussian.reachable_accuracy import forbidding_prior  # noqa: PLC0415
+
+        why = forbidding_prior(file.mission, distance)
+        if why is not None:
+            raise Unworkable(f"{source}: mission.{why}")
     return rendezvous(file.mission, distance, file.planner.name)
 
 
