@@ -67,8 +67,8 @@ def after_observation(
 
 def start_phase1(state: RobotState, rho0: float | None) -> RobotState:
     """Start phase 1 with the first anchor range `rho0` in m; None if the anchor was not detected."""
-    if rho0 is None and not state.config.mission.noise.exact:
-        return state  # the robot waits for its first range
+    if rho0 is None and state.estimator.corrects_poses:
+        return state  # a range may be missing by chance: the robot waits for its first one
     if rho0 is None:
         return state.undecided("the anchor is out of range at the start")
     known = state.estimator.on_anchor(state, rho0)

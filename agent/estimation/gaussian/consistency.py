@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
@@ -96,7 +95,7 @@ def _residuals_test(fitted: Fit, pair: PairRanges, robot: int) -> Inconsistency:
         level = min((noise.sigma_degrees + own.chi2) / degrees, HIGHEST_LEVEL)
         p_value = max(p_value, f_tail(more / more_free / level, more_free, degrees))
         p_value = min(p_value, 0.5 * math.erfc(_normal(more / HIGHEST_LEVEL, more_free) / math.sqrt(2.0)))
-        sigmas = normal_quantile(p_value)
+        sigmas = _normal(more / level, more_free)
     what = (
         "measurements and reports that contradict each other: "
         f"chi-square {fitted.chi2:.3g} for {free} degrees of freedom"
@@ -158,11 +157,6 @@ def _beta_fraction(x: float, a: float, b: float) -> float:
 
 FRACTION_TERMS = 500
 """The maximum number of terms of the fraction; it needs about the root of the degrees of freedom."""
-
-
-def normal_quantile(p_value: float) -> float:
-    """Return the sigmas that a standard normal variable exceeds with the probability `p_value`."""
-    return -NormalDist().inv_cdf(min(max(p_value, 1e-300), 1.0 - 1e-16))
 
 
 def _normal(chi2: float, free: int) -> float:

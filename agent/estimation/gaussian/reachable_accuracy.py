@@ -46,16 +46,14 @@ Tuned on the sweep `noise`: with 1, cells would be refused in which all missions
 
 @lru_cache(maxsize=64)
 def forbidding_prior(mission: Mission, distance: float) -> str | None:
-    """Return the field and why a prior forbids the accuracy of `mission`; None if none does.
+    """Return the field and why a prior forbids the accuracy of a noisy `mission`; None if none does.
 
     `distance` is that of the anchors in m. Where white noise alone would forbid it, no prior is named.
     """
     noise = mission.noise
-    if noise.exact:
-        return None
     reached = _reference_sigma(mission, distance, noise)
     most = ACTIVE * mission.accuracy
-    if reached <= most or _reference_sigma(mission, distance, noise.as_told) > most:
+    if not most < reached < math.inf or _reference_sigma(mission, distance, noise.as_told) > most:
         return None
     without = {
         name: _reference_sigma(mission, distance, replace(noise, **{name: 0.0}))
@@ -76,7 +74,7 @@ def _reference_sigma(mission: Mission, distance: float, noise: Noise) -> float:
     turn = math.tau / AROUND_ANCHOR
     radius = 0.3 * reach
     paths, guess = [], []
-    for way in (distance - 0.8 * reach, 0.0):
+    for way in (max(distance - 0.8 * reach, 0.0), 0.0):
         around = np.full(AROUND_ANCHOR, 2.0 * radius * math.sin(0.5 * turn) / np.sinc(0.5 * turn / math.pi))
         again = np.full(TOGETHER, around[0])
         v = np.concatenate((around, (way,), again)) / period
