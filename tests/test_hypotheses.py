@@ -242,7 +242,7 @@ def met(corner: bool, start: Pose, standing: Pose) -> tuple[PairRanges, list[Pla
     ticks = (13, 14, 16)
     looks = [distance(a.poses[tick], b.poses[tick].x, b.poses[tick].y) for tick in ticks]
     assert max(looks) < REACH
-    noise = Noise(EXACT, EXACT)
+    noise = Noise(EXACT, EXACT).as_told
     ranges = Ranges.of_lists(
         told([distance(pose, 0.0, 0.0) for pose in a.poses], 0.0, draws),
         told([distance(pose, 10.0, 0.0) for pose in b.poses], 0.0, draws),
