@@ -74,11 +74,13 @@ def _reference_sigma(mission: Mission, distance: float, noise: Noise) -> float:
     turn = math.tau / AROUND_ANCHOR
     radius = 0.3 * reach
     paths, guess = [], []
-    for way in (max(distance - 0.8 * reach, 0.0), 0.0):
+    for way, sign in ((max(distance - 0.8 * reach, 0.0), 1.0), (0.0, -0.7)):
         around = np.full(AROUND_ANCHOR, 2.0 * radius * math.sin(0.5 * turn) / np.sinc(0.5 * turn / math.pi))
         again = np.full(TOGETHER, around[0])
         v = np.concatenate((around, (way,), again)) / period
-        omega = np.concatenate((np.full(AROUND_ANCHOR, turn), (0.0,), np.full(TOGETHER, turn))) / period
+        omega = (
+            np.concatenate((np.full(AROUND_ANCHOR, turn), (0.0,), np.full(TOGETHER, sign * turn))) / period
+        )
         paths.append(track(v, omega, period))
         guess += [0.25 * reach, 0.5 * reach, 0.0]
     guess[5] = 0.7
