@@ -69,6 +69,13 @@ class NoSuchField(UserError):
     """A field path of a sweep does not exist in the scenario; the text names the part that is missing."""
 
 
+# --- range recordings -------------------------------------------------------------------------------
+
+
+class BadRecording(UserError):
+    """A range recording is invalid; the text names the file, the line and what is wrong."""
+
+
 # --- keys -------------------------------------------------------------------------------------------
 
 

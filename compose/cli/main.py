@@ -55,7 +55,7 @@ COMMANDS = (
     CommandEntry("keys", "Deploy", "Create certificates and access rules for networks without trust."),
     CommandEntry("audit", "Analyse", "Check a recording against the rules of the system."),
     CommandEntry("figures", "Analyse", "Draw the figures of a recording."),
-    CommandEntry("export", "Analyse", "Convert a recording to MCAP, CSV and Parquet."),
+    CommandEntry("export", "Analyse", "Convert a recording to MCAP, CSV, Parquet or a factor graph."),
     CommandEntry("watch", "Analyse", "Serve a web page that shows recordings or live missions."),
     CommandEntry("doctor", "Check", "Check this machine, its keys and its network before a mission."),
     CommandEntry("ps", "Check", "List the missions on a network and the robots in them."),
