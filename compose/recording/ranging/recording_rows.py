@@ -136,15 +136,18 @@ def row_of(values: Any, kind: type[RowKind], place: object) -> RowKind:
     try:
         return msgspec.convert(values, kind, strict=False)
     except msgspec.ValidationError as error:
-        raise BadRecording(f"{place}: {wrong_field(error)}") from None
+        raise BadRecording(f"{place}: {wrong_field(error, values)}") from None
 
 
-def wrong_field(error: msgspec.ValidationError) -> str:
-    """Return the message of an error for a user: the field, and what is wrong with it."""
+def wrong_field(error: msgspec.ValidationError, values: object = None) -> str:
+    """Return the message of an error for a user: the field of `values`, and what is wrong with it."""
     found = re.fullmatch(r"(?P<what>.*) - at `\$\.?(?P<field>.*)`", str(error), re.DOTALL)
     what, field = (found["what"], found["field"]) if found else (str(error), "")
-    what = what.replace("Object ", "").replace("`", "'")
-    what = what[:1].lower() + what[1:]
+    if isinstance(values, dict) and field in values:
+        expected = re.sub(r", got .*", "", what) + f", got {str(values[field])[:40]!a}"
+        what = re.sub(r"`str` matching regex '[^']*'", "a name of letters, digits, - and _", expected)
+    what = what.replace("Object ", "").replace("`float | null`", "a number").replace("`float`", "a number")
+    what = what[:1].lower() + what[1:].replace("`", "'")
     return f"{field}: {what}" if field else what
 
 
