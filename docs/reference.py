@@ -22,6 +22,7 @@ from msgspec import NODEFAULT
 from msgspec import inspect as types
 
 from compose.cli.main import COMMANDS, command_parser
+from compose.recording.ranging import recording_rows
 from compose.recording.ticks_csv import TickRow
 from compose.scenario.fault_syntax import FaultTable
 from compose.scenario.kills import KillTable
@@ -297,6 +298,11 @@ TABLES: dict[str, Callable[[], str]] = {
     "trial-columns": partial(columns_of, TrialRow),
     "robot-columns": partial(columns_of, RobotRow),
     "tick-columns": partial(columns_of, TickRow),
+    "odometry-columns": partial(fields_of, recording_rows.OdometryRow),
+    "range-columns": partial(fields_of, recording_rows.RangeRow),
+    "anchor-columns": partial(fields_of, recording_rows.AnchorRow),
+    "antenna-columns": partial(fields_of, recording_rows.AntennaRow),
+    "truth-columns": partial(fields_of, recording_rows.TruthRow),
     "final-report": partial(columns_of, messages.FinalReport),
     "wire-version": wire_version,
     "wire-keys": wire_keys,
