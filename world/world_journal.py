@@ -12,7 +12,7 @@ from protocol.journal.journal_file import CorruptJournal, UnexpectedFrame
 from protocol.messages import Command, DeadlineMissed, Environment, FinalReport, MissionEnd
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 from world.referee import MissionOutcome
-from world.scenario import Scenario
+from world.scenario import RecordedScenario, Scenario
 from world.tick import World, advance, release
 from world.truth import Truth
 
@@ -141,7 +141,7 @@ class WorldJournalReading:
             self.environment = named
             self.messages.append(named)
             return
-        scenario = decode(frame, Scenario, MAX_FRAME_BYTES)
+        scenario: Scenario = decode(frame, RecordedScenario, MAX_FRAME_BYTES)
         problem = _unpaired(scenario)
         if problem is not None:
             raise MalformedFrame(problem)
