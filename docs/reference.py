@@ -26,15 +26,16 @@ from compose.recording.ranging import recording_rows
 from compose.recording.ticks_csv import TickRow
 from compose.scenario.fault_syntax import FaultTable
 from compose.scenario.kills import KillTable
-from compose.scenario.scenario_file import PlannerTable, RobotTable, ScenarioFile
+from compose.scenario.scenario_file import PlannerTable, RobotTable, ScenarioFile, WorldTable
 from compose.sweep.draws import DrawTable, StartsTable
-from compose.sweep.spec import AxisTable, SpecFile
+from compose.sweep.spec import AxisTable, RowTable, SpecFile
 from compose.sweep.trial import RobotRow, TrialRow
 from protocol import messages, wire
 from protocol.attack import Attack
 from protocol.mission import Mission
 from protocol.network import keys
 from protocol.noise import Noise, VelocityNoise
+from world.world_noise import WorldActuationNoise, WorldNoise, WorldOdometryNoise
 
 MARKER = re.compile(r"^<!-- generated: (?P<name>[\w-]+) -->$", re.MULTILINE)
 NO_VALUE = "none"
@@ -55,9 +56,14 @@ NAMES = {
     "AxisTable": "`[[axis]]`",
     "DrawTable": "`[[draw]]`",
     "StartsTable": "table `[starts]`",
+    "WorldTable": "table `[world]`",
     "Attack": "table",
     "Noise": "table",
     "VelocityNoise": "table",
+    "WorldNoise": "table",
+    "WorldActuationNoise": "table",
+    "WorldOdometryNoise": "table",
+    "RowTable": "table",
 }
 """the types of tables of files, as a user writes them"""
 
@@ -289,10 +295,15 @@ TABLES: dict[str, Callable[[], str]] = {
     "attack": partial(fields_of, Attack),
     "noise": partial(fields_of, Noise),
     "velocity-noise": partial(fields_of, VelocityNoise),
+    "world": partial(fields_of, WorldTable),
+    "world-noise": partial(fields_of, WorldNoise),
+    "world-actuation-noise": partial(fields_of, WorldActuationNoise),
+    "world-odometry-noise": partial(fields_of, WorldOdometryNoise),
     "fault": partial(fields_of, FaultTable),
     "kill": partial(fields_of, KillTable),
     "sweep": partial(fields_of, SpecFile),
     "axis": partial(fields_of, AxisTable),
+    "row": partial(fields_of, RowTable),
     "draw": partial(fields_of, DrawTable),
     "starts": partial(fields_of, StartsTable),
     "trial-columns": partial(columns_of, TrialRow),

@@ -36,6 +36,7 @@ from __future__ import annotations
 
 import math
 import re
+from functools import cached_property
 from typing import Annotated, Literal
 
 import msgspec
@@ -45,7 +46,7 @@ from msgspec.structs import force_setattr
 from protocol.attack import Attack
 from protocol.mission import Anchor, Mission, PlannerName, Role
 from protocol.motion import Controls, Covariance, Pose, Segment
-from protocol.orbits import Rendezvous
+from protocol.orbits import Orbit, Rendezvous
 from protocol.units import (
     Angle,
     AngularVelocity,
@@ -213,7 +214,7 @@ class DeadlineMissed(Message, frozen=True):
 # --- from the world to a robot ---
 
 
-class RobotConfig(Message, frozen=True):
+class RobotConfig(Message, frozen=True, dict=True):
     """The configuration of a robot: everything that its agent needs to start."""
 
     robot: RobotId
@@ -237,10 +238,15 @@ class RobotConfig(Message, frozen=True):
     tick_s: Annotated[float, Meta(gt=0.0, le=1e6)] | None
     """The duration of a tick in s of wall time; None in lockstep, where a tick has no deadline."""
 
-    @property
+    @cached_property
     def anchor_distance(self) -> float:
         """The distance D between the two anchors, in m."""
         return math.hypot(self.anchor.x - self.peer_anchor.x, self.anchor.y - self.peer_anchor.y)
+
+    @cached_property
+    def orbit(self) -> Orbit:
+        """The orbit of this robot in phase 2."""
+        return self.rendezvous.of(self.role)
 
 
 class Observation(Message, frozen=True):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cached_property
 from typing import Annotated, Literal
 
 import msgspec
@@ -55,7 +56,7 @@ class Anchor(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields
     """The y coordinate, in m."""
 
 
-class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
     """The limits, sensors and required accuracy of the robots; the same for all of them (Section II)."""
 
     sensing_range: Length
@@ -76,7 +77,7 @@ class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     noise: Noise = Noise()
     """The noise of sensors and motion."""
 
-    @property
+    @cached_property
     def first_straight(self) -> float:
         """The length A_0 in m of the first manoeuvre: one tick at v_max, at most FIRST_STRAIGHT_LIMIT R."""
         return min(self.max_speed * self.period, FIRST_STRAIGHT_LIMIT * self.sensing_range)

@@ -52,6 +52,8 @@ PURE = {
     "world.channel",
     "world.referee",
     "world.scenario",
+    "world.sensor_model",
+    "world.world_noise",
     "protocol.messages",
     "protocol.mission",
     "protocol.motion",

@@ -97,6 +97,7 @@ def test_summary_has_every_documented_value_of_a_run(played: tuple[str, Path]) -
         },
         "planner": "paper",
         "max_ticks": told["parameters"]["max_ticks"],
+        "world_noise": None,
     }
     assert told["parameters"]["max_ticks"] > 2 * 226
     assert {"python", "tandem-ranging", "eclipse-zenoh", "numpy"} <= told["versions"].keys()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import msgspec
 
 from protocol.attack import Attack
@@ -11,6 +13,8 @@ from protocol.motion import Pose
 from protocol.orbits import Rendezvous
 from protocol.units import RobotId, Tick
 from world.faults import Fault
+from world.sensor_model import SensorModel, sensor_model
+from world.world_noise import WorldNoise
 
 
 class RobotSpec(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
@@ -32,7 +36,9 @@ class RobotSpec(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fie
     """The false data that the robot injects into its Reports; None for an honest robot."""
 
 
-class Scenario(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="scenario"):
+class Scenario(
+    msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="scenario", dict=True
+):
     """A validated mission. All its random and derived values have been computed."""
 
     name: str
@@ -49,6 +55,17 @@ class Scenario(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fiel
     """The robots, in pairs of peers."""
     faults: tuple[Fault, ...] = ()
     """The fault plan of the radio."""
+
+    @property
+    def world_noise(self) -> WorldNoise:
+        """The noise of the simulated sensors; here, what the robots are told."""
+        return WorldNoise()
+
+    @cached_property
+    def sensors(self) -> SensorModel:
+        """The sensors of all robots, with everything that is drawn once for the mission."""
+        robots = [(robot.id, robot.anchor) for robot in self.robots]
+        return sensor_model(self.mission, self.world_noise, robots, self.pairs(), self.seed)
 
     def pairs(self) -> tuple[tuple[int, int], ...]:
         """Return the pairs of peers as indices into `robots`, with robot a first."""
@@ -85,3 +102,16 @@ class Scenario(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fiel
             attack=own.attack,
             tick_s=tick_s,
         )
+
+
+class ScenarioWithWorldNoise(
+    Scenario, frozen=True, array_like=True, forbid_unknown_fields=True, tag="scenario-with-world-noise"
+):
+    """A mission in which the robots are told another noise than the simulated sensors have."""
+
+    world_noise: WorldNoise = WorldNoise()
+    """The noise of the simulated sensors."""
+
+
+RecordedScenario = Scenario | ScenarioWithWorldNoise
+"""The two kinds of scenario in a world's journal."""

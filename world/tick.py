@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import msgspec
 
 from protocol.messages import Command, Contact, Localised, Observation, Verdict
-from protocol.motion import Controls, Pose
+from protocol.motion import REST, Controls, Pose
 from world.channel import LinkState, link_faults, next_link_state
 from world.referee import MissionOutcome, decide_outcome
 from world.scenario import Scenario
@@ -35,6 +35,8 @@ class World(msgspec.Struct, frozen=True):
 
     Empty without faults.
     """
+    executed_before: tuple[Controls, ...] | None = None
+    """The executed controls over the tick before the previous one; None until tick 2."""
 
 
 def release(scenario: Scenario) -> World:
@@ -55,8 +57,11 @@ def observations(world: World) -> list[Observation]:
     scenario, truth, driven = world.scenario, world.truth, world.executed
     tick, robots = truth.tick, scenario.robots
     measured: Sequence[Controls | None] = driven or [None] * len(robots)
-    if driven is not None and not scenario.mission.noise.exact:
-        measured = [odometry(driven[i], scenario, robot.id, tick) for i, robot in enumerate(robots)]
+    if driven is not None and not scenario.sensors.exact:
+        before = world.executed_before or (REST,) * len(robots)
+        measured = [
+            odometry(driven[i], scenario, robot.id, tick, before[i]) for i, robot in enumerate(robots)
+        ]
     contacts: list[tuple[Contact, ...]] = [()] * len(robots)
     mutuals = mutual_ranges(truth, scenario, world.pairs)
     for i, ((one, other), mutual) in enumerate(zip(world.pairs, mutuals, strict=True)):
@@ -77,7 +82,7 @@ def advance(world: World, commands: Mapping[str, Command]) -> World | MissionOut
     scenario, truth = world.scenario, world.truth
     verdicts, claimed = world.verdicts, world.claimed
     driven = []
-    exact = scenario.mission.noise.exact
+    exact = scenario.sensors.exact
     for place, robot in enumerate(scenario.robots):
         command = commands.get(robot.id)
         controls = limited_controls(command, scenario.mission)
@@ -92,7 +97,9 @@ def advance(world: World, commands: Mapping[str, Command]) -> World | MissionOut
             return mission_outcome
     moved = truth.moved(driven, scenario.mission.period)
     links = _carried(world.links, scenario, moved, world.pairs)
-    return World(scenario, moved, tuple(driven), verdicts, claimed, world.pairs, links)
+    return World(
+        scenario, moved, tuple(driven), verdicts, claimed, world.pairs, links, executed_before=world.executed
+    )
 
 
 def _carried(

@@ -70,9 +70,11 @@ def _exceeded_limit(report: Report, mission: Mission) -> Inconsistent | None:
         mission.max_turn_rate, noise.actuation.omega, noise.odometry.omega, noise.standstill_bound[1]
     )
     for run in report.runs:
-        for name, value, largest in (("v", abs(run.v), speed), ("omega", abs(run.omega), rate)):
-            if value > largest:
-                return Inconsistent(f"{name} = {value:.6g}, limit {largest:.6g}", value - largest)
+        v, omega = abs(run.v), abs(run.omega)
+        if v > speed:
+            return Inconsistent(f"v = {v:.6g}, limit {speed:.6g}", v - speed)
+        if omega > rate:
+            return Inconsistent(f"omega = {omega:.6g}, limit {rate:.6g}", omega - rate)
     return None
 
 

@@ -235,7 +235,7 @@ def controls(state: RobotState) -> Controls:
     """Return the controls of the current mode."""
     match state.mode:
         case Orbiting(command):
-            return command or state.orbit.controls
+            return command or state.config.orbit.controls
         case Aligning() | Radial() | Tangent():
             return phase2_orbit.controls(
                 state.mode, state.odometry, state.start, state.orbit, state.config.mission

@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 
 from protocol import motion
-from protocol.journal.journal_file import CorruptJournal, UnexpectedFrame
+from protocol.journal.journal_file import CorruptJournal, UnexpectedFrame, take_all
 from protocol.messages import (
     Command,
     DeadlineMissed,
@@ -101,7 +101,9 @@ class AgentHistory(msgspec.Struct, frozen=True):
 class AgentJournalReading:
     """A reader of an agent's journal, frame by frame."""
 
-    def __init__(self) -> None:
+    def __init__(self, shared: dict[bytes, Any] | None = None) -> None:
+        """`shared` are the Reports and Commands that readers of the same recording have decoded, by frame."""
+        self._shared = {} if shared is None else shared
         self.environment: Environment | None = None
         self.config: RobotConfig | None = None
         """The configuration; None until it has been read."""
@@ -120,7 +122,11 @@ class AgentJournalReading:
 
         Raises MalformedFrame, also if the first frame besides the environment is no RobotConfig.
         """
-        message = decode(frame, OfRobot, MAX_FRAME_BYTES)
+        message = self._shared.get(frame)
+        if message is None:
+            message = decode(frame, OfRobot, MAX_FRAME_BYTES)
+            if isinstance(message, Report | Command):
+                self._shared[frame] = message
         if not self._fits(message, frame):
             tick: int | None = getattr(message, "tick", None)
             at = f" of tick {tick}" if tick is not None else ""
@@ -206,12 +212,9 @@ def agent_history(frames: Iterable[bytes], source: object) -> AgentHistory:
     Raises CorruptJournal, with a text that begins with `source`.
     """
     reading = AgentJournalReading()
-    try:
-        for frame in frames:
-            if not reading.take(frame):
-                break
-    except MalformedFrame as error:
-        raise CorruptJournal(f"{source}: {error}") from None
+    problem = take_all(reading, frames, source)
+    if problem is not None:
+        raise problem
     if reading.unexpected is not None:
         raise CorruptJournal(f"{source}: {reading.unexpected.what}")
     content = reading.content()

@@ -89,9 +89,10 @@ class Robot:
 
         `missed` names the peers whose reports did not arrive in time.
         """
-        self.state = self.planner.decide(self.state, [framed.report for framed in received])
+        reports = [framed.report for framed in received] if received else ()
+        self.state = self.planner.decide(self.state, reports)
         if received:
-            self.unheard.difference_update([framed.report.tick for framed in received])
+            self.unheard.difference_update([report.tick for report in reports])
         self.command = self.planner.command(self.state)
         if self._journal is not None:
             frames = [framed.frame for framed in received]

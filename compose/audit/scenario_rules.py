@@ -17,7 +17,8 @@ from protocol.mission import (
     safety_infeasibility,
 )
 from protocol.orbits import Rendezvous, rendezvous
-from world.scenario import RobotSpec
+from world.scenario import RobotSpec, Scenario
+from world.world_noise import world_noise_infeasibility, world_noise_mistake
 
 
 def scenario(run: Run) -> Checks:
@@ -25,6 +26,7 @@ def scenario(run: Run) -> Checks:
     found = run.scenario
     for why in (noise_infeasibility(found.mission), safety_infeasibility(found.mission)):
         yield _violation(None, why and f"mission.{why}")
+    yield _violation(None, _off_world_noise(found))
     place = {robot.id: place for place, robot in enumerate(found.robots)}
     for robot in found.robots:
         peer = found.robots[place[robot.peer]]
@@ -46,6 +48,16 @@ def config(run: Run) -> Checks:
         found = agent.config
         why = _off_plan(found.rendezvous, found.mission, found.planner_name, found.anchor, found.peer_anchor)
         yield Violation("config", None, robot, why) if why is not None else None
+
+
+def _off_world_noise(found: Scenario) -> str | None:
+    told = found.mission.noise
+    pairs = [(found.robots[i].id, found.robots[j].id) for i, j in found.pairs()]
+    mistake = world_noise_mistake(found.world_noise, told, pairs)
+    if mistake is not None:
+        return f"world.noise.{mistake[0]}: {mistake[1]}"
+    why = world_noise_infeasibility(found.world_noise, told)
+    return why and f"world.noise: {why}"
 
 
 def _off_role(robot: RobotSpec, *, first: bool) -> str | None:

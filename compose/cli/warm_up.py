@@ -8,12 +8,12 @@ from compose.scenario.scenario_file import load
 from protocol import wire
 from protocol.journal import environment
 from protocol.messages import Command, FinalReport, MissionEnd, Observation, Report, RobotConfig
-from world.scenario import Scenario
+from world.scenario import RecordedScenario
 
 MISSION = "paper-1"
 FORKED = ("world", "agent")
 """The commands that forked processes run."""
-RECEIVED = (RobotConfig, Scenario, Observation | MissionEnd, Report, Command, Command | FinalReport)
+RECEIVED = (RobotConfig, RecordedScenario, Observation | MissionEnd, Report, Command, Command | FinalReport)
 """The types that worlds and agents decode."""
 
 

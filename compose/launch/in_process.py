@@ -54,12 +54,11 @@ def played(scenario: Scenario, sinks: Mapping[str, Sink]) -> Run:
                 sent[observation.robot, observation.tick] = report
         commands: dict[str, Command] = {}
         for observation in observations:
-            received = [
-                sent[contact.peer, tick] for contact in observation.contacts for tick in contact.heard or ()
-            ]
-            agent = robots[observation.robot]
+            agent, received = robots[observation.robot], []
+            for contact in observation.contacts:
+                received += [sent[contact.peer, tick] for tick in contact.heard or ()]
             commands[observation.robot] = agent.decide(received)
-            if agent.journaled:
+            if sinks:
                 agent.estimate()
         if sent:
             for robot in ids:  # it can no longer be received

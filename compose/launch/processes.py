@@ -16,7 +16,7 @@ from compose.scenario.kills import WORLD, Kill, taken
 from protocol import limits
 from protocol.network.inbox import Inbox
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
-from world.scenario import Scenario
+from world.scenario import RecordedScenario, Scenario
 
 FOLLOW_S = 2.0
 """Time in s that the agents have to end after the world has ended."""
@@ -62,7 +62,8 @@ def free_endpoint(protocol: str = "tcp") -> str:
 def scenario_from_launcher() -> Scenario:
     """Return the scenario that the launcher sent to the standard input of this child process."""
     size = int.from_bytes(sys.stdin.buffer.read(4), "big")
-    return decode(sys.stdin.buffer.read(size), Scenario, MAX_FRAME_BYTES)
+    scenario: Scenario = decode(sys.stdin.buffer.read(size), RecordedScenario, MAX_FRAME_BYTES)
+    return scenario
 
 
 def run_mission(

@@ -21,11 +21,11 @@ from protocol.messages import (
     OfRobot,
 )
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, body, decode
-from world.scenario import Scenario
+from world.scenario import RecordedScenario
 
-OfWorld = Environment | Scenario | Command | DeadlineMissed | MissionEnd | FinalReport
+OfWorld = Environment | RecordedScenario | Command | DeadlineMissed | MissionEnd | FinalReport
 """The kinds of messages in the world's journal."""
-KINDS = Scenario | OfRobot
+KINDS = RecordedScenario | OfRobot
 """The kinds of messages in any journal."""
 
 

@@ -19,6 +19,7 @@ from compose.recording.ticks_csv import ticks_csv
 from protocol import files
 from protocol.messages import FinalReport
 from protocol.motion import Pose, wrap
+from world.scenario import Scenario
 from world.sensors import mutual_ranges
 
 Mode = Literal["processes", "in-process"]
@@ -53,10 +54,18 @@ def summary(run: Run, mode: Mode, wall_s: float | None) -> dict[str, Any]:
             **msgspec.to_builtins(scenario.mission),
             "planner": scenario.planner_name,
             "max_ticks": scenario.max_ticks,
+            "world_noise": _world_noise(scenario),
         },
         "versions": versions(),
         "robots": {robot: _robot_summary(run, robot) for robot in run.robots},
     }
+
+
+def _world_noise(scenario: Scenario) -> Any:
+    """Return the noise of the sensors; None if it is the one that the robots are told."""
+    if scenario.world_noise.changes_nothing(scenario.mission.noise):
+        return None
+    return msgspec.to_builtins(scenario.world_noise)
 
 
 def first_contact(run: Run) -> int | None:

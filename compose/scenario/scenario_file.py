@@ -16,6 +16,7 @@ from typing import Annotated, Any, get_args
 
 import msgspec
 from msgspec import Meta
+from msgspec.structs import asdict
 
 from compose.errors import BadFault, BadKill, BadScenario, Unworkable, UserError
 from compose.scenario.fault_syntax import FaultTable, added, table_of
@@ -39,7 +40,8 @@ from protocol.spelling import did_you_mean
 from protocol.units import NAME, RobotId
 from protocol.wire import MalformedFrame, decode, encode
 from world.faults import Fault, delivery_time_bound
-from world.scenario import RobotSpec, Scenario
+from world.scenario import RecordedScenario, RobotSpec, Scenario, ScenarioWithWorldNoise
+from world.world_noise import Distribution, WorldNoise, world_noise_infeasibility, world_noise_mistake
 
 MAX_TICKS = 10**9
 MAX_ROBOTS = 200
@@ -60,6 +62,7 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "name": get_args(PlannerName),
     "kind": get_args(Kind),
     "part": get_args(Part),
+    "distribution": get_args(Distribution),
     "point": (*POINTS, DRAWN),
 }
 """The permitted values of each field that takes one of a few words."""
@@ -74,6 +77,13 @@ class PlannerTable(_Table, frozen=True):
 
     name: PlannerName = "assured"
     """The planner of all robots."""
+
+
+class WorldTable(_Table, frozen=True):
+    """The `[world]` table: what the simulator does and the robots are not told."""
+
+    noise: WorldNoise = WorldNoise()
+    """The `[world.noise]` table: the noise that the sensors have."""
 
 
 class RobotTable(_Table, frozen=True):
@@ -106,6 +116,8 @@ class ScenarioFile(_Table, frozen=True):
     """The last tick of an undecided run; computed from the mission by default."""
     planner: PlannerTable = PlannerTable()
     """The `[planner]` table."""
+    world: WorldTable = WorldTable()
+    """The `[world]` table."""
     fault: list[FaultTable] = []
     """Faults of the radio, applied to each report one after the other."""
     kill: list[KillTable] = []
@@ -116,7 +128,7 @@ class ScenarioTemplate(msgspec.Struct, frozen=True):
     """A validated scenario file with its scenario, from which scenarios of other seeds are drawn cheaply."""
 
     file: ScenarioFile
-    scenario: Scenario
+    scenario: RecordedScenario
     """Scenario with the seed of the file."""
 
     def seeded(self, seed: int | None) -> Scenario:
@@ -256,6 +268,7 @@ def _validated(file: ScenarioFile, source: str, options: Sequence[str]) -> Scena
     """Return the scenario of `file`, with the faults of the `--fault` options added to its own."""
     _check_noise(file.mission, source)
     peers = _peers(file.robot, source)
+    _check_world_noise(file, list(peers.items()), source)
     place = {robot.id: i for i, robot in enumerate(file.robot)}
     placed: list[RobotSpec] = []
     plans: dict[str, Rendezvous] = {}
@@ -294,6 +307,8 @@ def _validated(file: ScenarioFile, source: str, options: Sequence[str]) -> Scena
         robots=tuple(placed),
         faults=faults,
     )
+    if not file.world.noise.changes_nothing(file.mission.noise):
+        scenario = ScenarioWithWorldNoise(**asdict(scenario), world_noise=file.world.noise)
     try:
         for one in scenario.robots:
             decode(encode(scenario.config(one.id)), RobotConfig)
@@ -334,6 +349,19 @@ def _check_noise(mission: Mission, source: str) -> None:
     why = noise_infeasibility(mission) or safety_infeasibility(mission)
     if why is not None:
         raise Unworkable(f"{source}: mission.{why}")
+
+
+def _check_world_noise(file: ScenarioFile, pairs: Sequence[tuple[str, str]], source: str) -> None:
+    """Raise BadScenario if the noise of the sensors is invalid, Unworkable if robots cannot localise.
+
+    `pairs` holds each pair of robots in both orders.
+    """
+    mistake = world_noise_mistake(file.world.noise, file.mission.noise, pairs)
+    if mistake is not None:
+        raise BadScenario(f"{source}: world.noise.{mistake[0]}: {mistake[1]}")
+    why = world_noise_infeasibility(file.world.noise, file.mission.noise)
+    if why is not None:
+        raise Unworkable(f"{source}: world.noise: {why}")
 
 
 def _plan(file: ScenarioFile, first: int, second: int, source: str) -> Rendezvous:

@@ -228,9 +228,16 @@ def summary_csv(sweep: Sweep, cells: Sequence[Cell], figures: Mapping[int, CellS
         axes: list[Any] = []
         for axis, place in zip(sweep.axes, cell.place, strict=True):
             axes += [axis.label(place)] if axis.labels is not None else []
-            axes += [value if isinstance(value, str) else canonical(value) for value in axis.values[place]]
+            axes += [_text(value) for value in axis.values[place]]
         rows.writerow([cell.index, *axes, *msgspec.structs.astuple(figures[cell.index])])
     return out.getvalue()
+
+
+def _text(value: Any) -> str:
+    """Return the value of a field as the text of a column; empty if the field is as in the base scenario."""
+    if value is None:
+        return ""
+    return value if isinstance(value, str) else canonical(value)
 
 
 def header(sweep: Sweep) -> list[str]:
