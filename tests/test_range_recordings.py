@@ -166,7 +166,7 @@ def test_odometry_and_ranges_of_the_sample_agree_with_its_truth() -> None:
         assert robot.truth is not None
         heading = np.unwrap(robot.truth.poses[:, 2])
         turned = np.diff(np.interp(robot.odometry.t1, robot.truth.t, heading))
-        assert np.std(turned - robot.odometry.increments[1:, 2]) < 0.004
+        assert np.std(turned - robot.odometry.increments[1:, 2]) < 0.003  # starts: 0.004 to 0.005
         t = recording.ranges.t
         places.append([np.interp(t, robot.truth.t, robot.truth.poses[:, axis]) for axis in (0, 1)])
     anchor = recording.anchors[0]

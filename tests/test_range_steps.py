@@ -79,7 +79,7 @@ def odometries(draw: st.DrawFn, pause: st.SearchStrategy[float] = pauses) -> Rob
     increments = []
     now = draw(st.floats(-1.0, 1.0))
     begin = now
-    for _ in range(draw(st.integers(8, 30))):
+    for _ in range(draw(st.integers(2, 10))):
         t0.append(now)
         now += draw(lengths)
         t1.append(now)
@@ -94,7 +94,7 @@ def odometries(draw: st.DrawFn, pause: st.SearchStrategy[float] = pauses) -> Rob
 stamps = st.lists(
     st.tuples(st.floats(-2.0, 12.0), st.just(0), st.sampled_from([1, 2]))
     | st.tuples(st.floats(-2.0, 12.0), st.just(1), st.just(2)),
-    max_size=40,
+    max_size=15,
 )
 
 
