@@ -137,6 +137,28 @@ def test_a_recording_cannot_be_changed(tmp_path: Path) -> None:
     assert not any(array.flags.writeable for array in arrays)
 
 
+def test_anchors_of_another_file_are_added_and_replace_those_of_the_same_names(tmp_path: Path) -> None:
+    other = tmp_path / "surveyed.csv"
+    other.write_text("anchor,x,y\nM1,30,40\nM2,5,6\n")
+    ranges = [*TABLES["ranges"], {"t": 1.0, "from": "b", "to": "M2", "range": 3.5}]
+    tables = {**TABLES, "ranges": ranges}
+    for path in (written_csv(tmp_path / "csv", tables), written_mcap(tmp_path / "one.mcap", tables)):
+        assert "M2 is neither a robot" in refused(path)
+        recording = read_ranges(path, other)
+        assert recording.anchors == (("M1", 30.0, 40.0, 0.0), ("M2", 5.0, 6.0, 0.0))
+        assert recording.radios[recording.ranges.second[-1]] == "M2"
+    for text, says in (
+        ("LC0,30,x", "line 2: y: expected a number, got 'x'"),
+        ("LC0,1,2\nLC0,1,2", "line 3: there are two anchors LC0"),
+    ):
+        other.write_text(f"anchor,x,y\n{text}\n")
+        with pytest.raises(BadRecording) as error:
+            read_ranges(SAMPLE, other)
+        assert str(error.value) == f"{other}, {says}"
+    other.write_text("anchor,x,y\nLC0,30,40\n")
+    assert read_ranges(SAMPLE, other).anchors == (("LC0", 30.0, 40.0, 0.0),)
+
+
 def test_the_sample_has_its_licence_and_is_small() -> None:
     assert sum(path.stat().st_size for path in SAMPLE.parent.iterdir()) <= MAX_SAMPLE_BYTES
     assert (SAMPLE.parent / "LICENSE").read_text().startswith("MIT License")

@@ -68,13 +68,16 @@ class Graph(NamedTuple):
     edges: dict[str, list[Edge]]
 
 
-def read_pyfg(path: Path) -> RangeRecording:
-    """Return the recording in the file `path`. Raises OSError, and BadRecording, which names the line."""
+def read_pyfg(path: Path, anchors: Sequence[AnchorRow] = ()) -> RangeRecording:
+    """Return the recording in the file `path`, with `anchors` in place of those of the same names there.
+
+    Raises OSError, and BadRecording, which names the line.
+    """
     try:
         text = files.read_text(path)
     except UnicodeDecodeError:
         raise BadRecording(f"{path}: it is not UTF-8 text") from None
-    builder, graph = RecordingBuilder(path), Graph({}, {})
+    builder, graph = RecordingBuilder(path, anchors), Graph({}, {})
     for number, line in enumerate(text.split("\n"), 1):
         if words := line.split():
             _take(words[0], words[1:], SourcePlace(path, number), graph, builder)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from compose.errors import BadRecording
@@ -36,9 +36,12 @@ TABLES: dict[str, type[AnyRow]] = {
 REQUIRED = ("odometry", "ranges")
 
 
-def read_csv(folder: Path) -> RangeRecording:
-    """Return the recording in `folder`. Raises OSError, and BadRecording, which names the file and line."""
-    builder = RecordingBuilder(folder)
+def read_csv(folder: Path, anchors: Sequence[AnchorRow] = ()) -> RangeRecording:
+    """Return the recording in `folder`, with `anchors` in place of those of the same names there.
+
+    Raises OSError, and BadRecording, which names the file and the line.
+    """
+    builder = RecordingBuilder(folder, anchors)
     for name, kind in TABLES.items():
         path = folder / f"{name}.csv"
         if name in REQUIRED or path.exists():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -16,21 +17,29 @@ from mcap.stream_reader import StreamReader
 from compose.errors import BadRecording
 from compose.recording.ranging.range_csv import TABLES
 from compose.recording.ranging.range_recording import RangeRecording
-from compose.recording.ranging.recording_rows import AnyRow, RecordingBuilder, SourcePlace, wrong_field
+from compose.recording.ranging.recording_rows import (
+    AnchorRow,
+    AnyRow,
+    RecordingBuilder,
+    SourcePlace,
+    wrong_field,
+)
 from protocol import files
 
 TOPICS = {f"/{name}": kind for name, kind in TABLES.items()}
 """The rows of each topic. Other topics are not used."""
 
 
-def read_mcap(path: Path) -> RangeRecording:
-    """Return the recording in the file `path`. Raises OSError, and BadRecording, which names the message."""
+def read_mcap(path: Path, anchors: Sequence[AnchorRow] = ()) -> RangeRecording:
+    """Return the recording in the file `path`, with `anchors` in place of those of the same names there.
+
+    Raises OSError, and BadRecording, which names the message.
+    """
     with files.open_file(path) as file:
-        return _read(file, path)
+        return _read(file, path, RecordingBuilder(path, anchors))
 
 
-def _read(file: BinaryIO, path: Path) -> RangeRecording:
-    builder = RecordingBuilder(path)
+def _read(file: BinaryIO, path: Path, builder: RecordingBuilder) -> RangeRecording:
     topics: dict[int, str] = {}
     counts = dict.fromkeys(TOPICS, 0)
     try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from collections.abc import Iterable
 from typing import Annotated, Any, NamedTuple, TypeVar
 
 import msgspec
@@ -154,12 +155,14 @@ def wrong_field(error: msgspec.ValidationError, values: object = None) -> str:
 class RecordingBuilder:
     """A range recording that is being read, row by row. Its errors are BadRecording and name the row."""
 
-    def __init__(self, source: object) -> None:
+    def __init__(self, source: object, anchors: Iterable[AnchorRow] = ()) -> None:
+        """Begin the recording in `source`. `anchors` replace those of the same names there."""
         self.source = str(source)
         self.unused: Counter[str] = Counter()
         """The number of entries that are not used, by kind."""
         self._odometry: dict[str, list[tuple[OdometryRow, Covariance6 | None]]] = {}
         self._truth: dict[str, list[TruthRow]] = {}
+        self._given = {row.anchor: row for row in anchors}
         self._anchors: dict[str, AnchorRow] = {}
         self._antennas: dict[str, AntennaRow] = {}
         self._ranges: list[tuple[RangeRow, object]] = []
@@ -182,7 +185,7 @@ class RecordingBuilder:
             case AnchorRow():
                 if row.anchor in self._anchors:
                     raise BadRecording(f"{place}: there are two anchors {row.anchor}")
-                self._anchors[row.anchor] = row
+                self._anchors[row.anchor] = self._given.get(row.anchor, row)
             case AntennaRow():
                 if row.robot in self._antennas:
                     raise BadRecording(f"{place}: there are two antennas of {row.robot}")
@@ -228,6 +231,7 @@ class RecordingBuilder:
         for robot, place in self._claims:
             if robot not in self._odometry:
                 raise BadRecording(f"{place}: robot: {robot} has no odometry")
+        self._anchors |= self._given
         for anchor in self._anchors:
             if anchor in self._odometry:
                 raise BadRecording(f"{self.source}: {anchor} is a robot and an anchor")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -31,16 +31,17 @@ covariance has no inverse. Estimators need one.
 """
 
 
-def ranges_of_run(run: Run) -> RangeRecording:
+def ranges_of_run(run: Run, given: Sequence[AnchorRow] = ()) -> RangeRecording:
     """Return the odometry, ranges and true poses in `run`, at the times of its ticks.
 
-    Equal anchors are one. A range between robots that both have measured appears once, and one to a robot
+    Equal anchors are one, with the name of the first robot that has it, and those in `given` replace those of
+    the same names. A range between robots that both have measured appears once, and one to a robot
     without a journal is left out. Raises BadRecording if no journal has the parameters of the mission.
     """
     setup = run.setup
     if setup is None or not run.length:
         raise BadRecording(f"{run.source}: no journal has the parameters of the mission and an Observation")
-    builder = RecordingBuilder(run.source)
+    builder = RecordingBuilder(run.source, given)
     anchors: dict[Anchor, str] = {}
     for one in setup.robots:
         builder.add_robot(one.id)
