@@ -278,6 +278,23 @@ def test_a_run_gives_what_its_robots_measured(noisy: Run) -> None:
     assert ranges.sigma[mutual[0]] == math.hypot(mission.noise.mutual_sigma, LEAST_SIGMA)
 
 
+def test_a_run_in_hardware_mode_has_no_truth_and_a_robot_alone_no_mutual_ranges(
+    noisy: Run, tmp_path: Path
+) -> None:
+    in_process.run_mission(load("noisy"), tmp_path)
+    (tmp_path / "world.journal").unlink()
+    pair, with_truth = read_ranges(tmp_path), ranges_of_run(noisy)
+    assert [robot.truth for robot in pair.robots] == [None, None]
+    np.testing.assert_array_equal(pair.ranges.range, with_truth.ranges.range)
+    ended = tandem("export", tmp_path, "--pyfg")
+    unknown = "the true poses of a, which a .pyfg file needs, are unknown"
+    assert ended == (USER_ERROR, "", f"tandem export: {tmp_path}: {unknown}\n")
+    (tmp_path / "agent-b.journal").unlink()
+    alone = read_ranges(tmp_path)
+    assert alone.radios == ("a", "anchor-a")
+    assert set(alone.pairs()) == {("a", "anchor-a")}
+
+
 @pytest.mark.parametrize("omega", [0.0, 1e-5, 0.7, -2.0])
 def test_the_covariance_of_an_increment_is_that_of_its_derivatives(omega: float) -> None:
     noise, executed, h = (
