@@ -25,6 +25,7 @@ BELOW = {
     "agent": {"agent", "protocol"},
     "world": {"world", "protocol"},
     "compose": {"compose", "agent", "world", "protocol"},
+    "tandem": {"tandem", "compose", "world", "protocol"},
 }
 """The packages of the project that each package may import."""
 
@@ -295,6 +296,9 @@ def loaded_by(module: str) -> set[str]:
 @pytest.mark.parametrize(
     ("module", "absent"),
     [
+        ("tandem", {"compose", "protocol", "msgspec", "numpy", "zenoh", "scipy", "rich"}),
+        ("tandem.missions", {"zenoh", "scipy", "rich", "matplotlib", "pyarrow", "pandas", "polars"}),
+        ("tandem.sweeps", {"zenoh", "rich", "distributed", "matplotlib", "pyarrow", "pandas", "polars"}),
         ("compose.cli.main", {"zenoh", "numpy", "scipy", "rich"}),
         ("agent.process.node", {"world", "compose", "scipy", "rich"}),
         ("world.hardware.bridge", {"numpy", "scipy", "rich", "agent", "compose", "rosbags"}),

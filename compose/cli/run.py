@@ -18,12 +18,11 @@ from compose.launch.signals import stop_by_signal
 from compose.launch.viewers import Viewer, foxglove_server, page, stay, viewing
 from compose.recording.recording_files import folder_for
 from compose.recording.run import Run, read
-from compose.scenario.kills import WORLD, Kill
-from compose.scenario.scenario_file import ScenarioTemplate, check_rate, run_name, setting
+from compose.scenario.kills import Kill
+from compose.scenario.scenario_file import check_rate, run_name, setting
 from compose.terminal.outcome import break_off, conclude, shown_live
 from protocol.journal.journal_file import CannotRecord
 from protocol.network.inbox import Inbox, Interrupted
-from protocol.spelling import did_you_mean
 from world.scenario import Scenario
 
 
@@ -88,7 +87,7 @@ def main(options: argparse.Namespace) -> int:
         need(*export_bar.MODULES)
         if options.out is None:
             raise UserError("--export: it needs --out DIR")
-    kills = _kills(options, found, scenario)
+    kills = found.kills(scenario.seed, options.kill)
     if options.secure:
         need("cryptography", extra="deploy")
     if options.in_process:
@@ -104,18 +103,6 @@ def _check_viewers(options: argparse.Namespace) -> None:
         need("foxglove")
     elif options.foxglove_origin:
         raise UserError("--foxglove-origin: it needs --foxglove")
-
-
-def _kills(options: argparse.Namespace, found: ScenarioTemplate, scenario: Scenario) -> tuple[Kill, ...]:
-    """Return the kills of the file, then those of the command line. Raises UserError."""
-    ids = [robot.id for robot in scenario.robots]
-    for kill in options.kill:
-        if kill.who not in (*ids, WORLD):
-            near = did_you_mean(kill.who, [*ids, WORLD])
-            raise UserError(
-                f"--kill: {kill.text}: there is no '{kill.who}'; there are {', '.join(ids)}, {WORLD}{near}"
-            )
-    return (*found.kills(scenario.seed), *options.kill)
 
 
 def _in_process(options: argparse.Namespace, scenario: Scenario, kills: tuple[Kill, ...]) -> int:

@@ -25,8 +25,8 @@ Mode = Literal["processes", "in-process"]
 SUMMARY = "summary.json"
 
 
-def summary(run: Run, mode: Mode, wall_s: float | None) -> dict[str, Any]:
-    """Return the content of `summary.json`; values that do not apply are None.
+def summary(run: Run, mode: Mode | None, wall_s: float | None) -> dict[str, Any]:
+    """Return the content of `summary.json`; values that do not apply or are unknown are None.
 
     `wall_s` is the wall time of the run in s.
     """

@@ -19,7 +19,7 @@ from msgspec import Meta
 
 from compose.errors import BadFault, BadKill, BadScenario, Unworkable, UserError
 from compose.scenario.fault_syntax import FaultTable, added, table_of
-from compose.scenario.kills import DRAWN, POINTS, Kill, KillTable, drawn
+from compose.scenario.kills import DRAWN, POINTS, WORLD, Kill, KillTable, drawn
 from compose.scenario.toml_file import field_first, read_text, table_in
 from protocol.attack import OF_THE_START, Attack, Kind, Part
 from protocol.messages import RobotConfig
@@ -135,9 +135,18 @@ class ScenarioTemplate(msgspec.Struct, frozen=True):
             ),
         )
 
-    def kills(self, seed: int) -> tuple[Kill, ...]:
-        """Return the kills of the file, with open fields drawn from `seed`. Raises BadKill."""
-        return drawn(self.file.kill, seed, [robot.id for robot in self.file.robot])
+    def kills(self, seed: int, options: Sequence[Kill] = ()) -> tuple[Kill, ...]:
+        """Return the kills of the file, with open fields drawn from `seed`, then those of `--kill` options.
+
+        Raises BadKill.
+        """
+        ids = [robot.id for robot in self.file.robot]
+        for kill in options:
+            if kill.who not in (*ids, WORLD):
+                anyone = [*ids, WORLD]
+                near = f"{', '.join(anyone)}{did_you_mean(kill.who, anyone)}"
+                raise BadKill(f"--kill: {kill.text}: there is no '{kill.who}'; there are {near}")
+        return (*drawn(self.file.kill, seed, ids), *options)
 
 
 def shipped(package: str = "scenario") -> dict[str, Path]:
@@ -214,6 +223,14 @@ def setting(source: str, faults: Sequence[str] = ()) -> ScenarioTemplate:
 
     Raises NotToml and BadScenario.
     """
+    return validate(scenario_table(source), source, faults)
+
+
+def scenario_table(source: str) -> dict[str, Any]:
+    """Return the content of the shipped scenario named `source`, or of the file at that path, not validated.
+
+    Raises NotToml and BadScenario.
+    """
     path = shipped().get(source, Path(source))
     try:
         text = read_text(path)
@@ -224,7 +241,7 @@ def setting(source: str, faults: Sequence[str] = ()) -> ScenarioTemplate:
     table = table_in(text, source)
     if (why := misplaced(source, table, "scenario")) is not None:
         raise BadScenario(why)
-    return validate(table, source, faults)
+    return table
 
 
 def parse(text: str, source: str, *, seed: int | None = None, faults: Sequence[str] = ()) -> Scenario:

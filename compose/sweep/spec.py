@@ -19,6 +19,7 @@ from compose.scenario import scenario_file
 from compose.scenario.toml_file import field_first, read_text, table_in
 from compose.sweep.draws import Draw, Draws, DrawTable, StartsTable
 from compose.sweep.field_paths import Steps, canonical, jsonable, steps, value_at, with_value
+from protocol.spelling import did_you_mean
 from protocol.units import NAME
 
 MAX_TRIALS = 10**7
@@ -127,16 +128,34 @@ def load(source: str, *, trials: int | None = None, seed: int | None = None) -> 
     path = shipped().get(source, Path(source))
     try:
         table = table_in(read_text(path), source)
-        if (why := scenario_file.misplaced(source, table, "sweep")) is not None:
-            raise BadSpec(why)
-        spec = msgspec.convert(table, SpecFile)
     except FileNotFoundError:
         raise BadSpec(scenario_file.unknown(source, "sweep")) from None
-    except msgspec.ValidationError as error:
-        raise BadSpec(f"{source}: {field_first(str(error), {})}") from None
     except ValueError as error:
         raise BadSpec(f"{source}: {error}") from None
-    base = _base(spec, path, source)
+    if (why := scenario_file.misplaced(source, table, "sweep")) is not None:
+        raise BadSpec(why)
+    return validated(table, source, path.parent, trials=trials, seed=seed)
+
+
+def validated(
+    table: Mapping[str, Any],
+    source: str,
+    folder: Path,
+    *,
+    base: dict[str, Any] | None = None,
+    trials: int | None = None,
+    seed: int | None = None,
+) -> Sweep:
+    """Return the sweep whose file has the content `table`.
+
+    `source` begins errors, and `folder` is that of the sweep file. `base` is the table of the scenario if it
+    is not in a file; `trials` and `seed` override the values of the sweep file. Raises BadSpec.
+    """
+    try:
+        spec = msgspec.convert(table, SpecFile)
+    except msgspec.ValidationError as error:
+        raise BadSpec(f"{source}: {field_first(str(error), {})}") from None
+    base = base if base is not None else _base(spec, folder, source)
     axes = tuple(_axis(axis, f"{source}: axis[{i}]", base) for i, axis in enumerate(spec.axis))
     draws = Draws(_draws(spec, axes, base, source), spec.starts)
     _check_together(axes, draws, source)
@@ -152,16 +171,16 @@ def load(source: str, *, trials: int | None = None, seed: int | None = None) -> 
     )
 
 
-def _base(spec: SpecFile, path: Path, source: str) -> dict[str, Any]:
+def _base(spec: SpecFile, folder: Path, source: str) -> dict[str, Any]:
     """Return the table of the base scenario of `spec`. Raises BadSpec if it cannot be read."""
-    file = scenario_file.shipped().get(spec.scenario, path.parent / spec.scenario)
+    file = scenario_file.shipped().get(spec.scenario, folder / spec.scenario)
     try:
         return table_in(read_text(file), spec.scenario)
     except FileNotFoundError:
-        names = ", ".join(scenario_file.shipped())
+        names = scenario_file.shipped()
         raise BadSpec(
             f"{source}: scenario: '{spec.scenario}' is neither a file in the folder of the sweep file nor a "
-            f"shipped scenario ({names})"
+            f"shipped scenario ({', '.join(names)}){did_you_mean(spec.scenario, names)}"
         ) from None
     except (ValueError, NotToml) as error:
         raise BadSpec(f"{source}: scenario: {error}") from None
