@@ -34,6 +34,7 @@ from protocol.attack import Attack
 from protocol.mission import Mission
 from protocol.network import keys
 from protocol.noise import Noise, VelocityNoise
+from tandem import rows
 
 MARKER = re.compile(r"^<!-- generated: (?P<name>[\w-]+) -->$", re.MULTILINE)
 NO_VALUE = "none"
@@ -297,6 +298,12 @@ TABLES: dict[str, Callable[[], str]] = {
     "trial-columns": partial(columns_of, TrialRow),
     "robot-columns": partial(columns_of, RobotRow),
     "tick-columns": partial(columns_of, TickRow),
+    "truth-table": partial(columns_of, rows.TruthRow),
+    "observation-table": partial(columns_of, rows.ObservationRow),
+    "command-table": partial(columns_of, rows.CommandRow),
+    "estimate-table": partial(columns_of, rows.EstimateRow),
+    "message-table": partial(columns_of, rows.MessageRow),
+    "claim-table": partial(columns_of, rows.ClaimRow),
     "final-report": partial(columns_of, messages.FinalReport),
     "wire-version": wire_version,
     "wire-keys": wire_keys,
