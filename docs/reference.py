@@ -7,14 +7,11 @@ A page has a line `<!-- generated: NAME -->` for each of TABLES, and the hook wr
 from __future__ import annotations
 
 import argparse
-import ast
 import inspect
 import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from functools import cache, partial
-from itertools import pairwise
-from types import ModuleType
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -24,6 +21,7 @@ from msgspec import inspect as types
 from compose.cli.main import COMMANDS, command_parser
 from compose.recording.ticks_csv import TickRow
 from compose.scenario.fault_syntax import FaultTable
+from compose.scenario.json_schema import described
 from compose.scenario.kills import KillTable
 from compose.scenario.scenario_file import PlannerTable, RobotTable, ScenarioFile
 from compose.sweep.draws import DrawTable, StartsTable
@@ -60,40 +58,6 @@ NAMES = {
     "VelocityNoise": "table",
 }
 """the types of tables of files, as a user writes them"""
-
-
-@cache
-def _docstrings(module: ModuleType) -> dict[str, dict[str, str]]:
-    """Return the docstring under each field of each class in `module`, by class and field."""
-    found: dict[str, dict[str, str]] = {}
-    try:
-        source = inspect.getsource(module)
-    except (OSError, TypeError):  # a module in C
-        return {}
-    for node in ast.parse(source).body:
-        if isinstance(node, ast.ClassDef):
-            found[node.name] = dict(_pairs(node.body))
-    return found
-
-
-def _pairs(body: Sequence[ast.stmt]) -> Iterable[tuple[str, str]]:
-    """Yield the names of annotated fields that have a string below them, and that string."""
-    for field, below in pairwise(body):
-        match field, below:
-            case (
-                ast.AnnAssign(target=ast.Name(id=name)),
-                ast.Expr(value=ast.Constant(value=str(text))),
-            ):
-                yield name, " ".join(text.split())
-
-
-def _described(struct: type[msgspec.Struct], field: str) -> str:
-    """Return the docstring of a field, of the class that declares it; empty if it has none."""
-    for cls in struct.__mro__:
-        module = inspect.getmodule(cls)
-        if module is not None and field in (found := _docstrings(module).get(cls.__name__, {})):
-            return found[field]
-    return ""
 
 
 def _bounds(kind: Any) -> str:
@@ -176,7 +140,7 @@ def fields_of(struct: type[msgspec.Struct], *, defaults: bool = True) -> str:
             f"`{field.encode_name}`",
             _typed(field.type),
             *([_default(field)] if defaults else []),
-            _described(struct, field.name),
+            described(struct, field.name),
         ]
         for field in info.fields
     ]
@@ -189,7 +153,7 @@ def columns_of(struct: type[msgspec.Struct]) -> str:
     assert isinstance(info, types.StructType)
     return _table(
         ["column", "type", "meaning"],
-        [[f"`{field.name}`", _typed(field.type), _described(struct, field.name)] for field in info.fields],
+        [[f"`{field.name}`", _typed(field.type), described(struct, field.name)] for field in info.fields],
     )
 
 

@@ -63,11 +63,11 @@ def test_a_file_that_is_not_toml_is_refused(text: bytes, says: str, tmp_path: Pa
 @pytest.mark.parametrize(
     ("was", "typo", "field"),
     [
-        ("seed = 1", "sede = 1", "unknown field 'sede'"),
+        ("seed = 1", "sede = 1", "unknown field 'sede'; did you mean 'seed'?"),
         ("[planner]", "[planer]", "unknown field 'planer'"),
-        ("period =", "peroid =", "mission: unknown field 'peroid'"),
+        ("period =", "peroid =", "mission: unknown field 'peroid'; did you mean 'period'?"),
         ('name = "paper"', 'nmae = "paper"', "planner: unknown field 'nmae'"),
-        ("start = [11", "statr = [11", "robot[1]: unknown field 'statr'"),
+        ("start = [11", "statr = [11", "robot[1]: unknown field 'statr'; did you mean 'start'?"),
         ("seed = 1", '"two\\nlines" = 1', "unknown field 'two"),
     ],
 )
@@ -78,7 +78,11 @@ def test_an_unknown_field_is_named(was: str, typo: str, field: str, tmp_path: Pa
 @pytest.mark.parametrize(
     ("was", "new", "says"),
     [
-        ('"paper"', '"papers"', "planner.name: there is no 'papers'; there are assured, paper"),
+        (
+            '"paper"',
+            '"papers"',
+            "planner.name: there is no 'papers'; there are assured, paper; did you mean 'paper'?",
+        ),
         (
             'id = "a"',
             'id = "a"\nattack = {kind = "scal", size = 2}',
@@ -92,12 +96,12 @@ def test_an_unknown_field_is_named(was: str, typo: str, field: str, tmp_path: Pa
         (
             'id = "a"',
             'id = "a"\nattack = {kind = "scale", size = 2, part = "orbits"}',
-            "robot[0].attack.part: there is no 'orbits'; there are phase-1, orbit, encounter, all",
+            "robot[0].attack.part: there is no 'orbits'; there are all, encounter, orbit, phase-1; did",
         ),
         (
             "[planner]",
             '[[kill]]\npoint = "sens"\n[planner]',
-            "kill[0].point: there is no 'sens'; there are observation, report, journal, command, ?",
+            "kill[0].point: there is no 'sens'; there are ?, command, journal, observation, report",
         ),
     ],
 )

@@ -12,16 +12,16 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta
 
 from compose.errors import BadFault, BadKill, BadScenario, Unworkable, UserError
 from compose.scenario.fault_syntax import FaultTable, added, table_of
-from compose.scenario.kills import DRAWN, POINTS, WORLD, Kill, KillTable, drawn
+from compose.scenario.kills import WORLD, Kill, KillTable, drawn
 from compose.scenario.toml_file import field_first, read_text, table_in
-from protocol.attack import OF_THE_START, Attack, Kind, Part
+from protocol.attack import OF_THE_START, Attack
 from protocol.messages import RobotConfig
 from protocol.mission import (
     Anchor,
@@ -54,15 +54,6 @@ TICK_S = (5e-4, 3600.0)
 """The bounds in s of the wall time of a tick in real time."""
 WITHIN = 1.0 - 1e-9
 """The part of R within which starts are drawn, so that rounding cannot move one outside."""
-
-
-CHOICES: dict[str, tuple[str, ...]] = {
-    "name": get_args(PlannerName),
-    "kind": get_args(Kind),
-    "part": get_args(Part),
-    "point": (*POINTS, DRAWN),
-}
-"""The permitted values of each field that takes one of a few words."""
 
 
 class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -260,7 +251,7 @@ def validate(table: Mapping[str, Any], source: str, faults: Sequence[str] = ()) 
     try:
         file = msgspec.convert(table, ScenarioFile)
     except msgspec.ValidationError as error:
-        raise BadScenario(f"{source}: {field_first(str(error), CHOICES)}") from None
+        raise BadScenario(f"{source}: {field_first(str(error), ScenarioFile)}") from None
     found = ScenarioTemplate(file, _validated(file, source, faults))
     try:
         found.kills(file.seed)

@@ -154,7 +154,7 @@ def validated(
     try:
         spec = msgspec.convert(table, SpecFile)
     except msgspec.ValidationError as error:
-        raise BadSpec(f"{source}: {field_first(str(error), {})}") from None
+        raise BadSpec(f"{source}: {field_first(str(error), SpecFile)}") from None
     base = base if base is not None else _base(spec, folder, source)
     axes = tuple(_axis(axis, f"{source}: axis[{i}]", base) for i, axis in enumerate(spec.axis))
     draws = Draws(_draws(spec, axes, base, source), spec.starts)

@@ -36,4 +36,4 @@ def main(file: str = "loss.png", trials: int = 20, workers: int | None = None) -
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:2])
+    main(sys.argv[1] if len(sys.argv) > 1 else "loss.png")

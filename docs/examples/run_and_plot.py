@@ -30,4 +30,4 @@ def main(file: str = "run.png") -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main(sys.argv[1] if len(sys.argv) > 1 else "run.png")
