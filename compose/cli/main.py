@@ -48,6 +48,7 @@ COMMANDS = (
     CommandEntry("run", "Run", "Run a mission on this machine."),
     CommandEntry("replay", "Run", "Run a recording again and compare it with the original bit by bit."),
     CommandEntry("scenarios", "Run", "List the scenarios and sweeps that ship with Tandem."),
+    CommandEntry("init", "Run", "Write a scenario, a sweep, a script and a driver to start from."),
     CommandEntry("sweep", "Run", "Run many trials of a scenario, over ranges of its fields."),
     CommandEntry("world", "Deploy", "Run the simulator of a mission; agents connect to it."),
     CommandEntry("agent", "Deploy", "Run the agent of one robot; it connects to a world."),
@@ -61,6 +62,7 @@ COMMANDS = (
     CommandEntry("ps", "Check", "List the missions on a network and the robots in them."),
     CommandEntry("check-driver", "Check", "Check a driver against its contract; the robot moves."),
     CommandEntry("bench", "Check", "Measure speed against baselines in the same run."),
+    CommandEntry("completion", "Check", "Print a script with which bash or zsh completes `tandem`."),
 )
 """All commands, in the order of `tandem --help`."""
 

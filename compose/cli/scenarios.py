@@ -12,7 +12,6 @@ from pathlib import Path
 from compose.cli.arguments import add_closing
 from compose.errors import ENDED
 from compose.scenario.scenario_file import ScenarioFile, shipped
-from compose.sweep.spec import SpecFile
 from compose.terminal import text_width
 from protocol.output import say
 
@@ -33,6 +32,7 @@ def main(options: argparse.Namespace) -> int:
     """List the scenarios and the sweeps that ship, with the first sentence of each; or print a schema."""
     if options.schema is not None:
         from compose.scenario.json_schema import json_schema  # noqa: PLC0415  # rarely needed
+        from compose.sweep.spec import SpecFile  # noqa: PLC0415
 
         schema = json_schema(ScenarioFile if options.schema == "scenario" else SpecFile)
         say(*json.dumps(schema, indent=2).splitlines())
