@@ -28,7 +28,7 @@ from world.scenario import Scenario
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `tandem run`."""
-    arguments.add_scenario(parser)
+    arguments.add_scenarios(parser)
     arguments.add_running(parser)
     parser.add_argument(
         "--in-process",
@@ -75,9 +75,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(options: argparse.Namespace) -> int:
-    """Run the mission, as processes or in this one, and return the exit status of its outcome."""
+    """Run the mission or missions, as processes or in this one, and return the exit status of the outcome."""
     if not options.in_process:
         supervisor.fork_server()  # it imports modules while this process does
+    missions = [(source, seed) for source in options.scenario for seed in options.seed]
+    if len(missions) > 1:
+        from compose.cli import several_runs  # noqa: PLC0415  # rarely needed
+
+        return several_runs.run_all(options, missions, run_one)
+    options.scenario, options.seed = missions[0]
+    return run_one(options)
+
+
+def run_one(options: argparse.Namespace) -> int:
+    """Run one mission, whose `scenario` and `seed` are single values, and return its exit status."""
     found = setting(options.scenario, options.fault)
     scenario = found.seeded(options.seed)
     if options.out is not None and any(options.out.glob("*.journal")):

@@ -8,6 +8,9 @@ import threading
 
 from protocol.network.inbox import Inbox
 
+STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""The signals that stop a command."""
+
 
 def stop_with_launcher(inbox: Inbox) -> None:
     """Put "stop" into `inbox` when standard input, which a launcher holds open, comes to its end."""
@@ -20,15 +23,21 @@ def stop_with_launcher(inbox: Inbox) -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
+def end_by_signal() -> None:
+    """Let SIGINT, SIGTERM and SIGHUP end the process at once and without output, until `stop_by_signal`."""
+    for number in STOPPING:
+        signal.signal(number, signal.SIG_DFL)
+
+
 def stop_by_signal(inbox: Inbox) -> None:
     """Put "stop" into `inbox` on SIGINT, SIGTERM and SIGHUP, from now until the process ends.
 
-    Before this call, such a signal ends the process at once and without output. The handlers are never
-    removed, so that a signal cannot interrupt the output and the files at the end of a run.
+    Before this call, such a signal ends the process at once and without output. The handlers are not
+    removed after a run, so that a signal cannot interrupt the output and the files at the end of a run.
     """
 
     def hand_over(number: int, _frame: object) -> None:
         inbox.put("stop", signal.Signals(number).name)
 
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    for number in STOPPING:
         signal.signal(number, hand_over)
