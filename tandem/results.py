@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from compose.audit.findings import Findings
-from compose.audit.rules import audit_run
 from compose.errors import UserError
 from compose.extras import need
 from compose.figures import PICTURES
@@ -30,6 +28,7 @@ from tandem.columns import Table, table_of
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from compose.audit.findings import Findings
     from compose.figures.agent_replay import AgentReplay
     from compose.figures.pair import PairRecord
 
@@ -143,6 +142,8 @@ class Run(msgspec.Struct, frozen=True, dict=True, eq=False):
 
         Raises UserError if the journal of a robot cannot be read.
         """
+        from compose.audit.rules import audit_run  # noqa: PLC0415  # it imports the planners
+
         with user_errors(Path(str(self.model.source))):
             return audit_run(self.model)
 

@@ -298,6 +298,7 @@ def loaded_by(module: str) -> set[str]:
     [
         ("tandem", {"compose", "protocol", "msgspec", "numpy", "zenoh", "scipy", "rich"}),
         ("tandem.missions", {"zenoh", "scipy", "rich", "matplotlib", "pyarrow", "pandas", "polars"}),
+        ("tandem.results", {"agent", "zenoh", "scipy", "rich", "matplotlib", "pyarrow", "pandas", "polars"}),
         ("tandem.sweeps", {"zenoh", "rich", "distributed", "matplotlib", "pyarrow", "pandas", "polars"}),
         ("compose.cli.main", {"zenoh", "numpy", "scipy", "rich"}),
         ("agent.process.node", {"world", "compose", "scipy", "rich"}),

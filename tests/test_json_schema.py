@@ -50,3 +50,4 @@ def test_the_command_prints_a_valid_schema_that_explains_every_field(kind: str) 
         for field, found in definition["properties"].items():
             assert found.get("description"), f"{name}.{field}"
     assert "null" not in ended.out
+    assert "\\\\A" not in ended.out, "not a pattern of ECMAScript"
