@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compose.extras import need
+from protocol.spelling import did_you_mean
 
 SHOWN = 10
 """The number of rows that a notebook shows."""
@@ -52,6 +53,10 @@ class Table:
         return self._columns.keys()
 
     def __getitem__(self, name: str) -> Column:
+        """Return a column. Raises KeyError, whose text has the names of all columns."""
+        if name not in self._columns:
+            known = f"{', '.join(self._columns)}{did_you_mean(name, self._columns)}"
+            raise KeyError(f"there is no column '{name}'; there are {known}")
         return self._columns[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -65,7 +70,7 @@ class Table:
         """Return the rows whose columns have these values. Raises KeyError if there is no such column."""
         chosen = np.ones(len(self), bool)
         for name, value in values.items():
-            chosen &= self._columns[name] == value
+            chosen &= self[name] == value
         return Table({name: column[chosen] for name, column in self._columns.items()})
 
     def arrow(self) -> Any:

@@ -169,6 +169,31 @@ def test_an_array_of_a_table_cannot_be_changed_by_accident(run: tandem.Run) -> N
     assert run.truth["x"][0] != 0.0
 
 
+def test_an_unknown_column_is_named_with_the_known_ones(run: tandem.Run) -> None:
+    with pytest.raises(KeyError, match=r"no column 'headng'; there are tick, .*; did you mean 'heading'\?"):
+        run.truth["headng"]
+    with pytest.raises(KeyError, match="no column 'robt'"):
+        run.truth.where(robt="a")
+
+
+def test_a_recording_of_hardware_mode_has_no_truth_and_no_errors(tmp_path: Path) -> None:
+    saved = tandem.run("noisy", seed=7).save(tmp_path / "recording")
+    for name in ("world.journal", "summary.json"):
+        (saved / name).unlink()
+    run = tandem.open(saved)
+    assert (run.outcome, run.seed, run.mode, len(run.truth)) == ("localised", None, None, 0)
+    assert run.claims["localised"].all()
+    assert not np.isnan(run.claims["x"]).any()
+    assert np.isnan(run.claims["position_error_m"]).all()
+    assert np.isnan(run.estimates["position_error_m"]).all()
+    assert run.audit().violations == ()
+    assert "hardware mode" in run._repr_html_()
+    with pytest.raises(tandem.UserError, match=r"there is no world\.journal$"):
+        _ = run.summary
+    again = tandem.open(run.save(tmp_path / "again"))
+    assert same(again.messages, run.messages)
+
+
 @pytest.mark.parametrize(("method", "library"), [("arrow", "pyarrow"), ("pandas",) * 2, ("polars",) * 2])
 def test_a_missing_library_is_named_with_its_extra(
     run: tandem.Run, method: str, library: str, monkeypatch: pytest.MonkeyPatch
